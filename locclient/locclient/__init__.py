@@ -1,0 +1,1 @@
+"""The localization client that runs on a robot."""

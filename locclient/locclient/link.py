@@ -1,0 +1,213 @@
+"""How a robot gets its map and reports: over the bus from a server, or out of a store's folder."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from fleetmap.bus import Bus, Handle
+from fleetmap.errors import FleetmapError, LinkError, MapFormatError, UnreachableError
+from fleetmap.mapformat import (
+    Manifest,
+    Tile,
+    TileEntry,
+    check_name,
+    check_sha256,
+    decode_manifest,
+    decode_tile,
+    verified,
+)
+from fleetmap.messages import (
+    PoseMessage,
+    RobotAck,
+    RobotHealth,
+    WantedVersion,
+    blob_key,
+    decode_message,
+    encode_message,
+    manifest_key,
+    robot_key,
+)
+from locclient.tile_cache import StoreFolder, TileCache
+
+
+@dataclass(frozen=True)
+class FetchedTiles:
+    """Tiles that are whole, and for each other one why the robot goes on without it."""
+
+    tiles: dict[tuple[int, int], Tile] = field(default_factory=dict)
+    refused: dict[tuple[int, int], str] = field(default_factory=dict)
+
+
+class MapSource(Protocol):
+    """What a robot reads its map from."""
+
+    def wanted(self) -> WantedVersion:
+        """The version that this robot should run."""
+
+    def manifest(self, wanted: WantedVersion) -> Manifest:
+        """The manifest of that version."""
+
+    def vocabulary(self, manifest: Manifest) -> bytes:
+        """The vocabulary of that version."""
+
+    def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
+        """Tiles of that version: all, or those of `cells` that it has."""
+
+
+class MapLink:
+    """A robot's link to the server, through a cache.
+
+    Bytes that are in the cache are not asked for again, so a known version can be read with the server away.
+    """
+
+    def __init__(self, bus: Bus, cache: TileCache, site: str, robot: str, *, timeout_s: float = 5.0) -> None:
+        """Raises UsageError for names that cannot be keys."""
+        self._bus = bus
+        self._cache = cache
+        self._site = check_name(site, "site")
+        self._robot = check_name(robot, "robot")
+        self._timeout_s = timeout_s
+
+    def announce_presence(self) -> Handle:
+        """Shows the server that this robot is there, until the handle or the bus is closed."""
+        return self._bus.declare_alive(self._key("alive"))
+
+    def wanted(self) -> WantedVersion:
+        """The version that the server wants this robot to run; raises LinkError when nobody answers."""
+        wanted = decode_message(self._bus.get(self._key("wanted"), timeout_s=self._timeout_s), WantedVersion)
+        if wanted.site != self._site:
+            raise LinkError(f"asked for site {self._site}, the server answered for {wanted.site[:80]!r}")
+        return wanted
+
+    def on_wanted(self, listen: Callable[[WantedVersion], None]) -> Handle:
+        """Calls `listen`, on a thread of the bus, whenever the server wants another version."""
+        return self._bus.subscribe(
+            self._key("wanted"), lambda _, payload: listen(decode_message(payload, WantedVersion))
+        )
+
+    def manifest(self, wanted: WantedVersion) -> Manifest:
+        """The wanted version's manifest, from the cache or the server.
+
+        Raises LinkError where the site has no version or nobody answers, MapFormatError for bytes that are not the
+        wanted ones.
+        """
+        version, sha256 = _address(wanted)
+        data = self._cache.get(sha256)
+        if data is None:
+            data = verified(self._bus.get(manifest_key(self._site, version), timeout_s=self._timeout_s), sha256)
+            self._cache.put(sha256, data)
+        return _checked(decode_manifest(data), wanted)
+
+    def vocabulary(self, manifest: Manifest) -> bytes:
+        """The version's vocabulary, from the cache or the server; errors as of `manifest`."""
+        return self._blob(manifest.vocabulary.sha256)
+
+    def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
+        """Tiles of the version, from the cache or the server: all, or those of `cells` that it has.
+
+        Never raises for a tile: one that is damaged or does not come is refused with its reason, the rest stays usable.
+        Once nobody answers, only the cache is asked, so that a robot without a network does not wait for every tile.
+        """
+        silence: list[UnreachableError] = []
+
+        def blob(sha256: str) -> bytes:
+            if silence and sha256 not in self._cache:
+                raise silence[0]
+            try:
+                return self._blob(sha256)
+            except UnreachableError as error:
+                silence.append(error)
+                raise
+
+        return _collect(manifest, cells, blob)
+
+    def ack(self, version: int | None, *, stamp_ns: int, refused: str = "") -> None:
+        """Tells the server which version this robot runs and, if so, why not the wanted one."""
+        message = RobotAck(
+            site=self._site, robot=self._robot, stamp_ns=stamp_ns, version=version, refused=refused[:2000]
+        )
+        self._bus.publish(self._key("ack"), encode_message(message))
+
+    def publish_health(self, health: RobotHealth) -> None:
+        """Sends the robot's report."""
+        self._bus.publish(self._key("health"), encode_message(health))
+
+    def publish_pose(self, message: PoseMessage) -> None:
+        """Sends an estimate; it may be lost when the network is full, because the next one is worth more."""
+        self._bus.publish(self._key("pose"), encode_message(message), may_drop=True)
+
+    def _key(self, what: str) -> str:
+        return robot_key(self._site, self._robot, what)
+
+    def _blob(self, sha256: str) -> bytes:
+        data = self._cache.get(sha256)
+        if data is None:
+            data = verified(self._bus.get(blob_key(self._site, sha256), timeout_s=self._timeout_s), sha256)
+            self._cache.put(sha256, data)
+        return data
+
+
+class StoreFolderLink:
+    """The same reading out of a store's folder, for a robot without a server."""
+
+    def __init__(self, folder: StoreFolder, site: str) -> None:
+        """Raises UsageError for a name that no site can have."""
+        self._folder = folder
+        self._site = check_name(site, "site")
+
+    def wanted(self) -> WantedVersion:
+        """The site's current version."""
+        sha256 = self._folder.current_manifest(self._site)
+        if sha256 is None:
+            return WantedVersion(site=self._site, version=None, manifest_sha256=None)
+        version = decode_manifest(self._folder.blob(sha256)).version
+        return WantedVersion(site=self._site, version=version, manifest_sha256=sha256)
+
+    def manifest(self, wanted: WantedVersion) -> Manifest:
+        """The wanted version's manifest; errors as of `MapLink.manifest`, StoreError where bytes are missing."""
+        return _checked(decode_manifest(self._folder.blob(_address(wanted)[1])), wanted)
+
+    def vocabulary(self, manifest: Manifest) -> bytes:
+        """The version's vocabulary."""
+        return self._folder.blob(manifest.vocabulary.sha256)
+
+    def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
+        """Tiles of the version, as `MapLink.tiles`."""
+        return _collect(manifest, cells, self._folder.blob)
+
+
+def _address(wanted: WantedVersion) -> tuple[int, str]:
+    if wanted.version is None or wanted.manifest_sha256 is None:
+        raise LinkError(f"site {wanted.site} has no published version; publish one with `mapserver publish`")
+    return wanted.version, check_sha256(wanted.manifest_sha256)
+
+
+def _checked(manifest: Manifest, wanted: WantedVersion) -> Manifest:
+    if (manifest.site, manifest.version) != (wanted.site, wanted.version):
+        raise MapFormatError(
+            f"the manifest is of {manifest.site} version {manifest.version}, wanted was {wanted.site} {wanted.version}"
+        )
+    return manifest
+
+
+def _collect(manifest: Manifest, cells: Iterable[tuple[int, int]] | None, blob: Callable[[str], bytes]) -> FetchedTiles:
+    fetched = FetchedTiles()
+    asked = None if cells is None else set(cells)
+    for entry in manifest.tiles:
+        cell = (entry.x, entry.y)
+        if asked is None or cell in asked:
+            try:
+                fetched.tiles[cell] = _tile(entry, manifest.tile_size_m, blob(entry.sha256))
+            except FleetmapError as error:
+                # The reason is the result: one bad tile must not cost a robot the rest of its map.
+                fetched.refused[cell] = str(error)
+    return fetched
+
+
+def _tile(entry: TileEntry, size_m: float, data: bytes) -> Tile:
+    tile = decode_tile(data)
+    if (tile.tile_x, tile.tile_y, tile.size_m, len(tile)) != (entry.x, entry.y, size_m, entry.landmarks):
+        raise MapFormatError(
+            f"{tile.name} with {len(tile)} landmarks is not the manifest's ({entry.x}, {entry.y}) of {entry.landmarks}"
+        )
+    return tile

@@ -1,0 +1,145 @@
+"""The robot's disk cache of map bytes, addressed by their SHA-256 and bounded in size. Also reads a store's folder."""
+
+import os
+import secrets
+from pathlib import Path
+
+from fleetmap.errors import MapFormatError, StoreError
+from fleetmap.mapformat import blob_path, check_sha256, current_path, verified
+
+DEFAULT_MAX_BYTES = 2_000_000_000
+
+
+class TileCache:
+    """Files below one folder; the least recently used go first when `max_bytes` is exceeded.
+
+    Nothing here trusts the disk: bytes are verified whenever they are read. A disk that refuses costs the cache, not
+    the robot's map: what went wrong is told by `take_faults`. Not for several threads at once. One process at a time
+    should use a folder; a second one does no harm but may evict what the first one still wants.
+    """
+
+    def __init__(self, folder: Path, *, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
+        """Makes the folder; raises StoreError where that is not possible."""
+        self._folder = folder
+        self._max_bytes = max_bytes
+        self._faults: list[str] = []
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._sizes = self._scan()
+        except OSError as error:
+            raise StoreError(f"the cache {folder} cannot be used ({error.strerror}); choose another folder") from error
+
+    def __contains__(self, sha256: str) -> bool:
+        return sha256 in self._sizes
+
+    @property
+    def total_bytes(self) -> int:
+        """Bytes of all cached files."""
+        return sum(self._sizes.values())
+
+    def get(self, sha256: str) -> bytes | None:
+        """The bytes of an address; None where they are not here. Damaged ones are removed and told as a fault."""
+        path = self._path(sha256)
+        try:
+            data = verified(path.read_bytes(), sha256)
+            os.utime(path)
+        except FileNotFoundError:
+            self._sizes.pop(sha256, None)
+            return None
+        except (OSError, MapFormatError) as error:
+            self._faults.append(f"cached {sha256} cannot be used and was removed: {error}")
+            self._remove(sha256)
+            return None
+        # Dictionaries keep their order: last used is last.
+        self._sizes[sha256] = self._sizes.pop(sha256, len(data))
+        return data
+
+    def put(self, sha256: str, data: bytes) -> None:
+        """Keeps `data`, written whole or not at all, and makes room for it.
+
+        Raises MapFormatError for bytes of another address. A disk that refuses is told as a fault.
+        """
+        verified(data, sha256)
+        path = self._path(sha256)
+        temporary = path.with_name(f".{sha256[:16]}.{secrets.token_hex(8)}.tmp")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with temporary.open("xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        except OSError as error:
+            self._faults.append(f"{path} cannot be written ({error.strerror}); make space for the cache")
+            self._try_unlink(temporary)
+            return
+        self._sizes.pop(sha256, None)
+        self._sizes[sha256] = len(data)
+        self._make_room(keep=sha256)
+
+    def take_faults(self) -> list[str]:
+        """What went wrong with the disk since the last call, in words."""
+        faults, self._faults = self._faults, []
+        return faults
+
+    def _scan(self) -> dict[str, int]:
+        found = []
+        for path in self._folder.glob("blobs/??/*"):
+            if path.suffix == ".tmp":
+                # Left by a process that died while writing.
+                path.unlink(missing_ok=True)
+            elif len(path.name) == 64:
+                status = path.stat()
+                found.append((status.st_mtime_ns, path.name, status.st_size))
+        return {name: size for _, name, size in sorted(found)}
+
+    def _make_room(self, keep: str) -> None:
+        total = self.total_bytes
+        for sha256 in list(self._sizes):
+            if total <= self._max_bytes:
+                return
+            if sha256 != keep:
+                total -= self._sizes[sha256]
+                self._remove(sha256)
+
+    def _remove(self, sha256: str) -> None:
+        self._sizes.pop(sha256, None)
+        self._try_unlink(self._path(sha256))
+
+    def _try_unlink(self, path: Path) -> None:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            self._faults.append(f"{path} cannot be removed ({error.strerror}); check the rights of the cache")
+
+    def _path(self, sha256: str) -> Path:
+        return self._folder / blob_path(sha256)
+
+
+class StoreFolder:
+    """Reads what a map store keeps in files, without its database: current manifests and bytes by address."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises StoreError where `folder` is no store."""
+        if not (folder / "sites").is_dir():
+            raise StoreError(f"{folder} is no map store; check --store, or make one with `mapserver build`")
+        self._folder = folder
+
+    def current_manifest(self, site: str) -> str | None:
+        """The address of the manifest of the site's current version, None where nothing is published."""
+        path = self._folder / current_path(site)
+        try:
+            return check_sha256(path.read_text("ascii").strip())
+        except FileNotFoundError:
+            return None
+        except (OSError, UnicodeDecodeError, MapFormatError) as error:
+            raise StoreError(f"{path} cannot be read ({error}); open the store with mapserver to repair it") from error
+
+    def blob(self, sha256: str) -> bytes:
+        """The bytes of an address; raises StoreError for missing ones, MapFormatError for damaged ones."""
+        path = self._folder / blob_path(sha256)
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise StoreError(f"{path} cannot be read ({error.strerror}); the store is incomplete") from error
+        return verified(data, sha256)

@@ -1,0 +1,1 @@
+"""The map server: surveys in, immutable map versions out."""

@@ -1,0 +1,58 @@
+"""Immutable bytes over HTTP: ETag, If-None-Match, and one byte range (RFC 9110)."""
+
+import re
+
+from fastapi import Request, Response
+
+from mapserver.api.problems import problem
+
+_RANGE = re.compile(r"^bytes=(\d{0,18})-(\d{0,18})$")
+
+
+def bytes_response(request: Request, data: bytes, sha256: str, media_type: str, *, immutable: bool) -> Response:
+    """The response for bytes whose address is `sha256`: 200, 206 for a range, 304 for what the client has, or 416.
+
+    immutable: the path itself names the bytes, so that caches may keep them for ever.
+    """
+    etag = f'"{sha256}"'
+    headers = {
+        "ETag": etag,
+        "Accept-Ranges": "bytes",
+        "Cache-Control": "public, max-age=31536000, immutable" if immutable else "no-cache",
+    }
+    if _matches(request.headers.get("if-none-match"), etag):
+        return Response(status_code=304, headers=headers)
+    span = _span(request, etag, len(data))
+    if span is None:
+        return Response(data, media_type=media_type, headers=headers)
+    start, end = span
+    if start >= end:
+        detail = f"range {request.headers['range']!r} lies outside of {len(data)} bytes"
+        return problem(416, detail, request.url.path, {"Content-Range": f"bytes */{len(data)}"})
+    headers["Content-Range"] = f"bytes {start}-{end - 1}/{len(data)}"
+    return Response(data[start:end], 206, media_type=media_type, headers=headers)
+
+
+def _matches(condition: str | None, etag: str) -> bool:
+    if condition is None:
+        return False
+    tags = [tag.strip().removeprefix("W/") for tag in condition.split(",")]
+    return "*" in tags or etag in tags
+
+
+def _span(request: Request, etag: str, size: int) -> tuple[int, int] | None:
+    """Start and end of the wanted range (empty when it cannot be satisfied); None for everything.
+
+    Ranges that cannot be parsed and lists of ranges are ignored, as the RFC allows, as is one whose If-Range fails.
+    """
+    if request.method != "GET" or request.headers.get("if-range", etag) != etag:
+        return None
+    match = _RANGE.match(request.headers.get("range", "").strip())
+    if match is None or not (match[1] or match[2]):
+        return None
+    if not match[1]:
+        return max(0, size - int(match[2])), size
+    if match[2] and int(match[2]) < int(match[1]):
+        return None
+    end = min(size, int(match[2]) + 1) if match[2] else size
+    return int(match[1]), end

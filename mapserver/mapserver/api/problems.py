@@ -1,0 +1,64 @@
+"""Errors of the HTTP API as RFC 9457 problem documents."""
+
+import logging
+from http import HTTPStatus
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from fleetmap.errors import FleetmapError, GateRefusedError, MapFormatError, StoreError, UsageError
+
+_log = logging.getLogger(__name__)
+
+_STATUS: tuple[tuple[type[FleetmapError], HTTPStatus], ...] = (
+    (UsageError, HTTPStatus.NOT_FOUND),  # the path named a site or version that is not there
+    (GateRefusedError, HTTPStatus.CONFLICT),
+    (StoreError, HTTPStatus.SERVICE_UNAVAILABLE),
+    (MapFormatError, HTTPStatus.INTERNAL_SERVER_ERROR),  # bytes in our own store are damaged
+)
+
+
+def problem(status: int, detail: str, path: str, headers: dict[str, str] | None = None) -> JSONResponse:
+    """A problem document; its type is about:blank, so that its title is the status's phrase."""
+    content = {
+        "type": "about:blank",
+        "title": HTTPStatus(status).phrase,
+        "status": status,
+        "detail": detail,
+        "instance": path,
+    }
+    return JSONResponse(content, status, headers=headers, media_type="application/problem+json")
+
+
+def install(app: FastAPI) -> None:
+    """Makes every error of `app` a problem document."""
+    app.add_exception_handler(FleetmapError, _fleetmap_error)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(RequestValidationError, _validation_error)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def _fleetmap_error(request: Request, error: Exception) -> Response:
+    status = next((status for kind, status in _STATUS if isinstance(error, kind)), HTTPStatus.INTERNAL_SERVER_ERROR)
+    if status >= HTTPStatus.INTERNAL_SERVER_ERROR:
+        _log.error("%s %s: %s", request.method, request.url.path, error)
+    return problem(status, str(error), request.url.path)
+
+
+def _http_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    headers = None if error.headers is None else dict(error.headers)
+    return problem(error.status_code, str(error.detail), request.url.path, headers)
+
+
+def _validation_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    faults = "; ".join(f"{'.'.join(str(part) for part in fault['loc'])}: {fault['msg']}" for fault in error.errors())
+    return problem(HTTPStatus.UNPROCESSABLE_ENTITY, faults, request.url.path)
+
+
+def _unexpected(request: Request, error: Exception) -> Response:
+    _log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    return problem(HTTPStatus.INTERNAL_SERVER_ERROR, "an internal error; the server's log says more", request.url.path)

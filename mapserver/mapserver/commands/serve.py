@@ -1,0 +1,122 @@
+"""`mapserver serve`: a store on HTTP and on the bus, until it is told to stop."""
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    import socket
+
+    from fastapi import FastAPI
+
+    from fleetmap.bus import ZenohBus
+    from mapserver.store import MapStore
+    from mapserver.tile_service import TileService
+
+_ANNOUNCE_EVERY_S = 1.0
+_STOP_WITHIN_S = 5
+
+
+def serve(
+    store: Annotated[Path, typer.Option(help="Folder of the map store.")],
+    http: Annotated[str, typer.Option(help="Where to listen for HTTP; port 0 takes a free one.")] = "127.0.0.1:8080",
+    zenoh: Annotated[
+        str, typer.Option(help="Where to listen for robots; port 0 takes a free one.")
+    ] = "tcp/127.0.0.1:7447",
+) -> None:
+    """Serve maps to robots and operators; prints the addresses when ready, ends with status 0 on SIGTERM or SIGINT."""
+    host, port = _host_and_port(http)
+    from fleetmap.bus import ZenohBus, check_endpoint
+
+    check_endpoint(zenoh)
+    from mapserver.store import MapStore
+
+    # The sockets come before the store is read, so that a wrong address is told at once.
+    with _listening(host, port) as listener, MapStore.open(store) as maps, ZenohBus.listen(zenoh) as bus:
+        _run(maps, bus, listener)
+
+
+def _run(maps: "MapStore", bus: "ZenohBus", listener: "socket.socket") -> None:
+    import logging
+    import signal
+    from contextlib import asynccontextmanager
+
+    import uvicorn
+
+    from mapserver.api.app import create_app
+    from mapserver.api.metrics import Metrics
+    from mapserver.fleet import Fleet
+    from mapserver.tile_service import TileService
+
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    fleet = Fleet(maps)
+    metrics = Metrics(maps, fleet)
+    service = TileService(maps, fleet, bus, metrics.count_bus)
+
+    @asynccontextmanager
+    async def lifespan(_: "FastAPI") -> AsyncIterator[None]:
+        import asyncio
+
+        announcing = asyncio.create_task(_announce(service))
+        host, port = listener.getsockname()[:2]
+        typer.echo(f"http: http://{f'[{host}]' if ':' in host else host}:{port}")
+        typer.echo(f"zenoh: {bus.endpoint}")
+        typer.echo("ready")
+        yield
+        announcing.cancel()
+        await asyncio.gather(announcing, return_exceptions=True)
+
+    app = create_app(maps, fleet, metrics, bus, lifespan)
+    config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=_STOP_WITHIN_S)
+    # uvicorn stops on these signals by itself and afterwards raises them again for the handlers that were there before:
+    # the default ones would end the process with a status that says it was killed.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: None)
+    try:
+        uvicorn.Server(config).run(sockets=[listener])
+    finally:
+        service.close()
+
+
+async def _announce(service: "TileService") -> None:
+    """Tells robots what other processes publish, about a second later."""
+    import asyncio
+    import logging
+
+    from fleetmap.errors import FleetmapError
+
+    while True:
+        try:
+            await asyncio.to_thread(service.announce_changes)
+        except FleetmapError as error:
+            # Robots also ask by themselves: a store that is busy for a moment must not stop the server.
+            logging.getLogger(__name__).warning("announcing failed: %s", error)
+        await asyncio.sleep(_ANNOUNCE_EVERY_S)
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    from fleetmap.errors import UsageError
+
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise UsageError(f"--http {address!r}: write it like 127.0.0.1:8080")
+    return host.strip("[]"), int(port)
+
+
+def _listening(host: str, port: int) -> "socket.socket":
+    import socket
+
+    from fleetmap.errors import UsageError
+
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+        listener.listen(1024)
+    except OSError as error:
+        listener.close()
+        raise UsageError(f"--http {host}:{port}: cannot listen there ({error.strerror}); choose another") from error
+    return listener

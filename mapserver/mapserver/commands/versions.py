@@ -1,0 +1,31 @@
+"""`mapserver versions`: what versions a site has."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def versions(
+    site: Annotated[str, typer.Option(help="Name of the site.")],
+    store: Annotated[Path, typer.Option(help="Folder of the map store.")],
+    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+) -> None:
+    """List the versions of a site with their states, oldest first."""
+    import msgspec
+    from rich.console import Console
+    from rich.table import Table
+
+    from mapserver.store import MapStore
+
+    with MapStore.open(store) as maps:
+        infos = maps.versions(site)
+    if json:
+        typer.echo(msgspec.json.format(msgspec.json.encode(infos), indent=2).decode())
+        return
+    table = Table("version", "state", "parent", "created", "tiles", "landmarks", "bytes")
+    for info in infos:
+        parent = "" if info.parent is None else str(info.parent)
+        sizes = (str(info.tiles), str(info.landmarks), str(info.map_bytes))
+        table.add_row(str(info.version), info.state, parent, info.created, *sizes)
+    Console().print(table)

@@ -1,0 +1,132 @@
+"""Reads the frames that the checks need and runs all of them."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from fleetmap.errors import RecordingError
+from fleetmap.geometry import so3_log
+from fleetmap.recordings import Recording
+from fleetmap.rectification import RectifiedFrame, Rectifier
+from fleetmap.samples import CameraFrame, SensorSet
+from mapserver.doctor import inertial, timing
+from mapserver.doctor.camera_rotation import rotation_between
+from mapserver.doctor.findings import Finding, Verdict
+from mapserver.doctor.gyro_images import CameraTurns, gyro_findings
+from mapserver.doctor.sharpness import laplacian_variance, sharpness
+from mapserver.doctor.stereo import StereoMatches, epipolar_error, match_pair, swapped_cameras
+
+SAMPLED_FRAMES = 40
+TURN_FRAMES = 300
+
+
+class _Frames:
+    """Reads frames and remembers which could not be."""
+
+    def __init__(self, recording: Recording, on_frame: Callable[[], None]) -> None:
+        self._recording, self._on_frame = recording, on_frame
+        self.tried = 0
+        self.errors: list[str] = []
+
+    def read(self, index: int) -> CameraFrame | None:
+        self.tried += 1
+        self._on_frame()
+        try:
+            return self._recording.read_frame(index)
+        except RecordingError as error:
+            self.errors.append(str(error))
+            return None
+
+
+def examine(recording: Recording, on_frame: Callable[[], None] = lambda: None) -> list[Finding]:
+    """All findings about a recording, in a fixed order. Reads at most 340 frames; `on_frame` is called after each."""
+    stamps_ns, imu = recording.frame_stamps_ns, recording.imu
+    frames = _Frames(recording, on_frame)
+    shift_s = recording.calibration.cameras[0].imu_minus_cam_s
+    findings = [
+        timing.camera_rate(stamps_ns),
+        timing.camera_gaps(stamps_ns),
+        timing.imu_rate(imu.stamps_ns),
+        timing.imu_gaps(imu.stamps_ns),
+        timing.stamp_order(recording.losses),
+        timing.camera_imu_overlap(stamps_ns, imu.stamps_ns, shift_s),
+        inertial.gravity_magnitude(imu),
+    ]
+    rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
+    pairs, variances = _sampled(recording, frames, rectifier)
+    if recording.sensor_set in (SensorSet.STEREO, SensorSet.STEREO_INERTIAL):
+        findings += [swapped_cameras(pairs), epipolar_error(pairs)]
+    turns = _camera_turns(recording, frames, rectifier)
+    findings += gyro_findings(turns, imu, shift_s)
+    findings += [sharpness(variances), _readable(frames)]
+    return findings + timing.other_losses(recording.losses)
+
+
+def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier) -> tuple[list[StereoMatches], list[float]]:
+    count = min(SAMPLED_FRAMES, len(recording))
+    pairs, variances = [], []
+    for index in np.unique(np.linspace(0, len(recording) - 1, count).round().astype(int)):
+        frame = frames.read(int(index))
+        if frame is None:
+            continue
+        variances.append(laplacian_variance(frame.left))
+        if frame.right is not None:
+            pairs.append(match_pair(rectifier.rectify(frame)))
+    return pairs, variances
+
+
+def _camera_turns(recording: Recording, frames: _Frames, rectifier: Rectifier) -> CameraTurns:
+    starts, ends, rates = [], [], []
+    rotation = rectifier.body_from_cam[:3, :3]
+    for before, after in _consecutive(recording, frames, rectifier):
+        before_from_after = rotation_between(before, after, rectifier.camera)
+        if before_from_after is None:
+            continue
+        dt_s = (after.stamp_ns - before.stamp_ns) * 1e-9
+        starts.append(before.stamp_ns)
+        ends.append(after.stamp_ns)
+        rates.append(so3_log(rotation @ before_from_after @ rotation.T) / dt_s)
+    return CameraTurns(np.array(starts, np.int64), np.array(ends, np.int64), np.array(rates).reshape(-1, 3))
+
+
+def _consecutive(
+    recording: Recording, frames: _Frames, rectifier: Rectifier
+) -> Iterator[tuple[RectifiedFrame, RectifiedFrame]]:
+    """Pairs of rectified frames close in time, from the run of frames in which the gyro is busiest."""
+    if len(recording.imu) == 0:
+        return
+    stamps_ns = recording.frame_stamps_ns
+    first = _busiest_start(recording)
+    previous: RectifiedFrame | None = None
+    for index in range(first, min(first + TURN_FRAMES, len(recording))):
+        is_close = previous is not None and stamps_ns[index] - previous.stamp_ns < timing.SPARSE_S * 1e9
+        has_next = index + 1 < len(recording) and stamps_ns[index + 1] - stamps_ns[index] < timing.SPARSE_S * 1e9
+        if not (is_close or has_next):
+            continue
+        frame = frames.read(index)
+        current = None if frame is None else rectifier.rectify(frame)
+        if previous is not None and current is not None and is_close:
+            yield previous, current
+        previous = current
+
+
+def _busiest_start(recording: Recording) -> int:
+    stamps_ns, imu = recording.frame_stamps_ns, recording.imu
+    if len(stamps_ns) <= TURN_FRAMES:
+        return 0
+    speeds = np.linalg.norm(imu.gyro_radps - np.median(imu.gyro_radps, axis=0), axis=1)
+    total = np.concatenate([[0.0], np.cumsum(np.minimum(speeds, 3.0))])
+    starts = np.arange(0, len(stamps_ns) - TURN_FRAMES, max(1, TURN_FRAMES // 4))
+    a = np.searchsorted(imu.stamps_ns, stamps_ns[starts])
+    b = np.searchsorted(imu.stamps_ns, stamps_ns[starts + TURN_FRAMES])
+    return int(starts[np.argmax(total[b] - total[a])])
+
+
+def _readable(frames: _Frames) -> Finding:
+    limit = "every frame that was looked at must be readable"
+    if not frames.errors:
+        return Finding("images", Verdict.OK, 0.0, limit, f"all {frames.tried} frames that were looked at are whole")
+    count = len(frames.errors)
+    return Finding(
+        "images", Verdict.FAIL, float(count), limit, f"{count} of {frames.tried} cannot be read; {frames.errors[0]}"
+    )

@@ -1,0 +1,46 @@
+"""What a check says."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Verdict(StrEnum):
+    """How bad a finding is. Only FAIL ends the command with another exit status."""
+
+    OK = "ok"
+    WARN = "warn"
+    FAIL = "fail"
+    NOT_JUDGED = "not judged"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One check: its name, what was measured against which limit (in words of the unit), and what to do next."""
+
+    name: str
+    verdict: Verdict
+    value: float | None
+    limit: str
+    sentence: str
+
+
+def judge(name: str, value: float, warn_above: float, fail_above: float, unit: str, good: str, bad: str) -> Finding:
+    """A finding about a value that should be small.
+
+    `good` is its sentence when it is, `bad` (with the next step) when not.
+    """
+    verdict = Verdict.FAIL if value > fail_above else Verdict.WARN if value > warn_above else Verdict.OK
+    limit = f"warn above {warn_above:g} {unit}, fail above {fail_above:g} {unit}".replace(" ,", ",").strip()
+    return Finding(name, verdict, value, limit, good if verdict is Verdict.OK else bad)
+
+
+def not_judged(name: str, reason: str) -> Finding:
+    """A check that this recording gives no ground for."""
+    return Finding(name, Verdict.NOT_JUDGED, None, "", f"not judged: {reason}")
+
+
+def worst(findings: Sequence[Finding]) -> Verdict:
+    """The worst verdict of all."""
+    order = [Verdict.FAIL, Verdict.WARN, Verdict.OK]
+    return next((verdict for verdict in order if any(f.verdict is verdict for f in findings)), Verdict.NOT_JUDGED)

@@ -1,0 +1,112 @@
+"""Left and right image against the calibration.
+
+Is the right one the right one, and do rows match after rectification?
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from fleetmap.geometry import Array
+from fleetmap.rectification import RectifiedFrame
+from mapserver.doctor.findings import Finding, judge, not_judged
+
+_MIN_MATCHES = 40
+_SEARCH_ROWS_PX = 25.0
+_LARGEST_SHARE_OF_WIDTH = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class StereoMatches:
+    """Matched points of one rectified pair: disparities_px (N,) left minus right column, row_errors_px (N,)."""
+
+    disparities_px: Array
+    row_errors_px: Array
+
+
+def match_pair(frame: RectifiedFrame) -> StereoMatches:
+    """Matches that do not presume the calibration.
+
+    ORB both ways, refined by Lucas-Kanade, any sign of disparity, rows within 25 px.
+    """
+    empty = StereoMatches(np.zeros(0), np.zeros(0))
+    if frame.right is None:
+        return empty
+    orb = cv2.ORB.create(nfeatures=1200, nlevels=4, fastThreshold=8)
+    left_points, left_words = orb.detectAndCompute(frame.left, None)
+    right_points, right_words = orb.detectAndCompute(frame.right, None)
+    if left_words is None or right_words is None:
+        return empty
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(left_words, right_words)
+    close = [m for m in matches if m.distance < 48]
+    if not close:
+        return empty
+    left = np.array([left_points[m.queryIdx].pt for m in close], np.float32)
+    right = np.array([right_points[m.trainIdx].pt for m in close], np.float32)
+    width = frame.left.shape[1]
+    plausible = (np.abs(left - right) < [_LARGEST_SHARE_OF_WIDTH * width, _SEARCH_ROWS_PX]).all(axis=1)
+    return _refined(frame, left[plausible], right[plausible])
+
+
+def swapped_cameras(pairs: Sequence[StereoMatches]) -> Finding:
+    """Points lie further left in the right image; where they do not, the images are swapped."""
+    name = "left and right"
+    disparities = np.concatenate([p.disparities_px for p in pairs]) if pairs else np.zeros(0)
+    decided = disparities[np.abs(disparities) > 1.0]
+    if len(decided) < _MIN_MATCHES:
+        return not_judged(name, f"{len(decided)} matches with a disparity above 1 px are too few")
+    wrong_share = float((decided < 0).mean())
+    return judge(
+        name,
+        wrong_share,
+        0.2,
+        0.5,
+        "of the matches with negative disparity",
+        "the left image is the left one",
+        f"{wrong_share:.0%} of the matches have negative disparity; left and right are swapped, exchange the folders "
+        f"or topics",
+    )
+
+
+def epipolar_error(pairs: Sequence[StereoMatches]) -> Finding:
+    """How far matches are from their row after rectification: median judged, 90 % named."""
+    name = "epipolar error"
+    errors = np.concatenate([p.row_errors_px for p in pairs]) if pairs else np.zeros(0)
+    if len(errors) < _MIN_MATCHES:
+        return not_judged(name, f"{len(errors)} stereo matches are too few")
+    magnitude = np.abs(errors)
+    median, p90 = float(np.median(magnitude)), float(np.percentile(magnitude, 90))
+    words = f"rows differ by {median:.2f} px in the median, {p90:.2f} px at 90 %, {np.median(errors):+.2f} px with sign"
+    return judge(
+        name, median, 0.5, 1.2, "px (median)", words, f"{words}; calibrate the cameras again, or check their time"
+    )
+
+
+def _refined(frame: RectifiedFrame, left: Array, right: Array) -> StereoMatches:
+    if len(left) == 0 or frame.right is None:
+        return StereoMatches(np.zeros(0), np.zeros(0))
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        frame.left,
+        frame.right,
+        left.reshape(-1, 1, 2),
+        right.reshape(-1, 1, 2).copy(),
+        winSize=(15, 15),
+        maxLevel=0,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    found = found.reshape(-1, 2)
+    kept = (status.ravel() == 1) & (np.abs(found - right).max(axis=1) < 3.0)
+    offsets = (left - found)[kept].astype(np.float64)
+    return _without_strays(StereoMatches(offsets[:, 0], offsets[:, 1]))
+
+
+def _without_strays(matches: StereoMatches) -> StereoMatches:
+    """Wrong matches fall on any row; right ones gather around the median."""
+    if len(matches.row_errors_px) < 8:
+        return matches
+    centre = np.median(matches.row_errors_px)
+    spread = 1.4826 * np.median(np.abs(matches.row_errors_px - centre))
+    kept = np.abs(matches.row_errors_px - centre) < max(4 * spread, 1.0)
+    return StereoMatches(matches.disparities_px[kept], matches.row_errors_px[kept])

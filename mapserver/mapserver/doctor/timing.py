@@ -1,0 +1,117 @@
+"""Rates, gaps, order of stamps, and whether camera and IMU ran at the same time."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fleetmap.samples import Loss, Stamps
+from mapserver.doctor.findings import Finding, Verdict, judge, not_judged
+
+SPARSE_S = 0.35  # frames further apart than this are keyframes, not a video
+_SLOWEST_CAMERA_HZ, _SLOWEST_IMU_HZ = 5.0, 90.0
+
+
+def median_period_s(stamps_ns: Stamps) -> float:
+    """Median step between stamps (N,); inf for fewer than two."""
+    return float(np.median(np.diff(stamps_ns))) * 1e-9 if len(stamps_ns) > 1 else float("inf")
+
+
+def camera_rate(frame_stamps_ns: Stamps) -> Finding:
+    """Frames per second, by the median step."""
+    period_s = median_period_s(frame_stamps_ns)
+    if period_s > SPARSE_S:
+        return not_judged("camera rate", f"frames are {period_s:.2f} s apart, this is no video")
+    return _rate("camera rate", 1 / period_s, _SLOWEST_CAMERA_HZ, "record with a higher frame rate")
+
+
+def imu_rate(imu_stamps_ns: Stamps) -> Finding:
+    """Inertial samples per second, by the median step."""
+    if len(imu_stamps_ns) < 2:
+        return not_judged("imu rate", "there is no IMU")
+    rate_hz = 1 / median_period_s(imu_stamps_ns)
+    return _rate("imu rate", rate_hz, _SLOWEST_IMU_HZ, "set the IMU to 200 Hz, slow ones miss vibration and turns")
+
+
+def camera_gaps(frame_stamps_ns: Stamps) -> Finding:
+    """The longest time without a frame."""
+    period_s = median_period_s(frame_stamps_ns)
+    if period_s > SPARSE_S:
+        return not_judged("camera gaps", f"frames are {period_s:.2f} s apart, this is no video")
+    return _gaps("camera gaps", frame_stamps_ns, max(3.5 * period_s, 0.3), 2.0, "frames")
+
+
+def imu_gaps(imu_stamps_ns: Stamps) -> Finding:
+    """The longest time without an inertial sample."""
+    if len(imu_stamps_ns) < 2:
+        return not_judged("imu gaps", "there is no IMU")
+    return _gaps("imu gaps", imu_stamps_ns, max(3.5 * median_period_s(imu_stamps_ns), 0.02), 0.2, "inertial samples")
+
+
+def stamp_order(losses: Sequence[Loss]) -> Finding:
+    """Whether stamps that do not increase were left out when the recording was opened."""
+    found = [loss for loss in losses if "stamps not increasing" in loss.what]
+    limit = "none may be out of order"
+    if not found:
+        return Finding("stamp order", Verdict.OK, 0.0, limit, "all stamps increase")
+    words = "; ".join(f"{loss.what}, {loss.detail}" for loss in found)
+    sentence = f"{words}; look for a clock that is set while recording, or for a driver that sends late"
+    return Finding("stamp order", Verdict.FAIL, float(len(found)), limit, sentence)
+
+
+def other_losses(losses: Sequence[Loss]) -> list[Finding]:
+    """One warning for everything else that could not be read."""
+    return [
+        Finding(
+            "lost data",
+            Verdict.WARN,
+            None,
+            "nothing lost",
+            f"{loss.what}: {loss.detail}; copy the recording again if it has more",
+        )
+        for loss in losses
+        if "stamps not increasing" not in loss.what
+    ]
+
+
+def camera_imu_overlap(frame_stamps_ns: Stamps, imu_stamps_ns: Stamps, imu_minus_cam_s: float) -> Finding:
+    """The share of frames during which the IMU ran."""
+    if len(imu_stamps_ns) == 0:
+        return not_judged("camera-imu overlap", "there is no IMU")
+    moments_ns = frame_stamps_ns + round(imu_minus_cam_s * 1e9)
+    step_ns = round(median_period_s(imu_stamps_ns) * 1e9) if len(imu_stamps_ns) > 1 else 0
+    inside = (moments_ns >= imu_stamps_ns[0] - step_ns) & (moments_ns <= imu_stamps_ns[-1] + step_ns)
+    outside_share = 1 - float(inside.mean())
+    start_s = float(imu_stamps_ns[0] - moments_ns[0]) * 1e-9
+    return judge(
+        "camera-imu overlap",
+        outside_share,
+        0.01,
+        0.5,
+        "of the frames without IMU",
+        "the IMU ran while the camera did",
+        f"{outside_share:.0%} of the frames have no IMU at their time, which starts {start_s:+.3f} s after them; "
+        "stamp both sensors by one clock",
+    )
+
+
+def _rate(name: str, rate_hz: float, slowest_hz: float, advice: str) -> Finding:
+    is_good = rate_hz >= slowest_hz
+    sentence = f"{rate_hz:.1f} Hz" if is_good else f"{rate_hz:.1f} Hz is slow; {advice}"
+    return Finding(name, Verdict.OK if is_good else Verdict.WARN, rate_hz, f"warn below {slowest_hz:g} Hz", sentence)
+
+
+def _gaps(name: str, stamps_ns: Stamps, warn_s: float, fail_s: float, what: str) -> Finding:
+    steps_s = np.diff(stamps_ns) * 1e-9
+    longest = int(np.argmax(steps_s))
+    count = int((steps_s > warn_s).sum())
+    at_s = float(stamps_ns[longest] - stamps_ns[0]) * 1e-9
+    return judge(
+        name,
+        float(steps_s[longest]),
+        round(warn_s, 4),
+        max(fail_s, round(warn_s, 4)),
+        "s",
+        f"the longest step is {steps_s[longest]:.3f} s",
+        f"{count} gaps without {what}, the longest {steps_s[longest]:.3f} s, {at_s:.1f} s after the start; "
+        "look at the recorder's disk and the driver's queue",
+    )

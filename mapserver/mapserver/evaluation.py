@@ -1,0 +1,170 @@
+"""How far an estimated trajectory is from the truth, at the estimate's stamps. Both are of the same body."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleetmap.errors import SurveyError
+from fleetmap.geometry import Array, align_points, rotation_angle_rad, se3_inverse, transform_points
+from fleetmap.samples import Stamps, Trajectory
+
+MAX_GAP_NS = 200_000_000
+KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+
+
+@dataclass(frozen=True, slots=True)
+class AteResult:
+    """Position errors after one alignment.
+
+    frame_from_estimate (4, 4) and scale place the estimate in the truth's frame: scale * R @ p + t. matched stamps had
+    a truth; evaluated_share is their share of the frames that were asked for. stamps_ns and errors_m (matched,).
+    """
+
+    rmse_m: float
+    mean_m: float
+    median_m: float
+    max_m: float
+    scale: float
+    matched: int
+    evaluated_share: float
+    frame_from_estimate: Array
+    stamps_ns: Stamps
+    errors_m: Array
+
+
+@dataclass(frozen=True, slots=True)
+class RelativeResult:
+    """Errors of relative transforms: translations_m and rotations_rad (pairs,), with their root mean squares."""
+
+    rmse_m: float
+    rmse_rad: float
+    translations_m: Array
+    rotations_rad: Array
+
+
+@dataclass(frozen=True, slots=True)
+class DriftResult:
+    """Mean drift over segments, KITTI style: share of the length, and radians a metre."""
+
+    translation_share: float
+    rotation_radpm: float
+    segments: int
+
+
+def paired(estimate: Trajectory, truth: Trajectory, max_gap_ns: int = MAX_GAP_NS) -> tuple[Trajectory, Trajectory]:
+    """Estimate and truth at those stamps of the estimate at which the truth is known.
+
+    The truth is interpolated at constant twist; not outside it, nor inside a gap longer than `max_gap_ns`.
+    """
+    found = [truth.at(int(stamp), max_gap_ns) for stamp in estimate.stamps_ns]
+    known = np.array([transform is not None for transform in found], bool)
+    stamps = estimate.stamps_ns[known]
+    true_frame_from_body = np.array([transform for transform in found if transform is not None]).reshape(-1, 4, 4)
+    return Trajectory(stamps, estimate.frame_from_body[known]), Trajectory(stamps, true_frame_from_body)
+
+
+def absolute_trajectory_error(
+    estimate: Trajectory,
+    truth: Trajectory,
+    *,
+    with_scale: bool = False,
+    max_gap_ns: int = MAX_GAP_NS,
+    frames: int | None = None,
+) -> AteResult:
+    """Position errors after the least-squares rigid (or similarity) alignment of all matched positions.
+
+    frames: how many frames should have had an estimate (default: as many as have one), the base of evaluated_share.
+    Raises SurveyError where fewer than three stamps have a truth. Source: Sturm et al. 2012 (ATE), Umeyama 1991.
+    """
+    mine, true = paired(estimate, truth, max_gap_ns)
+    if len(mine) < 3:
+        raise SurveyError(
+            f"{len(mine)} of {len(estimate)} estimated stamps have ground truth within {max_gap_ns / 1e6:.0f} ms gaps; "
+            "at least 3 are needed: check that both are on the same clock"
+        )
+    frame_from_estimate, scale = align_points(true.positions_m, mine.positions_m, with_scale=with_scale)
+    errors = np.linalg.norm(transform_points(frame_from_estimate, scale * mine.positions_m) - true.positions_m, axis=1)
+    return AteResult(
+        rmse_m=_rms(errors),
+        mean_m=float(errors.mean()),
+        median_m=float(np.median(errors)),
+        max_m=float(errors.max()),
+        scale=scale,
+        matched=len(mine),
+        evaluated_share=len(mine) / (len(estimate) if frames is None else max(frames, 1)),
+        frame_from_estimate=frame_from_estimate,
+        stamps_ns=mine.stamps_ns,
+        errors_m=errors,
+    )
+
+
+def unaligned_errors(
+    estimate: Trajectory, truth: Trajectory, max_gap_ns: int = MAX_GAP_NS
+) -> tuple[Stamps, Array, Array]:
+    """Stamps (P,), metres and radians (P,) between estimate and truth as they are, both already in one frame."""
+    mine, true = paired(estimate, truth, max_gap_ns)
+    errors_m, errors_rad = _split_errors(se3_inverse(true.frame_from_body) @ mine.frame_from_body)
+    return mine.stamps_ns, errors_m, errors_rad
+
+
+def relative_trajectory_error(
+    estimate: Trajectory, truth: Trajectory, *, step: int = 1, max_gap_ns: int = MAX_GAP_NS
+) -> RelativeResult:
+    """Errors of the motion over `step` matched stamps, for every start.
+
+    Needs no alignment. Raises SurveyError where no pair of stamps has a truth. Source: Sturm et al. 2012 (RPE).
+    """
+    mine, true = paired(estimate, truth, max_gap_ns)
+    if len(mine) <= step:
+        raise SurveyError(f"{len(mine)} matched stamps are too few for relative errors over {step}; check the clocks")
+    errors_m, errors_rad = _split_errors(_motion_errors(mine, true, np.arange(len(mine) - step), step))
+    return RelativeResult(_rms(errors_m), _rms(errors_rad), errors_m, errors_rad)
+
+
+def kitti_drift(
+    estimate: Trajectory,
+    truth: Trajectory,
+    *,
+    lengths_m: tuple[float, ...] = KITTI_LENGTHS_M,
+    every: int = 10,
+    max_gap_ns: int = MAX_GAP_NS,
+) -> DriftResult | None:
+    """Mean drift over all segments of the given lengths along the truth, beginning at every `every`-th matched stamp.
+
+    None where the path is shorter than the shortest length. Source: Geiger et al. 2012 (KITTI odometry benchmark).
+    """
+    mine, true = paired(estimate, truth, max_gap_ns)
+    if len(mine) < 2:
+        return None
+    steps = np.linalg.norm(np.diff(true.positions_m, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    shares, rates = [], []
+    for start in range(0, len(mine), every):
+        for length in lengths_m:
+            end = int(np.searchsorted(along, along[start] + length, side="right"))
+            if end == len(mine):
+                continue
+            error_m, error_rad = _split_errors(_motion_errors(mine, true, np.array([start]), end - start))
+            shares.append(float(error_m[0]) / length)
+            rates.append(float(error_rad[0]) / length)
+    if not shares:
+        return None
+    return DriftResult(float(np.mean(shares)), float(np.mean(rates)), len(shares))
+
+
+def _motion_errors(mine: Trajectory, true: Trajectory, starts: Stamps, step: int) -> Array:
+    """(S, 4, 4) true motion inverse times estimated motion from each start over `step` stamps."""
+    moved = [se3_inverse(t.frame_from_body[starts]) @ t.frame_from_body[starts + step] for t in (true, mine)]
+    return np.asarray(se3_inverse(moved[0]) @ moved[1])
+
+
+def _split_errors(transforms: Array) -> tuple[Array, Array]:
+    """Metres and radians (S,) of error transforms (S, 4, 4)."""
+    return (
+        np.linalg.norm(transforms[:, :3, 3], axis=1),
+        np.array([rotation_angle_rad(transform[:3, :3]) for transform in transforms]),
+    )
+
+
+def _rms(errors: Array) -> float:
+    return float(np.sqrt(np.mean(errors**2)))

@@ -1,0 +1,123 @@
+"""The archive of a version: all of a survey, from which a later one can optimise again. Stays on the server.
+
+Format 1, magic FMAR, in the envelope of `fleetmap.mapformat.container`. The payload: u32 length of a JSON head (the
+camera, then name, dtype and shape of every array), the head, and the arrays' bytes one after the other in that order,
+little-endian.
+"""
+
+import struct
+from dataclasses import asdict
+from math import prod
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from fleetmap.errors import MapFormatError
+from fleetmap.geometry import AnyArray
+from fleetmap.mapformat import pack, unpack
+from fleetmap.rectification import StereoCamera
+from fleetmap.samples import Trajectory
+from mapserver.survey.result import SurveyMap
+
+ARCHIVE_MAGIC = b"FMAR"
+ARCHIVE_FORMAT = 1
+MAX_ARCHIVE_PAYLOAD_BYTES = (1 << 32) - 1
+_LEVEL = 3  # written once, hardly ever read, and large: speed counts more than size
+_HEAD_SIZE = struct.Struct("<I")
+_DTYPES = {
+    "body_from_cam": "<f8",
+    "keyframe_stamps_ns": "<i8",
+    "map_from_body": "<f8",
+    "landmark_ids": "<u4",
+    "points_map": "<f8",
+    "descriptors": "|u1",
+    "point_sigma_m": "<f8",
+    "obs_keyframe": "<i4",
+    "obs_landmark": "<i4",
+    "obs_pixels": "<f8",
+    "obs_octave": "|i1",
+    "obs_sigma_px": "<f8",
+    "trajectory_estimated": "|b1",
+    "patches": "|u1",
+    "trajectory_stamps_ns": "<i8",
+    "trajectory_frame_from_body": "<f8",
+}
+
+
+class _ArrayHead(msgspec.Struct, frozen=True):
+    name: str
+    dtype: str
+    shape: Annotated[tuple[Annotated[int, msgspec.Meta(ge=0, le=1 << 40)], ...], msgspec.Meta(max_length=8)]
+
+
+class _Head(msgspec.Struct, frozen=True):
+    camera: StereoCamera
+    arrays: tuple[_ArrayHead, ...]
+
+
+def encode_archive(survey: SurveyMap) -> bytes:
+    """The survey's bytes, without loss."""
+    arrays = {name: np.ascontiguousarray(values, _DTYPES[name]) for name, values in _arrays(survey).items()}
+    head = msgspec.json.encode(
+        {
+            "camera": asdict(survey.camera),
+            "arrays": [{"name": n, "dtype": _DTYPES[n], "shape": list(a.shape)} for n, a in arrays.items()],
+        }
+    )
+    body = [array.tobytes() for array in arrays.values()]
+    size = _HEAD_SIZE.size + len(head) + sum(len(part) for part in body)
+    if size > MAX_ARCHIVE_PAYLOAD_BYTES:
+        raise MapFormatError(
+            f"archive of {size} bytes, the limit is {MAX_ARCHIVE_PAYLOAD_BYTES}; survey in several parts"
+        )
+    payload = b"".join([_HEAD_SIZE.pack(len(head)), head, *body])
+    return pack(ARCHIVE_MAGIC, ARCHIVE_FORMAT, payload, level=_LEVEL)
+
+
+def decode_archive(data: bytes) -> SurveyMap:
+    """The survey of `encode_archive`'s bytes.
+
+    Raises NewerFormatError for a newer format, MapFormatError for bytes that are not a whole archive.
+    """
+    _, payload = unpack(ARCHIVE_MAGIC, ARCHIVE_FORMAT, data, "archive", MAX_ARCHIVE_PAYLOAD_BYTES)
+    head, offset = _read_head(payload)
+    arrays: dict[str, AnyArray] = {}
+    for entry in head.arrays:
+        if _DTYPES.get(entry.name) != entry.dtype or entry.name in arrays:
+            raise MapFormatError(
+                f"archive: array {entry.name!r} of {entry.dtype!r} is none of ours; the bytes are damaged"
+            )
+        count = prod(entry.shape)
+        end = offset + count * np.dtype(entry.dtype).itemsize
+        if end > len(payload):
+            raise MapFormatError(f"archive: array {entry.name} of {entry.shape} does not fit in {len(payload)} bytes")
+        arrays[entry.name] = np.frombuffer(payload, entry.dtype, count, offset).reshape(entry.shape).copy()
+        offset = end
+    if offset != len(payload) or len(arrays) != len(_DTYPES):
+        missing = sorted(set(_DTYPES) - set(arrays))
+        raise MapFormatError(
+            f"archive: {len(payload) - offset} bytes too many, arrays missing: {missing}; it is damaged"
+        )
+    trajectory = Trajectory(arrays.pop("trajectory_stamps_ns"), arrays.pop("trajectory_frame_from_body"))
+    fields: dict[str, Any] = {"camera": head.camera, "trajectory": trajectory, **arrays}
+    return SurveyMap(**fields)
+
+
+def _arrays(survey: SurveyMap) -> dict[str, AnyArray]:
+    arrays = {name: getattr(survey, name) for name in _DTYPES if not name.startswith("trajectory_")}
+    return arrays | {
+        "trajectory_estimated": survey.trajectory_estimated,
+        "trajectory_stamps_ns": survey.trajectory.stamps_ns,
+        "trajectory_frame_from_body": survey.trajectory.frame_from_body,
+    }
+
+
+def _read_head(payload: bytes) -> tuple[_Head, int]:
+    if len(payload) < _HEAD_SIZE.size:
+        raise MapFormatError(f"archive: {len(payload)} bytes are too few for its head; the bytes are damaged")
+    end = _HEAD_SIZE.size + int(_HEAD_SIZE.unpack_from(payload)[0])
+    try:
+        return msgspec.json.decode(payload[_HEAD_SIZE.size : end], type=_Head), end
+    except msgspec.MsgspecError as error:
+        raise MapFormatError(f"archive: head {error}; the bytes are damaged") from error

@@ -1,0 +1,76 @@
+"""What the store tells about versions, robots and events."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from fleetmap.mapformat import CameraEntry, RecordingEntry
+
+
+@dataclass(frozen=True, slots=True)
+class VersionInfo:
+    """One version of a site. state: draft, published, current or retired."""
+
+    site: str
+    version: int
+    state: str
+    parent: int | None
+    created: str
+    published_ns: int | None
+    manifest_sha256: str
+    manifest_bytes: int
+    tiles: int
+    tile_bytes: int
+    landmarks: int
+    vocabulary_sha256: str
+    vocabulary_bytes: int
+    archive_sha256: str | None
+
+    @property
+    def map_bytes(self) -> int:
+        """What a robot downloads for the whole site, vocabulary apart."""
+        return self.manifest_bytes + self.tile_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class SiteInfo:
+    """One site and its current version, if any."""
+
+    site: str
+    current_version: int | None
+    versions: int
+    vocabulary_sha256: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class RobotInfo:
+    """What a robot said last: the version it runs (None before its first acknowledgement) and its report."""
+
+    site: str
+    robot: str
+    version: int | None
+    last_seen_ns: int
+    last_report: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened to a site."""
+
+    stamp_ns: int
+    site: str
+    kind: str
+    detail: str
+
+
+class DraftDetails(msgspec.Struct, frozen=True, kw_only=True):
+    """The fields of a draft's manifest that only the survey knows; `created` is ISO 8601 in UTC."""
+
+    created: str
+    tile_size_m: float
+    camera: CameraEntry
+    recordings: tuple[RecordingEntry, ...]
+    configuration: dict[str, Any]
+    libraries: dict[str, str]
+    report: dict[str, Any]

@@ -1,0 +1,96 @@
+"""Which keyframes are matched with which, and whether a match may be believed."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.rectification import StereoCamera
+from mapserver.survey.keyframes import Keyframe
+from mapserver.survey.pairs import PairMatch, match_pair, view_overlap
+from mapserver.survey.settings import SurveySettings
+
+_NEAR_CANDIDATES = 40
+_MAX_VIEW_ANGLE_DEG = 75.0
+
+
+class PairFinder:
+    """Matches keyframes that should see the same things, given where they are."""
+
+    def __init__(self, keyframes: list[Keyframe], camera: StereoCamera, body_from_cam: Array, settings: SurveySettings) -> None:
+        self._keyframes, self._camera, self._body_from_cam, self._settings = keyframes, camera, body_from_cam, settings
+        self._depths = np.array([median_depth_m(k) for k in keyframes])
+
+    def candidates(self, map_from_body: Array, *, previous: int, only_near: int | None = None) -> list[tuple[int, int]]:
+        """Pairs (i, j), i < j: the last few in time, and the most covisible ones by predicted view.
+
+        only_near: no more than so many keyframes apart, before loops have been closed.
+        """
+        map_from_cam = map_from_body @ self._body_from_cam
+        positions, axes = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]
+        settings = self._settings.pairs
+        found = []
+        for j in range(1, len(map_from_cam)):
+            first = 0 if only_near is None else max(0, j - only_near)
+            chosen = set(range(max(first, j - previous), j))
+            earlier = np.arange(first, max(j - previous, first))
+            distance = np.linalg.norm(positions[earlier] - positions[j], axis=1)
+            near = (distance < 2.0 * np.maximum(self._depths[earlier], self._depths[j])) & (
+                axes[earlier] @ axes[j] > np.cos(np.radians(_MAX_VIEW_ANGLE_DEG))
+            )
+            closest = earlier[near][np.argsort(distance[near], kind="stable")][:_NEAR_CANDIDATES]
+            cam_j_from_map = se3_inverse(map_from_cam[j])
+            overlap = [(view_overlap(self._keyframes[i], self._camera, cam_j_from_map @ map_from_cam[i]), int(i)) for i in closest]
+            best = sorted(overlap, reverse=True)[: settings.covisible]
+            chosen |= {i for share, i in best if share > settings.min_overlap}
+            found.extend((i, j) for i in sorted(chosen))
+        return found
+
+    def match(
+        self, candidates: list[tuple[int, int]], map_from_body: Array, allowed_m: Callable[[int, int], float], *,
+        rotation_sigma_rad: float | None, is_known: bool, progress: Callable[[int], None],
+    ) -> list[PairMatch]:  # fmt: skip
+        """Verified matches whose measured motion agrees with the predicted one to within allowed_m(i, j)."""
+        map_from_cam = map_from_body @ self._body_from_cam
+        matches = []
+        for number, (i, j) in enumerate(candidates):
+            predicted = se3_inverse(map_from_cam[j]) @ map_from_cam[i]
+            match = match_pair(
+                i, j, self._keyframes, self._camera, predicted, rotation_sigma_rad, self._settings.pairs, is_known=is_known
+            )
+            if match is not None and _agrees(match.j_from_i, predicted, allowed_m(i, j)):
+                matches.append(match)
+            progress(number)
+        return matches
+
+
+def _agrees(measured: Array, predicted: Array, allowed_m: float) -> bool:
+    off = se3_inverse(predicted) @ measured
+    return bool(np.linalg.norm(off[:3, 3]) <= allowed_m and rotation_angle_rad(off[:3, :3]) < np.radians(10.0))
+
+
+def drift_allowance_m(covariances: NDArray[np.float64], positions_m: Array) -> Callable[[int, int], float]:
+    """How far apart measured and predicted motion may be before loops are closed: three sigmas of the odometry since, and a floor.
+
+    covariances (K, 6, 6) of the keyframes' odometry; what was gained between two of them is their relative uncertainty.
+    """
+
+    def allowed_m(i: int, j: int) -> float:
+        gained = max(float(np.trace(covariances[j][3:, 3:] - covariances[i][3:, 3:])), 0.0)
+        floor = 0.05 + 0.03 * float(np.linalg.norm(positions_m[j] - positions_m[i]))
+        return 3.0 * float(np.sqrt(gained + floor**2))
+
+    return allowed_m
+
+
+def fixed_allowance_m(map_from_body: Array) -> Callable[[int, int], float]:
+    """The same after bundle adjustment: what a well-matched pair may be off by."""
+    positions = map_from_body[:, :3, 3]
+    return lambda i, j: 0.15 + 0.05 * float(np.linalg.norm(positions[j] - positions[i]))
+
+
+def median_depth_m(keyframe: Keyframe) -> float:
+    """Median depth of a keyframe's stereo points; 5 m without any."""
+    depths = keyframe.points_cam[np.isfinite(keyframe.disparities[:, 0]), 2]
+    return float(np.median(depths)) if len(depths) else 5.0

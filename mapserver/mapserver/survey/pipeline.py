@@ -1,0 +1,182 @@
+"""The survey from end to end: the list of its stages."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.bow import Vocabulary, train_vocabulary
+from fleetmap.calibration import RigCalibration
+from fleetmap.errors import SurveyError
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.rectification import Rectifier
+from fleetmap.samples import CameraFrame, ImuSamples
+from mapserver.survey.adjust import Motion, SurveyState, adjust, adjust_windows
+from mapserver.survey.bundle import RelativeTerm
+from mapserver.survey.first_guess import FirstGuess, run_odometry
+from mapserver.survey.graph_marginals import GraphMarginals
+from mapserver.survey.keyframes import Keyframe
+from mapserver.survey.loops import LoopCloser, Loops
+from mapserver.survey.matching import PairFinder, drift_allowance_m, fixed_allowance_m
+from mapserver.survey.pairs import PairMatch
+from mapserver.survey.pose_graph import PoseEdge, optimize_pose_graph
+from mapserver.survey.result import SurveyMap
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.summary import summarise
+from mapserver.survey.tracks import build_landmarks
+from mapserver.survey.zones import Zones
+
+Progress = Callable[[str, int, int], None]  # stage, done, total
+_MIN_KEYFRAMES = 2
+_MIN_LANDMARKS = 30
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a survey gives: the map, the vocabulary it used, the loops with their reasons, and the first guess it began with."""
+
+    map: SurveyMap
+    vocabulary: Vocabulary
+    loops: Loops
+    first_guess: FirstGuess
+
+
+def survey(
+    frames: Iterable[CameraFrame], frame_count: int, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
+    vocabulary: Vocabulary | None, settings: SurveySettings, zones: Zones, progress: Progress,
+) -> Survey:  # fmt: skip
+    """Maps one recording. Raises SurveyError where it holds too little to map."""
+    guess = run_odometry(frames, imu, calibration, rectifier, settings, lambda n: progress("odometry", n + 1, frame_count))
+    keyframes = guess.keyframes
+    if len(keyframes) < _MIN_KEYFRAMES:
+        raise SurveyError(f"{frame_count} frames gave {len(keyframes)} keyframe(s); a map needs motion, at least {_MIN_KEYFRAMES}")
+    state = _first_state(guess, imu, calibration, rectifier, settings)
+    finder = PairFinder(keyframes, rectifier.camera, rectifier.body_from_cam, settings)
+    pairs = _match_neighbours(guess, state, finder, settings, progress)
+    state.landmarks = build_landmarks(keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings)
+    if len(state.landmarks.points_map) < _MIN_LANDMARKS:
+        raise SurveyError(
+            f"{len(keyframes)} keyframes share only {len(state.landmarks.points_map)} landmarks; look at the recording with "
+            "`mapserver doctor`: dark, blurred, or the wrong calibration?"
+        )
+    progress("local adjustment", 0, 1)
+    adjust_windows(state, settings)
+    if state.motion.inertial:
+        adjust(state, settings, rounds=2)
+    vocabulary = vocabulary or _train(keyframes, settings)
+    loops = _close_loops(guess, state, pairs, vocabulary, settings, zones, progress)
+    for round_number in range(2):
+        progress("global adjustment", round_number, 2)
+        pairs = _match_all(state, finder, settings, progress)
+        state.landmarks = build_landmarks(keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings)
+        adjust(state, settings)
+    progress("global adjustment", 2, 2)
+    return Survey(summarise(state, guess, settings), vocabulary, loops, guess)
+
+
+def _first_state(
+    guess: FirstGuess, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings
+) -> SurveyState:
+    """Keyframes where odometry put them, no landmarks yet."""
+    numbers = [k.frame_index for k in guess.keyframes]
+    estimates = [guess.estimates[n] for n in numbers]
+    map_from_body = guess.odom_from_body[numbers]
+    motion = Motion(
+        guess.inertial, imu, calibration.imu, rectifier.imu_minus_cam_s,
+        np.array([e.velocity_odom_mps for e in estimates]), np.array([e.gyro_bias_radps for e in estimates]),
+        np.array([e.accel_bias_mps2 for e in estimates]), [] if guess.inertial else _odometry_terms(guess, numbers),
+    )  # fmt: skip
+    nothing = build_landmarks([], [], map_from_body, rectifier.body_from_cam, rectifier.camera, settings)
+    stamps = np.array([k.stamp_ns for k in guess.keyframes], np.int64)
+    return SurveyState(stamps, map_from_body.copy(), rectifier.body_from_cam, rectifier.camera, motion, nothing)
+
+
+def _odometry_terms(guess: FirstGuess, numbers: list[int]) -> list[RelativeTerm]:
+    """Without an IMU, neighbours are held by odometry: weakly, so that it decides only where landmarks do not."""
+    terms = []
+    for k, (a, b) in enumerate(zip(numbers, numbers[1:], strict=False)):
+        i_from_j = se3_inverse(guess.odom_from_body[a]) @ guess.odom_from_body[b]
+        terms.append(RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(25.0 * _edge_covariance(guess, a, b))))
+    return terms
+
+
+def _edge_covariance(guess: FirstGuess, a: int, b: int) -> Array:
+    """(6, 6) of i_from_j between frames a and b, axes of a: what the odometry's uncertainty gained, with a floor."""
+    rotation = guess.odom_from_body[a, :3, :3].T
+    gained = guess.covariances[b] - guess.covariances[a]
+    values, vectors = np.linalg.eigh(0.5 * (gained + gained.T))
+    gained = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    carry = np.kron(np.eye(2), rotation)
+    distance = float(np.linalg.norm(guess.odom_from_body[b, :3, 3] - guess.odom_from_body[a, :3, 3]))
+    floor = np.diag([0.004**2] * 3 + [(0.01 + 0.02 * distance) ** 2] * 3)
+    return np.asarray(carry @ gained @ carry.T + floor)
+
+
+def _match_neighbours(
+    guess: FirstGuess, state: SurveyState, finder: PairFinder, settings: SurveySettings, progress: Progress
+) -> list[PairMatch]:
+    candidates = finder.candidates(
+        state.map_from_body, previous=settings.pairs.previous, only_near=max(settings.loops.min_gap_keyframes, settings.pairs.previous)
+    )
+    covariances = guess.covariances[[k.frame_index for k in guess.keyframes]]
+    return finder.match(
+        candidates, state.map_from_body, drift_allowance_m(covariances, state.map_from_body[:, :3, 3]),
+        rotation_sigma_rad=0.02 if guess.inertial else None, is_known=False,
+        progress=lambda n: progress("matching", n + 1, len(candidates)),
+    )  # fmt: skip
+
+
+def _match_all(state: SurveyState, finder: PairFinder, settings: SurveySettings, progress: Progress) -> list[PairMatch]:
+    candidates = finder.candidates(state.map_from_body, previous=settings.pairs.previous)
+    return finder.match(
+        candidates, state.map_from_body, fixed_allowance_m(state.map_from_body), rotation_sigma_rad=0.02, is_known=True,
+        progress=lambda n: progress("matching again", n + 1, len(candidates)),
+    )  # fmt: skip
+
+
+def _train(keyframes: list[Keyframe], settings: SurveySettings) -> Vocabulary:
+    descriptors = np.concatenate([k.features.descriptors for k in keyframes])
+    images = np.concatenate([np.full(len(k.features), n) for n, k in enumerate(keyframes)])
+    rng = np.random.default_rng(settings.seed)
+    if len(descriptors) > settings.vocabulary.max_descriptors:
+        chosen = np.sort(rng.choice(len(descriptors), settings.vocabulary.max_descriptors, replace=False))
+        descriptors, images = descriptors[chosen], images[chosen]
+    return train_vocabulary(descriptors, settings.vocabulary.branching, settings.vocabulary.levels, rng, images)
+
+
+def _close_loops(
+    guess: FirstGuess, state: SurveyState, pairs: list[PairMatch], vocabulary: Vocabulary, settings: SurveySettings, zones: Zones,
+    progress: Progress,
+) -> Loops:  # fmt: skip
+    """Finds loops, and moves the keyframes to where the pose graph with them says."""
+    keyframes = guess.keyframes
+    chain = _chain_edges(guess, state)
+    vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in keyframes]
+    closer = LoopCloser(
+        keyframes, vectors, vocabulary.word_count, state.camera, state.body_from_cam, state.map_from_body,
+        GraphMarginals(state.map_from_body, chain), {(p.i, p.j) for p in pairs}, settings, zones,
+    )  # fmt: skip
+    for i in range(len(keyframes)):
+        closer.close(i)
+        progress("loops", i + 1, len(keyframes))
+    if closer.loops.edges:
+        solved = optimize_pose_graph(state.map_from_body, [*chain, *closer.loops.edges])
+        closer.loops.disbelieve(solved.loop_weights)
+        _move(state, solved.map_from_body)
+    return closer.loops
+
+
+def _chain_edges(guess: FirstGuess, state: SurveyState) -> list[PoseEdge]:
+    edges = []
+    numbers = [k.frame_index for k in guess.keyframes]
+    for k, (a, b) in enumerate(zip(numbers, numbers[1:], strict=False)):
+        i_from_j = se3_inverse(state.map_from_body[k]) @ state.map_from_body[k + 1]
+        edges.append(PoseEdge(k, k + 1, i_from_j, _edge_covariance(guess, a, b), is_loop=False))
+    return edges
+
+
+def _move(state: SurveyState, map_from_body: NDArray[np.float64]) -> None:
+    turns = map_from_body[:, :3, :3] @ state.map_from_body[:, :3, :3].transpose(0, 2, 1)
+    state.motion = replace(state.motion, velocities_mps=np.einsum("kij,kj->ki", turns, state.motion.velocities_mps))
+    state.map_from_body = map_from_body

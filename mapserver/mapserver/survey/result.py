@@ -1,0 +1,38 @@
+"""What a survey hands on: keyframes, landmarks, what saw what, and where every frame was."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array
+from fleetmap.rectification import StereoCamera
+from fleetmap.samples import Stamps, Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyMap:
+    """A finished survey in `map`; K keyframes, N landmarks, M observations, F selected frames.
+
+    map_from_body (K, 4, 4). points_map (N, 3), descriptors (N, 32) uint8, point_sigma_m (N,) largest standard deviation.
+    obs_keyframe and obs_landmark (M,) index the arrays here; obs_pixels (M, 3) is u_left, v, u_right (NaN without a right
+    match); obs_sigma_px (M,) of u and v. trajectory holds all F frames; where trajectory_estimated (F,) is false the transform
+    is a guess between neighbours. patches (N, P, P) uint8 are cut from each landmark's reference keyframe at its octave.
+    """
+
+    camera: StereoCamera
+    body_from_cam: Array
+    keyframe_stamps_ns: Stamps
+    map_from_body: Array
+    landmark_ids: NDArray[np.uint32]
+    points_map: Array
+    descriptors: NDArray[np.uint8]
+    point_sigma_m: Array
+    obs_keyframe: NDArray[np.int32]
+    obs_landmark: NDArray[np.int32]
+    obs_pixels: Array
+    obs_octave: NDArray[np.int8]
+    obs_sigma_px: Array
+    trajectory: Trajectory
+    trajectory_estimated: NDArray[np.bool_]
+    patches: NDArray[np.uint8]

@@ -1,0 +1,89 @@
+"""Settings of a survey: one set for each sensor set, none for a single recording."""
+
+from typing import Literal
+
+from fleetmap.config import Section
+from fleetmap.features.orb import OrbSettings
+from fleetmap.features.patch_align import AlignSettings
+from fleetmap.features.stereo import StereoSettings
+from fleetmap.odometry import OdometrySettings
+from mapserver.survey.bundle import BundleSettings
+
+
+class KeyframeSettings(Section, frozen=True):
+    """When a frame becomes a keyframe."""
+
+    policy: Literal["overlap", "every", "every-nth"] = "overlap"
+    every_nth: int = 5
+    min_overlap: float = 0.6
+    max_rotation_deg: float = 12.0
+    max_parallax: float = 0.12
+    max_interval_s: float = 2.0
+    min_sharpness: float = 0.5
+    break_overlap: float = 0.3
+
+
+class PairSettings(Section, frozen=True):
+    """Which keyframes are matched with each other, and how."""
+
+    previous: int = 6
+    covisible: int = 10
+    min_overlap: float = 0.15
+    max_distance: int = 70
+    ratio: float = 0.85
+    guided_distance: int = 60
+    guided_radius_px: float = 6.0
+    search_px: float = 8.0
+    min_inliers: int = 12
+    match_sigma_px: float = 1.5
+
+
+class LoopSettings(Section, frozen=True):
+    """Which revisits are looked for and believed."""
+
+    top: int = 8
+    min_gap_keyframes: int = 8
+    chi_square_share: float = 0.999
+    view_range_depths: float = 1.0
+    min_inliers: int = 15
+    alone_inliers: int = 30
+    min_cells: int = 6
+    rotation_sigma_limit_rad: float = 0.12
+
+
+class NoiseSettings(Section, frozen=True):
+    """What the bundle adjustment believes of its measurements."""
+
+    aligned_sigma_px: float = 0.35
+    descriptor_sigma_px: float = 0.9
+    disparity_sigma_px: float = 0.2
+    cut_sigmas: float = 4.0
+    accel_noise_scale: float = 5.0
+    gyro_noise_scale: float = 2.0
+    walk_scale: float = 1.0
+
+
+class VocabularySettings(Section, frozen=True):
+    """The tree trained on a site's first survey."""
+
+    branching: int = 10
+    levels: int = 4
+    max_descriptors: int = 200_000
+
+
+class SurveySettings(Section, frozen=True):
+    """All of it."""
+
+    seed: int = 0
+    odometry: OdometrySettings = OdometrySettings()
+    orb: OrbSettings = OrbSettings(count=1200)
+    stereo: StereoSettings = StereoSettings()
+    align: AlignSettings = AlignSettings()
+    keyframes: KeyframeSettings = KeyframeSettings()
+    pairs: PairSettings = PairSettings()
+    loops: LoopSettings = LoopSettings()
+    noise: NoiseSettings = NoiseSettings()
+    bundle: BundleSettings = BundleSettings(max_iterations=20, relative_cost_tolerance=1e-6)
+    vocabulary: VocabularySettings = VocabularySettings()
+    local_window: int = 20
+    min_observations: int = 2

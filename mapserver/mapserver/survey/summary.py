@@ -1,0 +1,104 @@
+"""From the adjusted state to the finished map: descriptors, patches, uncertainties, trajectory."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.features.matching import packed
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.samples import Trajectory
+from mapserver.survey.adjust import SurveyState
+from mapserver.survey.first_guess import FirstGuess
+from mapserver.survey.keyframes import Keyframe
+from mapserver.survey.result import SurveyMap
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.tracks import Landmarks
+from mapserver.survey.trajectory import frame_trajectory
+
+_PATCH_HALF_PX = 5
+_MIN_TIED = 8
+
+
+def summarise(state: SurveyState, guess: FirstGuess, settings: SurveySettings) -> SurveyMap:
+    """The SurveyMap of an adjusted survey, in the survey's own frame."""
+    marks, keyframes = state.landmarks, guess.keyframes
+    octaves = np.array([keyframes[k].features.octaves[f] for k, f in zip(marks.obs_keyframe, marks.obs_feature, strict=True)], np.int8)
+    frame_stamps = np.array([e.stamp_ns for e in guess.estimates], np.int64)
+    numbers = [k.frame_index for k in keyframes]
+    map_from_body = frame_trajectory(frame_stamps, guess.odom_from_body, numbers, state.map_from_body)
+    return SurveyMap(
+        camera=state.camera,
+        body_from_cam=state.body_from_cam,
+        keyframe_stamps_ns=state.stamps_ns,
+        map_from_body=state.map_from_body,
+        landmark_ids=np.arange(len(marks.points_map), dtype=np.uint32),
+        points_map=marks.points_map,
+        descriptors=_descriptors(marks, keyframes),
+        point_sigma_m=_point_sigmas(state),
+        obs_keyframe=marks.obs_keyframe,
+        obs_landmark=marks.obs_landmark,
+        obs_pixels=marks.obs_pixels,
+        obs_octave=octaves,
+        obs_sigma_px=marks.obs_sigma_px[:, 0].copy(),
+        trajectory=Trajectory(frame_stamps, map_from_body),
+        trajectory_estimated=_estimated(state, guess),
+        patches=_patches(marks, keyframes),
+    )
+
+
+def _descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
+    """(N, 32): of each landmark's descriptors the one nearest to all others (their medoid)."""
+    rows = np.array([keyframes[k].features.descriptors[f] for k, f in zip(marks.obs_keyframe, marks.obs_feature, strict=True)])
+    out = np.zeros((len(marks.points_map), 32), np.uint8)
+    starts = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map) + 1))
+    words = packed(rows) if len(rows) else np.zeros((0, 4), np.uint64)
+    for n in range(len(out)):
+        own = words[starts[n] : starts[n + 1]]
+        total = np.bitwise_count(own[:, None] ^ own[None]).sum(axis=(1, 2))
+        out[n] = rows[starts[n] + int(np.argmin(total))]
+    return out
+
+
+def _point_sigmas(state: SurveyState) -> Array:
+    """(N,) largest standard deviation of each landmark, keyframes taken as known."""
+    marks, camera = state.landmarks, state.camera
+    cam_from_map = se3_inverse(state.map_from_body @ state.body_from_cam)[marks.obs_keyframe]
+    rotations = cam_from_map[:, :3, :3]
+    seen = np.einsum("mij,mj->mi", rotations, marks.points_map[marks.obs_landmark]) + cam_from_map[:, :3, 3]
+    z = np.maximum(seen[:, 2], 0.05)
+    f = camera.focal_px
+    rows = np.zeros((len(z), 3, 3))
+    rows[:, 0, 0] = rows[:, 1, 1] = f / z
+    rows[:, 0, 2], rows[:, 1, 2] = -f * seen[:, 0] / z**2, -f * seen[:, 1] / z**2
+    rows[:, 2, 2] = np.where(np.isfinite(marks.obs_pixels[:, 2]), -f * camera.baseline_m / z**2, 0.0)
+    sigma = np.column_stack([marks.obs_sigma_px[:, 0], marks.obs_sigma_px[:, 0], marks.obs_sigma_px[:, 1]])
+    jacobian = (rows / sigma[:, :, None]) @ rotations
+    information = np.zeros((len(marks.points_map), 3, 3))
+    np.add.at(information, marks.obs_landmark, jacobian.transpose(0, 2, 1) @ jacobian)
+    weakest = np.linalg.eigvalsh(information)[:, 0]
+    return np.asarray(1.0 / np.sqrt(np.maximum(weakest, 1e-6)))
+
+
+def _patches(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
+    """(N, 11, 11) windows around each landmark's first observation, at the halving nearest to its octave."""
+    size = 2 * _PATCH_HALF_PX + 1
+    out = np.zeros((len(marks.points_map), size, size), np.uint8)
+    first = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map)))
+    steps = np.arange(-_PATCH_HALF_PX, _PATCH_HALF_PX + 1)
+    for n, row in enumerate(first):
+        keyframe = keyframes[marks.obs_keyframe[row]]
+        level = min(int(np.rint(keyframe.features.octaves[marks.obs_feature[row]] * np.log2(1.2))), 2)
+        image = keyframe.pyramid[level]
+        x, y = np.rint(marks.obs_pixels[row, :2] / 2.0**level).astype(int)
+        rows = np.clip(y + steps, 0, image.shape[0] - 1)
+        columns = np.clip(x + steps, 0, image.shape[1] - 1)
+        out[n] = image[rows[:, None], columns]
+    return out
+
+
+def _estimated(state: SurveyState, guess: FirstGuess) -> NDArray[np.bool_]:
+    """(F,) frames that something measured ties to the map: landmarks, unbroken odometry, or the IMU through a gap."""
+    tied = guess.tracked.astype(bool).copy()
+    counts = np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns))
+    for keyframe, count in zip(guess.keyframes, counts, strict=True):
+        tied[keyframe.frame_index] |= bool(count >= _MIN_TIED) or state.motion.inertial
+    return tied

@@ -1,0 +1,148 @@
+"""Landmarks from verified pairs: features joined across keyframes, one per keyframe, with sub-pixel coordinates."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.features import patch_align, stereo
+from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.rectification import StereoCamera
+from mapserver.survey.keyframes import Keyframe
+from mapserver.survey.pairs import PairMatch
+from mapserver.survey.settings import NoiseSettings, SurveySettings
+
+
+@dataclass
+class Landmarks:
+    """N landmarks and their M observations, sorted by landmark; the first observation of each is its reference.
+
+    obs_keyframe, obs_landmark, obs_feature (M,); obs_pixels (M, 3) u_left v u_right; obs_sigma_px (M, 2) of pixel and disparity.
+    """
+
+    points_map: Array
+    obs_keyframe: NDArray[np.int32]
+    obs_landmark: NDArray[np.int32]
+    obs_feature: NDArray[np.int64]
+    obs_pixels: Array
+    obs_sigma_px: Array
+
+    def keep_observations(self, keep: NDArray[np.bool_], min_observations: int) -> "Landmarks":
+        """Without the other observations, and without landmarks that are then seen too rarely."""
+        counts = np.bincount(self.obs_landmark[keep], minlength=len(self.points_map))
+        lasting = counts >= min_observations
+        keep = keep & lasting[self.obs_landmark]
+        number = np.cumsum(lasting) - 1
+        return Landmarks(
+            self.points_map[lasting], self.obs_keyframe[keep], number[self.obs_landmark[keep]].astype(np.int32),
+            self.obs_feature[keep], self.obs_pixels[keep], self.obs_sigma_px[keep],
+        )  # fmt: skip
+
+
+def join_tracks(keyframes: list[Keyframe], pairs: list[PairMatch]) -> list[list[tuple[int, int]]]:
+    """Groups of (keyframe, feature) that pairs connect, no keyframe twice in a group; strongest pairs are joined first."""
+    parent: dict[tuple[int, int], tuple[int, int]] = {}
+    members: dict[tuple[int, int], dict[int, int]] = {}
+
+    def root(node: tuple[int, int]) -> tuple[int, int]:
+        while parent[node] != node:
+            parent[node] = parent[parent[node]]
+            node = parent[node]
+        return node
+
+    for pair in sorted(pairs, key=lambda p: (-len(p.features), p.i, p.j)):
+        for feature_i, feature_j in pair.features.tolist():
+            nodes = (pair.i, feature_i), (pair.j, feature_j)
+            for node in nodes:
+                if node not in parent:
+                    parent[node] = node
+                    members[node] = {node[0]: node[1]}
+            a, b = root(nodes[0]), root(nodes[1])
+            if a == b or members[a].keys() & members[b].keys():
+                continue
+            if len(members[a]) < len(members[b]):
+                a, b = b, a
+            parent[b] = a
+            members[a].update(members.pop(b))
+    return [sorted(group.items()) for _, group in sorted(members.items()) if len(group) > 1]
+
+
+def build_landmarks(
+    keyframes: list[Keyframe], pairs: list[PairMatch], map_from_body: Array, body_from_cam: Array, camera: StereoCamera,
+    settings: SurveySettings,
+) -> Landmarks:  # fmt: skip
+    """Tracks of the pairs with a stereo point to start from, each observation's coordinate refined against the reference patch."""
+    rows: list[tuple[int, int, int]] = []
+    points: list[Array] = []
+    map_from_cam = map_from_body @ body_from_cam
+    for group in join_tracks(keyframes, pairs):
+        reference = _reference(keyframes, group)
+        if reference is None:
+            continue
+        keyframe, feature = reference
+        points.append(transform_points(map_from_cam[keyframe], keyframes[keyframe].points_cam[feature][None])[0])
+        ordered = [reference, *(node for node in group if node != reference)]
+        rows.extend((k, len(points) - 1, f) for k, f in ordered)
+    if not rows:
+        nothing = np.zeros(0, np.int32)
+        return Landmarks(np.zeros((0, 3)), nothing, nothing, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)))
+    table = np.array(rows, np.int64)
+    pixels, sigmas = _observe(keyframes, table, map_from_cam, camera, settings)
+    return Landmarks(np.array(points), table[:, 0].astype(np.int32), table[:, 1].astype(np.int32), table[:, 2], pixels, sigmas)
+
+
+def _reference(keyframes: list[Keyframe], group: list[tuple[int, int]]) -> tuple[int, int] | None:
+    """The observation that defines the landmark's patch: with depth, finest octave, nearest."""
+    usable = [(k, f) for k, f in group if np.isfinite(keyframes[k].disparities[f, 0])]
+    if not usable:
+        return None
+    return min(usable, key=lambda node: (keyframes[node[0]].features.octaves[node[1]], -keyframes[node[0]].disparities[node[1], 0]))
+
+
+def _observe(
+    keyframes: list[Keyframe], table: NDArray[np.int64], map_from_cam: Array, camera: StereoCamera, settings: SurveySettings
+) -> tuple[Array, Array]:
+    """Pixels (M, 3) and sigmas (M, 2) of observations (keyframe, landmark, feature), references first in each landmark."""
+    noise = settings.noise
+    is_reference = np.r_[True, table[1:, 1] != table[:-1, 1]]
+    reference_row = np.maximum.accumulate(np.where(is_reference, np.arange(len(table)), 0))
+    pixels, sigmas = np.empty((len(table), 3)), np.empty((len(table), 2))
+    for k in np.unique(table[:, 0]):
+        rows = np.flatnonzero(table[:, 0] == k)
+        own = keyframes[k]
+        features = table[rows, 2]
+        left, sigma = own.features.pixels[features].copy(), _descriptor_sigma(own, features, noise)
+        sigma[is_reference[rows]] = noise.aligned_sigma_px
+        for source in np.unique(table[reference_row[rows], 0]):
+            inner = np.flatnonzero((table[reference_row[rows], 0] == source) & ~is_reference[rows])
+            if not len(inner):
+                continue
+            theirs = table[reference_row[rows[inner]], 2]
+            own_from_source = se3_inverse(map_from_cam[k]) @ map_from_cam[source]
+            refined = _align(keyframes[source], theirs, own, features[inner], own_from_source, camera, settings)
+            sure = np.isfinite(refined[:, 0])
+            left[inner[sure]] = refined[sure, :2]
+            sigma[inner[sure]] = np.hypot(noise.aligned_sigma_px, refined[sure, 2])
+        found = stereo.disparities(own.frame, camera, left, settings.stereo, own.disparities[features, 0])
+        pixels[rows] = np.column_stack([left, left[:, 0] - found[:, 0]])
+        sigmas[rows] = np.column_stack([sigma, np.hypot(noise.disparity_sigma_px, np.nan_to_num(found[:, 1], nan=1.0))])
+    return pixels, sigmas
+
+
+def _descriptor_sigma(keyframe: Keyframe, features: NDArray[np.int64], noise: NoiseSettings) -> Array:
+    return np.asarray(noise.descriptor_sigma_px * 1.2 ** keyframe.features.octaves[features].astype(np.float64))
+
+
+def _align(
+    reference: Keyframe, theirs: NDArray[np.int64], own: Keyframe, ours: NDArray[np.int64], own_from_reference: Array,
+    camera: StereoCamera, settings: SurveySettings,
+) -> Array:  # fmt: skip
+    """Refined pixels (N, 3) of `ours`; the warp comes from the motion, which is finer than the octaves and angles of features."""
+    a, b = reference.features.take(theirs), own.features.take(ours)
+    warp = patch_align.similarity_from_motion(camera, reference.points_cam[theirs], own_from_reference)
+    rough = patch_align.similarity_from_features(a.octaves, a.angles_deg, b.octaves, b.angles_deg)
+    unknown = ~np.isfinite(warp).all(axis=(1, 2))
+    warp[unknown] = rough[unknown]
+    return patch_align.refine_matches(
+        reference.pyramid, own.pyramid, a.pixels, a.octaves, b.pixels, b.octaves, warp, settings.align
+    )

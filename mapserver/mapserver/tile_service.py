@@ -1,0 +1,114 @@
+"""The server's side of the bus: answers for versions, manifests and bytes, hears the robots, announces new versions."""
+
+import logging
+from collections.abc import Callable
+
+from fleetmap.bus import Bus, Handle
+from fleetmap.errors import FleetmapError, LinkError
+from fleetmap.mapformat import check_name
+from fleetmap.messages import (
+    PoseMessage,
+    RobotAck,
+    RobotHealth,
+    blob_key,
+    decode_message,
+    encode_message,
+    manifest_key,
+    robot_key,
+    split_key,
+)
+from mapserver.fleet import Fleet
+from mapserver.store import MapStore
+
+Count = Callable[[str, str, int], None]
+"""Counts for metrics: (what, "ok" or "refused", bytes sent)."""
+
+_log = logging.getLogger(__name__)
+
+
+class TileService:
+    """Serves a store on a bus from its making to `close`. Reads what other processes publish meanwhile."""
+
+    def __init__(self, store: MapStore, fleet: Fleet, bus: Bus, count: Count) -> None:
+        self._store = store
+        self._fleet = fleet
+        self._bus = bus
+        self._count = count
+        self._announced: dict[str, str | None] = {}
+        self._handles: list[Handle] = [
+            bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
+            bus.queryable(manifest_key("*", "*"), self._counted("manifest", self._manifest)),
+            bus.queryable(blob_key("*", "*"), self._counted("blob", self._blob)),
+            *(bus.subscribe(robot_key("*", "*", what), self._hear) for what in ("ack", "health", "pose")),
+        ]
+
+    def announce_changes(self) -> list[str]:
+        """Tells the known robots of every site whose current version changed since the last call; returns those sites.
+
+        The first call tells all of them, because they may have missed what happened while no server ran.
+        """
+        changed = []
+        for info in self._store.sites():
+            current = self._store.current(info.site)
+            address = None if current is None else current.manifest_sha256
+            if info.site not in self._announced or self._announced[info.site] != address:
+                for robot in self._fleet.known_robots(info.site):
+                    wanted = self._fleet.wanted_version(info.site, robot)
+                    self._bus.publish(robot_key(info.site, robot, "wanted"), encode_message(wanted))
+                self._announced[info.site] = address
+                changed.append(info.site)
+        return changed
+
+    def close(self) -> None:
+        """Answers no more."""
+        for handle in self._handles:
+            handle.close()
+
+    def _counted(self, what: str, answer: Callable[[str, bytes], bytes]) -> Callable[[str, bytes], bytes]:
+        def counted(key: str, payload: bytes) -> bytes:
+            try:
+                data = answer(key, payload)
+            except FleetmapError:
+                self._count(what, "refused", 0)
+                raise
+            self._count(what, "ok", len(data))
+            return data
+
+        return counted
+
+    def _wanted(self, key: str, _: bytes) -> bytes:
+        site, robot, _what = split_key(key)
+        return encode_message(self._fleet.take_question(site, check_name(robot, "robot")))
+
+    def _manifest(self, key: str, _: bytes) -> bytes:
+        site, _what, number = split_key(key)
+        if not number.isdecimal() or len(number) > 10:
+            raise LinkError(f"{number[:80]!r} is no version number; ask {manifest_key(site, 'NUMBER')}")
+        info = self._store.version(site, int(number))
+        if info.state == "draft":
+            raise LinkError(f"version {number} of site {site} is a draft; robots get published versions only")
+        return self._store.blob(info.manifest_sha256)
+
+    def _blob(self, key: str, _: bytes) -> bytes:
+        site, _what, sha256 = split_key(key)
+        if self._store.served_kind(sha256, site) is None:
+            raise LinkError(f"site {site} has no published bytes {sha256}; fetch its current manifest again")
+        return self._store.blob(sha256)
+
+    def _hear(self, key: str, payload: bytes) -> None:
+        what = key.rpartition("/")[2]
+        try:
+            site, robot, _ = split_key(key)
+            check_name(robot, "robot")
+            if what == "ack":
+                self._fleet.take_ack(site, robot, decode_message(payload, RobotAck))
+            elif what == "health":
+                self._fleet.take_health(site, robot, decode_message(payload, RobotHealth))
+            else:
+                self._fleet.take_pose(site, robot, decode_message(payload, PoseMessage))
+        except FleetmapError as error:
+            # Nobody waits for an answer to what was published: the log and the metric are where it can be seen.
+            _log.warning("message under %s refused: %s", key, error)
+            self._count(what, "refused", 0)
+        else:
+            self._count(what, "ok", 0)

@@ -1,0 +1,17 @@
+"""Places by their words: a vocabulary of binary descriptors and an index that says which places look alike."""
+
+from fleetmap.bow.place_index import PlaceIndex
+from fleetmap.bow.training import train_vocabulary
+from fleetmap.bow.vocabulary import BowVector, Vocabulary
+from fleetmap.bow.vocabulary_codec import VOCABULARY_FORMAT, decode_vocabulary, encode_vocabulary, vocabulary_hash
+
+__all__ = [
+    "VOCABULARY_FORMAT",
+    "BowVector",
+    "PlaceIndex",
+    "Vocabulary",
+    "decode_vocabulary",
+    "encode_vocabulary",
+    "train_vocabulary",
+    "vocabulary_hash",
+]

@@ -1,0 +1,99 @@
+"""Which places look like this one: an inverted file over bag-of-words vectors."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.bow import place_index_kernels
+from fleetmap.bow.vocabulary import BowVector
+
+_SMALLEST_TAIL = 64
+_TAIL_SHARE = 8  # the tail is sorted in when it holds more than an eighth of the places
+
+
+class PlaceIndex:
+    """Places and their vectors, growing.
+
+    Postings are sorted by word; the newest places wait unsorted in a tail that is compared one by one and sorted in
+    when it has grown, so that adding stays cheap. What a query returns does not depend on when that happened.
+    """
+
+    def __init__(self, word_count: int) -> None:
+        """An empty index for the words of one vocabulary."""
+        self._word_count = word_count
+        self._place_ids: list[int] = []
+        self._known: set[int] = set()
+        self._starts = np.zeros(word_count + 1, np.int64)
+        self._slots = np.zeros(0, np.int32)
+        self._weights = np.zeros(0, np.float32)
+        self._sorted_places = 0
+        self._tail: list[BowVector] = []
+        self._flat_tail: _Flat | None = None
+
+    def __len__(self) -> int:
+        return len(self._place_ids)
+
+    @property
+    def place_ids(self) -> NDArray[np.int64]:
+        """(P,) ids in the order in which they were added: what a candidates mask goes along."""
+        return np.array(self._place_ids, np.int64)
+
+    def add(self, place_id: int, vector: BowVector) -> None:
+        """Adds a place; its id must be new."""
+        assert place_id not in self._known, place_id
+        assert len(vector) == 0 or vector.word_ids[-1] < self._word_count
+        self._known.add(place_id)
+        self._place_ids.append(place_id)
+        self._tail.append(vector)
+        self._flat_tail = None
+        if len(self._tail) > max(_SMALLEST_TAIL, self._sorted_places // _TAIL_SHARE):
+            self._sort_tail_in()
+
+    def query(
+        self, vector: BowVector, candidates_mask: NDArray[np.bool_] | None = None, top_k: int = 10
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Ids and scores of the up to `top_k` most similar places, best first; those that share no word are left out.
+
+        candidates_mask (P,) in the order of `place_ids` says which may be returned. The score is 1 - |a - b|_1 / 2, in
+        0..1, 1 for equal vectors (DBoW2's L1 score). Ties go to the lower id.
+        """
+        scores = self.scores(vector)
+        if candidates_mask is not None:
+            assert candidates_mask.shape == scores.shape
+            scores = np.where(candidates_mask, scores, 0.0)
+        found = np.flatnonzero(scores > 0.0)
+        if len(found) > top_k:
+            least = np.partition(scores[found], len(found) - top_k)[len(found) - top_k]
+            found = found[scores[found] >= least]
+        ids = self.place_ids[found]
+        order = np.lexsort((ids, -scores[found]))[:top_k]
+        return ids[order], scores[found][order]
+
+    def scores(self, vector: BowVector) -> NDArray[np.float64]:
+        """(P,) score of every place, in the order of `place_ids`."""
+        scores = np.zeros(len(self), np.float64)
+        place_index_kernels.add_sorted_scores(
+            vector.word_ids, vector.weights, self._starts, self._slots, self._weights, scores
+        )
+        if self._tail:
+            if self._flat_tail is None:
+                self._flat_tail = _flatten(self._tail)
+            spread = np.zeros(self._word_count, np.float32)
+            spread[vector.word_ids] = vector.weights
+            place_index_kernels.add_tail_scores(spread, *self._flat_tail, scores[self._sorted_places :])
+        return scores
+
+    def _sort_tail_in(self) -> None:
+        self._starts, self._slots, self._weights = place_index_kernels.merged_postings(
+            self._starts, self._slots, self._weights, self._sorted_places, *_flatten(self._tail)
+        )
+        self._sorted_places = len(self)
+        self._tail, self._flat_tail = [], None
+
+
+_Flat = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
+
+
+def _flatten(vectors: list[BowVector]) -> _Flat:
+    """Bounds (len + 1,), word ids and weights of the vectors, one after the other."""
+    bounds = np.concatenate([[0], np.cumsum([len(vector) for vector in vectors])]).astype(np.int64)
+    return bounds, np.concatenate([v.word_ids for v in vectors]), np.concatenate([v.weights for v in vectors])

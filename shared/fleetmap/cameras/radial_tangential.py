@@ -1,0 +1,66 @@
+"""Pinhole with radial-tangential distortion k1 k2 p1 p2 [k3]; none at all for an empty distortion. Source: Brown 1966, OpenCV's order."""
+
+import numpy as np
+
+from fleetmap.geometry import Array
+
+_ITERATIONS = 12
+
+
+def _coefficients(distortion: Array) -> tuple[float, float, float, float, float]:
+    padded = np.zeros(5)
+    padded[: len(distortion)] = distortion
+    return float(padded[0]), float(padded[1]), float(padded[2]), float(padded[3]), float(padded[4])
+
+
+def _distort(distortion: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    k1, k2, p1, p2, k3 = _coefficients(distortion)
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def _radial_limit(distortion: Array) -> float:
+    """Largest r^2 up to which the distorted radius still grows; beyond it the polynomial folds back."""
+    k1, k2, _, _, k3 = _coefficients(distortion)
+    # d/dr of r (1 + k1 r^2 + k2 r^4 + k3 r^6), as a polynomial in r^2
+    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    real = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
+    return float(real.min()) if len(real) else np.inf
+
+
+def pixel_from_ray(intrinsics_px: Array, distortion: Array, rays_cam: Array) -> Array:
+    """(N, 2) pixels of rays (N, 3); NaN behind the camera and where the polynomial is past its fold."""
+    fx, fy, cx, cy = intrinsics_px
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = rays_cam[:, 0] / rays_cam[:, 2], rays_cam[:, 1] / rays_cam[:, 2]
+        seen = (rays_cam[:, 2] > 1e-9) & (x * x + y * y < _radial_limit(distortion))
+        distorted_x, distorted_y = _distort(distortion, x, y)
+    pixels = np.stack([fx * distorted_x + cx, fy * distorted_y + cy], axis=1)
+    pixels[~seen] = np.nan
+    return pixels
+
+
+def ray_from_pixel(intrinsics_px: Array, distortion: Array, pixels: Array) -> Array:
+    """(N, 3) unit rays of pixels (N, 2). Newton's method with a numeric Jacobian; NaN where it does not come back to the pixel."""
+    fx, fy, cx, cy = intrinsics_px
+    goal_x, goal_y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
+    x, y = goal_x.copy(), goal_y.copy()
+    step = 1e-6
+    for _ in range(_ITERATIONS):
+        dx, dy = _distort(distortion, x, y)
+        dx_x, dy_x = _distort(distortion, x + step, y)
+        dx_y, dy_y = _distort(distortion, x, y + step)
+        a, b, c, d = (dx_x - dx) / step, (dx_y - dx) / step, (dy_x - dy) / step, (dy_y - dy) / step
+        det = a * d - b * c
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = x + (d * (goal_x - dx) - b * (goal_y - dy)) / det, y + (a * (goal_y - dy) - c * (goal_x - dx)) / det
+    back_x, back_y = _distort(distortion, x, y)
+    missed = ~((np.hypot(back_x - goal_x, back_y - goal_y) < 1e-7) & (x * x + y * y < _radial_limit(distortion)))
+    rays = np.stack([x, y, np.ones_like(x)], axis=1)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays[missed] = np.nan
+    return np.asarray(rays)

@@ -1,0 +1,67 @@
+"""Everything that can go wrong with what comes from outside: files, network, users.
+
+FleetmapError                      exit status 3
+├── UsageError                     exit status 2: a command line or setting that cannot be right
+├── RecordingError                 a recording that cannot be read or contradicts itself
+│   └── CalibrationError           missing or impossible calibration
+├── SurveyError                    a recording from which no honest map can be made
+├── MapFormatError                 tile, manifest or vocabulary bytes that are not what they claim
+│   └── NewerFormatError           made by a newer fleetmap; names the version that is needed
+├── StoreError                     a store that cannot be opened, read or written
+├── LinkError                      the other side cannot be reached, refuses or answers nonsense
+│   └── UnreachableError           nobody answered in time; asking again later may help
+└── GateRefusedError               exit status 4: the draft is not good enough to publish
+
+The message holds the offending value and the next step. Caught only in the commands' `main` and the HTTP API.
+"I do not know where I am" is a value with a status, never one of these.
+"""
+
+
+class FleetmapError(Exception):
+    """Base of the tree; `exit_status` is what a command line ends with."""
+
+    exit_status = 3
+
+
+class UsageError(FleetmapError):
+    """A command line or a setting that cannot be right."""
+
+    exit_status = 2
+
+
+class RecordingError(FleetmapError):
+    """A recording that cannot be read or contradicts itself."""
+
+
+class CalibrationError(RecordingError):
+    """Missing or impossible calibration."""
+
+
+class SurveyError(FleetmapError):
+    """A recording from which no honest map can be made."""
+
+
+class MapFormatError(FleetmapError):
+    """Tile, manifest or vocabulary bytes that are not what they claim to be."""
+
+
+class NewerFormatError(MapFormatError):
+    """Bytes or a store made by a newer fleetmap than this one."""
+
+
+class StoreError(FleetmapError):
+    """A store that cannot be opened, read or written."""
+
+
+class LinkError(FleetmapError):
+    """The other side cannot be reached, refuses or answers nonsense."""
+
+
+class UnreachableError(LinkError):
+    """Nobody answered in time; asking again later may help."""
+
+
+class GateRefusedError(FleetmapError):
+    """The draft is not good enough to publish."""
+
+    exit_status = 4

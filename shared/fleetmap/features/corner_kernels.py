@@ -1,0 +1,90 @@
+"""Inner loops of corner selection and orientation."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array
+from fleetmap.kernel import kernel
+
+
+@kernel
+def min_eigenvalue_scores(image: NDArray[np.uint8], pixels: NDArray[np.float32], half: int) -> Array:
+    """(N,) smaller eigenvalue of the gradient matrix in a (2 half + 1)^2 window. Source: Shi and Tomasi 1994."""
+    height, width = image.shape
+    scores = np.zeros(len(pixels))
+    for n in range(len(pixels)):
+        x, y = int(pixels[n, 0]), int(pixels[n, 1])
+        if x < half + 1 or y < half + 1 or x >= width - half - 1 or y >= height - half - 1:
+            continue
+        xx, xy, yy = 0.0, 0.0, 0.0
+        for v in range(y - half, y + half + 1):
+            for u in range(x - half, x + half + 1):
+                gx = float(image[v, u + 1]) - float(image[v, u - 1])
+                gy = float(image[v + 1, u]) - float(image[v - 1, u])
+                xx += gx * gx
+                xy += gx * gy
+                yy += gy * gy
+        mean = 0.5 * (xx + yy)
+        scores[n] = mean - np.sqrt(max(mean * mean - (xx * yy - xy * xy), 0.0))
+    return scores
+
+
+@kernel
+def select_spread(
+    pixels: NDArray[np.float32], order: NDArray[np.int64], taken: NDArray[np.float32], cell_px: float, count: int, width: int, height: int
+) -> NDArray[np.int64]:
+    """Indices of up to `count` pixels, best first as `order` says, no two within about `cell_px` of each other or of `taken`.
+
+    One pixel for a cell and its neighbours nearer than cell_px: a greedy suppression on a grid of cells.
+    """
+    columns, rows = int(width / cell_px) + 1, int(height / cell_px) + 1
+    slots = 4
+    held = np.zeros((rows, columns), np.int64)
+    places = np.zeros((rows, columns, slots, 2))
+    for n in range(len(taken)):
+        c, r = int(taken[n, 0] / cell_px), int(taken[n, 1] / cell_px)
+        if 0 <= c < columns and 0 <= r < rows and held[r, c] < slots:
+            places[r, c, held[r, c], 0] = taken[n, 0]
+            places[r, c, held[r, c], 1] = taken[n, 1]
+            held[r, c] += 1
+    chosen = np.empty(count, np.int64)
+    found = 0
+    for k in range(len(order)):
+        if found == count:
+            break
+        x, y = pixels[order[k], 0], pixels[order[k], 1]
+        c, r = int(x / cell_px), int(y / cell_px)
+        free = held[r, c] < slots
+        for rr in range(max(r - 1, 0), min(r + 2, rows)):
+            for cc in range(max(c - 1, 0), min(c + 2, columns)):
+                for s in range(held[rr, cc]):
+                    dx, dy = places[rr, cc, s, 0] - x, places[rr, cc, s, 1] - y
+                    if dx * dx + dy * dy < cell_px * cell_px:
+                        free = False
+        if not free:
+            continue
+        places[r, c, held[r, c], 0] = x
+        places[r, c, held[r, c], 1] = y
+        held[r, c] += 1
+        chosen[found] = order[k]
+        found += 1
+    return chosen[:found]
+
+
+@kernel
+def centroid_angles_deg(image: NDArray[np.uint8], pixels: NDArray[np.float32], radius: int) -> NDArray[np.float32]:
+    """(N,) direction in degrees [0, 360) from each pixel to the intensity centroid of its disc. Source: Rosin 1999, as ORB uses it."""
+    angles = np.zeros(len(pixels), np.float32)
+    height, width = image.shape
+    for n in range(len(pixels)):
+        x, y = int(pixels[n, 0] + 0.5), int(pixels[n, 1] + 0.5)
+        m10, m01 = 0.0, 0.0
+        for dv in range(-radius, radius + 1):
+            v = min(max(y + dv, 0), height - 1)
+            reach = int(np.sqrt(radius * radius - dv * dv))
+            for du in range(-reach, reach + 1):
+                u = min(max(x + du, 0), width - 1)
+                m10 += du * float(image[v, u])
+                m01 += dv * float(image[v, u])
+        angles[n] = np.degrees(np.arctan2(m01, m10)) % 360.0
+    return angles

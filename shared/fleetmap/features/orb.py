@@ -1,0 +1,117 @@
+"""Grid ORB: oriented FAST corners spread over the image and its scales, with OpenCV's rotated binary descriptors."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.config import Section
+from fleetmap.features.corner_kernels import centroid_angles_deg, min_eigenvalue_scores, select_spread
+from fleetmap.features.corners import fast_corners
+from fleetmap.geometry import Array
+from fleetmap.samples import Image
+
+SCALE_FACTOR = 1.2
+_PATCH_RADIUS = 15
+_BORDER_PX = 19
+
+
+class OrbSettings(Section, frozen=True):
+    """How many features and where."""
+
+    count: int = 1000
+    levels: int = 8
+    fast_threshold: int = 12
+    min_distance_px: float = 7.0
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """N features of one rectified image, in level-0 pixels: pixels (N, 2), octaves (N,), angles_deg (N,), descriptors (N, 32)."""
+
+    pixels: Array
+    octaves: NDArray[np.int8]
+    angles_deg: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def take(self, indices: NDArray[np.int64]) -> "Features":
+        """The features at `indices`."""
+        return Features(self.pixels[indices], self.octaves[indices], self.angles_deg[indices], self.descriptors[indices])
+
+    @classmethod
+    def empty(cls) -> "Features":
+        """No features."""
+        return cls(np.zeros((0, 2)), np.zeros(0, np.int8), np.zeros(0, np.float32), np.zeros((0, 32), np.uint8))
+
+
+def detect(image: Image, settings: OrbSettings) -> Features:
+    """Features of a rectified grey image, spread by suppression per level. Source: Rublee et al. 2011 (ORB), Mur-Artal 2015 (levels)."""
+    found = [_detect_level(image, level, quota, settings) for level, quota in enumerate(_quotas(settings))]
+    keypoints = [keypoint for level in found for keypoint in level]
+    return describe(image, keypoints, settings.levels)
+
+
+def describe(image: Image, keypoints: list[cv2.KeyPoint], levels: int) -> Features:
+    """Features of given oriented keypoints; those too near the border are left out."""
+    if not keypoints:
+        return Features.empty()
+    engine = cv2.ORB.create(nfeatures=len(keypoints), scaleFactor=SCALE_FACTOR, nlevels=levels, edgeThreshold=_BORDER_PX)
+    kept, descriptors = engine.compute(image, keypoints)
+    if not kept:
+        return Features.empty()
+    return Features(
+        np.array([k.pt for k in kept], np.float64).reshape(-1, 2),
+        np.array([k.octave for k in kept], np.int8),
+        np.array([k.angle for k in kept], np.float32),
+        np.asarray(descriptors, np.uint8),
+    )
+
+
+def describe_pixels(image: Image, pixels: Array, settings: OrbSettings) -> tuple[Features, NDArray[np.int64]]:
+    """Level-0 features at given pixels (N, 2), and the index of the pixel that each describes."""
+    points = pixels.astype(np.float32)
+    angles = centroid_angles_deg(image, points, _PATCH_RADIUS)
+    keypoints = [
+        cv2.KeyPoint(float(x), float(y), 31.0, float(angle), 1.0, 0, index)
+        for index, ((x, y), angle) in enumerate(zip(points, angles, strict=True))
+    ]
+    engine = cv2.ORB.create(nfeatures=max(len(keypoints), 1), scaleFactor=SCALE_FACTOR, nlevels=settings.levels, edgeThreshold=_BORDER_PX)
+    kept, descriptors = engine.compute(image, keypoints)
+    index = np.array([k.class_id for k in kept], np.int64)
+    if not kept:
+        return Features.empty(), index
+    return Features(pixels[index], np.zeros(len(index), np.int8), angles[index], np.asarray(descriptors, np.uint8)), index
+
+
+def _quotas(settings: OrbSettings) -> list[int]:
+    shares = SCALE_FACTOR ** -np.arange(settings.levels)
+    return [int(np.ceil(settings.count * s / shares.sum())) for s in shares]
+
+
+def _detect_level(image: Image, level: int, quota: int, settings: OrbSettings) -> list[cv2.KeyPoint]:
+    scale = SCALE_FACTOR**level
+    height, width = (round(s / scale) for s in image.shape)
+    scaled = image if level == 0 else np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
+    candidates = fast_corners(scaled, settings.fast_threshold)
+    if len(candidates) < 2 * quota:
+        candidates = fast_corners(scaled, max(settings.fast_threshold // 2, 4))
+    inside = (
+        (candidates[:, 0] >= _BORDER_PX)
+        & (candidates[:, 1] >= _BORDER_PX)
+        & (candidates[:, 0] < width - _BORDER_PX)
+        & (candidates[:, 1] < height - _BORDER_PX)
+    )
+    candidates = candidates[inside]
+    scores = min_eigenvalue_scores(scaled, candidates, 3)
+    order = np.argsort(-scores, kind="stable")
+    nothing = np.zeros((0, 2), np.float32)
+    chosen = candidates[select_spread(candidates, order, nothing, settings.min_distance_px, quota, width, height)]
+    angles = centroid_angles_deg(scaled, chosen, _PATCH_RADIUS)
+    return [
+        cv2.KeyPoint(float(x) * scale, float(y) * scale, 31.0 * scale, float(angle), 1.0, level)
+        for (x, y), angle in zip(chosen, angles, strict=True)
+    ]

@@ -1,0 +1,70 @@
+"""Sub-pixel disparities of features in a rectified pair."""
+
+import cv2
+import numpy as np
+
+from fleetmap.config import Section
+from fleetmap.features.stereo_kernels import match_rows
+from fleetmap.geometry import Array
+from fleetmap.rectification import RectifiedFrame, StereoCamera
+from fleetmap.samples import Image
+
+
+class StereoSettings(Section, frozen=True):
+    """Windows and limits of the row matcher. Small windows: large ones shift the scale of the map at depth edges."""
+
+    min_depth_m: float = 0.3
+    min_disparity_px: float = 0.7
+    min_correlation: float = 0.75
+    uniqueness: float = 0.93
+    wide_half_px: int = 5
+    narrow_half_px: int = 4
+    agreement_px: float = 0.25
+    depth_sigma_px: float = 0.3
+
+
+def halved(image: Image) -> Image:
+    """The image at half size, smoothed."""
+    return np.asarray(cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def disparities(
+    frame: RectifiedFrame, camera: StereoCamera, pixels: Array, settings: StereoSettings, prior_px: Array | None = None
+) -> Array:
+    """(N, 2) disparity and standard deviation in pixels for left pixels (N, 2); NaN where unknown.
+
+    prior_px (N,), NaN for none, confines the search to a few pixels around. From the depth image where the frame has one, NaN
+    throughout for a single camera.
+    """
+    count = len(pixels)
+    if frame.disparity_px is not None:
+        return _from_depth(frame, pixels, settings)
+    if frame.right is None or count == 0:
+        return np.full((count, 2), np.nan)
+    max_disparity = min(camera.focal_px * camera.baseline_m / settings.min_depth_m, 0.6 * camera.width_px)
+    prior = np.full(count, np.nan) if prior_px is None else np.asarray(prior_px, np.float64)
+    matched = match_rows(
+        frame.left, frame.right, halved(frame.left), halved(frame.right), np.asarray(pixels, np.float64), prior, max_disparity,
+        settings.min_correlation, settings.uniqueness, settings.wide_half_px, settings.narrow_half_px, settings.agreement_px,
+    )  # fmt: skip
+    matched[~(matched[:, 0] > settings.min_disparity_px)] = np.nan
+    return matched
+
+
+def _from_depth(frame: RectifiedFrame, pixels: Array, settings: StereoSettings) -> Array:
+    """Median of the 3x3 neighbourhood; NaN at depth edges, where colour and depth cannot be registered well enough."""
+    assert frame.disparity_px is not None
+    height, width = frame.disparity_px.shape
+    out = np.full((len(pixels), 2), np.nan)
+    column, row = np.rint(pixels[:, 0]).astype(np.int64), np.rint(pixels[:, 1]).astype(np.int64)
+    inside = (column > 0) & (row > 0) & (column < width - 1) & (row < height - 1)
+    steps = np.arange(-1, 2)
+    patches = frame.disparity_px[(row[inside, None, None] + steps[:, None]), (column[inside, None, None] + steps)]
+    patches = patches.reshape(-1, 9)
+    middle = np.median(patches, axis=1)
+    spread = patches.max(axis=1) - patches.min(axis=1)
+    good = np.isfinite(middle) & (spread < 0.08 * middle + 0.5)
+    index = np.flatnonzero(inside)[good]
+    out[index, 0] = middle[good]
+    out[index, 1] = settings.depth_sigma_px
+    return out

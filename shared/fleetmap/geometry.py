@@ -1,0 +1,161 @@
+"""Rotations, rigid transforms and alignments on numpy arrays.
+
+A transform is a (4, 4) float64 matrix named `target_from_source`. Tangent vectors are rotation first:
+(rx, ry, rz, tx, ty, tz), radians and metres. Quaternions are `quat_wxyz`, unit, w >= 0.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+AnyArray = NDArray[Any]
+
+
+def skew(vector: Array) -> Array:
+    """(3, 3) matrix S with S @ x = vector x x (cross product)."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def so3_exp(rotvec_rad: Array) -> Array:
+    """(3, 3) rotation of a rotation vector (3,). Source: Rodrigues' formula, series below 1e-6 rad."""
+    angle = float(np.linalg.norm(rotvec_rad))
+    cross = skew(np.asarray(rotvec_rad, dtype=np.float64))
+    if angle < 1e-6:
+        return np.eye(3) + cross + 0.5 * cross @ cross
+    return np.eye(3) + np.sin(angle) / angle * cross + (1.0 - np.cos(angle)) / angle**2 * cross @ cross
+
+
+def so3_log(rotation: Array) -> Array:
+    """Rotation vector (3,) of a rotation (3, 3), angle in [0, pi]. Goes through the quaternion, stable near pi."""
+    quat = quat_wxyz_from_rotation(rotation)
+    sine = float(np.linalg.norm(quat[1:]))
+    if sine < 1e-10:
+        return 2.0 * quat[1:]
+    return np.asarray(2.0 * np.arctan2(sine, quat[0]) / sine * quat[1:])
+
+
+def so3_left_jacobian(rotvec_rad: Array) -> Array:
+    """(3, 3) left Jacobian of SO(3): d Exp(r) = J dr, applied from the left. Source: Barfoot, State Estimation, 7.77."""
+    angle = float(np.linalg.norm(rotvec_rad))
+    cross = skew(rotvec_rad)
+    if angle < 1e-5:
+        return np.eye(3) + 0.5 * cross + cross @ cross / 6.0
+    return (
+        np.eye(3)
+        + (1.0 - np.cos(angle)) / angle**2 * cross
+        + (angle - np.sin(angle)) / angle**3 * cross @ cross
+    )
+
+
+def se3(rotation: Array, translation_m: Array) -> Array:
+    """(4, 4) rigid transform of a rotation (3, 3) and a translation (3,)."""
+    target_from_source = np.eye(4)
+    target_from_source[:3, :3] = rotation
+    target_from_source[:3, 3] = translation_m
+    return target_from_source
+
+
+def se3_inverse(target_from_source: Array) -> Array:
+    """source_from_target; also for stacks (..., 4, 4)."""
+    rotation = np.swapaxes(target_from_source[..., :3, :3], -1, -2)
+    source_from_target = np.zeros_like(target_from_source)
+    source_from_target[..., :3, :3] = rotation
+    source_from_target[..., :3, 3] = -(rotation @ target_from_source[..., :3, 3:])[..., 0]
+    source_from_target[..., 3, 3] = 1.0
+    return source_from_target
+
+
+def se3_exp(rot_trans: Array) -> Array:
+    """(4, 4) transform of a tangent vector (6,), rotation first."""
+    rotvec = np.asarray(rot_trans[:3], dtype=np.float64)
+    return se3(so3_exp(rotvec), so3_left_jacobian(rotvec) @ rot_trans[3:])
+
+
+def se3_log(target_from_source: Array) -> Array:
+    """Tangent vector (6,), rotation first, of a transform (4, 4)."""
+    rotvec = so3_log(target_from_source[:3, :3])
+    translation = np.linalg.solve(so3_left_jacobian(rotvec), target_from_source[:3, 3])
+    return np.concatenate([rotvec, translation])
+
+
+def rotation_from_quat_wxyz(quat_wxyz: Array) -> Array:
+    """(3, 3) rotation of a quaternion (4,), normalised here."""
+    w, x, y, z = np.asarray(quat_wxyz, dtype=np.float64) / np.linalg.norm(quat_wxyz)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quat_wxyz_from_rotation(rotation: Array) -> Array:
+    """Unit quaternion (4,) with w >= 0. Source: Shepperd 1978 (largest component first)."""
+    m = rotation
+    squares = np.array(
+        [
+            1 + m[0, 0] + m[1, 1] + m[2, 2],
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+        ]
+    )
+    rows = (
+        (squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]),
+        (m[2, 1] - m[1, 2], squares[1], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]),
+        (m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], squares[2], m[1, 2] + m[2, 1]),
+        (m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[3]),
+    )
+    quat = np.array(rows[int(np.argmax(squares))])
+    quat /= np.linalg.norm(quat)
+    return np.asarray(-quat if quat[0] < 0 else quat)
+
+
+def transform_points(target_from_source: Array, points_source: Array) -> Array:
+    """points_target (N, 3) of points_source (N, 3)."""
+    return np.asarray(points_source @ target_from_source[:3, :3].T + target_from_source[:3, 3])
+
+
+def interpolate_se3(frame_from_a: Array, frame_from_b: Array, fraction: float) -> Array:
+    """The transform `fraction` of the way from a to b, at constant twist."""
+    return np.asarray(frame_from_a @ se3_exp(fraction * se3_log(se3_inverse(frame_from_a) @ frame_from_b)))
+
+
+def align_points(points_target: Array, points_source: Array, *, with_scale: bool = False) -> tuple[Array, float]:
+    """Least-squares `target_from_source` (4, 4) and scale for paired points (N, 3).
+
+    points_target ~ scale * R @ points_source + t; scale is 1 unless asked for. The returned matrix holds R and t without
+    the scale. Source: Umeyama 1991.
+    """
+    assert points_target.shape == points_source.shape
+    assert points_target.ndim == 2
+    mean_target, mean_source = points_target.mean(0), points_source.mean(0)
+    target, source = points_target - mean_target, points_source - mean_source
+    u, singular, vt = np.linalg.svd(target.T @ source)
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ sign @ vt
+    scale = float((singular * np.diag(sign)).sum() / max((source**2).sum(), 1e-300)) if with_scale else 1.0
+    return se3(rotation, mean_target - scale * rotation @ mean_source), scale
+
+
+def rotation_angle_rad(rotation: Array) -> float:
+    """Angle in [0, pi] of a rotation (3, 3)."""
+    return float(np.linalg.norm(so3_log(rotation)))
+
+
+def rotation_between_vectors(source: Array, target: Array) -> Array:
+    """The smallest rotation (3, 3) that turns direction `source` (3,) into direction `target` (3,)."""
+    a, b = source / np.linalg.norm(source), target / np.linalg.norm(target)
+    axis = np.cross(a, b)
+    sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
+    if sine < 1e-12:
+        if cosine > 0:
+            return np.eye(3)
+        other = np.eye(3)[int(np.argmin(np.abs(a)))]
+        axis = np.cross(a, other)
+        return so3_exp(np.pi * axis / np.linalg.norm(axis))
+    return so3_exp(np.arctan2(sine, cosine) * axis / sine)

@@ -1,0 +1,12 @@
+"""What the IMU says about motion between two moments."""
+
+from fleetmap.inertial.preintegration import (
+    GRAVITY_MAP,
+    GRAVITY_MPS2,
+    NavTrack,
+    Preintegrated,
+    preintegrate,
+    propagate_nav,
+)
+
+__all__ = ["GRAVITY_MAP", "GRAVITY_MPS2", "NavTrack", "Preintegrated", "preintegrate", "propagate_nav"]

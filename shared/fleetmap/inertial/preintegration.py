@@ -1,0 +1,200 @@
+"""Inertial samples between two moments, summed up once: relative motion, its uncertainty, how both follow the biases.
+
+Convention, in a gravity-aligned frame: R_j = R_i dR, v_j = v_i + g dt + R_i dv and
+p_j = p_i + v_i dt + g dt^2 / 2 + R_i dp.
+Errors are those of the increments: rotation on the right (dR Exp(error)), then velocity, position and the two biases.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.calibration import ImuNoise
+from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.inertial.preintegration_kernels import integrate_samples, propagate_samples
+from fleetmap.samples import ImuSamples, Stamps
+
+GRAVITY_MPS2 = 9.81
+GRAVITY_MAP = np.array([0.0, 0.0, -GRAVITY_MPS2])
+
+GAP_PERIODS = 3.0  # a longer distance between samples counts as missing data
+GAP_GYRO_RADPS = 0.5  # how far the true rate may be from the interpolated one where samples are missing
+GAP_ACCEL_MPS2 = 2.0
+BLIND_GYRO_RADPS = 1.0  # the same with no sample at all
+BLIND_ACCEL_MPS2 = 20.0
+DEFAULT_PERIOD_S = 0.01
+
+
+@dataclass(frozen=True)
+class Preintegrated:
+    """Relative motion of the body between two stamps as the IMU felt it, in body axes at `start_ns`.
+
+    delta_rotation (3, 3), delta_velocity_mps (3,), delta_position_m (3,): without gravity and initial velocity.
+    cov (15, 15): rotation, velocity, position, gyro bias, accelerometer bias; the last six are the biases' walk since
+    `start_ns`, with its correlation to the motion. d_*_d_* (3, 3): derivatives at the linearisation point
+    gyro_bias_radps (3,), accel_bias_mps2 (3,), rotation as a right perturbation. max_gap_s: longest stretch without a
+    sample, one sample period in a healthy recording.
+    """
+
+    start_ns: int
+    end_ns: int
+    dt_s: float
+    delta_rotation: Array
+    delta_velocity_mps: Array
+    delta_position_m: Array
+    cov: Array
+    d_rotation_d_gyro: Array
+    d_velocity_d_gyro: Array
+    d_velocity_d_accel: Array
+    d_position_d_gyro: Array
+    d_position_d_accel: Array
+    gyro_bias_radps: Array
+    accel_bias_mps2: Array
+    max_gap_s: float
+
+    @property
+    def cov_rot_vel_pos(self) -> Array:
+        """(9, 9) covariance of the motion alone, the biases' walk included."""
+        return np.asarray(self.cov[:9, :9])
+
+    def corrected(self, gyro_bias: Array, accel_bias: Array) -> tuple[Array, Array, Array]:
+        """Increments (3, 3), (3,), (3,) for other biases, to first order. Source: Forster et al. 2017, eq. 44."""
+        gyro, accel = gyro_bias - self.gyro_bias_radps, accel_bias - self.accel_bias_mps2
+        return (
+            self.delta_rotation @ so3_exp(self.d_rotation_d_gyro @ gyro),
+            self.delta_velocity_mps + self.d_velocity_d_gyro @ gyro + self.d_velocity_d_accel @ accel,
+            self.delta_position_m + self.d_position_d_gyro @ gyro + self.d_position_d_accel @ accel,
+        )
+
+    def predict(
+        self, map_from_body: Array, velocity_map_mps: Array, gyro_bias: Array, accel_bias: Array
+    ) -> tuple[Array, Array]:
+        """map_from_body (4, 4) and velocity (3,) at `end_ns` from those at `start_ns`, in a gravity-aligned frame."""
+        rotation, velocity, position = self.corrected(gyro_bias, accel_bias)
+        map_from_start, dt = map_from_body[:3, :3], self.dt_s
+        moved = map_from_body[:3, 3] + velocity_map_mps * dt + 0.5 * GRAVITY_MAP * dt**2 + map_from_start @ position
+        after = velocity_map_mps + GRAVITY_MAP * dt + map_from_start @ velocity
+        return se3(map_from_start @ rotation, moved), np.asarray(after)
+
+
+@dataclass(frozen=True)
+class NavTrack:
+    """Dead reckoning: stamps_ns (N,), frame_from_body (N, 4, 4), velocities_mps (N, 3) in the frame."""
+
+    stamps_ns: Stamps
+    frame_from_body: Array
+    velocities_mps: Array
+
+
+def preintegrate(
+    imu: ImuSamples, start_ns: int, end_ns: int, gyro_bias: Array, accel_bias: Array, noise: ImuNoise
+) -> Preintegrated:
+    """The motion from `start_ns` to `end_ns`, biases (3,) taken as constant.
+
+    Samples are interpolated at both ends and held beyond the data. Where more than a few sample periods are missing,
+    `max_gap_s` says so and the covariance grows by what an unseen motion can be; no data at all gives zero increments
+    with a covariance to match. Source: Forster et al. 2017, On-manifold preintegration for real-time VIO.
+    """
+    assert end_ns >= start_ns
+    stamps, gyro, accel, holes_s, period_s = _cut(imu, start_ns, end_ns)
+    rotation, velocity, position = np.eye(3), np.zeros(3), np.zeros(3)
+    jacobians, cov = np.zeros((5, 3, 3)), np.zeros((15, 15))
+    blind = len(imu) == 0
+    if not blind:
+        gyro, accel = gyro - gyro_bias, accel - accel_bias
+    times_s = _seconds(stamps, start_ns)
+    variances = _step_variances(np.diff(times_s), holes_s > GAP_PERIODS * period_s, blind, noise)
+    integrate_samples(times_s, gyro, accel, variances, rotation, velocity, position, jacobians, cov)
+    return Preintegrated(
+        start_ns=int(start_ns),
+        end_ns=int(end_ns),
+        dt_s=(end_ns - start_ns) * 1e-9,
+        delta_rotation=rotation,
+        delta_velocity_mps=velocity,
+        delta_position_m=position,
+        cov=cov,
+        d_rotation_d_gyro=jacobians[0],
+        d_velocity_d_gyro=jacobians[1],
+        d_velocity_d_accel=jacobians[2],
+        d_position_d_gyro=jacobians[3],
+        d_position_d_accel=jacobians[4],
+        gyro_bias_radps=np.array(gyro_bias, dtype=np.float64),
+        accel_bias_mps2=np.array(accel_bias, dtype=np.float64),
+        max_gap_s=float(holes_s.max(initial=0.0)),
+    )
+
+
+def propagate_nav(
+    imu: ImuSamples,
+    start_ns: int,
+    end_ns: int,
+    frame_from_body: Array,
+    velocity_mps: Array,
+    gyro_bias: Array,
+    accel_bias: Array,
+) -> NavTrack:
+    """Dead reckoning from the state at `start_ns` through the samples to `end_ns`, one row per sample and both ends.
+
+    frame_from_body (4, 4) and velocity_mps (3,) are given in any gravity-aligned frame. Beyond the data samples are
+    held; without any, the body keeps its velocity.
+    """
+    stamps, gyro, accel, _, _ = _cut(imu, start_ns, end_ns)
+    frame_from_bodies, velocities = np.empty((len(stamps), 4, 4)), np.empty((len(stamps), 3))
+    frame_from_bodies[0], velocities[0] = frame_from_body, velocity_mps
+    blind = len(imu) == 0
+    gravity = np.zeros(3) if blind else GRAVITY_MAP
+    if not blind:
+        gyro, accel = gyro - gyro_bias, accel - accel_bias
+    propagate_samples(_seconds(stamps, start_ns), gyro, accel, gravity, frame_from_bodies, velocities)
+    return NavTrack(stamps, frame_from_bodies, velocities)
+
+
+def _seconds(stamps: Stamps, start_ns: int) -> Array:
+    return np.asarray((stamps - start_ns) * 1e-9, dtype=np.float64)
+
+
+def _cut(imu: ImuSamples, start_ns: int, end_ns: int) -> tuple[Stamps, Array, Array, Array, float]:
+    """Stamps (N,), rates, forces (N, 3) with both ends added, the hole (N - 1,) around each step, the sample period."""
+    all_stamps = imu.stamps_ns
+    first = int(np.searchsorted(all_stamps, start_ns, side="right"))
+    last = max(int(np.searchsorted(all_stamps, end_ns)), first)
+    stamps = np.concatenate([[start_ns], all_stamps[first:last], [end_ns]]).astype(np.int64)
+    if len(all_stamps) == 0:
+        nothing = np.zeros((2, 3))
+        return stamps, nothing, nothing.copy(), np.array([(end_ns - start_ns) * 1e-9]), DEFAULT_PERIOD_S
+    near = slice(max(first - 2, 0), last + 2)
+    gyro = _with_ends(stamps, all_stamps[near], imu.gyro_radps[near], imu.gyro_radps[first:last])
+    accel = _with_ends(stamps, all_stamps[near], imu.accel_mps2[near], imu.accel_mps2[first:last])
+    diffs = np.diff(all_stamps[near])
+    period_s = float(np.median(diffs)) * 1e-9 if len(diffs) else DEFAULT_PERIOD_S
+    return stamps, gyro, accel, _holes_s(stamps, all_stamps), period_s
+
+
+def _with_ends(stamps: Stamps, near_stamps: Stamps, near_values: Array, inner: Array) -> Array:
+    ends = np.array([[np.interp(s, near_stamps, column) for column in near_values.T] for s in stamps[[0, -1]]])
+    return np.concatenate([ends[:1], inner, ends[1:]])
+
+
+def _holes_s(stamps: Stamps, all_stamps: Stamps) -> Array:
+    """For each step the distance between the recorded samples around it; outside the data, from the data's end."""
+    after = np.searchsorted(all_stamps, stamps[1:])
+    before = np.searchsorted(all_stamps, stamps[:-1], side="right") - 1
+    begins = np.where(before >= 0, all_stamps[np.maximum(before, 0)], stamps[:-1])
+    ends = np.where(after < len(all_stamps), all_stamps[np.minimum(after, len(all_stamps) - 1)], stamps[1:])
+    return np.asarray((ends - begins) * 1e-9)
+
+
+def _step_variances(dt_s: Array, missing: NDArray[np.bool_], blind: bool, noise: ImuNoise) -> Array:
+    """(N, 4) variances of mean rate and acceleration in each step and of the biases' walk across it."""
+    step = np.maximum(dt_s, 1e-12)
+    gyro_gap, accel_gap = (BLIND_GYRO_RADPS, BLIND_ACCEL_MPS2) if blind else (GAP_GYRO_RADPS, GAP_ACCEL_MPS2)
+    return np.stack(
+        [
+            noise.gyro_noise_radps_rthz**2 / step + np.where(missing, gyro_gap**2, 0.0),
+            noise.accel_noise_mps2_rthz**2 / step + np.where(missing, accel_gap**2, 0.0),
+            noise.gyro_walk_radps2_rthz**2 * dt_s,
+            noise.accel_walk_mps3_rthz**2 * dt_s,
+        ],
+        axis=1,
+    )

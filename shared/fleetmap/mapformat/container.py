@@ -1,0 +1,65 @@
+"""The envelope of every binary format here: magic, format number, size, one zstd frame.
+
+    offset  type   content
+    0       4 s    magic, names the kind
+    4       u16    format number
+    6       u16    0
+    8       u32    size of the payload before compression
+    12      ...    one zstd frame with content size and checksum, and nothing after it
+
+Little-endian. Opening untrusted bytes never allocates more than the limit that the caller states.
+"""
+
+import struct
+
+import zstandard
+
+from fleetmap.errors import MapFormatError, NewerFormatError
+
+_HEADER = struct.Struct("<4sHHI")
+_LEVEL = 19  # tiles are written once at night and read by every robot
+_MAX_WINDOW_BYTES = 1 << 27
+
+
+def pack(magic: bytes, format_number: int, payload: bytes, *, level: int = _LEVEL) -> bytes:
+    """`payload` in its envelope. The same input gives the same bytes (for one release of zstd)."""
+    compressor = zstandard.ZstdCompressor(level=level, write_checksum=True, write_content_size=True)
+    return _HEADER.pack(magic, format_number, 0, len(payload)) + compressor.compress(payload)
+
+
+def unpack(magic: bytes, newest: int, data: bytes, what: str, max_bytes: int) -> tuple[int, bytes]:
+    """Format number and payload of `data`.
+
+    Raises NewerFormatError for a format number above `newest`, MapFormatError for everything else that is not a whole
+    envelope of kind `magic` with at most `max_bytes` inside. `what` names the thing in messages.
+    """
+    if len(data) < _HEADER.size or data[:4] != magic:
+        raise MapFormatError(
+            f"{what}: {len(data)} bytes beginning {data[:4]!r}, not {magic!r}; this is another kind of file"
+        )
+    _, number, reserved, size = _HEADER.unpack_from(data)
+    if number > newest:
+        raise NewerFormatError(
+            f"{what} has format {number}, this fleetmap reads up to {newest}; update fleetmap to read it"
+        )
+    if number < 1 or reserved != 0:
+        raise MapFormatError(
+            f"{what}: format {number} with reserved bytes {reserved} was never written; the bytes are damaged"
+        )
+    if size > max_bytes:
+        raise MapFormatError(f"{what} declares {size} bytes, the limit is {max_bytes}; it is damaged or not ours")
+    return number, _decompress(data[_HEADER.size :], size, what)
+
+
+def _decompress(frame: bytes, size: int, what: str) -> bytes:
+    try:
+        declared = zstandard.get_frame_parameters(frame).content_size
+        if declared != size:
+            raise MapFormatError(f"{what}: header says {size} bytes, its zstd frame {declared}; the bytes are damaged")
+        decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW_BYTES)
+        payload = decompressor.decompress(frame, max_output_size=max(size, 1), allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise MapFormatError(f"{what}: {error}; the bytes are damaged, fetch them again") from error
+    if len(payload) != size:
+        raise MapFormatError(f"{what}: {len(payload)} bytes instead of {size}; the bytes are damaged, fetch them again")
+    return payload

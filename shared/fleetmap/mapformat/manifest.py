@@ -1,0 +1,115 @@
+"""The manifest: what a version consists of, as canonical JSON. Its SHA-256 is the version's identity."""
+
+from typing import Annotated, Any
+
+import msgspec
+
+from fleetmap.errors import MapFormatError, NewerFormatError
+from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
+
+MANIFEST_FORMAT = 1
+MAX_MANIFEST_BYTES = 64 << 20
+
+Sha256 = Annotated[str, msgspec.Meta(pattern=SHA256_PATTERN)]
+Name = Annotated[str, msgspec.Meta(pattern=NAME_PATTERN)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 62))]
+Positive = Annotated[int, msgspec.Meta(ge=1, le=(1 << 62))]
+
+
+class TileEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One tile: its place in the grid, its address, its size, what is in it."""
+
+    x: Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 31)]
+    y: Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 31)]
+    sha256: Sha256
+    bytes: Positive
+    landmarks: Count
+
+
+class BlobEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Bytes by their address."""
+
+    sha256: Sha256
+    bytes: Positive
+
+
+class CameraEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The rectified camera that made the survey; robots compare their own with it."""
+
+    focal_px: float
+    width_px: Positive
+    height_px: Positive
+    baseline_m: float
+
+
+class RecordingEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A recording that went into the survey."""
+
+    name: str
+    sha256: Sha256
+    frames: Count
+
+
+class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a version consists of. `created` is ISO 8601 in UTC; `parent` is the version that was current then."""
+
+    format_version: Positive = MANIFEST_FORMAT
+    site: Name
+    version: Positive
+    parent: Positive | None = None
+    created: str
+    tile_size_m: Annotated[float, msgspec.Meta(gt=0)]
+    tiles: tuple[TileEntry, ...]
+    vocabulary: BlobEntry
+    camera: CameraEntry
+    recordings: tuple[RecordingEntry, ...] = ()
+    configuration: dict[str, Any] = {}
+    libraries: dict[str, str] = {}
+    report: dict[str, Any] = {}
+
+    @property
+    def landmarks(self) -> int:
+        """Landmarks in all tiles."""
+        return sum(tile.landmarks for tile in self.tiles)
+
+    @property
+    def tile_bytes(self) -> int:
+        """Bytes of all tiles, as they travel."""
+        return sum(tile.bytes for tile in self.tiles)
+
+
+class _FormatOnly(msgspec.Struct):
+    format_version: int
+
+
+def encode_manifest(manifest: Manifest) -> bytes:
+    """Canonical JSON: sorted keys, no spaces, so that equal manifests have equal hashes.
+
+    Raises MapFormatError for values that JSON can't hold.
+    """
+    try:
+        return msgspec.json.encode(manifest, order="deterministic")
+    except (TypeError, ValueError) as error:
+        raise MapFormatError(
+            f"manifest of {manifest.site} version {manifest.version}: {error}; use plain values"
+        ) from error
+
+
+def decode_manifest(data: bytes) -> Manifest:
+    """The manifest of `data`.
+
+    Raises NewerFormatError for a newer format, MapFormatError for anything that isn't a manifest.
+    """
+    if len(data) > MAX_MANIFEST_BYTES:
+        raise MapFormatError(
+            f"manifest of {len(data)} bytes, the limit is {MAX_MANIFEST_BYTES}; it is damaged or not ours"
+        )
+    try:
+        number = msgspec.json.decode(data, type=_FormatOnly).format_version
+        if number > MANIFEST_FORMAT:
+            raise NewerFormatError(
+                f"manifest has format {number}, this fleetmap reads up to {MANIFEST_FORMAT}; update fleetmap to read it"
+            )
+        return msgspec.json.decode(data, type=Manifest)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise MapFormatError(f"manifest: {error}; it is damaged or not a manifest") from error

@@ -1,0 +1,56 @@
+"""How things are addressed: sites and robots by name, bytes by their SHA-256."""
+
+import hashlib
+import re
+
+from fleetmap.errors import MapFormatError, UsageError
+
+NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
+SHA256_PATTERN = r"^[0-9a-f]{64}$"
+_NAME = re.compile(NAME_PATTERN)
+_SHA256 = re.compile(SHA256_PATTERN)
+
+
+def check_name(name: str, what: str) -> str:
+    """`name` itself, fit to be a folder, a key of the bus and part of an address.
+
+    Raises UsageError (`what` says whose name it is) for anything but 1-64 of a-z 0-9 _ -, or one that
+    begins with a sign.
+    """
+    if _NAME.fullmatch(name) is None:
+        raise UsageError(
+            f"{what} name {name[:80]!r}: use 1 to 64 of a-z, 0-9, '_' and '-', beginning with a letter or digit"
+        )
+    return name
+
+
+def check_sha256(sha256: str) -> str:
+    """`sha256` itself; raises MapFormatError unless it is 64 lower-case hexadecimal digits."""
+    if _SHA256.fullmatch(sha256) is None:
+        raise MapFormatError(f"{sha256[:80]!r} is not a SHA-256 (64 lower-case hexadecimal digits)")
+    return sha256
+
+
+def blob_path(sha256: str) -> str:
+    """Where a store keeps the bytes of an address, relative to its folder."""
+    return f"blobs/{check_sha256(sha256)[:2]}/{sha256}"
+
+
+def current_path(site: str) -> str:
+    """Where a store keeps the manifest's address of the site's current version, as text, relative to its folder."""
+    return f"sites/{check_name(site, 'site')}/current"
+
+
+def sha256_hex(data: bytes) -> str:
+    """The address of `data`."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def verified(data: bytes, sha256: str) -> bytes:
+    """`data` itself; raises MapFormatError unless its SHA-256 is `sha256`."""
+    found = sha256_hex(data)
+    if found != sha256:
+        raise MapFormatError(
+            f"{len(data)} bytes that should have SHA-256 {sha256} have {found}; they were damaged, fetch them again"
+        )
+    return data

@@ -1,0 +1,143 @@
+"""What robots and the server say to each other, as MessagePack, and the keys of the bus under which they say it.
+
+fleetmap/{site}/robots/{robot}/wanted    asked by the robot; published by the server when it changes: WantedVersion
+fleetmap/{site}/robots/{robot}/ack       published by the robot: RobotAck
+fleetmap/{site}/robots/{robot}/health    published by the robot: RobotHealth
+fleetmap/{site}/robots/{robot}/pose      published by the robot: PoseMessage
+fleetmap/{site}/robots/{robot}/alive     liveliness token of the robot
+fleetmap/{site}/manifests/{version}      asked by the robot: manifest bytes
+fleetmap/{site}/blobs/{sha256}           asked by the robot: bytes of a tile or vocabulary
+"""
+
+from typing import Annotated, Any, Self, TypeVar
+
+import msgspec
+import numpy as np
+
+from fleetmap.errors import LinkError
+from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
+
+MAX_MESSAGE_BYTES = 1 << 20
+_ROOT = "fleetmap"
+
+Name = Annotated[str, msgspec.Meta(max_length=64)]
+Text = Annotated[str, msgspec.Meta(max_length=2000)]
+Version = Annotated[int, msgspec.Meta(ge=1, le=(1 << 31))]
+Metrics = Annotated[dict[Name, float | int | str | bool | None], msgspec.Meta(max_length=256)]
+Flags = Annotated[tuple[Name, ...], msgspec.Meta(max_length=64)]
+
+
+class WantedVersion(msgspec.Struct, frozen=True, kw_only=True):
+    """The version that a robot should run; None while the site has none."""
+
+    site: Name
+    version: Version | None
+    manifest_sha256: str | None
+
+
+class RobotAck(msgspec.Struct, frozen=True, kw_only=True):
+    """A robot says which version it runs. refused: why it does not run the wanted one, empty if it does."""
+
+    site: Name
+    robot: Name
+    stamp_ns: int
+    version: Version | None
+    refused: Text = ""
+
+
+class RobotHealth(msgspec.Struct, frozen=True, kw_only=True):
+    """A robot's last report: status of the localization, flags that are raised, metrics by name."""
+
+    site: Name
+    robot: Name
+    stamp_ns: int
+    version: Version | None
+    status: Name
+    flags: Flags = ()
+    metrics: Metrics = {}
+
+
+class PoseMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """An estimate of map_from_base: position in metres, unit quaternion, covariance (rotation first, row by row)."""
+
+    stamp_ns: int
+    position_map_m: tuple[float, float, float]
+    quat_wxyz: tuple[float, float, float, float]
+    cov_rot_trans: Annotated[tuple[float, ...], msgspec.Meta(min_length=36, max_length=36)]
+    status: Name
+    map_version: Version | None
+
+    @classmethod
+    def of(
+        cls, stamp_ns: int, map_from_base: Array, cov_rot_trans: Array, status: str, map_version: int | None
+    ) -> Self:
+        """The message of map_from_base (4, 4) with cov_rot_trans (6, 6)."""
+        assert map_from_base.shape == (4, 4)
+        assert cov_rot_trans.shape == (6, 6)
+        x, y, z = (float(value) for value in map_from_base[:3, 3])
+        qw, qx, qy, qz = (float(value) for value in quat_wxyz_from_rotation(map_from_base[:3, :3]))
+        return cls(
+            stamp_ns=int(stamp_ns),
+            position_map_m=(x, y, z),
+            quat_wxyz=(qw, qx, qy, qz),
+            cov_rot_trans=tuple(float(value) for value in cov_rot_trans.ravel()),
+            status=status,
+            map_version=map_version,
+        )
+
+    @property
+    def map_from_base(self) -> Array:
+        """(4, 4) transform of this message."""
+        return se3(rotation_from_quat_wxyz(np.array(self.quat_wxyz)), np.array(self.position_map_m))
+
+
+Message = WantedVersion | RobotAck | RobotHealth | PoseMessage
+M = TypeVar("M", WantedVersion, RobotAck, RobotHealth, PoseMessage)
+
+
+def encode_message(message: Message) -> bytes:
+    """MessagePack of a message."""
+    return msgspec.msgpack.encode(message)
+
+
+def decode_message(data: bytes, message_type: type[M]) -> M:
+    """The message of `data`; raises LinkError for bytes that are not one of that type."""
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise LinkError(f"{message_type.__name__} of {len(data)} bytes, the limit is {MAX_MESSAGE_BYTES}")
+    try:
+        return msgspec.msgpack.decode(data, type=message_type)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise LinkError(
+            f"{len(data)} bytes are no {message_type.__name__} ({error}); do both sides run the same fleetmap?"
+        ) from error
+
+
+def report_dict(message: Message) -> dict[str, Any]:
+    """The message as plain values, for reports."""
+    built: dict[str, Any] = msgspec.to_builtins(message)
+    return built
+
+
+def robot_key(site: str, robot: str, what: str) -> str:
+    """Key of a robot's wanted, ack, health, pose or alive; '*' for any site or robot."""
+    return f"{_ROOT}/{site}/robots/{robot}/{what}"
+
+
+def manifest_key(site: str, version: int | str) -> str:
+    """Key of a version's manifest; '*' for any."""
+    return f"{_ROOT}/{site}/manifests/{version}"
+
+
+def blob_key(site: str, sha256: str) -> str:
+    """Key of the bytes of an address; '*' for any."""
+    return f"{_ROOT}/{site}/blobs/{sha256}"
+
+
+def split_key(key: str) -> tuple[str, str, str]:
+    """Site, robot (or 'manifests', 'blobs') and last chunk of a key made above; raises LinkError for any other."""
+    chunks = key.split("/")
+    if len(chunks) == 5 and chunks[0] == _ROOT and chunks[2] == "robots":
+        return chunks[1], chunks[3], chunks[4]
+    if len(chunks) == 4 and chunks[0] == _ROOT and chunks[2] in {"manifests", "blobs"}:
+        return chunks[1], chunks[2], chunks[3]
+    raise LinkError(f"key {key[:200]!r} is none of fleetmap's; its keys are listed in fleetmap.messages")

@@ -1,0 +1,256 @@
+"""The right-invariant multi-state constraint filter: state, propagation, clones, update."""
+
+from dataclasses import dataclass, field
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.calibration import ImuNoise
+from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log
+from fleetmap.odometry import filter_kernels
+from fleetmap.odometry.settings import FilterSettings
+from fleetmap.rectification import StereoCamera
+from fleetmap.samples import ImuSamples
+
+GRAVITY_MPS2 = 9.81
+_GRAVITY = np.array([0.0, 0.0, -GRAVITY_MPS2])
+_NAV = 15  # rotation, velocity, position, gyro bias, accelerometer bias
+_OFFSET = 15  # index of the time offset
+_CLONES = 16  # index of the first clone
+_POSITION_GATE = 11.345  # 0.99 of chi-square with 3 degrees of freedom
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Observations of one point: which clones (n,), pixels (n, 3) u_left v u_right; a first guess of it as clone `anchor` sees it.
+
+    The guess is in camera axes (3,), so that it follows the clone when an iterated update moves it.
+    """
+
+    clone_ids: NDArray[np.int64]
+    pixels: Array
+    anchor: int
+    point_cam: Array
+
+
+@dataclass
+class NavState:
+    """Nominal state in `odom`."""
+
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+    velocity_mps: Array = field(default_factory=lambda: np.zeros(3))
+    position_m: Array = field(default_factory=lambda: np.zeros(3))
+    gyro_bias_radps: Array = field(default_factory=lambda: np.zeros(3))
+    accel_bias_mps2: Array = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def odom_from_body(self) -> Array:
+        """(4, 4)."""
+        return se3(self.rotation, self.position_m)
+
+
+class InvariantFilter:
+    """Keeps the current state and a window of past body transforms (clones) with their joint covariance.
+
+    Without an IMU the state moves by `displace` instead of `propagate`; velocity and biases are then idle.
+    """
+
+    def __init__(self, state: NavState, nav_covariance: Array, settings: FilterSettings, camera: StereoCamera, body_from_cam: Array) -> None:
+        self.state = state
+        self.imu_minus_cam_s = 0.0
+        self.clone_ids: list[int] = []
+        self._rotations: list[Array] = []
+        self._positions: list[Array] = []
+        self._settings = settings
+        self._camera = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.focal_px * camera.baseline_m])
+        self._weights = np.array([1 / settings.pixel_sigma_px, 1 / settings.disparity_sigma_px])
+        self._body_from_cam = np.ascontiguousarray(body_from_cam)
+        self._quantile = NormalDist().inv_cdf(settings.chi_square_share)
+        self.covariance = np.zeros((_CLONES, _CLONES))
+        self.covariance[:_NAV, :_NAV] = nav_covariance
+        self.covariance[_OFFSET, _OFFSET] = settings.time_offset_sigma_s**2
+
+    def propagate(self, imu: ImuSamples, start_ns: int, end_ns: int, noise: ImuNoise) -> Array:
+        """Moves the state from start_ns to end_ns; returns the last angular rate (3,), bias removed."""
+        steps_s, gyro, accel = imu_intervals(imu, start_ns, end_ns)
+        phi, process = np.eye(_NAV), np.zeros((_NAV, _NAV))
+        densities = np.array(
+            [noise.gyro_noise_radps_rthz, noise.accel_noise_mps2_rthz, noise.gyro_walk_radps2_rthz, noise.accel_walk_mps3_rthz]
+        )
+        s = self.state
+        if len(steps_s):
+            filter_kernels.propagate(
+                s.rotation, s.velocity_mps, s.position_m, s.gyro_bias_radps, s.accel_bias_mps2, _GRAVITY,
+                steps_s, gyro, accel, densities, phi, process,
+            )  # fmt: skip
+        self._transition(phi, process)
+        return gyro[-1] - s.gyro_bias_radps if len(gyro) else np.zeros(3)
+
+    def displace(self, body_from_next: Array, rotation_sigma_rad: float, translation_sigma_m: float) -> None:
+        """Moves the state by a relative transform that is known only as well as the sigmas say."""
+        s = self.state
+        rotation = s.rotation.copy()
+        s.position_m = s.position_m + rotation @ body_from_next[:3, 3]
+        s.rotation = rotation @ body_from_next[:3, :3]
+        shape = np.zeros((_NAV, 6))
+        shape[0:3, 0:3] = s.rotation
+        shape[6:9, 0:3] = skew(s.position_m) @ s.rotation
+        shape[6:9, 3:6] = s.rotation
+        sigmas = np.array([rotation_sigma_rad] * 3 + [translation_sigma_m] * 3)
+        self._transition(np.eye(_NAV), (shape * sigmas**2) @ shape.T)
+
+    def add_clone(self, clone_id: int, rate_body_radps: Array) -> None:
+        """Keeps the current body transform in the window; the rate ties it to the time offset."""
+        s, size = self.state, len(self.covariance)
+        turn = s.rotation @ rate_body_radps
+        jacobian = np.zeros((6, size))
+        jacobian[0:3, 0:3] = np.eye(3)
+        jacobian[3:6, 6:9] = np.eye(3)
+        jacobian[0:3, _OFFSET] = turn
+        jacobian[3:6, _OFFSET] = s.velocity_mps + np.cross(s.position_m, turn)
+        cross = jacobian @ self.covariance
+        grown = np.empty((size + 6, size + 6))
+        grown[:size, :size] = self.covariance
+        grown[size:, :size] = cross
+        grown[:size, size:] = cross.T
+        grown[size:, size:] = cross @ jacobian.T
+        self.covariance = grown
+        self.clone_ids.append(clone_id)
+        self._rotations.append(s.rotation.copy())
+        self._positions.append(s.position_m.copy())
+
+    def remove_clone(self, clone_id: int) -> None:
+        """Forgets a clone (marginalises it)."""
+        index = self.clone_ids.index(clone_id)
+        keep = np.ones(len(self.covariance), bool)
+        keep[_CLONES + 6 * index : _CLONES + 6 * index + 6] = False
+        self.covariance = self.covariance[np.ix_(keep, keep)]
+        for values in (self.clone_ids, self._rotations, self._positions):
+            del values[index]
+
+    def odom_from_clone(self, clone_id: int) -> Array:
+        """(4, 4) odom_from_body of a clone."""
+        index = self.clone_ids.index(clone_id)
+        return se3(self._rotations[index], self._positions[index])
+
+    def update(
+        self, tracks: list[Track], iterations: int = 1, newest_odom_from_body: Array | None = None, sigma_scale: float = 1.0
+    ) -> NDArray[np.int8]:
+        """Uses each track once; (T,) 1 taken, 0 not triangulated, -1 refused by its gate.
+
+        More than one iteration relinearises (iterated Kalman filter), for large corrections; newest_odom_from_body is then where
+        the newest clone is linearised first, when vision knows it better than the prediction. It adds no information.
+        sigma_scale widens the measurement noise, for matches that are less exact than flow.
+        """
+        used = np.zeros(len(tracks), np.int8)
+        if not tracks:
+            return used
+        index_of = {clone_id: index for index, clone_id in enumerate(self.clone_ids)}
+        starts = np.concatenate([[0], np.cumsum([len(t.clone_ids) for t in tracks])]).astype(np.int64)
+        clones = np.array([index_of[int(c)] for t in tracks for c in t.clone_ids], np.int64)
+        pixels = np.concatenate([t.pixels for t in tracks])
+        points = np.array([t.point_cam for t in tracks])
+        anchors = np.array([index_of[t.anchor] for t in tracks], np.int64)
+        prior = (NavState(**vars(self.state)), list(self._rotations), list(self._positions), self.imu_minus_cam_s)
+        size = 6 * len(self.clone_ids)
+        inner = np.ascontiguousarray(self.covariance[_CLONES:, _CLONES:])
+        moved = np.zeros(size)
+        if newest_odom_from_body is not None:
+            error = newest_odom_from_body @ se3_inverse(se3(self._rotations[-1], self._positions[-1]))
+            moved[-6:] = np.concatenate([so3_log(error[:3, :3]), error[:3, 3]])
+            self._rotations[-1], self._positions[-1] = newest_odom_from_body[:3, :3].copy(), newest_odom_from_body[:3, 3].copy()
+        for _ in range(iterations):
+            information, vector = np.zeros((size, size)), np.zeros(size)
+            filter_kernels.accumulate_tracks(
+                np.array(self._rotations), np.array(self._positions), self._body_from_cam, starts, clones, pixels, anchors, points,
+                self._camera, self._weights / sigma_scale, inner, moved, self._quantile, information, vector, used,
+            )  # fmt: skip
+            gain = np.linalg.solve(np.eye(size) + information @ inner, np.column_stack([vector, information]))
+            correction = self.covariance[:, _CLONES:] @ gain[:, 0]
+            self._restore(prior)
+            self._correct(correction)
+            moved = correction[_CLONES:]
+        columns = self.covariance[:, _CLONES:]
+        updated = self.covariance - columns @ gain[:, 1:] @ columns.T
+        self.covariance = 0.5 * (updated + updated.T)
+        return used
+
+    def correct_with(self, jacobian: Array, residual: Array, noise: Array) -> float:
+        """A linear measurement residual = jacobian @ error + noise; returns its normalised innovation squared."""
+        cross = self.covariance @ jacobian.T
+        innovation = jacobian @ cross + noise
+        gain = np.linalg.solve(innovation, cross.T).T
+        self._correct(gain @ residual)
+        updated = self.covariance - gain @ innovation @ gain.T
+        self.covariance = 0.5 * (updated + updated.T)
+        return float(residual @ np.linalg.solve(innovation, residual))
+
+    def open_up(self, clone_id: int, seen_odom_from_body: Array, gap_s: float) -> bool:
+        """Widens position and velocity where vision contradicts the prediction since `clone_id` beyond its covariance.
+
+        After seconds without pictures an IMU's error can exceed what its noise figures admit; a filter that then refuses every
+        picture never recovers. True where it widened. To be called before the clone of this moment is added.
+        """
+        at = _CLONES + 6 * self.clone_ids.index(clone_id)
+        pick = np.zeros((3, len(self.covariance)))
+        pick[:, 6:9], pick[:, at + 3 : at + 6] = np.eye(3), -np.eye(3)
+        pick[:, 0:3] = -skew(self.state.position_m)
+        pick[:, at : at + 3] = skew(self.state.position_m)
+        off = seen_odom_from_body[:3, 3] - self.state.position_m
+        spread = pick @ self.covariance @ pick.T + 1e-4 * np.eye(3)
+        if off @ np.linalg.solve(spread, off) < _POSITION_GATE:
+            return False
+        size = float(np.linalg.norm(off))
+        self.covariance[6:9, 6:9] += size**2 * np.eye(3)
+        self.covariance[3:6, 3:6] += (size / max(gap_s, 0.1)) ** 2 * np.eye(3)
+        return True
+
+    def body_covariance(self) -> Array:
+        """cov_rot_trans (6, 6) of odom_from_body: rotation error in odom axes, then position error."""
+        jacobian = np.zeros((6, _NAV))
+        jacobian[0:3, 0:3] = np.eye(3)
+        jacobian[3:6, 0:3] = -skew(self.state.position_m)
+        jacobian[3:6, 6:9] = np.eye(3)
+        return np.asarray(jacobian @ self.covariance[:_NAV, :_NAV] @ jacobian.T)
+
+    def _transition(self, phi: Array, process: Array) -> None:
+        self.covariance[:_NAV, :] = phi @ self.covariance[:_NAV, :]
+        self.covariance[:, :_NAV] = self.covariance[:, :_NAV] @ phi.T
+        self.covariance[:_NAV, :_NAV] += process
+
+    def _restore(self, kept: tuple[NavState, list[Array], list[Array], float]) -> None:
+        self.state = NavState(**vars(kept[0]))
+        self._rotations, self._positions, self.imu_minus_cam_s = list(kept[1]), list(kept[2]), kept[3]
+
+    def _correct(self, error: Array) -> None:
+        s = self.state
+        turn = so3_exp(error[0:3])
+        s.rotation = turn @ s.rotation
+        s.velocity_mps = turn @ s.velocity_mps + error[3:6]
+        s.position_m = turn @ s.position_m + error[6:9]
+        s.gyro_bias_radps = s.gyro_bias_radps + error[9:12]
+        s.accel_bias_mps2 = s.accel_bias_mps2 + error[12:15]
+        self.imu_minus_cam_s += float(error[_OFFSET])
+        for index in range(len(self.clone_ids)):
+            at = _CLONES + 6 * index
+            turn = so3_exp(error[at : at + 3])
+            self._rotations[index] = turn @ self._rotations[index]
+            self._positions[index] = turn @ self._positions[index] + error[at + 3 : at + 6]
+
+
+def imu_intervals(imu: ImuSamples, start_ns: int, end_ns: int) -> tuple[Array, Array, Array]:
+    """Intervals (N,) seconds between start and end with gyro and accel (N, 3) at their middles, linearly interpolated.
+
+    Beyond the first and last sample the nearest one is held.
+    """
+    if end_ns <= start_ns or len(imu) == 0:
+        return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
+    inside = imu.stamps_ns[(imu.stamps_ns > start_ns) & (imu.stamps_ns < end_ns)]
+    edges = np.concatenate([[start_ns], inside, [end_ns]]).astype(np.int64)
+    origin = edges[0]
+    middles = 0.5 * ((edges[1:] - origin) + (edges[:-1] - origin))
+    at = (imu.stamps_ns - origin).astype(np.float64)
+    gyro = np.stack([np.interp(middles, at, imu.gyro_radps[:, k]) for k in range(3)], axis=1)
+    accel = np.stack([np.interp(middles, at, imu.accel_mps2[:, k]) for k in range(3)], axis=1)
+    return np.diff(edges) * 1e-9, gyro, accel

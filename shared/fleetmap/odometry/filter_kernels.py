@@ -1,0 +1,289 @@
+"""Inner loops of the right-invariant multi-state constraint filter.
+
+Error convention: true = Exp(error) * estimate, in `odom` axes. For a rotation R, a velocity v and a position p and the error
+(r, nu, rho): R = Exp(r) R^, v = Exp(r) v^ + nu, p = Exp(r) p^ + rho (to first order). Source: Barrau and Bonnabel 2017 for the
+error, Mourikis and Roumeliotis 2007 for the multi-state constraint.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array
+from fleetmap.kernel import kernel
+from fleetmap.linear_kernels import cholesky_in_place, exp_so3, forward_substitute, matmul, matmul_nt, solve_spd
+
+
+@kernel
+def _skew(v: Array) -> Array:
+    out = np.zeros((3, 3))
+    out[0, 1], out[0, 2], out[1, 2] = -v[2], v[1], -v[0]
+    out[1, 0], out[2, 0], out[2, 1] = v[2], -v[1], v[0]
+    return out
+
+
+@kernel
+def _rotate(rotation: Array, vector: Array) -> Array:
+    out = np.zeros(3)
+    for a in range(3):
+        for b in range(3):
+            out[a] += rotation[a, b] * vector[b]
+    return out
+
+
+@kernel
+def propagate(
+    rotation: Array, velocity: Array, position: Array, gyro_bias: Array, accel_bias: Array, gravity: Array,
+    steps_s: Array, gyro: Array, accel: Array, noise: Array, state_to_state: Array, process: Array,
+) -> None:  # fmt: skip
+    """Moves the state (in place) through N intervals of constant rate and specific force.
+
+    steps_s (N,), gyro and accel (N, 3) at each interval's middle. noise (4,): densities of gyro, accel, gyro walk, accel walk.
+    state_to_state (15, 15) and process (15, 15) receive the accumulated error transition and noise, order r nu rho bg ba.
+    """
+    phi = np.eye(15)
+    q = np.zeros((15, 15))
+    for n in range(len(steps_s)):
+        dt = steps_s[n]
+        rate = gyro[n] - gyro_bias
+        middle = matmul(rotation, exp_so3(0.5 * dt * rate))
+        acceleration = _rotate(middle, accel[n] - accel_bias) + gravity
+        step = np.eye(15)
+        g = _skew(gravity)
+        step[3:6, 0:3] = g * dt
+        step[6:9, 0:3] = 0.5 * dt * dt * g
+        step[6:9, 3:6] = np.eye(3) * dt
+        mid_velocity = velocity + 0.5 * dt * acceleration
+        mid_position = position + 0.5 * dt * velocity
+        lever_v, lever_p = matmul(_skew(mid_velocity), middle), matmul(_skew(mid_position), middle)
+        # bias columns by the middle of the interval: first order in the interval, second where the chain r -> nu -> rho needs it
+        step[0:3, 9:12] = -middle * dt
+        step[3:6, 9:12] = -lever_v * dt - 0.5 * dt * dt * matmul(g, middle)
+        step[6:9, 9:12] = -lever_p * dt - 0.5 * dt * dt * lever_v
+        step[3:6, 12:15] = -middle * dt
+        step[6:9, 12:15] = -0.5 * dt * dt * middle
+        shape = np.zeros((15, 6))
+        shape[0:3, 0:3], shape[3:6, 0:3], shape[6:9, 0:3] = middle, lever_v, lever_p
+        shape[3:6, 3:6] = middle
+        diffusion = np.zeros((15, 15))
+        for k in range(6):
+            density = noise[0] if k < 3 else noise[1]
+            for a in range(9):
+                for b in range(9):
+                    diffusion[a, b] += shape[a, k] * shape[b, k] * density * density * dt
+        for a in range(3):
+            diffusion[9 + a, 9 + a] = noise[2] * noise[2] * dt
+            diffusion[12 + a, 12 + a] = noise[3] * noise[3] * dt
+        phi = matmul(step, phi)
+        q = matmul_nt(matmul(step, q), step) + diffusion
+        position += velocity * dt + 0.5 * dt * dt * acceleration
+        velocity += acceleration * dt
+        rotation[:, :] = matmul(rotation, exp_so3(dt * rate))
+    state_to_state[:, :] = phi
+    process[:, :] = q
+
+
+@kernel
+def _observe(
+    point: Array, cam_from_odom_rotation: Array, cam_position: Array, focal: float, cx: float, cy: float, focal_base: float, out: Array
+) -> bool:
+    """u_left, v, disparity of a point, and its camera coordinates in out[3:6]; False behind the camera."""
+    for a in range(3):
+        out[3 + a] = 0.0
+        for b in range(3):
+            out[3 + a] += cam_from_odom_rotation[a, b] * (point[b] - cam_position[b])
+    z = out[5]
+    if z < 0.05:
+        return False
+    out[0] = focal * out[3] / z + cx
+    out[1] = focal * out[4] / z + cy
+    out[2] = focal_base / z
+    return True
+
+
+@kernel
+def triangulate(
+    rotations: Array, positions: Array, clones: NDArray[np.int64], pixels: Array, camera: Array, weights: Array, point: Array
+) -> bool:
+    """Least-squares point (in place, odom) from one track; False where it does not settle in front of every camera.
+
+    rotations (M, 3, 3) odom_from_cam, positions (M, 3); clones (n,) which of them saw it; pixels (n, 3) u_left v u_right (NaN none).
+    camera: focal, cx, cy, focal * baseline. weights: 1/sigma of pixels and of disparity. `point` must hold a start.
+    """
+    z = np.empty(6)
+    for _ in range(8):
+        hessian, gradient = np.zeros((3, 3)), np.zeros(3)
+        jacobian = np.empty((3, 3))
+        for k in range(len(clones)):
+            turn = rotations[clones[k]].T
+            if not _observe(point, turn, positions[clones[k]], camera[0], camera[1], camera[2], camera[3], z):
+                return False
+            inverse = 1.0 / z[5]
+            for b in range(3):
+                jacobian[0, b] = camera[0] * inverse * (turn[0, b] - z[3] * inverse * turn[2, b]) * weights[0]
+                jacobian[1, b] = camera[0] * inverse * (turn[1, b] - z[4] * inverse * turn[2, b]) * weights[0]
+                jacobian[2, b] = -camera[3] * inverse * inverse * turn[2, b] * weights[1]
+            rows = 3 if pixels[k, 2] == pixels[k, 2] else 2
+            for row in range(rows):
+                if row < 2:
+                    residual = (pixels[k, row] - z[row]) * weights[0]
+                else:
+                    residual = (pixels[k, 0] - pixels[k, 2] - z[2]) * weights[1]
+                huber = 1.0 if abs(residual) < 3.0 else 3.0 / abs(residual)
+                for a in range(3):
+                    gradient[a] += huber * jacobian[row, a] * residual
+                    for b in range(3):
+                        hessian[a, b] += huber * jacobian[row, a] * jacobian[row, b]
+        trace = hessian[0, 0] + hessian[1, 1] + hessian[2, 2]
+        for a in range(3):
+            hessian[a, a] += 1e-9 * trace
+        if not solve_spd(hessian, gradient):
+            return False
+        point += gradient
+        if np.abs(gradient).max() < 1e-4 * (1.0 + z[5]):
+            break
+    for k in range(len(clones)):
+        if not _observe(point, rotations[clones[k]].T, positions[clones[k]], camera[0], camera[1], camera[2], camera[3], z):
+            return False
+    return bool(np.isfinite(point).all())
+
+
+@kernel
+def _chi_square_limit(dof: int, normal_quantile: float) -> float:
+    """Quantile of the chi-square distribution. Source: Wilson and Hilferty 1931."""
+    k = 2.0 / (9.0 * dof)
+    return float(dof * (1.0 - k + normal_quantile * np.sqrt(k)) ** 3)
+
+
+@kernel
+def accumulate_tracks(
+    odom_from_body_rotations: Array, body_positions: Array, body_from_cam: Array, starts: NDArray[np.int64], clones: NDArray[np.int64],
+    pixels: Array, anchors: NDArray[np.int64], first_points: Array, camera: Array, weights: Array, clone_covariance: Array, moved: Array, normal_quantile: float,
+    information: Array, vector: Array, used: NDArray[np.int8],
+) -> None:  # fmt: skip
+    """Adds every track that passes its gate to the normal equations of the clone errors, points projected out.
+
+    starts (T + 1,) delimits each track's rows of clones (n,) and pixels (n, 3). first_points (T, 3): where triangulation starts,
+    in the camera of clone anchors (T,). clone_covariance (6 M, 6 M) in the error of this module, order rotation then position. moved (6 M,): how far the clones
+    given here stand from the prior mean, when an iterated filter relinearises. information (6 M, 6 M) and
+    vector (6 M,) are summed into. used (T,) becomes 1 for a track that was taken, 0 for one that could not be triangulated and
+    -1 for one that failed its gate.
+    """
+    count = len(body_positions)
+    rotations, positions = np.empty((count, 3, 3)), np.empty((count, 3))
+    for m in range(count):
+        rotations[m] = matmul(odom_from_body_rotations[m], body_from_cam[:3, :3])
+        positions[m] = _rotate(odom_from_body_rotations[m], body_from_cam[:3, 3]) + body_positions[m]
+    z = np.empty(6)
+    for t in range(len(starts) - 1):
+        seen = clones[starts[t] : starts[t + 1]]
+        measured = pixels[starts[t] : starts[t + 1]]
+        point = _rotate(rotations[anchors[t]], first_points[t]) + positions[anchors[t]]
+        used[t] = 0
+        if not triangulate(rotations, positions, seen, measured, camera, weights, point):
+            continue
+        n = len(seen)
+        rows = 0
+        by_clone, by_point, residual = np.zeros((3 * n, 6 * n)), np.zeros((3 * n, 3)), np.zeros(3 * n)
+        lever = _skew(point)
+        for k in range(n):
+            turn = rotations[seen[k]].T
+            _observe(point, turn, positions[seen[k]], camera[0], camera[1], camera[2], camera[3], z)
+            inverse = 1.0 / z[5]
+            stereo = measured[k, 2] == measured[k, 2]
+            for row in range(3 if stereo else 2):
+                for b in range(3):
+                    if row == 0:
+                        by_point[rows, b] = camera[0] * inverse * (turn[0, b] - z[3] * inverse * turn[2, b]) * weights[0]
+                    elif row == 1:
+                        by_point[rows, b] = camera[0] * inverse * (turn[1, b] - z[4] * inverse * turn[2, b]) * weights[0]
+                    else:
+                        by_point[rows, b] = -camera[3] * inverse * inverse * turn[2, b] * weights[1]
+                # point as the clone sees it: R^T (p_f - p); with the invariant error its change is R^T (p_f x r - rho)
+                for b in range(3):
+                    total = 0.0
+                    for c in range(3):
+                        total += by_point[rows, c] * lever[c, b]
+                    by_clone[rows, 6 * k + b] = total
+                    by_clone[rows, 6 * k + 3 + b] = -by_point[rows, b]
+                if row < 2:
+                    residual[rows] = (measured[k, row] - z[row]) * weights[0]
+                else:
+                    residual[rows] = (measured[k, 0] - measured[k, 2] - z[2]) * weights[1]
+                rows += 1
+        dof = rows - 3
+        if dof < 1:
+            continue
+        _project_out(by_point, by_clone, residual, rows)
+        reduced = np.ascontiguousarray(by_clone[3:rows])
+        left = residual[3:rows].copy()
+        index = np.empty(6 * n, np.int64)
+        for k in range(n):
+            for a in range(6):
+                index[6 * k + a] = 6 * seen[k] + a
+        small = np.empty((6 * n, 6 * n))
+        for a in range(6 * n):
+            for b in range(6 * n):
+                small[a, b] = clone_covariance[index[a], index[b]]
+        for row in range(dof):
+            for a in range(6 * n):
+                left[row] += reduced[row, a] * moved[index[a]]
+        innovation = matmul_nt(matmul(reduced, small), reduced)
+        for a in range(dof):
+            innovation[a, a] += 1.0
+        whitened = left.copy()
+        if not cholesky_in_place(innovation):
+            continue
+        forward_substitute(innovation, whitened)
+        if (whitened * whitened).sum() > _chi_square_limit(dof, normal_quantile):
+            used[t] = -1
+            continue
+        used[t] = 1
+        gained = matmul(reduced.T, reduced)
+        pushed = np.zeros(6 * n)
+        for row in range(dof):
+            for a in range(6 * n):
+                pushed[a] += reduced[row, a] * left[row]
+        for a in range(6 * n):
+            vector[index[a]] += pushed[a]
+            for b in range(6 * n):
+                information[index[a], index[b]] += gained[a, b]
+
+
+@kernel
+def _project_out(by_point: Array, by_clone: Array, residual: Array, rows: int) -> None:
+    """Householder on the three point columns, applied to everything: rows 3.. no longer depend on the point."""
+    columns = by_clone.shape[1]
+    for k in range(3):
+        norm = 0.0
+        for i in range(k, rows):
+            norm += by_point[i, k] * by_point[i, k]
+        norm = np.sqrt(norm)
+        if norm < 1e-12:
+            continue
+        alpha = -norm if by_point[k, k] > 0 else norm
+        v = np.zeros(rows)
+        v[k] = by_point[k, k] - alpha
+        for i in range(k + 1, rows):
+            v[i] = by_point[i, k]
+        beta = 0.0
+        for i in range(k, rows):
+            beta += v[i] * v[i]
+        beta = 2.0 / beta
+        for c in range(k, 3):
+            dot = 0.0
+            for i in range(k, rows):
+                dot += v[i] * by_point[i, c]
+            for i in range(k, rows):
+                by_point[i, c] -= beta * dot * v[i]
+        for c in range(columns):
+            dot = 0.0
+            for i in range(k, rows):
+                dot += v[i] * by_clone[i, c]
+            if dot != 0.0:
+                for i in range(k, rows):
+                    by_clone[i, c] -= beta * dot * v[i]
+        dot = 0.0
+        for i in range(k, rows):
+            dot += v[i] * residual[i]
+        for i in range(k, rows):
+            residual[i] -= beta * dot * v[i]

@@ -1,0 +1,304 @@
+"""The odometry of robot and survey: samples in, one estimate for each frame out. Never touches a file, a socket or a clock."""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.calibration import ImuNoise, RigCalibration
+from fleetmap.features.stereo import StereoSettings
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.odometry.filter import InvariantFilter, NavState, Track
+from fleetmap.odometry.settings import FilterSettings, OdometrySettings
+from fleetmap.odometry.start import Start, start_steady, start_in_motion
+from fleetmap.odometry.tracker import Tracked, Tracker
+from fleetmap.rectification import RectifiedFrame, StereoCamera
+from fleetmap.samples import ImuSamples, Trajectory
+
+_FAR_DEPTH_M = 20.0
+_IMU_MEMORY_S = 25.0
+_ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
+
+
+class OdometryStatus(StrEnum):
+    """How far an estimate can be trusted."""
+
+    INITIALISING = "initialising"
+    TRACKING = "tracking"
+    DEGRADED = "degraded"
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryEstimate:
+    """The body at one frame.
+
+    odom_from_body (4, 4); cov_rot_trans (6, 6) in odom axes; velocity, biases (3,). track_ids (N,) of the
+    points seen; after_gap where they had to be matched by descriptors; inertial once gravity is known. new_odom_from_old_odom is given when the frame
+    `odom` was redefined (gravity found): earlier estimates must be multiplied by it from the left.
+    """
+
+    stamp_ns: int
+    odom_from_body: Array
+    cov_rot_trans: Array
+    velocity_odom_mps: Array
+    gyro_bias_radps: Array
+    accel_bias_mps2: Array
+    status: OdometryStatus
+    track_ids: NDArray[np.int64]
+    scene_depth_m: float
+    inlier_share: float
+    after_gap: bool
+    inertial: bool
+    new_odom_from_old_odom: Array | None
+
+
+class Odometry:
+    """Stereo-inertial, or stereo alone where the rig has no IMU."""
+
+    def __init__(
+        self, calibration: RigCalibration, camera: StereoCamera, body_from_cam: Array, imu_minus_cam_s: float, settings: OdometrySettings,
+        stereo_settings: StereoSettings | None = None,
+    ) -> None:  # fmt: skip
+        self._noise = None if calibration.imu is None else _widened(calibration.imu, settings.filter)
+        self._camera, self._body_from_cam = camera, body_from_cam
+        self._cam_from_body = se3_inverse(body_from_cam)
+        self._offset_s = imu_minus_cam_s
+        self._settings = settings
+        self._tracker = Tracker(camera, settings.tracker, stereo_settings)
+        self._imu = ImuSamples.empty()
+        self._pending: list[ImuSamples] = []
+        self._filter: InvariantFilter | None = None
+        self._inertial = False
+        self._state_ns = 0
+        self._frame_index = 0
+        self._tracks: dict[int, list[tuple[int, Array]]] = {}
+        self._vision: list[tuple[int, Array]] = []
+        self._last_motion = np.eye(4)
+        self._clone_stamps: dict[int, int] = {}
+
+    def handle_imu(self, samples: ImuSamples) -> None:
+        """Takes samples newer than any before; ignored by a rig without IMU noise figures."""
+        self._pending.append(samples)
+
+    def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
+        """The estimate at `frame`, which must be newer than any before. IMU samples up to its stamp should have come."""
+        self._absorb_imu(frame.stamp_ns)
+        stamp_ns = frame.stamp_ns + int(self._offset_s * 1e9)
+        if self._filter is None:
+            self._begin(stamp_ns)
+        assert self._filter is not None
+        rate = self._predict(stamp_ns)
+        tracked = self._tracker.track(frame, self._motion_since, _ROTATION_SIGMA_RAD if self._inertial else None)
+        if not self._inertial:
+            self._displace(tracked)
+        else:
+            self._doubt(tracked)
+        self._filter.add_clone(self._frame_index, rate)
+        self._clone_stamps[self._frame_index] = self._state_ns
+        self._remember(tracked)
+        used = self._consume(tracked)
+        self._prune()
+        change = None if self._inertial or self._noise is None else self._try_start(stamp_ns, tracked)
+        estimate = self._estimate(frame.stamp_ns, tracked, used, change)
+        self._frame_index += 1
+        return estimate
+
+    # --- start -----------------------------------------------------------------------------------------------------------
+
+    def _absorb_imu(self, stamp_ns: int) -> None:
+        if self._pending:
+            parts = [self._imu, *self._pending]
+            self._imu = ImuSamples(
+                np.concatenate([p.stamps_ns for p in parts]),
+                np.concatenate([p.gyro_radps for p in parts]),
+                np.concatenate([p.accel_mps2 for p in parts]),
+            )
+            self._pending.clear()
+        oldest = min(stamp_ns, self._state_ns or stamp_ns) - int(_IMU_MEMORY_S * 1e9)
+        if len(self._imu) and self._imu.stamps_ns[0] < oldest - int(10e9):
+            self._imu = self._imu.between(oldest, int(self._imu.stamps_ns[-1]) + 1)
+
+    def _begin(self, stamp_ns: int) -> None:
+        start = None
+        if self._noise is not None:
+            start = start_steady(self._imu, stamp_ns, self._settings.start, self._settings.filter)
+        if start is not None:
+            self._install(start)
+            return
+        self._filter = self._new_filter(NavState(), np.diag([1e-10] * 15))
+        self._state_ns = stamp_ns
+
+    def _new_filter(self, state: NavState, covariance: Array) -> InvariantFilter:
+        return InvariantFilter(state, covariance, self._settings.filter, self._camera, self._body_from_cam)
+
+    def _install(self, start: Start) -> None:
+        self._filter = self._new_filter(start.state, start.covariance)
+        self._inertial = True
+        self._state_ns = start.stamp_ns
+        self._tracks.clear()
+
+    def _try_start(self, stamp_ns: int, tracked: Tracked) -> Array | None:
+        """Switches to the inertial filter once gravity is known, by rest or by motion; the turn of `odom` then, else None."""
+        assert self._filter is not None
+        assert self._noise is not None
+        seen = self._filter.state.odom_from_body
+        s = self._settings.start
+        start = start_steady(self._imu, stamp_ns, s, self._settings.filter)
+        if start is None:
+            if tracked.lost:
+                self._vision.clear()
+            self._vision.append((stamp_ns, seen))
+            recent = self._vision[-s.moving_frames :]
+            stamps = np.array([t for t, _ in recent], np.int64)
+            if len(recent) < 5 or stamps[-1] - stamps[0] < s.moving_duration_s * 0.9e9 or np.diff(stamps).max() > s.moving_gap_s * 1e9:
+                return None
+            vision = Trajectory(stamps, np.array([m for _, m in recent]))
+            start = start_in_motion(vision, self._imu, self._noise, s, self._settings.filter)
+            if start is None:
+                return None
+        self._install(start)
+        rate = self._predict(stamp_ns)
+        self._filter.add_clone(self._frame_index, rate)
+        self._seed_tracks()
+        return np.asarray(self._filter.state.odom_from_body @ se3_inverse(seen))
+
+    def _seed_tracks(self) -> None:
+        """After a restart the tracks go on from the newest frame alone."""
+        ids, pixels = self._newest
+        for track_id, pixel in zip(ids.tolist(), pixels, strict=True):
+            self._tracks[track_id] = [(self._frame_index, pixel)]
+
+    # --- one frame -------------------------------------------------------------------------------------------------------
+
+    def _predict(self, stamp_ns: int) -> Array:
+        assert self._filter is not None
+        rate = np.zeros(3)
+        if self._inertial and self._noise is not None:
+            target = stamp_ns + int(self._filter.imu_minus_cam_s * 1e9)
+            rate = self._filter.propagate(self._imu, self._state_ns, target, self._noise)
+            stamp_ns = max(target, self._state_ns)
+        self._state_ns = stamp_ns
+        return rate
+
+    def _motion_since(self, frame_index: int) -> Array | None:
+        """cam_from_earlier (4, 4): from the propagated state, or the last motion again without an IMU."""
+        assert self._filter is not None
+        if not self._inertial:
+            return self._last_motion if frame_index == self._frame_index - 1 else None
+        if frame_index not in self._filter.clone_ids:
+            return None
+        earlier = self._filter.odom_from_clone(frame_index)
+        return np.asarray(self._cam_from_body @ se3_inverse(self._filter.state.odom_from_body) @ earlier @ self._body_from_cam)
+
+    def _displace(self, tracked: Tracked) -> None:
+        assert self._filter is not None
+        if self._frame_index == 0:
+            return
+        s = self._settings.filter
+        if tracked.cam_from_previous is not None:
+            self._last_motion = tracked.cam_from_previous
+        elif (seen := self._seen_body(tracked)) is not None:
+            self._last_motion = self._cam_from_body @ se3_inverse(seen[1]) @ self._filter.state.odom_from_body @ self._body_from_cam
+        body_from_next = self._body_from_cam @ se3_inverse(self._last_motion) @ self._cam_from_body
+        self._filter.displace(body_from_next, s.free_rotation_sigma_rad, s.free_translation_sigma_m)
+
+    def _seen_body(self, tracked: Tracked) -> tuple[int, Array] | None:
+        """After a gap: the best matched clone and odom_from_body (4, 4) as vision measured it since then."""
+        assert self._filter is not None
+        best = next((e for e in tracked.earlier if e.frame_index in self._filter.clone_ids), None)
+        if best is None:
+            return None
+        now = self._filter.odom_from_clone(best.frame_index) @ self._body_from_cam @ se3_inverse(best.cam_from_earlier)
+        return best.frame_index, np.asarray(now @ self._cam_from_body)
+
+    def _doubt(self, tracked: Tracked) -> None:
+        assert self._filter is not None
+        seen = self._seen_body(tracked)
+        if seen is not None:
+            self._filter.open_up(seen[0], seen[1], (self._state_ns - self._clone_stamps[seen[0]]) * 1e-9)
+
+    def _remember(self, tracked: Tracked) -> None:
+        for earlier in tracked.earlier:
+            for track_id, pixel in zip(earlier.ids.tolist(), earlier.pixels, strict=True):
+                self._tracks[track_id] = [(earlier.frame_index, pixel)]
+        for track_id, pixel in zip(tracked.ids.tolist(), tracked.pixels, strict=True):
+            self._tracks.setdefault(track_id, []).append((self._frame_index, pixel))
+        self._newest = (tracked.ids, tracked.pixels)
+
+    def _consume(self, tracked: Tracked) -> NDArray[np.int8]:
+        """Uses tracks that ended, that are due in their turn, or (after a gap) all: every observation serves exactly once."""
+        assert self._filter is not None
+        settings = self._settings.filter
+        chunk = settings.chunk_frames if self._inertial else settings.chunk_frames_without_imu
+        alive = set(tracked.ids.tolist())
+        held = set(self._filter.clone_ids)
+        chosen: list[Track] = []
+        for track_id in list(self._tracks):
+            due = track_id not in alive or tracked.by_descriptors or (self._frame_index + track_id) % chunk == 0
+            if not due:
+                continue
+            observations = [o for o in self._tracks[track_id] if o[0] in held]
+            if track_id not in alive:
+                del self._tracks[track_id]
+            if len(observations) < 2:
+                continue
+            self._tracks.pop(track_id, None)
+            chosen.append(self._track(observations))
+        seen = self._seen_body(tracked)
+        if seen is None:
+            return self._filter.update(chosen, iterations=1 if self._inertial else 4)
+        return self._filter.update(chosen, 4, newest_odom_from_body=seen[1], sigma_scale=settings.descriptor_sigma_scale)
+
+    def _track(self, observations: list[tuple[int, Array]]) -> Track:
+        """A track with a first guess of its point: stereo from the nearest view, else far along the newest ray."""
+        pixels = np.array([p for _, p in observations])
+        disparities = pixels[:, 0] - pixels[:, 2]
+        best = int(np.nanargmax(disparities)) if np.isfinite(disparities).any() else len(pixels) - 1
+        disparity = disparities[best : best + 1]
+        if not np.isfinite(disparity[0]):
+            disparity = np.array([self._camera.focal_px * max(self._camera.baseline_m, 0.01) / _FAR_DEPTH_M])
+        point_cam = self._camera.point_from_pixel(pixels[best : best + 1, :2], disparity)
+        return Track(np.array([c for c, _ in observations], np.int64), pixels, observations[best][0], point_cam[0])
+
+    def _prune(self) -> None:
+        """Drops the second newest clone where the robot hardly moved since the one before, else the oldest."""
+        assert self._filter is not None
+        settings = self._settings.filter
+        while len(self._filter.clone_ids) >= settings.clones:
+            ids = self._filter.clone_ids
+            earlier, candidate = self._filter.odom_from_clone(ids[-3]), self._filter.odom_from_clone(ids[-2])
+            moved = se3_inverse(earlier) @ candidate
+            angle = np.arccos(np.clip(0.5 * (np.trace(moved[:3, :3]) - 1), -1, 1))
+            parallax = float(np.linalg.norm(moved[:3, 3])) / self._scene_depth_m()
+            still = angle < settings.keyframe_rotation_rad and parallax < settings.keyframe_parallax
+            gone = ids[-2] if still else ids[0]
+            self._filter.remove_clone(gone)
+            self._clone_stamps.pop(gone, None)
+
+    def _scene_depth_m(self) -> float:
+        _, pixels = self._newest
+        disparities = pixels[:, 0] - pixels[:, 2]
+        known = disparities[np.isfinite(disparities)]
+        return self._camera.focal_px * self._camera.baseline_m / float(np.median(known)) if len(known) else 5.0
+
+    def _estimate(self, stamp_ns: int, tracked: Tracked, used: NDArray[np.int8], change: Array | None) -> OdometryEstimate:
+        assert self._filter is not None
+        state = self._filter.state
+        lost = self._frame_index > 0 and tracked.lost
+        waiting = self._noise is not None and not self._inertial
+        status = OdometryStatus.DEGRADED if lost else OdometryStatus.INITIALISING if waiting else OdometryStatus.TRACKING
+        taken = int((used == 1).sum())
+        share = taken / len(used) if len(used) else tracked.inlier_share
+        return OdometryEstimate(
+            stamp_ns, state.odom_from_body, self._filter.body_covariance(), state.velocity_mps.copy(), state.gyro_bias_radps.copy(),
+            state.accel_bias_mps2.copy(), status, tracked.ids, self._scene_depth_m(), share, tracked.by_descriptors, self._inertial, change,
+        )  # fmt: skip
+
+
+def _widened(noise: ImuNoise, settings: FilterSettings) -> ImuNoise:
+    return replace(
+        noise,
+        gyro_noise_radps_rthz=noise.gyro_noise_radps_rthz * settings.gyro_noise_scale,
+        accel_noise_mps2_rthz=noise.accel_noise_mps2_rthz * settings.accel_noise_scale,
+    )

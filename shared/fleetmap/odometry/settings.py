@@ -1,0 +1,66 @@
+"""Settings of the odometry; the same for every recording of a sensor set."""
+
+from fleetmap.config import Section
+
+
+class TrackerSettings(Section, frozen=True):
+    """Points to follow from frame to frame."""
+
+    max_points: int = 180
+    min_distance_px: float = 22.0
+    window_px: int = 15
+    pyramid_levels: int = 3
+    back_check_px: float = 0.5
+    max_gap_s: float = 0.35
+    match_features: int = 800
+    ransac_px: float = 2.0
+    min_inliers: int = 12
+    min_inliers_known_rotation: int = 8
+    memory_frames: int = 5
+
+
+class FilterSettings(Section, frozen=True):
+    """Noise and window of the multi-state constraint filter.
+
+    The scales widen the data sheet's densities: vibration above the IMU's bandwidth folds into what it reports.
+    """
+
+    clones: int = 11
+    chunk_frames: int = 9
+    chunk_frames_without_imu: int = 3
+    pixel_sigma_px: float = 0.6
+    disparity_sigma_px: float = 0.35
+    descriptor_sigma_scale: float = 2.5
+    chi_square_share: float = 0.99
+    gyro_noise_scale: float = 2.0
+    accel_noise_scale: float = 5.0
+    keyframe_rotation_rad: float = 0.05
+    keyframe_parallax: float = 0.03
+    free_rotation_sigma_rad: float = 0.15
+    free_translation_sigma_m: float = 1.5
+    time_offset_sigma_s: float = 0.002
+    initial_velocity_sigma_mps: float = 1.0
+    initial_tilt_sigma_rad: float = 0.01
+    initial_gyro_bias_sigma_radps: float = 0.005
+    initial_accel_bias_sigma_mps2: float = 0.1
+
+
+class StartSettings(Section, frozen=True):
+    """How the filter finds gravity and biases."""
+
+    steady_window_s: float = 0.8
+    steady_gyro_sigma_radps: float = 0.015
+    steady_gyro_mean_radps: float = 0.15
+    steady_accel_sigma_mps2: float = 0.1
+    moving_frames: int = 20
+    moving_duration_s: float = 1.0
+    moving_gap_s: float = 0.5
+    max_gravity_error_mps2: float = 0.6
+
+
+class OdometrySettings(Section, frozen=True):
+    """All of it."""
+
+    tracker: TrackerSettings = TrackerSettings()
+    filter: FilterSettings = FilterSettings()
+    start: StartSettings = StartSettings()

@@ -1,0 +1,70 @@
+"""Recordings of camera robots: EuRoC, TUM-VI, KITTI and 7-Scenes folders, and MCAP. To add a format.
+
+A file and a line here.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from fleetmap.errors import RecordingError
+from fleetmap.recordings import euroc, kitti, mcap_reader, seven_scenes, tumvi
+from fleetmap.recordings.calibration_files import format_calibration, read_calibration
+from fleetmap.recordings.images import StoredFrame, StoredImage
+from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording, Topics
+from fleetmap.recordings.selection import FrameSelection
+
+__all__ = [
+    "RECORDING_FORMATS",
+    "FrameSelection",
+    "FrameSource",
+    "OpenOptions",
+    "Recording",
+    "RecordingFormat",
+    "StoredFrame",
+    "StoredImage",
+    "Topics",
+    "format_calibration",
+    "open_recording",
+    "read_calibration",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingFormat:
+    """How one format is recognised and opened; `layout` says in words what it looks like."""
+
+    layout: str
+    recognises: Callable[[Path], bool]
+    open: Callable[[Path, OpenOptions], Recording]
+
+
+RECORDING_FORMATS = {
+    "euroc": RecordingFormat("a folder with mav0/cam0/data.csv in it", euroc.recognises, euroc.open_euroc),
+    "tumvi": RecordingFormat("a folder with cam0/images and camchain.yaml", tumvi.recognises, tumvi.open_tumvi),
+    "kitti": RecordingFormat("a folder with image_l or image_0 and calib.txt", kitti.recognises, kitti.open_kitti),
+    "7scenes": RecordingFormat(
+        "a folder with frame-NNNNNN.color.* and .depth.png", seven_scenes.recognises, seven_scenes.open_seven_scenes
+    ),
+    "mcap": RecordingFormat("an .mcap file, or a folder with one in it", mcap_reader.recognises, mcap_reader.open_mcap),
+}
+
+
+def open_recording(path: Path, options: OpenOptions | None = None) -> Recording:
+    """The recording at `path`, its format recognised from what is there.
+
+    RecordingError for what does not exist, is of no known format or contradicts itself; CalibrationError for a missing
+    or impossible calibration.
+    """
+    options = options or OpenOptions()
+    if not path.exists():
+        raise RecordingError(
+            f"{path} does not exist; a recording is a folder (the parent of mav0 for EuRoC) or an .mcap file"
+        )
+    for recording_format in RECORDING_FORMATS.values():
+        if recording_format.recognises(path):
+            return recording_format.open(path, options)
+    if path.is_dir() and not any(path.iterdir()):
+        raise RecordingError(f"{path} is an empty folder; copy the recording again")
+    known = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in RECORDING_FORMATS.items())
+    raise RecordingError(f"{path} is in no format that is known. Known are {known}")

@@ -1,0 +1,280 @@
+"""Calibration from files: EuRoC `sensor.yaml` and Kalibr camchain, and the one form in which the project writes it.
+
+The form of `--calibration FILE` is Kalibr's camchain (cam0, cam1 with camera_model, intrinsics, distortion_model,
+distortion_coeffs, resolution, T_cam_imu or T_cn_cnm1, timeshift_cam_imu), with these keys beside the cameras:
+
+    imu0:                                  Kalibr's names, also accepted on the top level
+      gyroscope_noise_density: 1.7e-4      rad/s/sqrt(Hz)
+      gyroscope_random_walk: 1.9e-5        rad/s^2/sqrt(Hz)
+      accelerometer_noise_density: 2.0e-3  m/s^2/sqrt(Hz)
+      accelerometer_random_walk: 3.0e-3    m/s^3/sqrt(Hz)
+    base_from_body: [[...], [...], [...], [...]]   4x4 rows, where the IMU sits on the robot
+
+and `has_imu: false` for a rig whose cameras alone are described, and inside a camera `body_from_cam` (4x4 rows), which
+goes before T_cam_imu: it is what this project writes, because a matrix that is inverted twice is not the same to the
+last bit.
+"""
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from fleetmap.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
+from fleetmap.errors import CalibrationError
+from fleetmap.geometry import Array, se3_inverse
+
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_MODELS = {
+    ("pinhole", "radial-tangential"): "radial-tangential",
+    ("pinhole", "radtan"): "radial-tangential",
+    ("pinhole", "plumb_bob"): "radial-tangential",
+    ("pinhole", "none"): "radial-tangential",
+    ("pinhole", "equidistant"): "equidistant",
+}
+_NOISE_KEYS = {
+    "gyro_noise_radps_rthz": "gyroscope_noise_density",
+    "gyro_walk_radps2_rthz": "gyroscope_random_walk",
+    "accel_noise_mps2_rthz": "accelerometer_noise_density",
+    "accel_walk_mps3_rthz": "accelerometer_random_walk",
+}
+Values = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationFile:
+    """What a calibration file holds.
+
+    The calibration, and the topics that Kalibr noted (`rostopic`) as cam0, cam1, imu0.
+    """
+
+    calibration: RigCalibration
+    topics: Mapping[str, str]
+
+
+def load_calibration(path: Path) -> CalibrationFile:
+    """The calibration of a Kalibr camchain with this module's extra keys.
+
+    An `imu*.yaml` of Kalibr beside a camchain that has no noise values is read too. CalibrationError for missing files,
+    nonsense and impossible values.
+    """
+    found = parse_calibration(_read(path), str(path))
+    if found.calibration.imu is not None and not found.topics.get("noise"):
+        for candidate in sorted(path.parent.glob("imu*.yaml")):
+            noise = _imu_noise(read_yaml(candidate), str(candidate))
+            if noise is not None:
+                return replace(found, calibration=replace(found.calibration, imu=noise))
+    return found
+
+
+def read_calibration(path: Path) -> RigCalibration:
+    """The calibration alone, as `load_calibration`."""
+    return load_calibration(path).calibration
+
+
+def parse_calibration(text: str, where: str) -> CalibrationFile:
+    """The calibration in the text of a camchain; `where` names it in error messages."""
+    values = _parse_yaml(text, where)
+    names = sorted((key for key in values if key.startswith("cam") and key[3:].isdigit()), key=lambda key: int(key[3:]))
+    if not names:
+        raise CalibrationError(
+            f"{where}: no cam0 in it; the file must be a Kalibr camchain (cam0: camera_model, intrinsics, ...)"
+        )
+    noise = _imu_noise(values, where)
+    first = _section(values, names[0], where)
+    has_imu = bool(values.get("has_imu", noise is not None or "T_cam_imu" in first))
+    cameras: list[CameraCalibration] = []
+    topics: dict[str, str] = {"noise": "given"} if noise is not None else {}
+    for name in names:
+        camera = _section(values, name, where)
+        previous = cameras[-1] if cameras else None
+        cameras.append(_kalibr_camera(camera, previous, f"{where}: {name}"))
+        topics[name] = str(camera.get("rostopic", ""))
+    imu = (noise or ImuNoise()) if has_imu else None
+    base = matrix_4x4(values["base_from_body"], f"{where}: base_from_body") if "base_from_body" in values else np.eye(4)
+    if isinstance(values.get("imu0"), dict):
+        topics["imu0"] = str(values["imu0"].get("rostopic", ""))
+    return CalibrationFile(RigCalibration(tuple(cameras), imu, base), {k: v for k, v in topics.items() if v})
+
+
+def format_calibration(calibration: RigCalibration) -> str:
+    """The YAML text from which `parse_calibration` makes the same calibration, bit for bit."""
+    out = io.StringIO()
+    for number, camera in enumerate(calibration.cameras):
+        model = "radtan" if camera.model == "radial-tangential" else camera.model
+        distortion = "none" if len(camera.distortion) == 0 else model
+        out.write(f"cam{number}:\n  camera_model: pinhole\n  distortion_model: {distortion}\n")
+        out.write(f"  intrinsics: {_row(camera.intrinsics_px)}\n  distortion_coeffs: {_row(camera.distortion)}\n")
+        out.write(
+            f"  resolution: [{camera.width_px}, {camera.height_px}]\n  timeshift_cam_imu: "
+            f"{float(camera.imu_minus_cam_s)!r}\n"
+        )
+        out.write(f"  T_cam_imu:\n{_rows(se3_inverse(camera.body_from_cam), '  ')}")
+        out.write(f"  body_from_cam:\n{_rows(camera.body_from_cam, '  ')}")
+    if calibration.imu is None:
+        out.write("has_imu: false\n")
+    else:
+        out.write("imu0:\n")
+        for field_name, key in _NOISE_KEYS.items():
+            out.write(f"  {key}: {float(getattr(calibration.imu, field_name))!r}\n")
+    out.write(f"base_from_body:\n{_rows(calibration.base_from_body, '')}")
+    return out.getvalue()
+
+
+def read_euroc_camera(path: Path) -> CameraCalibration:
+    """The camera of a EuRoC `sensor.yaml`, mounted on the frame that the file calls body (`T_BS`)."""
+    where, values = str(path), read_yaml(path)
+    model = _model(values.get("camera_model", "pinhole"), values.get("distortion_model", "none"), where)
+    camera = _camera(values, model, values.get("distortion_coefficients", []), where)
+    return check_camera(
+        replace(camera, body_from_cam=matrix_4x4(_need(values, "T_BS", where), f"{where}: T_BS")), where
+    )
+
+
+def read_euroc_imu(path: Path) -> tuple[Array, ImuNoise]:
+    """(4, 4) `T_BS` of a EuRoC IMU `sensor.yaml` (EuRoC's body from the IMU) and its noise.
+
+    Defaults where it says nothing.
+    """
+    where, values = str(path), read_yaml(path)
+    mounting = matrix_4x4(values["T_BS"], f"{where}: T_BS") if "T_BS" in values else np.eye(4)
+    return mounting, _imu_noise(values, where) or ImuNoise()
+
+
+def read_yaml(path: Path) -> Values:
+    """The mapping in a YAML file, with or without OpenCV's `%YAML:1.0` first line.
+
+    CalibrationError for anything else.
+    """
+    return _parse_yaml(_read(path), str(path))
+
+
+def matrix_4x4(value: object, where: str) -> Array:
+    """(4, 4) from nested rows, 16 numbers or EuRoC's {rows, cols, data}.
+
+    CalibrationError unless it is a rigid transform.
+    """
+    data = value.get("data") if isinstance(value, dict) else value
+    try:
+        matrix = np.array(data, dtype=np.float64).reshape(4, 4)
+    except (TypeError, ValueError):
+        raise CalibrationError(
+            f"{where}: {str(value)[:80]!r} is no 4x4 matrix; write four rows of four numbers"
+        ) from None
+    rotation = matrix[:3, :3]
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=2e-3) and np.linalg.det(rotation) > 0
+    if not (np.isfinite(matrix).all() and is_rotation and np.array_equal(matrix[3], [0, 0, 0, 1])):
+        raise CalibrationError(
+            f"{where}: {np.round(matrix, 4).tolist()} is no rotation and translation; check its rows"
+        )
+    return matrix
+
+
+def _kalibr_camera(values: Values, previous: CameraCalibration | None, where: str) -> CameraCalibration:
+    model = _model(_need(values, "camera_model", where), values.get("distortion_model", "none"), where)
+    camera = _camera(values, model, values.get("distortion_coeffs", []), where)
+    shift = values.get("timeshift_cam_imu", previous.imu_minus_cam_s if previous else 0.0)
+    mounting = _mounting(values, previous, where)
+    return check_camera(replace(camera, body_from_cam=mounting, imu_minus_cam_s=_numbers([shift], 1, where)[0]), where)
+
+
+def _mounting(values: Values, previous: CameraCalibration | None, where: str) -> Array:
+    if "body_from_cam" in values:
+        return matrix_4x4(values["body_from_cam"], f"{where}: body_from_cam")
+    if "T_cam_imu" in values:
+        return se3_inverse(matrix_4x4(values["T_cam_imu"], f"{where}: T_cam_imu"))
+    if previous is None:
+        return np.eye(4)
+    if "T_cn_cnm1" not in values:
+        raise CalibrationError(f"{where}: neither T_cam_imu nor T_cn_cnm1 says where the camera sits; add one of them")
+    return previous.body_from_cam @ se3_inverse(matrix_4x4(values["T_cn_cnm1"], f"{where}: T_cn_cnm1"))
+
+
+def _camera(values: Values, model: str, distortion: object, where: str) -> CameraCalibration:
+    width, height = _numbers(_need(values, "resolution", where), 2, f"{where}: resolution")
+    intrinsics = _numbers(_need(values, "intrinsics", where), 4, f"{where}: intrinsics (fx fy cx cy)")
+    coefficients = _numbers(distortion, None, f"{where}: distortion coefficients")
+    if not np.any(coefficients) and model == "radial-tangential" and len(coefficients) not in (4, 5):
+        coefficients = np.zeros(0)
+    return CameraCalibration(model, int(width), int(height), intrinsics, coefficients, np.eye(4))
+
+
+def _imu_noise(values: Values, where: str) -> ImuNoise | None:
+    inner = values.get("imu0", values.get("imu", values))
+    if not isinstance(inner, dict) or not any(key in inner for key in _NOISE_KEYS.values()):
+        return None
+    given = {name: _numbers([inner[key]], 1, f"{where}: {key}")[0] for name, key in _NOISE_KEYS.items() if key in inner}
+    for name, value in given.items():
+        if not 0 < value < 10:
+            raise CalibrationError(
+                f"{where}: {_NOISE_KEYS[name]} is {value}; noise densities in SI units are small and positive"
+            )
+    return ImuNoise(**{name: float(value) for name, value in given.items()})
+
+
+def _model(camera_model: object, distortion_model: object, where: str) -> str:
+    pair = (str(camera_model).lower(), str(distortion_model).lower())
+    if pair not in _MODELS:
+        known = ", ".join(f"{camera} with {lens}" for camera, lens in _MODELS)
+        raise CalibrationError(
+            f"{where}: camera model {pair[0]} with distortion {pair[1]} is not known; known are {known}"
+        )
+    return _MODELS[pair]
+
+
+def _numbers(value: object, count: int | None, where: str) -> Array:
+    try:
+        # YAML 1.1 reads 1e-5 as text
+        numbers = np.array([float(v) for v in value], np.float64)  # type: ignore[attr-defined]
+    except (TypeError, ValueError):
+        raise CalibrationError(f"{where}: {value!r} are not numbers") from None
+    if (count is not None and len(numbers) != count) or not np.isfinite(numbers).all():
+        raise CalibrationError(f"{where}: {value!r}; {count or 'finite'} numbers are expected")
+    return numbers
+
+
+def _need(values: Values, key: str, where: str) -> Any:
+    if key not in values:
+        raise CalibrationError(f"{where}: {key} is missing; it holds {', '.join(map(str, values)) or 'nothing'}")
+    return values[key]
+
+
+def _section(values: Values, name: str, where: str) -> Values:
+    section = values[name]
+    if not isinstance(section, dict):
+        raise CalibrationError(
+            f"{where}: {name} is {section!r}; a mapping with camera_model, intrinsics, ... is expected"
+        )
+    return section
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"calibration file {path} cannot be read ({error}); check the path") from error
+
+
+def _parse_yaml(text: str, where: str) -> Values:
+    lines = text.replace("!!opencv-matrix", "").splitlines()
+    if lines and lines[0].startswith("%YAML"):
+        lines[0] = ""
+    try:
+        values = yaml.load("\n".join(lines), Loader=_LOADER)
+    except yaml.YAMLError as error:
+        raise CalibrationError(f"{where} is not YAML ({' '.join(str(error).split())}); check the file") from error
+    if not isinstance(values, dict):
+        raise CalibrationError(f"{where} holds {str(values)[:60]!r}; a calibration is a mapping of names to values")
+    return values
+
+
+def _row(values: Array) -> str:
+    return "[" + ", ".join(repr(float(v)) for v in values) + "]"
+
+
+def _rows(matrix: Array, indent: str) -> str:
+    return "".join(f"{indent}- {_row(row)}\n" for row in matrix)

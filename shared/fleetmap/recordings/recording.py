@@ -1,0 +1,139 @@
+"""What a recording is, whatever format it came in."""
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from fleetmap.calibration import RigCalibration
+from fleetmap.config import Section
+from fleetmap.errors import RecordingError
+from fleetmap.recordings.images import StoredFrame
+from fleetmap.samples import (
+    CameraFrame,
+    ImuSamples,
+    Loss,
+    PositionPrior,
+    SensorSet,
+    Stamps,
+    Trajectory,
+    WheelSample,
+)
+
+
+class Topics(Section, frozen=True):
+    """Topic names in an MCAP file. An image topic also stands for itself with `/compressed` behind it."""
+
+    left: str = "/cam0/image_raw"
+    right: str = "/cam1/image_raw"
+    depth: str = "/depth/image_raw"
+    left_info: str = "/cam0/camera_info"
+    right_info: str = "/cam1/camera_info"
+    imu: str = "/imu0"
+    wheel: str = "/odom"
+    prior: str = "/prior"
+    ground_truth: str = "/ground_truth"
+    tf_static: str = "/tf_static"
+
+
+@dataclass(frozen=True)
+class OpenOptions:
+    """How to open a recording. calibration_file goes before any calibration inside the recording."""
+
+    calibration_file: Path | None = None
+    topics: Topics = field(default_factory=Topics)
+
+
+class FrameSource(Protocol):
+    """Where the images of a recording lie: F frames, in any order of access."""
+
+    def stored(self, index: int) -> StoredFrame:
+        """Frame `index` as it was stored, images still encoded; RecordingError where the bytes are gone."""
+
+    def frame(self, index: int) -> CameraFrame:
+        """Frame `index`, decoded; RecordingError naming the image that cannot be."""
+
+    def hash_into(self, digest: "hashlib._Hash") -> None:
+        """Feeds all that was read of the recording, images included, to `digest`, in an order that never changes."""
+
+    def close(self) -> None:
+        """Lets go of open files."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recording, opened: everything but the images in memory, the images read on demand.
+
+    frame_stamps_ns (F,), strictly increasing: left frames that have their partner (right image or depth). imu: all
+    samples, also those before the first frame; empty where the calibration does not say how the IMU is mounted (stated
+    in losses). ground_truth: frame_from_body of the body (the IMU, or the frame that the calibration's body_from_cam
+    refers to without one). losses: what could not be read.
+    """
+
+    path: Path
+    name: str
+    format: str
+    sensor_set: SensorSet
+    calibration: RigCalibration
+    frame_stamps_ns: Stamps
+    imu: ImuSamples
+    frames: FrameSource
+    wheel: tuple[WheelSample, ...] = ()
+    priors: tuple[PositionPrior, ...] = ()
+    ground_truth: Trajectory | None = None
+    losses: tuple[Loss, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.frame_stamps_ns)
+
+    def read_frame(self, index: int) -> CameraFrame:
+        """Frame `index`, 0 <= index < F, decoded.
+
+        RecordingError for damaged images and sizes other than the calibration's.
+        """
+        self._check_index(index)
+        frame = self.frames.frame(index)
+        for number, (image, camera) in enumerate(
+            zip((frame.left, frame.right), self.calibration.cameras, strict=False)
+        ):
+            if image is not None and image.shape != (camera.height_px, camera.width_px):
+                raise RecordingError(
+                    f"{self.path}: the cam{number} image at {frame.stamp_ns} is {image.shape[1]}x{image.shape[0]} px, "
+                    f"the "
+                    f"calibration says {camera.width_px}x{camera.height_px}; pass the matching one with --calibration "
+                    f"FILE"
+                )
+        if frame.depth_m is not None and frame.depth_m.shape != frame.left.shape:
+            raise RecordingError(
+                f"{self.path}: the depth image at {frame.stamp_ns} is "
+                f"{frame.depth_m.shape[1]}x{frame.depth_m.shape[0]} px, "
+                f"the colour image {frame.left.shape[1]}x{frame.left.shape[0]}; record depth registered to colour"
+            )
+        return frame
+
+    def stored_frame(self, index: int) -> StoredFrame:
+        """Frame `index` with its images as they were stored, for copying without loss."""
+        self._check_index(index)
+        return self.frames.stored(index)
+
+    def content_hash(self) -> str:
+        """SHA-256 (hex) over the content that was read, the images included; the same on every machine."""
+        digest = hashlib.sha256()
+        self.frames.hash_into(digest)
+        return digest.hexdigest()
+
+    def close(self) -> None:
+        """Lets go of open files; the recording's arrays stay usable."""
+        self.frames.close()
+
+    def __enter__(self) -> "Recording":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _check_index(self, index: int) -> None:
+        if not 0 <= index < len(self):
+            raise RecordingError(
+                f"{self.path}: frame {index} was asked for, there are {len(self)} (0 to {len(self) - 1})"
+            )

@@ -1,0 +1,85 @@
+"""Trajectories as TUM text: one line `t x y z qx qy qz qw` each, seconds and metres, quaternion with w last.
+
+Stamps are written with nine decimals and read as decimals, never through a float, so that nanoseconds survive.
+"""
+
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from fleetmap.errors import RecordingError
+from fleetmap.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
+from fleetmap.samples import Trajectory
+
+_NS = 1_000_000_000
+_MOST_S = 9_223_372_036  # what 64 bits of nanoseconds hold
+
+
+def format_tum(trajectory: Trajectory) -> str:
+    """The lines of a trajectory, with a comment line that names the columns first."""
+    lines = ["# timestamp_s tx ty tz qx qy qz qw"]
+    for stamp, frame_from_body in zip(trajectory.stamps_ns.tolist(), trajectory.frame_from_body, strict=True):
+        w, x, y, z = quat_wxyz_from_rotation(frame_from_body[:3, :3])
+        numbers = [*frame_from_body[:3, 3], x, y, z, w]
+        sign, (whole, rest) = "-" if stamp < 0 else "", divmod(abs(stamp), _NS)
+        lines.append(f"{sign}{whole}.{rest:09d} " + " ".join(f"{number:.9f}" for number in numbers))
+    return "\n".join(lines) + "\n"
+
+
+def parse_tum(text: str, what: str = "trajectory") -> Trajectory:
+    """The trajectory in `text`; empty lines and those that begin with # are skipped.
+
+    Raises RecordingError, naming `what` and the line, for anything but eight finite numbers, a quaternion that is not
+    of unit length within 1 %, or stamps that do not rise.
+    """
+    stamps: list[int] = []
+    transforms = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        fields = line.replace(",", " ").split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        try:
+            stamp = _stamp_ns(fields[0])
+            values = np.array([float(field) for field in fields[1:]])
+        except ValueError as error:
+            raise RecordingError(f"{what}, line {number}: {line[:80]!r} is not all numbers ({error})") from error
+        if len(values) != 7 or not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 0.01:
+            raise RecordingError(
+                f"{what}, line {number}: {line[:80]!r} is not 't x y z qx qy qz qw' with a unit quaternion"
+            )
+        if stamps and stamp <= stamps[-1]:
+            raise RecordingError(f"{what}, line {number}: stamp {fields[0]} does not rise; sort the lines by time")
+        stamps.append(stamp)
+        transforms.append(se3(rotation_from_quat_wxyz(values[[6, 3, 4, 5]]), values[:3]))
+    return Trajectory(np.array(stamps, np.int64), np.array(transforms).reshape(-1, 4, 4))
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Writes `trajectory` as TUM text; RecordingError where the file cannot be written."""
+    try:
+        path.write_text(format_tum(trajectory), encoding="ascii")
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be written ({error.strerror}); check folder and space") from error
+
+
+def read_tum(path: Path) -> Trajectory:
+    """The trajectory in the file at `path`; RecordingError as `parse_tum`, and where it cannot be read."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the path") from error
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{path} is not a text file ({error.reason}); a TUM trajectory is expected") from error
+    return parse_tum(text, str(path))
+
+
+def _stamp_ns(field: str) -> int:
+    """Nanoseconds of a decimal number of seconds; what is finer is cut off. ValueError for anything else."""
+    try:
+        seconds = Decimal(field)
+    except InvalidOperation as error:
+        raise ValueError(f"stamp {field!r}") from error
+    if not seconds.is_finite() or abs(seconds) > _MOST_S:
+        raise ValueError(f"stamp {field!r} is not within {_MOST_S} seconds")
+    return int(seconds * _NS)

@@ -1,0 +1,121 @@
+"""What sensors deliver, as values. Stamps are `stamp_ns` on the sensor clock."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array, interpolate_se3
+
+Image = NDArray[np.uint8]
+Stamps = NDArray[np.int64]
+
+
+class SensorSet(StrEnum):
+    """What a recording carries, recognised from its content."""
+
+    STEREO_INERTIAL = "stereo-inertial"
+    STEREO = "stereo"
+    RGBD = "rgbd"
+    MONO_INERTIAL = "mono-inertial"
+    MONO = "mono"
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSamples:
+    """N inertial samples in `body` axes, stamps strictly increasing.
+
+    stamps_ns (N,), gyro_radps (N, 3), accel_mps2 (N, 3): specific force, +9.81 upwards at rest.
+    """
+
+    stamps_ns: Stamps
+    gyro_radps: Array
+    accel_mps2: Array
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @classmethod
+    def empty(cls) -> "ImuSamples":
+        """No samples."""
+        return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+
+    def between(self, start_ns: int, end_ns: int) -> "ImuSamples":
+        """Samples with start_ns <= stamp < end_ns."""
+        a, b = np.searchsorted(self.stamps_ns, [start_ns, end_ns])
+        return ImuSamples(self.stamps_ns[a:b], self.gyro_radps[a:b], self.accel_mps2[a:b])
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFrame:
+    """One moment of the camera rig, as recorded (not rectified).
+
+    left: (H, W) uint8 grey. right: the same for the second camera, None without one. depth_m: (H, W) float32 registered to
+    `left`, 0 or NaN where unknown, None without a depth sensor.
+    """
+
+    stamp_ns: int
+    left: Image
+    right: Image | None = None
+    depth_m: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class WheelSample:
+    """Wheel odometry: velocity in `base` axes, forward/left/up m/s (3,) and yaw rate, with their standard deviations."""
+
+    stamp_ns: int
+    velocity_base_mps: Array
+    yaw_rate_radps: float
+    sigma_mps: float
+    sigma_radps: float
+
+
+@dataclass(frozen=True, slots=True)
+class PositionPrior:
+    """A coarse place in `map` from a dock, tag, zone or operator.
+
+    map_from_base (4, 4); cov_rot_trans (6, 6) of a perturbation in map axes; infinite where unknown.
+    """
+
+    stamp_ns: int
+    map_from_base: Array
+    cov_rot_trans: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Stamped transforms of the body: stamps_ns (N,) increasing, frame_from_body (N, 4, 4)."""
+
+    stamps_ns: Stamps
+    frame_from_body: Array
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def positions_m(self) -> Array:
+        """(N, 3) metres."""
+        return np.asarray(self.frame_from_body[:, :3, 3])
+
+    def at(self, stamp_ns: int, max_gap_ns: int = 200_000_000) -> Array | None:
+        """Interpolated frame_from_body at `stamp_ns`; None outside, or inside a gap longer than `max_gap_ns`."""
+        index = int(np.searchsorted(self.stamps_ns, stamp_ns))
+        if index < len(self) and self.stamps_ns[index] == stamp_ns:
+            return np.asarray(self.frame_from_body[index])
+        if index in (0, len(self)):
+            return None
+        before, after = int(self.stamps_ns[index - 1]), int(self.stamps_ns[index])
+        if after - before > max_gap_ns:
+            return None
+        fraction = (stamp_ns - before) / (after - before)
+        return interpolate_se3(self.frame_from_body[index - 1], self.frame_from_body[index], fraction)
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """Something that a recording should hold and does not: what, and how much in words."""
+
+    what: str
+    detail: str = field(default="")

@@ -1,0 +1,1 @@
+"""The warehouse simulator: writes recordings that both sides can read."""

@@ -1,0 +1,111 @@
+"""What the commands do: recording with progress, contact sheets."""
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from fleetmap.errors import FleetmapError
+from fleetmap.recordings.mcap_writer import McapRecordingWriter
+from fleetmap.samples import Image
+from fleetsim.euroc_writer import EurocRecordingWriter
+from fleetsim.layout import Layout
+from fleetsim.recorder import Order, Session, prepare, write_session
+from fleetsim.scenarios import find_scenario
+
+_THUMBNAIL_PX = 320
+_PLAN_PX_PER_M = 12
+
+
+def _progress() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=Console(stderr=True))
+
+
+def _ready(order: Order, progress: Progress, workers: ThreadPoolExecutor) -> Session:
+    """Builds the site and takes one picture, so that compiling (once per machine, half a minute) has its own line."""
+    task = progress.add_task("building the warehouse", total=2)
+    session = prepare(order, workers)
+    progress.update(task, advance=1, description="lighting it, compiling the painter (first time only)")
+    session.renderer.shoot(session.frame_times_s[0])
+    progress.update(task, advance=1, description="warehouse ready")
+    return session
+
+
+def record_order(order: Order, out: Path, format_: str) -> str:
+    """Records to `out`; a line that says what was written and how long it took."""
+    started = time.monotonic()
+    with _progress() as progress, ThreadPoolExecutor(2) as workers:
+        session = _ready(order, progress, workers)
+        count = len(session.frame_times_s)
+        task = progress.add_task(f"recording {order.scenario}", total=count)
+        name = f"{order.scenario}-{order.robot or 'first'}-seed{order.seed}-day{order.day}-{order.light}"
+        try:
+            if format_ == "euroc":
+                folder = EurocRecordingWriter(out, session.nominal)
+                write_session(session, folder, lambda done: progress.update(task, completed=done))
+                folder.close()
+            else:
+                with McapRecordingWriter(out, session.nominal, name=name) as writer:
+                    write_session(session, writer, lambda done: progress.update(task, completed=done))
+        finally:
+            session.renderer.close()
+    path_m = float(np.linalg.norm(np.diff(session.truth.positions_m, axis=0), axis=1).sum())
+    seconds = time.monotonic() - started
+    driven = f"{count} frames, {path_m:.1f} m, {session.frame_times_s[-1]:.1f} s of driving"
+    return f"{out}: {driven}, recorded in {seconds:.1f} s"
+
+
+def show_order(order: Order, out: Path, pictures: int) -> str:
+    """Writes a contact sheet to `out`; a line that says so."""
+    with _progress() as progress, ThreadPoolExecutor(2) as workers:
+        session = _ready(order, progress, workers)
+        task = progress.add_task("taking pictures", total=pictures)
+        thumbnails = []
+        last = len(session.frame_times_s) - 1
+        for number in np.linspace(0, last, pictures + 2)[1:-1]:
+            shot = session.renderer.shoot(session.frame_times_s[round(float(number))])
+            height = round(_THUMBNAIL_PX * shot.left.shape[0] / shot.left.shape[1])
+            thumbnails.append(
+                np.asarray(cv2.resize(shot.left, (_THUMBNAIL_PX, height), interpolation=cv2.INTER_AREA), np.uint8)
+            )
+            progress.advance(task)
+        session.renderer.close()
+    sheet = _tile(thumbnails, 4)
+    plan = _plan(find_scenario(order.scenario).layout, session)
+    scale = sheet.shape[1] / plan.shape[1]
+    plan = np.asarray(
+        cv2.resize(plan, (sheet.shape[1], round(plan.shape[0] * scale)), interpolation=cv2.INTER_AREA), np.uint8
+    )
+    if not cv2.imwrite(str(out), np.concatenate([sheet, plan])):
+        raise FleetmapError(f"{out} cannot be written; does the folder exist?")
+    return f"{out}: {pictures} moments and the plan"
+
+
+def _tile(images: list[Image], columns: int) -> Image:
+    height, width = images[0].shape
+    rows = -(-len(images) // columns)
+    sheet = np.zeros((rows * height, columns * width), np.uint8)
+    for number, image in enumerate(images):
+        row, column = divmod(number, columns)
+        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = image
+    return sheet
+
+
+def _plan(layout: Layout, session: Session) -> Image:
+    """The site from above, racks grey, the route white; x to the right, y up."""
+    scale = min(_PLAN_PX_PER_M * 1.0, 2400 / layout.length_m)
+    image = np.full((round(layout.width_m * scale), round(layout.length_m * scale)), 40, np.uint8)
+    for x_min, y_min, x_max, y_max in layout.solid_rectangles():
+        rows = slice(max(0, round((layout.width_m - y_max) * scale)), round((layout.width_m - y_min) * scale))
+        image[rows, max(0, round(x_min * scale)) : round(x_max * scale)] = 110
+    places = session.truth.positions_m[:, :2] * scale
+    points = np.stack([places[:, 0], image.shape[0] - places[:, 1]], axis=1)
+    cv2.polylines(
+        image, [np.rint(points).astype(np.int32)], isClosed=False, color=255, thickness=2, lineType=cv2.LINE_AA
+    )
+    return image

@@ -1,0 +1,116 @@
+"""The plan of a warehouse: sizes, counts and rates, and where things stand."""
+
+from typing import ClassVar
+
+from fleetmap.config import Section
+
+Rectangle = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max in map, metres
+
+
+class Layout(Section, frozen=True):
+    """Parallel aisles along x, rack rows on both sides of each, open ground at both ends.
+
+    has_landmarks: posters, columns with signs, marked docks, all different. are_aisles_identical: stock, labels and
+    floor repeat from aisle to aisle (until a slot is restocked), so that only geometry and context tell them apart.
+    restock_per_day:
+    share of slots.
+    """
+
+    aisles: int = 3
+    bays: int = 4
+    levels: int = 4
+    aisle_width_m: float = 2.8
+    end_m: float = 6.0
+    has_landmarks: bool = True
+    are_aisles_identical: bool = False
+    restock_per_day: float = 0.125
+    empty_share: float = 0.1
+
+    bay_m: ClassVar[float] = 2.7
+    rack_depth_m: ClassVar[float] = 1.1
+    margin_m: ClassVar[float] = 1.0
+    ceiling_m: ClassVar[float] = 7.5
+    shelf_heights_m: ClassVar[tuple[float, ...]] = (0.0, 1.5, 2.95, 4.4)
+    bays_per_chunk: ClassVar[int] = 4
+
+    @property
+    def pitch_m(self) -> float:
+        """From one aisle to the next."""
+        return self.aisle_width_m + 2 * self.rack_depth_m
+
+    @property
+    def length_m(self) -> float:
+        """Of the hall, along x."""
+        return 2 * self.end_m + self.bays * self.bay_m
+
+    @property
+    def width_m(self) -> float:
+        """Of the hall, along y."""
+        return 2 * self.margin_m + self.aisles * self.pitch_m
+
+    @property
+    def rack_top_m(self) -> float:
+        """Height of the uprights."""
+        return self.shelf_heights_m[self.levels - 1] + 1.3
+
+    @property
+    def rows(self) -> int:
+        """Rack rows, two per aisle: even ones at larger y, odd ones at smaller y than their aisle."""
+        return 2 * self.aisles
+
+    def aisle_y_m(self, aisle: int) -> float:
+        """Centre line of an aisle."""
+        return self.margin_m + self.pitch_m * (aisle + 0.5)
+
+    def row_y_m(self, row: int) -> float:
+        """Centre line of a rack row."""
+        side = -1.0 if row % 2 else 1.0
+        return self.aisle_y_m(row // 2) + side * (self.aisle_width_m + self.rack_depth_m) / 2
+
+    def bay_x_m(self, bay: int) -> float:
+        """Where a bay begins."""
+        return self.end_m + bay * self.bay_m
+
+    @property
+    def chunk_length_m(self) -> float:
+        """Of a chunk, along x: about four bays."""
+        return self.length_m / self.chunk_counts[0]
+
+    @property
+    def chunk_counts(self) -> tuple[int, int]:
+        """Chunks along x and y; a chunk is one aisle wide."""
+        return max(1, round(self.length_m / (self.bays_per_chunk * self.bay_m))), self.aisles
+
+    def chunk_at(self, x_m: float, y_m: float) -> tuple[int, int]:
+        """The chunk that holds a point; points outside belong to the nearest one."""
+        columns, rows = self.chunk_counts
+        column = int(x_m // self.chunk_length_m)
+        row = int((y_m - self.margin_m) // self.pitch_m)
+        return min(max(column, 0), columns - 1), min(max(row, 0), rows - 1)
+
+    def solid_rectangles(self) -> list[Rectangle]:
+        """Ground that no robot may enter: rack rows with their end guards, columns."""
+        x_first, x_last = self.end_m - 0.2, self.bay_x_m(self.bays) + 0.2
+        half = self.rack_depth_m / 2
+        racks = [(x_first, self.row_y_m(row) - half, x_last, self.row_y_m(row) + half) for row in range(self.rows)]
+        columns = [(x - 0.2, y - 0.2, x + 0.2, y + 0.2) for x, y in self.columns_m()]
+        return racks + columns + [(x - 0.45, y - 0.65, x + 0.45, y + 0.65) for x, y in self.parked_pallets_m()]
+
+    def parked_pallets_m(self) -> list[tuple[float, float]]:
+        """Centres of the pallets along the end walls, two beside each aisle's line; none without landmarks."""
+        if not self.has_landmarks:
+            return []
+        offsets = (-0.5 * self.aisle_width_m - 0.1, 0.5 * self.aisle_width_m + 0.1)
+        return [
+            (x, self.aisle_y_m(aisle) + y)
+            for x in (0.6, self.length_m - 0.6)
+            for aisle in range(self.aisles)
+            for y in offsets
+        ]
+
+    def columns_m(self) -> list[tuple[float, float]]:
+        """Feet of the columns, near the end walls in line with the racks' backs."""
+        lines = [
+            min(max(self.margin_m + self.pitch_m * row, 0.6), self.width_m - 0.6) for row in range(self.aisles + 1)
+        ]
+        return [(x, y) for x in (1.2, self.length_m - 1.2) for y in lines]

@@ -1,0 +1,191 @@
+"""Records one run of a scenario: every sensor's samples and pictures in the order of time."""
+
+import zlib
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from fleetmap.calibration import RigCalibration
+from fleetmap.errors import UsageError
+from fleetmap.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
+from fleetsim.faults import LATE_S, Fault, FaultPlan
+from fleetsim.layout import Layout
+from fleetsim.light import LIGHT_STATES
+from fleetsim.motion import CarriedMotion, Motion, RouteMotion
+from fleetsim.painter import Look
+from fleetsim.rendering import StereoRenderer
+from fleetsim.robots import nominal_calibration, true_calibration
+from fleetsim.routes import check_clear
+from fleetsim.scenarios import Run, find_scenario
+from fleetsim.sensors import measure_imu, measure_priors, measure_wheels, sample_times, stamps_from_s
+from fleetsim.world import World
+
+_TRUTH_STEP_S = 0.02
+S = TypeVar("S", WheelSample, PositionPrior)
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What to record. robot: a run of the scenario, its first one for None. frames: at most so many, all for None."""
+
+    scenario: str
+    seed: int = 0
+    day: int = 0
+    light: str = "day"
+    robot: str | None = None
+    lens: str | None = None
+    frames: int | None = None
+    faults: tuple[Fault, ...] = ()
+    size_px: tuple[int, int] | None = None
+
+
+class Writer(Protocol):
+    """Where samples go; fleetmap's McapRecordingWriter is one."""
+
+    def write_frame(self, frame: CameraFrame) -> None:
+        """One pair."""
+        ...
+
+    def write_imu(self, samples: ImuSamples) -> None:
+        """Inertial samples."""
+        ...
+
+    def write_wheel(self, samples: tuple[WheelSample, ...]) -> None:
+        """Wheel odometry."""
+        ...
+
+    def write_prior(self, priors: tuple[PositionPrior, ...]) -> None:
+        """Position priors."""
+        ...
+
+    def write_ground_truth(self, trajectory: Trajectory) -> None:
+        """True transforms."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """A run made ready: the rig as it is believed and as it is, the motion, the samples other than pictures."""
+
+    order: Order
+    world: World
+    nominal: RigCalibration
+    renderer: StereoRenderer
+    motion: Motion
+    frame_times_s: tuple[float, ...]
+    imu: ImuSamples
+    wheel: tuple[WheelSample, ...]
+    priors: tuple[PositionPrior, ...]
+    truth: Trajectory
+
+    def frames(self) -> Iterator[CameraFrame]:
+        """The pictures, one pair at a time; stamps on the cameras' clock."""
+        for time_s, stamp_ns in zip(self.frame_times_s, self.frame_stamps_ns(), strict=True):
+            shot = self.renderer.shoot(time_s)
+            yield CameraFrame(stamp_ns, shot.left, shot.right)
+
+    def frame_stamps_ns(self) -> list[int]:
+        """Stamps of the frames: late ones late, all shifted by the rig's hidden delay."""
+        delay_s, plan = self.renderer.imu_minus_cam_s, self.renderer.faults
+        shifted = [t - delay_s + (LATE_S if plan.has("frames-late", t) else 0.0) for t in self.frame_times_s]
+        return [int(stamp) for stamp in stamps_from_s(np.array(shifted))]
+
+
+def _generator(order: Order, robot: str, purpose: str) -> np.random.Generator:
+    """Independent randomness per site, day, robot and purpose."""
+    return np.random.default_rng([order.seed, order.day, zlib.crc32(robot.encode()), zlib.crc32(purpose.encode())])
+
+
+def drive(run: Run, layout: Layout, rng: np.random.Generator) -> Motion:
+    """The run's motion; UsageError where it comes too near to a solid thing."""
+    kind = run.kind
+    pieces = [RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, rng) for route in run.routes]
+    motion: Motion = pieces[0] if len(pieces) == 1 else CarriedMotion(pieces)
+    places = motion.map_from_body(sample_times(motion.duration_s, 20.0))[:, :2, 3]
+    check_clear(places, layout, kind.clearance_m)
+    return motion
+
+
+def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
+    """Everything of a run but its pictures. Raises UsageError for unknown names and routes through solid things."""
+    scenario = find_scenario(order.scenario)
+    if order.light not in LIGHT_STATES:
+        raise UsageError(f"unknown light {order.light!r}; known are {', '.join(LIGHT_STATES)}")
+    if order.day < 0 or order.seed < 0:
+        raise UsageError(f"seed {order.seed} and day {order.day} must not be negative")
+    name, run = scenario.run(order.robot)
+    kind = run.kind.with_lens(order.lens or run.kind.lens)
+    if order.size_px is not None:
+        kind = replace(kind, width_px=order.size_px[0], height_px=order.size_px[1])
+    nominal, true = nominal_calibration(kind), true_calibration(kind, _generator(order, name, "mounting"))
+    shaking = _generator(order, name, "motion")
+    pieces = [RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, shaking) for route in run.routes]
+    motion: Motion = pieces[0] if len(pieces) == 1 else CarriedMotion(pieces)
+    check_clear(
+        motion.map_from_body(sample_times(motion.duration_s, 20.0))[:, :2, 3], scenario.layout, kind.clearance_m
+    )
+    plan = FaultPlan((*run.faults, *order.faults))
+    every_time = [float(t) for t in sample_times(motion.duration_s, run.rate_hz)]
+    times = [t for t in every_time if not plan.has("frames-dropped", t)][: order.frames]
+    end_s = times[-1] + 0.1 if times else motion.duration_s
+    world = World(scenario.layout, seed=order.seed, day=order.day, workers=workers)
+    renderer = StereoRenderer(
+        world, true, motion, order.light, look=Look(has_blur=not run.is_sharp), movers=scenario.movers,
+        faults=plan, key=zlib.crc32(name.encode()),
+    )  # fmt: skip
+    imu = plan.spoil_imu(measure_imu(motion, kind.imu, _generator(order, name, "imu")))
+    wheel = plan.spoil_wheels(
+        measure_wheels(motion, kind.body_height_m, kind.wheels, _generator(order, name, "wheels"))
+    )
+    priors = measure_priors(motion, nominal.base_from_body, run.zone_period_s, _generator(order, name, "priors"))
+    last_ns = int(stamps_from_s(np.array([end_s]))[0])
+    return Session(
+        order, world, nominal, renderer, motion, tuple(times), imu.between(0, last_ns),
+        tuple(sample for sample in wheel if sample.stamp_ns < last_ns),
+        tuple(prior for prior in priors if prior.stamp_ns < last_ns),
+        _truth(motion, times, end_s),
+    )  # fmt: skip
+
+
+def _truth(motion: Motion, frame_times_s: list[float], end_s: float) -> Trajectory:
+    """Exact map_from_body at every frame and each 20 ms."""
+    grid = sample_times(min(end_s, motion.duration_s), 1.0 / _TRUTH_STEP_S)
+    times = np.unique(np.rint(np.concatenate([grid, frame_times_s]) * 1e9)) * 1e-9
+    return Trajectory(stamps_from_s(times), motion.map_from_body(times))
+
+
+def write_session(session: Session, writer: Writer, on_frame: Callable[[int], None] = lambda done: None) -> None:
+    """Writes everything in the order of time, a frame's worth at a time."""
+    frames = session.frames()
+    wheel, priors = list(session.wheel), list(session.priors)
+    start_ns = 0
+    for done, frame in enumerate(frames, start=1):
+        end_ns = frame.stamp_ns
+        _write_between(session, writer, start_ns, end_ns, wheel, priors)
+        writer.write_frame(frame)
+        on_frame(done)
+        start_ns = end_ns
+    _write_between(session, writer, start_ns, 1 << 62, wheel, priors)
+
+
+def _write_between(
+    session: Session, writer: Writer, start_ns: int, end_ns: int, wheel: list[WheelSample], priors: list[PositionPrior]
+) -> None:
+    """Writes the samples with start <= stamp < end, taking them from the lists."""
+    truth = session.truth
+    first, last = np.searchsorted(truth.stamps_ns, [start_ns, end_ns])
+    writer.write_prior(tuple(_take(priors, end_ns)))
+    writer.write_imu(session.imu.between(start_ns, end_ns))
+    writer.write_wheel(tuple(_take(wheel, end_ns)))
+    writer.write_ground_truth(Trajectory(truth.stamps_ns[first:last], truth.frame_from_body[first:last]))
+
+
+def _take(samples: list[S], end_ns: int) -> list[S]:
+    """Removes and returns the samples before end_ns, which come first."""
+    count = sum(1 for sample in samples if sample.stamp_ns < end_ns)
+    taken = samples[:count]
+    del samples[:count]
+    return taken

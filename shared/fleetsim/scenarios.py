@@ -1,0 +1,184 @@
+"""The scenarios, smallest first. To add one: a line in SCENARIOS."""
+
+from dataclasses import dataclass, replace
+
+from fleetmap.errors import UsageError
+from fleetsim.faults import Fault
+from fleetsim.layout import Layout
+from fleetsim.movers import Mover
+from fleetsim.robots import ROBOTS, RobotKind
+from fleetsim.routes import Route
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One robot's drive. Several routes: the robot is carried from the end of one to the start of the next.
+
+    is_sharp: without motion blur, as a survey at leisure with a short exposure.
+    """
+
+    robot: str
+    routes: tuple[Route, ...]
+    rate_hz: float = 15.0
+    is_sharp: bool = False
+    faults: tuple[Fault, ...] = ()
+    zone_period_s: float = 0.0
+
+    @property
+    def kind(self) -> RobotKind:
+        """The robot's model."""
+        return ROBOTS[self.robot]
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """A site with the runs that can be recorded in it, the first one by default."""
+
+    description: str
+    layout: Layout
+    runs: dict[str, Run]
+    movers: tuple[Mover, ...] = ()
+
+    def run(self, name: str | None) -> tuple[str, Run]:
+        """The named run, the first one for None; UsageError naming the known ones."""
+        if name is None:
+            return next(iter(self.runs.items()))
+        if name not in self.runs:
+            raise UsageError(f"no robot {name!r} in this scenario; there are {', '.join(self.runs)}")
+        return name, self.runs[name]
+
+
+_END_M = 2.7  # how far from the end walls the robots drive
+
+
+def _loop(layout: Layout, first: int, last: int, *, overlap_m: float = 8.0, shift_m: float = 0.0) -> Route:
+    """Up one aisle, down another, and on along the first again."""
+    y0, y1 = layout.aisle_y_m(first) + shift_m, layout.aisle_y_m(last) + shift_m
+    left, right = _END_M, layout.length_m - _END_M
+    return Route(((left, y0), (right, y0), (right, y1), (left, y1), (left, y0), (left + overlap_m, y0)))
+
+
+def _snake(layout: Layout, aisles: range) -> Route:
+    """Every aisle in turn, back along the ends, and into the first one again."""
+    left, right = _END_M, layout.length_m - _END_M
+    points: list[tuple[float, float]] = []
+    for number, aisle in enumerate(aisles):
+        ends = (left, right) if number % 2 == 0 else (right, left)
+        points += [(end, layout.aisle_y_m(aisle)) for end in ends]
+    if len(aisles) % 2:
+        raise UsageError("a snake that comes home needs an even number of aisles")
+    return Route((*points, points[0], (left + 8.0, points[0][1])))
+
+
+def _small_loop() -> Scenario:
+    layout = Layout(aisles=2, bays=4)
+    y0, y1 = layout.aisle_y_m(0), layout.aisle_y_m(1)
+    left, right = _END_M, layout.length_m - _END_M
+    first = Route(((left + 0.3, y0 - 0.3), (right + 0.2, y0 - 0.3), (right + 0.2, y1 + 0.3), (11.0, y1 + 0.3)))
+    second = Route(((16.0, y1 - 0.25), (left - 0.2, y1 - 0.25), (left - 0.2, y0 + 0.25), (15.0, y0 + 0.25)))
+    runs = {
+        "survey": Run("surveyor", (_loop(layout, 0, 1),), is_sharp=True),
+        "tote-1": Run("tote", (first,)),
+        "tote-2": Run("tote", (second,)),
+    }
+    return Scenario("a loop through two aisles; what `make demo` records", layout, runs)
+
+
+def _clip() -> Scenario:
+    layout = Layout(aisles=2, bays=4)
+    y = layout.aisle_y_m(0)
+    straight = Route(((5.0, y), (8.0, y)), rest_s=0.5)
+    turn = Route(((3.0, y - 0.2), (5.0, y - 0.2), (9.0, y + 0.2)), rest_s=0.5)
+    return Scenario(
+        "three metres of one aisle, for tests and first looks",
+        layout,
+        {"survey": Run("surveyor", (straight,), is_sharp=True), "tote-1": Run("tote", (turn,))},
+    )
+
+
+def _busy() -> Scenario:
+    layout = Layout(aisles=4, bays=9)
+    y = [layout.aisle_y_m(aisle) for aisle in range(4)]
+    middle, right = layout.length_m / 2, layout.length_m - _END_M
+    movers = (
+        Mover("person", ((8.0, y[0] + 0.8), (24.0, y[0] + 0.8)), 0.9),
+        Mover("person", ((6.0, y[1] - 0.8), (20.0, y[1] - 0.8)), 1.1, 5.0),
+        Mover("forklift", ((middle, y[2] + 0.7), (middle + 9, y[2] + 0.7)), 0.8),
+        Mover("robot", ((4.0, y[3] - 0.7), (right, y[3] - 0.7)), 1.2),
+        Mover("robot", ((9.0, y[0] - 0.8), (18.0, y[0] - 0.8)), 0.7),
+    )
+    passing = Route(((_END_M, y[0]), (right, y[0]), (right, y[1]), (_END_M, y[1])), stops=((1, 2.0),))
+    runs = {
+        "survey": Run("surveyor", (_snake(layout, range(4)),), is_sharp=True),
+        "tote-1": Run("tote", (passing,), zone_period_s=15.0),
+        "pallet-1": Run("pallet-mover", (_loop(layout, 2, 3),), zone_period_s=15.0),
+    }
+    return Scenario("four aisles with people, a forklift and other robots", layout, runs, movers)
+
+
+def _identical() -> Scenario:
+    layout = Layout(aisles=6, bays=8, has_landmarks=False, are_aisles_identical=True)
+    runs = {
+        "survey": Run("surveyor", (_snake(layout, range(6)),), is_sharp=True, zone_period_s=20.0),
+        "tote-1": Run("tote", (_loop(layout, 1, 2),), zone_period_s=20.0),
+    }
+    return Scenario("six aisles that look the same until stock is moved: aliasing", layout, runs)
+
+
+def _faulty() -> Scenario:
+    base = _small_loop()
+    loop = base.runs["tote-1"].routes
+    names = {
+        "dark": Fault("camera-dark", 8.0, 10.0),
+        "frozen": Fault("camera-frozen", 8.0, 11.0),
+        "dropped": Fault("frames-dropped", 8.0, 9.5),
+        "late": Fault("frames-late", 8.0, 12.0),
+        "imu-gap": Fault("imu-gap", 8.0, 8.4),
+        "imu-spike": Fault("imu-spike", 8.0, 8.1),
+        "glare": Fault("over-exposure", 8.0, 11.0),
+        "person": Fault("person-in-front", 8.0, 12.0),
+        "slip": Fault("wheel-slip", 8.0, 11.0),
+    }
+    runs = {"survey": base.runs["survey"]} | {name: Run("tote", loop, faults=(fault,)) for name, fault in names.items()}
+    runs["kidnapped"] = Run("tote", (loop[0], base.runs["tote-2"].routes[0]))
+    return replace(base, description="the small loop with one fault per robot, eight seconds in", runs=runs)
+
+
+def _site() -> Scenario:
+    layout = Layout(aisles=44, bays=70, end_m=5.5, aisle_width_m=2.3)
+    across = [layout.aisle_y_m(aisle) for aisle in (20, 22)]
+    left, right = _END_M, layout.length_m - _END_M
+    tour = Route(
+        (
+            (left, across[0]),
+            (right, across[0]),
+            (right, across[1]),
+            (left, across[1]),
+            (left, across[0]),
+            (left + 8, across[0]),
+        )
+    )
+    runs = {
+        "survey": Run("surveyor", (_loop(layout, 0, 1),), is_sharp=True, zone_period_s=20.0),
+        "survey-middle": Run("surveyor", (tour,), is_sharp=True, zone_period_s=20.0),
+        "tote-1": Run("tote", (_loop(layout, 0, 1, shift_m=0.2),), zone_period_s=20.0),
+    }
+    return Scenario("the whole site: 44 aisles on 200 m x 200 m", layout, runs)
+
+
+# Functions, so that listing them builds nothing.
+SCENARIOS = {
+    "clip": _clip,
+    "small-loop": _small_loop,
+    "faults": _faulty,
+    "busy": _busy,
+    "identical-aisles": _identical,
+    "site": _site,
+}
+
+
+def find_scenario(name: str) -> Scenario:
+    """The named scenario; UsageError naming the known ones."""
+    if name not in SCENARIOS:
+        raise UsageError(f"unknown scenario {name!r}; known are {', '.join(SCENARIOS)}")
+    return SCENARIOS[name]()

@@ -1,0 +1,138 @@
+"""What every entry of RECORDING_FORMATS must do."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import RecordingError
+from fleetmap.recordings import RECORDING_FORMATS, Recording, open_recording
+from fleetmap.recordings.copying import copy_to_mcap
+from recording_samples import (
+    make_sample,
+    world_from_cam0,
+    write_euroc,
+    write_kitti,
+    write_seven_scenes,
+    write_tumvi,
+)
+
+SAMPLE = make_sample(5)
+
+
+def _write_mcap(folder: Path) -> Path:
+    folder.mkdir()
+    source = open_recording(write_euroc(folder / "source", SAMPLE))
+    copy_to_mcap(source, folder / "copy.mcap")
+    return folder / "copy.mcap"
+
+
+WRITERS: dict[str, Callable[[Path], Path]] = {
+    "euroc": lambda folder: write_euroc(folder, SAMPLE),
+    "tumvi": lambda folder: write_tumvi(folder, SAMPLE),
+    "kitti": lambda folder: write_kitti(folder, SAMPLE),
+    "7scenes": lambda folder: write_seven_scenes(folder, SAMPLE),
+    "mcap": _write_mcap,
+}
+
+
+@pytest.fixture(params=list(RECORDING_FORMATS))
+def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    return WRITERS[request.param](tmp_path / "recording")
+
+
+def _assert_same_frames(first: Recording, second: Recording) -> None:
+    np.testing.assert_array_equal(first.frame_stamps_ns, second.frame_stamps_ns)
+    for index in (len(first) - 1, 0, 2):  # in no order
+        a, b = first.read_frame(index), second.read_frame(index)
+        assert a.stamp_ns == b.stamp_ns == first.frame_stamps_ns[index]
+        for x, y in ((a.left, b.left), (a.right, b.right), (a.depth_m, b.depth_m)):
+            assert (x is None) == (y is None)
+            if x is not None:
+                np.testing.assert_array_equal(x, y)
+
+
+def test_each_format_has_a_writer_here() -> None:
+    assert set(WRITERS) == set(RECORDING_FORMATS)
+
+
+def test_exactly_its_own_format_recognises_it(path: Path) -> None:
+    assert len([name for name, f in RECORDING_FORMATS.items() if f.recognises(path)]) == 1
+
+
+def test_stamps_increase_and_images_are_the_samples(path: Path) -> None:
+    recording = open_recording(path)
+    assert recording.losses == ()
+    assert len(recording) == len(SAMPLE.left)
+    assert (np.diff(recording.frame_stamps_ns) > 0).all()
+    for index in (3, 0, 4, 4):
+        frame = recording.read_frame(index)
+        assert frame.left.dtype == np.uint8
+        np.testing.assert_array_equal(frame.left, SAMPLE.left[index])
+        if frame.right is not None:
+            np.testing.assert_array_equal(frame.right, SAMPLE.right[index])
+        if frame.depth_m is not None:
+            assert frame.depth_m.dtype == np.float32
+
+
+def test_the_hash_is_that_of_a_copy_elsewhere_and_not_of_another_recording(path: Path, tmp_path: Path) -> None:
+    first = open_recording(path).content_hash()
+    elsewhere = tmp_path / "elsewhere"
+    if path.is_dir():
+        shutil.copytree(path, elsewhere)
+    else:
+        shutil.copy(path, elsewhere)
+    assert open_recording(elsewhere).content_hash() == first
+    image = max((p for p in path.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size) if path.is_dir() else path
+    image.write_bytes(image.read_bytes() + b"\0")
+    assert open_recording(path).content_hash() != first
+
+
+def test_truth_is_that_of_the_body(path: Path) -> None:
+    recording = open_recording(path)
+    assert recording.ground_truth is not None
+    for index, stamp_ns in enumerate(recording.frame_stamps_ns):
+        frame_from_body = recording.ground_truth.at(int(stamp_ns))
+        assert frame_from_body is not None
+        frame_from_cam = frame_from_body @ recording.calibration.cameras[0].body_from_cam
+        np.testing.assert_allclose(frame_from_cam, world_from_cam0(int(SAMPLE.stamps_ns[index])), atol=1e-9)
+
+
+def test_a_conversion_to_mcap_loses_nothing(path: Path, tmp_path: Path) -> None:
+    source = open_recording(path)
+    copy_to_mcap(source, tmp_path / "converted.mcap")
+    with open_recording(tmp_path / "converted.mcap") as copy:
+        assert copy.losses == ()
+        assert (copy.name, copy.sensor_set) == (source.name, source.sensor_set)
+        _assert_same_frames(source, copy)
+        for field in ("stamps_ns", "gyro_radps", "accel_mps2"):
+            np.testing.assert_array_equal(getattr(source.imu, field), getattr(copy.imu, field))
+        assert copy.calibration.imu == source.calibration.imu
+        np.testing.assert_array_equal(copy.calibration.base_from_body, source.calibration.base_from_body)
+        for a, b in zip(source.calibration.cameras, copy.calibration.cameras, strict=True):
+            assert (a.model, a.width_px, a.height_px, a.imu_minus_cam_s) == (
+                b.model,
+                b.width_px,
+                b.height_px,
+                b.imu_minus_cam_s,
+            )
+            for name in ("intrinsics_px", "distortion", "body_from_cam"):
+                np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        assert source.ground_truth is not None
+        assert copy.ground_truth is not None
+        np.testing.assert_allclose(copy.ground_truth.frame_from_body, source.ground_truth.frame_from_body, atol=1e-12)
+
+
+def test_a_frame_outside_is_refused(path: Path) -> None:
+    recording = open_recording(path)
+    for index in (-1, len(recording)):
+        with pytest.raises(RecordingError, match=str(index)):
+            recording.read_frame(index)
+
+
+def test_closing_twice_is_fine(path: Path) -> None:
+    recording = open_recording(path)
+    recording.close()
+    recording.close()

@@ -1,0 +1,114 @@
+"""Manifests as canonical JSON."""
+
+import json
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleetmap.errors import MapFormatError, NewerFormatError, UsageError
+from fleetmap.mapformat import (
+    BlobEntry,
+    CameraEntry,
+    Manifest,
+    RecordingEntry,
+    TileEntry,
+    blob_path,
+    check_name,
+    current_path,
+    decode_manifest,
+    encode_manifest,
+    sha256_hex,
+    verified,
+)
+
+MANIFEST = Manifest(
+    site="hall-3",
+    version=2,
+    parent=1,
+    created="2026-01-02T03:04:05Z",
+    tile_size_m=16.0,
+    tiles=(
+        TileEntry(x=0, y=-1, sha256="0" * 64, bytes=100, landmarks=3),
+        TileEntry(x=0, y=0, sha256="1" * 64, bytes=50, landmarks=4),
+    ),
+    vocabulary=BlobEntry(sha256="a" * 64, bytes=10),
+    camera=CameraEntry(focal_px=450.0, width_px=752, height_px=480, baseline_m=0.11),
+    recordings=(RecordingEntry(name="walk", sha256="b" * 64, frames=9),),
+    configuration={"b": {"y": 1, "x": 2.5}, "a": [1, 2]},
+    libraries={"numpy": "2.4"},
+    report={"path_m": 12.5},
+)
+
+
+def test_round_trip_and_sums() -> None:
+    data = encode_manifest(MANIFEST)
+    assert decode_manifest(data) == MANIFEST
+    assert encode_manifest(decode_manifest(data)) == data
+    assert (MANIFEST.landmarks, MANIFEST.tile_bytes) == (7, 150)
+
+
+def test_bytes_do_not_depend_on_the_order_of_keys() -> None:
+    data = encode_manifest(MANIFEST)
+    turned = decode_manifest(json.dumps(dict(reversed(json.loads(data).items()))).encode())
+    turned.configuration["b"] = {"x": 2.5, "y": 1}
+    assert encode_manifest(turned) == data
+    assert b'"configuration":{"a":[1,2],"b":{"x":2.5,"y":1}}' in data
+
+
+def test_a_manifest_of_format_1_stays_readable() -> None:
+    # Written by the first release; never to be changed.
+    assert sha256_hex(encode_manifest(MANIFEST)) == "f37b9c1d514d29e5ef4990fbe55e6b9e083e3fa05f016473f369d27e6d120fb5"
+
+
+def test_a_newer_manifest_is_refused_by_its_number() -> None:
+    newer = json.loads(encode_manifest(MANIFEST)) | {"format_version": 3, "something": "new"}
+    with pytest.raises(NewerFormatError, match=r"format 3.*up to 1"):
+        decode_manifest(json.dumps(newer).encode())
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("site", "../etc"),
+        ("version", 0),
+        ("tile_size_m", 0),
+        ("vocabulary", {"sha256": "../../x", "bytes": 1}),
+        ("tiles", [{"x": 0, "y": 0, "sha256": "0" * 64, "bytes": -1, "landmarks": 1}]),
+        ("unknown", 1),
+        ("created", None),
+    ],
+)
+def test_damaged_manifests_are_refused(key: str, value: object) -> None:
+    damaged = json.loads(encode_manifest(MANIFEST)) | {key: value}
+    with pytest.raises(MapFormatError, match=key):
+        decode_manifest(json.dumps(damaged).encode())
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.binary(max_size=200)
+    | st.recursive(st.none() | st.integers() | st.text(), st.lists, max_leaves=5).map(lambda v: json.dumps(v).encode())
+)
+def test_anything_else_is_refused(data: bytes) -> None:
+    with pytest.raises(MapFormatError):
+        decode_manifest(data)
+
+
+def test_deeply_nested_json_is_refused() -> None:
+    with pytest.raises(MapFormatError):
+        decode_manifest(b'{"format_version":1,"report":' + b"[" * 100_000)
+
+
+def test_names_and_addresses() -> None:
+    assert current_path("lab_1") == "sites/lab_1/current"
+    assert blob_path("ab" * 32) == "blobs/ab/" + "ab" * 32
+    for name in ("", "Lab", "a/b", "..", "-a", "a" * 65, "a b", "lab\n"):
+        with pytest.raises(UsageError, match="site name"):
+            check_name(name, "site")
+    for sha256 in ("", "g" * 64, "A" * 64, "0" * 63, "0" * 64 + "\n"):
+        with pytest.raises(MapFormatError, match="SHA-256"):
+            blob_path(sha256)
+    assert verified(b"x", sha256_hex(b"x")) == b"x"
+    with pytest.raises(MapFormatError, match="damaged"):
+        verified(b"y", sha256_hex(b"x"))

@@ -1,0 +1,192 @@
+"""Tiles as bytes: the documented layout, what is lost, what is refused."""
+
+import struct
+import time
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleetmap.errors import MapFormatError, NewerFormatError
+from fleetmap.geometry import rotation_angle_rad, se3
+from fleetmap.mapformat import LANDMARK_BYTES, Tile, decode_tile, encode_tile, pack, sha256_hex, unpack
+from map_samples import random_tile
+
+LIMIT = 64 << 20
+
+
+def golden_tile() -> Tile:
+    """Two landmarks, one place, numbers that the format holds exactly."""
+    return Tile(
+        tile_x=-1,
+        tile_y=2,
+        size_m=16.0,
+        landmark_ids=np.array([7, 300], np.uint32),
+        points_map=np.array([[-16.0, 32.5, -1.0], [-0.5, 47.0, 2.0]]),
+        descriptors=np.arange(64, dtype=np.uint8).reshape(2, 32),
+        view_directions_map=np.array([[1, 0, 0], [0, 0, 1]], np.float32),
+        view_half_angle_rad=np.array([0, np.pi], np.float32),
+        max_distance_m=np.array([0.2, 12.8], np.float32),
+        sigma_m=np.array([1e-4, 1.6e-3], np.float32),
+        place_ids=np.array([5], np.uint32),
+        map_from_cam=se3(np.eye(3), np.array([-8.0, 40.25, 1.0]))[None],
+        place_landmark_ids=(np.array([7, 300, 65536 + 300], np.uint32),),
+    )
+
+
+def golden_payload() -> bytes:
+    """The same tile written by hand from the documentation of the format, not by the code under test."""
+    q = 4096
+    landmark_planes = bytes([7, 37, 0, 1, 0, 0, 0, 0])  # 7, then 300 - 7 = 293 = 0x125
+    x = [0, int(15.5 * q)]
+    y = [int(0.5 * q), 15 * q]
+    z = [0, 3 * q]
+    return b"".join(
+        [
+            struct.pack("<iidiIII", -1, 2, 16.0, -1 * q, 2, 1, 3),
+            landmark_planes,
+            *(bytes(value >> shift & 255 for value in axis) for axis in (x, y) for shift in (0, 8)),
+            *(bytes(value >> shift & 255 for value in z) for shift in (0, 8, 16)),
+            bytes(range(64)),
+            bytes([127, 0, 0, 0]),
+            bytes([0, 255]),
+            bytes([20, 140]),  # 0.1 m * 2 ** (20 / 20), 0.1 m * 2 ** (140 / 20)
+            bytes([0, 64]),  # 0.1 mm * 2 ** (64 / 16)
+            bytes([5, 0, 0, 0]),
+            struct.pack("<iii", int(-8.0 * 65536), int(40.25 * 65536), 65536),
+            bytes([0]),
+            bytes(6),
+            bytes([3, 0, 0, 0]),
+            bytes([7, 37, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]),  # 7, 293, 65536, as four planes
+        ]
+    )
+
+
+def test_layout_is_the_documented_one() -> None:
+    number, payload = unpack(b"FMTL", 1, encode_tile(golden_tile()), "tile", LIMIT)
+    assert number == 1
+    assert payload == golden_payload()
+
+
+def test_a_file_of_format_1_stays_readable() -> None:
+    # Written by the first release; never to be changed.
+    data = bytes.fromhex(GOLDEN_HEX)
+    assert sha256_hex(data) == GOLDEN_SHA256
+    tile, expected = decode_tile(data), golden_tile()
+    for field in expected.__dataclass_fields__:
+        found, wanted = getattr(tile, field), getattr(expected, field)
+        if field == "place_landmark_ids":
+            assert [ids.tolist() for ids in found] == [ids.tolist() for ids in wanted]
+        else:
+            np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7, err_msg=field)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 60), st.integers(0, 4), st.sampled_from([16.0, 10.0, 7.3]))
+def test_round_trip_loses_only_what_is_documented(seed: int, landmarks: int, places: int, size_m: float) -> None:
+    tile = random_tile(np.random.default_rng(seed), landmarks=landmarks, places=places, size_m=size_m)
+    data = encode_tile(tile)
+    back = decode_tile(data)
+    assert encode_tile(back) == data
+    assert (back.tile_x, back.tile_y, back.size_m) == (tile.tile_x, tile.tile_y, tile.size_m)
+    assert np.array_equal(back.landmark_ids, tile.landmark_ids)
+    assert np.array_equal(back.descriptors, tile.descriptors)
+    assert np.array_equal(back.place_ids, tile.place_ids)
+    assert [ids.tolist() for ids in back.place_landmark_ids] == [ids.tolist() for ids in tile.place_landmark_ids]
+    quantum_m = size_m / 65536
+    # Half a quantum, except at the far edge, where the last code must do for the last whole quantum.
+    assert np.abs(back.points_map - tile.points_map).max(initial=0) <= quantum_m
+    assert np.quantile(np.abs(back.points_map - tile.points_map), 0.9) <= quantum_m / 2 + 1e-12 if landmarks else True
+    assert np.abs(back.map_from_cam[:, :3, 3] - tile.map_from_cam[:, :3, 3]).max(initial=0) <= 0.5 / 65536 + 1e-9
+    for mine, theirs in zip(back.map_from_cam, tile.map_from_cam, strict=True):
+        assert rotation_angle_rad(mine[:3, :3].T @ theirs[:3, :3]) < 1e-4
+
+
+def test_landmarks_take_48_bytes_before_compression() -> None:
+    sizes = [
+        len(unpack(b"FMTL", 1, encode_tile(random_tile(np.random.default_rng(0), landmarks=n, places=0)), "", LIMIT)[1])
+        for n in (0, 1000)
+    ]
+    assert sizes[1] - sizes[0] == 1000 * LANDMARK_BYTES == 48_000
+
+
+def test_a_newer_format_is_refused_by_its_number() -> None:
+    newer = pack(b"FMTL", 7, golden_payload())
+    with pytest.raises(NewerFormatError, match=r"format 7.*up to 1"):
+        decode_tile(newer)
+
+
+def test_every_truncation_and_every_flipped_byte_is_refused() -> None:
+    data = encode_tile(golden_tile())
+    for length in range(len(data)):
+        with pytest.raises(MapFormatError):
+            decode_tile(data[:length])
+    for position in range(len(data)):
+        for mask in (0x01, 0x80, 0xFF):
+            damaged = bytearray(data)
+            damaged[position] ^= mask
+            try:
+                assert encode_tile(decode_tile(bytes(damaged))) == data, position
+            except MapFormatError:
+                continue
+    with pytest.raises(MapFormatError):
+        decode_tile(data + b"\0")
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=400), st.integers(0, 40), st.integers(0, 3), st.integers(0, 9))
+def test_hostile_payloads_are_refused_or_decoded(body: bytes, count: int, places: int, references: int) -> None:
+    head = struct.pack("<iidiIII", 0, 0, 16.0, 0, count, places, references)
+    size = count * 48 + places * 27 + references * 4
+    payload = head + (body * (size // max(len(body), 1) + 1))[:size]
+    try:
+        decode_tile(pack(b"FMTL", 1, payload, level=1))
+    except MapFormatError as error:
+        assert str(error)
+
+
+def test_bombs_are_refused_before_they_are_unpacked() -> None:
+    bomb = zstandard.ZstdCompressor().compress(bytes(300 << 20))
+    honest = struct.pack("<4sHHI", b"FMTL", 1, 0, 300 << 20) + bomb
+    lying = struct.pack("<4sHHI", b"FMTL", 1, 0, 1000) + bomb
+    counts = pack(b"FMTL", 1, struct.pack("<iidiIII", 0, 0, 16.0, 0, 2**32 - 1, 2**32 - 1, 2**32 - 1))
+    started = time.perf_counter()
+    tracemalloc.start()
+    for data in (honest, lying, counts):
+        with pytest.raises(MapFormatError):
+            decode_tile(data)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 20
+    assert time.perf_counter() - started < 5
+
+
+def test_tiles_that_break_their_own_rules_are_not_written() -> None:
+    tile = golden_tile()
+    for change, words in (
+        ({"landmark_ids": tile.landmark_ids[::-1].copy()}, "strictly increasing"),
+        ({"landmark_ids": tile.landmark_ids.astype(np.int64)}, "uint32"),
+        ({"points_map": tile.points_map + np.array([100.0, 0, 0])}, "outside"),
+        ({"points_map": tile.points_map * np.nan}, "not finite"),
+        ({"points_map": tile.points_map + np.array([[0, 0, 0], [0, 0, 1e5]])}, "24 bits"),
+        ({"descriptors": tile.descriptors[:, :31]}, "shape"),
+        ({"view_directions_map": tile.view_directions_map * 2}, "lengths"),
+        ({"size_m": -1.0}, "size_m"),
+        ({"tile_x": 1 << 31}, "too far"),
+        ({"place_landmark_ids": ()}, "0 landmark lists"),
+    ):
+        with pytest.raises(MapFormatError, match=words):
+            encode_tile(replace(tile, **change))
+
+
+GOLDEN_HEX = (
+    "464d544c01000000a700000028b52ffd24a75d04004407ff0200304000f001000000030000000725000100f8000008f0"
+    "000000300000000102030405060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f20212223242526272829"
+    "2a2b2c2d2e2f303132333435363738393a3b3c3d3e3f7f00000000ff148c004005ff004028000001000000080034037c"
+    "24c04552968787e98e3f7310402000d85a30caa5"
+)
+GOLDEN_SHA256 = "d0346ce18229f33cf3bde5e090af33d269b7573348ea42106ca1357a5366b92e"

@@ -1,0 +1,239 @@
+"""Folders that cannot be right: the message names the value and the next step, or the loss is counted."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.recordings import RECORDING_FORMATS, OpenOptions, open_recording
+from recording_samples import HEIGHT, WIDTH, make_sample, write_euroc, write_euroc_imu, write_kitti, write_tumvi
+
+SAMPLE = make_sample(4, imu_before_ns=3_000_000_000)
+
+
+@pytest.fixture
+def euroc(tmp_path: Path) -> Path:
+    return write_euroc(tmp_path / "recording", SAMPLE)
+
+
+def test_no_such_path(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"nowhere does not exist"):
+        open_recording(tmp_path / "nowhere")
+
+
+def test_unknown_format_names_the_known_ones(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(RecordingError) as caught:
+        open_recording(tmp_path)
+    assert all(name in str(caught.value) for name in RECORDING_FORMATS)
+
+
+def test_empty_folder(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="empty folder"):
+        open_recording(tmp_path)
+
+
+def test_missing_camera_folder(euroc: Path) -> None:
+    shutil.rmtree(euroc / "mav0/cam0")
+    with pytest.raises(RecordingError, match="cam0 is missing"):
+        open_recording(euroc)
+
+
+@pytest.mark.parametrize(("write", "gone"), [(write_kitti, "image_0"), (write_kitti, "image_1"), (write_tumvi, "cam0")])
+def test_missing_camera_folder_elsewhere(tmp_path: Path, write: Callable[..., Path], gone: str) -> None:
+    folder = write(tmp_path / "r", SAMPLE)
+    shutil.rmtree(folder / gone)
+    with pytest.raises(RecordingError, match=rf"{gone}.* is missing"):
+        open_recording(folder)
+
+
+def test_camera_folder_without_table_or_images(euroc: Path) -> None:
+    (euroc / "mav0/cam0/data.csv").write_text("#timestamp [ns],filename\n")
+    with pytest.raises(RecordingError, match="names no image"):
+        open_recording(euroc)
+    (euroc / "mav0/cam0/data.csv").unlink()
+    with pytest.raises(RecordingError, match=r"data\.csv cannot be read"):
+        open_recording(euroc)
+
+
+def test_zero_byte_image_is_left_out_and_counted(euroc: Path) -> None:
+    (euroc / "mav0/cam0/data/image3.png").write_bytes(b"")
+    recording = open_recording(euroc)
+    assert len(recording) == 3
+    assert any("without a byte" in loss.what and "image3.png" in loss.detail for loss in recording.losses)
+
+
+def test_nothing_but_zero_byte_images(euroc: Path) -> None:
+    for file in (euroc / "mav0/cam1/data").iterdir():
+        file.write_bytes(b"")
+    with pytest.raises(RecordingError, match=r"cam1: none of the 4 images .*4 are empty"):
+        open_recording(euroc)
+
+
+@pytest.mark.parametrize("image_type", ["png", "jpg"])
+def test_cut_image_is_refused_instead_of_filled_with_grey(tmp_path: Path, image_type: str) -> None:
+    folder = write_euroc(tmp_path / "r", SAMPLE, image_type=image_type)
+    file = folder / f"mav0/cam0/data/image2.{image_type}"
+    file.write_bytes(file.read_bytes()[:-900])
+    recording = open_recording(folder)
+    recording.read_frame(1)
+    with pytest.raises(RecordingError, match=rf"image2\.{image_type}.*cut off"):
+        recording.read_frame(2)
+
+
+def test_image_that_is_none(euroc: Path) -> None:
+    (euroc / "mav0/cam0/data/image2.png").write_bytes(b"this is no image at all")
+    with pytest.raises(RecordingError, match=r"image2\.png.*cannot read as an image"):
+        open_recording(euroc).read_frame(2)
+
+
+def test_image_size_against_calibration_at_open_and_later(euroc: Path) -> None:
+    file = euroc / "mav0/cam1/data/image2.png"
+    whole = file.read_bytes()
+    cv2.imwrite(str(file), np.zeros((HEIGHT, WIDTH - 8), np.uint8))
+    recording = open_recording(euroc)
+    with pytest.raises(
+        RecordingError, match=f"cam1 image .* is {WIDTH - 8}x{HEIGHT} px, the calibration says {WIDTH}x{HEIGHT}"
+    ):
+        recording.read_frame(2)
+    file.write_bytes(whole)
+    sensor = euroc / "mav0/cam0/sensor.yaml"
+    sensor.write_text(sensor.read_text().replace(f"[{WIDTH}, {HEIGHT}]", "[752, 480]"))
+    with pytest.raises(RecordingError, match="752x480.*--calibration"):
+        open_recording(euroc)
+
+
+def test_accelerometer_in_g(euroc: Path) -> None:
+    write_euroc_imu(euroc / "mav0/imu0/data.csv", SAMPLE.imu_stamps_ns, SAMPLE.gyro_radps, SAMPLE.accel_mps2 / 9.80665)
+    with pytest.raises(RecordingError, match=r"in g \(median 1\.00"):
+        open_recording(euroc)
+
+
+def test_gyro_in_degrees(euroc: Path) -> None:
+    write_euroc_imu(
+        euroc / "mav0/imu0/data.csv", SAMPLE.imu_stamps_ns, np.degrees(SAMPLE.gyro_radps), SAMPLE.accel_mps2
+    )
+    with pytest.raises(RecordingError, match="degrees per second"):
+        open_recording(euroc)
+
+
+def test_backward_stamps_are_dropped_and_counted_never_sorted(euroc: Path) -> None:
+    stamps = SAMPLE.imu_stamps_ns.copy()
+    stamps[[50, 51]] = stamps[[51, 50]]
+    stamps[80] = stamps[79]
+    stamps[100] += 10**12  # one wild stamp costs itself alone
+    write_euroc_imu(euroc / "mav0/imu0/data.csv", stamps, SAMPLE.gyro_radps, SAMPLE.accel_mps2)
+    recording = open_recording(euroc)
+    assert (np.diff(recording.imu.stamps_ns) > 0).all()
+    assert len(recording.imu) == len(stamps) - 3
+    (loss,) = recording.losses
+    assert loss.what == "imu: stamps not increasing"
+    assert f"3 of {len(stamps)}" in loss.detail
+    kept = np.isin(SAMPLE.imu_stamps_ns, recording.imu.stamps_ns)
+    np.testing.assert_array_equal(recording.imu.gyro_radps[:50], SAMPLE.gyro_radps[kept][:50])
+
+
+def test_a_clock_that_runs_backwards_is_refused(euroc: Path) -> None:
+    write_euroc_imu(euroc / "mav0/imu0/data.csv", SAMPLE.imu_stamps_ns[::-1], SAMPLE.gyro_radps, SAMPLE.accel_mps2)
+    with pytest.raises(RecordingError, match="stamps go backwards"):
+        open_recording(euroc)
+
+
+def test_camera_stamps_backwards(euroc: Path) -> None:
+    file = euroc / "mav0/cam0/data.csv"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join([lines[0], lines[1], lines[3], lines[2], lines[4]]))
+    recording = open_recording(euroc)
+    assert len(recording) == 3
+    assert (np.diff(recording.frame_stamps_ns) > 0).all()
+    assert any("cam0: stamps not increasing" in loss.what for loss in recording.losses)
+
+
+def test_table_cut_off_in_the_middle_of_a_line(euroc: Path) -> None:
+    file = euroc / "mav0/imu0/data.csv"
+    text = file.read_text()
+    file.write_text(text[: len(text) - 60])
+    recording = open_recording(euroc)
+    assert len(recording.imu) == len(SAMPLE.imu_stamps_ns) - 1
+    assert any("unreadable lines" in loss.what and loss.detail.startswith("1 of") for loss in recording.losses)
+
+
+def test_values_that_are_not_finite(euroc: Path) -> None:
+    gyro = SAMPLE.gyro_radps.copy()
+    gyro[7, 1] = np.nan
+    write_euroc_imu(euroc / "mav0/imu0/data.csv", SAMPLE.imu_stamps_ns, gyro, SAMPLE.accel_mps2)
+    recording = open_recording(euroc)
+    assert np.isfinite(recording.imu.gyro_radps).all()
+    assert any("impossible values" in loss.what for loss in recording.losses)
+
+
+def test_truth_without_rotation_is_left_out(euroc: Path) -> None:
+    file = euroc / "mav0/state_groundtruth_estimate0/data.csv"
+    lines = file.read_text().splitlines()
+    stamp = lines[2].split(",")[0]
+    lines[2] = ",".join([stamp, *["0"] * 16])
+    file.write_text("\n".join(lines))
+    recording = open_recording(euroc)
+    assert recording.ground_truth is not None
+    assert len(recording.ground_truth) == 3
+    assert any("unit quaternion" in loss.detail for loss in recording.losses)
+
+
+def test_missing_sensor_yaml(euroc: Path) -> None:
+    (euroc / "mav0/cam1/sensor.yaml").unlink()
+    with pytest.raises(CalibrationError, match=r"cam1/sensor\.yaml is missing.*--calibration FILE"):
+        open_recording(euroc)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (None, "cannot be read"),
+        ("cam0: [", "is not YAML"),
+        ("just words", "mapping"),
+        ("left: {}", "no cam0"),
+        ("cam0: 3", "cam0 is 3"),
+        ("cam0: {camera_model: omni, distortion_model: radtan}", "omni with distortion radtan is not known"),
+        ("cam0: {camera_model: pinhole, intrinsics: [a, b, c, d], resolution: [1, 1]}", "are not numbers"),
+        ("cam0: {camera_model: pinhole, intrinsics: [1, 1, 1], resolution: [4, 4]}", "4 numbers are expected"),
+        ("cam0: {camera_model: pinhole, resolution: [4, 4]}", "intrinsics is missing"),
+        ("cam0: {camera_model: pinhole, intrinsics: [9, 9, 99, 9], resolution: [20, 20]}", "principal point"),
+        ("cam0: {camera_model: pinhole, intrinsics: [-9, 9, 9, 9], resolution: [20, 20]}", "focal lengths"),
+        (
+            "cam0: {camera_model: pinhole, intrinsics: [9, 9, 9, 9], resolution: [20, 20], T_cam_imu: [[2, 0, 0, 0], "
+            "[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}",
+            "no rotation and translation",
+        ),
+    ],
+)
+def test_calibration_file_missing_or_nonsense(euroc: Path, tmp_path: Path, content: str | None, says: str) -> None:
+    file = tmp_path / "rig.yaml"
+    if content is not None:
+        file.write_text(content)
+    with pytest.raises(CalibrationError, match=says) as caught:
+        open_recording(euroc, OpenOptions(calibration_file=file))
+    assert "rig.yaml" in str(caught.value)
+
+
+def test_calibration_file_with_too_few_cameras(euroc: Path, tmp_path: Path) -> None:
+    file = tmp_path / "rig.yaml"
+    file.write_text(
+        f"cam0: {{camera_model: pinhole, intrinsics: [200, 200, 160, 120], resolution: [{WIDTH}, {HEIGHT}]}}"
+    )
+    with pytest.raises(CalibrationError, match="2 cameras are recorded, the calibration describes 1"):
+        open_recording(euroc, OpenOptions(calibration_file=file))
+
+
+def test_imu_without_mounting_is_not_used_and_said_so(euroc: Path, tmp_path: Path) -> None:
+    file = tmp_path / "rig.yaml"
+    lens = f"camera_model: pinhole, intrinsics: [200, 200, 160, 120], resolution: [{WIDTH}, {HEIGHT}]"
+    rows = "[[1, 0, 0, -0.2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+    file.write_text(f"cam0: {{{lens}}}\ncam1: {{{lens}, T_cn_cnm1: {rows}}}\n")
+    recording = open_recording(euroc, OpenOptions(calibration_file=file))
+    assert recording.sensor_set.value == "stereo"
+    assert len(recording.imu) == 0
+    assert [loss.what for loss in recording.losses] == ["imu not used"]

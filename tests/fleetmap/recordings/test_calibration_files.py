@@ -1,0 +1,91 @@
+"""Calibration files: Kalibr's meaning, and writing that comes back bit for bit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.calibration import CameraCalibration, ImuNoise, RigCalibration
+from fleetmap.geometry import se3, se3_exp
+from fleetmap.recordings import format_calibration, read_calibration
+from fleetmap.recordings.calibration_files import load_calibration, parse_calibration, read_euroc_camera
+from realdata import real_data
+from recording_samples import calibration, kalibr_text
+
+
+def random_rig(seed: int, *, has_imu: bool) -> RigCalibration:
+    rng = np.random.default_rng(seed)
+    cameras = tuple(
+        CameraCalibration(
+            model,
+            640,
+            480,
+            np.array([400, 400, 320, 240]) + rng.standard_normal(4),
+            0.1 * rng.standard_normal(count),
+            se3_exp(rng.standard_normal(6)),
+            float(rng.normal(0, 0.01)),
+        )
+        for model, count in (("equidistant", 4), ("radial-tangential", 5), ("radial-tangential", 0))
+    )
+    noise = ImuNoise(*np.abs(rng.normal(0, 1e-3, 4)).tolist()) if has_imu else None
+    return RigCalibration(cameras, noise, se3_exp(rng.standard_normal(6)))
+
+
+@pytest.mark.parametrize("has_imu", [True, False])
+@pytest.mark.parametrize("seed", range(5))
+def test_what_is_written_comes_back_bit_for_bit(seed: int, has_imu: bool) -> None:
+    rig = random_rig(seed, has_imu=has_imu)
+    back = parse_calibration(format_calibration(rig), "text").calibration
+    assert back.imu == rig.imu
+    np.testing.assert_array_equal(back.base_from_body, rig.base_from_body)
+    for a, b in zip(back.cameras, rig.cameras, strict=True):
+        assert (a.model, a.width_px, a.height_px, a.imu_minus_cam_s) == (
+            b.model,
+            b.width_px,
+            b.height_px,
+            b.imu_minus_cam_s,
+        )
+        np.testing.assert_array_equal(a.intrinsics_px, b.intrinsics_px)
+        np.testing.assert_array_equal(a.distortion, b.distortion)
+        np.testing.assert_array_equal(a.body_from_cam, b.body_from_cam)
+
+
+def test_kalibrs_chain_and_topics(tmp_path: Path) -> None:
+    file = tmp_path / "camchain.yaml"
+    file.write_text(
+        kalibr_text() + "imu0: {gyroscope_noise_density: 1e-4, rostopic: /imu}\nbase_from_body: [[1, 0, 0, 0.2], "
+        "[0, 1, 0, 0], [0, 0, 1, 0.3], [0, 0, 0, 1]]\n"
+    )
+    found = load_calibration(file)
+    for ours, wanted in zip(found.calibration.cameras, calibration().cameras, strict=True):
+        np.testing.assert_allclose(ours.body_from_cam, wanted.body_from_cam, atol=1e-12)
+    assert found.calibration.imu is not None
+    assert found.calibration.imu.gyro_noise_radps_rthz == 1e-4
+    np.testing.assert_array_equal(found.calibration.base_from_body, se3(np.eye(3), np.array([0.2, 0, 0.3])))
+    assert (found.topics["cam1"], found.topics["imu0"]) == ("/cam1/image_raw", "/imu")
+
+
+def test_time_shift_is_kalibrs(tmp_path: Path) -> None:
+    file = tmp_path / "camchain.yaml"
+    file.write_text(kalibr_text().replace("  rostopic: /cam0", "  timeshift_cam_imu: 0.0125\n  rostopic: /cam0"))
+    assert [camera.imu_minus_cam_s for camera in read_calibration(file).cameras] == [0.0125, 0.0125]
+
+
+def test_the_real_chain_agrees_with_itself() -> None:
+    """TUM-VI's file gives cam1 twice, by T_cam_imu and by T_cn_cnm1 after cam0."""
+    file = real_data("tumvi_room1_fisheye_8") / "camchain.yaml"
+    both = read_calibration(file)
+    text = file.read_text()
+    start = text.index("T_cam_imu", text.index("cam1:"))
+    without = text[:start] + text[text.index("T_cn_cnm1") :]
+    chained = parse_calibration(without, "without").calibration
+    np.testing.assert_allclose(chained.cameras[1].body_from_cam, both.cameras[1].body_from_cam, atol=1e-6)
+    assert both.cameras[0].model == "equidistant"
+    assert both.imu is not None
+    assert both.imu.gyro_noise_radps_rthz == pytest.approx(0.00016)
+
+
+def test_the_real_euroc_camera() -> None:
+    camera = read_euroc_camera(real_data("euroc_v101_keyframes") / "mav0/cam0/sensor.yaml")
+    assert camera.body_from_cam[0, 3] == -0.0216401454975
+    assert camera.intrinsics_px.tolist() == [458.654, 457.296, 367.215, 248.375]

@@ -1,0 +1,184 @@
+"""What is particular to single folder formats."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fleetmap.geometry import se3, se3_inverse, so3_exp
+from fleetmap.recordings import OpenOptions, open_recording
+from fleetmap.samples import SensorSet
+from recording_samples import (
+    BASELINE_M,
+    BODY_FROM_CAM0,
+    FOCAL,
+    HEIGHT,
+    WIDTH,
+    calibration,
+    make_sample,
+    write_euroc,
+    write_kitti,
+    write_seven_scenes,
+    write_tumvi,
+)
+
+SAMPLE = make_sample(4)
+
+
+@pytest.mark.parametrize("yaml_line", [True, False])
+def test_euroc_with_and_without_opencvs_first_line(tmp_path: Path, yaml_line: bool) -> None:
+    recording = open_recording(write_euroc(tmp_path / "r", SAMPLE, yaml_line=yaml_line))
+    assert (recording.sensor_set, recording.name, recording.format) == (SensorSet.STEREO_INERTIAL, "r", "euroc")
+    for ours, wanted in zip(recording.calibration.cameras, calibration().cameras, strict=True):
+        np.testing.assert_array_equal(ours.body_from_cam, wanted.body_from_cam)
+        np.testing.assert_array_equal(ours.intrinsics_px, wanted.intrinsics_px)
+    assert recording.calibration.imu == calibration().imu
+    np.testing.assert_array_equal(recording.imu.gyro_radps, SAMPLE.gyro_radps)
+    assert recording.imu.stamps_ns[0] == SAMPLE.stamps_ns[0] - 500_000_000
+
+
+def test_euroc_by_the_mav0_folder_itself(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path / "flight", SAMPLE)
+    recording = open_recording(folder / "mav0")
+    assert recording.name == "flight"
+    assert recording.content_hash() == open_recording(folder).content_hash()
+
+
+def test_euroc_without_second_camera_or_imu(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path / "r", SAMPLE)
+    shutil.rmtree(folder / "mav0/cam1")
+    mono = open_recording(folder)
+    assert mono.sensor_set is SensorSet.MONO_INERTIAL
+    assert mono.read_frame(0).right is None
+    shutil.rmtree(folder / "mav0/imu0")
+    assert open_recording(folder).sensor_set is SensorSet.MONO
+
+
+def test_euroc_imu_that_is_not_the_body(tmp_path: Path) -> None:
+    """The body is the IMU: cameras and truth are given in its axes, wherever EuRoC's body is."""
+    folder = write_euroc(tmp_path / "r", SAMPLE)
+    mounting = se3(so3_exp(np.array([0.1, -0.2, 0.3])), np.array([0.01, 0.02, 0.03]))
+    file = folder / "mav0/imu0/sensor.yaml"
+    text = file.read_text()
+    start, end = text.index("data: [") + 7, text.index("]", text.index("data: ["))
+    file.write_text(text[:start] + ", ".join(repr(float(v)) for v in mounting.ravel()) + text[end:])
+    recording = open_recording(folder)
+    imu_from_cam = recording.calibration.cameras[0].body_from_cam
+    np.testing.assert_allclose(imu_from_cam, se3_inverse(mounting) @ BODY_FROM_CAM0, atol=1e-12)
+    assert recording.ground_truth is not None
+    np.testing.assert_allclose(
+        recording.ground_truth.frame_from_body[0], SAMPLE.world_from_body[0] @ mounting, atol=1e-9
+    )
+
+
+def test_frames_without_partner_are_left_out_and_counted(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path / "r", SAMPLE)
+    (folder / "mav0/cam1/data/image1.png").unlink()
+    recording = open_recording(folder)
+    np.testing.assert_array_equal(recording.frame_stamps_ns, np.delete(SAMPLE.stamps_ns, 1))
+    np.testing.assert_array_equal(recording.read_frame(1).right, SAMPLE.right[2])
+    assert [loss.what for loss in recording.losses] == ["cam1: images missing", "images without their partner"]
+    assert "1 of 4" in recording.losses[0].detail
+
+
+def test_right_images_a_little_late_are_paired(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path / "r", SAMPLE)
+    rows = [f"{s + 1_000_000},image{i}.png" for i, s in enumerate(SAMPLE.stamps_ns)]
+    (folder / "mav0/cam1/data.csv").write_text("\n".join(rows))
+    recording = open_recording(folder)
+    np.testing.assert_array_equal(recording.frame_stamps_ns, SAMPLE.stamps_ns)
+    assert recording.losses == ()
+
+
+def test_jpeg_colour_and_16_bits(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path / "r", SAMPLE)
+    images = folder / "mav0/cam0/data"
+    cv2.imwrite(str(images / "image0.png"), SAMPLE.left[0].astype(np.uint16) * 256 + 255)
+    cv2.imwrite(str(images / "image1.png"), cv2.cvtColor(SAMPLE.left[1], cv2.COLOR_GRAY2BGR))
+    recording = open_recording(folder)
+    for index in (0, 1):
+        np.testing.assert_array_equal(recording.read_frame(index).left, SAMPLE.left[index])
+
+
+def test_kitti_calibration_and_stamps(tmp_path: Path) -> None:
+    recording = open_recording(write_kitti(tmp_path / "r", SAMPLE))
+    assert recording.sensor_set is SensorSet.STEREO
+    np.testing.assert_array_equal(recording.frame_stamps_ns, 100_000_000 * np.arange(4))
+    left, right = recording.calibration.cameras
+    np.testing.assert_allclose(left.intrinsics_px, [FOCAL, FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5])
+    np.testing.assert_array_equal(left.body_from_cam, np.eye(4))
+    np.testing.assert_allclose(right.body_from_cam[:3, 3], [BASELINE_M, 0, 0])
+    assert (left.width_px, left.height_px) == (WIDTH, HEIGHT)
+
+
+def test_kitti_times_and_unlabelled_rows(tmp_path: Path) -> None:
+    folder = write_kitti(tmp_path / "r", SAMPLE)
+    (folder / "times.txt").write_text("0.0\n1.037e-01\n0.2074\n0.311\n")
+    lines = (folder / "calib.txt").read_text().splitlines()[:2]
+    (folder / "calib.txt").write_text("\n".join(line.partition(":")[2].strip() for line in lines))
+    recording = open_recording(folder)
+    np.testing.assert_array_equal(recording.frame_stamps_ns, [0, 103_700_000, 207_400_000, 311_000_000])
+    assert recording.calibration.cameras[1].body_from_cam[0, 3] == pytest.approx(BASELINE_M)
+
+
+def test_tumvi_chain_noise_and_16_bits(tmp_path: Path) -> None:
+    recording = open_recording(write_tumvi(tmp_path / "r", SAMPLE))
+    assert (recording.sensor_set, recording.format) == (SensorSet.STEREO_INERTIAL, "tumvi")
+    for ours, wanted in zip(recording.calibration.cameras, calibration().cameras, strict=True):
+        np.testing.assert_allclose(ours.body_from_cam, wanted.body_from_cam, atol=1e-12)
+    assert recording.calibration.imu == calibration().imu
+    np.testing.assert_array_equal(recording.frame_stamps_ns, SAMPLE.stamps_ns)
+
+
+def test_tumvis_export_in_eurocs_layout(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path / "r", SAMPLE)
+    tumvi = write_tumvi(tmp_path / "t", SAMPLE)
+    for file in folder.glob("mav0/*/sensor.yaml"):
+        file.unlink()
+    (folder / "dso").mkdir()
+    shutil.copy(tumvi / "camchain.yaml", folder / "dso")
+    shutil.rmtree(folder / "mav0/state_groundtruth_estimate0")
+    shutil.copy(tumvi / "gt_imu.csv", folder / "dso")
+    recording = open_recording(folder)
+    assert recording.sensor_set is SensorSet.STEREO_INERTIAL
+    np.testing.assert_allclose(recording.calibration.cameras[0].body_from_cam, BODY_FROM_CAM0, atol=1e-12)
+    assert recording.ground_truth is not None
+    assert len(recording.ground_truth) == 4
+
+
+def test_seven_scenes_depth_is_registered_to_colour(tmp_path: Path) -> None:
+    """A step in the middle stays there; one elsewhere moves towards the middle by 525/585."""
+    folder = write_seven_scenes(tmp_path / "r", SAMPLE)
+    recording = open_recording(folder)
+    assert recording.sensor_set is SensorSet.RGBD
+    assert recording.frame_stamps_ns.tolist() == [round(i * 5 * 1e9 / 30) for i in range(4)]
+    depth = recording.read_frame(0).depth_m
+    assert depth is not None
+    assert set(np.unique(depth)) == {np.float32(0), np.float32(2), np.float32(5)}
+    middle = depth[HEIGHT // 2]
+    # The depth lens is the longer one: it does not see the colour image's outer 16 columns
+    assert (middle[17 : WIDTH // 2] == 2).all()
+    assert (middle[WIDTH // 2 + 1 : -17] == 5).all()
+    assert (middle[:16] == 0).all()
+    # The unknown rows end 100 rows above the centre in the depth image, 100 * 525/585 = 89.7 in the colour image
+    known_rows = np.flatnonzero(depth[:, 40] > 0)
+    assert known_rows[0] == pytest.approx(HEIGHT / 2 - 100 * 525 / 585, abs=1)
+    assert known_rows[-1] == pytest.approx(HEIGHT / 2 + 100 * 525 / 585, abs=1)
+
+
+def test_seven_scenes_with_a_depth_camera_beside_the_colour_camera(tmp_path: Path) -> None:
+    """A point at depth z seen from 50 mm to the right moves by f * 0.05 / z px in the colour image."""
+    folder = write_seven_scenes(tmp_path / "r", SAMPLE)
+    lens = f"camera_model: pinhole, distortion_model: none, intrinsics: [300, 300, {WIDTH / 2}, {HEIGHT / 2}], resolution: [{WIDTH}, {HEIGHT}]"
+    rows = "[[1, 0, 0, -0.05], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+    (tmp_path / "rig.yaml").write_text(f"cam0: {{{lens}}}\ncam1: {{{lens}, T_cn_cnm1: {rows}}}\n")
+    recording = open_recording(folder, OpenOptions(calibration_file=tmp_path / "rig.yaml"))
+    depth = recording.read_frame(0).depth_m
+    assert depth is not None
+    near = np.flatnonzero(depth[HEIGHT // 2] == 2)
+    far = np.flatnonzero(depth[HEIGHT // 2] == 5)
+    assert near[-1] == pytest.approx(WIDTH // 2 - 1 + 300 * 0.05 / 2, abs=1)
+    assert far[0] == near[-1] + 1
+    assert far[-1] == WIDTH - 1

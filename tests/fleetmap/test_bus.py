@@ -1,0 +1,187 @@
+"""Both buses keep the same promises; zenoh's own pitfalls are covered on loopback."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from fleetmap.bus import Bus, MemoryBus, MemoryHub, ZenohBus, check_endpoint, key_matches
+from fleetmap.errors import LinkError, StoreError, UnreachableError, UsageError
+
+
+@pytest.fixture(params=["memory", "zenoh"])
+def pair(request: pytest.FixtureRequest) -> Iterator[tuple[Bus, Bus]]:
+    """Server and robot."""
+    if request.param == "memory":
+        hub = MemoryHub()
+        server, robot = MemoryBus(hub), MemoryBus(hub)
+    else:
+        server = ZenohBus.listen("tcp/127.0.0.1:0")
+        robot = ZenohBus.connect(server.endpoint)
+    with server, robot:
+        yield server, robot
+    assert server.closed()
+    assert robot.closed()
+
+
+def eventually(condition: Callable[[], bool], within_s: float = 5.0) -> bool:
+    deadline = time.monotonic() + within_s
+    while time.monotonic() < deadline:
+        if condition():
+            return True
+        time.sleep(0.01)
+    return condition()
+
+
+def test_questions_are_answered(pair: tuple[Bus, Bus]) -> None:
+    server, robot = pair
+    server.queryable("site/*/blobs/*", lambda key, payload: key.encode() + b"|" + payload)
+    assert robot.get("site/a/blobs/b", b"why") == b"site/a/blobs/b|why"
+    big = bytes(range(256)) * 8192
+    server.queryable("big", lambda *_: big)
+    assert robot.get("big") == big
+    assert eventually(robot.connected)
+
+
+def test_refusals_and_faults_reach_the_asker(pair: tuple[Bus, Bus], caplog: pytest.LogCaptureFixture) -> None:
+    server, robot = pair
+
+    def answer(key: str, _: bytes) -> bytes:
+        if key.endswith("known"):
+            raise StoreError("the disk is gone")
+        raise ZeroDivisionError
+
+    server.queryable("ask/*", answer)
+    with pytest.raises(LinkError, match="disk is gone") as refusal:
+        robot.get("ask/known")
+    assert not isinstance(refusal.value, UnreachableError)
+    with pytest.raises(LinkError, match=r"internal error.*ZeroDivisionError"):
+        robot.get("ask/fault")
+    assert "answering ask/fault failed" in caplog.text
+
+
+def test_silence_is_an_error(pair: tuple[Bus, Bus]) -> None:
+    with pytest.raises(UnreachableError, match=r"nobody answered for nothing/here"):
+        pair[1].get("nothing/here", timeout_s=0.2)
+
+
+def test_a_slow_answer_is_silence_not_a_refusal() -> None:
+    done = threading.Event()
+    with ZenohBus.listen("tcp/127.0.0.1:0") as server, ZenohBus.connect(server.endpoint) as robot:
+        server.queryable("slow", lambda *_: b"late" if done.wait(20) else b"")
+        with pytest.raises(UnreachableError):
+            robot.get("slow", timeout_s=0.3)
+        done.set()
+        assert robot.get("slow") == b"late"
+
+
+def test_publications_reach_matching_subscribers(pair: tuple[Bus, Bus], caplog: pytest.LogCaptureFixture) -> None:
+    server, robot = pair
+    heard: list[tuple[str, bytes]] = []
+
+    def fail(*_: object) -> None:
+        raise ValueError
+
+    robot.subscribe("a/*/c", lambda key, payload: heard.append((key, payload)))
+    robot.subscribe("a/b/c", fail)
+
+    def told() -> bool:
+        server.publish("a/b/c", b"1")
+        return len(heard) > 0
+
+    assert eventually(told)
+    assert heard[0] == ("a/b/c", b"1")
+    server.publish("a/b/other", b"2", may_drop=True)
+    assert all(key == "a/b/c" for key, _ in heard)
+    assert eventually(lambda: "subscriber for a/b/c failed" in caplog.text)
+
+
+def test_presence_ends_with_its_handle(pair: tuple[Bus, Bus]) -> None:
+    server, robot = pair
+    robot.declare_alive("robots/r1/alive")
+    second = robot.declare_alive("robots/r2/alive")
+    assert eventually(lambda: server.alive("robots/*/alive") == ["robots/r1/alive", "robots/r2/alive"])
+    second.close()
+    second.close()
+    assert eventually(lambda: server.alive("robots/*/alive") == ["robots/r1/alive"])
+    robot.close()
+    assert eventually(lambda: server.alive("robots/*/alive") == [])
+
+
+def test_a_closed_handle_answers_no_more(pair: tuple[Bus, Bus]) -> None:
+    server, robot = pair
+    handle = server.queryable("x", lambda *_: b"y")
+    assert robot.get("x") == b"y"
+    handle.close()
+    with pytest.raises(UnreachableError):
+        robot.get("x", timeout_s=0.2)
+    server.close()
+    with pytest.raises(LinkError, match="closed"):
+        server.queryable("x", lambda *_: b"y")
+
+
+def test_a_robot_survives_the_absence_of_its_server() -> None:
+    server = ZenohBus.listen("tcp/127.0.0.1:0")
+    endpoint = server.endpoint
+    server.close()
+    with ZenohBus.connect(endpoint) as robot:
+        robot.publish("lost", b"")
+        with pytest.raises(UnreachableError):
+            robot.get("x", timeout_s=0.2)
+        for _ in range(2):
+            with ZenohBus.listen(endpoint) as back:
+                back.queryable("x", lambda *_: b"back")
+                assert robot.get("x", timeout_s=20) == b"back"
+
+
+def test_the_server_stays_on_its_own_endpoint() -> None:
+    with ZenohBus.listen("tcp/127.0.0.1:0") as server:
+        with pytest.raises(LinkError, match="another server"):
+            ZenohBus.listen(server.endpoint)
+        with ZenohBus.listen("tcp/127.0.0.1:0") as other:
+            other.queryable("x", lambda *_: b"not yours")
+            with ZenohBus.connect(server.endpoint) as robot, pytest.raises(UnreachableError):
+                # Nothing is found by multicast or gossip: servers on one network don't see each other's robots.
+                robot.get("x", timeout_s=0.5)
+
+
+def test_threads_end_with_the_bus() -> None:
+    before = threading.active_count()
+    with ZenohBus.listen("tcp/127.0.0.1:0") as server:
+        server.subscribe("a", lambda *_: None)
+        server.queryable("b", lambda *_: b"")
+    assert eventually(lambda: threading.active_count() <= before)
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["", "127.0.0.1:7447", "tcp/127.0.0.1", "tcp/:7447", "http/127.0.0.1:80", "tcp/a:99999"]
+)
+def test_wrong_endpoints_are_usage_errors(endpoint: str) -> None:
+    with pytest.raises(UsageError, match="endpoint"):
+        check_endpoint(endpoint)
+
+
+def test_memory_network_can_be_away() -> None:
+    hub = MemoryHub()
+    with MemoryBus(hub) as server, MemoryBus(hub) as robot:
+        server.queryable("x", lambda *_: b"y")
+        hub.reachable = False
+        assert not robot.connected()
+        with pytest.raises(UnreachableError):
+            robot.get("x")
+        hub.reachable = True
+        assert robot.get("x") == b"y"
+
+
+def test_key_expressions() -> None:
+    for key_expr, key, expected in (
+        ("a/*/c", "a/b/c", True),
+        ("a/*/c", "a/b/d/c", False),
+        ("a/**/c", "a/b/d/c", True),
+        ("a/**", "a", True),
+        ("**", "a/b", True),
+        ("a", "b", False),
+        ("a/*", "a", False),
+    ):
+        assert key_matches(key_expr, key) is expected, (key_expr, key)

@@ -1,0 +1,167 @@
+"""The commands: recordings that both formats' readers open, faults in the pictures, equal bytes for equal seeds."""
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fleetmap.errors import UsageError
+from fleetmap.recordings import open_recording
+from fleetmap.samples import SensorSet
+from fleetsim.cli import app
+from fleetsim.faults import Fault
+from fleetsim.recorder import Order, prepare
+from fleetsim.scenarios import SCENARIOS
+
+SIZE = ["--size", "160x120"]
+
+
+def _run(*arguments: str) -> str:
+    result = CliRunner().invoke(app, list(arguments))
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def _record(folder: Path, *arguments: str) -> Path:
+    out = folder / "clip.mcap"
+    _run("record", "clip", "--out", str(out), "--frames", "6", *SIZE, *arguments)
+    return out
+
+
+def test_scenarios_come_smallest_first() -> None:
+    names = [line.split()[0] for line in _run("scenarios").splitlines()]
+    assert names == list(SCENARIOS)
+    sizes = [SCENARIOS[name]().layout.length_m * SCENARIOS[name]().layout.width_m for name in names]
+    assert sizes == sorted(sizes)
+
+
+def test_an_mcap_recording_opens_with_everything_in_it(tmp_path: Path) -> None:
+    recording = open_recording(_record(tmp_path, "--robot", "tote-1"))
+    assert recording.sensor_set is SensorSet.STEREO_INERTIAL
+    assert len(recording.frame_stamps_ns) == 6
+    assert recording.losses == ()
+    assert len(recording.priors) == 1
+    assert len(recording.wheel) > 10
+    assert recording.calibration.base_from_body[2, 3] == 0.25
+    truth = recording.ground_truth
+    assert truth is not None
+    for index, stamp_ns in enumerate(recording.frame_stamps_ns.tolist()):
+        assert truth.at(stamp_ns) is not None
+        frame = recording.read_frame(index)
+        assert frame.left.shape == (120, 160)
+        assert frame.right is not None
+        assert 20 < frame.left.mean() < 200
+        assert not np.array_equal(frame.left, frame.right)
+    assert recording.imu.stamps_ns[0] <= recording.frame_stamps_ns[0]
+    assert recording.imu.stamps_ns[-1] >= recording.frame_stamps_ns[-1]
+
+
+def test_both_formats_hold_the_same(tmp_path: Path) -> None:
+    mcap = open_recording(_record(tmp_path))
+    _run("record", "clip", "--out", str(tmp_path / "folder"), "--frames", "6", "--format", "euroc", *SIZE)
+    euroc = open_recording(tmp_path / "folder")
+    np.testing.assert_array_equal(mcap.frame_stamps_ns, euroc.frame_stamps_ns)
+    np.testing.assert_array_equal(mcap.imu.gyro_radps, euroc.imu.gyro_radps)
+    np.testing.assert_array_equal(mcap.read_frame(4).right, euroc.read_frame(4).right)
+    for one, other in zip(mcap.calibration.cameras, euroc.calibration.cameras, strict=True):
+        np.testing.assert_array_equal(one.intrinsics_px, other.intrinsics_px)
+        np.testing.assert_array_equal(one.body_from_cam, other.body_from_cam)
+    assert mcap.ground_truth is not None
+    assert euroc.ground_truth is not None
+    np.testing.assert_allclose(mcap.ground_truth.frame_from_body, euroc.ground_truth.frame_from_body, atol=1e-9)
+
+
+def test_equal_seeds_give_equal_bytes_and_others_do_not(tmp_path: Path) -> None:
+    digests = []
+    for number, arguments in enumerate(([], [], ["--seed", "1"], ["--light", "night"])):
+        (tmp_path / str(number)).mkdir()
+        digests.append(hashlib.sha256(_record(tmp_path / str(number), *arguments).read_bytes()).hexdigest())
+    assert digests[0] == digests[1]
+    assert len(set(digests)) == 3
+
+
+_PICTURES = """
+import hashlib
+from fleetsim.recorder import Order, prepare
+session = prepare(Order("clip", seed=4, robot="tote-1", lens="equidistant", size_px=(160, 120)))
+shots = [session.renderer.shoot(t) for t in (1.2, 1.9)]
+print(hashlib.sha256(b"".join(s.left.tobytes() + s.right.tobytes() for s in shots)).hexdigest())
+session.renderer.close()
+"""
+
+
+@pytest.mark.slow
+def test_the_same_bytes_on_an_older_machine(tmp_path: Path) -> None:
+    """Compiled for a processor without AVX and FMA the pictures are the same to the bit."""
+    digests = []
+    for name in ("", "x86-64-v2"):
+        environment = dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path))
+        if name:
+            environment |= {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(tmp_path)}
+        done = subprocess.run(
+            [sys.executable, "-c", _PICTURES], env=environment, capture_output=True, text=True, check=True
+        )
+        digests.append(done.stdout.strip())
+    assert digests[0] == digests[1]
+
+
+def test_contact_sheet(tmp_path: Path) -> None:
+    _run("show", "clip", "--out", str(tmp_path / "sheet.png"), "--pictures", "2")
+    assert (tmp_path / "sheet.png").stat().st_size > 10_000
+
+
+def test_camera_faults_are_in_the_pictures() -> None:
+    faults = (
+        Fault("camera-dark", 0.5, 0.6), Fault("camera-frozen", 0.7, 0.9), Fault("over-exposure", 1.0, 1.1),
+        Fault("person-in-front", 1.2, 1.3), Fault("frames-dropped", 1.4, 1.5), Fault("frames-late", 1.6, 1.7),
+    )  # fmt: skip
+    session = prepare(Order("clip", size_px=(160, 120), faults=faults))
+    try:
+        shoot = session.renderer.shoot
+        plain, dark, glare = shoot(0.45), shoot(0.55), shoot(1.05)
+        assert dark.left.mean() < 0.2 * plain.left.mean()
+        assert glare.left.mean() > 1.7 * plain.left.mean()
+        before, first, second = shoot(0.65), shoot(0.75), shoot(0.85)
+        assert np.array_equal(before.right, first.right)
+        assert np.array_equal(first.right, second.right)
+        assert not np.array_equal(first.left, second.left)
+        assert 0.3 < np.median(shoot(1.25).depth_m[40:110, 60:100]) < 0.9
+        assert not any(1.4 <= time_s < 1.5 for time_s in session.frame_times_s)
+        stamps, regular = np.array(session.frame_stamps_ns()), np.array(session.frame_times_s)
+        lateness = (stamps - stamps[0]) * 1e-9 - regular
+        late = (regular >= 1.6) & (regular < 1.7)
+        assert late.any()
+        assert lateness[late] == pytest.approx(0.05, abs=1e-6)
+        assert lateness[~late] == pytest.approx(0.0, abs=1e-6)
+    finally:
+        session.renderer.close()
+
+
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        (Order("moon"), "unknown scenario 'moon'; known are clip"),
+        (Order("clip", light="dusk"), "unknown light 'dusk'; known are day"),
+        (Order("clip", robot="r2"), "no robot 'r2'.*survey"),
+        (Order("clip", lens="fish"), "unknown lens 'fish'; known are pinhole"),
+        (Order("clip", day=-1), "day -1"),
+    ],
+)
+def test_nonsense_orders_are_refused(order: Order, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        prepare(order)
+
+
+def test_an_existing_file_is_kept(tmp_path: Path) -> None:
+    out = tmp_path / "there.mcap"
+    out.write_bytes(b"precious")
+    with pytest.raises(UsageError, match="exists already"):
+        _run("record", "clip", "--out", str(out))
+    assert out.read_bytes() == b"precious"

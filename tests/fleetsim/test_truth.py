@@ -1,0 +1,86 @@
+"""Pictures against the truth: what KLT tracks must lie where calibration, true depth and true motion put it."""
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fleetmap.calibration import RigCalibration
+from fleetmap.geometry import se3_inverse, transform_points
+from fleetsim.motion import RouteMotion
+from fleetsim.painter import Look
+from fleetsim.rendering import StereoRenderer
+from fleetsim.robots import ROBOTS, nominal_calibration
+from fleetsim.routes import Route
+from simulated_views import small_world
+
+Array = NDArray[np.float64]
+MOMENTS_S = (3.0, 6.0, 9.5, 12.0, 14.0)
+
+
+def _renderer(lens: str, *, has_blur: bool) -> tuple[RigCalibration, StereoRenderer]:
+    world = small_world()
+    y = world.layout.aisle_y_m(0), world.layout.aisle_y_m(1)
+    route = Route(((2.7, y[0]), (20.0, y[0]), (20.0, y[1]), (12.0, y[1])))
+    kind = ROBOTS["surveyor"].with_lens(lens)
+    motion = RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, np.random.default_rng(0))
+    rig = nominal_calibration(kind)
+    return rig, StereoRenderer(world, rig, motion, "day", look=Look(has_blur=has_blur))
+
+
+def _track(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], pixels: NDArray[np.float32]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Pixels in `second`, and which of them come back to within half a pixel when tracked in reverse."""
+    options = {"winSize": (21, 21), "maxLevel": 4}
+    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, pixels, None, **options)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, None, **options)
+    kept = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (np.linalg.norm((back - pixels)[:, 0], axis=1) < 0.5)
+    return there[:, 0].astype(np.float64), kept
+
+
+@pytest.mark.parametrize(
+    ("lens", "has_blur"), [("pinhole", False), ("radial-tangential", False), ("equidistant", False), ("pinhole", True)]
+)
+def test_tracks_lie_where_truth_says(lens: str, has_blur: bool) -> None:
+    rig, renderer = _renderer(lens, has_blur=has_blur)
+    left, right = rig.cameras
+    epipolar_px, temporal_px, stereo_px = [], [], []
+    for moment_s in MOMENTS_S:
+        shot, later = renderer.shoot(moment_s), renderer.shoot(moment_s + 0.05)
+        corners = cv2.goodFeaturesToTrack(shot.left, 300, 0.01, 12)
+        pixels = corners[:, 0].astype(np.float64)
+        rays = left.ray_from_pixel(pixels)
+        column, row = np.rint(pixels).astype(int).T
+        points_left = rays / rays[:, 2:] * shot.depth_m[row, column].astype(np.float64)[:, None]
+
+        seen, kept = _track(shot.left, shot.right, corners)
+        rays_right = right.ray_from_pixel(seen)
+        rise = rays[:, 1] / rays[:, 2] - rays_right[:, 1] / rays_right[:, 2]
+        epipolar_px.append(np.median(np.abs(rise[kept])) * left.intrinsics_px[0])
+        right_from_left = se3_inverse(right.body_from_cam) @ left.body_from_cam
+        expected = right.pixel_from_ray(transform_points(right_from_left, points_left))
+        stereo_px.append(np.median(np.linalg.norm(expected - seen, axis=1)[kept]))
+
+        seen, kept = _track(shot.left, later.left, corners)
+        later_from_left = se3_inverse(renderer.path(0)(moment_s + 0.05)) @ renderer.path(0)(moment_s)
+        expected = left.pixel_from_ray(transform_points(later_from_left, points_left))
+        temporal_px.append(np.median(np.linalg.norm(expected - seen, axis=1)[kept]))
+        assert kept.mean() > 0.6
+    renderer.close()
+    assert np.median(epipolar_px) < 0.12
+    assert np.median(temporal_px) < 0.25
+    assert np.median(stereo_px) < 0.4
+
+
+def test_exposure_follows_the_light() -> None:
+    means = {}
+    for light in ("day", "evening", "night"):
+        _, renderer = _renderer("pinhole", has_blur=False)
+        by_light = StereoRenderer(small_world(), nominal_calibration(ROBOTS["surveyor"]), renderer._motion, light)
+        exposure, shot = by_light.exposure(6.0), by_light.shoot(6.0)
+        means[light] = float(shot.left.mean()), exposure.time_s * exposure.gain
+        renderer.close()
+        by_light.close()
+    assert all(50 < mean < 150 for mean, _ in means.values())
+    assert means["day"][1] < means["evening"][1] < means["night"][1]

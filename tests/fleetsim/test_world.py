@@ -1,0 +1,88 @@
+"""Stock that moves by day, aisles that are identical on request, chunks that do not depend on the way there."""
+
+import numpy as np
+import pytest
+
+from fleetsim.layout import Layout
+from fleetsim.stock import Slot, last_restock_day, mix, slot_generator
+from fleetsim.world import World
+
+
+def _slots(layout: Layout) -> list[Slot]:
+    return [
+        Slot(row, bay, level)
+        for row in range(layout.rows)
+        for bay in range(layout.bays)
+        for level in range(layout.levels)
+    ]
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.125, 0.5])
+def test_share_of_restocked_slots(rate: float) -> None:
+    layout = Layout(aisles=10, bays=20, restock_per_day=rate)
+    slots = _slots(layout)
+    after_one = np.mean([last_restock_day(layout, 5, 1, slot) == 1 for slot in slots])
+    after_three = np.mean([last_restock_day(layout, 5, 3, slot) > 0 for slot in slots])
+    assert abs(after_one - rate) < 0.03
+    assert abs(after_three - (1 - (1 - rate) ** 3)) < 0.04
+
+
+def test_a_slot_keeps_its_content_until_it_is_restocked() -> None:
+    layout = Layout(aisles=2, bays=4)
+    changed = 0
+    for slot in _slots(layout):
+        first, next_day = (slot_generator(layout, 5, day, slot).random(4) for day in (0, 1))
+        is_same = np.array_equal(first, next_day)
+        assert is_same == (last_restock_day(layout, 5, 1, slot) == 0)
+        changed += not is_same
+    assert 0 < changed < len(_slots(layout)) / 2
+
+
+def test_stock_changes_faces_only_where_restocked() -> None:
+    today, tomorrow = (World(Layout(aisles=1, bays=4), seed=5, day=day).detailed_faces(0, 0).quads for day in (0, 3))
+    common = {row.tobytes() for row in today} & {row.tobytes() for row in tomorrow}
+    assert 0.5 * len(today) < len(common) < len(today)
+
+
+def _inside_rows(world: World, row: int) -> set[bytes]:
+    """Faces of a chunk that carry texture, relative to their aisle, rounded to a micrometre."""
+    faces = world.detailed_faces(0, row)
+    moved = faces.quads.copy()
+    moved[:, 1] -= world.layout.aisle_y_m(row)
+    columns = np.concatenate([np.round(moved, 6), np.round(faces.values, 6), faces.numbers[:, :2]], axis=1) + 0.0
+    return {line.tobytes() for line in columns}
+
+
+def test_identical_aisles_are_identical_and_others_are_not() -> None:
+    plain = {"aisles": 5, "bays": 4, "has_landmarks": False}
+    identical = World(Layout(**plain, are_aisles_identical=True), seed=5)
+    inner = [_inside_rows(identical, row) for row in (1, 2, 3)]
+    assert inner[0] == inner[1] == inner[2]
+    distinct = World(Layout(**plain), seed=5)
+    inner = [_inside_rows(distinct, row) for row in (1, 2)]
+    assert len(inner[0] & inner[1]) < 0.1 * len(inner[0])
+
+
+def test_a_chunk_looks_the_same_whatever_was_visited_before() -> None:
+    layout = Layout(aisles=6, bays=8)
+    direct, roundabout = World(layout, seed=1), World(layout, seed=1)
+    for x_m, y_m in ((3.0, 27.0), (5.0, 3.0)):
+        roundabout.scene_around(x_m, y_m)
+    one, other = direct.scene_around(28.0, 20.0), roundabout.scene_around(28.0, 20.0)
+    assert one is not other
+    for name in ("quads", "values", "numbers", "light"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_far_chunks_are_plain() -> None:
+    world = World(Layout(aisles=12, bays=4), seed=1)
+    scene = world.scene_around(5.0, 3.0)
+    sizes = np.diff(scene.ranges, axis=1)[:, 0]
+    assert sizes[-1] < 0.2 * sizes[0]
+
+
+def test_mixing_is_even_and_repeats() -> None:
+    bits = np.array([mix(7, number) for number in range(4000)], np.uint64)
+    assert mix(7, 5) == mix(7, 5) != mix(5, 7)
+    ones = np.array([int((bits >> np.uint64(place) & np.uint64(1)).sum()) for place in range(64)])
+    assert (np.abs(ones - 2000) < 200).all()

@@ -1,0 +1,212 @@
+"""The HTTP API: answers, validators, ranges, problem documents."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi.testclient import TestClient
+
+from fleetmap.bus import MemoryBus, MemoryHub
+from fleetmap.mapformat import blob_path, decode_manifest, decode_tile, sha256_hex
+from fleetmap.messages import RobotAck, RobotHealth
+from map_samples import save_sample_draft
+from mapserver.api.app import create_app
+from mapserver.api.metrics import Metrics
+from mapserver.fleet import Fleet
+from mapserver.store import MapStore
+
+
+@dataclass
+class Server:
+    client: TestClient
+    store: MapStore
+    fleet: Fleet
+    bus: MemoryBus
+    folder: Path
+
+    @property
+    def tile(self) -> str:
+        return self.store.manifest("lab", 1).tiles[0].sha256
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    with MapStore.open(tmp_path, create=True) as store, MemoryBus(MemoryHub()) as bus:
+        save_sample_draft(store)
+        store.publish("lab")
+        save_sample_draft(store, seed=2)
+        fleet = Fleet(store)
+        app = create_app(store, fleet, Metrics(store, fleet), bus)
+        with TestClient(app, raise_server_exceptions=False) as client:
+            yield Server(client, store, fleet, bus, tmp_path)
+
+
+def check_problem(response: httpx.Response, status: int, words: str) -> None:
+    assert response.status_code == status
+    assert response.headers["content-type"] == "application/problem+json"
+    body = response.json()
+    assert body["status"] == status
+    assert body["type"] == "about:blank"
+    assert body["title"]
+    assert words in body["detail"]
+    assert body["instance"] == response.request.url.path
+
+
+def test_lists(server: Server) -> None:
+    sites = server.client.get("/v1/sites").json()["sites"]
+    assert [(site["site"], site["current_version"], site["versions"]) for site in sites] == [("lab", 1, 2)]
+    versions = server.client.get("/v1/sites/lab/versions").json()["versions"]
+    assert [(v["version"], v["state"], v["parent"]) for v in versions] == [(1, "current", None), (2, "draft", 1)]
+    current = server.client.get("/v1/sites/lab/current").json()
+    assert current == versions[0]
+    assert current["map_bytes"] == server.store.version("lab", 1).map_bytes
+
+
+def test_manifests_and_blobs_are_the_stored_bytes(server: Server) -> None:
+    response = server.client.get("/v1/sites/lab/versions/1")
+    assert response.headers["content-type"] == "application/json"
+    assert sha256_hex(response.content) == server.store.version("lab", 1).manifest_sha256
+    manifest = decode_manifest(response.content)
+    for entry in manifest.tiles:
+        tile = server.client.get(f"/v1/tiles/{entry.sha256}")
+        assert sha256_hex(tile.content) == entry.sha256
+        assert "immutable" in tile.headers["cache-control"]
+        assert len(decode_tile(tile.content)) == entry.landmarks
+    vocabulary = server.client.get(f"/v1/vocabularies/{manifest.vocabulary.sha256}")
+    assert vocabulary.content == b"words" * 50
+
+
+def test_etag(server: Server) -> None:
+    url, etag = f"/v1/tiles/{server.tile}", f'"{server.tile}"'
+    assert server.client.get(url).headers["etag"] == etag
+    for condition in (etag, f"W/{etag}", f'"other", {etag}', "*"):
+        response = server.client.get(url, headers={"If-None-Match": condition})
+        assert (response.status_code, response.content, response.headers["etag"]) == (304, b"", etag)
+    assert server.client.get(url, headers={"If-None-Match": '"other"'}).status_code == 200
+    head = server.client.head(url)
+    assert (head.status_code, head.content) == (200, b"")
+    assert int(head.headers["content-length"]) == server.store.manifest("lab", 1).tiles[0].bytes
+
+
+@pytest.mark.parametrize(
+    ("header", "start", "end"),
+    [
+        ("bytes=0-0", 0, 1),
+        ("bytes=10-19", 10, 20),
+        ("bytes=100-", 100, None),
+        ("bytes=-7", -7, None),
+        ("bytes=5-99999999", 5, None),
+        ("bytes=-99999999", 0, None),
+    ],
+)
+def test_ranges(server: Server, header: str, start: int, end: int | None) -> None:
+    url = f"/v1/tiles/{server.tile}"
+    whole = server.client.get(url).content
+    response = server.client.get(url, headers={"Range": header})
+    assert response.status_code == 206
+    assert response.content == whole[start:end]
+    first = start % len(whole) if start < 0 else start
+    assert response.headers["content-range"] == f"bytes {first}-{first + len(response.content) - 1}/{len(whole)}"
+
+
+def test_ranges_that_cannot_be_or_need_not_be_served(server: Server) -> None:
+    url = f"/v1/tiles/{server.tile}"
+    size = len(server.client.get(url).content)
+    for header in (f"bytes={size}-", "bytes=-0"):
+        response = server.client.get(url, headers={"Range": header})
+        check_problem(response, 416, "outside")
+        assert response.headers["content-range"] == f"bytes */{size}"
+    for headers in (
+        {"Range": "bytes=5-2"},
+        {"Range": "bytes=0-1,3-4"},
+        {"Range": "lines=0-1"},
+        {"Range": "bytes=-"},
+        {"Range": "bytes=0-1", "If-Range": '"other"'},
+    ):
+        response = server.client.get(url, headers=headers)
+        assert (response.status_code, len(response.content)) == (200, size)
+
+
+def test_problems(server: Server) -> None:
+    get = server.client.get
+    check_problem(get("/v1/sites/nowhere/versions"), 404, "no site nowhere")
+    check_problem(get("/v1/sites/..%2Fetc/current"), 404, "")
+    check_problem(get("/v1/sites/Lab/current"), 404, "site name")
+    check_problem(get("/v1/sites/lab/versions/9"), 404, "no version 9")
+    check_problem(get("/v1/sites/lab/versions/x"), 422, "version")
+    check_problem(get("/v1/tiles/zz"), 422, "sha256")
+    check_problem(get("/v1/tiles/" + "0" * 64), 404, "no published tile")
+    check_problem(get("/nowhere"), 404, "")
+    check_problem(server.client.post("/v1/sites"), 405, "")
+    save_sample_draft(server.store, site="new")
+    check_problem(get("/v1/sites/new/current"), 404, "no published version")
+
+
+def test_archives_drafts_and_other_kinds_are_not_served(server: Server) -> None:
+    info = server.store.version("lab", 1)
+    for sha256 in (
+        info.archive_sha256,
+        info.manifest_sha256,
+        info.vocabulary_sha256,
+        server.store.manifest("lab", 2).tiles[0].sha256,
+    ):
+        check_problem(server.client.get(f"/v1/tiles/{sha256}"), 404, "no published tile")
+
+
+def test_damaged_and_missing_bytes_are_server_errors(server: Server) -> None:
+    path = server.folder / blob_path(server.tile)
+    path.write_bytes(path.read_bytes() + b"x")
+    check_problem(server.client.get(f"/v1/tiles/{server.tile}"), 500, "damaged")
+    path.unlink()
+    check_problem(server.client.get(f"/v1/tiles/{server.tile}"), 503, "cannot be read")
+
+
+def test_an_unexpected_fault_is_a_problem_too(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("secret")
+
+    monkeypatch.setattr(server.store, "sites", fail)
+    response = server.client.get("/v1/sites")
+    check_problem(response, 500, "internal error")
+    assert "secret" not in response.text
+
+
+def test_robots(server: Server) -> None:
+    assert server.client.get("/v1/robots").json() == {"robots": []}
+    server.fleet.take_ack("lab", "r1", RobotAck(site="lab", robot="r1", stamp_ns=1, version=1))
+    server.fleet.take_health("lab", "r1", RobotHealth(site="lab", robot="r1", stamp_ns=2, version=1, status="TRACKING"))
+    (robot,) = server.client.get("/v1/robots").json()["robots"]
+    assert (robot["robot"], robot["site"], robot["version"], robot["wanted_version"]) == ("r1", "lab", 1, 1)
+    assert robot["last_health"]["status"] == "TRACKING"
+    assert 0 <= robot["seconds_since"] < 60
+    assert server.client.get("/v1/robots?site=other").json() == {"robots": []}
+
+
+def test_service_endpoints(server: Server) -> None:
+    assert server.client.get("/healthz").json() == {"status": "ok"}
+    assert server.client.get("/readyz").json() == {"status": "ok"}
+    assert server.client.get("/version").json()["tile_format"] == 1
+    server.bus.close()
+    check_problem(server.client.get("/readyz"), 503, "bus")
+
+
+def test_metrics(server: Server) -> None:
+    for path in ("/v1/sites/lab/current", "/v1/sites/nowhere/current", "/made/up/1", "/made/up/2"):
+        server.client.get(path)
+    server.client.request("BREW", "/v1/sites")
+    text = server.client.get("/metrics").text
+    assert 'fleetmap_http_requests_total{method="GET",route="/v1/sites/{site}/current",status="404"} 1.0' in text
+    assert 'fleetmap_http_requests_total{method="GET",route="other",status="404"} 2.0' in text
+    assert 'method="other"' in text
+    assert "made" not in text
+    assert 'fleetmap_site_current_version{site="lab"} 1.0' in text
+
+
+def test_no_page_names_an_address_outside(server: Server) -> None:
+    assert server.client.get("/docs").status_code == 404
+    assert server.client.get("/redoc").status_code == 404
+    document = server.client.get("/openapi.json")
+    assert "http" not in document.text.replace("HTTPValidationError", "")
+    assert "/v1/tiles/{sha256}" in document.json()["paths"]

@@ -1,0 +1,251 @@
+"""The store: versions and their states, what it refuses, what a crash leaves."""
+
+import os
+import sqlite3
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import GateRefusedError, MapFormatError, NewerFormatError, StoreError, UsageError
+from fleetmap.mapformat import blob_path, current_path, decode_tile, sha256_hex
+from map_samples import draft_details, random_tile, save_sample_draft
+from mapserver.store import MapStore
+from mapserver.store import map_store as map_store_module
+from mapserver.store.database import MIGRATIONS
+
+
+@pytest.fixture
+def store(tmp_path: Path):
+    with MapStore.open(tmp_path / "store", create=True, clock_ns=lambda: 1_000) as opened:
+        yield opened
+
+
+def test_a_draft_becomes_current_and_the_next_one_replaces_it(store: MapStore, tmp_path: Path) -> None:
+    assert save_sample_draft(store, seed=1) == 1
+    assert store.current("lab") is None
+    assert store.publish("lab") == 1
+    first = store.current("lab")
+    assert (first.state, first.parent, first.published_ns) == ("current", None, 1_000)
+    assert save_sample_draft(store, seed=2) == 2
+    assert store.current("lab").version == 1
+    assert store.publish("lab") == 2
+    assert [(v.version, v.state, v.parent) for v in store.versions("lab")] == [
+        (1, "published", None),
+        (2, "current", 1),
+    ]
+    manifest = store.manifest("lab", 2)
+    assert [(tile.x, tile.y) for tile in manifest.tiles] == [(0, 0), (1, 0)]
+    for entry in manifest.tiles:
+        data = store.blob(entry.sha256)
+        assert (sha256_hex(data), len(data)) == (entry.sha256, entry.bytes)
+        assert len(decode_tile(data)) == entry.landmarks == 40
+    info = store.version("lab", 2)
+    assert info.map_bytes == info.manifest_bytes + sum(tile.bytes for tile in manifest.tiles)
+    text = (tmp_path / "store" / current_path("lab")).read_text()
+    assert text == info.manifest_sha256 + "\n"
+    assert store.archive("lab", 2) == b"archive"
+    assert [event.kind for event in store.events("lab")] == ["published", "published"]
+    assert [(s.site, s.current_version, s.versions) for s in store.sites()] == [("lab", 2, 2)]
+
+
+def test_equal_tiles_are_kept_once(store: MapStore, tmp_path: Path) -> None:
+    save_sample_draft(store, seed=1)
+    before = sum(1 for _ in (tmp_path / "store" / "blobs").glob("??/*"))
+    save_sample_draft(store, seed=1)
+    assert sum(1 for _ in (tmp_path / "store" / "blobs").glob("??/*")) == before + 1  # only the manifest is new
+
+
+def test_only_published_map_bytes_are_served(store: MapStore) -> None:
+    save_sample_draft(store)
+    info = store.version("lab", 1)
+    tile = store.manifest("lab", 1).tiles[0].sha256
+    assert store.served_kind(tile) is None
+    store.publish("lab")
+    assert store.served_kind(tile) == "tile"
+    assert store.served_kind(tile, "lab") == "tile"
+    assert store.served_kind(tile, "other") is None
+    assert store.served_kind(info.vocabulary_sha256) == "vocabulary"
+    assert store.served_kind(info.manifest_sha256) == "manifest"
+    assert store.served_kind(info.archive_sha256) is None
+    assert store.served_kind("0" * 64) is None
+
+
+def test_drafts_that_no_robot_could_use_are_refused(store: MapStore) -> None:
+    empty = random_tile(np.random.default_rng(0), landmarks=0)
+    for tiles in ([], [empty]):
+        store.save_draft("lab", tiles=tiles, vocabulary=b"v", details=draft_details())
+        with pytest.raises(GateRefusedError, match="0 landmarks"):
+            store.publish("lab")
+    assert store.current("lab") is None
+    assert {info.state for info in store.versions("lab")} == {"draft"}
+
+
+def test_a_site_keeps_its_vocabulary(store: MapStore) -> None:
+    assert store.site_vocabulary("lab") is None
+    save_sample_draft(store, vocabulary=b"one")
+    save_sample_draft(store, vocabulary=b"two")
+    assert store.site_vocabulary("lab") == b"two"
+    store.publish("lab", 1)
+    assert store.site_vocabulary("lab") == b"one"
+    with pytest.raises(GateRefusedError, match="keeps"):
+        store.publish("lab", 2)
+
+
+def test_wrong_use_is_told(store: MapStore, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="it has: none"):
+        store.versions("lab")
+    save_sample_draft(store)
+    with pytest.raises(UsageError, match="no version 9"):
+        store.publish("lab", 9)
+    store.publish("lab")
+    with pytest.raises(UsageError, match="no draft"):
+        store.publish("lab")
+    with pytest.raises(UsageError, match="is current"):
+        store.publish("lab", 1)
+    with pytest.raises(UsageError, match="site name"):
+        save_sample_draft(store, site="../up")
+    with pytest.raises(StoreError, match="no map store"):
+        MapStore.open(tmp_path / "nothing")
+
+
+def test_a_damaged_tile_is_not_published(store: MapStore, tmp_path: Path) -> None:
+    save_sample_draft(store)
+    tile = store.manifest("lab", 1).tiles[0].sha256
+    path = tmp_path / "store" / blob_path(tile)
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    with pytest.raises(MapFormatError, match=tile):
+        store.publish("lab")
+    path.unlink()
+    with pytest.raises(StoreError, match="incomplete"):
+        store.publish("lab")
+    assert store.current("lab") is None
+    # Saving the same bytes again heals the file.
+    save_sample_draft(store)
+    assert store.publish("lab") == 2
+
+
+def test_robots_reports_are_kept(store: MapStore) -> None:
+    store.record_robot_report("lab", "r2", {"a": 1}, 3)
+    store.record_robot_report("lab", "r1", {})
+    store.record_robot_report("lab", "r2", {"a": 2})
+    assert [(r.robot, r.version, r.last_report, r.last_seen_ns) for r in store.robots("lab")] == [
+        ("r1", None, {}, 1_000),
+        ("r2", 3, {"a": 2}, 1_000),
+    ]
+    assert store.robots("other") == []
+
+
+def test_two_open_stores_share_one_folder(store: MapStore, tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "store") as other:
+        assert [save_sample_draft(s) for s in (store, other, store)] == [1, 2, 3]
+        other.publish("lab", 2)
+        assert store.current("lab").version == 2
+
+
+def test_readers_see_whole_versions_while_another_process_publishes(store: MapStore, tmp_path: Path) -> None:
+    save_sample_draft(store)
+    store.publish("lab")
+    stop = threading.Event()
+
+    def read() -> int:
+        newest = 0
+        while not stop.is_set():
+            info = store.current("lab")
+            assert info.version >= newest
+            newest = info.version
+            assert store.manifest("lab", newest).version == newest
+            store.record_robot_report("lab", "r1", {"version": newest}, newest)
+        return newest
+
+    with ThreadPoolExecutor(3) as readers, MapStore.open(tmp_path / "store") as writer:
+        reading = [readers.submit(read) for _ in range(3)]
+        for seed in range(5):
+            save_sample_draft(writer, seed=seed)
+            writer.publish("lab")
+        stop.set()
+        assert all(future.result(timeout=30) >= 1 for future in reading)
+    assert store.current("lab").version == 6
+
+
+def test_a_store_of_a_newer_format_is_refused(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        save_sample_draft(store)
+    connection = sqlite3.connect(tmp_path / "store.sqlite3")
+    connection.execute(f"PRAGMA user_version = {len(MIGRATIONS) + 1}")
+    connection.close()
+    before = (tmp_path / "store.sqlite3").read_bytes()
+    with pytest.raises(NewerFormatError, match=rf"format {len(MIGRATIONS) + 1}.*up to {len(MIGRATIONS)}"):
+        MapStore.open(tmp_path)
+    assert (tmp_path / "store.sqlite3").read_bytes() == before
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "store.sqlite3").write_bytes(b"no database at all" * 100)
+    with pytest.raises(StoreError, match="cannot be opened"):
+        MapStore.open(tmp_path)
+    (tmp_path / "store.sqlite3").unlink()
+    connection = sqlite3.connect(tmp_path / "store.sqlite3")
+    connection.execute("CREATE TABLE recipes (name)")
+    connection.close()
+    with pytest.raises(StoreError, match="not the database of a map store"):
+        MapStore.open(tmp_path)
+
+
+def test_a_crash_before_the_transaction_leaves_no_version(store: MapStore, tmp_path: Path, monkeypatch) -> None:
+    save_sample_draft(store, seed=1)
+    store.publish("lab")
+
+    def crash(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(MapStore, "_insert_version", crash)
+    with pytest.raises(KeyboardInterrupt):
+        save_sample_draft(store, seed=2)
+    monkeypatch.undo()
+    with MapStore.open(tmp_path / "store") as again:
+        assert [info.version for info in again.versions("lab")] == [1]
+        assert save_sample_draft(again, seed=2) == 2
+        assert again.publish("lab") == 2
+
+
+def test_a_kill_between_the_transaction_and_the_derived_file_is_repaired(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        save_sample_draft(store, seed=1)
+        store.publish("lab")
+        save_sample_draft(store, seed=2)
+        wanted = store.version("lab", 2).manifest_sha256
+    program = (
+        "import os, sys\nfrom pathlib import Path\nfrom mapserver.store import map_store\n"
+        "map_store.MapStore._write_current_file = lambda *_: os._exit(9)\n"
+        "map_store.MapStore.open(Path(sys.argv[1])).publish('lab')\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", program, str(tmp_path)], env=environment, check=False, timeout=60)
+    assert done.returncode == 9
+    current = tmp_path / current_path("lab")
+    assert current.read_text().strip() != wanted
+    with MapStore.open(tmp_path) as store:
+        assert store.current("lab").version == 2
+        assert current.read_text().strip() == wanted
+
+
+def test_a_full_disk_is_told_and_leaves_nothing_half_written(store: MapStore, tmp_path: Path, monkeypatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("mapserver.store.blobs.os.fsync", full)
+    with pytest.raises(StoreError, match="No space left"):
+        save_sample_draft(store)
+    monkeypatch.undo()
+    assert not list((tmp_path / "store").rglob("*.tmp"))
+    assert store.sites() == []
+
+
+def test_the_module_names_every_served_kind() -> None:
+    kinds = "".join(MIGRATIONS[0])
+    assert all(f"'{kind}'" in kinds for kind in map_store_module._SERVED_KINDS)

@@ -1,0 +1,252 @@
+"""From the store over the bus to the robot and back, on the in-memory bus."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.bus import MemoryBus, MemoryHub
+from fleetmap.errors import LinkError, MapFormatError, UnreachableError, UsageError
+from fleetmap.mapformat import blob_path
+from fleetmap.messages import (
+    PoseMessage,
+    RobotAck,
+    RobotHealth,
+    WantedVersion,
+    blob_key,
+    encode_message,
+    manifest_key,
+    robot_key,
+)
+from locclient.link import MapLink, StoreFolderLink
+from locclient.tile_cache import StoreFolder, TileCache
+from map_samples import save_sample_draft
+from mapserver.fleet import Fleet
+from mapserver.store import MapStore
+from mapserver.tile_service import TileService
+
+
+@dataclass
+class World:
+    folder: Path
+    hub: MemoryHub
+    store: MapStore
+    fleet: Fleet
+    service: TileService
+    counts: list[tuple[str, str, int]]
+    robot_bus: MemoryBus
+    cache: TileCache
+    link: MapLink
+    now_ns: int = 0
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    """A server with one published version of site lab, and one robot."""
+    hub = MemoryHub()
+    clock = {"ns": 10**18}
+    counts: list[tuple[str, str, int]] = []
+    with MapStore.open(tmp_path / "store", create=True, clock_ns=lambda: clock["ns"]) as store, MemoryBus(hub) as bus:
+        save_sample_draft(store)
+        store.publish("lab")
+        fleet = Fleet(store, clock_ns=lambda: clock["ns"])
+        service = TileService(store, fleet, bus, lambda *event: counts.append(event))
+        with MemoryBus(hub) as robot_bus:
+            cache = TileCache(tmp_path / "cache")
+            link = MapLink(robot_bus, cache, "lab", "r1")
+            yield World(tmp_path / "store", hub, store, fleet, service, counts, robot_bus, cache, link)
+        service.close()
+
+
+def test_a_robot_fetches_everything_once(world: World) -> None:
+    wanted = world.link.wanted()
+    assert wanted == WantedVersion(site="lab", version=1, manifest_sha256=world.store.current("lab").manifest_sha256)
+    manifest = world.link.manifest(wanted)
+    assert world.link.vocabulary(manifest) == b"words" * 50
+    fetched = world.link.tiles(manifest)
+    assert sorted(fetched.tiles) == [(0, 0), (1, 0)]
+    assert fetched.refused == {}
+    assert sorted(world.link.tiles(manifest, [(1, 0), (9, 9)]).tiles) == [(1, 0)]
+    assert [what for what, result, _ in world.counts if result == "ok"] == [
+        "wanted",
+        "manifest",
+        "blob",
+        "blob",
+        "blob",
+    ]
+
+
+def test_a_store_folder_gives_the_same(world: World) -> None:
+    folder = StoreFolderLink(StoreFolder(world.folder), "lab")
+    wanted = folder.wanted()
+    assert wanted == world.link.wanted()
+    manifest = folder.manifest(wanted)
+    assert manifest == world.link.manifest(wanted)
+    assert folder.vocabulary(manifest) == world.link.vocabulary(manifest)
+    mine, theirs = folder.tiles(manifest).tiles, world.link.tiles(manifest).tiles
+    assert sorted(mine) == sorted(theirs)
+    np.testing.assert_array_equal(mine[0, 0].points_map, theirs[0, 0].points_map)
+    other = StoreFolderLink(StoreFolder(world.folder), "elsewhere")
+    assert other.wanted().version is None
+    with pytest.raises(LinkError, match="no published version"):
+        other.manifest(other.wanted())
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "missing"])
+def test_a_corrupt_tile_is_refused_and_the_rest_stays(world: World, damage: str) -> None:
+    manifest = world.link.manifest(world.link.wanted())
+    bad = manifest.tiles[0]
+    path = world.folder / blob_path(bad.sha256)
+    data = path.read_bytes()
+    if damage == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(data[:-1] if damage == "cut" else data[:100] + bytes([data[100] ^ 1]) + data[101:])
+    for link in (world.link, StoreFolderLink(StoreFolder(world.folder), "lab")):
+        fetched = link.tiles(manifest)
+        assert sorted(fetched.tiles) == [(1, 0)]
+        assert list(fetched.refused) == [(0, 0)]
+        assert bad.sha256 in fetched.refused[0, 0]
+
+
+def test_a_lying_server_is_refused_by_hash(world: World) -> None:
+    manifest = world.link.manifest(world.link.wanted())
+    world.service.close()
+    with MemoryBus(world.hub) as liar:
+        liar.queryable(blob_key("*", "*"), lambda *_: b"something else")
+        liar.queryable(manifest_key("*", "*"), lambda *_: b"{}")
+        fetched = world.link.tiles(manifest)
+        assert fetched.tiles == {}
+        assert all("damaged" in reason for reason in fetched.refused.values())
+        wanted = WantedVersion(site="lab", version=2, manifest_sha256="0" * 64)
+        with pytest.raises(MapFormatError, match="damaged"):
+            world.link.manifest(wanted)
+    assert all(tile.sha256 not in world.cache for tile in manifest.tiles)
+
+
+def test_a_known_version_is_read_with_the_server_away(world: World) -> None:
+    wanted = world.link.wanted()
+    manifest = world.link.manifest(wanted)
+    world.link.vocabulary(manifest)
+    world.link.tiles(manifest, [(0, 0)])
+    world.hub.reachable = False
+    with pytest.raises(UnreachableError):
+        world.link.wanted()
+    assert world.link.manifest(wanted) == manifest
+    assert world.link.vocabulary(manifest)
+    fetched = world.link.tiles(manifest)
+    assert sorted(fetched.tiles) == [(0, 0)]
+    assert "nobody answered" in fetched.refused[1, 0]
+
+
+def test_silence_is_waited_for_once(world: World) -> None:
+    manifest = world.link.manifest(world.link.wanted())
+    asked: list[str] = []
+
+    def silent(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+        asked.append(key)
+        raise UnreachableError("nobody")
+
+    world.robot_bus.get = silent
+    assert len(world.link.tiles(manifest).refused) == 2
+    assert len(asked) == 1
+
+
+def test_robots_see_published_things_only(world: World) -> None:
+    save_sample_draft(world.store, seed=3)
+    draft = world.store.version("lab", 2)
+    tile = world.store.manifest("lab", 2).tiles[0].sha256
+    archive = world.store.version("lab", 1).archive_sha256
+    for key, words in (
+        (manifest_key("lab", 2), "draft"),
+        (manifest_key("lab", 7), "no version 7"),
+        (manifest_key("lab", "x"), "no version number"),
+        (blob_key("lab", tile), "no published bytes"),
+        (blob_key("lab", archive), "no published bytes"),
+        (blob_key("lab", draft.manifest_sha256), "no published bytes"),
+        (blob_key("lab", ".."), "not a SHA-256"),
+        (robot_key("nowhere", "r1", "wanted"), "no site nowhere"),
+        (robot_key("lab", "R 1", "wanted"), "robot name"),
+    ):
+        with pytest.raises(LinkError, match=words):
+            world.robot_bus.get(key)
+    assert world.counts[-1] == ("wanted", "refused", 0)
+
+
+def test_new_versions_are_announced_to_known_robots(world: World) -> None:
+    heard: list[WantedVersion] = []
+    world.link.on_wanted(heard.append)
+    assert world.link.wanted().version == 1  # asking makes it known
+    assert world.service.announce_changes() == ["lab"]
+    assert [message.version for message in heard] == [1]
+    assert world.service.announce_changes() == []
+    with MapStore.open(world.folder) as other_process:
+        save_sample_draft(other_process, seed=9)
+        other_process.publish("lab")
+    assert world.service.announce_changes() == ["lab"]
+    assert [message.version for message in heard] == [1, 2]
+    assert world.link.manifest(heard[-1]).version == 2
+
+
+def test_reports_reach_the_fleet_and_survive_a_restart(world: World) -> None:
+    world.link.ack(1, stamp_ns=5, refused="tile (0, 0): damaged")
+    world.link.publish_health(
+        RobotHealth(site="lab", robot="r1", stamp_ns=6, version=1, status="TRACKING", metrics={"matches": 80})
+    )
+    world.link.publish_pose(PoseMessage.of(7, np.eye(4), np.eye(6), "TRACKING", 1))
+    (status,) = world.fleet.robots()
+    assert (status.site, status.robot, status.version, status.wanted_version, status.seconds_since) == (
+        "lab",
+        "r1",
+        1,
+        1,
+        0,
+    )
+    assert status.last_ack["refused"] == "tile (0, 0): damaged"
+    assert status.last_health["metrics"] == {"matches": 80}
+    assert status.last_pose["stamp_ns"] == 7
+    (again,) = Fleet(world.store, clock_ns=lambda: 10**18 + 5 * 10**9).robots("lab")
+    assert (again.version, again.seconds_since) == (1, 5)
+    assert again.last_ack == status.last_ack
+    assert Fleet(world.store).robots("other") == []
+
+
+def test_health_is_saved_at_most_every_second(tmp_path: Path) -> None:
+    now = {"ns": 10**18}
+    with MapStore.open(tmp_path, create=True, clock_ns=lambda: now["ns"]) as store:
+        save_sample_draft(store)
+        fleet = Fleet(store, clock_ns=lambda: now["ns"])
+        saved = []
+        for step in range(30):
+            now["ns"] = 10**18 + step * 100_000_000
+            health = RobotHealth(site="lab", robot="r1", stamp_ns=step, version=None, status="LOST")
+            fleet.take_health("lab", "r1", health)
+            saved.append(store.robots()[0].last_report["health"]["stamp_ns"])
+        assert sorted(set(saved)) == [0, 10, 20]
+        assert fleet.robots()[0].last_health["stamp_ns"] == 29
+
+
+def test_bad_messages_are_counted_and_change_nothing(world: World, caplog: pytest.LogCaptureFixture) -> None:
+    bus = world.robot_bus
+    bus.publish(robot_key("lab", "r1", "ack"), b"nonsense")
+    stolen = RobotAck(site="lab", robot="r2", stamp_ns=1, version=1)
+    bus.publish(robot_key("lab", "r1", "ack"), encode_message(stolen))
+    bus.publish(
+        robot_key("nowhere", "r1", "health"),
+        encode_message(RobotHealth(site="nowhere", robot="r1", stamp_ns=1, version=None, status="LOST")),
+    )
+    assert [event for event in world.counts if event[1] == "refused"] == [("ack", "refused", 0)] * 2 + [
+        ("health", "refused", 0)
+    ]
+    assert world.fleet.robots() == []
+    assert "speaks for 'r2'" in caplog.text
+
+
+def test_presence_and_names(world: World) -> None:
+    handle = world.link.announce_presence()
+    assert world.robot_bus.alive(robot_key("lab", "*", "alive")) == [robot_key("lab", "r1", "alive")]
+    handle.close()
+    with pytest.raises(UsageError, match="robot name"):
+        MapLink(world.robot_bus, world.cache, "lab", "Robot One")
