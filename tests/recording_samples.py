@@ -26,8 +26,10 @@ def calibration(*, has_imu: bool = True) -> RigCalibration:
     intrinsics = np.array([FOCAL, FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5])
     cam0_from_cam1 = se3(np.eye(3), np.array([BASELINE_M, 0, 0]))
     cameras = tuple(
-        CameraCalibration("radial-tangential", WIDTH, HEIGHT, intrinsics, np.array([1e-9, 0.0, 0.0, 0.0]), mounting)
-        for mounting in (BODY_FROM_CAM0, BODY_FROM_CAM0 @ cam0_from_cam1)
+        CameraCalibration(
+            "radial-tangential", WIDTH, HEIGHT, intrinsics, np.array([1e-9, 0.0, 0.0, 0.0]), body_from_cam
+        )
+        for body_from_cam in (BODY_FROM_CAM0, BODY_FROM_CAM0 @ cam0_from_cam1)
     )
     return RigCalibration(cameras, ImuNoise(1.7e-4, 1.9e-5, 2.0e-3, 3.0e-3) if has_imu else None)
 
@@ -53,7 +55,7 @@ class Sample:
 
 
 def make_sample(frames: int = 6, *, imu_before_ns: int = 500_000_000) -> Sample:
-    """`frames` stereo pairs at 20 Hz and an IMU at 200 Hz from `imu_before_ns` before the first to 0.1 s after the last."""
+    """Stereo pairs at 20 Hz, an IMU at 200 Hz from `imu_before_ns` before the first to 0.1 s after the last."""
     texture = _texture()
     stamps_ns = START_NS + FRAME_NS * np.arange(frames, dtype=np.int64)
     left = [_render(texture, world_from_cam0(int(s))) for s in stamps_ns]
@@ -82,8 +84,9 @@ def write_euroc(folder: Path, sample: Sample, *, image_type: str = "png", yaml_l
     write_euroc_imu(imu / "data.csv", sample.imu_stamps_ns, sample.gyro_radps, sample.accel_mps2)
     (imu / "sensor.yaml").write_text(
         ("%YAML:1.0\n" if yaml_line else "")
-        + "sensor_type: imu\nT_BS:\n  cols: 4\n  rows: 4\n  data: [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, "
-        "0.0, 0.0, 0.0, 1.0]\nrate_hz: 200\ngyroscope_noise_density: 1.7e-4\ngyroscope_random_walk: 1.9e-5\n"
+        + "sensor_type: imu\nT_BS:\n  cols: 4\n  rows: 4\n  data: [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, "
+        "0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]\nrate_hz: 200\n"
+        "gyroscope_noise_density: 1.7e-4\ngyroscope_random_walk: 1.9e-5\n"
         "accelerometer_noise_density: 2.0e-3\naccelerometer_random_walk: 3.0e-3\n"
     )
     truth = folder / "mav0/state_groundtruth_estimate0"

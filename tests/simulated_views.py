@@ -22,6 +22,6 @@ def map_from_cam(x_m: float, y_m: float, z_m: float, yaw_rad: float, pitch_rad: 
     """A camera that looks along yaw, pitched down."""
     cy, sy, cp, sp = np.cos(yaw_rad), np.sin(yaw_rad), np.cos(pitch_rad), np.sin(pitch_rad)
     turned = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1.0]]) @ np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = turned @ OPTICAL, (x_m, y_m, z_m)
-    return transform
+    placed = np.eye(4)
+    placed[:3, :3], placed[:3, 3] = turned @ OPTICAL, (x_m, y_m, z_m)
+    return placed

@@ -57,9 +57,9 @@ def paired(estimate: Trajectory, truth: Trajectory, max_gap_ns: int = MAX_GAP_NS
     The truth is interpolated at constant twist; not outside it, nor inside a gap longer than `max_gap_ns`.
     """
     found = [truth.at(int(stamp), max_gap_ns) for stamp in estimate.stamps_ns]
-    known = np.array([transform is not None for transform in found], bool)
+    known = np.array([there is not None for there in found], bool)
     stamps = estimate.stamps_ns[known]
-    true_frame_from_body = np.array([transform for transform in found if transform is not None]).reshape(-1, 4, 4)
+    true_frame_from_body = np.array([there for there in found if there is not None]).reshape(-1, 4, 4)
     return Trajectory(stamps, estimate.frame_from_body[known]), Trajectory(stamps, true_frame_from_body)
 
 
@@ -158,11 +158,11 @@ def _motion_errors(mine: Trajectory, true: Trajectory, starts: Stamps, step: int
     return np.asarray(se3_inverse(moved[0]) @ moved[1])
 
 
-def _split_errors(transforms: Array) -> tuple[Array, Array]:
-    """Metres and radians (S,) of error transforms (S, 4, 4)."""
+def _split_errors(true_from_estimated: Array) -> tuple[Array, Array]:
+    """Metres and radians (S,) of errors (S, 4, 4)."""
     return (
-        np.linalg.norm(transforms[:, :3, 3], axis=1),
-        np.array([rotation_angle_rad(transform[:3, :3]) for transform in transforms]),
+        np.linalg.norm(true_from_estimated[:, :3, 3], axis=1),
+        np.array([rotation_angle_rad(error[:3, :3]) for error in true_from_estimated]),
     )
 
 

@@ -109,7 +109,7 @@ AnyMover = Mover | Apparition
 
 
 def add_movers(builder: FaceBuilder, movers: tuple[AnyMover, ...], textures: Textures, t_s: float) -> Array:
-    """Adds the movers as they stand at t; their soft shadows (M, 3): x, y, radius."""
+    """Adds the movers as they stand at t; their soft shadows (M, 3): x, y, 1 / radius^2."""
     materials = {f"cloth{number}": cloth for number, cloth in enumerate(textures.cloth)}
     materials |= {"vest": textures.vest, "grey": textures.grey, "dark": textures.dark, "hazard": textures.hazard}
     materials |= {"wood": textures.wood, "goods": textures.skus[3].front}
@@ -120,7 +120,7 @@ def add_movers(builder: FaceBuilder, movers: tuple[AnyMover, ...], textures: Tex
         for (px, py, pz), half, material in MOVER_KINDS[mover.kind].parts(t_s):
             centre = (x + cosine * px - sine * py, y + sine * px + cosine * py, pz)
             builder.add_box(centre, half, materials[material], yaw_rad=yaw)
-        shadows[number] = x, y, MOVER_KINDS[mover.kind].shadow_m
+        shadows[number] = x, y, 1.0 / MOVER_KINDS[mover.kind].shadow_m ** 2
     return shadows
 
 

@@ -69,9 +69,9 @@ class StereoRenderer:
 
     def exposure(self, t_s: float) -> Exposure:
         """What the automatic exposure has settled on."""
-        map_from_cam = [self.path(0)(max(t_s - 0.25 * step, 0.0)) for step in range(5)]
-        places = np.array([transform[:3, 3] for transform in map_from_cam])
-        forward = np.array([transform[:3, 2] for transform in map_from_cam])
+        moments = np.maximum(t_s - 0.25 * np.arange(5), 0.0)
+        map_from_cam = self._motion.map_from_body(moments) @ self._rig.cameras[0].body_from_cam
+        places, forward = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]
         chosen = self._exposure.choose(self._world.lamps, self._groups, places, forward)
         if self.faults.has("over-exposure", t_s):
             return Exposure(chosen.time_s, chosen.gain * OVER_EXPOSURE)

@@ -71,7 +71,7 @@ def sample(
             taps = 3
             if most_taps > 3 and longer > 12.0 * max(shorter, 1.0):
                 taps = 4
-        extent = max(shorter, longer / (taps * taps))
+        extent = max(shorter, longer * (0.25 if taps == 2 else (1.0 / 9.0 if taps == 3 else 0.0625)))
     extent *= 0.8 * area
     level = 0
     scale = 1.0
@@ -140,7 +140,7 @@ def floor_pattern(
         ax * shrink, ay * shrink, bx * shrink, by * shrink, 1, area, False,
     ) * (1.0 / 128.0)  # fmt: skip
     column, row = int(x * (1.0 / 512.0)), int(y * (1.0 / 512.0))
-    decal = decals[row % decals.shape[0], column % decals.shape[1]]
+    decal = decals[row & (decals.shape[0] - 1), column & (decals.shape[1] - 1)]
     if decal >= 0:
         px, py = 0.5 * (x - column * 512.0), 0.5 * (y - row * 512.0)
         qax, qay, qbx, qby = 0.5 * ax, 0.5 * ay, 0.5 * bx, 0.5 * by
@@ -184,26 +184,30 @@ def shade(
 
     per_px_x, per_px_y: how far xn and yn move per pixel. floor: numbers of the coarse concrete and the dirt texture.
     """
-    h = homographies[k]
-    w = h[6] * xn + h[7] * yn + h[8]
+    # Each entry by itself: a row of the array would be a counted reference, which costs more than the arithmetic.
+    h0, h1, h2 = homographies[k, 0], homographies[k, 1], homographies[k, 2]
+    h3, h4, h5 = homographies[k, 3], homographies[k, 4], homographies[k, 5]
+    h6, h7, h8 = homographies[k, 6], homographies[k, 7], homographies[k, 8]
+    w = h6 * xn + h7 * yn + h8
     z = 1.0 / w
-    u = (h[0] * xn + h[1] * yn + h[2]) * z
-    v = (h[3] * xn + h[4] * yn + h[5]) * z
+    u = (h0 * xn + h1 * yn + h2) * z
+    v = (h3 * xn + h4 * yn + h5) * z
     material = numbers[f, 0]
     if material == 2:
         return values[f, 5] * groups[numbers[f, 2]], u, v, w
     along_u, along_v = values[f, 0], values[f, 1]
     step_x, step_y = per_px_x * z, per_px_y * z
-    ax, ay = (h[0] - u * h[6]) * step_x * along_u, (h[3] - v * h[6]) * step_x * along_v
-    bx, by = (h[1] - u * h[7]) * step_y * along_u, (h[4] - v * h[7]) * step_y * along_v
+    ax, ay = (h0 - u * h6) * step_x * along_u, (h3 - v * h6) * step_x * along_v
+    bx, by = (h1 - u * h7) * step_y * along_u, (h4 - v * h7) * step_y * along_v
     x, y = u * along_u, v * along_v
-    if material == 1:
+    is_floor = material == 1
+    if is_floor:
         x += values[f, 3]
         y += values[f, 4]
-        grey = sample(texels, table, numbers[f, 1], x, y, ax, ay, bx, by, most_taps, area, True)
+    grey = sample(texels, table, numbers[f, 1], x, y, ax, ay, bx, by, most_taps, area, True)
+    if is_floor:
         grey *= floor_pattern(texels, table, decals, floor[0], x, y, ax, ay, bx, by, most_taps, area)
-    else:
-        grey = sample(texels, table, numbers[f, 1], x, y, ax, ay, bx, by, most_taps, area, True)
+    elif area == 1.0:  # a reflection is too blurred to show the dirt
         dirt_x, dirt_y = x + values[f, 3], y + values[f, 4]
         grey *= sample(texels, table, floor[1], dirt_x, dirt_y, ax, ay, bx, by, 1, area, False) * (1.0 / 128.0)
     columns, rows = numbers[f, 4], numbers[f, 5]
@@ -255,7 +259,7 @@ def shade_image(
     owner (H S, W S): visible polygon per sample; equal ones in a pixel are shaded once, at their mean place. rays (H,
     W, 4): a lens' xn, yn and their change per pixel, empty for a pinhole. mirror_*: the world reflected in the floor,
     one
-    sample per pixel of the pinhole. shadows (M, 3): x, y, radius of soft contact shadows on the floor.
+    sample per pixel of the pinhole. shadows (M, 3): x, y, 1 / radius^2 of soft contact shadows on the floor.
     With wants_truth also depth_m (along the optical axis) and the face of each pixel (-1 nothing).
     """
     height, width = radiance.shape
@@ -314,7 +318,7 @@ def shade_image(
                     x_map, y_map = quads[f, 0] + u * quads[f, 3], quads[f, 1] + v * quads[f, 7]
                     for s in range(shadows.shape[0]):
                         dx, dy = x_map - shadows[s, 0], y_map - shadows[s, 1]
-                        inside = 1.0 - (dx * dx + dy * dy) / (shadows[s, 2] * shadows[s, 2])
+                        inside = 1.0 - (dx * dx + dy * dy) * shadows[s, 2]
                         if inside > 0.0:
                             value *= 1.0 - 0.55 * inside * inside
                     if reflectance > 0.0:

@@ -21,10 +21,10 @@ def _truth(count: int = 400, step_m: float = 0.1) -> Trajectory:
     """A winding path, 20 Hz."""
     rng = np.random.default_rng(3)
     turn = np.cumsum(rng.normal(0.0, 0.01, (count, 3)), axis=0)
-    transforms = [np.eye(4)]
+    frame_from_body = [np.eye(4)]
     for k in range(count - 1):
-        transforms.append(transforms[-1] @ se3_exp(np.concatenate([turn[k] * 0.1, [step_m, 0.01, 0.0]])))
-    return Trajectory(np.arange(count, dtype=np.int64) * 50_000_000 + 10**18, np.array(transforms))
+        frame_from_body.append(frame_from_body[-1] @ se3_exp(np.concatenate([turn[k] * 0.1, [step_m, 0.01, 0.0]])))
+    return Trajectory(np.arange(count, dtype=np.int64) * 50_000_000 + 10**18, np.array(frame_from_body))
 
 
 def _estimate(truth: Trajectory, scale: float = 1.0) -> Trajectory:
@@ -131,9 +131,9 @@ def _scaled(truth: Trajectory, factor: float) -> Array:
 
 
 def test_drift_of_a_wrong_scale_on_a_straight_road() -> None:
-    transforms = np.tile(np.eye(4), (600, 1, 1))
-    transforms[:, 0, 3] = np.arange(600) * 0.5
-    truth = Trajectory(np.arange(600, dtype=np.int64) * 10**8, transforms)
+    frame_from_body = np.tile(np.eye(4), (600, 1, 1))
+    frame_from_body[:, 0, 3] = np.arange(600) * 0.5
+    truth = Trajectory(np.arange(600, dtype=np.int64) * 10**8, frame_from_body)
     drift = kitti_drift(Trajectory(truth.stamps_ns, _scaled(truth, 1.02)), truth, lengths_m=(100.0, 200.0))
     assert drift is not None
     assert drift.translation_share == pytest.approx(0.02, rel=0.02)

@@ -17,7 +17,7 @@ from mapserver.doctor.sharpness import laplacian_variance, sharpness
 from mapserver.doctor.stereo import StereoMatches, epipolar_error, match_pair, swapped_cameras
 
 SAMPLED_FRAMES = 40
-TURN_FRAMES = 300
+TURN_FRAMES = 200
 
 
 class _Frames:
@@ -39,7 +39,7 @@ class _Frames:
 
 
 def examine(recording: Recording, on_frame: Callable[[], None] = lambda: None) -> list[Finding]:
-    """All findings about a recording, in a fixed order. Reads at most 340 frames; `on_frame` is called after each."""
+    """All findings about a recording, in a fixed order. Reads at most 240 frames; `on_frame` is called after each."""
     stamps_ns, imu = recording.frame_stamps_ns, recording.imu
     frames = _Frames(recording, on_frame)
     shift_s = recording.calibration.cameras[0].imu_minus_cam_s

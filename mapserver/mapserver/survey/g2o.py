@@ -34,7 +34,7 @@ def parse_g2o(text: str) -> tuple[Array, list[PoseEdge]]:
     strange = sorted({vertex for i, j, _ in rows for vertex in (i, j)} - set(index))
     if strange:
         raise SurveyError(f"g2o: edges join vertices {strange[:5]} that the file does not place; add their lines")
-    map_from_body = np.array([_transform(vertices[vertex]) for vertex in index]).reshape(-1, 4, 4)
+    map_from_body = np.array([_se3_of(vertices[vertex]) for vertex in index]).reshape(-1, 4, 4)
     return map_from_body, [_edge(index[i], index[j], numbers) for i, j, numbers in rows]
 
 
@@ -45,7 +45,7 @@ def _numbers(fields: list[str]) -> Array:
     return numbers
 
 
-def _transform(numbers: Array) -> Array:
+def _se3_of(numbers: Array) -> Array:
     """(4, 4) of x y z qx qy qz qw."""
     return se3(rotation_from_quat_wxyz(numbers[[6, 3, 4, 5]]), numbers[:3])
 
@@ -55,6 +55,6 @@ def _edge(i: int, j: int, numbers: Array) -> PoseEdge:
     upper = np.zeros((6, 6))
     upper[np.triu_indices(6)] = numbers[7:]
     information = (upper + np.triu(upper, 1).T)[np.ix_(_ROTATION_FIRST, _ROTATION_FIRST)]
-    i_from_j = _transform(numbers)
+    i_from_j = _se3_of(numbers)
     carried = adjoint(i_from_j)
     return PoseEdge(i, j, i_from_j, carried @ np.linalg.inv(information) @ carried.T, is_loop=abs(i - j) != 1)

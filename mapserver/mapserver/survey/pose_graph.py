@@ -134,8 +134,8 @@ def _is_covariance(cov: Array) -> bool:
 
 def _values(map_from_body: Array) -> gtsam.Values:
     values = gtsam.Values()
-    for k, transform in enumerate(map_from_body):
-        values.insert(k, gtsam.Pose3(transform))
+    for k, map_from_k in enumerate(map_from_body):
+        values.insert(k, gtsam.Pose3(map_from_k))
     return values
 
 

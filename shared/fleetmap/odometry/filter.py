@@ -206,6 +206,24 @@ class InvariantFilter:
         self.covariance[3:6, 3:6] += (size / max(gap_s, 0.1)) ** 2 * np.eye(3)
         return True
 
+    def motion_since(self, clone_id: int) -> tuple[Array, Array]:
+        """earlier_from_now (4, 4) between a clone and the newest one, and its covariance (6, 6): left, axes of the earlier body.
+
+        From the joint covariance of both, so that what they share cancels.
+        """
+        at = _CLONES + 6 * self.clone_ids.index(clone_id)
+        newest = _CLONES + 6 * (len(self.clone_ids) - 1)
+        c = self.covariance
+        difference = c[newest : newest + 6, newest : newest + 6] + c[at : at + 6, at : at + 6]
+        difference = difference - c[newest : newest + 6, at : at + 6] - c[at : at + 6, newest : newest + 6]
+        earlier_from_odom = se3_inverse(self.odom_from_clone(clone_id))
+        rotation = earlier_from_odom[:3, :3]
+        carry = np.zeros((6, 6))
+        carry[:3, :3] = carry[3:, 3:] = rotation
+        carry[3:, :3] = skew(earlier_from_odom[:3, 3]) @ rotation
+        now = self.odom_from_clone(self.clone_ids[-1])
+        return np.asarray(earlier_from_odom @ now), np.asarray(carry @ difference @ carry.T)
+
     def body_covariance(self) -> Array:
         """cov_rot_trans (6, 6) of odom_from_body: rotation error in odom axes, then position error."""
         jacobian = np.zeros((6, _NAV))

@@ -39,6 +39,7 @@ class OdometryEstimate:
     """
 
     stamp_ns: int
+    frame_index: int
     odom_from_body: Array
     cov_rot_trans: Array
     velocity_odom_mps: Array
@@ -89,7 +90,7 @@ class Odometry:
             self._begin(stamp_ns)
         assert self._filter is not None
         rate = self._predict(stamp_ns)
-        tracked = self._tracker.track(frame, self._motion_since, _ROTATION_SIGMA_RAD if self._inertial else None)
+        tracked = self._tracker.track(frame, self._predicted_since, _ROTATION_SIGMA_RAD if self._inertial else None)
         if not self._inertial:
             self._displace(tracked)
         else:
@@ -103,6 +104,22 @@ class Odometry:
         estimate = self._estimate(frame.stamp_ns, tracked, used, change)
         self._frame_index += 1
         return estimate
+
+    def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
+        """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance; None where it is forgotten.
+
+        The covariance (6, 6) is that of a left perturbation in the earlier body's axes, rotation first. Sparse pictures can revise
+        where earlier frames were: what two estimates differ by is then not the motion between them, this is.
+        """
+        if self._filter is None or frame_index not in self._filter.clone_ids:
+            return None
+        return self._filter.motion_since(frame_index)
+
+    @property
+    def oldest_frame_index(self) -> int:
+        """The oldest frame that `motion_since` still knows."""
+        assert self._filter is not None
+        return self._filter.clone_ids[0]
 
     # --- start -----------------------------------------------------------------------------------------------------------
 
@@ -181,7 +198,7 @@ class Odometry:
         self._state_ns = stamp_ns
         return rate
 
-    def _motion_since(self, frame_index: int) -> Array | None:
+    def _predicted_since(self, frame_index: int) -> Array | None:
         """cam_from_earlier (4, 4): from the propagated state, or the last motion again without an IMU."""
         assert self._filter is not None
         if not self._inertial:
@@ -291,7 +308,7 @@ class Odometry:
         taken = int((used == 1).sum())
         share = taken / len(used) if len(used) else tracked.inlier_share
         return OdometryEstimate(
-            stamp_ns, state.odom_from_body, self._filter.body_covariance(), state.velocity_mps.copy(), state.gyro_bias_radps.copy(),
+            stamp_ns, self._frame_index, state.odom_from_body, self._filter.body_covariance(), state.velocity_mps.copy(), state.gyro_bias_radps.copy(),
             state.accel_bias_mps2.copy(), status, tracked.ids, self._scene_depth_m(), share, tracked.by_descriptors, self._inertial, change,
         )  # fmt: skip
 

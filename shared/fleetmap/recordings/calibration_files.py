@@ -141,8 +141,8 @@ def read_euroc_imu(path: Path) -> tuple[Array, ImuNoise]:
     Defaults where it says nothing.
     """
     where, values = str(path), read_yaml(path)
-    mounting = matrix_4x4(values["T_BS"], f"{where}: T_BS") if "T_BS" in values else np.eye(4)
-    return mounting, _imu_noise(values, where) or ImuNoise()
+    body_from_imu = matrix_4x4(values["T_BS"], f"{where}: T_BS") if "T_BS" in values else np.eye(4)
+    return body_from_imu, _imu_noise(values, where) or ImuNoise()
 
 
 def read_yaml(path: Path) -> Values:
@@ -178,11 +178,13 @@ def _kalibr_camera(values: Values, previous: CameraCalibration | None, where: st
     model = _model(_need(values, "camera_model", where), values.get("distortion_model", "none"), where)
     camera = _camera(values, model, values.get("distortion_coeffs", []), where)
     shift = values.get("timeshift_cam_imu", previous.imu_minus_cam_s if previous else 0.0)
-    mounting = _mounting(values, previous, where)
-    return check_camera(replace(camera, body_from_cam=mounting, imu_minus_cam_s=_numbers([shift], 1, where)[0]), where)
+    body_from_cam = _body_from_cam(values, previous, where)
+    return check_camera(
+        replace(camera, body_from_cam=body_from_cam, imu_minus_cam_s=_numbers([shift], 1, where)[0]), where
+    )
 
 
-def _mounting(values: Values, previous: CameraCalibration | None, where: str) -> Array:
+def _body_from_cam(values: Values, previous: CameraCalibration | None, where: str) -> Array:
     if "body_from_cam" in values:
         return matrix_4x4(values["body_from_cam"], f"{where}: body_from_cam")
     if "T_cam_imu" in values:

@@ -87,24 +87,24 @@ def _camera(folder: Path, name: str, losses: list[Loss], read_files: list[Path])
 def _calibration(root: Path, count: int, options: OpenOptions, read_files: list[Path]) -> tuple[RigCalibration, Array]:
     """The calibration with the IMU as body, and EuRoC's body from the IMU (4, 4)."""
     imu_file = root / "mav0/imu0/sensor.yaml"
-    imu_mounting, noise = read_euroc_imu(imu_file) if imu_file.is_file() else (np.eye(4), None)
+    euroc_from_imu, noise = read_euroc_imu(imu_file) if imu_file.is_file() else (np.eye(4), None)
     given = calibration_of_options(options)
     if given is not None and options.calibration_file is not None:
         read_files.append(options.calibration_file)
-        return given.calibration, imu_mounting
+        return given.calibration, euroc_from_imu
     camera_files = [root / f"mav0/cam{i}/sensor.yaml" for i in range(count)]
     if all(file.is_file() for file in camera_files):
         read_files += camera_files + ([imu_file] if noise is not None else [])
         cameras = [read_euroc_camera(file) for file in camera_files]
-        imu_from_body = se3_inverse(imu_mounting)
-        if np.array_equal(imu_mounting, np.eye(4)):
-            return RigCalibration(tuple(cameras), noise), imu_mounting
-        mounted = tuple(replace(c, body_from_cam=imu_from_body @ c.body_from_cam) for c in cameras)
-        return RigCalibration(mounted, noise), imu_mounting
+        imu_from_body = se3_inverse(euroc_from_imu)
+        if np.array_equal(euroc_from_imu, np.eye(4)):
+            return RigCalibration(tuple(cameras), noise), euroc_from_imu
+        cameras_on_imu = tuple(replace(c, body_from_cam=imu_from_body @ c.body_from_cam) for c in cameras)
+        return RigCalibration(cameras_on_imu, noise), euroc_from_imu
     for name in _CAMCHAINS:
         if (root / name).is_file():
             read_files.append(root / name)
-            return load_calibration(root / name).calibration, imu_mounting
+            return load_calibration(root / name).calibration, euroc_from_imu
     missing = next(file for file in camera_files if not file.is_file())
     raise CalibrationError(
         f"{missing} is missing and there is no camchain.yaml; pass a calibration with --calibration FILE"

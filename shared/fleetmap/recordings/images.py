@@ -100,6 +100,12 @@ def grey_image(image: Image, where: str = "") -> StoredImage:
     return StoredImage("mono8", np.ascontiguousarray(image).tobytes(), where, width, height, width)
 
 
+def png_image(image: Image, where: str = "") -> StoredImage:
+    """A grey (H, W) uint8 image as PNG at its lowest compression: without loss, and fast."""
+    _, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return StoredImage("file", data.tobytes(), where)
+
+
 def depth_image(depth_m: NDArray[np.float32], where: str = "") -> StoredImage:
     """Depth in metres (H, W), stored as 32FC1 row by row, bit for bit."""
     height, width = depth_m.shape

@@ -40,8 +40,8 @@ def check_imu_units(imu: ImuSamples, where: str) -> None:
 def gravity_direction_errors_rad(imu: ImuSamples, gyro_scale: float) -> Array:
     """(K,) angle between the specific force that the gyro times `gyro_scale` predicts and the measured one.
 
-    Over windows of half a second, and only where both ends measure within 1 m/s^2 of gravity: elsewhere the direction is
-    that of an acceleration.
+    Over windows of half a second, and only where both ends measure within 1 m/s^2 of gravity: elsewhere the direction
+    is that of an acceleration.
     """
     period_s = float(np.median(np.diff(imu.stamps_ns))) * 1e-9
     smooth = max(1, round(_SMOOTH_S / period_s))

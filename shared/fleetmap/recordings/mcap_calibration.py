@@ -38,18 +38,24 @@ def calibration_of_messages(
     """
     frames = [info.frame_id.lstrip("/") for info in infos]
     lenses = [_camera(info, rectified, where) for info, rectified in zip(infos, are_rectified, strict=True)]
-    mountings: Sequence[Array | None] = [_find(links, imu_frame, frame) if imu_frame else None for frame in frames]
-    has_imu = all(mounting is not None for mounting in mountings)
+    body_from_cams: Sequence[Array | None] = [
+        _target_from_source(links, imu_frame, frame) if imu_frame else None for frame in frames
+    ]
+    has_imu = all(body_from_cam is not None for body_from_cam in body_from_cams)
     if not has_imu:
-        mountings = [np.eye(4)] + [_left_from_right(infos, are_rectified, links, where) for _ in infos[1:]]
+        body_from_cams = [np.eye(4)] + [_left_from_right(infos, are_rectified, links, where) for _ in infos[1:]]
     cameras = [
-        check_camera(_mounted(lens, mounting), f"{where}: {info.frame_id}")
-        for lens, mounting, info in zip(lenses, mountings, infos, strict=True)
-        if mounting is not None
+        check_camera(_on_body(lens, body_from_cam), f"{where}: {info.frame_id}")
+        for lens, body_from_cam, info in zip(lenses, body_from_cams, infos, strict=True)
+        if body_from_cam is not None
     ]
     body_frame = imu_frame if has_imu and imu_frame else frames[0]
-    bases = [base for base in (_find(links, name, body_frame) for name in _BASE_FRAMES) if base is not None]
-    return RigCalibration(tuple(cameras), ImuNoise() if has_imu else None, bases[0] if bases else np.eye(4))
+    base_from_bodies = [
+        found for found in (_target_from_source(links, name, body_frame) for name in _BASE_FRAMES) if found is not None
+    ]
+    return RigCalibration(
+        tuple(cameras), ImuNoise() if has_imu else None, base_from_bodies[0] if base_from_bodies else np.eye(4)
+    )
 
 
 def _camera(info: CameraInfo, is_rectified: bool, where: str) -> CameraCalibration:
@@ -69,7 +75,7 @@ def _camera(info: CameraInfo, is_rectified: bool, where: str) -> CameraCalibrati
     return CameraCalibration(model, info.width_px, info.height_px, intrinsics, distortion, np.eye(4))
 
 
-def _mounted(camera: CameraCalibration, body_from_cam: Array) -> CameraCalibration:
+def _on_body(camera: CameraCalibration, body_from_cam: Array) -> CameraCalibration:
     return CameraCalibration(
         camera.model, camera.width_px, camera.height_px, camera.intrinsics_px, camera.distortion, body_from_cam
     )
@@ -83,11 +89,13 @@ def _left_from_right(
     There, K, R and P are those of ROS's stereo calibration: P[0, 3] = -fx * baseline.
     """
     left, right = infos[0], infos[1]
-    known = (
-        _find(links, left.frame_id.lstrip("/"), right.frame_id.lstrip("/")) if left.frame_id != right.frame_id else None
+    cam0_from_cam1 = (
+        _target_from_source(links, left.frame_id.lstrip("/"), right.frame_id.lstrip("/"))
+        if left.frame_id != right.frame_id
+        else None
     )
-    if known is not None:
-        return known
+    if cam0_from_cam1 is not None:
+        return cam0_from_cam1
     fx = right.projection[0, 0]
     baseline_m = -right.projection[0, 3] / fx if fx else 0.0
     if baseline_m <= 0:
@@ -103,7 +111,7 @@ def _left_from_right(
     return se3_inverse(se3(left_rotation, np.zeros(3))) @ rect_from_rect @ se3(right_rotation, np.zeros(3))
 
 
-def _find(links: Sequence[FrameLink], target: str, source: str) -> Array | None:
+def _target_from_source(links: Sequence[FrameLink], target: str, source: str) -> Array | None:
     """(4, 4) target_from_source along the links in either direction, None where they do not lead there."""
     target_from: dict[str, Array] = {target.lstrip("/"): np.eye(4)}
     waiting = list(target_from)

@@ -81,6 +81,9 @@ def open_mcap(path: Path, options: OpenOptions) -> Recording:
     file_path = _mcap_file(path)
     if file_path is None:
         raise RecordingError(f"{path} is no MCAP file; choose a file that ends in .mcap")
+    pieces = len(list(path.glob("*.mcap"))) if path.is_dir() else 1
+    if pieces > 1:
+        raise RecordingError(f"{path} holds {pieces} .mcap files; choose one of them, or merge them with `mcap merge`")
     given = calibration_of_options(options)
     file = file_path.open("rb")
     try:
@@ -321,8 +324,7 @@ def _in_words(losses: Iterable[Loss]) -> str:
 
 def _mcap_file(path: Path) -> Path | None:
     if path.is_dir():
-        files = sorted(path.glob("*.mcap"))
-        return files[0] if len(files) == 1 else None
+        return next(iter(sorted(path.glob("*.mcap"))), None)
     if not path.is_file():
         return None
     with path.open("rb") as file:

@@ -42,7 +42,7 @@ class McapRecordingWriter:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._counts: dict[str, int] = {}
-        self._mounting_is_written = False
+        self._links_are_written = False
         try:
             self._file = self._part.open("wb")
         except OSError as error:
@@ -135,8 +135,8 @@ class McapRecordingWriter:
         self._write(topic, "sensor_msgs/CameraInfo", stamp_ns, data)
 
     def _write(self, topic: str, type_name: str, stamp_ns: int, data: bytes) -> None:
-        if not self._mounting_is_written:
-            self._mounting_is_written = True
+        if not self._links_are_written:
+            self._links_are_written = True
             links = [
                 ros_messages.FrameLink(BODY_FRAME, f"cam{i}", camera.body_from_cam)
                 for i, camera in enumerate(self._calibration.cameras)

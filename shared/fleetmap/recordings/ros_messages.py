@@ -184,7 +184,7 @@ def decode_prior(data: bytes) -> PositionPrior:
     """geometry_msgs/PoseWithCovarianceStamped as map_from_base."""
     reader = CdrReader(data)
     stamp_ns, _ = reader.stamp_ns(), reader.text()
-    map_from_base = _transform(reader.doubles(7))
+    map_from_base = _target_from_source(reader.doubles(7))
     order = _ROT_TRANS_FROM_TRANS_ROT
     return PositionPrior(stamp_ns, map_from_base, reader.doubles(36).reshape(6, 6)[np.ix_(order, order)])
 
@@ -215,7 +215,7 @@ def decode_frame_links(data: bytes) -> list[FrameLink]:
     for _ in range(reader.unsigned()):
         _, parent = reader.stamp_ns(), reader.text()
         child = reader.text()
-        links.append(FrameLink(parent.lstrip("/"), child.lstrip("/"), _transform(reader.doubles(7))))
+        links.append(FrameLink(parent.lstrip("/"), child.lstrip("/"), _target_from_source(reader.doubles(7))))
     return links
 
 
@@ -227,7 +227,7 @@ def encode_frame_links(stamp_ns: int, links: Sequence[FrameLink]) -> bytes:
     return writer.message()
 
 
-def _transform(position_quat_xyzw: Array) -> Array:
+def _target_from_source(position_quat_xyzw: Array) -> Array:
     norm = float(np.linalg.norm(position_quat_xyzw[3:]))
     if not np.isfinite(position_quat_xyzw).all() or abs(norm - 1) > 0.01:
         raise ValueError(f"the quaternion {position_quat_xyzw[3:].tolist()} is not of unit length")

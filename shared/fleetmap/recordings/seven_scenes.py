@@ -178,7 +178,7 @@ def _centred(shape: Sequence[int], focal_px: float) -> CameraCalibration:
 
 def _ground_truth(colour: ImageFolder, read_files: list[Path], losses: list[Loss]) -> Trajectory | None:
     stamps: list[int] = []
-    transforms: list[Array] = []
+    frame_from_cams: list[Array] = []
     bad = 0
     for stamp_ns, path in zip(colour.stamps_ns.tolist(), colour.paths, strict=True):
         file = path.with_name(path.name.partition(".")[0] + ".pose.txt")
@@ -190,10 +190,10 @@ def _ground_truth(colour: ImageFolder, read_files: list[Path], losses: list[Loss
             bad += 1
             continue
         stamps.append(stamp_ns)
-        transforms.append(matrix)
+        frame_from_cams.append(matrix)
     if bad:
         losses.append(Loss("ground truth: no rigid transform", f"{bad} of {bad + len(stamps)} files left out"))
-    return Trajectory(_stamps(stamps), np.stack(transforms)) if stamps else None
+    return Trajectory(_stamps(stamps), np.stack(frame_from_cams)) if stamps else None
 
 
 def _rigid(file: Path) -> Array | None:
@@ -219,7 +219,7 @@ def _nearest_surface(points_colour: Array, colour: CameraCalibration) -> Depth:
     """(H, W) depth of the nearest of the points (N, 3) at each pixel, 0 where there is none."""
     image = np.full((colour.height_px, colour.width_px), np.inf, np.float32)
     corners = np.floor(colour.pixel_from_ray(points_colour))
-    # All four pixels around a point: with the nearest alone the background would shine through between foreground points
+    # All four pixels around a point: with the nearest alone the background would shine through the foreground
     for step in ((0, 0), (1, 0), (0, 1), (1, 1)):
         pixels = corners + step
         inside = (pixels >= 0).all(axis=1) & (pixels < [colour.width_px, colour.height_px]).all(axis=1)

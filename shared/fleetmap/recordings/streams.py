@@ -6,6 +6,7 @@ What is left out is counted, never hidden.
 import bisect
 import io
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,9 @@ def read_stamped_rows(path: Path, columns: int, losses: list[Loss]) -> tuple[Sta
     text = _read_text(path).replace(",", " ")
     dtype = np.dtype([("stamp_ns", np.int64), ("values", np.float64, (columns,))])
     try:
-        table: AnyArray = np.loadtxt(io.StringIO(text), dtype, comments="#", usecols=range(columns + 1), ndmin=1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of empty tables, which are an error below
+            table: AnyArray = np.loadtxt(io.StringIO(text), dtype, comments="#", usecols=range(columns + 1), ndmin=1)
     except ValueError:
         table = _read_rows_singly(path, text, columns, dtype, losses)
     if len(table) == 0:

@@ -34,7 +34,7 @@ def parse_tum(text: str, what: str = "trajectory") -> Trajectory:
     of unit length within 1 %, or stamps that do not rise.
     """
     stamps: list[int] = []
-    transforms = []
+    frame_from_body = []
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.replace(",", " ").split()
         if not fields or fields[0].startswith("#"):
@@ -51,8 +51,8 @@ def parse_tum(text: str, what: str = "trajectory") -> Trajectory:
         if stamps and stamp <= stamps[-1]:
             raise RecordingError(f"{what}, line {number}: stamp {fields[0]} does not rise; sort the lines by time")
         stamps.append(stamp)
-        transforms.append(se3(rotation_from_quat_wxyz(values[[6, 3, 4, 5]]), values[:3]))
-    return Trajectory(np.array(stamps, np.int64), np.array(transforms).reshape(-1, 4, 4))
+        frame_from_body.append(se3(rotation_from_quat_wxyz(values[[6, 3, 4, 5]]), values[:3]))
+    return Trajectory(np.array(stamps, np.int64), np.array(frame_from_body).reshape(-1, 4, 4))
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from realdata import real_data
 
 from fleetmap.bow import PlaceIndex, train_vocabulary
 from fleetmap.features.orb import OrbSettings, detect
 from fleetmap.geometry import Array, rotation_angle_rad, rotation_from_quat_wxyz
+from realdata import real_data
 
 
 def _flight(root: Path) -> tuple[list[np.ndarray], Array, list[Array]]:

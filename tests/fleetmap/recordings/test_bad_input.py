@@ -103,7 +103,7 @@ def test_image_size_against_calibration_at_open_and_later(euroc: Path) -> None:
     file.write_bytes(whole)
     sensor = euroc / "mav0/cam0/sensor.yaml"
     sensor.write_text(sensor.read_text().replace(f"[{WIDTH}, {HEIGHT}]", "[752, 480]"))
-    with pytest.raises(RecordingError, match="752x480.*--calibration"):
+    with pytest.raises(RecordingError, match=r"752x480.*--calibration"):
         open_recording(euroc)
 
 

@@ -59,17 +59,17 @@ def test_euroc_without_second_camera_or_imu(tmp_path: Path) -> None:
 def test_euroc_imu_that_is_not_the_body(tmp_path: Path) -> None:
     """The body is the IMU: cameras and truth are given in its axes, wherever EuRoC's body is."""
     folder = write_euroc(tmp_path / "r", SAMPLE)
-    mounting = se3(so3_exp(np.array([0.1, -0.2, 0.3])), np.array([0.01, 0.02, 0.03]))
+    euroc_from_imu = se3(so3_exp(np.array([0.1, -0.2, 0.3])), np.array([0.01, 0.02, 0.03]))
     file = folder / "mav0/imu0/sensor.yaml"
     text = file.read_text()
     start, end = text.index("data: [") + 7, text.index("]", text.index("data: ["))
-    file.write_text(text[:start] + ", ".join(repr(float(v)) for v in mounting.ravel()) + text[end:])
+    file.write_text(text[:start] + ", ".join(repr(float(v)) for v in euroc_from_imu.ravel()) + text[end:])
     recording = open_recording(folder)
     imu_from_cam = recording.calibration.cameras[0].body_from_cam
-    np.testing.assert_allclose(imu_from_cam, se3_inverse(mounting) @ BODY_FROM_CAM0, atol=1e-12)
+    np.testing.assert_allclose(imu_from_cam, se3_inverse(euroc_from_imu) @ BODY_FROM_CAM0, atol=1e-12)
     assert recording.ground_truth is not None
     np.testing.assert_allclose(
-        recording.ground_truth.frame_from_body[0], SAMPLE.world_from_body[0] @ mounting, atol=1e-9
+        recording.ground_truth.frame_from_body[0], SAMPLE.world_from_body[0] @ euroc_from_imu, atol=1e-9
     )
 
 
@@ -171,7 +171,7 @@ def test_seven_scenes_depth_is_registered_to_colour(tmp_path: Path) -> None:
 def test_seven_scenes_with_a_depth_camera_beside_the_colour_camera(tmp_path: Path) -> None:
     """A point at depth z seen from 50 mm to the right moves by f * 0.05 / z px in the colour image."""
     folder = write_seven_scenes(tmp_path / "r", SAMPLE)
-    lens = f"camera_model: pinhole, distortion_model: none, intrinsics: [300, 300, {WIDTH / 2}, {HEIGHT / 2}], resolution: [{WIDTH}, {HEIGHT}]"
+    lens = f"camera_model: pinhole, intrinsics: [300, 300, {WIDTH / 2}, {HEIGHT / 2}], resolution: [{WIDTH}, {HEIGHT}]"
     rows = "[[1, 0, 0, -0.05], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
     (tmp_path / "rig.yaml").write_text(f"cam0: {{{lens}}}\ncam1: {{{lens}, T_cn_cnm1: {rows}}}\n")
     recording = open_recording(folder, OpenOptions(calibration_file=tmp_path / "rig.yaml"))

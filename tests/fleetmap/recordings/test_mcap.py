@@ -258,7 +258,12 @@ def test_images_of_every_encoding(tmp_path: Path) -> None:
         (StoredImage("bgr8", colour.tobytes(), "", WIDTH, HEIGHT, 3 * WIDTH), wanted),
         (StoredImage("rgb8", colour[..., ::-1].tobytes(), "", WIDTH, HEIGHT, 3 * WIDTH), wanted),
         (StoredImage("mono16", (grey.astype("<u2") * 256).tobytes(), "", WIDTH, HEIGHT, 2 * WIDTH), grey),
-        (StoredImage("mono16", (grey.astype(np.uint16) * 256).astype(">u2").tobytes(), "", WIDTH, HEIGHT, 2 * WIDTH, True), grey),
+        (
+            StoredImage(
+                "mono16", (grey.astype(np.uint16) * 256).astype(">u2").tobytes(), "", WIDTH, HEIGHT, 2 * WIDTH, True
+            ),
+            grey,
+        ),
         (StoredImage("mono8", padded.tobytes(), "", WIDTH, HEIGHT, WIDTH + 12), grey),
     ]
     messages: list[Message] = [("/cam0/camera_info", "sensor_msgs/CameraInfo", 1, camera_info("", []))]
@@ -320,3 +325,22 @@ def test_base_and_time_shift_travel(tmp_path: Path) -> None:
     recording = open_recording(write(tmp_path / "a.mcap", calibration=rig))
     np.testing.assert_array_equal(recording.calibration.base_from_body, rig.base_from_body)
     assert [c.imu_minus_cam_s for c in recording.calibration.cameras] == [0.0123, 0.0123]
+
+
+def test_a_rosbag2_folder(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    write_foreign(bag / "bag_0.mcap", foreign_messages())
+    with open_recording(bag) as recording:
+        assert_is_the_sample(recording)
+    write_foreign(bag / "bag_1.mcap", foreign_messages())
+    with pytest.raises(RecordingError, match=r"holds 2 \.mcap files"):
+        open_recording(bag)
+
+
+def test_a_closed_recording_says_so(tmp_path: Path) -> None:
+    recording = open_recording(write(tmp_path / "a.mcap"))
+    recording.close()
+    with pytest.raises(RecordingError, match="after the recording was closed"):
+        recording.read_frame(0)

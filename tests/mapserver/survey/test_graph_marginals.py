@@ -24,8 +24,8 @@ def _exact(drive: Drive, pairs: list[tuple[int, int]], is_loop: bool = True) -> 
 
 def _gtsam_relative_cov(map_from_body: Array, edges: list[PoseEdge], i: int, j: int) -> Array:
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for k, transform in enumerate(map_from_body):
-        values.insert(k, gtsam.Pose3(transform))
+    for k, map_from_k in enumerate(map_from_body):
+        values.insert(k, gtsam.Pose3(map_from_k))
     for edge in edges:
         j_from_i = adjoint(se3_inverse(edge.i_from_j))
         noise = gtsam.noiseModel.Gaussian.Covariance(j_from_i @ edge.cov_rot_trans @ j_from_i.T, False)

@@ -17,8 +17,8 @@ from realdata import real_data
 def _revisit_error_m(drive: Drive, map_from_body: Array) -> float:
     """Root mean square error of where a keyframe is seen from the same place of the lap before, over all of them."""
     seen, true = (
-        np.array([np.linalg.inv(transforms[k - 40]) @ transforms[k] for k in range(40, 80)])[:, :3, 3]
-        for transforms in (map_from_body, drive.truth)
+        np.array([np.linalg.inv(frame_from_body[k - 40]) @ frame_from_body[k] for k in range(40, 80)])[:, :3, 3]
+        for frame_from_body in (map_from_body, drive.truth)
     )
     return float(np.sqrt(np.mean(np.sum((seen - true) ** 2, axis=1))))
 

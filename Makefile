@@ -1,0 +1,69 @@
+# Five verbs. Each makes .venv itself; all that is needed is Python >= 3.11 (with venv) and make.
+#
+#   make demo RECORDING=PATH   build a map of half of a recording, serve it, localize the other half in it
+#   make test                  every test
+#   make check                 format, lint, types, import contracts
+#   make bench                 how fast and how exact, in numbers
+#   make clean                 remove everything that the other verbs made
+
+PYTHON ?= python3
+RECORDING ?=
+TESTS ?= tests
+BENCHMARKS ?= tests/benchmarks
+PYTEST_ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# Stamps: the time of the last install. Installing for development covers what the demo runs.
+RUN_STAMP := $(VENV)/.installed-run
+DEV_STAMP := $(VENV)/.installed-dev
+INPUTS := pyproject.toml constraints.txt
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo demo-recording test check bench clean
+
+help:
+	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
+
+demo: demo-recording $(RUN_STAMP)
+	@BIN=$(BIN) deploy/demo.sh "$(RECORDING)"
+
+# Before the minute of installing.
+demo-recording:
+	@deploy/demo.sh --check "$(RECORDING)"
+
+test: $(DEV_STAMP)
+	$(BIN)/python -m pytest $(TESTS) --ignore=$(BENCHMARKS) $(PYTEST_ARGS)
+
+check: $(DEV_STAMP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(DEV_STAMP)
+	$(BIN)/python -m pytest $(BENCHMARKS) -s $(PYTEST_ARGS)
+
+clean:
+	rm -rf $(VENV) out dist build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@command -v "$(PYTHON)" >/dev/null || { \
+	  echo "fleetmap: no $(PYTHON) found; install Python 3.11 or newer, or name one: make PYTHON=/path/to/python3" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "fleetmap: $$("$(PYTHON)" --version 2>&1) is too old; Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@"$(PYTHON)" -m venv $(VENV) || { \
+	  rm -rf $(VENV); echo "fleetmap: $(PYTHON) cannot make virtual environments; install its venv module (python3-venv on Debian)" >&2; exit 1; }
+
+$(DEV_STAMP): $(INPUTS) | $(BIN)/python
+	@echo "installing fleetmap with everything that tests need into $(VENV)"
+	@$(INSTALL) -e ".[dev]"
+	@touch $(RUN_STAMP) $(DEV_STAMP)
+
+$(RUN_STAMP): $(INPUTS) | $(BIN)/python
+	@echo "installing fleetmap, server and client, into $(VENV)"
+	@$(INSTALL) -e ".[server,client]"
+	@touch $(RUN_STAMP)

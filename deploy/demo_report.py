@@ -1,0 +1,118 @@
+"""What the demo shows: whether a recording has a truth, the robots that the server knows, the table of results."""
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+Report = dict[str, Any]
+
+# Title, path of the key in the report, factor, format of the value with its unit.
+BUILD_ROWS = (
+    ("position error of the survey (ATE, RMSE)", "ate_rmse_m", 1, "{:.3f} m"),
+    ("the same after removing scale", "ate_sim3_rmse_m", 1, "{:.3f} m"),
+    ("frames with an estimate", "evaluated_share", 100, "{:.1f} %"),
+    ("path", "path_m", 1, "{:.1f} m"),
+    ("keyframes", "keyframes", 1, "{:d}"),
+    ("landmarks", "landmarks", 1, "{:d}"),
+    ("map that a robot downloads", "map_bytes", 1e-3, "{:.0f} kB"),
+    ("vocabulary, once per site", "vocabulary_bytes", 1e-3, "{:.0f} kB"),
+    ("loops looked at", "loops.candidates", 1, "{:d}"),
+    ("loops refused by position", "loops.gated_out", 1, "{:d}"),
+    ("loops refused by geometry", "loops.rejected", 1, "{:d}"),
+    ("loops accepted", "loops.accepted", 1, "{:d}"),
+    ("time", "seconds", 1, "{:.1f} s"),
+    ("peak memory", "peak_rss_mb", 1, "{:.0f} MB"),
+)
+REPLAY_ROWS = (
+    ("map version", "map_version", 1, "{:d}"),
+    ("frames", "frames", 1, "{:d}"),
+    ("first fix after", "first_fix_s", 1, "{:.2f} s"),
+    ("localised", "localised_share", 100, "{:.1f} %"),
+    ("position error, median", "error_m.median", 1, "{:.3f} m"),
+    ("position error, 95 %", "error_m.p95", 1, "{:.3f} m"),
+    ("position error, 99 %", "error_m.p99", 1, "{:.3f} m"),
+    ("position error, worst", "error_m.max", 1, "{:.3f} m"),
+    ("direction error, median", "error_deg.median", 1, "{:.2f} deg"),
+    ("position failures", "position_failures", 1, "{:d}"),
+    ("silent failures", "silent_failures", 1, "{:d}"),
+    ("CPU time for a frame, median", "frame_ms.p50", 1, "{:.1f} ms"),
+    ("CPU time for a frame, 99 %", "frame_ms.p99", 1, "{:.1f} ms"),
+    ("peak memory", "peak_rss_mb", 1, "{:.0f} MB"),
+)
+
+
+def value_at(report: Report, path: str) -> Any:
+    """The value at a dotted path; None where it, or what should hold it, is null."""
+    value: Any = report
+    for key in path.split("."):
+        if value is None:
+            return None
+        value = value[key]
+    return value
+
+
+def table_of(title: str, report: Report, rows: Sequence[tuple[str, str, float, str]]) -> Table:
+    """Two columns, one row per value."""
+    table = Table("", title, title=None)
+    table.columns[1].justify = "right"
+    for name, path, factor, shown in rows:
+        value = value_at(report, path)
+        table.add_row(name, "not known" if value is None else shown.format(value if factor == 1 else value * factor))
+    return table
+
+
+def has_truth(recording: Path) -> bool:
+    """Whether the recording carries ground truth."""
+    from fleetmap.recordings import open_recording
+
+    with open_recording(recording) as source:
+        return source.ground_truth is not None
+
+
+def show_robots(console: Console, url: str) -> None:
+    """One line for each robot; no robot is an error, because one has just reported."""
+    with urlopen(url, timeout=10) as answer:  # an address that the server itself has printed
+        robots = json.load(answer)["robots"]
+    if not robots:
+        raise SystemExit(f"demo: {url} shows no robot, though one has just run; see the server's log")
+    for robot in robots:
+        health = robot["last_health"] or {}
+        console.print(
+            Text(
+                f"robot {robot['robot']} on site {robot['site']}: runs version {robot['version']}, "
+                f"should run {robot['wanted_version']}, last status {health.get('status')}, "
+                f"flags {', '.join(health.get('flags') or ()) or 'none'}, heard {robot['seconds_since']:.1f} s ago"
+            )
+        )
+
+
+def main(arguments: list[str]) -> None:
+    """Runs one of: has-truth RECORDING, robots URL, table BUILD.json REPLAY.json."""
+    console = Console(width=78)
+    match arguments:
+        case ["has-truth", recording]:
+            from fleetmap.errors import FleetmapError
+
+            try:
+                print("yes" if has_truth(Path(recording)) else "no")
+            except FleetmapError as error:
+                print(f"demo: {error}", file=sys.stderr)
+                sys.exit(error.exit_status)
+        case ["robots", url]:
+            show_robots(console, url)
+        case ["table", build, replay]:
+            console.print(table_of("build", json.loads(Path(build).read_text("utf-8")), BUILD_ROWS))
+            console.print(table_of("replay", json.loads(Path(replay).read_text("utf-8")), REPLAY_ROWS))
+        case _:
+            sys.exit("usage: demo_report.py has-truth RECORDING | robots URL | table BUILD.json REPLAY.json")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,38 @@
+"""The command `locclient`. Heavy imports happen inside the commands, after their arguments are checked."""
+
+import sys
+from importlib import import_module
+from pkgutil import iter_modules
+
+import typer
+
+from fleetmap.errors import FleetmapError
+from locclient import commands
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.callback()
+def locclient() -> None:
+    """Localise a camera robot in the maps of its fleet."""
+
+
+# One file in `commands` for each command, with a function of the same name.
+for _module in sorted(iter_modules(commands.__path__), key=lambda module: module.name):
+    app.command()(getattr(import_module(f"{commands.__name__}.{_module.name}"), _module.name))
+
+
+def main() -> None:
+    """Runs the command line; a FleetmapError becomes its message on stderr and its exit status, Ctrl-C becomes 130."""
+    try:
+        app()
+    except FleetmapError as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(error.exit_status)
+    except KeyboardInterrupt:
+        typer.echo("interrupted", err=True)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""`locclient replay`: a recording played to the localizer against a published map."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from fleetmap.errors import UsageError
+
+
+def replay(
+    recording: Annotated[Path, typer.Argument(help="A folder (the parent of mav0 for EuRoC) or an .mcap file.")],
+    server: Annotated[str | None, typer.Option(help="zenoh endpoint of the map server, tcp/HOST:PORT.")] = None,
+    store: Annotated[Path | None, typer.Option(help="A store's folder, instead of a server.")] = None,
+    site: Annotated[str | None, typer.Option(help="Name of the site.")] = None,
+    robot: Annotated[str | None, typer.Option(help="Name under which the robot reports.")] = None,
+    frames: Annotated[str | None, typer.Option(help="Which frames, as a Python slice A:B:C.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file that goes before the recording's own.")] = None,
+    prior: Annotated[str | None, typer.Option(help="Where the robot starts: X,Y,YAW,SIGMA_M (metres, radians).")] = None,
+    reverse: Annotated[bool | None, typer.Option("--reverse", help="Play backwards, with new stamps and without IMU.")] = None,
+    realtime: Annotated[bool | None, typer.Option("--realtime", help="As fast as it was recorded, not as fast as possible.")] = None,
+    report: Annotated[Path | None, typer.Option(help="Write the report here, JSON.")] = None,
+    trajectory: Annotated[Path | None, typer.Option(help="Write the localised frames here, TUM format.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Write a top-down picture here, PNG.")] = None,
+    cache: Annotated[Path | None, typer.Option(help="Folder of the tile cache (default: the user's cache).")] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file with these options and the localizer's settings.")] = None,
+) -> None:
+    """Fetches the site's map, localises every frame in it, and reports what the run was worth."""
+    given = {name: value for name, value in locals().items() if name not in ("recording", "config") and value is not None}
+    from fleetmap.config import load_toml
+    from locclient.config import LocclientConfig
+
+    loaded = load_toml(config, LocclientConfig) if config is not None else LocclientConfig()
+    options = _merged(loaded, given)
+    if options["site"] is None:
+        raise UsageError("--site NAME is missing: which site's map?")
+    if (options["server"] is None) == (options["store"] is None):
+        raise UsageError("give either --server tcp/HOST:PORT or --store DIR")
+    _run(recording, options, loaded)
+
+
+def _merged(config: Any, given: dict[str, Any]) -> dict[str, Any]:
+    section = {name: getattr(config.replay, name) for name in config.replay.__struct_fields__}
+    return {**section, **given}
+
+
+def _run(path: Path, options: dict[str, Any], config: Any) -> None:
+    import json
+
+    import cv2
+    import msgspec
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from fleetmap.recordings import FrameSelection, OpenOptions, open_recording
+    from fleetmap.recordings.tum import write_tum
+    from locclient.connection import connected
+    from locclient.pictures import replay_picture
+    from locclient.replay import replay as play
+    from locclient.sources import ReplaySource
+
+    prior = _prior(options["prior"])
+    calibration = None if options["calibration"] is None else Path(options["calibration"])
+    selection = FrameSelection.parse(options["frames"])
+    console = Console(stderr=True)
+    with (
+        open_recording(path, OpenOptions(calibration_file=calibration, topics=config.topics)) as recording,
+        connected(options) as link,
+        Progress(console=console, disable=not console.is_terminal) as bar,
+    ):
+        for loss in recording.losses:
+            console.print(f"note: {loss.what} {loss.detail}".rstrip())
+        source = ReplaySource.of(recording, selection, reverse=options["reverse"])
+        task = bar.add_task("replay", total=len(source))
+        result = play(source, link, config.localizer, prior, realtime=options["realtime"], progress=lambda n: bar.update(task, completed=n + 1))
+    built = result.report()
+    if options["report"] is not None:
+        Path(options["report"]).write_text(json.dumps(msgspec.to_builtins(built), indent=2) + "\n")
+    if options["trajectory"] is not None:
+        write_tum(Path(options["trajectory"]), result.trajectory())
+    if options["picture"] is not None and not cv2.imwrite(str(options["picture"]), replay_picture(result)):
+        raise UsageError(f"the picture cannot be written to {options['picture']}; give a path that ends in .png")
+    _print_table(built)
+
+
+def _prior(text: str | None) -> Any:
+    if text is None:
+        return None
+    import numpy as np
+
+    from fleetmap.geometry import se3, so3_exp
+    from fleetmap.samples import PositionPrior
+
+    try:
+        x_m, y_m, yaw_rad, sigma_m = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UsageError(f"--prior {text!r} is not X,Y,YAW,SIGMA_M: four numbers, metres and radians") from error
+    if not sigma_m > 0:
+        raise UsageError(f"--prior {text!r}: SIGMA_M must be positive metres")
+    covariance = np.diag([np.inf, np.inf, np.inf, sigma_m**2, sigma_m**2, np.inf])
+    return PositionPrior(0, se3(so3_exp(np.array([0.0, 0.0, yaw_rad])), np.array([x_m, y_m, 0.0])), covariance)
+
+
+def _print_table(report: dict[str, object]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("measure", "value")
+    for name, value in report.items():
+        if isinstance(value, dict):
+            value = "  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in value.items())
+        elif isinstance(value, float):
+            value = f"{value:.4g}"
+        table.add_row(name, "-" if value is None or value in ("", []) else str(value))
+    Console().print(table)

@@ -1,0 +1,84 @@
+"""The part of a map that a robot holds: landmarks and places of the tiles around, ready to be looked up."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.bow import PlaceIndex, Vocabulary
+from fleetmap.features.orb import SCALE_FACTOR
+from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.mapformat import Tile
+from fleetmap.rectification import StereoCamera
+
+Rows = NDArray[np.int64]
+
+
+class MapView:
+    """Landmarks (N) and places (K) of some tiles of one version.
+
+    landmark arrays are as in Tile; survey_focal_px is that of the camera that made the map: a robot's lens sees the same corner at
+    the same scale from a distance that grows with its own focal length.
+    """
+
+    def __init__(self, tiles: Iterable[Tile], vocabulary: Vocabulary, survey_focal_px: float) -> None:
+        held = sorted(tiles, key=lambda t: (t.tile_x, t.tile_y))
+        self.vocabulary = vocabulary
+        self._survey_focal_px = survey_focal_px
+        self.landmark_ids = _joined([t.landmark_ids for t in held], (0,), np.uint32)
+        self.points_map = _joined([t.points_map for t in held], (0, 3), np.float64)
+        self.descriptors = _joined([t.descriptors for t in held], (0, 32), np.uint8)
+        self.view_directions_map = _joined([t.view_directions_map for t in held], (0, 3), np.float32)
+        self.view_half_angles_rad = _joined([t.view_half_angle_rad for t in held], (0,), np.float32)
+        self.max_distances_m = _joined([t.max_distance_m for t in held], (0,), np.float32)
+        self.sigmas_m = _joined([t.sigma_m for t in held], (0,), np.float32)
+        self.map_from_cam = _joined([t.map_from_cam for t in held], (0, 4, 4), np.float64)
+        self.place_rows = [self._rows(ids) for t in held for ids in t.place_landmark_ids]
+        self._index = PlaceIndex(vocabulary.word_count)
+        words = vocabulary.words(self.descriptors) if len(self.descriptors) else np.zeros(0, np.int32)
+        for place, rows in enumerate(self.place_rows):
+            self._index.add(place, vocabulary.bow_vector(words[rows]))
+
+    def __len__(self) -> int:
+        return len(self.points_map)
+
+    def _rows(self, ids: NDArray[np.uint32]) -> Rows:
+        """Rows of landmark ids; those in tiles that are not held are left out."""
+        order = np.argsort(self.landmark_ids, kind="stable")
+        at = np.searchsorted(self.landmark_ids[order], ids)
+        at = np.minimum(at, max(len(order) - 1, 0))
+        rows = order[at] if len(order) else np.zeros(0, np.int64)
+        return np.asarray(rows[self.landmark_ids[rows] == ids] if len(order) else rows, np.int64)
+
+    def similar_places(self, descriptors: NDArray[np.uint8], allowed: NDArray[np.bool_] | None, top: int) -> Rows:
+        """Places that share the most words with the descriptors, best first."""
+        vector = self.vocabulary.bow_vector(self.vocabulary.words(descriptors))
+        places, _ = self._index.query(vector, allowed, top)
+        return places
+
+    def visible(self, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float) -> tuple[Rows, Array, Array]:
+        """Rows (V,) of landmarks that a camera there should see, their pixels (V, 3) and expected octaves (V,)."""
+        near = np.linalg.norm(self.points_map - map_from_cam[:3, 3], axis=1)
+        reach = self.max_distances_m * (camera.focal_px / self._survey_focal_px)
+        rows = np.flatnonzero((near < 1.3 * reach) & (near > 0.2))
+        points_cam = transform_points(se3_inverse(map_from_cam), self.points_map[rows])
+        pixels = camera.pixel_from_point(points_cam)
+        towards = (map_from_cam[:3, 3] - self.points_map[rows]) / near[rows, None]
+        cosine = np.einsum("ni,ni->n", towards, self.view_directions_map[rows].astype(np.float64))
+        limit = np.cos(np.minimum(self.view_half_angles_rad[rows] + max_view_angle_rad, np.pi))
+        inside = (pixels[:, 0] > -margin_px) & (pixels[:, 0] < camera.width_px + margin_px)
+        inside &= (pixels[:, 1] > -margin_px) & (pixels[:, 1] < camera.height_px + margin_px) & (cosine > limit)
+        rows = rows[inside]
+        octaves = np.log(np.maximum(reach[rows] / near[rows], 0.5)) / np.log(SCALE_FACTOR)
+        return rows, pixels[inside], octaves
+
+    def neighbourhood(self, place: int, reach_m: float) -> Rows:
+        """Rows of all landmarks of places near one place that look a similar way."""
+        positions, axes = self.map_from_cam[:, :3, 3], self.map_from_cam[:, :3, 2]
+        near = np.linalg.norm(positions - positions[place], axis=1) < reach_m
+        near &= axes @ axes[place] > 0.5
+        return np.unique(np.concatenate([self.place_rows[p] for p in np.flatnonzero(near)]))
+
+
+def _joined(parts: list[NDArray[np.generic]], shape: tuple[int, ...], dtype: type) -> NDArray:  # type: ignore[type-arg]
+    return np.concatenate(parts).astype(dtype) if parts else np.zeros(shape, dtype)

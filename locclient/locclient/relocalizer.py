@@ -1,0 +1,168 @@
+"""One frame placed in the map: by projection where it nearly is, by words where it might be anywhere. Pure."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.features import orb, stereo
+from fleetmap.features.matching import match_by_projection, match_mutual
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.pose_solver import Resection, ransac_resection, refine_resection, resection_with_rotation
+from fleetmap.rectification import RectifiedFrame, StereoCamera
+from locclient.map_view import MapView
+from locclient.settings import FixSettings, LocalizerSettings
+
+_NEIGHBOURHOOD_M = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """A verified place of one frame.
+
+    map_from_cam (4, 4); cov_rot_trans (6, 6) in map axes, rotation first; inliers and cells of the image that hold them.
+    """
+
+    map_from_cam: Array
+    cov_rot_trans: Array
+    inliers: int
+    cells: int
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """Features of one frame and their disparities: pixels (N, 3) u_left v u_right."""
+
+    features: orb.Features
+    pixels: Array
+
+
+class Relocalizer:
+    """Finds fixes of frames in one map view."""
+
+    def __init__(self, view: MapView, camera: StereoCamera, settings: LocalizerSettings) -> None:
+        self.view = view
+        self._camera = camera
+        self._settings = settings
+
+    def look(self, frame: RectifiedFrame) -> Seen:
+        """What one frame shows."""
+        features = orb.detect(frame.left, self._settings.orb)
+        found = stereo.disparities(frame, self._camera, features.pixels, self._settings.stereo)
+        return Seen(features, np.column_stack([features.pixels, features.pixels[:, 0] - found[:, 0]]))
+
+    def near(self, seen: Seen, map_from_cam: Array, cov_rot_trans: Array) -> Fix | None:
+        """The fix near a predicted place whose covariance (map axes) sets the search window; None where nothing agrees."""
+        radius = self._radius_px(map_from_cam, cov_rot_trans)
+        if radius > self._settings.fix.max_radius_px:
+            return None
+        return self._by_projection(seen, map_from_cam, radius)
+
+    def anywhere(
+        self, seen: Seen, allowed: NDArray[np.bool_] | None = None, map_from_cam_rotation: Array | None = None
+    ) -> list[Fix]:
+        """Fixes of all places that look like this one and verify, best first, duplicates removed.
+
+        allowed (K,): places that may be considered. map_from_cam_rotation: the orientation, where it is known.
+        """
+        fixes: list[Fix] = []
+        for place in self.view.similar_places(seen.features.descriptors, allowed, self._settings.fix.top_places):
+            fix = self._at_place(seen, int(place), map_from_cam_rotation)
+            if fix is not None and all(not _same(fix, other) for other in fixes):
+                fixes.append(fix)
+        return sorted(fixes, key=lambda f: -f.inliers)
+
+    def _at_place(self, seen: Seen, place: int, rotation: Array | None) -> Fix | None:
+        settings = self._settings.fix
+        rows = self.view.neighbourhood(place, _NEIGHBOURHOOD_M)
+        pairs = match_mutual(self.view.descriptors[rows], seen.features.descriptors, settings.max_distance, settings.ratio)
+        if len(pairs) < settings.min_inliers // 2:
+            return None
+        points, pixels = self.view.points_map[rows[pairs[:, 0]]], seen.pixels[pairs[:, 1]]
+        sigmas = self._sigmas(seen, pairs[:, 1], rows[pairs[:, 0]], points, None)
+        found: Resection | None = None
+        if rotation is not None:
+            found = resection_with_rotation(
+                self._camera, points, pixels, sigmas, rotation.T, threshold_px=2 * settings.ransac_px + settings.rotation_sigma_rad * self._camera.focal_px,
+                min_inliers=settings.min_inliers // 2, rotation_sigma_rad=settings.rotation_sigma_rad,
+            )  # fmt: skip
+        if found is None:
+            found = ransac_resection(
+                self._camera, points, pixels, sigmas, threshold_px=settings.ransac_px, min_inliers=settings.min_inliers // 2,
+                seed=self._settings.seed,
+            )  # fmt: skip
+            if found is None or found.inliers.sum() < 0.15 * len(pairs):
+                return None
+        return self._by_projection(seen, se3_inverse(found.cam_from_source), settings.guided_radius_px)
+
+    def _by_projection(self, seen: Seen, map_from_cam: Array, radius_px: float) -> Fix | None:
+        """Guided matching of all visible landmarks around a place, twice: wide, then narrow around the first answer."""
+        settings = self._settings.fix
+        found: Resection | None = None
+        inlier_features: NDArray[np.int64] = np.zeros(0, np.int64)
+        for radius in (radius_px, min(radius_px, settings.guided_radius_px) * 0.6):
+            rows, pixels, octaves = self.view.visible(
+                map_from_cam, self._camera, radius, np.radians(settings.max_view_angle_deg)
+            )
+            if len(rows) < settings.min_inliers:
+                return None
+            span = np.column_stack([np.floor(octaves) - 2, np.ceil(octaves) + 2]).astype(np.int64)
+            window = radius * orb.SCALE_FACTOR ** np.clip(octaves, 0, 3)
+            hit, _ = match_by_projection(
+                pixels[:, :2], window, self.view.descriptors[rows], span, seen.features.pixels, seen.features.octaves,
+                seen.features.descriptors, settings.guided_distance, settings.guided_ratio,
+            )  # fmt: skip
+            kept = np.flatnonzero(hit >= 0)
+            if len(kept) < settings.min_inliers:
+                return None
+            points = self.view.points_map[rows[kept]]
+            sigmas = self._sigmas(seen, hit[kept], rows[kept], points, map_from_cam)
+            found = refine_resection(self._camera, points, seen.pixels[hit[kept]], sigmas, se3_inverse(map_from_cam))
+            if found is None or found.inliers.sum() < settings.min_inliers:
+                return None
+            map_from_cam = se3_inverse(found.cam_from_source)
+            inlier_features = hit[kept][found.inliers]
+        assert found is not None
+        return self._verified(seen, found, inlier_features)
+
+    def _verified(self, seen: Seen, found: Resection, features: NDArray[np.int64]) -> Fix | None:
+        settings = self._settings.fix
+        pixels = seen.pixels[features]
+        column = np.clip(pixels[:, 0] / self._camera.width_px * 8, 0, 7).astype(int)
+        row = np.clip(pixels[:, 1] / self._camera.height_px * 6, 0, 5).astype(int)
+        cells = len(np.unique(column * 6 + row))
+        share = float(found.inliers.mean())
+        if cells < settings.min_cells or share < 0.35:
+            return None
+        map_from_cam = se3_inverse(found.cam_from_source)
+        rotation = map_from_cam[:3, :3]
+        carry = np.zeros((6, 6))  # left perturbation in camera axes -> rotation about the camera's place and its position, map axes
+        carry[:3, :3] = carry[3:, 3:] = -rotation
+        covariance = settings.covariance_scale * carry @ found.cov_rot_trans @ carry.T
+        covariance += np.diag([settings.floor_rad**2] * 3 + [settings.floor_m**2] * 3)
+        return Fix(map_from_cam, covariance, int(found.inliers.sum()), cells)
+
+    def _sigmas(
+        self, seen: Seen, features: NDArray[np.int64], rows: NDArray[np.int64], points: Array, map_from_cam: Array | None
+    ) -> Array:
+        """(N, 2): of pixels by octave, widened by the landmark's own uncertainty; of disparities."""
+        base = self._settings.fix.feature_sigma_px * orb.SCALE_FACTOR ** np.minimum(seen.features.octaves[features], 5).astype(np.float64)
+        if map_from_cam is not None:
+            distance = np.linalg.norm(points - map_from_cam[:3, 3], axis=1)
+            base = np.hypot(base, np.minimum(self._camera.focal_px * self.view.sigmas_m[rows] / distance, 10.0))
+        return np.column_stack([base, np.maximum(base, 1.0)])
+
+    def _radius_px(self, map_from_cam: Array, cov_rot_trans: Array) -> float:
+        """Three sigmas of a landmark's predicted pixel, at the median distance of what should be visible."""
+        rows, _, _ = self.view.visible(map_from_cam, self._camera, 50.0, np.pi)
+        if not len(rows):
+            return np.inf
+        depth = float(np.median(np.linalg.norm(self.view.points_map[rows] - map_from_cam[:3, 3], axis=1)))
+        position = float(np.sqrt(np.linalg.eigvalsh(cov_rot_trans[3:, 3:])[-1]))
+        angle = float(np.sqrt(np.linalg.eigvalsh(cov_rot_trans[:3, :3])[-1]))
+        return max(self._settings.fix.guided_radius_px, 3.0 * self._camera.focal_px * (position / max(depth, 0.5) + angle))
+
+
+def _same(a: Fix, b: Fix) -> bool:
+    cosine = 0.5 * (np.trace(a.map_from_cam[:3, :3].T @ b.map_from_cam[:3, :3]) - 1)
+    return bool(np.linalg.norm(a.map_from_cam[:3, 3] - b.map_from_cam[:3, 3]) < 0.5 and cosine > np.cos(np.radians(10)))

@@ -1,0 +1,61 @@
+"""Settings of the localization client; the same for every robot."""
+
+from fleetmap.config import Section
+from fleetmap.features.orb import OrbSettings
+from fleetmap.features.stereo import StereoSettings
+from fleetmap.odometry import OdometrySettings
+
+
+class FixSettings(Section, frozen=True):
+    """How one frame is placed in the map."""
+
+    min_inliers: int = 15
+    min_inliers_alone: int = 25
+    min_cells: int = 6
+    top_places: int = 8
+    max_distance: int = 75
+    ratio: float = 0.9
+    guided_distance: int = 70
+    guided_ratio: float = 0.95
+    guided_radius_px: float = 12.0
+    max_radius_px: float = 60.0
+    feature_sigma_px: float = 1.0
+    ransac_px: float = 5.0
+    rotation_sigma_rad: float = 0.03
+    covariance_scale: float = 4.0
+    floor_m: float = 0.01
+    floor_rad: float = 0.002
+    max_view_angle_deg: float = 75.0
+
+
+class TrackSettings(Section, frozen=True):
+    """When an estimate may be believed."""
+
+    fix_interval_s: float = 0.2
+    confirming_fixes: int = 3
+    confirming_distance_m: float = 1.0
+    tight_prior_sigma_m: float = 0.6
+    innovation_limit: float = 22.458
+    hypothesis_distance_m: float = 0.5
+    hypothesis_angle_deg: float = 6.0
+    rival_share: float = 0.5
+    max_misses: int = 4
+    drift_share: float = 0.01
+    drift_floor_m: float = 0.005
+    degraded_after_s: float = 1.5
+    degraded_radius_m: float = 0.3
+    lost_radius_m: float = 3.0
+    kidnap_fixes: int = 3
+    map_sigma_m: float = 0.02
+    map_sigma_rad: float = 0.006
+
+
+class LocalizerSettings(Section, frozen=True):
+    """All of it."""
+
+    seed: int = 0
+    odometry: OdometrySettings = OdometrySettings()
+    stereo: StereoSettings = StereoSettings()
+    orb: OrbSettings = OrbSettings(count=1000)
+    fix: FixSettings = FixSettings()
+    track: TrackSettings = TrackSettings()

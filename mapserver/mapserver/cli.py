@@ -1,0 +1,48 @@
+"""The command `mapserver`. Heavy imports happen inside the commands, after their arguments are checked."""
+
+import sys
+
+import typer
+
+from fleetmap.errors import FleetmapError
+from mapserver.commands.build import build
+from mapserver.commands.config_option import ConfigFile
+from mapserver.commands.convert import convert
+from mapserver.commands.doctor import doctor
+from mapserver.commands.evaluate import evaluate
+from mapserver.commands.inspect import inspect
+from mapserver.commands.publish import publish
+from mapserver.commands.serve import serve
+from mapserver.commands.versions import versions
+
+COMMANDS = (build, publish, versions, inspect, serve, convert, doctor, evaluate)
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.callback()
+def mapserver(config: ConfigFile = None) -> None:
+    """Build, keep and serve the maps of a fleet of camera robots.
+
+    Every option can also stand in the TOML file of --config, in a section named after its command.
+    """
+
+
+for _command in COMMANDS:
+    app.command()(_command)
+
+
+def main() -> None:
+    """Runs the command line; a FleetmapError becomes its message on stderr and its exit status, Ctrl-C becomes 130."""
+    try:
+        app()
+    except FleetmapError as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(error.exit_status)
+    except KeyboardInterrupt:
+        typer.echo("interrupted", err=True)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+"""`mapserver build`: a recording becomes a draft in the store."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleetmap.errors import UsageError
+from mapserver.commands.config_option import ConfigFile, config_path
+
+
+def build(
+    context: typer.Context,
+    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folder or .mcap file to survey.")],
+    site: Annotated[str, typer.Option(help="Name of the site.")],
+    store: Annotated[Path, typer.Option(help="Folder of the map store; made if it is not there.")],
+    frames: Annotated[str, typer.Option(metavar="A:B:C", help="Slice of the frames that take part.")] = "::",
+    calibration: Annotated[Path | None, typer.Option(metavar="FILE", help="Kalibr camchain to use.")] = None,
+    zones: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="TOML file with areas that never see each other.")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the JSON report here.")] = None,
+    trajectory: Annotated[Path | None, typer.Option(metavar="FILE.tum", help="Write all frames' poses here.")] = None,
+    picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the map from above here.")] = None,
+    frame_from_ground_truth: Annotated[
+        bool, typer.Option("--frame-from-ground-truth", help="Place the finished map in the ground truth's frame.")
+    ] = False,
+    config: ConfigFile = None,
+) -> None:
+    """Survey RECORDING and store the map as a draft version of the site."""
+    if len(recordings) != 1:
+        raise UsageError(f"{len(recordings)} recordings: one recording per build; joining several comes with sessions")
+    for option, path in (("--report", report), ("--trajectory", trajectory), ("--picture", picture)):
+        if path is not None and (path.is_dir() or not path.parent.is_dir()):
+            raise UsageError(f"{option} {path}: name a file in a folder that exists")
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise UsageError(f"--picture {picture} does not end in .png; name it so, other types are not drawn")
+    from fleetmap.mapformat import check_name
+
+    check_name(site, "site")
+    from mapserver.building import BuildOrder, run_build
+    from mapserver.config import read_config
+
+    order = BuildOrder(
+        recordings[0], site, store, frames, calibration, zones, report, trajectory, picture, frame_from_ground_truth
+    )
+    typer.echo(run_build(order, read_config(config_path(context)).survey))

@@ -1,0 +1,93 @@
+"""The configuration file of `mapserver`: one section for each command, and [survey] for how maps are made.
+
+A command's section holds its options under their names, with `_` for `-`. Paths are relative to the working directory,
+as on the command line.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fleetmap.config import Section, load_toml, to_dict
+from mapserver.survey.settings import SurveySettings
+
+
+class BuildSection(Section, frozen=True):
+    """Options of `mapserver build`."""
+
+    site: str | None = None
+    store: str | None = None
+    frames: str | None = None
+    calibration: str | None = None
+    zones: str | None = None
+    report: str | None = None
+    trajectory: str | None = None
+    picture: str | None = None
+    frame_from_ground_truth: bool | None = None
+
+
+class StoreSection(Section, frozen=True):
+    """Options of `mapserver publish`, `versions` and `inspect` that make sense in a file."""
+
+    site: str | None = None
+    store: str | None = None
+    version: int | None = None
+    json: bool | None = None
+
+
+class ServeSection(Section, frozen=True):
+    """Options of `mapserver serve`."""
+
+    store: str | None = None
+    http: str | None = None
+    zenoh: str | None = None
+
+
+class ConvertSection(Section, frozen=True):
+    """Options of `mapserver convert`."""
+
+    calibration: str | None = None
+    force: bool | None = None
+
+
+class DoctorSection(Section, frozen=True):
+    """Options of `mapserver doctor`; json_file is its --json."""
+
+    calibration: str | None = None
+    json_file: str | None = None
+
+
+class EvaluateSection(Section, frozen=True):
+    """Options of `mapserver evaluate`."""
+
+    ground_truth: str | None = None
+    json: bool | None = None
+
+
+class MapserverConfig(Section, frozen=True):
+    """The whole file."""
+
+    build: BuildSection = BuildSection()
+    survey: SurveySettings = SurveySettings()
+    publish: StoreSection = StoreSection()
+    versions: StoreSection = StoreSection()
+    inspect: StoreSection = StoreSection()
+    serve: ServeSection = ServeSection()
+    convert: ConvertSection = ConvertSection()
+    doctor: DoctorSection = DoctorSection()
+    evaluate: EvaluateSection = EvaluateSection()
+
+
+def read_config(path: Path | None) -> MapserverConfig:
+    """The settings of the file at `path`, the defaults without one; UsageError as `load_toml`."""
+    return MapserverConfig() if path is None else load_toml(path, MapserverConfig)
+
+
+def command_defaults(config: MapserverConfig) -> dict[str, dict[str, Any]]:
+    """By command, the options that the file sets."""
+    commands = (name for name in msgspec.structs.asdict(config) if name != "survey")
+    return {
+        name: {option: value for option, value in to_dict(getattr(config, name)).items() if value is not None}
+        for name in commands
+    }

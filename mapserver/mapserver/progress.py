@@ -1,0 +1,71 @@
+"""How far a build has come: bars on a terminal, one line for each stage elsewhere; and the seconds of each stage."""
+
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+
+class StageTimes:
+    """Seconds of each stage, from calls (stage, done, total) and the time between them.
+
+    The time before a call belongs to the stage of the call before, unless that was finished and another one has begun.
+    """
+
+    def __init__(self, clock_s: Callable[[], float]) -> None:
+        self.seconds: dict[str, float] = {}
+        self._clock_s, self._last_s = clock_s, clock_s()
+        self._stage, self._finished = "", True
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Notes that `done` of `total` parts of a stage are done."""
+        self._spend(stage if self._finished and done > 0 else self._stage or stage)
+        self._stage, self._finished = stage, done >= total
+
+    def begin(self, stage: str) -> None:
+        """Ends the stage that runs and begins another, of which nothing more is heard."""
+        self._spend(self._stage or stage)
+        self._stage, self._finished = stage, False
+
+    def _spend(self, stage: str) -> None:
+        now_s = self._clock_s()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now_s - self._last_s
+        self._last_s = now_s
+
+
+class ProgressView:
+    """Shows calls (stage, done, total) on a console until it is closed."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._shown = ""
+        self._tasks: dict[str, TaskID] = {}
+        columns = (TextColumn("{task.description:<18}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        self._bars = Progress(*columns, console=console) if console.is_terminal else None
+
+    def __enter__(self) -> Self:
+        if self._bars is not None:
+            self._bars.start()
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Shows that `done` of `total` parts of a stage are done."""
+        if self._bars is not None:
+            self._show_bar(self._bars, stage, done, total)
+        elif stage != self._shown:
+            self._console.print(f"{stage}: {total}" if total > 1 else stage, markup=False, highlight=False)
+        self._shown = stage
+
+    def _show_bar(self, bars: Progress, stage: str, done: int, total: int) -> None:
+        if stage not in self._tasks:
+            self._tasks[stage] = bars.add_task(stage, total=total)
+        if self._shown and stage != self._shown:  # "matching again" comes twice: begin anew, close the one before
+            last = bars.tasks[self._tasks[self._shown]]
+            bars.update(last.id, completed=last.total)
+        bars.update(self._tasks[stage], completed=done, total=total)

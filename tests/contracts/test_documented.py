@@ -1,0 +1,114 @@
+"""Commands, options, endpoints, metrics, bus keys and report keys stand in the documents, and no table row is stale."""
+
+import importlib
+import inspect
+import re
+import tomllib
+from pathlib import Path
+
+import click
+import msgspec
+import pytest
+import typer
+
+from contracts_documents import REPOSITORY, code_words, rows, section, text
+from fleetmap import messages
+from locclient.health import METRICS
+from mapserver.build_report import BuildReport
+
+COMMANDS = "docs/command_line.md"
+SERVICE = "docs/service.md"
+REPORTS = "docs/reports.md"
+LINKED = re.compile(r"\]\((?!https?:)([^)#]+)")
+
+
+def _command(path: str) -> click.Command:
+    """A command by its words, such as "mapserver build", as its script has it."""
+    script, *words = path.split()
+    project = tomllib.loads(text("pyproject.toml"))["project"]
+    module = project["scripts"][script].partition(":")[0]
+    found = typer.main.get_command(importlib.import_module(module).app)
+    for word in words:
+        found = found.commands[word]  # type: ignore[attr-defined]
+    return found
+
+
+def _scripts() -> list[str]:
+    return sorted(tomllib.loads(text("pyproject.toml"))["project"]["scripts"])
+
+
+def _documented_commands() -> list[str]:
+    return re.findall(r"^## `(\w+ \w+)`", text(COMMANDS), re.MULTILINE)
+
+
+def _arguments(command: click.Command) -> set[str]:
+    """Names of the arguments as its usage line shows them."""
+    context = click.Context(command)
+    return {
+        parameter.make_metavar(context).strip("[]{}")
+        for parameter in command.params
+        if parameter.param_type_name == "argument"
+    }
+
+
+@pytest.mark.parametrize("script", _scripts())
+def test_commands_are_documented(script: str) -> None:
+    group = _command(script)
+    commands = {f"{script} {name}" for name in group.commands}  # type: ignore[attr-defined]
+    assert commands == {path for path in _documented_commands() if path.split()[0] == script}
+
+
+@pytest.mark.parametrize("path", _documented_commands())
+def test_options_are_documented(path: str) -> None:
+    command = _command(path)
+    options = {parameter.opts[0] for parameter in command.params if parameter.param_type_name == "option"}
+    documented = {code_words(row[0])[0] for row in rows(section(COMMANDS, f"`{path}`"))}
+    assert {word.split()[0] for word in documented if word.startswith("--")} == options - {"--help"}
+    assert {word for word in documented if not word.startswith("--")} == _arguments(command)
+
+
+def test_endpoints_are_documented(tmp_path: Path) -> None:
+    from mapserver.api.app import create_app
+    from mapserver.api.metrics import Metrics
+    from mapserver.fleet import Fleet
+    from mapserver.store import MapStore
+
+    with MapStore.open(tmp_path, create=True) as store:
+        fleet = Fleet(store)
+        metrics = Metrics(store, fleet)
+        paths = set(create_app(store, fleet, metrics, None).openapi()["paths"])
+        families = set(re.findall(r"^# TYPE (fleetmap_\w+)", metrics.text().decode(), re.MULTILINE))
+    documented = {code_words(row[0])[0] for row in rows(section(SERVICE, "HTTP"))}
+    assert documented == paths | {"/openapi.json"}
+    # The client library exposes the creation time of every counter beside it.
+    assert {code_words(row[0])[0] for row in rows(section(SERVICE, "Metrics"))} == {
+        family for family in families if not family.endswith("_created")
+    }
+
+
+def test_bus_keys_are_documented() -> None:
+    keys = set(re.findall(r"^(fleetmap/\S+)", inspect.getdoc(messages) or "", re.MULTILINE))
+    assert len(keys) >= 7
+    assert {code_words(row[0])[0] for row in rows(section(SERVICE, "Bus"))} == keys
+
+
+def test_build_report_keys_are_documented() -> None:
+    keys = {field.name for field in msgspec.structs.fields(BuildReport)}
+    assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Build"))} == keys
+
+
+def test_replay_report_keys_are_documented() -> None:
+    keys = set(METRICS) | {"peak_rss_mb", "map_version"}
+    assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Replay"))} == keys
+
+
+@pytest.mark.parametrize("document", sorted(str(p.relative_to(REPOSITORY)) for p in REPOSITORY.glob("docs/*.md")))
+def test_every_document_is_reached_from_the_readme(document: str) -> None:
+    assert document in text("README.md")
+
+
+@pytest.mark.parametrize("document", ["README.md", "shared/README.md", COMMANDS, SERVICE, REPORTS, "docs/settings.md"])
+def test_links_lead_somewhere(document: str) -> None:
+    folder = (REPOSITORY / document).parent
+    missing = [target for target in LINKED.findall(text(document)) if not (folder / target).exists()]
+    assert missing == []

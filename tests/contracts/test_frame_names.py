@@ -1,0 +1,150 @@
+"""Rigid transforms are named target_from_source, and the names meet where transforms are multiplied."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+ROOTS = ("shared", "mapserver", "locclient", "tests", "deploy")
+# Names of values that say neither target nor source, alone or as the last word; and T as in papers.
+VAGUE = re.compile(r"^(.*_)?(poses?|transforms?|extrinsics?)$|^T$|^T_|_T$")
+# Functions act on poses and messages of that name; only one that is nothing but the word returns a matrix.
+VAGUE_FUNCTION = re.compile(r"^_?(poses?|transforms?|extrinsics?|T)$")
+ALLOWED = {
+    "mapserver/mapserver/fleet.py": {"last_pose"},  # the last PoseMessage as plain values, not a matrix
+    "shared/fleetmap/recordings/mcap_codecs.py": {"pose"},  # the codec of PoseStamped, beside those of image and imu
+    "shared/fleetmap/recordings/mcap_foxglove.py": {"pose"},
+}
+# Products are checked where both names say one of the project's own frames; others may be the same by another name.
+KNOWN = {"map", "survey", "odom", "body", "base", "cam"}
+FRAMES = re.compile(r"^_?([a-z0-9_]+?)_from_([a-z0-9_]+)$")
+INVERSES = {"se3_inverse", "inverse_se3", "inv"}
+
+Offence = tuple[int, str]
+
+
+def offences(source: str, allowed: frozenset[str] = frozenset()) -> list[Offence]:
+    """Line and complaint for each offence in a module's text."""
+    tree = ast.parse(source)
+    found = [(line, f"{name}: name it target_from_source") for line, name in _vague(tree) if name not in allowed]
+    return sorted(found + list(_mismatches(tree)))
+
+
+def _vague(tree: ast.Module) -> Iterator[Offence]:
+    type_variables = {
+        target
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
+        if isinstance(node.value.func, ast.Name) and node.value.func.id in ("TypeVar", "ParamSpec")
+        for target in node.targets
+    }
+    for node in ast.walk(tree):
+        match node:
+            case ast.Name(id=name, ctx=ast.Store()) if node not in type_variables:
+                pass
+            case ast.Attribute(attr=name, ctx=ast.Store()) | ast.arg(arg=name):
+                pass
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name):
+                if VAGUE_FUNCTION.search(name):
+                    yield node.lineno, name
+                continue
+            case _:
+                continue
+        if VAGUE.search(name):
+            yield node.lineno, name
+
+
+def _mismatches(tree: ast.Module) -> Iterator[Offence]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
+            left, right = _frames(node.left), _frames(node.right)
+            if left and right and not _same(left[1], right[0]):
+                yield node.lineno, f"{ast.unparse(node)}: {left[1]} meets {right[0]}"
+        elif isinstance(node, ast.Assign) and len(node.targets) == 1:
+            wanted, built = _frames(node.targets[0]), _frames(node.value)
+            if wanted and built and not (_same(wanted[0], built[0]) and _same(wanted[1], built[1])):
+                yield node.lineno, f"{ast.unparse(node)}: that is {built[0]}_from_{built[1]}"
+
+
+def _frames(node: ast.expr) -> tuple[str, str] | None:
+    """Target and source of what an expression is by its name; None where names do not say."""
+    match node:
+        case ast.Name(id=name) | ast.Attribute(attr=name):
+            found = FRAMES.match(name)
+            return (found[1], found[2]) if found else None
+        case ast.Subscript(value=value):
+            return _frames(value)
+        case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name), args=[only]) if name in INVERSES:
+            inner = _frames(only)
+            return (inner[1], inner[0]) if inner else None
+        case ast.BinOp(op=ast.MatMult(), left=left, right=right):
+            first, last = _frames(left), _frames(right)
+            return (first[0], last[1]) if first and last else None
+    return None
+
+
+def _same(one: str, other: str) -> bool:
+    """Whether two names may be one frame: body and body_a, cam0 and cam; or one of them is not a known frame."""
+    known = [KNOWN & {word.rstrip("0123456789") for word in name.split("_")} for name in (one, other)]
+    return not (known[0] and known[1]) or bool(known[0] & known[1])
+
+
+def _modules() -> list[str]:
+    return sorted(str(path.relative_to(REPOSITORY)) for root in ROOTS for path in (REPOSITORY / root).rglob("*.py"))
+
+
+def test_modules_are_found() -> None:
+    assert len(_modules()) > 100
+
+
+@pytest.mark.parametrize("module", _modules())
+def test_frames(module: str) -> None:
+    found = offences((REPOSITORY / module).read_text("utf-8"), frozenset(ALLOWED.get(module, ())))
+    assert not found, "\n".join(f"{module}:{line}: {what}" for line, what in found)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        "pose = f()",
+        "def f(T): ...",
+        "self.camera_pose = x",
+        "T_cam_imu: object = 1",
+        "for transform in stack: ...",
+        "class A:\n    extrinsics: int",
+        "def transform(): ...",
+        "cam0_from_old_body = cam1_from_map",
+        "a = map_from_body @ map_from_cam",
+        "a = se3_inverse(map_from_body) @ body_from_cam",
+        "map_from_cam = body_from_cam",
+        "cam_from_map = se3_inverse(cam_from_map)",
+        "a = map_from_odom @ odom_from_body @ cam_from_body",
+    ],
+)
+def test_offenders_are_caught(bad: str) -> None:
+    assert offences(bad)
+
+
+@pytest.mark.parametrize(
+    "good",
+    [
+        'T = TypeVar("T", bound=int)',
+        "pose_graph = 1",
+        "pose_info, poses_per_s = 1, 2",
+        "rotation = x.T",
+        "map_from_body = map_from_odom @ odom_from_body",
+        "map_from_cam = map_from_body[3] @ self.body_from_cam",
+        "cam_from_map = se3_inverse(map_from_cam)",
+        "map_from_b = map_from_a @ se3_inverse(b_from_a)",
+        "error = se3_inverse(true_frame_from_body) @ frame_from_body",
+        "points = map_from_cam[:3, :3] @ points_cam",
+        "a_from_b = se3_inverse(map_from_body[a]) @ map_from_body[b]",
+        "map_from_rect = map_from_cam @ cam0_from_rect",
+        "def publish_pose(): ...",
+    ],
+)
+def test_good_names_pass(good: str) -> None:
+    assert not offences(good)

@@ -1,0 +1,179 @@
+"""`mapserver build` from the command line, on a small recording that holds its own truth."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from fleetmap.bow import decode_vocabulary
+from fleetmap.errors import FleetmapError, RecordingError, StoreError, UsageError
+from fleetmap.geometry import Array
+from fleetmap.mapformat import decode_tile
+from mapserver.cli import app
+from mapserver.store import MapStore
+from mapserver.store.archive import decode_archive
+from recording_samples import make_sample, write_euroc
+
+FRAMES = 24
+SAMPLE = make_sample(FRAMES)
+KEYS = [
+    *("recordings", "duration_s", "seconds", "realtime_factor", "path_m", "keyframes", "landmarks", "map_bytes"),
+    *("vocabulary_bytes", "loops", "ate_rmse_m", "ate_sim3_rmse_m", "evaluated_share", "peak_rss_mb"),
+]
+
+
+@pytest.fixture(scope="module")
+def euroc(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_euroc(tmp_path_factory.mktemp("recordings") / "walk", SAMPLE)
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["build", *(str(a) for a in arguments)])
+
+
+def built(*arguments: object) -> str:
+    result = run(*arguments)
+    if result.exception is not None:
+        raise result.exception
+    assert result.exit_code == 0
+    return result.stdout
+
+
+def refused(*arguments: object) -> FleetmapError:
+    result = run(*arguments)
+    assert isinstance(result.exception, FleetmapError), result.output
+    return result.exception
+
+
+def read_tum(path: Path) -> Array:
+    """(F, 8) t x y z qx qy qz qw."""
+    return np.loadtxt(path, comments="#", ndmin=2)
+
+
+@pytest.fixture(scope="module")
+def done(euroc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with everything that one build in the truth's frame leaves."""
+    out = tmp_path_factory.mktemp("out")
+    files = ["--report", out / "r.json", "--trajectory", out / "t.tum", "--picture", out / "p.png"]
+    said = built(euroc, "--site", "lab", "--store", out / "store", "--frame-from-ground-truth", *files)
+    assert "draft 1" in said
+    assert "mapserver publish --site lab" in said
+    return out
+
+
+def test_the_report_has_the_stable_keys_with_their_meanings(done: Path) -> None:
+    """Against the files that the same build left, counted independently."""
+    report = json.loads((done / "r.json").read_text())
+    assert [key for key in report if key in KEYS] == KEYS
+    positions = read_tum(done / "t.tum")[:, 1:4]
+    assert len(positions) == report["frames"] == FRAMES
+    assert report["recordings"] == ["walk"]
+    assert report["duration_s"] == pytest.approx((FRAMES - 1) * 0.05)
+    assert report["path_m"] == pytest.approx(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum(), abs=1e-4)
+    assert report["realtime_factor"] == pytest.approx(report["duration_s"] / report["seconds"], rel=0.01)
+    assert set(report["loops"]) == {"candidates", "gated_out", "rejected", "accepted"}
+    assert report["evaluated_share"] == 1.0
+    assert 50 < report["peak_rss_mb"] < 20_000
+    assert report["seconds"] == pytest.approx(sum(report["stage_s"].values()), rel=0.5)
+    with MapStore.open(done / "store") as maps:
+        manifest = maps.manifest("lab", 1)
+        sizes = [len(maps.blob(tile.sha256)) for tile in manifest.tiles]
+        landmarks = sum(len(decode_tile(maps.blob(tile.sha256)).landmark_ids) for tile in manifest.tiles)
+        manifest_bytes = len(maps.blob(maps.version("lab", 1).manifest_sha256))
+        assert report["map_bytes"] == sum(sizes) + manifest_bytes
+        assert report["landmarks"] == landmarks > 100
+        assert report["vocabulary_bytes"] == len(maps.blob(manifest.vocabulary.sha256))
+        assert decode_vocabulary(maps.blob(manifest.vocabulary.sha256)).word_count > 10
+        archive = maps.archive("lab", 1)
+    assert archive is not None
+    assert len(decode_archive(archive).map_from_body) == report["keyframes"]
+
+
+def test_the_manifest_tells_what_the_map_depends_on(done: Path) -> None:
+    with MapStore.open(done / "store") as maps:
+        manifest = maps.manifest("lab", 1)
+    report = json.loads((done / "r.json").read_text())
+    assert manifest.report == {key: report[key] for key in KEYS if key != "map_bytes"}
+    assert manifest.configuration["survey"]["keyframes"]["policy"] == "overlap"
+    assert set(manifest.libraries) == {"numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fleetmap"}
+    assert [(r.name, r.frames) for r in manifest.recordings] == [("walk", FRAMES)]
+    assert str(done) not in str(manifest)
+
+
+def test_the_map_lies_in_the_frame_of_the_truth(done: Path) -> None:
+    """Without any alignment, the errors of the trajectory are the report's aligned ones."""
+    truth = np.array(SAMPLE.world_from_body)[:, :3, 3]
+    errors_m = np.linalg.norm(read_tum(done / "t.tum")[:, 1:4] - truth, axis=1)
+    ate_m = json.loads((done / "r.json").read_text())["ate_rmse_m"]
+    assert np.sqrt(np.mean(errors_m**2)) == pytest.approx(ate_m, rel=1e-4)
+    assert ate_m < 0.02
+    with MapStore.open(done / "store") as maps:
+        tiles = [decode_tile(maps.blob(tile.sha256)) for tile in maps.manifest("lab", 1).tiles]
+    points = np.concatenate([tile.points_map for tile in tiles])
+    assert np.median(points[:, 2]) == pytest.approx(5.0, abs=0.1)  # the wall, in the axes of the first camera
+
+
+def test_the_picture_is_one(done: Path) -> None:
+    picture = cv2.imread(str(done / "p.png"))
+    assert picture is not None
+    assert min(picture.shape[:2]) > 400
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+def test_building_again_gives_the_same_tiles_with_the_same_vocabulary(euroc: Path, done: Path, tmp_path: Path) -> None:
+    common = [euroc, "--site", "lab", "--frame-from-ground-truth", "--store"]
+    built(*common, tmp_path)
+    assert "draft 2" in built(*common, tmp_path)
+    with MapStore.open(tmp_path) as maps, MapStore.open(done / "store") as before:
+        first, second, other = maps.manifest("lab", 1), maps.manifest("lab", 2), before.manifest("lab", 1)
+    assert first.tiles == second.tiles == other.tiles
+    assert first.vocabulary == second.vocabulary == other.vocabulary
+
+
+def test_a_site_keeps_its_vocabulary_whatever_is_surveyed(euroc: Path, tmp_path: Path) -> None:
+    built(euroc, "--site", "lab", "--store", tmp_path, "--frames", ":16")
+    built(euroc, "--site", "lab", "--store", tmp_path, "--frames", "6:")
+    built(euroc, "--site", "other", "--store", tmp_path, "--frames", "6:")
+    with MapStore.open(tmp_path) as maps:
+        assert maps.manifest("lab", 2).vocabulary == maps.manifest("lab", 1).vocabulary
+        assert maps.manifest("other", 1).vocabulary != maps.manifest("lab", 1).vocabulary
+        assert maps.manifest("lab", 2).tiles != maps.manifest("lab", 1).tiles
+
+
+def test_without_truth_nothing_is_claimed(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path / "walk", SAMPLE)
+    shutil.rmtree(folder / "mav0/state_groundtruth_estimate0")
+    built(folder, "--site", "lab", "--store", tmp_path / "store", "--report", tmp_path / "r.json")
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["ate_rmse_m"] is report["ate_sim3_rmse_m"] is report["evaluated_share"] is None
+    error = refused(folder, "--site", "lab", "--store", tmp_path / "store", "--frame-from-ground-truth")
+    assert isinstance(error, RecordingError)
+    assert "no ground truth" in str(error)
+
+
+def test_wrong_orders_are_refused_before_the_work(euroc: Path, tmp_path: Path) -> None:
+    to_store = ["--site", "lab", "--store", tmp_path / "store"]
+    for arguments, kind, said in (
+        ([euroc, euroc, *to_store], UsageError, "one recording per build"),
+        ([euroc, "--site", "La b", "--store", tmp_path / "store"], UsageError, "La b"),
+        ([euroc, *to_store, "--report", tmp_path / "no/r.json"], UsageError, "--report"),
+        ([euroc, *to_store, "--trajectory", tmp_path], UsageError, "--trajectory"),
+        ([euroc, *to_store, "--picture", tmp_path / "p.jpg"], UsageError, ".png"),
+        ([euroc, *to_store, "--frames", "1:2:x"], UsageError, "1:2:x"),
+        ([euroc, *to_store, "--frames", "900:"], UsageError, "900"),
+        ([euroc, *to_store, "--frames", ":2", "--frame-from-ground-truth"], RecordingError, "2 of 2"),
+        ([tmp_path / "nothing", *to_store], RecordingError, "nothing"),
+    ):
+        error = refused(*arguments)
+        assert isinstance(error, kind)
+        assert said in str(error)
+    assert not (tmp_path / "store").exists()
+
+
+def test_a_place_that_is_no_store_is_refused(euroc: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    assert isinstance(refused(euroc, "--site", "lab", "--store", tmp_path / "file"), StoreError)
