@@ -159,8 +159,8 @@ def write_kitti(folder: Path, sample: Sample) -> Path:
     fx, fy, cx, cy = calibration().cameras[0].intrinsics_px
     rows = [f"P{i}: {fx} 0 {cx} {-fx * baseline} 0 {fy} {cy} 0 0 0 1 0" for i, baseline in ((0, 0.0), (1, BASELINE_M))]
     (folder / "calib.txt").write_text("\n".join([*rows, "Tr: 1 0 0 0 0 1 0 0 0 0 1 0"]))
-    poses = [world_from_cam0(int(s))[:3].ravel() for s in sample.stamps_ns]
-    (folder / "poses.txt").write_text("\n".join(" ".join(repr(float(v)) for v in row) for row in poses))
+    places = [world_from_cam0(int(s))[:3].ravel() for s in sample.stamps_ns]
+    (folder / "poses.txt").write_text("\n".join(" ".join(repr(float(v)) for v in row) for row in places))
     return folder
 
 

@@ -1,5 +1,6 @@
 """The command `locclient`. Heavy imports happen inside the commands, after their arguments are checked."""
 
+import os
 import sys
 from importlib import import_module
 from pkgutil import iter_modules
@@ -20,6 +21,10 @@ def locclient() -> None:
 # One file in `commands` for each command, with a function of the same name.
 for _module in sorted(iter_modules(commands.__path__), key=lambda module: module.name):
     app.command()(getattr(import_module(f"{commands.__name__}.{_module.name}"), _module.name))
+
+
+# Before anything imports numpy: many small products, for which a second BLAS thread costs more than it brings.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def main() -> None:

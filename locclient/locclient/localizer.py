@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
 from fleetmap.calibration import RigCalibration
@@ -195,7 +196,7 @@ class Localizer:
         fixes += relocalizer.anywhere(seen, self._places_in_prior(), known)
         return [f for f in fixes if f.inliers >= self._settings.fix.min_inliers and self._in_prior(f)]
 
-    def _places_in_prior(self) -> np.ndarray | None:  # type: ignore[type-arg]
+    def _places_in_prior(self) -> NDArray[np.bool_] | None:
         if self._prior is None or self._relocalizer is None:
             return None
         off = self._relocalizer.view.map_from_cam[:, :2, 3] - self._prior.map_from_base[:2, 3]
@@ -315,9 +316,10 @@ class Localizer:
         hypotheses = tuple(Hypothesis(c.now_map_from_body, c.support) for c in ranked)
         rivals = [c for c in ranked[1:] if c.support >= settings.rival_share * ranked[0].support]
         status = Status.AMBIGUOUS if rivals else Status.LOST if self._ever_tracked else Status.INITIALISING
-        place, covariance = (ranked[0].now_map_from_body, ranked[0].now_cov) if ranked and not rivals else (None, None)
+        best = ranked[0] if ranked and not rivals else None
         return Estimate(
-            odometry.stamp_ns, status, place, None if covariance is None else self._published(covariance), self._map_version, fix, refused,
+            odometry.stamp_ns, status, None if best is None else best.now_map_from_body,
+            None if best is None else self._published(best.now_cov), self._map_version, fix, refused,
             innovation, hypotheses, odometry, self._stage_s,
         )  # fmt: skip
 

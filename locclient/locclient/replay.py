@@ -147,7 +147,9 @@ class _Reporter:
             self._publish_health(self._result.estimates[-1])
 
     def _publish_health(self, estimate: Estimate) -> None:
-        figures = {name: value for name, value in self._result.report().items() if isinstance(value, int | float | str | bool)}
+        figures: dict[str, float | int | str | bool | None] = {
+            name: value for name, value in self._result.report().items() if isinstance(value, int | float | str | bool)
+        }
         for group in ("error_m", "frame_ms"):
             spread = METRICS[group](self._result.frames)
             if isinstance(spread, dict):

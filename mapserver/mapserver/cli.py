@@ -1,5 +1,6 @@
 """The command `mapserver`. Heavy imports happen inside the commands, after their arguments are checked."""
 
+import os
 import sys
 
 import typer
@@ -30,6 +31,10 @@ def mapserver(config: ConfigFile = None) -> None:
 
 for _command in COMMANDS:
     app.command()(_command)
+
+
+# Before anything imports numpy: many small products, for which a second BLAS thread costs more than it brings.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def main() -> None:

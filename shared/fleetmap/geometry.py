@@ -25,7 +25,8 @@ def so3_exp(rotvec_rad: Array) -> Array:
     cross = skew(np.asarray(rotvec_rad, dtype=np.float64))
     if angle < 1e-6:
         return np.eye(3) + cross + 0.5 * cross @ cross
-    return np.eye(3) + np.sin(angle) / angle * cross + (1.0 - np.cos(angle)) / angle**2 * cross @ cross
+    turned = np.eye(3) + np.sin(angle) / angle * cross + (1.0 - np.cos(angle)) / angle**2 * cross @ cross
+    return np.asarray(turned)
 
 
 def so3_log(rotation: Array) -> Array:
@@ -38,16 +39,16 @@ def so3_log(rotation: Array) -> Array:
 
 
 def so3_left_jacobian(rotvec_rad: Array) -> Array:
-    """(3, 3) left Jacobian of SO(3): d Exp(r) = J dr, applied from the left. Source: Barfoot, State Estimation, 7.77."""
+    """(3, 3) left Jacobian of SO(3): d Exp(r) = J dr, applied from the left.
+
+    Source: Barfoot, State Estimation for Robotics, 7.77.
+    """
     angle = float(np.linalg.norm(rotvec_rad))
     cross = skew(rotvec_rad)
     if angle < 1e-5:
         return np.eye(3) + 0.5 * cross + cross @ cross / 6.0
-    return (
-        np.eye(3)
-        + (1.0 - np.cos(angle)) / angle**2 * cross
-        + (angle - np.sin(angle)) / angle**3 * cross @ cross
-    )
+    first, second = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    return np.asarray(np.eye(3) + first * cross + second * cross @ cross)
 
 
 def se3(rotation: Array, translation_m: Array) -> Array:
@@ -128,8 +129,8 @@ def interpolate_se3(frame_from_a: Array, frame_from_b: Array, fraction: float) -
 def align_points(points_target: Array, points_source: Array, *, with_scale: bool = False) -> tuple[Array, float]:
     """Least-squares `target_from_source` (4, 4) and scale for paired points (N, 3).
 
-    points_target ~ scale * R @ points_source + t; scale is 1 unless asked for. The returned matrix holds R and t without
-    the scale. Source: Umeyama 1991.
+    points_target ~ scale * R @ points_source + t; scale is 1 unless asked for. The returned matrix holds R and t
+    without the scale. Source: Umeyama 1991.
     """
     assert points_target.shape == points_source.shape
     assert points_target.ndim == 2

@@ -1,4 +1,7 @@
-"""Small dense linear algebra for kernels. numba's own np.linalg and @ need scipy at run time, which a robot does not carry."""
+"""Small dense linear algebra for kernels.
+
+numba's own np.linalg and @ need scipy at run time, which a robot does not carry.
+"""
 
 import numpy as np
 
@@ -64,7 +67,10 @@ def forward_substitute(lower: Array, b: Array) -> None:
 
 @kernel
 def solve_spd(a: Array, b: Array) -> bool:
-    """Solves a @ x = b in place for symmetric positive definite `a` (n, n), destroyed; b (n,). False where it is not definite."""
+    """Solves a @ x = b in place for symmetric positive definite `a` (n, n), destroyed; b (n,).
+
+    False where `a` is not definite.
+    """
     if not cholesky_in_place(a):
         return False
     forward_substitute(a, b)

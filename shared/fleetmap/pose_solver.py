@@ -18,7 +18,8 @@ GATE_SQUARED = 11.345  # 0.99 of chi-square with 3 degrees of freedom: u, v, dis
 class Resection:
     """A solved camera.
 
-    cam_from_source (4, 4); cov_rot_trans (6, 6) of a left perturbation in camera axes; inliers (N,); squared normalised residuals (N,).
+    cam_from_source (4, 4); cov_rot_trans (6, 6) of a left perturbation in camera axes; inliers (N,); squared normalised
+    residuals (N,).
     """
 
     cam_from_source: Array
@@ -53,7 +54,17 @@ def refine_resection(
     if inliers.sum() >= 4:  # once more on the inliers alone, so that no outlier leans on the result
         again = np.empty(int(inliers.sum()))
         solved = pose_solver_kernels.refine(
-            rotation, translation, points[inliers], measured[inliers], weights[inliers], intrinsics, _WIDTH, prior, 5, hessian, again
+            rotation,
+            translation,
+            points[inliers],
+            measured[inliers],
+            weights[inliers],
+            intrinsics,
+            _WIDTH,
+            prior,
+            5,
+            hessian,
+            again,
         )
         if not solved:
             return None
@@ -61,19 +72,32 @@ def refine_resection(
             rotation, translation, points, measured, weights, intrinsics, _WIDTH, np.empty((6, 6)), np.empty(6), squared
         )
         inliers = squared < GATE_SQUARED
-    return Resection(se3(rotation, translation), np.linalg.inv(hessian + prior + 1e-9 * np.eye(6)), inliers, squared)
+    return Resection(
+        se3(rotation, translation), np.asarray(np.linalg.inv(hessian + prior + 1e-9 * np.eye(6))), inliers, squared
+    )
 
 
 def ransac_resection(
-    camera: StereoCamera, points_source: Array, pixels: Array, sigmas_px: Array, *, threshold_px: float, min_inliers: int, seed: int
+    camera: StereoCamera,
+    points_source: Array,
+    pixels: Array,
+    sigmas_px: Array,
+    *,
+    threshold_px: float,
+    min_inliers: int,
+    seed: int,
 ) -> Resection | None:
-    """As `refine_resection` without a start: three-point RANSAC first. None below min_inliers. Source: Ke and Roumeliotis 2017 (AP3P)."""
+    """As `refine_resection` without a start: three-point RANSAC first.
+
+    None below min_inliers. Source: Ke and Roumeliotis 2017 (AP3P).
+    """
     if len(points_source) < max(min_inliers, 4):
         return None
     cv2.setRNGSeed(seed)
     found, rotvec, translation, inliers = cv2.solvePnPRansac(
-        np.ascontiguousarray(points_source, np.float64), np.ascontiguousarray(pixels[:, :2], np.float64), camera.matrix, np.zeros(4),
-        iterationsCount=2000, reprojectionError=threshold_px, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P,
+        np.ascontiguousarray(points_source, np.float64), np.ascontiguousarray(pixels[:, :2], np.float64),
+        camera.matrix, np.zeros(4),
+        iterationsCount=800, reprojectionError=threshold_px, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
     )  # fmt: skip
     if not found or inliers is None or len(inliers) < min_inliers:
         return None
@@ -90,9 +114,10 @@ def resection_with_rotation(
     camera: StereoCamera, points_source: Array, pixels: Array, sigmas_px: Array, cam_from_source_rotation: Array, *,
     threshold_px: float, min_inliers: int, rotation_sigma_rad: float,
 ) -> Resection | None:  # fmt: skip
-    """As `ransac_resection` where the rotation is nearly known (from the IMU): one correspondence proposes the translation.
+    """As `ransac_resection` where the rotation is nearly known (from the IMU).
 
-    Needs depth in both views. Finds the place among far more wrong matches than three points can; none below min_inliers.
+    One correspondence proposes the translation. Needs depth in both views. Finds the place among far more wrong matches
+    than three points can; none below min_inliers.
     """
     if len(points_source) < min_inliers:
         return None
@@ -100,8 +125,8 @@ def resection_with_rotation(
     intrinsics = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.focal_px * camera.baseline_m])
     translation = np.zeros(3)
     score = pose_solver_kernels.search_translation(
-        np.ascontiguousarray(cam_from_source_rotation), np.ascontiguousarray(points_source), seen, np.ascontiguousarray(pixels[:, :2]),
-        intrinsics, threshold_px, translation,
+        np.ascontiguousarray(cam_from_source_rotation), np.ascontiguousarray(points_source), seen,
+        np.ascontiguousarray(pixels[:, :2]), intrinsics, threshold_px, translation,
     )  # fmt: skip
     if score < min_inliers:
         return None

@@ -12,11 +12,12 @@ def linearize(
     rotation: Array, translation: Array, points: Array, pixels: Array, weights: Array, camera: Array, width: float,
     hessian: Array, gradient: Array, squared: Array,
 ) -> float:  # fmt: skip
-    """Robust cost, normal equations (6, 6), (6,) and squared normalised residuals (N,) of cam_from_source = (rotation, translation).
+    """Robust cost, normal equations (6, 6), (6,) and squared normalised residuals (N,) of a camera.
 
-    points (N, 3) in the source frame; pixels (N, 3) u_left v u_right (NaN none); weights (N, 2) 1/sigma of u and v, of the disparity.
-    camera: focal, cx, cy, focal * baseline. The step is rotation first, applied from the left in camera axes.
-    Robust by the redescending weight of Geman and McClure, `width` in sigmas: gross outliers must not pull at all.
+    cam_from_source = (rotation, translation).     points (N, 3) in the source frame; pixels (N, 3) u_left v u_right
+    (NaN none); weights (N, 2) 1/sigma of u and v, of the disparity. camera: focal, cx, cy, focal * baseline. The step
+    is rotation first, applied from the left in camera axes. Robust by the redescending weight of Geman and McClure,
+    `width` in sigmas: gross outliers must not pull at all.
     """
     cost = 0.0
     hessian[:, :] = 0.0
@@ -24,9 +25,24 @@ def linearize(
     j = np.empty((3, 6))
     r = np.empty(3)
     for n in range(len(points)):
-        x = rotation[0, 0] * points[n, 0] + rotation[0, 1] * points[n, 1] + rotation[0, 2] * points[n, 2] + translation[0]
-        y = rotation[1, 0] * points[n, 0] + rotation[1, 1] * points[n, 1] + rotation[1, 2] * points[n, 2] + translation[1]
-        z = rotation[2, 0] * points[n, 0] + rotation[2, 1] * points[n, 1] + rotation[2, 2] * points[n, 2] + translation[2]
+        x = (
+            rotation[0, 0] * points[n, 0]
+            + rotation[0, 1] * points[n, 1]
+            + rotation[0, 2] * points[n, 2]
+            + translation[0]
+        )
+        y = (
+            rotation[1, 0] * points[n, 0]
+            + rotation[1, 1] * points[n, 1]
+            + rotation[1, 2] * points[n, 2]
+            + translation[1]
+        )
+        z = (
+            rotation[2, 0] * points[n, 0]
+            + rotation[2, 1] * points[n, 1]
+            + rotation[2, 2] * points[n, 2]
+            + translation[2]
+        )
         squared[n] = 1e12
         if z < 0.05:
             cost += 0.5 * width * width
@@ -63,8 +79,9 @@ def refine(
     rotation: Array, translation: Array, points: Array, pixels: Array, weights: Array, camera: Array, width: float,
     prior: Array, iterations: int, hessian: Array, squared: Array,
 ) -> bool:  # fmt: skip
-    """Levenberg-Marquardt from a start, in place; leaves the last Hessian and squared residuals. False where it is singular.
+    """Levenberg-Marquardt from a start, in place; leaves the last Hessian and squared residuals.
 
+    False where it is singular.
     prior (6, 6): information that holds the start (zeros for none).
     """
     gradient, step = np.empty(6), np.empty(6)
@@ -92,7 +109,9 @@ def refine(
                 new_translation[a] = step[3 + a]
                 for b in range(3):
                     new_translation[a] += turn[a, b] * translation[b]
-                    new_rotation[a, b] = turn[a, 0] * rotation[0, b] + turn[a, 1] * rotation[1, b] + turn[a, 2] * rotation[2, b]
+                    new_rotation[a, b] = (
+                        turn[a, 0] * rotation[0, b] + turn[a, 1] * rotation[1, b] + turn[a, 2] * rotation[2, b]
+                    )
             new_moved = moved + step
             new_cost = linearize(
                 new_rotation, new_translation, points, pixels, weights, camera, width, trial_hessian, gradient, squared
@@ -125,9 +144,10 @@ def refine(
 def search_translation(
     rotation: Array, points: Array, seen_points: Array, pixels: Array, camera: Array, threshold_px: float, best: Array
 ) -> int:
-    """Best translation (3,) for a known rotation, each correspondence with depth in both views proposing one; its inlier count.
+    """Best translation (3,) for a known rotation, and its inlier count.
 
-    points (N, 3) source, seen_points (N, 3) the same in the camera by its own stereo (NaN none), pixels (N, 2) in the camera.
+    Each correspondence with depth in both views proposes one.     points (N, 3) source, seen_points (N, 3) the same in
+    the camera by its own stereo (NaN none), pixels (N, 2) in the camera.
     """
     count, best_score = len(points), 0
     turned = np.empty((count, 3))
@@ -135,9 +155,13 @@ def search_translation(
         for a in range(3):
             turned[n, a] = rotation[a, 0] * points[n, 0] + rotation[a, 1] * points[n, 1] + rotation[a, 2] * points[n, 2]
     for k in range(count):
-        if not seen_points[k, 2] == seen_points[k, 2]:
+        if np.isnan(seen_points[k, 2]):
             continue
-        tx, ty, tz = seen_points[k, 0] - turned[k, 0], seen_points[k, 1] - turned[k, 1], seen_points[k, 2] - turned[k, 2]
+        tx, ty, tz = (
+            seen_points[k, 0] - turned[k, 0],
+            seen_points[k, 1] - turned[k, 1],
+            seen_points[k, 2] - turned[k, 2],
+        )
         score = 0
         for n in range(count):
             z = turned[n, 2] + tz

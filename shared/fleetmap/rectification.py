@@ -1,8 +1,8 @@
 """From a rig with lenses to the one camera that all geometry uses: a rectified pinhole pair.
 
-After rectification a point at (x, y, z) in `cam0` (rectified axes) is seen at u = f x/z + cx, v = f y/z + cy on the left and at
-u - f b/z on the right, same row. An RGB-D frame becomes the same thing with a baseline chosen here, a single camera has
-baseline 0.
+After rectification a point at (x, y, z) in `cam0` (rectified axes) is seen at u = f x/z + cx, v = f y/z + cy on the
+left and at u - f b/z on the right, same row. An RGB-D frame becomes the same thing with a baseline chosen here, a
+single camera has baseline 0.
 """
 
 from dataclasses import dataclass
@@ -47,7 +47,8 @@ class StereoCamera:
         with np.errstate(divide="ignore", invalid="ignore"):
             z = self.focal_px * self.baseline_m / disparities_px
             return np.stack(
-                [(pixels[:, 0] - self.cx_px) * z / self.focal_px, (pixels[:, 1] - self.cy_px) * z / self.focal_px, z], axis=1
+                [(pixels[:, 0] - self.cx_px) * z / self.focal_px, (pixels[:, 1] - self.cy_px) * z / self.focal_px, z],
+                axis=1,
             )
 
 
@@ -95,15 +96,16 @@ class Rectifier:
             depth = np.where(frame.depth_m > 0, frame.depth_m, np.nan)
             disparity = (self.camera.focal_px * self.camera.baseline_m / depth).astype(np.float32)
             if self._maps[0] is not None:
-                disparity = cv2.remap(disparity, *self._maps[0], cv2.INTER_NEAREST, borderValue=float("nan"))  # type: ignore[call-overload]
+                nearest = cv2.remap(disparity, *self._maps[0], cv2.INTER_NEAREST, borderValue=float("nan"))
+                disparity = np.asarray(nearest, np.float32)
         return RectifiedFrame(frame.stamp_ns, left, right, disparity)
 
     def _remap(self, image: Image, index: int, stamp_ns: int) -> Image:
         if image.shape != self._sizes[index]:
             height, width = self._sizes[index]
             raise RecordingError(
-                f"cam{index} image at {stamp_ns} is {image.shape[1]}x{image.shape[0]}, the calibration says {width}x{height}; "
-                "pass the matching one with --calibration FILE"
+                f"cam{index} image at {stamp_ns} is {image.shape[1]}x{image.shape[0]}, "
+                f"the calibration says {width}x{height}; pass the matching one with --calibration FILE"
             )
         tables = self._maps[index]
         if tables is None:
@@ -117,10 +119,13 @@ def _rectifying_rotation(left: CameraCalibration, right: CameraCalibration) -> t
     baseline_cam0 = cam0_from_cam1[:3, 3]
     baseline_m = float(np.linalg.norm(baseline_cam0))
     if baseline_m < 1e-3:
-        raise CalibrationError(f"the two cameras are {baseline_m * 1000:.3f} mm apart; stereo needs a baseline, check body_from_cam")
+        raise CalibrationError(
+            f"the two cameras are {baseline_m * 1000:.3f} mm apart; stereo needs a baseline, check body_from_cam"
+        )
     if baseline_cam0[0] < 0.7 * baseline_m:
         raise CalibrationError(
-            f"cam1 lies at {np.round(baseline_cam0, 4).tolist()} m in cam0's axes, not to its right; are left and right swapped?"
+            f"cam1 lies at {np.round(baseline_cam0, 4).tolist()} m in cam0's axes, not to its right; "
+            "are left and right swapped?"
         )
     half = so3_exp(0.5 * so3_log(cam0_from_cam1[:3, :3]))
     x_axis = baseline_cam0 / baseline_m
@@ -139,8 +144,12 @@ def _remap_tables(
     rectified: StereoCamera, camera: CameraCalibration, cam_from_rect: Array
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]] | None:
     """Fixed-point look-up tables for cv2.remap, or None where the image is rectified already (as KITTI's are)."""
-    u, v = np.meshgrid(np.arange(rectified.width_px, dtype=np.float64), np.arange(rectified.height_px, dtype=np.float64))
-    rays = np.stack([(u - rectified.cx_px) / rectified.focal_px, (v - rectified.cy_px) / rectified.focal_px, np.ones_like(u)], -1)
+    u, v = np.meshgrid(
+        np.arange(rectified.width_px, dtype=np.float64), np.arange(rectified.height_px, dtype=np.float64)
+    )
+    rays = np.stack(
+        [(u - rectified.cx_px) / rectified.focal_px, (v - rectified.cy_px) / rectified.focal_px, np.ones_like(u)], -1
+    )
     pixels = camera.pixel_from_ray(rays.reshape(-1, 3) @ cam_from_rect.T).reshape(*u.shape, 2)
     if np.nanmax(np.hypot(pixels[..., 0] - u, pixels[..., 1] - v)) < 0.02 and np.isfinite(pixels).all():
         return None

@@ -1,5 +1,6 @@
 """The command `fleetsim`: lists scenarios, records them, shows what they look like."""
 
+import math
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -44,22 +45,38 @@ def record(
     size: Size = None,
     frames: Annotated[int | None, typer.Option(min=1, help="At most so many frames.")] = None,
     fault: Faults = None,
+    camera_delay_ms: Annotated[
+        float, typer.Option(min=-100.0, max=100.0, help="Frames carry stamps this much too early.")
+    ] = 0.0,
+    camera_turn_deg: Annotated[
+        float, typer.Option(min=0.0, max=5.0, help="Each camera is turned this much from its calibration.")
+    ] = 0.0,
+    camera_shift_mm: Annotated[
+        float, typer.Option(min=0.0, max=50.0, help="Each camera sits this far from its calibrated place.")
+    ] = 0.0,
     format_: Annotated[str, typer.Option("--format", help="mcap or euroc.")] = "mcap",
+    images: Annotated[
+        str, typer.Option(help="How mcap stores pictures: png, jpeg (smaller, with loss) or raw.")
+    ] = "png",
     force: Annotated[bool, typer.Option("--force", help="Write over an existing file.")] = False,
 ) -> None:
     """Records one robot's run: pictures, IMU, wheels, position priors, exact ground truth."""
     if format_ not in ("mcap", "euroc"):
         raise UsageError(f"unknown format {format_!r}; there are mcap and euroc")
+    if images not in ("png", "jpeg", "raw") or (format_ == "euroc" and images != "png"):
+        raise UsageError(f"pictures as {images!r}: mcap holds png, jpeg or raw ones, euroc png alone")
     if out.exists() and not (force and out.is_file()):
         raise UsageError(f"{out} exists already; choose another name{' or pass --force' if out.is_file() else ''}")
     from fleetsim.faults import parse_fault
     from fleetsim.recorder import Order
+    from fleetsim.robots import HiddenErrors
 
     faults = tuple(parse_fault(text) for text in fault or [])
-    order = Order(scenario, seed, day, light, robot, lens, frames, faults, _size_px(size))
+    hidden = HiddenErrors(camera_delay_ms * 1e-3, math.radians(camera_turn_deg), camera_shift_mm * 1e-3)
+    order = Order(scenario, seed, day, light, robot, lens, frames, faults, _size_px(size), hidden)
     from fleetsim.commands import record_order
 
-    typer.echo(record_order(order, out, format_))
+    typer.echo(record_order(order, out, format_, images))
 
 
 @app.command()

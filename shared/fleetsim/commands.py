@@ -1,6 +1,7 @@
 """What the commands do: recording with progress, contact sheets."""
 
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -10,13 +11,17 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from fleetmap.errors import FleetmapError
+from fleetmap.recordings.images import StoredFrame, StoredImage, grey_image, jpeg_image, png_image
 from fleetmap.recordings.mcap_writer import McapRecordingWriter
-from fleetmap.samples import Image
+from fleetmap.samples import CameraFrame, Image
 from fleetsim.euroc_writer import EurocRecordingWriter
 from fleetsim.layout import Layout
 from fleetsim.recorder import Order, Session, prepare, write_session
 from fleetsim.scenarios import find_scenario
 
+# Measured on 640x480 pictures of day and night, one core, per pair: raw 614 kB; png 340 kB, 9 ms to write and 4 ms to
+# read, lossless; jpeg 213 kB, 1 ms and 2 ms, but it adds an error of 1.7 grey rms, as much as the sensor's noise.
+IMAGE_ENCODINGS: dict[str, Callable[[Image], StoredImage]] = {"png": png_image, "jpeg": jpeg_image, "raw": grey_image}
 _THUMBNAIL_PX = 320
 _PLAN_PX_PER_M = 12
 
@@ -36,8 +41,31 @@ def _ready(order: Order, progress: Progress, workers: ThreadPoolExecutor) -> Ses
     return session
 
 
-def record_order(order: Order, out: Path, format_: str) -> str:
-    """Records to `out`; a line that says what was written and how long it took."""
+class _EncodingWriter(McapRecordingWriter):
+    """Stores pictures through `encode`, left and right at once."""
+
+    def __init__(
+        self,
+        path: Path,
+        session: Session,
+        name: str,
+        encode: Callable[[Image], StoredImage],
+        workers: ThreadPoolExecutor,
+    ) -> None:
+        super().__init__(path, session.nominal, name=name)
+        self._encode, self._workers = encode, workers
+
+    def write_frame(self, frame: CameraFrame | StoredFrame) -> None:
+        """One frame; pictures that are encoded already stay as they are."""
+        if isinstance(frame, CameraFrame):
+            assert frame.right is not None
+            left, right = self._workers.map(self._encode, (frame.left, frame.right))
+            frame = StoredFrame(frame.stamp_ns, left, right)
+        super().write_frame(frame)
+
+
+def record_order(order: Order, out: Path, format_: str, images: str = "png") -> str:
+    """Records to `out`; a line that says what was written and how long it took. images: a key of IMAGE_ENCODINGS."""
     started = time.monotonic()
     with _progress() as progress, ThreadPoolExecutor(2) as workers:
         session = _ready(order, progress, workers)
@@ -50,7 +78,7 @@ def record_order(order: Order, out: Path, format_: str) -> str:
                 write_session(session, folder, lambda done: progress.update(task, completed=done))
                 folder.close()
             else:
-                with McapRecordingWriter(out, session.nominal, name=name) as writer:
+                with _EncodingWriter(out, session, name, IMAGE_ENCODINGS[images], workers) as writer:
                     write_session(session, writer, lambda done: progress.update(task, completed=done))
         finally:
             session.renderer.close()

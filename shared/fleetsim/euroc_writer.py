@@ -13,7 +13,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation
 from fleetmap.samples import CameraFrame, Image, ImuSamples, PositionPrior, Trajectory, WheelSample
 
-_PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+_PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 _IMU_HEAD = "#timestamp [ns],w_x [rad s^-1],w_y,w_z,a_x [m s^-2],a_y,a_z"
 _TRUTH_HEAD = (
     "#timestamp [ns],p_x [m],p_y,p_z,q_w [],q_x,q_y,q_z,v_x [m s^-1],v_y,v_z,"

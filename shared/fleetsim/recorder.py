@@ -3,7 +3,7 @@
 import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -17,7 +17,7 @@ from fleetsim.light import LIGHT_STATES
 from fleetsim.motion import CarriedMotion, Motion, RouteMotion
 from fleetsim.painter import Look
 from fleetsim.rendering import StereoRenderer
-from fleetsim.robots import nominal_calibration, true_calibration
+from fleetsim.robots import HiddenErrors, nominal_calibration, true_calibration
 from fleetsim.routes import check_clear
 from fleetsim.scenarios import Run, find_scenario
 from fleetsim.sensors import measure_imu, measure_priors, measure_wheels, sample_times, stamps_from_s
@@ -29,7 +29,10 @@ S = TypeVar("S", WheelSample, PositionPrior)
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What to record. robot: a run of the scenario, its first one for None. frames: at most so many, all for None."""
+    """What to record. robot: a run of the scenario, its first one for None. frames: at most so many, all for None.
+
+    hidden: errors of mounting and clock that the recording's calibration does not admit.
+    """
 
     scenario: str
     seed: int = 0
@@ -40,13 +43,14 @@ class Order:
     frames: int | None = None
     faults: tuple[Fault, ...] = ()
     size_px: tuple[int, int] | None = None
+    hidden: HiddenErrors = field(default_factory=HiddenErrors)
 
 
 class Writer(Protocol):
     """Where samples go; fleetmap's McapRecordingWriter is one."""
 
     def write_frame(self, frame: CameraFrame) -> None:
-        """One pair."""
+        """One pair, as pixels."""
         ...
 
     def write_imu(self, samples: ImuSamples) -> None:
@@ -73,6 +77,7 @@ class Session:
     order: Order
     world: World
     nominal: RigCalibration
+    true: RigCalibration
     renderer: StereoRenderer
     motion: Motion
     frame_times_s: tuple[float, ...]
@@ -117,7 +122,7 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     if order.day < 0 or order.seed < 0:
         raise UsageError(f"seed {order.seed} and day {order.day} must not be negative")
     name, run = scenario.run(order.robot)
-    kind = run.kind.with_lens(order.lens or run.kind.lens)
+    kind = replace(run.kind.with_lens(order.lens or run.kind.lens), hidden=order.hidden)
     if order.size_px is not None:
         kind = replace(kind, width_px=order.size_px[0], height_px=order.size_px[1])
     nominal, true = nominal_calibration(kind), true_calibration(kind, _generator(order, name, "mounting"))
@@ -143,7 +148,7 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     priors = measure_priors(motion, nominal.base_from_body, run.zone_period_s, _generator(order, name, "priors"))
     last_ns = int(stamps_from_s(np.array([end_s]))[0])
     return Session(
-        order, world, nominal, renderer, motion, tuple(times), imu.between(0, last_ns),
+        order, world, nominal, true, renderer, motion, tuple(times), imu.between(0, last_ns),
         tuple(sample for sample in wheel if sample.stamp_ns < last_ns),
         tuple(prior for prior in priors if prior.stamp_ns < last_ns),
         _truth(motion, times, end_s),

@@ -41,13 +41,25 @@ class WheelErrors:
 
 
 @dataclass(frozen=True, slots=True)
+class HiddenErrors:
+    """What the calibration does not say.
+
+    imu_minus_cam_s: of both cameras. turn_rad, shift_m: of each camera by itself, in a direction of its own.
+    """
+
+    imu_minus_cam_s: float = 0.0
+    turn_rad: float = 0.0
+    shift_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class RobotKind:
     """One model of robot.
 
     The IMU is the body, straight above the base; cameras sit baseline_m apart around their mount.
 
-    pitch_rad: cameras look down by this. hidden_*: rms by which the true mounting and clock differ from the
-    calibration.
+    pitch_rad: cameras look down by this.
+    hidden: by how much the true mounting and clock differ from the calibration.
     """
 
     limits: Limits
@@ -63,9 +75,7 @@ class RobotKind:
     clearance_m: float = 0.3
     imu: ImuErrors = field(default_factory=ImuErrors)
     wheels: WheelErrors = field(default_factory=WheelErrors)
-    hidden_rotation_rad: float = 0.0
-    hidden_translation_m: float = 0.0
-    hidden_delay_s: float = 0.0
+    hidden: HiddenErrors = field(default_factory=HiddenErrors)
 
     def with_lens(self, lens: str) -> "RobotKind":
         """A copy with another lens; UsageError naming the known ones."""
@@ -102,13 +112,12 @@ def nominal_calibration(kind: RobotKind) -> RigCalibration:
 
 
 def true_calibration(kind: RobotKind, rng: np.random.Generator) -> RigCalibration:
-    """What the sensors really are: the nominal values with this robot's hidden errors."""
-    nominal = nominal_calibration(kind)
+    """What the sensors really are: the nominal values with this robot's hidden errors, in directions drawn from rng."""
+    nominal, hidden = nominal_calibration(kind), kind.hidden
     cameras = []
-    delay = float(rng.normal(0.0, 1.0)) * kind.hidden_delay_s
     for camera in nominal.cameras:
-        turn = so3_exp(rng.normal(0.0, 1.0, 3) * kind.hidden_rotation_rad)
-        shift = rng.normal(0.0, 1.0, 3) * kind.hidden_translation_m
-        body_from_cam: Array = camera.body_from_cam @ se3(turn, shift)
-        cameras.append(replace(camera, body_from_cam=body_from_cam, imu_minus_cam_s=delay))
+        turn, shift = (direction / np.linalg.norm(direction) for direction in rng.standard_normal((2, 3)))
+        error = se3(so3_exp(turn * hidden.turn_rad), shift * hidden.shift_m)
+        body_from_cam: Array = camera.body_from_cam @ error
+        cameras.append(replace(camera, body_from_cam=body_from_cam, imu_minus_cam_s=hidden.imu_minus_cam_s))
     return RigCalibration(tuple(cameras), nominal.imu, nominal.base_from_body)

@@ -42,13 +42,9 @@ def _documented_commands() -> list[str]:
 
 
 def _arguments(command: click.Command) -> set[str]:
-    """Names of the arguments as its usage line shows them."""
-    context = click.Context(command)
-    return {
-        parameter.make_metavar(context).strip("[]{}")
-        for parameter in command.params
-        if parameter.param_type_name == "argument"
-    }
+    """Names of the arguments as the command's help shows them."""
+    arguments = (parameter for parameter in command.params if parameter.param_type_name == "argument")
+    return {argument.metavar or (argument.name or "").upper() for argument in arguments}
 
 
 @pytest.mark.parametrize("script", _scripts())

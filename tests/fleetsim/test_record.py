@@ -11,11 +11,13 @@ import pytest
 from typer.testing import CliRunner
 
 from fleetmap.errors import UsageError
+from fleetmap.geometry import rotation_angle_rad, se3_inverse
 from fleetmap.recordings import open_recording
 from fleetmap.samples import SensorSet
 from fleetsim.cli import app
 from fleetsim.faults import Fault
 from fleetsim.recorder import Order, prepare
+from fleetsim.robots import HiddenErrors
 from fleetsim.scenarios import SCENARIOS
 
 SIZE = ["--size", "160x120"]
@@ -85,6 +87,44 @@ def test_equal_seeds_give_equal_bytes_and_others_do_not(tmp_path: Path) -> None:
         digests.append(hashlib.sha256(_record(tmp_path / str(number), *arguments).read_bytes()).hexdigest())
     assert digests[0] == digests[1]
     assert len(set(digests)) == 3
+
+
+def test_hidden_errors_are_in_the_pictures_and_not_in_the_calibration(tmp_path: Path) -> None:
+    plain, hidden = Order("clip"), Order("clip", hidden=HiddenErrors(0.02, 0.01, 0.005))
+    one, other = prepare(plain), prepare(hidden)
+    try:
+        for camera, same in zip(one.nominal.cameras, other.nominal.cameras, strict=True):
+            np.testing.assert_array_equal(camera.body_from_cam, same.body_from_cam)
+        for number in range(2):
+            true_from_believed = se3_inverse(other.renderer.path(number)(1.0)) @ one.renderer.path(number)(1.0)
+            assert rotation_angle_rad(true_from_believed[:3, :3]) == pytest.approx(0.01)
+            assert np.linalg.norm(true_from_believed[:3, 3]) == pytest.approx(0.005)
+        early = np.array(one.frame_stamps_ns()) - np.array(other.frame_stamps_ns())
+        assert (early == 20_000_000).all()
+        np.testing.assert_array_equal(one.imu.stamps_ns, other.imu.stamps_ns)
+    finally:
+        one.renderer.close()
+        other.renderer.close()
+    folder = tmp_path / "hidden"
+    folder.mkdir()
+    arguments = ["--camera-delay-ms", "20", "--camera-turn-deg", "0.5", "--camera-shift-mm", "5"]
+    spoiled, true = open_recording(_record(folder, *arguments)), open_recording(_record(tmp_path))
+    assert (true.frame_stamps_ns - spoiled.frame_stamps_ns == 20_000_000).all()
+    assert spoiled.calibration.cameras[0].imu_minus_cam_s == 0.0
+    assert not np.array_equal(spoiled.read_frame(2).left, true.read_frame(2).left)
+
+
+def test_pictures_are_stored_as_asked(tmp_path: Path) -> None:
+    sizes, pictures = {}, {}
+    for kind in ("raw", "png", "jpeg"):
+        (tmp_path / kind).mkdir()
+        path = _record(tmp_path / kind, "--images", kind)
+        sizes[kind], pictures[kind] = path.stat().st_size, open_recording(path).read_frame(3).left
+    assert sizes["jpeg"] < sizes["png"] < sizes["raw"]
+    np.testing.assert_array_equal(pictures["png"], pictures["raw"])
+    assert 0 < np.abs(pictures["jpeg"].astype(int) - pictures["raw"]).mean() < 4
+    with pytest.raises(UsageError, match="euroc png alone"):
+        _run("record", "clip", "--out", str(tmp_path / "folder"), "--format", "euroc", "--images", "jpeg")
 
 
 _PICTURES = """

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
 from fleetmap.bow import decode_vocabulary
@@ -117,11 +118,19 @@ def test_the_map_lies_in_the_frame_of_the_truth(done: Path) -> None:
     assert np.median(points[:, 2]) == pytest.approx(5.0, abs=0.1)  # the wall, in the axes of the first camera
 
 
-def test_the_picture_is_one(done: Path) -> None:
+def test_the_picture_shows_the_map_on_the_left_and_its_errors_on_the_right(done: Path) -> None:
     picture = cv2.imread(str(done / "p.png"))
     assert picture is not None
-    assert min(picture.shape[:2]) > 400
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+    half = picture.shape[1] // 2
+
+    def count(hexadecimal: str, part: NDArray[np.uint8]) -> int:
+        return int((part == np.array(list(bytes.fromhex(hexadecimal)))[::-1]).all(axis=2).sum())
+
+    left, right = picture[:, :half], picture[:, half:]
+    assert count("14924b", left) > 100  # the start
+    assert count("d1342f", left) > 100  # the end
+    assert count("2563eb", right) > 500  # the errors
+    assert count("14924b", right) + count("d1342f", right) == 0
 
 
 def test_building_again_gives_the_same_tiles_with_the_same_vocabulary(euroc: Path, done: Path, tmp_path: Path) -> None:

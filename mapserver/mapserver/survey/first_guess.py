@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap.calibration import RigCalibration
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, rotation_between_vectors, se3
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from fleetmap.rectification import RectifiedFrame, Rectifier
 from fleetmap.samples import CameraFrame, ImuSamples
@@ -40,7 +40,7 @@ def run_odometry(
     )
     policy = KeyframePolicy(settings.keyframes)
     estimates: list[OdometryEstimate] = []
-    transforms: list[Array] = []
+    odom_from_body: list[Array] = []
     keyframes: list[Keyframe] = []
     fed_ns = -(2**62)
     for number, raw in enumerate(frames):
@@ -50,16 +50,16 @@ def run_odometry(
         fed_ns = until_ns
         estimate = odometry.handle_stereo(frame)
         if estimate.new_odom_from_old_odom is not None:
-            transforms = [estimate.new_odom_from_old_odom @ earlier for earlier in transforms]
+            odom_from_body = [estimate.new_odom_from_old_odom @ earlier for earlier in odom_from_body]
         estimates.append(estimate)
-        transforms.append(estimate.odom_from_body)
+        odom_from_body.append(estimate.odom_from_body)
         if policy.wants(_summary(frame, estimate)):
             keyframes.append(make_keyframe(frame, number, rectifier.camera, settings))
         progress(number)
     inertial = bool(estimates) and calibration.imu is not None and estimates[-1].inertial
     return FirstGuess(
         estimates,
-        np.array(transforms),
+        np.array(odom_from_body),
         np.array([e.cov_rot_trans for e in estimates]),
         np.array([e.status is not OdometryStatus.DEGRADED for e in estimates]),
         keyframes,
@@ -71,3 +71,13 @@ def _summary(frame: RectifiedFrame, estimate: OdometryEstimate) -> FrameSummary:
     return FrameSummary(
         frame.stamp_ns, estimate.odom_from_body, estimate.track_ids, estimate.scene_depth_m, sharpness(frame), estimate.after_gap
     )
+
+
+def _levelled(odom_from_body: Array, covariances: Array, body_from_cam: Array) -> tuple[Array, Array]:
+    """The same turned so that z points up, where no accelerometer tells: cameras are taken to be upright on the whole."""
+    down = (odom_from_body[:, :3, :3] @ body_from_cam[:3, 1]).mean(axis=0)
+    if np.linalg.norm(down) < 1e-6:
+        return odom_from_body, covariances
+    level_from_odom = se3(rotation_between_vectors(down, np.array([0.0, 0.0, -1.0])), np.zeros(3))
+    turn = np.kron(np.eye(2), level_from_odom[:3, :3])
+    return level_from_odom @ odom_from_body, turn @ covariances @ turn.T

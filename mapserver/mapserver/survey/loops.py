@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.bow import BowVector, PlaceIndex
 from fleetmap.geometry import Array, se3_inverse
@@ -105,8 +106,15 @@ class LoopCloser:
     def _judge(self, i: int, j: int, score: float) -> tuple[PoseEdge, LoopRecord] | None:
         """The edge of one candidate that passed every test alone; records the failure of any other."""
 
-        def refuse(verdict: Verdict, reason: str, inliers: int = 0) -> None:
-            self.loops.records.append(LoopRecord(i, j, score, verdict, reason, inliers))
+        outcome = self._examine(i, j, score)
+        if isinstance(outcome, LoopRecord):
+            self.loops.records.append(outcome)
+            return None
+        return outcome
+
+    def _examine(self, i: int, j: int, score: float) -> tuple[PoseEdge, LoopRecord] | LoopRecord:
+        def refuse(verdict: Verdict, reason: str, inliers: int = 0) -> LoopRecord:
+            return LoopRecord(i, j, score, verdict, reason, inliers)
 
         reach_m = self._settings.loops.view_range_depths * max(
             median_depth_m(self._keyframes[i]), median_depth_m(self._keyframes[j])
@@ -135,10 +143,8 @@ class LoopCloser:
         """Match of j (as reference) with i; the graph's rotation is used where it is known well enough."""
         predicted = self._cam_from_body @ se3_inverse(self._map_from_body[i]) @ self._map_from_body[j] @ self._body_from_cam
         sigma = float(np.sqrt(np.trace(self._marginals.relative_cov(i, j)[:3, :3])))
-        sigma = sigma if sigma < self._settings.loops.rotation_sigma_limit_rad else None  # type: ignore[assignment]
-        return match_pair(
-            j, i, self._keyframes, self._camera, predicted, None if sigma is None else max(sigma, 0.02), self._settings.pairs
-        )
+        known = max(sigma, 0.02) if sigma < self._settings.loops.rotation_sigma_limit_rad else None
+        return match_pair(j, i, self._keyframes, self._camera, predicted, known, self._settings.pairs)
 
     def _edge(self, match: PairMatch) -> PoseEdge:
         """Body i from body j; the match has camera i (its j) from camera j (its i)."""
@@ -184,7 +190,7 @@ class LoopCloser:
             self._marginals.add(edge)
 
 
-def _cells(keyframe: Keyframe, features: Array, camera: StereoCamera) -> int:
+def _cells(keyframe: Keyframe, features: NDArray[np.int64], camera: StereoCamera) -> int:
     """How many of 8 x 6 image cells hold one of the features."""
     pixels = keyframe.features.pixels[features]
     column = np.clip(pixels[:, 0] / camera.width_px * 8, 0, 7).astype(int)

@@ -30,7 +30,7 @@ class PairFinder:
         map_from_cam = map_from_body @ self._body_from_cam
         positions, axes = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]
         settings = self._settings.pairs
-        found = []
+        found: list[tuple[int, int]] = []
         for j in range(1, len(map_from_cam)):
             first = 0 if only_near is None else max(0, j - only_near)
             chosen = set(range(max(first, j - previous), j))

@@ -65,12 +65,10 @@ def _from_descriptors(
     points, measured, sigmas = a.points_cam[index_a], _measured(b, index_b), _sigmas(b, index_b, settings)
     if j_from_i is not None and rotation_sigma_rad is not None:
         threshold = max(settings.search_px, 1.5 * rotation_sigma_rad * camera.focal_px)
-        found = resection_with_rotation(
+        return resection_with_rotation(
             camera, points, measured, sigmas, j_from_i[:3, :3], threshold_px=threshold, min_inliers=settings.min_inliers,
             rotation_sigma_rad=rotation_sigma_rad,
         )  # fmt: skip
-        if found is not None:
-            return found
     found = ransac_resection(
         camera, points, measured, sigmas, threshold_px=4.0, min_inliers=settings.min_inliers, seed=len(pairs)
     )

@@ -97,7 +97,7 @@ def _odometry_terms(guess: FirstGuess, numbers: list[int]) -> list[RelativeTerm]
     terms = []
     for k, (a, b) in enumerate(zip(numbers, numbers[1:], strict=False)):
         i_from_j = se3_inverse(guess.odom_from_body[a]) @ guess.odom_from_body[b]
-        terms.append(RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(25.0 * _edge_covariance(guess, a, b))))
+        terms.append(RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(25.0 * _edge_covariance(guess, a, b)).astype(np.float64)))
     return terms
 
 

@@ -140,7 +140,9 @@ def _align(
     """Refined pixels (N, 3) of `ours`; the warp comes from the motion, which is finer than the octaves and angles of features."""
     a, b = reference.features.take(theirs), own.features.take(ours)
     warp = patch_align.similarity_from_motion(camera, reference.points_cam[theirs], own_from_reference)
-    rough = patch_align.similarity_from_features(a.octaves, a.angles_deg, b.octaves, b.angles_deg)
+    rough = patch_align.similarity_from_features(
+        a.octaves, a.angles_deg.astype(np.float64), b.octaves, b.angles_deg.astype(np.float64)
+    )
     unknown = ~np.isfinite(warp).all(axis=(1, 2))
     warp[unknown] = rough[unknown]
     return patch_align.refine_matches(

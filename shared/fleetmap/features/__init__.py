@@ -1,4 +1,7 @@
-"""What is found in pictures: corners, descriptors, matches, sub-pixel positions. To add an extractor: a file and a line."""
+"""What is found in pictures: corners, descriptors, matches, sub-pixel positions.
+
+To add an extractor: a file and a line.
+"""
 
 from fleetmap.features import orb
 

@@ -31,9 +31,15 @@ def min_eigenvalue_scores(image: NDArray[np.uint8], pixels: NDArray[np.float32],
 
 @kernel
 def select_spread(
-    pixels: NDArray[np.float32], order: NDArray[np.int64], taken: NDArray[np.float32], cell_px: float, count: int, width: int, height: int
+    pixels: NDArray[np.float32],
+    order: NDArray[np.int64],
+    taken: NDArray[np.float32],
+    cell_px: float,
+    count: int,
+    width: int,
+    height: int,
 ) -> NDArray[np.int64]:
-    """Indices of up to `count` pixels, best first as `order` says, no two within about `cell_px` of each other or of `taken`.
+    """Indices of up to `count` pixels, best first as `order` says, no two within `cell_px` of each other or of `taken`.
 
     One pixel for a cell and its neighbours nearer than cell_px: a greedy suppression on a grid of cells.
     """
@@ -73,7 +79,10 @@ def select_spread(
 
 @kernel
 def centroid_angles_deg(image: NDArray[np.uint8], pixels: NDArray[np.float32], radius: int) -> NDArray[np.float32]:
-    """(N,) direction in degrees [0, 360) from each pixel to the intensity centroid of its disc. Source: Rosin 1999, as ORB uses it."""
+    """(N,) direction in degrees [0, 360) from each pixel to the intensity centroid of its disc.
+
+    Source: Rosin 1999, as ORB uses it.
+    """
     angles = np.zeros(len(pixels), np.float32)
     height, width = image.shape
     for n in range(len(pixels)):

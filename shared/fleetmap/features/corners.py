@@ -20,7 +20,13 @@ def fast_corners(image: Image, threshold: int) -> Pixels:
 
 
 def spread_corners(
-    image: Image, count: int, *, min_distance_px: float, taken: Pixels | None = None, threshold: int = 12, border_px: int = 8
+    image: Image,
+    count: int,
+    *,
+    min_distance_px: float,
+    taken: Pixels | None = None,
+    threshold: int = 12,
+    border_px: int = 8,
 ) -> Pixels:
     """Up to `count` corners (N, 2), best first, at least min_distance_px from each other and from `taken` (M, 2).
 
@@ -41,4 +47,4 @@ def spread_corners(
     scores = min_eigenvalue_scores(image, candidates, _HALF_WINDOW)
     order = np.argsort(-scores, kind="stable")
     order = order[scores[order] > 0]
-    return candidates[select_spread(candidates, order, held, min_distance_px, count, width, height)]
+    return np.asarray(candidates[select_spread(candidates, order, held, min_distance_px, count, width, height)])

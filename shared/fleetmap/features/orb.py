@@ -28,7 +28,10 @@ class OrbSettings(Section, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """N features of one rectified image, in level-0 pixels: pixels (N, 2), octaves (N,), angles_deg (N,), descriptors (N, 32)."""
+    """N features of one rectified image, in level-0 pixels.
+
+    pixels (N, 2), octaves (N,), angles_deg (N,), descriptors (N, 32).
+    """
 
     pixels: Array
     octaves: NDArray[np.int8]
@@ -40,7 +43,9 @@ class Features:
 
     def take(self, indices: NDArray[np.int64]) -> "Features":
         """The features at `indices`."""
-        return Features(self.pixels[indices], self.octaves[indices], self.angles_deg[indices], self.descriptors[indices])
+        return Features(
+            self.pixels[indices], self.octaves[indices], self.angles_deg[indices], self.descriptors[indices]
+        )
 
     @classmethod
     def empty(cls) -> "Features":
@@ -49,7 +54,10 @@ class Features:
 
 
 def detect(image: Image, settings: OrbSettings) -> Features:
-    """Features of a rectified grey image, spread by suppression per level. Source: Rublee et al. 2011 (ORB), Mur-Artal 2015 (levels)."""
+    """Features of a rectified grey image, spread by suppression per level.
+
+    Source: Rublee et al. 2011 (ORB), Mur-Artal 2015 (levels).
+    """
     found = [_detect_level(image, level, quota, settings) for level, quota in enumerate(_quotas(settings))]
     keypoints = [keypoint for level in found for keypoint in level]
     return describe(image, keypoints, settings.levels)
@@ -59,7 +67,9 @@ def describe(image: Image, keypoints: list[cv2.KeyPoint], levels: int) -> Featur
     """Features of given oriented keypoints; those too near the border are left out."""
     if not keypoints:
         return Features.empty()
-    engine = cv2.ORB.create(nfeatures=len(keypoints), scaleFactor=SCALE_FACTOR, nlevels=levels, edgeThreshold=_BORDER_PX)
+    engine = cv2.ORB.create(
+        nfeatures=len(keypoints), scaleFactor=SCALE_FACTOR, nlevels=levels, edgeThreshold=_BORDER_PX
+    )
     kept, descriptors = engine.compute(image, keypoints)
     if not kept:
         return Features.empty()
@@ -79,12 +89,16 @@ def describe_pixels(image: Image, pixels: Array, settings: OrbSettings) -> tuple
         cv2.KeyPoint(float(x), float(y), 31.0, float(angle), 1.0, 0, index)
         for index, ((x, y), angle) in enumerate(zip(points, angles, strict=True))
     ]
-    engine = cv2.ORB.create(nfeatures=max(len(keypoints), 1), scaleFactor=SCALE_FACTOR, nlevels=settings.levels, edgeThreshold=_BORDER_PX)
+    engine = cv2.ORB.create(
+        nfeatures=max(len(keypoints), 1), scaleFactor=SCALE_FACTOR, nlevels=settings.levels, edgeThreshold=_BORDER_PX
+    )
     kept, descriptors = engine.compute(image, keypoints)
     index = np.array([k.class_id for k in kept], np.int64)
     if not kept:
         return Features.empty(), index
-    return Features(pixels[index], np.zeros(len(index), np.int8), angles[index], np.asarray(descriptors, np.uint8)), index
+    return Features(
+        pixels[index], np.zeros(len(index), np.int8), angles[index], np.asarray(descriptors, np.uint8)
+    ), index
 
 
 def _quotas(settings: OrbSettings) -> list[int]:
@@ -95,7 +109,11 @@ def _quotas(settings: OrbSettings) -> list[int]:
 def _detect_level(image: Image, level: int, quota: int, settings: OrbSettings) -> list[cv2.KeyPoint]:
     scale = SCALE_FACTOR**level
     height, width = (round(s / scale) for s in image.shape)
-    scaled = image if level == 0 else np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
+    scaled = (
+        image
+        if level == 0
+        else np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
+    )
     candidates = fast_corners(scaled, settings.fast_threshold)
     if len(candidates) < 2 * quota:
         candidates = fast_corners(scaled, max(settings.fast_threshold // 2, 4))

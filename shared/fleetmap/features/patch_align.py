@@ -32,7 +32,10 @@ def half_pyramid(image: Image) -> Pyramid:
 
 
 def similarity_from_features(
-    octaves_reference: NDArray[np.int8], angles_reference_deg: Array, octaves_current: NDArray[np.int8], angles_current_deg: Array
+    octaves_reference: NDArray[np.int8],
+    angles_reference_deg: NDArray[np.floating],
+    octaves_current: NDArray[np.int8],
+    angles_current_deg: NDArray[np.floating],
 ) -> Array:
     """(N, 2, 2) reference_from_current for level-0 offsets, from two features' octaves and orientations."""
     scale = SCALE_FACTOR ** (octaves_reference.astype(np.float64) - octaves_current)
@@ -42,7 +45,10 @@ def similarity_from_features(
 
 
 def similarity_from_motion(camera: StereoCamera, points_reference: Array, current_from_reference: Array) -> Array:
-    """(N, 2, 2) reference_from_current for pixel offsets around points (N, 3), each on a plane that faces the reference camera."""
+    """(N, 2, 2) reference_from_current for pixel offsets around points (N, 3).
+
+    Each point lies on a plane that faces the reference camera. NaN where the warp is degenerate.
+    """
     focal = camera.focal_px
     step = 0.01 * points_reference[:, 2:3]
     middle = camera.pixel_from_point(transform_points(current_from_reference, points_reference))[:, :2]
@@ -54,7 +60,11 @@ def similarity_from_motion(camera: StereoCamera, points_reference: Array, curren
         columns.append((moved - middle) / (focal * step / points_reference[:, 2:3]))
     current_from_reference_px = np.stack(columns, axis=2)
     determinant = np.linalg.det(np.nan_to_num(current_from_reference_px, nan=1.0))
-    usable = np.isfinite(current_from_reference_px).all(axis=(1, 2)) & (np.abs(determinant) > 0.02) & (np.abs(determinant) < 50)
+    usable = (
+        np.isfinite(current_from_reference_px).all(axis=(1, 2))
+        & (np.abs(determinant) > 0.02)
+        & (np.abs(determinant) < 50)
+    )
     out = np.full((len(points_reference), 2, 2), np.nan)
     out[usable] = np.linalg.inv(current_from_reference_px[usable])
     return out
@@ -87,4 +97,4 @@ def refine_matches(
 
 
 def _halvings(octaves: NDArray[np.int8]) -> NDArray[np.int64]:
-    return np.clip(np.rint(octaves * np.log2(SCALE_FACTOR)), 0, _LEVELS - 1).astype(np.int64)
+    return np.asarray(np.clip(np.rint(octaves * np.log2(SCALE_FACTOR)), 0, _LEVELS - 1), np.int64)

@@ -22,9 +22,10 @@ def align_patches(
 ) -> None:  # fmt: skip
     """Moves each current pixel until the reference's window, warped, lies on it.
 
-    reference_from_current (N, 2, 2) maps offsets in the current picture to offsets in the reference. out (N, 4): x, y, sigma_px
-    (from the residual and the window's gradients, the weaker direction), correlation; NaN where alignment fails or leaves
-    max_shift_px. Inverse compositional translation with free offset and gain. Source: Baker and Matthews 2004.
+    reference_from_current (N, 2, 2) maps offsets in the current picture to offsets in the reference. out (N, 4): x, y,
+    sigma_px (from the residual and the window's gradients, the weaker direction), correlation; NaN where alignment
+    fails or leaves max_shift_px. Inverse compositional translation with free offset and gain. Source: Baker and
+    Matthews 2004.
     """
     side = 2 * half + 1
     count = side * side
@@ -51,7 +52,10 @@ def align_patches(
         xx, xy, yy, energy = 0.0, 0.0, 0.0, 0.0
         for v in range(1, side + 1):
             for u in range(1, side + 1):
-                gx, gy = 0.5 * (template[v, u + 1] - template[v, u - 1]), 0.5 * (template[v + 1, u] - template[v - 1, u])
+                gx, gy = (
+                    0.5 * (template[v, u + 1] - template[v, u - 1]),
+                    0.5 * (template[v + 1, u] - template[v - 1, u]),
+                )
                 xx += gx * gx
                 xy += gx * gy
                 yy += gy * gy

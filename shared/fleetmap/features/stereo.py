@@ -25,7 +25,9 @@ class StereoSettings(Section, frozen=True):
 
 def halved(image: Image) -> Image:
     """The image at half size, smoothed."""
-    return np.asarray(cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(
+        cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA), np.uint8
+    )
 
 
 def disparities(
@@ -33,8 +35,8 @@ def disparities(
 ) -> Array:
     """(N, 2) disparity and standard deviation in pixels for left pixels (N, 2); NaN where unknown.
 
-    prior_px (N,), NaN for none, confines the search to a few pixels around. From the depth image where the frame has one, NaN
-    throughout for a single camera.
+    prior_px (N,), NaN for none, confines the search to a few pixels around. From the depth image where the frame has
+    one, NaN throughout for a single camera.
     """
     count = len(pixels)
     if frame.disparity_px is not None:
@@ -44,8 +46,9 @@ def disparities(
     max_disparity = min(camera.focal_px * camera.baseline_m / settings.min_depth_m, 0.6 * camera.width_px)
     prior = np.full(count, np.nan) if prior_px is None else np.asarray(prior_px, np.float64)
     matched = match_rows(
-        frame.left, frame.right, halved(frame.left), halved(frame.right), np.asarray(pixels, np.float64), prior, max_disparity,
-        settings.min_correlation, settings.uniqueness, settings.wide_half_px, settings.narrow_half_px, settings.agreement_px,
+        frame.left, frame.right, halved(frame.left), halved(frame.right), np.asarray(pixels, np.float64), prior,
+        max_disparity, settings.min_correlation, settings.uniqueness, settings.wide_half_px, settings.narrow_half_px,
+        settings.agreement_px,
     )  # fmt: skip
     matched[~(matched[:, 0] > settings.min_disparity_px)] = np.nan
     return matched

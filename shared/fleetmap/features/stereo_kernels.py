@@ -103,7 +103,7 @@ def _refine(
                 return np.nan, np.nan
             sigma = np.sqrt((rr / count + 4.0) / jj)
             break
-    return (disparity, sigma) if sigma == sigma else (np.nan, np.nan)
+    return (np.nan, np.nan) if np.isnan(sigma) else (disparity, sigma)
 
 
 @kernel
@@ -156,7 +156,9 @@ def match_rows(
             first = max(int(prior_px[n] + 0.5) - 3, 0)
             last = first + 6
         else:
-            coarse, score, second = _search(left_half, right_half, xi // 2, yi // 2, 0, int(max_disparity_px / 2), 4, scores)
+            coarse, score, second = _search(
+                left_half, right_half, xi // 2, yi // 2, 0, int(max_disparity_px / 2), 4, scores
+            )
             if score < min_correlation or second > uniqueness * score:
                 continue
             first, last = max(2 * coarse - 3, 0), 2 * coarse + 3
@@ -164,11 +166,11 @@ def match_rows(
         if score < min_correlation:
             continue
         start = whole + (x - xi) * 0.0
-        d_wide, sigma_wide = _refine(left, right, x, y, start, wide, window)
-        if not d_wide == d_wide:
+        d_wide, _ = _refine(left, right, x, y, start, wide, window)
+        if np.isnan(d_wide):
             continue
         d_narrow, sigma_narrow = _refine(left, right, x, y, d_wide, narrow, window)
-        if not d_narrow == d_narrow or abs(d_wide - d_narrow) > agreement_px:
+        if np.isnan(d_narrow) or abs(d_wide - d_narrow) > agreement_px:
             continue
         out[n, 0] = d_narrow
         out[n, 1] = np.sqrt(sigma_narrow * sigma_narrow + 0.25 * (d_wide - d_narrow) * (d_wide - d_narrow))

@@ -23,9 +23,10 @@ _POSITION_GATE = 11.345  # 0.99 of chi-square with 3 degrees of freedom
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Observations of one point: which clones (n,), pixels (n, 3) u_left v u_right; a first guess of it as clone `anchor` sees it.
+    """Observations of one point: which clones (n,), pixels (n, 3) u_left v u_right.
 
-    The guess is in camera axes (3,), so that it follows the clone when an iterated update moves it.
+    A first guess of the point as clone `anchor` sees it is in camera axes (3,), so that it follows the clone when an
+    iterated update moves it.
     """
 
     clone_ids: NDArray[np.int64]
@@ -56,7 +57,14 @@ class InvariantFilter:
     Without an IMU the state moves by `displace` instead of `propagate`; velocity and biases are then idle.
     """
 
-    def __init__(self, state: NavState, nav_covariance: Array, settings: FilterSettings, camera: StereoCamera, body_from_cam: Array) -> None:
+    def __init__(
+        self,
+        state: NavState,
+        nav_covariance: Array,
+        settings: FilterSettings,
+        camera: StereoCamera,
+        body_from_cam: Array,
+    ) -> None:
         self.state = state
         self.imu_minus_cam_s = 0.0
         self.clone_ids: list[int] = []
@@ -76,7 +84,12 @@ class InvariantFilter:
         steps_s, gyro, accel = imu_intervals(imu, start_ns, end_ns)
         phi, process = np.eye(_NAV), np.zeros((_NAV, _NAV))
         densities = np.array(
-            [noise.gyro_noise_radps_rthz, noise.accel_noise_mps2_rthz, noise.gyro_walk_radps2_rthz, noise.accel_walk_mps3_rthz]
+            [
+                noise.gyro_noise_radps_rthz,
+                noise.accel_noise_mps2_rthz,
+                noise.gyro_walk_radps2_rthz,
+                noise.accel_walk_mps3_rthz,
+            ]
         )
         s = self.state
         if len(steps_s):
@@ -135,13 +148,17 @@ class InvariantFilter:
         return se3(self._rotations[index], self._positions[index])
 
     def update(
-        self, tracks: list[Track], iterations: int = 1, newest_odom_from_body: Array | None = None, sigma_scale: float = 1.0
+        self,
+        tracks: list[Track],
+        iterations: int = 1,
+        newest_odom_from_body: Array | None = None,
+        sigma_scale: float = 1.0,
     ) -> NDArray[np.int8]:
         """Uses each track once; (T,) 1 taken, 0 not triangulated, -1 refused by its gate.
 
-        More than one iteration relinearises (iterated Kalman filter), for large corrections; newest_odom_from_body is then where
-        the newest clone is linearised first, when vision knows it better than the prediction. It adds no information.
-        sigma_scale widens the measurement noise, for matches that are less exact than flow.
+        More than one iteration relinearises (iterated Kalman filter), for large corrections; newest_odom_from_body is
+        then where the newest clone is linearised first, when vision knows it better than the prediction. It adds no
+        information. sigma_scale widens the measurement noise, for matches that are less exact than flow.
         """
         used = np.zeros(len(tracks), np.int8)
         if not tracks:
@@ -159,12 +176,16 @@ class InvariantFilter:
         if newest_odom_from_body is not None:
             error = newest_odom_from_body @ se3_inverse(se3(self._rotations[-1], self._positions[-1]))
             moved[-6:] = np.concatenate([so3_log(error[:3, :3]), error[:3, 3]])
-            self._rotations[-1], self._positions[-1] = newest_odom_from_body[:3, :3].copy(), newest_odom_from_body[:3, 3].copy()
+            self._rotations[-1], self._positions[-1] = (
+                newest_odom_from_body[:3, :3].copy(),
+                newest_odom_from_body[:3, 3].copy(),
+            )
         for _ in range(iterations):
             information, vector = np.zeros((size, size)), np.zeros(size)
             filter_kernels.accumulate_tracks(
-                np.array(self._rotations), np.array(self._positions), self._body_from_cam, starts, clones, pixels, anchors, points,
-                self._camera, self._weights / sigma_scale, inner, moved, self._quantile, information, vector, used,
+                np.array(self._rotations), np.array(self._positions), self._body_from_cam, starts, clones, pixels,
+                anchors, points, self._camera, self._weights / sigma_scale, inner, moved, self._quantile, information, vector,
+                used,
             )  # fmt: skip
             gain = np.linalg.solve(np.eye(size) + information @ inner, np.column_stack([vector, information]))
             correction = self.covariance[:, _CLONES:] @ gain[:, 0]
@@ -189,8 +210,9 @@ class InvariantFilter:
     def open_up(self, clone_id: int, seen_odom_from_body: Array, gap_s: float) -> bool:
         """Widens position and velocity where vision contradicts the prediction since `clone_id` beyond its covariance.
 
-        After seconds without pictures an IMU's error can exceed what its noise figures admit; a filter that then refuses every
-        picture never recovers. True where it widened. To be called before the clone of this moment is added.
+        After seconds without pictures an IMU's error can exceed what its noise figures admit; a filter that then
+        refuses every picture never recovers. True where it widened. To be called before the clone of this moment is
+        added.
         """
         at = _CLONES + 6 * self.clone_ids.index(clone_id)
         pick = np.zeros((3, len(self.covariance)))
@@ -207,9 +229,10 @@ class InvariantFilter:
         return True
 
     def motion_since(self, clone_id: int) -> tuple[Array, Array]:
-        """earlier_from_now (4, 4) between a clone and the newest one, and its covariance (6, 6): left, axes of the earlier body.
+        """earlier_from_now (4, 4) between a clone and the newest one, and its covariance (6, 6).
 
-        From the joint covariance of both, so that what they share cancels.
+        The covariance is that of a left perturbation in axes of the earlier body, from the joint covariance of both, so
+        that what they share cancels.
         """
         at = _CLONES + 6 * self.clone_ids.index(clone_id)
         newest = _CLONES + 6 * (len(self.clone_ids) - 1)

@@ -1,8 +1,8 @@
 """Inner loops of the right-invariant multi-state constraint filter.
 
-Error convention: true = Exp(error) * estimate, in `odom` axes. For a rotation R, a velocity v and a position p and the error
-(r, nu, rho): R = Exp(r) R^, v = Exp(r) v^ + nu, p = Exp(r) p^ + rho (to first order). Source: Barrau and Bonnabel 2017 for the
-error, Mourikis and Roumeliotis 2007 for the multi-state constraint.
+Error convention: true = Exp(error) * estimate, in `odom` axes. For a rotation R, a velocity v and a position p and the
+error (r, nu, rho): R = Exp(r) R^, v = Exp(r) v^ + nu, p = Exp(r) p^ + rho (to first order). Source: Barrau and Bonnabel
+2017 for the error, Mourikis and Roumeliotis 2007 for the multi-state constraint.
 """
 
 import numpy as np
@@ -37,8 +37,9 @@ def propagate(
 ) -> None:  # fmt: skip
     """Moves the state (in place) through N intervals of constant rate and specific force.
 
-    steps_s (N,), gyro and accel (N, 3) at each interval's middle. noise (4,): densities of gyro, accel, gyro walk, accel walk.
-    state_to_state (15, 15) and process (15, 15) receive the accumulated error transition and noise, order r nu rho bg ba.
+    steps_s (N,), gyro and accel (N, 3) at each interval's middle. noise (4,): densities of gyro, accel, gyro walk,
+    accel walk. state_to_state (15, 15) and process (15, 15) receive the accumulated error transition and noise, order r
+    nu rho bg ba.
     """
     phi = np.eye(15)
     q = np.zeros((15, 15))
@@ -55,7 +56,7 @@ def propagate(
         mid_velocity = velocity + 0.5 * dt * acceleration
         mid_position = position + 0.5 * dt * velocity
         lever_v, lever_p = matmul(_skew(mid_velocity), middle), matmul(_skew(mid_position), middle)
-        # bias columns by the middle of the interval: first order in the interval, second where the chain r -> nu -> rho needs it
+        # bias columns by the middle of the interval: first order in it, second where the chain r -> nu -> rho needs it
         step[0:3, 9:12] = -middle * dt
         step[3:6, 9:12] = -lever_v * dt - 0.5 * dt * dt * matmul(g, middle)
         step[6:9, 9:12] = -lever_p * dt - 0.5 * dt * dt * lever_v
@@ -84,7 +85,14 @@ def propagate(
 
 @kernel
 def _observe(
-    point: Array, cam_from_odom_rotation: Array, cam_position: Array, focal: float, cx: float, cy: float, focal_base: float, out: Array
+    point: Array,
+    cam_from_odom_rotation: Array,
+    cam_position: Array,
+    focal: float,
+    cx: float,
+    cy: float,
+    focal_base: float,
+    out: Array,
 ) -> bool:
     """u_left, v, disparity of a point, and its camera coordinates in out[3:6]; False behind the camera."""
     for a in range(3):
@@ -102,12 +110,19 @@ def _observe(
 
 @kernel
 def triangulate(
-    rotations: Array, positions: Array, clones: NDArray[np.int64], pixels: Array, camera: Array, weights: Array, point: Array
+    rotations: Array,
+    positions: Array,
+    clones: NDArray[np.int64],
+    pixels: Array,
+    camera: Array,
+    weights: Array,
+    point: Array,
 ) -> bool:
     """Least-squares point (in place, odom) from one track; False where it does not settle in front of every camera.
 
-    rotations (M, 3, 3) odom_from_cam, positions (M, 3); clones (n,) which of them saw it; pixels (n, 3) u_left v u_right (NaN none).
-    camera: focal, cx, cy, focal * baseline. weights: 1/sigma of pixels and of disparity. `point` must hold a start.
+    rotations (M, 3, 3) odom_from_cam, positions (M, 3); clones (n,) which of them saw it; pixels (n, 3) u_left v
+    u_right (NaN none). camera: focal, cx, cy, focal * baseline. weights: 1/sigma of pixels and of disparity. `point`
+    must hold a start.
     """
     z = np.empty(6)
     for _ in range(8):
@@ -142,7 +157,9 @@ def triangulate(
         if np.abs(gradient).max() < 1e-4 * (1.0 + z[5]):
             break
     for k in range(len(clones)):
-        if not _observe(point, rotations[clones[k]].T, positions[clones[k]], camera[0], camera[1], camera[2], camera[3], z):
+        if not _observe(
+            point, rotations[clones[k]].T, positions[clones[k]], camera[0], camera[1], camera[2], camera[3], z
+        ):
             return False
     return bool(np.isfinite(point).all())
 
@@ -155,25 +172,66 @@ def _chi_square_limit(dof: int, normal_quantile: float) -> float:
 
 
 @kernel
+def linearize_track(
+    point: Array, rotations: Array, positions: Array, clones: NDArray[np.int64], pixels: Array, camera: Array,
+    weights: Array, by_clone: Array, by_point: Array, residual: Array,
+) -> int:  # fmt: skip
+    """Whitened residuals of one track and their derivatives; returns how many rows were filled.
+
+    point (3,) odom; rotations (M, 3, 3) odom_from_cam, positions (M, 3); clones (n,), pixels (n, 3) u_left v u_right (NaN
+    none). by_clone (3 n, 6 n) by the errors of the body transforms of this module, rotation then position, in the order of
+    `clones`; by_point (3 n, 3); residual (3 n,) measured minus predicted, as 1/sigma in weights (2,) says.
+    """
+    z = np.empty(6)
+    lever = _skew(point)
+    rows = 0
+    for k in range(len(clones)):
+        turn = rotations[clones[k]].T
+        _observe(point, turn, positions[clones[k]], camera[0], camera[1], camera[2], camera[3], z)
+        inverse = 1.0 / z[5]
+        stereo = pixels[k, 2] == pixels[k, 2]
+        for row in range(3 if stereo else 2):
+            for b in range(3):
+                if row < 2:
+                    slope = turn[row, b] - z[3 + row] * inverse * turn[2, b]
+                    by_point[rows, b] = camera[0] * inverse * slope * weights[0]
+                else:
+                    by_point[rows, b] = -camera[3] * inverse * inverse * turn[2, b] * weights[1]
+            # point as the clone sees it: R^T (p_f - p); with the invariant error its change is R^T (p_f x r - rho)
+            for b in range(3):
+                total = 0.0
+                for c in range(3):
+                    total += by_point[rows, c] * lever[c, b]
+                by_clone[rows, 6 * k + b] = total
+                by_clone[rows, 6 * k + 3 + b] = -by_point[rows, b]
+            if row < 2:
+                residual[rows] = (pixels[k, row] - z[row]) * weights[0]
+            else:
+                residual[rows] = (pixels[k, 0] - pixels[k, 2] - z[2]) * weights[1]
+            rows += 1
+    return rows
+
+
+@kernel
 def accumulate_tracks(
-    odom_from_body_rotations: Array, body_positions: Array, body_from_cam: Array, starts: NDArray[np.int64], clones: NDArray[np.int64],
-    pixels: Array, anchors: NDArray[np.int64], first_points: Array, camera: Array, weights: Array, clone_covariance: Array, moved: Array, normal_quantile: float,
+    odom_from_body_rotations: Array, body_positions: Array, body_from_cam: Array, starts: NDArray[np.int64],
+    clones: NDArray[np.int64], pixels: Array, anchors: NDArray[np.int64], first_points: Array, camera: Array,
+    weights: Array, clone_covariance: Array, moved: Array, normal_quantile: float,
     information: Array, vector: Array, used: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Adds every track that passes its gate to the normal equations of the clone errors, points projected out.
 
-    starts (T + 1,) delimits each track's rows of clones (n,) and pixels (n, 3). first_points (T, 3): where triangulation starts,
-    in the camera of clone anchors (T,). clone_covariance (6 M, 6 M) in the error of this module, order rotation then position. moved (6 M,): how far the clones
-    given here stand from the prior mean, when an iterated filter relinearises. information (6 M, 6 M) and
-    vector (6 M,) are summed into. used (T,) becomes 1 for a track that was taken, 0 for one that could not be triangulated and
-    -1 for one that failed its gate.
+    starts (T + 1,) delimits each track's rows of clones (n,) and pixels (n, 3). first_points (T, 3): where
+    triangulation starts, in the camera of clone anchors (T,). clone_covariance (6 M, 6 M) in the error of this module,
+    order rotation then position. moved (6 M,): how far the clones given here stand from the prior mean, when an
+    iterated filter relinearises. information (6 M, 6 M) and vector (6 M,) are summed into. used (T,) becomes 1 for a
+    track that was taken, 0 for one that could not be triangulated and -1 for one that failed its gate.
     """
     count = len(body_positions)
     rotations, positions = np.empty((count, 3, 3)), np.empty((count, 3))
     for m in range(count):
         rotations[m] = matmul(odom_from_body_rotations[m], body_from_cam[:3, :3])
         positions[m] = _rotate(odom_from_body_rotations[m], body_from_cam[:3, 3]) + body_positions[m]
-    z = np.empty(6)
     for t in range(len(starts) - 1):
         seen = clones[starts[t] : starts[t + 1]]
         measured = pixels[starts[t] : starts[t + 1]]
@@ -182,34 +240,10 @@ def accumulate_tracks(
         if not triangulate(rotations, positions, seen, measured, camera, weights, point):
             continue
         n = len(seen)
-        rows = 0
         by_clone, by_point, residual = np.zeros((3 * n, 6 * n)), np.zeros((3 * n, 3)), np.zeros(3 * n)
-        lever = _skew(point)
-        for k in range(n):
-            turn = rotations[seen[k]].T
-            _observe(point, turn, positions[seen[k]], camera[0], camera[1], camera[2], camera[3], z)
-            inverse = 1.0 / z[5]
-            stereo = measured[k, 2] == measured[k, 2]
-            for row in range(3 if stereo else 2):
-                for b in range(3):
-                    if row == 0:
-                        by_point[rows, b] = camera[0] * inverse * (turn[0, b] - z[3] * inverse * turn[2, b]) * weights[0]
-                    elif row == 1:
-                        by_point[rows, b] = camera[0] * inverse * (turn[1, b] - z[4] * inverse * turn[2, b]) * weights[0]
-                    else:
-                        by_point[rows, b] = -camera[3] * inverse * inverse * turn[2, b] * weights[1]
-                # point as the clone sees it: R^T (p_f - p); with the invariant error its change is R^T (p_f x r - rho)
-                for b in range(3):
-                    total = 0.0
-                    for c in range(3):
-                        total += by_point[rows, c] * lever[c, b]
-                    by_clone[rows, 6 * k + b] = total
-                    by_clone[rows, 6 * k + 3 + b] = -by_point[rows, b]
-                if row < 2:
-                    residual[rows] = (measured[k, row] - z[row]) * weights[0]
-                else:
-                    residual[rows] = (measured[k, 0] - measured[k, 2] - z[2]) * weights[1]
-                rows += 1
+        rows = linearize_track(
+            point, rotations, positions, seen, measured, camera, weights, by_clone, by_point, residual
+        )
         dof = rows - 3
         if dof < 1:
             continue

@@ -1,4 +1,7 @@
-"""The odometry of robot and survey: samples in, one estimate for each frame out. Never touches a file, a socket or a clock."""
+"""The odometry of robot and survey: samples in, one estimate for each frame out.
+
+Never touches a file, a socket or a clock.
+"""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -11,7 +14,7 @@ from fleetmap.features.stereo import StereoSettings
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry.filter import InvariantFilter, NavState, Track
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
-from fleetmap.odometry.start import Start, start_steady, start_in_motion
+from fleetmap.odometry.start import Start, start_in_motion, start_steady
 from fleetmap.odometry.tracker import Tracked, Tracker
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import ImuSamples, Trajectory
@@ -33,9 +36,9 @@ class OdometryStatus(StrEnum):
 class OdometryEstimate:
     """The body at one frame.
 
-    odom_from_body (4, 4); cov_rot_trans (6, 6) in odom axes; velocity, biases (3,). track_ids (N,) of the
-    points seen; after_gap where they had to be matched by descriptors; inertial once gravity is known. new_odom_from_old_odom is given when the frame
-    `odom` was redefined (gravity found): earlier estimates must be multiplied by it from the left.
+    odom_from_body (4, 4); cov_rot_trans (6, 6) in odom axes; velocity, biases (3,). track_ids (N,) of the points seen;
+    after_gap where they had to be matched by descriptors; inertial once gravity is known. new_odom_from_old_odom is
+    given when the frame `odom` was redefined (gravity found): earlier estimates must be multiplied by it from the left.
     """
 
     stamp_ns: int
@@ -58,9 +61,14 @@ class Odometry:
     """Stereo-inertial, or stereo alone where the rig has no IMU."""
 
     def __init__(
-        self, calibration: RigCalibration, camera: StereoCamera, body_from_cam: Array, imu_minus_cam_s: float, settings: OdometrySettings,
+        self,
+        calibration: RigCalibration,
+        camera: StereoCamera,
+        body_from_cam: Array,
+        imu_minus_cam_s: float,
+        settings: OdometrySettings,
         stereo_settings: StereoSettings | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._noise = None if calibration.imu is None else _widened(calibration.imu, settings.filter)
         self._camera, self._body_from_cam = camera, body_from_cam
         self._cam_from_body = se3_inverse(body_from_cam)
@@ -83,7 +91,10 @@ class Odometry:
         self._pending.append(samples)
 
     def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
-        """The estimate at `frame`, which must be newer than any before. IMU samples up to its stamp should have come."""
+        """The estimate at `frame`, which must be newer than any before.
+
+        IMU samples up to its stamp should have come.
+        """
         self._absorb_imu(frame.stamp_ns)
         stamp_ns = frame.stamp_ns + int(self._offset_s * 1e9)
         if self._filter is None:
@@ -106,10 +117,11 @@ class Odometry:
         return estimate
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
-        """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance; None where it is forgotten.
+        """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance.
 
-        The covariance (6, 6) is that of a left perturbation in the earlier body's axes, rotation first. Sparse pictures can revise
-        where earlier frames were: what two estimates differ by is then not the motion between them, this is.
+        None where the frame is forgotten. The covariance (6, 6) is that of a left perturbation in the earlier body's
+        axes, rotation first. Sparse pictures can revise where earlier frames were: what two estimates differ by is then
+        not the motion between them, this is.
         """
         if self._filter is None or frame_index not in self._filter.clone_ids:
             return None
@@ -121,7 +133,7 @@ class Odometry:
         assert self._filter is not None
         return self._filter.clone_ids[0]
 
-    # --- start -----------------------------------------------------------------------------------------------------------
+    # --- start ---
 
     def _absorb_imu(self, stamp_ns: int) -> None:
         if self._pending:
@@ -156,7 +168,10 @@ class Odometry:
         self._tracks.clear()
 
     def _try_start(self, stamp_ns: int, tracked: Tracked) -> Array | None:
-        """Switches to the inertial filter once gravity is known, by rest or by motion; the turn of `odom` then, else None."""
+        """Switches to the inertial filter once gravity is known, by rest or by motion.
+
+        Returns new_odom_from_old_odom (4, 4) then, else None.
+        """
         assert self._filter is not None
         assert self._noise is not None
         seen = self._filter.state.odom_from_body
@@ -168,7 +183,11 @@ class Odometry:
             self._vision.append((stamp_ns, seen))
             recent = self._vision[-s.moving_frames :]
             stamps = np.array([t for t, _ in recent], np.int64)
-            if len(recent) < 5 or stamps[-1] - stamps[0] < s.moving_duration_s * 0.9e9 or np.diff(stamps).max() > s.moving_gap_s * 1e9:
+            if (
+                len(recent) < 5
+                or stamps[-1] - stamps[0] < s.moving_duration_s * 0.9e9
+                or np.diff(stamps).max() > s.moving_gap_s * 1e9
+            ):
                 return None
             vision = Trajectory(stamps, np.array([m for _, m in recent]))
             start = start_in_motion(vision, self._imu, self._noise, s, self._settings.filter)
@@ -186,7 +205,7 @@ class Odometry:
         for track_id, pixel in zip(ids.tolist(), pixels, strict=True):
             self._tracks[track_id] = [(self._frame_index, pixel)]
 
-    # --- one frame -------------------------------------------------------------------------------------------------------
+    # --- one frame ---
 
     def _predict(self, stamp_ns: int) -> Array:
         assert self._filter is not None
@@ -206,7 +225,9 @@ class Odometry:
         if frame_index not in self._filter.clone_ids:
             return None
         earlier = self._filter.odom_from_clone(frame_index)
-        return np.asarray(self._cam_from_body @ se3_inverse(self._filter.state.odom_from_body) @ earlier @ self._body_from_cam)
+        return np.asarray(
+            self._cam_from_body @ se3_inverse(self._filter.state.odom_from_body) @ earlier @ self._body_from_cam
+        )
 
     def _displace(self, tracked: Tracked) -> None:
         assert self._filter is not None
@@ -216,7 +237,9 @@ class Odometry:
         if tracked.cam_from_previous is not None:
             self._last_motion = tracked.cam_from_previous
         elif (seen := self._seen_body(tracked)) is not None:
-            self._last_motion = self._cam_from_body @ se3_inverse(seen[1]) @ self._filter.state.odom_from_body @ self._body_from_cam
+            self._last_motion = (
+                self._cam_from_body @ se3_inverse(seen[1]) @ self._filter.state.odom_from_body @ self._body_from_cam
+            )
         body_from_next = self._body_from_cam @ se3_inverse(self._last_motion) @ self._cam_from_body
         self._filter.displace(body_from_next, s.free_rotation_sigma_rad, s.free_translation_sigma_m)
 
@@ -244,7 +267,10 @@ class Odometry:
         self._newest = (tracked.ids, tracked.pixels)
 
     def _consume(self, tracked: Tracked) -> NDArray[np.int8]:
-        """Uses tracks that ended, that are due in their turn, or (after a gap) all: every observation serves exactly once."""
+        """Uses tracks that ended, that are due in their turn, or (after a gap) all.
+
+        Every observation serves exactly once.
+        """
         assert self._filter is not None
         settings = self._settings.filter
         chunk = settings.chunk_frames if self._inertial else settings.chunk_frames_without_imu
@@ -265,7 +291,9 @@ class Odometry:
         seen = self._seen_body(tracked)
         if seen is None:
             return self._filter.update(chosen, iterations=1 if self._inertial else 4)
-        return self._filter.update(chosen, 4, newest_odom_from_body=seen[1], sigma_scale=settings.descriptor_sigma_scale)
+        return self._filter.update(
+            chosen, 4, newest_odom_from_body=seen[1], sigma_scale=settings.descriptor_sigma_scale
+        )
 
     def _track(self, observations: list[tuple[int, Array]]) -> Track:
         """A track with a first guess of its point: stereo from the nearest view, else far along the newest ray."""
@@ -299,18 +327,34 @@ class Odometry:
         known = disparities[np.isfinite(disparities)]
         return self._camera.focal_px * self._camera.baseline_m / float(np.median(known)) if len(known) else 5.0
 
-    def _estimate(self, stamp_ns: int, tracked: Tracked, used: NDArray[np.int8], change: Array | None) -> OdometryEstimate:
+    def _estimate(
+        self, stamp_ns: int, tracked: Tracked, used: NDArray[np.int8], change: Array | None
+    ) -> OdometryEstimate:
         assert self._filter is not None
         state = self._filter.state
         lost = self._frame_index > 0 and tracked.lost
         waiting = self._noise is not None and not self._inertial
-        status = OdometryStatus.DEGRADED if lost else OdometryStatus.INITIALISING if waiting else OdometryStatus.TRACKING
+        status = (
+            OdometryStatus.DEGRADED if lost else OdometryStatus.INITIALISING if waiting else OdometryStatus.TRACKING
+        )
         taken = int((used == 1).sum())
         share = taken / len(used) if len(used) else tracked.inlier_share
         return OdometryEstimate(
-            stamp_ns, self._frame_index, state.odom_from_body, self._filter.body_covariance(), state.velocity_mps.copy(), state.gyro_bias_radps.copy(),
-            state.accel_bias_mps2.copy(), status, tracked.ids, self._scene_depth_m(), share, tracked.by_descriptors, self._inertial, change,
-        )  # fmt: skip
+            stamp_ns=stamp_ns,
+            frame_index=self._frame_index,
+            odom_from_body=state.odom_from_body,
+            cov_rot_trans=self._filter.body_covariance(),
+            velocity_odom_mps=state.velocity_mps.copy(),
+            gyro_bias_radps=state.gyro_bias_radps.copy(),
+            accel_bias_mps2=state.accel_bias_mps2.copy(),
+            status=status,
+            track_ids=tracked.ids,
+            scene_depth_m=self._scene_depth_m(),
+            inlier_share=share,
+            after_gap=tracked.by_descriptors,
+            inertial=self._inertial,
+            new_odom_from_old_odom=change,
+        )
 
 
 def _widened(noise: ImuNoise, settings: FilterSettings) -> ImuNoise:

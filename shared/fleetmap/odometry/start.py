@@ -6,7 +6,7 @@ import numpy as np
 
 from fleetmap.calibration import ImuNoise
 from fleetmap.geometry import Array, rotation_between_vectors, skew, so3_exp, so3_log
-from fleetmap.inertial import preintegrate
+from fleetmap.inertial import Preintegrated, preintegrate
 from fleetmap.odometry.filter import GRAVITY_MPS2, NavState
 from fleetmap.odometry.settings import FilterSettings, StartSettings
 from fleetmap.samples import ImuSamples, Trajectory
@@ -16,7 +16,10 @@ _MAX_LOOK_BACK_S = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """A first state with covariance (15, 15) in the filter's error, valid at stamp_ns; odom_from_old turns earlier transforms."""
+    """A first state with covariance (15, 15) in the filter's error, valid at stamp_ns.
+
+    odom_from_old (4, 4) turns earlier transforms.
+    """
 
     state: NavState
     covariance: Array
@@ -24,7 +27,9 @@ class Start:
     odom_from_old: Array
 
 
-def start_steady(imu: ImuSamples, until_ns: int, settings: StartSettings, filter_settings: FilterSettings) -> Start | None:
+def start_steady(
+    imu: ImuSamples, until_ns: int, settings: StartSettings, filter_settings: FilterSettings
+) -> Start | None:
     """The state at the end of the latest steady window before `until_ns`; None where the IMU was never steady."""
     window_ns = int(settings.steady_window_s * 1e9)
     if not len(imu):
@@ -83,9 +88,10 @@ def _steady_state(window: ImuSamples, stamp_ns: int, settings: FilterSettings) -
 def start_in_motion(
     vision: Trajectory, imu: ImuSamples, noise: ImuNoise, settings: StartSettings, filter_settings: FilterSettings
 ) -> Start | None:
-    """Aligns visual odometry (metric, body transforms in any frame) with the IMU: gyro bias, gravity, velocity, accelerometer bias.
+    """Aligns visual odometry (metric, body transforms in any frame) with the IMU.
 
-    None where the alignment does not give gravity its size. Source: Mur-Artal and Tardos 2017 (alignment), Qin 2018 (gravity on a sphere).
+    Solves for gyro bias, gravity, velocity and accelerometer bias. None where the alignment does not give gravity its
+    size. Source: Mur-Artal and Tardos 2017 (alignment), Qin 2018 (gravity on a sphere).
     """
     stamps, bodies = vision.stamps_ns, vision.frame_from_body
     count = len(stamps)
@@ -102,7 +108,9 @@ def start_in_motion(
     accel_bias = np.zeros(3)
     for _ in range(4):
         basis = _tangent(direction)
-        solution, covariance = _sphere_step(bodies, terms, direction, basis, accel_bias, filter_settings.initial_accel_bias_sigma_mps2)
+        solution, covariance = _sphere_step(
+            bodies, terms, direction, basis, accel_bias, filter_settings.initial_accel_bias_sigma_mps2
+        )
         turn = basis @ solution[:2]
         direction = so3_exp(np.cross(direction, turn)) @ direction
         accel_bias = accel_bias + solution[2:5]
@@ -123,7 +131,7 @@ def _gyro_bias_step(vision: Trajectory, imu: ImuSamples, noise: ImuNoise, gyro_b
     return np.asarray(np.linalg.solve(hessian + 1e-12 * np.eye(3), gradient))
 
 
-def _free_gravity(bodies: Array, terms: list) -> Array | None:  # type: ignore[type-arg]
+def _free_gravity(bodies: Array, terms: list[Preintegrated]) -> Array | None:
     """Gravity (3,) with its size free, by linear least squares over all velocities."""
     count = len(bodies)
     rows, right = np.zeros((6 * (count - 1), 3 + 3 * count)), np.zeros(6 * (count - 1))
@@ -142,8 +150,13 @@ def _free_gravity(bodies: Array, terms: list) -> Array | None:  # type: ignore[t
     return np.asarray(solution[:3]) if rank == rows.shape[1] else None
 
 
-def _sphere_step(bodies: Array, terms: list, direction: Array, basis: Array, accel_bias: Array, bias_sigma: float) -> tuple[Array, Array]:  # type: ignore[type-arg]
-    """One Gauss-Newton step: gravity's direction (2), accelerometer bias (3), velocities (3 each); solution and covariance."""
+def _sphere_step(
+    bodies: Array, terms: list[Preintegrated], direction: Array, basis: Array, accel_bias: Array, bias_sigma: float
+) -> tuple[Array, Array]:
+    """One Gauss-Newton step; solution and covariance.
+
+    Order: gravity's direction (2), accelerometer bias (3), velocities (3 each).
+    """
     count = len(bodies)
     size = 5 + 3 * count
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
@@ -173,7 +186,7 @@ def _sphere_step(bodies: Array, terms: list, direction: Array, basis: Array, acc
     hessian[2:5, 2:5] += np.eye(3) / bias_sigma**2
     gradient[2:5] -= accel_bias / bias_sigma**2
     covariance = np.linalg.inv(hessian + 1e-9 * np.eye(size))
-    return covariance @ gradient, covariance
+    return np.asarray(covariance @ gradient), np.asarray(covariance)
 
 
 def _tangent(direction: Array) -> Array:
@@ -185,9 +198,15 @@ def _tangent(direction: Array) -> Array:
 
 
 def _motion_state(
-    vision: Trajectory, direction: Array, velocity: Array, gyro_bias: Array, accel_bias: Array, basis: Array, solved: Array,
+    vision: Trajectory,
+    direction: Array,
+    velocity: Array,
+    gyro_bias: Array,
+    accel_bias: Array,
+    basis: Array,
+    solved: Array,
     settings: FilterSettings,
-) -> Start:  # fmt: skip
+) -> Start:
     """The filter's first state and covariance, in the old frame turned so that gravity points down."""
     turn = rotation_between_vectors(direction, np.array([0.0, 0.0, -1.0]))
     odom_from_old = np.eye(4)
@@ -201,7 +220,7 @@ def _motion_state(
     joint[5:8, size - 3 :] = np.eye(3)
     solved = joint @ solved @ joint.T
     to_error = np.zeros((15, 8))
-    # gravity known as d, truly d + B x: the frame must turn by r with r x d_odom = -T B x, so r = -d_odom x (T B x) ... d_odom = -z
+    # gravity known as d, truly d + B x: the frame must turn by r with r x d_odom = -T B x, so r = -d_odom x (T B x)
     down = np.array([0.0, 0.0, -1.0])
     to_error[0:3, 0:2] = -skew(down) @ turn @ basis
     to_error[3:6, 5:8] = turn

@@ -21,7 +21,10 @@ MotionSince = Callable[[int], Array | None]
 
 @dataclass(frozen=True, slots=True)
 class Earlier:
-    """Observations (ids (N,), pixels (N, 3)) of an earlier frame, for tracks that were begun there only now, and the motion since."""
+    """Observations of an earlier frame, for tracks that were begun there only now, and the motion since.
+
+    ids (N,), pixels (N, 3) u_left v u_right, cam_from_earlier (4, 4).
+    """
 
     frame_index: int
     ids: Ids
@@ -33,8 +36,9 @@ class Earlier:
 class Tracked:
     """What one frame saw.
 
-    ids (N,) and pixels (N, 3) u_left v u_right of the current frame. cam_from_previous: the motion measured since the previous
-    frame, None where too few points agree. After a gap (by_descriptors) `earlier` holds what was matched, best first.
+    ids (N,) and pixels (N, 3) u_left v u_right of the current frame. cam_from_previous: the motion measured since the
+    previous frame, None where too few points agree. After a gap (by_descriptors) `earlier` holds what was matched, best
+    first.
     """
 
     ids: Ids
@@ -71,7 +75,9 @@ class _Points:
 class Tracker:
     """Feeds on rectified frames in order; ids never repeat."""
 
-    def __init__(self, camera: StereoCamera, settings: TrackerSettings, stereo_settings: stereo.StereoSettings | None = None) -> None:
+    def __init__(
+        self, camera: StereoCamera, settings: TrackerSettings, stereo_settings: stereo.StereoSettings | None = None
+    ) -> None:
         self._camera = camera
         self._settings = settings
         self._stereo = stereo_settings or stereo.StereoSettings()
@@ -82,13 +88,17 @@ class Tracker:
         self._frame_index = -1
         self._memory: list[_Remembered] = []
 
-    def track(self, frame: RectifiedFrame, motion_since: MotionSince, rotation_sigma_rad: float | None = None) -> Tracked:
+    def track(
+        self, frame: RectifiedFrame, motion_since: MotionSince, rotation_sigma_rad: float | None = None
+    ) -> Tracked:
         """Follows the points into `frame`.
 
-        motion_since(frame_index) predicts cam_from_earlier (4, 4) since a frame counted from 0, None where it is forgotten;
-        rotation_sigma_rad says how well its rotation is known, None where it is only a guess.
+        motion_since(frame_index) predicts cam_from_earlier (4, 4) since a frame counted from 0, None where it is
+        forgotten; rotation_sigma_rad says how well its rotation is known, None where it is only a guess.
         """
-        motion, share, earlier, far = None, 1.0, (), False
+        motion: Array | None = None
+        earlier: tuple[Earlier, ...] = ()
+        share, far = 1.0, False
         self._frame_index += 1
         if self._previous is not None:
             far = (frame.stamp_ns - self._previous.stamp_ns) * 1e-9 > self._settings.max_gap_s
@@ -111,7 +121,9 @@ class Tracker:
 
     def _predict(self, points_cam: Array, pixels: Array, cam_from_previous: Array) -> Array:
         """Where the previous points should appear; those without depth move as if far away."""
-        rays = np.column_stack([(pixels[:, :2] - [self._camera.cx_px, self._camera.cy_px]) / self._camera.focal_px, np.ones(len(pixels))])
+        rays = np.column_stack(
+            [(pixels[:, :2] - [self._camera.cx_px, self._camera.cy_px]) / self._camera.focal_px, np.ones(len(pixels))]
+        )
         turned = rays @ cam_from_previous[:3, :3].T
         known = np.isfinite(points_cam).all(axis=1)
         turned[known] = transform_points(cam_from_previous, points_cam[known])
@@ -154,8 +166,8 @@ class Tracker:
         window = (s.window_px, s.window_px)
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
         new, found, _ = cv2.calcOpticalFlowPyrLK(
-            self._previous.left, frame.left, old, start.copy(), winSize=window, maxLevel=s.pyramid_levels, criteria=criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            self._previous.left, frame.left, old, start.copy(), winSize=window, maxLevel=s.pyramid_levels,
+            criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
         back, found_back, _ = cv2.calcOpticalFlowPyrLK(
             frame.left, self._previous.left, new, old.copy(), winSize=window, maxLevel=1, criteria=criteria,
@@ -169,7 +181,10 @@ class Tracker:
         return new.astype(np.float64), kept
 
     def _motion(self, points_cam: Array, flowed: Array, kept: NDArray[np.bool_], guess: Array) -> Resection | None:
-        """cam_from_previous from points with depth: least squares from the guess, RANSAC where most points disagree with it."""
+        """cam_from_previous from points with depth.
+
+        Least squares from the guess, RANSAC where most points disagree with it.
+        """
         usable = kept & np.isfinite(points_cam).all(axis=1)
         count = int(usable.sum())
         if count < self._settings.min_inliers:
@@ -190,7 +205,10 @@ class Tracker:
     def _rematch(
         self, frame: RectifiedFrame, motion_since: MotionSince, rotation_sigma_rad: float | None
     ) -> tuple[tuple[Earlier, ...], float]:
-        """After a gap: new tracks from descriptor matches with the last few frames, each verified by one rigid motion."""
+        """After a gap: new tracks from descriptor matches with the last few frames.
+
+        The matches with each frame are verified by one rigid motion.
+        """
         assert self._previous is not None
         if not self._memory or self._memory[-1].frame_index != self._frame_index - 1:
             self._memory.append(self._remember(self._previous, self._frame_index - 1))
@@ -200,7 +218,9 @@ class Tracker:
         free = np.ones(len(current.features), bool)
         for old in reversed(self._memory):
             guess = motion_since(old.frame_index)
-            matched = self._match_pair(old, current, free, np.eye(4) if guess is None else guess, None if guess is None else rotation_sigma_rad)
+            matched = self._match_pair(
+                old, current, free, np.eye(4) if guess is None else guess, None if guess is None else rotation_sigma_rad
+            )
             if matched is not None:
                 found.append(matched)
         self._memory = [*self._memory[-(self._settings.memory_frames - 1) :], current]
@@ -214,7 +234,12 @@ class Tracker:
         return _Remembered(frame_index, patch_align.half_pyramid(frame.left), features, depth, points)
 
     def _match_pair(
-        self, old: _Remembered, current: _Remembered, free: NDArray[np.bool_], guess: Array, rotation_sigma_rad: float | None
+        self,
+        old: _Remembered,
+        current: _Remembered,
+        free: NDArray[np.bool_],
+        guess: Array,
+        rotation_sigma_rad: float | None,
     ) -> Earlier | None:
         """Matches with one earlier frame; adds their tracks to the current points and takes them out of `free`."""
         usable = np.flatnonzero(free)
@@ -229,7 +254,14 @@ class Tracker:
         before, now = old.features.take(a), current.features.take(b)
         warp = patch_align.similarity_from_features(before.octaves, before.angles_deg, now.octaves, now.angles_deg)
         refined = patch_align.refine_matches(
-            old.pyramid, current.pyramid, before.pixels, before.octaves, now.pixels, now.octaves, warp, patch_align.AlignSettings()
+            old.pyramid,
+            current.pyramid,
+            before.pixels,
+            before.octaves,
+            now.pixels,
+            now.octaves,
+            warp,
+            patch_align.AlignSettings(),
         )
         sure = np.isfinite(refined[:, 0])
         a, b = a[sure], b[sure]
@@ -245,7 +277,9 @@ class Tracker:
         earlier = np.column_stack([old.features.pixels[a], old.features.pixels[a, 0] - old.disparities[a]])
         return Earlier(old.frame_index, ids, earlier, found.cam_from_source)
 
-    def _wide_motion(self, points_cam: Array, measured: Array, guess: Array, rotation_sigma_rad: float | None) -> Resection | None:
+    def _wide_motion(
+        self, points_cam: Array, measured: Array, guess: Array, rotation_sigma_rad: float | None
+    ) -> Resection | None:
         """cam_from_previous from raw descriptor matches: with a known rotation first, without any guess else."""
         sigmas = np.full((len(points_cam), 2), 1.5)
         least = self._settings.min_inliers
@@ -257,7 +291,13 @@ class Tracker:
             if found is not None:
                 return found
         found = ransac_resection(
-            self._camera, points_cam, measured, sigmas, threshold_px=2 * self._settings.ransac_px, min_inliers=least, seed=len(measured)
+            self._camera,
+            points_cam,
+            measured,
+            sigmas,
+            threshold_px=2 * self._settings.ransac_px,
+            min_inliers=least,
+            seed=len(measured),
         )
         if found is None or found.inliers.sum() < max(least, 0.25 * len(points_cam)):
             return None
@@ -275,7 +315,10 @@ class Tracker:
         if missing < 0.15 * self._settings.max_points:
             return
         corners = spread_corners(
-            frame.left, missing, min_distance_px=self._settings.min_distance_px, taken=self._points.pixels[:, :2].astype(np.float32)
+            frame.left,
+            missing,
+            min_distance_px=self._settings.min_distance_px,
+            taken=self._points.pixels[:, :2].astype(np.float32),
         ).astype(np.float64)
         found = stereo.disparities(frame, self._camera, corners, self._stereo)
         fresh = np.column_stack([corners, corners[:, 0] - found[:, 0]])

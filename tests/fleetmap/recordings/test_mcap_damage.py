@@ -46,10 +46,10 @@ def assert_nothing_is_invented(recording: Recording) -> None:
     np.testing.assert_array_equal(recording.imu.gyro_radps, SAMPLE.gyro_radps[places])
     if recording.ground_truth is not None:
         truth: dict[int, Array] = dict(zip(SAMPLE.stamps_ns.tolist(), SAMPLE.world_from_body, strict=True))
-        for stamp_ns, transform in zip(
+        for stamp_ns, frame_from_body in zip(
             recording.ground_truth.stamps_ns.tolist(), recording.ground_truth.frame_from_body, strict=True
         ):
-            np.testing.assert_allclose(transform, truth[stamp_ns], atol=1e-12)
+            np.testing.assert_allclose(frame_from_body, truth[stamp_ns], atol=1e-12)
 
 
 def write_bytes(tmp_path: Path, data: bytes) -> Path:

@@ -1,0 +1,126 @@
+"""The figures that the project promises, on real recordings; each is built once.
+
+Held-out means: the map comes from every second pair of a flight, the others are localised in it and compared with the
+truth without any alignment.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fleetmap.geometry import Array
+from fleetmap.recordings import open_recording
+from locclient.cli import app as locclient_app
+from mapserver.cli import app as mapserver_app
+from realdata import real_data
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
+Report = dict[str, Any]
+
+
+def run(app: Any, *arguments: object) -> None:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    if result.exception is not None:
+        raise result.exception
+    assert result.exit_code == 0, result.output
+
+
+def built(recording: Path, out: Path, *options: object) -> Report:
+    """The report of a build, published as site `s` of `out`/store."""
+    to_store = ["--site", "s", "--store", out / "store"]
+    files = ["--report", out / "b.json", "--trajectory", out / "b.tum"]
+    run(mapserver_app, "build", recording, *to_store, "--frame-from-ground-truth", *files, *options)
+    run(mapserver_app, "publish", *to_store)
+    report: Report = json.loads((out / "b.json").read_text())
+    return report
+
+
+def replayed(recording: Path, out: Path, *options: object) -> Report:
+    """The report of a replay against `built`'s map."""
+    to_store = ["--site", "s", "--store", out / "store"]
+    run(
+        locclient_app,
+        "replay",
+        recording,
+        *to_store,
+        "--report",
+        out / "r.json",
+        "--trajectory",
+        out / "r.tum",
+        *options,
+    )
+    report: Report = json.loads((out / "r.json").read_text())
+    return report
+
+
+def true_positions(stamps_s: Array) -> Array:
+    """(N, 3) of the flight at the samples of the truth nearest to the stamps."""
+    truth = open_recording(real_data("euroc_v101_keyframes")).ground_truth
+    assert truth is not None
+    nearest = [int(np.argmin(np.abs(truth.stamps_ns - stamp * 1e9))) for stamp in stamps_s]
+    assert np.abs(truth.stamps_ns[nearest] * 1e-9 - stamps_s).max() < 1e-3
+    return truth.positions_m[nearest]
+
+
+@pytest.fixture(scope="module")
+def v101(tmp_path_factory: pytest.TempPathFactory) -> tuple[Report, Path]:
+    out = tmp_path_factory.mktemp("v101")
+    return built(real_data("euroc_v101_keyframes"), out, "--frames", "0::2"), out
+
+
+@pytest.fixture(scope="module")
+def v101_held_out(v101: tuple[Report, Path]) -> tuple[Report, Path]:
+    return replayed(real_data("euroc_v101_keyframes"), v101[1], "--frames", "1::2"), v101[1]
+
+
+def test_v101_survey(v101: tuple[Report, Path]) -> None:
+    report, out = v101
+    assert report["sensor_set"] == "stereo-inertial"
+    assert report["inertial"]
+    assert report["ate_rmse_m"] <= 0.05
+    assert report["evaluated_share"] == 1.0
+    assert report["loops"]["accepted"] >= 5
+    positions = true_positions(np.loadtxt(out / "b.tum", comments="#", ndmin=2)[:, 0])
+    assert len(positions) == 50
+    assert report["path_m"] == pytest.approx(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum(), rel=0.01)
+
+
+def test_v101_held_out_pairs_are_localised(v101_held_out: tuple[Report, Path]) -> None:
+    report, _ = v101_held_out
+    assert report["frames"] == 50
+    assert report["localised_share"] >= 0.9
+    assert report["error_m"]["median"] <= 0.05
+    assert report["error_m"]["p95"] <= 0.15
+    assert report["silent_failures"] == 0
+
+
+def test_v101_errors_are_those_of_the_trajectory(v101_held_out: tuple[Report, Path]) -> None:
+    """From the written poses and the recording's own truth, no alignment: the report does not flatter itself."""
+    report, out = v101_held_out
+    rows = np.loadtxt(out / "r.tum", comments="#", ndmin=2)
+    errors_m = np.linalg.norm(rows[:, 1:4] - true_positions(rows[:, 0]), axis=1)
+    assert report["error_m"]["median"] == pytest.approx(np.median(errors_m), abs=0.002)
+    assert report["error_m"]["max"] == pytest.approx(np.max(errors_m), abs=0.01)
+
+
+def test_mh01_start_survey(tmp_path: Path) -> None:
+    """Stereo-inertial, moving from the first frame."""
+    report = built(real_data("euroc_mh01_start"), tmp_path)
+    assert report["inertial"]
+    assert report["evaluated_share"] == 1.0
+    assert report["ate_rmse_m"] <= 0.015
+
+
+def test_kitti_survey(tmp_path: Path) -> None:
+    """Stereo alone, 60 m."""
+    report = built(real_data("kitti_stereo_51"), tmp_path)
+    assert report["sensor_set"] == "stereo"
+    assert not report["inertial"]
+    assert report["evaluated_share"] == 1.0
+    assert report["ate_rmse_m"] <= 0.20
+    assert 55 < report["path_m"] < 65

@@ -1,0 +1,97 @@
+"""What a robot installs: the built wheel with the extra `client` alone, without any of the server's libraries."""
+
+import json
+import os
+import subprocess
+import sys
+import venv
+from collections.abc import Sequence
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+SOURCES = os.pathsep.join(str(REPOSITORY / folder) for folder in ("shared", "mapserver", "locclient"))
+NOT_ON_ROBOTS = ("fastapi", "gtsam", "matplotlib", "prometheus_client", "scipy", "sqlite_utils", "starlette", "uvicorn")
+PACKAGES = {"fleetmap", "fleetsim", "mapserver", "locclient"}
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+
+def run(command: Sequence[str | Path], folder: Path, *, sources: str | None = None) -> str:
+    """The standard output of a command that must succeed; `sources` is its PYTHONPATH."""
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    if sources is not None:
+        environment["PYTHONPATH"] = sources
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{' '.join(map(str, command))}\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder], REPOSITORY)
+    (built,) = folder.glob("fleetmap-*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def robot(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The programs' folder of an environment with nothing but the wheel and what the extra `client` asks for."""
+    folder = tmp_path_factory.mktemp("robot")
+    venv.create(folder, with_pip=True)
+    programs = folder / "bin"
+    constraints = REPOSITORY / "constraints.txt"
+    install = [programs / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    run([*install, "-c", constraints, f"{wheel}[client]"], folder)
+    return programs
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a recording of a few metres of warehouse, `clip.mcap`, and a published map of it, `store`."""
+    folder = tmp_path_factory.mktemp("site")
+    for module, *arguments in (
+        ["fleetsim.cli", "record", "clip", "--out", "clip.mcap", "--frames", "60"],
+        ["mapserver.cli", "build", "clip.mcap", "--site", "lab", "--store", "store", "--frame-from-ground-truth"],
+        ["mapserver.cli", "publish", "--site", "lab", "--store", "store"],
+    ):
+        start = f"from {module} import main; main()"
+        run([sys.executable, "-c", start, *arguments], folder, sources=SOURCES)
+    return folder
+
+
+def test_wheel_holds_the_four_packages_and_nothing_else(wheel: Path) -> None:
+    names = ZipFile(wheel).namelist()
+    tops = {name.partition("/")[0] for name in names}
+    assert {top for top in tops if not top.endswith(".dist-info")} == PACKAGES
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+    assert "fleetmap/py.typed" in names
+
+
+def test_robot_has_no_server_library(robot: Path) -> None:
+    script = f"import importlib.util as u; print([n for n in {NOT_ON_ROBOTS!r} if u.find_spec(n)])"
+    assert run([robot / "python", "-c", script], robot).strip() == "[]"
+
+
+def test_help(robot: Path) -> None:
+    assert "replay" in run([robot / "locclient", "--help"], robot)
+    assert "--server" in run([robot / "locclient", "replay", "--help"], robot)
+
+
+def test_replay(robot: Path, site: Path, tmp_path: Path) -> None:
+    recording, store = site / "clip.mcap", site / "store"
+    run(
+        [robot / "locclient", "replay", recording, "--store", store, "--site", "lab", "--report", tmp_path / "r.json",
+         "--trajectory", tmp_path / "r.tum"],
+        tmp_path,
+    )  # fmt: skip
+    report = json.loads((tmp_path / "r.json").read_text("utf-8"))
+    assert report["map_version"] == 1
+    assert report["first_fix_s"] < 1.0
+    # Tracking is announced after fixes that agree over a metre, which is a good part of this short drive.
+    assert report["localised_share"] > 0.25
+    assert report["error_m"]["median"] < 0.05
+    assert (tmp_path / "r.tum").read_text("utf-8").count("\n") > report["frames"] // 2

@@ -1,0 +1,302 @@
+"""When the localizer says that it knows where it is: scripted odometry and scripted fixes, every status by its cause.
+
+The robot drives along x. Odometry is exact; what a frame's fixes say is where the robot truly is, moved by the offsets
+that the script gives for that frame.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleetmap.calibration import CameraCalibration, RigCalibration
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
+from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.rectification import RectifiedFrame, StereoCamera
+from fleetmap.samples import PositionPrior
+from locclient import localizer as module
+from locclient.localizer import Estimate, Localizer, Status
+from locclient.relocalizer import Fix
+from locclient.settings import LocalizerSettings, TrackSettings
+
+BODY_FROM_CAM = se3(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.05, 0.3]))
+MAP_FROM_ODOM = se3(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([12.0, -5.0, 1.0]))
+FRAME_NS = 200_000_000  # as often as the localizer looks
+CLONES = 8
+NO_FIX: tuple[Array, ...] = ()
+TRUE = (np.zeros(3),)
+
+
+def off(*metres: float) -> Array:
+    """A wrong place, so far from the true one."""
+    return np.array([*metres, 0.0, 0.0])[:3]
+
+
+class ScriptedOdometry:
+    """Exact, with a covariance that grows with the way; forgets frames as the real one does."""
+
+    def __init__(self) -> None:
+        self.odom_from_body: list[Array] = []
+        self.next_motion = np.eye(4)
+        self.redefine: Array | None = None
+        self.drift_share = 0.0
+
+    def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
+        change, self.redefine = self.redefine, None
+        if change is not None:
+            self.odom_from_body = [change @ earlier for earlier in self.odom_from_body]
+        last = self.odom_from_body[-1] if self.odom_from_body else np.eye(4)
+        self.odom_from_body.append(last @ self.next_motion)
+        return OdometryEstimate(
+            frame.stamp_ns, len(self.odom_from_body) - 1, self.odom_from_body[-1], 1e-6 * np.eye(6), np.zeros(3),
+            np.zeros(3), np.zeros(3), OdometryStatus.TRACKING, np.arange(50), 5.0, 1.0, False, True, change,
+        )  # fmt: skip
+
+    @property
+    def oldest_frame_index(self) -> int:
+        return max(0, len(self.odom_from_body) - CLONES)
+
+    def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
+        if frame_index < self.oldest_frame_index:
+            return None
+        motion = se3_inverse(self.odom_from_body[frame_index]) @ self.odom_from_body[-1]
+        sigma_m = self.drift_share * float(np.linalg.norm(motion[:3, 3]))
+        return motion, np.diag([1e-8] * 3 + [sigma_m**2 + 1e-8] * 3)
+
+
+@dataclass
+class ScriptedRelocalizer:
+    """Offers the fixes of the present frame: near the prediction the one that lies there, anywhere all of them."""
+
+    fixes: list[Fix] = field(default_factory=list)
+
+    @property
+    def view(self) -> Any:
+        return type("View", (), {"map_from_cam": np.tile(np.eye(4), (4, 1, 1))})
+
+    def look(self, frame: RectifiedFrame) -> RectifiedFrame:
+        return frame
+
+    def near(self, seen: object, map_from_cam: Array, cov_rot_trans: Array) -> Fix | None:
+        reach_m = 0.3 + 3 * np.sqrt(np.trace(cov_rot_trans[3:, 3:]))
+        close = [f for f in self.fixes if np.linalg.norm(f.map_from_cam[:3, 3] - map_from_cam[:3, 3]) < reach_m]
+        return close[0] if close else None
+
+    def anywhere(self, seen: object, allowed: object = None, rotation: object = None) -> list[Fix]:
+        return list(self.fixes)
+
+
+class Robot:
+    """A localizer on a ride; `go` plays one frame."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **track: Any) -> None:
+        self.relocalizer = ScriptedRelocalizer()
+        monkeypatch.setattr(module, "MapView", lambda *_: None)
+        monkeypatch.setattr(module, "Relocalizer", lambda *_: self.relocalizer)
+        lens = CameraCalibration(
+            "radial-tangential", 640, 480, np.array([400, 400, 320, 240.0]), np.zeros(4), BODY_FROM_CAM
+        )
+        camera = StereoCamera(400.0, 320.0, 240.0, 0.1, 640, 480)
+        settings = LocalizerSettings(track=TrackSettings(**track))
+        self.localizer = Localizer(RigCalibration((lens,)), camera, BODY_FROM_CAM, 0.0, settings)
+        self.odometry = ScriptedOdometry()
+        self.localizer._odometry = self.odometry  # type: ignore[assignment]
+        self.frames = 0
+        self.map_from_body = MAP_FROM_ODOM.copy()
+
+    def load(self, version: int = 1) -> "Robot":
+        self.localizer.handle_version(version, [], None, 400.0)  # type: ignore[arg-type]
+        return self
+
+    def go(self, step_m: float, offsets: Iterable[Array] = TRUE, turn_rad: float = 0.02) -> Estimate:
+        """One frame after so much way along the body's x; the fixes are the true place moved by each offset."""
+        motion = se3(so3_exp(np.array([0, 0, turn_rad])), np.array([step_m, 0, 0])) if self.frames else np.eye(4)
+        self.map_from_body = self.map_from_body @ motion
+        self.odometry.next_motion = motion
+        self.relocalizer.fixes = [self._fix(offset) for offset in offsets]
+        self.frames += 1
+        blank = np.zeros((480, 640), np.uint8)
+        return self.localizer.handle_stereo(RectifiedFrame(self.frames * FRAME_NS, blank, None, None))
+
+    def ride(self, steps: int, step_m: float, offsets: Sequence[Array] = TRUE) -> list[Estimate]:
+        return [self.go(step_m, offsets) for _ in range(steps)]
+
+    def _fix(self, offset: Array) -> Fix:
+        moved = self.map_from_body.copy()
+        moved[:3, 3] += offset
+        return Fix(moved @ BODY_FROM_CAM, np.diag([0.002**2] * 3 + [0.01**2] * 3), 60, 20)
+
+    def error_m(self, estimate: Estimate) -> float:
+        assert estimate.map_from_body is not None
+        return float(np.linalg.norm(estimate.map_from_body[:3, 3] - self.map_from_body[:3, 3]))
+
+
+@pytest.fixture
+def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
+    return Robot(monkeypatch).load()
+
+
+@pytest.fixture
+def tracking(robot: Robot) -> Robot:
+    """One that knows where it is."""
+    assert robot.ride(6, 0.4)[-1].status is Status.TRACKING
+    return robot
+
+
+def prior(robot: Robot, sigma_m: float, offset: Array | None = None) -> PositionPrior:
+    map_from_base = robot.map_from_body.copy()
+    map_from_base[:3, 3] += np.zeros(3) if offset is None else offset
+    covariance = np.diag([np.inf, np.inf, np.inf, sigma_m**2, sigma_m**2, np.inf])
+    return PositionPrior(0, map_from_base, covariance)
+
+
+def test_without_a_map_there_is_nothing_to_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimate = Robot(monkeypatch).go(0.1)
+    assert estimate.status is Status.INITIALISING
+    assert estimate.map_from_body is estimate.cov_rot_trans is estimate.map_version is estimate.fix is None
+
+
+def test_tracking_takes_three_fixes_however_far_the_way(robot: Robot) -> None:
+    said = [e.status for e in robot.ride(3, 3.0)]
+    assert said == [Status.INITIALISING, Status.INITIALISING, Status.TRACKING]
+
+
+def test_tracking_takes_a_metre_however_many_the_fixes(robot: Robot) -> None:
+    said = robot.ride(12, 0.13)  # the first frame stands; 8 steps are 1.04 m
+    assert [e.status for e in said] == [Status.INITIALISING] * 8 + [Status.TRACKING] * 4
+    assert all(e.fix is not None for e in said)
+    assert all(robot.error_m(e) < 1e-6 for e in said[-1:])
+
+
+def test_fixes_that_do_not_agree_never_confirm(robot: Robot) -> None:
+    """Each frame shows another place."""
+    rng = np.random.default_rng(4)
+    for _ in range(30):
+        estimate = robot.go(0.4, [rng.uniform(-30, 30, 3)])
+        assert estimate.status is not Status.TRACKING
+
+
+def test_a_tight_prior_confirms_the_first_fix(robot: Robot) -> None:
+    robot.localizer.handle_prior(prior(robot, 0.5))
+    estimate = robot.go(0.0)
+    assert estimate.status is Status.TRACKING
+    assert robot.error_m(estimate) < 1e-6
+
+
+def test_a_wide_prior_only_narrows_the_search(robot: Robot) -> None:
+    """Aliased places 9 m apart: the one outside the prior is never believed, the other must still be confirmed."""
+    robot.localizer.handle_prior(prior(robot, 2.0))
+    said = [robot.go(0.4, [off(9.0), off(0.0)]) for _ in range(4)]
+    assert said[0].status is Status.INITIALISING
+    assert said[-1].status is Status.TRACKING
+    assert robot.error_m(said[-1]) < 1e-6
+
+
+def test_a_fix_outside_a_tight_prior_is_not_believed(robot: Robot) -> None:
+    robot.localizer.handle_prior(prior(robot, 0.3, off(3.0)))
+    assert {e.status for e in robot.ride(8, 0.4)} == {Status.INITIALISING}
+
+
+def test_two_places_that_fit_are_ambiguous_until_motion_decides(robot: Robot) -> None:
+    places = [off(0.0), off(0.0, 5.0)]
+    said = [robot.go(0.4, places) for _ in range(8)]
+    assert {e.status for e in said} == {Status.AMBIGUOUS}
+    last = said[-1]
+    assert last.map_from_body is None
+    assert last.fix is None
+    assert "2 places" in last.refused
+    found = sorted(float(np.linalg.norm(h.map_from_body[:3, 3] - robot.map_from_body[:3, 3])) for h in last.hypotheses)
+    assert found == pytest.approx([0.0, 5.0], abs=1e-6)
+    after = [robot.go(0.4, places[:1]) for _ in range(10)]
+    assert after[-1].status is Status.TRACKING
+    assert robot.error_m(after[-1]) < 1e-6
+
+
+def test_a_wrong_fix_is_refused_and_said(tracking: Robot) -> None:
+    for metres in (0.4, 2.0, 30.0):
+        estimate = tracking.go(0.2, [off(metres)])
+        assert estimate.status is Status.TRACKING
+        assert estimate.fix is None
+        assert f"{metres:.2f} m off" in estimate.refused
+        assert estimate.innovation is not None
+        assert estimate.innovation > TrackSettings().innovation_limit
+        assert tracking.error_m(estimate) < 0.01
+        assert tracking.go(0.2).fix is not None
+
+
+def test_a_kidnapped_robot_leaves_tracking_and_finds_its_new_place(tracking: Robot) -> None:
+    """Carried 8 m away without a turn of its wheels: the fixes say so, three times in a row."""
+    tracking.map_from_body[:3, 3] += off(-8.0)
+    said = [tracking.go(0.25).status for _ in range(3)]
+    assert said[:2] == [Status.TRACKING] * 2
+    assert said[2] is not Status.TRACKING
+    after = tracking.ride(6, 0.25)
+    assert after[-1].status is Status.TRACKING
+    assert tracking.error_m(after[-1]) < 1e-6
+
+
+def test_wrong_fixes_that_disagree_kidnap_nobody(tracking: Robot) -> None:
+    rng = np.random.default_rng(8)
+    for number in range(12):
+        place = [rng.uniform(10, 40, 3)] if number % 4 else TRUE
+        estimate = tracking.go(0.05, place)
+        assert estimate.status is Status.TRACKING
+        assert tracking.error_m(estimate) < 0.01
+
+
+def test_without_fixes_tracking_ages_into_degraded(tracking: Robot) -> None:
+    """Standing still, odometry without drift: only the age tells."""
+    said = tracking.ride(12, 0.0, NO_FIX)
+    ages = [(k + 1) * FRAME_NS * 1e-9 for k in range(12)]
+    for age_s, estimate in zip(ages, said, strict=True):
+        expected = Status.DEGRADED if age_s > TrackSettings().degraded_after_s + 1e-9 else Status.TRACKING
+        assert estimate.status is expected
+        assert "nothing in the map" in estimate.refused
+    assert tracking.go(0.0).status is Status.TRACKING
+
+
+def test_drift_without_fixes_ends_lost_and_the_radius_says_so(tracking: Robot) -> None:
+    tracking.odometry.drift_share = 0.2
+    said = tracking.ride(60, 0.5, NO_FIX)
+    order = [Status.TRACKING, Status.DEGRADED, Status.LOST]
+    ranks = [order.index(e.status) for e in said]
+    assert ranks == sorted(ranks)
+    assert ranks[-1] == 2
+    assert 1 in ranks
+    radii = []
+    for estimate in said:
+        assert estimate.cov_rot_trans is not None
+        radii.append(2.796 * float(np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[3:, 3:])[-1])))
+    assert all(later > earlier for earlier, later in pairwise(radii))
+    first_lost = ranks.index(2)
+    assert radii[first_lost] > TrackSettings().lost_radius_m > 0.95 * radii[first_lost - 1]
+
+
+def test_a_new_version_is_taken_over_without_losing_the_place(tracking: Robot) -> None:
+    tracking.load(2)
+    estimate = tracking.go(0.1)
+    assert (estimate.status, estimate.map_version) == (Status.TRACKING, 2)
+    assert tracking.error_m(estimate) < 1e-6
+
+
+def test_odometry_that_redefines_its_frame_moves_nothing(tracking: Robot) -> None:
+    tracking.odometry.redefine = se3(so3_exp(np.array([0.1, -0.2, 2.0])), np.array([4.0, 5.0, -1.0]))
+    estimate = tracking.go(0.2, NO_FIX)
+    assert tracking.error_m(estimate) < 1e-6
+
+
+def test_no_number_of_fixes_claims_more_than_the_map_knows(tracking: Robot) -> None:
+    estimate = tracking.ride(40, 0.05)[-1]
+    assert estimate.cov_rot_trans is not None
+    settings = TrackSettings()
+    assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[3:, 3:])[0]) >= settings.map_sigma_m
+    assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[:3, :3])[0]) >= settings.map_sigma_rad
+
+
+def test_the_map_is_looked_at_as_often_as_set_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Robot(monkeypatch, fix_interval_s=0.6).load()
+    said = robot.ride(10, 0.5)
+    assert [e.fix is not None for e in said] == [k % 3 == 0 for k in range(10)]
