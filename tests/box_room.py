@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, so3_exp, so3_log
+from fleetmap.samples import CameraFrame
 from recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, START_NS, WIDTH, Sample
 
 ROOM_M = np.array([[-4.0, -3.0, -1.5], [4.0, 3.0, 1.5]])
@@ -102,3 +103,20 @@ def _texture(face: int) -> NDArray[np.uint8]:
         x, y, w, h = (int(v) for v in (*rng.integers(0, 800, 2), *rng.integers(6, 45, 2)))
         canvas[y : y + h, x : x + w] = rng.uniform(20, 235)
     return np.asarray(np.clip(cv2.GaussianBlur(canvas, (0, 0), 1.2), 0, 255), np.uint8)
+
+
+def points_seen(map_from_cam: Array, pixels: Array) -> Array:
+    """(N, 3) where the room's surface is hit by the rays of pixels (N, 2)."""
+    rays_cam = np.column_stack([(pixels - [WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5]) / FOCAL, np.ones(len(pixels))])
+    rays = rays_cam @ map_from_cam[:3, :3].T
+    origin = map_from_cam[:3, 3]
+    with np.errstate(divide="ignore"):
+        reach = np.where(rays > 0, ROOM_M[1] - origin, ROOM_M[0] - origin) / rays
+    return origin + rays * reach.min(axis=1)[:, None]
+
+
+def stereo_pair(map_from_body: Array, stamp_ns: int) -> CameraFrame:
+    """What the rig sees from one place."""
+    map_from_cam = map_from_body @ BODY_FROM_CAM0
+    shift = se3(np.eye(3), np.array([BASELINE_M, 0, 0]))
+    return CameraFrame(stamp_ns, _render(map_from_cam), _render(map_from_cam @ shift))

@@ -98,6 +98,7 @@ class Localizer:
         self._relocalizer: Relocalizer | None = None
         self._map_version: int | None = None
         self._prior: PositionPrior | None = None
+        self._way_since_prior_m = 0.0
         self._anchor: _Anchor | None = None  # the confirmed place
         self._candidates: list[_Anchor] = []  # unconfirmed ones
         self._last_odom: Array | None = None
@@ -109,8 +110,8 @@ class Localizer:
         self._odometry.handle_imu(samples)
 
     def handle_prior(self, prior: PositionPrior) -> None:
-        """A coarse place; used for the search until a fix has been confirmed."""
-        self._prior = prior
+        """A coarse place at this moment; used for the search until a fix has been confirmed, widened by the way since."""
+        self._prior, self._way_since_prior_m = prior, 0.0
 
     def handle_version(self, version: int, tiles: Iterable[Tile], vocabulary: Vocabulary, survey_focal_px: float) -> None:
         """The tiles around, of one version; takes the place of what was held."""
@@ -136,6 +137,7 @@ class Localizer:
         change = odometry.new_odom_from_old_odom
         last = None if self._last_odom is None else self._last_odom if change is None else change @ self._last_odom
         step = np.eye(4) if last is None else se3_inverse(last) @ odometry.odom_from_body
+        self._way_since_prior_m += float(np.linalg.norm(step[:3, 3]))
         anchors = [*([self._anchor, *self._anchor.strangers] if self._anchor else []), *self._candidates]
         for anchor in anchors:
             anchor.travelled_m += float(np.linalg.norm(step[:3, 3]))
@@ -196,11 +198,16 @@ class Localizer:
         fixes += relocalizer.anywhere(seen, self._places_in_prior(), known)
         return [f for f in fixes if f.inliers >= self._settings.fix.min_inliers and self._in_prior(f)]
 
+    def _prior_cov_m2(self) -> Array:
+        """(2, 2) of the prior's horizontal position now: the way since may have led anywhere."""
+        assert self._prior is not None
+        return np.asarray(self._prior.cov_rot_trans[3:5, 3:5] + (0.05**2 + self._way_since_prior_m**2) * np.eye(2))
+
     def _places_in_prior(self) -> NDArray[np.bool_] | None:
         if self._prior is None or self._relocalizer is None:
             return None
         off = self._relocalizer.view.map_from_cam[:, :2, 3] - self._prior.map_from_base[:2, 3]
-        sigma = float(np.sqrt(np.linalg.eigvalsh(self._prior.cov_rot_trans[3:5, 3:5])[-1]))
+        sigma = float(np.sqrt(np.linalg.eigvalsh(self._prior_cov_m2())[-1]))
         return np.asarray(np.linalg.norm(off, axis=1) < 3.7 * sigma + 10.0)
 
     def _in_prior(self, fix: Fix) -> bool:
@@ -209,8 +216,7 @@ class Localizer:
             return True
         map_from_base = fix.map_from_cam @ self._cam_from_body @ se3_inverse(self._base_from_body)
         off = map_from_base[:2, 3] - self._prior.map_from_base[:2, 3]
-        covariance = self._prior.cov_rot_trans[3:5, 3:5] + 0.05**2 * np.eye(2)
-        return bool(off @ np.linalg.solve(covariance, off) < 13.816)
+        return bool(off @ np.linalg.solve(self._prior_cov_m2(), off) < 13.816)
 
     # --- tracking --------------------------------------------------------------------------------------------------------
 
@@ -287,7 +293,7 @@ class Localizer:
 
     def _is_confirmed(self, candidate: _Anchor) -> bool:
         settings = self._settings.track
-        tight = self._prior is not None and np.sqrt(np.linalg.eigvalsh(self._prior.cov_rot_trans[3:5, 3:5])[-1]) <= settings.tight_prior_sigma_m
+        tight = self._prior is not None and np.sqrt(np.linalg.eigvalsh(self._prior_cov_m2())[-1]) <= settings.tight_prior_sigma_m
         enough = candidate.support >= settings.confirming_fixes and candidate.travelled_m >= settings.confirming_distance_m
         return bool(tight or enough)
 

@@ -95,6 +95,8 @@ def replay(
             time.sleep(max(0.0, (raw.stamp_ns - first_ns) * 1e-9 - (time.monotonic() - begun_s)))
         wall_s, cpu_s = time.monotonic(), time.process_time()
         localizer.handle_imu(imu)
+        for coarse in source.priors_before(number):
+            localizer.handle_prior(coarse)
         frame = rectifier.rectify(raw)
         rectified_s = time.process_time()
         estimate = localizer.handle_stereo(frame)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fleetmap.calibration import RigCalibration
 from fleetmap.geometry import Array
 from fleetmap.recordings import FrameSelection, Recording
-from fleetmap.samples import CameraFrame, ImuSamples
+from fleetmap.samples import CameraFrame, ImuSamples, PositionPrior
 
 _IMU_LEAD_NS = 10_000_000  # a frame is handled when the IMU has come a little past it
 
@@ -65,6 +65,13 @@ class ReplaySource:
             until_ns = self.recorded_stamp_ns(number) + offset_ns + _IMU_LEAD_NS
             yield self.recording.imu.between(fed_ns, until_ns)
             fed_ns = until_ns
+
+    def priors_before(self, number: int) -> list[PositionPrior]:
+        """Coarse places that the recording tells between the frame before and frame `number`; none backwards."""
+        if self.reverse:
+            return []
+        since = self.recorded_stamp_ns(number - 1) if number else -(2**62)
+        return [p for p in self.recording.priors if since < p.stamp_ns <= self.recorded_stamp_ns(number)]
 
     def truth_map_from_body(self, number: int) -> Array | None:
         """The recording's ground truth at frame `number`, None where there is none."""

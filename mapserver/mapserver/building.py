@@ -25,6 +25,7 @@ from mapserver.store import DraftDetails, MapStore
 from mapserver.store.archive import encode_archive
 from mapserver.survey.moving import moved
 from mapserver.survey.pipeline import Survey, survey
+from mapserver.survey.placing import map_from_survey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.zones import Zones
 from mapserver.tiling import TILE_SIZE_M, tiles_from_survey
@@ -111,6 +112,9 @@ def _survey(
             None if vocabulary is None else decode_vocabulary(vocabulary), settings, zones, progress,
         )  # fmt: skip
     times.begin("storing")
+    placed = map_from_survey(done.map, recording.priors, recording.calibration.base_from_body)
+    if placed is not None:
+        done = replace(done, map=moved(done.map, placed))
     found = accuracy(done.map, recording.ground_truth)
     if order.frame_from_ground_truth:
         if found.rigid is None:

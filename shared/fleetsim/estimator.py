@@ -136,7 +136,7 @@ class EstimatorSession:
         toward = centre - seen.points_map
         azimuths = np.arctan2(toward[:, 1], toward[:, 0])
         count = estimator_kernels.detect(
-            seen.keys, seen.pixels, seen.octaves, azimuths, frame, self._seed, model.found_share, model.corner_px, model.octave_sigma,
+            seen.keys, seen.pixels, seen.octaves, azimuths, frame, self._seed, model.found_share, model.view_share, model.corner_px, model.octave_sigma,
             model.disparity_known_share, model.disparity_px, model.disparity_wrong_share, model.disparity_wrong_px,
             model.dirt_bits, model.view_bits, model.view_step_rad, model.noise_bits, self._table, rows, pixels, octaves, words,
         )  # fmt: skip

@@ -61,7 +61,7 @@ def flow_noise(
 
 @kernel
 def detect(
-    keys: Words, exact: Float, exact_octaves: Float, azimuths: Float, frame: int, seed: int, found_share: float, corner_px: float,
+    keys: Words, exact: Float, exact_octaves: Float, azimuths: Float, frame: int, seed: int, found_share: float, view_share: float, corner_px: float,
     octave_sigma: float, known_share: float, disparity_px: float, wrong_share: float, wrong_px: float, dirt_bits: int, view_bits: int, view_step_rad: float,
     noise_bits: float, table: Float, rows: NDArray[np.int32], pixels: Float, octaves: NDArray[np.int8], words: Words,
 ) -> int:  # fmt: skip
@@ -74,6 +74,10 @@ def detect(
         own = mixed(keys[n, 2], np.uint64(seed))
         now = mixed(own, np.uint64(frame + 5000))
         if uniform(mixed(now, np.uint64(1))) >= found_share:
+            continue
+        step = int(math.floor(azimuths[n] / view_step_rad + uniform(mixed(keys[n, 0], np.uint64(41)))))
+        view = mixed(mixed(keys[n, 0], np.uint64(42)), np.uint64(step + 1000))
+        if uniform(mixed(view, keys[n, 1])) >= view_share:
             continue
         octave = int(round(exact_octaves[n] + octave_sigma * normal(mixed(now, np.uint64(2)), table)))
         if octave < 0 or octave > 7:
@@ -91,8 +95,7 @@ def detect(
             state = mixed(state, np.uint64(word))
             words[count, word] = state
         change_bits(words, count, mixed(keys[n, 0], keys[n, 1]), dirt_bits)
-        step = int(math.floor(azimuths[n] / view_step_rad + uniform(mixed(keys[n, 0], np.uint64(41)))))
-        change_bits(words, count, mixed(mixed(keys[n, 0], np.uint64(42)), np.uint64(step + 1000)), view_bits)
+        change_bits(words, count, view, view_bits)
         change_bits(words, count, mixed(now, np.uint64(43)), int(noise_bits * 2.0 * uniform(mixed(now, np.uint64(44))) + 0.5))
         octaves[count] = octave
         rows[count] = n

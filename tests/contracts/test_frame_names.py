@@ -34,16 +34,10 @@ def offences(source: str, allowed: frozenset[str] = frozenset()) -> list[Offence
 
 
 def _vague(tree: ast.Module) -> Iterator[Offence]:
-    type_variables = {
-        target
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
-        if isinstance(node.value.func, ast.Name) and node.value.func.id in ("TypeVar", "ParamSpec")
-        for target in node.targets
-    }
+    other = {target for target, value in _assigned(tree) if _is_no_matrix(value)}
     for node in ast.walk(tree):
         match node:
-            case ast.Name(id=name, ctx=ast.Store()) if node not in type_variables:
+            case ast.Name(id=name, ctx=ast.Store()) if node not in other:
                 pass
             case ast.Attribute(attr=name, ctx=ast.Store()) | ast.arg(arg=name):
                 pass
@@ -55,6 +49,27 @@ def _vague(tree: ast.Module) -> Iterator[Offence]:
                 continue
         if VAGUE.search(name):
             yield node.lineno, name
+
+
+def _assigned(tree: ast.Module) -> Iterator[tuple[ast.expr, ast.expr]]:
+    """Targets with their values, those of tuples one by one."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign):
+            for target in node.targets:
+                if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+                    yield from zip(target.elts, node.value.elts, strict=False)
+                else:
+                    yield target, node.value
+
+
+def _is_no_matrix(value: ast.expr) -> bool:
+    """A type variable, or a constant of a class such as Status.TRACKING."""
+    match value:
+        case ast.Call(func=ast.Name(id="TypeVar" | "ParamSpec")):
+            return True
+        case ast.Attribute(attr=name):
+            return name.isupper()
+    return False
 
 
 def _mismatches(tree: ast.Module) -> Iterator[Offence]:
@@ -113,6 +128,7 @@ def test_frames(module: str) -> None:
     [
         "pose = f()",
         "def f(T): ...",
+        "T, R = frame.map_from_body, x",
         "self.camera_pose = x",
         "T_cam_imu: object = 1",
         "for transform in stack: ...",
@@ -134,6 +150,7 @@ def test_offenders_are_caught(bad: str) -> None:
     "good",
     [
         'T = TypeVar("T", bound=int)',
+        "T, L = Status.TRACKING, Status.LOST",
         "pose_graph = 1",
         "pose_info, poses_per_s = 1, 2",
         "rotation = x.T",

@@ -10,9 +10,9 @@ from contracts_documents import REPOSITORY, code_words, rows, section, text
 from fleetmap.config import Section
 
 DOCUMENT = "docs/settings.md"
+# The simulator has no configuration file: its sections are values in its code.
 PACKAGES = {
     "shared/fleetmap": "fleetmap",
-    "shared/fleetsim": "fleetsim",
     "mapserver/mapserver": "mapserver",
     "locclient/locclient": "locclient",
 }

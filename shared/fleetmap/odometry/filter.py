@@ -184,8 +184,8 @@ class InvariantFilter:
             information, vector = np.zeros((size, size)), np.zeros(size)
             filter_kernels.accumulate_tracks(
                 np.array(self._rotations), np.array(self._positions), self._body_from_cam, starts, clones, pixels,
-                anchors, points, self._camera, self._weights / sigma_scale, inner, moved, self._quantile, information, vector,
-                used,
+                anchors, points, self._camera, self._weights / sigma_scale, inner, moved, self._quantile, information,
+                vector, used,
             )  # fmt: skip
             gain = np.linalg.solve(np.eye(size) + information @ inner, np.column_stack([vector, information]))
             correction = self.covariance[:, _CLONES:] @ gain[:, 0]

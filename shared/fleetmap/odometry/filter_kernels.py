@@ -178,9 +178,9 @@ def linearize_track(
 ) -> int:  # fmt: skip
     """Whitened residuals of one track and their derivatives; returns how many rows were filled.
 
-    point (3,) odom; rotations (M, 3, 3) odom_from_cam, positions (M, 3); clones (n,), pixels (n, 3) u_left v u_right (NaN
-    none). by_clone (3 n, 6 n) by the errors of the body transforms of this module, rotation then position, in the order of
-    `clones`; by_point (3 n, 3); residual (3 n,) measured minus predicted, as 1/sigma in weights (2,) says.
+    point (3,) odom; rotations (M, 3, 3) odom_from_cam, positions (M, 3); clones (n,), pixels (n, 3) u_left v u_right
+    (NaN none). by_clone (3 n, 6 n) by the errors of the body transforms of this module, rotation then position, in the
+    order of `clones`; by_point (3 n, 3); residual (3 n,) measured minus predicted, as 1/sigma in weights (2,) says.
     """
     z = np.empty(6)
     lever = _skew(point)

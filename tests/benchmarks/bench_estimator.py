@@ -1,0 +1,119 @@
+"""The estimator-level simulation against the rendered one: speed, odometry and localization on the same drive.
+
+`python tests/benchmarks/bench_estimator.py [--frames N] [--out FILE.json]`; about two minutes for 150 rendered frames. For the
+localization the map is in both cases the estimator-level survey's recipe, applied to pictures with exact depth.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import estimator_loop
+from fleetmap.geometry import Array
+from fleetmap.odometry import Odometry, OdometrySettings
+from fleetmap.odometry.odometry import OdometryEstimate
+from fleetmap.rectification import RectifiedFrame, Rectifier
+from fleetsim.estimator import EstimatorSession
+from fleetsim.recorder import Order, Session, prepare
+
+Figures = dict[str, float]
+
+
+def rendered_frames(session: Session, count: int) -> Iterator[RectifiedFrame]:
+    """The first frames of a session, rendered and rectified."""
+    rectifier = Rectifier(session.nominal)
+    for number, frame in enumerate(session.frames()):
+        if number == count:
+            return
+        yield rectifier.rectify(frame)
+
+
+def rendered_odometry(session: Session, frames: list[RectifiedFrame]) -> list[OdometryEstimate]:
+    """The odometry's estimates over pictures."""
+    rectifier = Rectifier(session.nominal)
+    odometry = Odometry(session.nominal, rectifier.camera, rectifier.body_from_cam, 0.0, OdometrySettings())
+    estimates, last_ns = [], 0
+    for frame in frames:
+        odometry.handle_imu(session.imu.between(last_ns, frame.stamp_ns + 1))
+        last_ns = frame.stamp_ns + 1
+        estimates.append(odometry.handle_stereo(frame))
+    return estimates
+
+
+def odometry_figures(estimates: list[OdometryEstimate], map_from_body: Array) -> Figures:
+    """Inlier share, tracks, errors of the motion over one second."""
+    errors = estimator_loop.relative_errors_m(estimates, map_from_body)
+    moving = [e for e in estimates if e.inertial]
+    return {
+        "inlier_share": float(np.mean([e.inlier_share for e in moving])),
+        "tracks": float(np.mean([len(e.track_ids) for e in moving])),
+        "error_1s_mm_median": float(np.median(errors) * 1e3),
+        "error_1s_mm_rms": float(np.sqrt(np.mean(errors**2)) * 1e3),
+    }
+
+
+def cpu_s(work: Callable[[], object]) -> float:
+    """CPU seconds of the work."""
+    begun = time.process_time()
+    work()
+    return time.process_time() - begun
+
+
+def measure_everything(session: EstimatorSession) -> None:
+    """Every frame's flow and features, the way a robot would ask for them."""
+    ids, pixels = np.zeros(0, np.uint64), np.zeros((0, 3))
+    for frame in range(len(session)):
+        pixels, kept = session.follow(frame, ids)
+        ids, pixels = ids[kept], pixels[kept]
+        if len(ids) < 150:
+            ids = np.union1d(ids, session.corners(frame, pixels, 180 - len(ids), 22.0))
+        session.features(frame)
+
+
+def speeds(robot: EstimatorSession, survey: EstimatorSession) -> Figures:
+    """Times real time on one core: generating, with odometry, with localization in a map."""
+    tiles, vocabulary = estimator_loop.survey_map(survey, np.random.default_rng(0))
+    duration_s = robot.session.frame_times_s[-1]
+    runs: dict[str, Callable[[], object]] = {
+        "generate": lambda: measure_everything(robot),
+        "odometry": lambda: estimator_loop.run_odometry(robot),
+        "odometry and localization": lambda: estimator_loop.run_localizer(robot, tiles, vocabulary),
+    }
+    estimator_loop.run_localizer(robot, tiles, vocabulary, frames=60)  # compiles
+    measure_everything(robot)
+    return {name: duration_s / cpu_s(run) for name, run in runs.items()}
+
+
+def main() -> None:
+    """Prints both runs' figures side by side; writes them as JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=150)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    result: dict[str, object] = {}
+    for robot, day in (("survey", 0), ("tote-1", 1)):
+        session = prepare(Order("small-loop", robot=robot, day=day))
+        simulated = EstimatorSession(session)
+        frames = list(rendered_frames(session, options.frames))
+        rendered = odometry_figures(rendered_odometry(session, frames), simulated.map_from_body)
+        without = odometry_figures(estimator_loop.run_odometry(simulated, options.frames), simulated.map_from_body)
+        print(f"\n{robot}: {'rendered':>32s} {'estimator':>10s} {'ratio':>7s}")
+        for name, value in rendered.items():
+            print(f"  {name:36s} {value:10.3f} {without[name]:10.3f} {without[name] / value:7.2f}")
+        result[robot] = {"rendered": rendered, "estimator": without}
+        session.renderer.close()
+    survey, robot_session = prepare(Order("small-loop")), prepare(Order("small-loop", robot="tote-1", day=1))
+    result["times_real_time"] = speeds(EstimatorSession(robot_session), EstimatorSession(survey))
+    print("\ntimes real time on one core:", {name: round(value, 1) for name, value in result["times_real_time"].items()})  # type: ignore[attr-defined]
+    survey.renderer.close()
+    robot_session.renderer.close()
+    if options.out is not None:
+        options.out.write_text(json.dumps(result, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

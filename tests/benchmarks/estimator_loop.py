@@ -1,0 +1,190 @@
+"""Odometry and localization fed by `fleetsim.estimator` instead of pictures. What closes the loop lives here, because neither side
+may know the other."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.bow import Vocabulary, train_vocabulary
+from fleetmap.features import orb
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.mapformat import Tile
+from fleetmap.odometry import Odometry, OdometrySettings
+from fleetmap.odometry.odometry import OdometryEstimate
+from fleetmap.odometry.settings import TrackerSettings
+from fleetmap.odometry.tracker import MotionSince, Tracked, Tracker
+from fleetmap.rectification import RectifiedFrame, StereoCamera
+from fleetmap.samples import PositionPrior
+from fleetsim.estimator import EstimatorSession
+from locclient.localizer import Estimate, Localizer
+from locclient.relocalizer import Seen
+from locclient.settings import LocalizerSettings
+
+_TILE_M = 1024.0
+_NEVER_S = 1e9
+
+
+class EstimatorTracker(Tracker):
+    """The tracker with its eyes replaced: flow, disparities and corners come from a session, everything else is its own.
+
+    Track ids are the landmarks'. After a gap the flow simply goes on.
+    """
+
+    def __init__(self, session: EstimatorSession, camera: StereoCamera, settings: TrackerSettings) -> None:
+        fields = {name: getattr(settings, name) for name in settings.__struct_fields__}
+        super().__init__(camera, TrackerSettings(**(fields | {"max_gap_s": _NEVER_S})))
+        self._session = session
+
+    def track(self, frame: RectifiedFrame, motion_since: MotionSince, rotation_sigma_rad: float | None = None) -> Tracked:
+        """As the tracker's; frames must come one by one from the session's first."""
+        return super().track(frame, motion_since, rotation_sigma_rad)
+
+    def _measure(self, ids: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
+        return self._session.follow(self._frame_index, ids.astype(np.uint64))
+
+    def _flow(self, frame: RectifiedFrame, predicted: Array) -> tuple[Array, NDArray[np.bool_]]:
+        pixels, kept = self._measure(self._points.ids)
+        return np.where(kept[:, None], pixels[:, :2], predicted), kept
+
+    def _renew_disparities(self, frame: RectifiedFrame) -> None:
+        pixels, _ = self._measure(self._points.ids)
+        self._points.pixels[:, 2] = pixels[:, 2]
+
+    def _add_corners(self, frame: RectifiedFrame) -> None:
+        missing = self._settings.max_points - len(self._points.ids)
+        if missing < 0.15 * self._settings.max_points:
+            return
+        wanted = self._session.corners(self._frame_index, self._points.pixels, missing, self._settings.min_distance_px)
+        ids = np.setdiff1d(wanted.astype(np.int64), self._points.ids)
+        pixels, kept = self._measure(ids)
+        self._points = type(self._points)(
+            np.concatenate([self._points.ids, ids[kept]]), np.concatenate([self._points.pixels, pixels[kept]])
+        )
+
+
+def seen(session: EstimatorSession, frame: int) -> Seen:
+    """What Relocalizer.look would have made of the picture."""
+    found = session.features(frame)
+    angles = np.zeros(len(found.rows), np.float32)
+    return Seen(orb.Features(found.pixels[:, :2].copy(), found.octaves, angles, found.descriptors), found.pixels)
+
+
+def blank(session: EstimatorSession, frame: int) -> RectifiedFrame:
+    """A frame that carries its stamp alone."""
+    return RectifiedFrame(session.stamps_ns[frame], np.zeros((1, 1), np.uint8), None, None)
+
+
+def run_odometry(session: EstimatorSession, frames: int | None = None) -> list[OdometryEstimate]:
+    """The odometry's estimates over a session."""
+    nominal, settings = session.session.nominal, OdometrySettings()
+    odometry = Odometry(nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s, settings)
+    odometry._tracker = EstimatorTracker(session, session.camera, settings.tracker)
+    estimates, last_ns = [], 0
+    for frame in range(len(session) if frames is None else min(frames, len(session))):
+        stamp_ns = session.stamps_ns[frame]
+        odometry.handle_imu(session.session.imu.between(last_ns, stamp_ns + 1))
+        last_ns = stamp_ns + 1
+        estimates.append(odometry.handle_stereo(blank(session, frame)))
+    return estimates
+
+
+@dataclass
+class _Observed:
+    """Sums over the sightings of one landmark."""
+
+    point_map: Array
+    directions: list[Array] = field(default_factory=list)
+    reaches_m: list[float] = field(default_factory=list)
+    descriptors: list[NDArray[np.uint8]] = field(default_factory=list)
+
+
+def survey_map(session: EstimatorSession, rng: np.random.Generator, *, every_m: float = 0.4, sigma_m: float = 0.01) -> tuple[list[Tile], Vocabulary]:
+    """A map as a survey would have left it: landmarks found at least twice, with an error of sigma_m, a place each every_m.
+
+    The vocabulary is trained on its descriptors.
+    """
+    observed: dict[int, _Observed] = {}
+    places: list[tuple[Array, list[int]]] = []
+    for frame in range(len(session)):
+        map_from_cam = session.map_from_body[frame] @ session.body_from_cam
+        if places:
+            since = se3_inverse(places[-1][0]) @ map_from_cam
+            if np.linalg.norm(since[:3, 3]) < every_m and rotation_angle_rad(since[:3, :3]) < 0.2:
+                continue
+        sighting, found = session.sighting(frame), session.features(frame)
+        members = []
+        for feature in np.flatnonzero(found.rows >= 0).tolist():
+            row = int(found.rows[feature])
+            landmark = int(sighting.ids[row])
+            entry = observed.setdefault(landmark, _Observed(sighting.points_map[row]))
+            away = map_from_cam[:3, 3] - sighting.points_map[row]
+            entry.directions.append(away / np.linalg.norm(away))
+            entry.reaches_m.append(float(sighting.distances_m[row]) * orb.SCALE_FACTOR ** float(found.octaves[feature]))
+            entry.descriptors.append(found.descriptors[feature])
+            members.append(landmark)
+        places.append((map_from_cam, members))
+    return _as_tile(observed, places, rng, sigma_m)
+
+
+def _as_tile(
+    observed: dict[int, _Observed], places: list[tuple[Array, list[int]]], rng: np.random.Generator, sigma_m: float
+) -> tuple[list[Tile], Vocabulary]:
+    kept = sorted(landmark for landmark, entry in observed.items() if len(entry.descriptors) >= 2)
+    number = {landmark: index for index, landmark in enumerate(kept)}
+    entries = [observed[landmark] for landmark in kept]
+    directions = np.array([np.mean(entry.directions, axis=0) for entry in entries])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    half = [np.arccos(np.clip((np.array(e.directions) @ d).min(), -1, 1)) for e, d in zip(entries, directions, strict=True)]
+    points = np.array([entry.point_map for entry in entries]) + rng.normal(0.0, sigma_m, (len(entries), 3))
+    descriptors = np.array([entry.descriptors[len(entry.descriptors) // 2] for entry in entries])
+    lists = tuple(np.array(sorted({number[i] for i in members if i in number}), np.uint32) for _, members in places)
+    tile = Tile(
+        0, 0, _TILE_M, np.arange(len(kept), dtype=np.uint32), np.clip(points, 0.0, _TILE_M), descriptors,
+        directions.astype(np.float32), np.array(half, np.float32),
+        np.array([np.median(entry.reaches_m) for entry in entries], np.float32), np.full(len(kept), sigma_m, np.float32),
+        np.arange(len(places), dtype=np.uint32), np.array([placed for placed, _ in places]), lists,
+    )  # fmt: skip
+    images = np.zeros(len(kept), np.int64)
+    for place, ids in enumerate(lists):
+        images[ids] = place
+    return [tile], train_vocabulary(descriptors, 10, 3, rng, images)
+
+
+def run_localizer(
+    session: EstimatorSession, tiles: list[Tile], vocabulary: Vocabulary, prior: PositionPrior | None = None, frames: int | None = None
+) -> list[Estimate]:
+    """The localizer's estimates over a session in a map."""
+    nominal, settings = session.session.nominal, LocalizerSettings()
+    localizer = Localizer(nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s, settings)
+    localizer._odometry._tracker = EstimatorTracker(session, session.camera, settings.odometry.tracker)
+    localizer.handle_version(1, tiles, vocabulary, session.camera.focal_px)
+    index_of = {stamp: index for index, stamp in enumerate(session.stamps_ns)}
+    assert localizer._relocalizer is not None
+    localizer._relocalizer.look = lambda frame: seen(session, index_of[frame.stamp_ns])  # type: ignore[method-assign]
+    if prior is not None:
+        localizer.handle_prior(prior)
+    estimates, last_ns = [], 0
+    for frame in range(len(session) if frames is None else min(frames, len(session))):
+        stamp_ns = session.stamps_ns[frame]
+        localizer.handle_imu(session.session.imu.between(last_ns, stamp_ns + 1))
+        last_ns = stamp_ns + 1
+        estimates.append(localizer.handle_stereo(blank(session, frame)))
+    return estimates
+
+
+def relative_errors_m(estimates: list[OdometryEstimate], map_from_body: Array, step: int = 15) -> Array:
+    """(N,) errors of the motion over `step` frames, of estimates that know gravity."""
+    known = [k for k in range(len(estimates) - step) if estimates[k].inertial]
+    errors = []
+    for k in known:
+        moved = se3_inverse(estimates[k].odom_from_body) @ estimates[k + step].odom_from_body
+        truly = se3_inverse(map_from_body[k]) @ map_from_body[k + step]
+        errors.append(float(np.linalg.norm(moved[:3, 3] - truly[:3, 3])))
+    return np.array(errors)
+
+
+def position_errors_m(estimates: list[Estimate], map_from_body: Array) -> Array:
+    """(N,) distances from the truth of the estimates that are there."""
+    pairs = zip(estimates, map_from_body, strict=False)
+    return np.array([np.linalg.norm(e.map_from_body[:3, 3] - truth[:3, 3]) for e, truth in pairs if e.map_from_body is not None])
