@@ -1,5 +1,6 @@
 # Five verbs. Each makes .venv itself; all that is needed is Python >= 3.11 (with venv) and make.
 #
+#   make demo                  survey a simulated warehouse, serve its map, localize the robots of the next day in it
 #   make demo RECORDING=PATH   build a map of half of a recording, serve it, localize the other half in it
 #   make test                  every test
 #   make check                 format, lint, types, import contracts
@@ -64,6 +65,6 @@ $(DEV_STAMP): $(INPUTS) | $(BIN)/python
 	@touch $(RUN_STAMP) $(DEV_STAMP)
 
 $(RUN_STAMP): $(INPUTS) | $(BIN)/python
-	@echo "installing fleetmap, server and client, into $(VENV)"
-	@$(INSTALL) -e ".[server,client]"
+	@echo "installing fleetmap, server, client and simulator, into $(VENV)"
+	@$(INSTALL) -e ".[server,client,sim]"
 	@touch $(RUN_STAMP)

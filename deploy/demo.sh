@@ -1,16 +1,20 @@
 #!/usr/bin/env bash
-# The whole path on one recording: half of its frames become a map, the other half is localized in it.
+# The whole path. Without a recording: a simulated warehouse is surveyed, mapped and served, and two robots of the next day, after
+# stock has moved, are localized in it. With one: half of its frames become the map, the other half is localized in it.
 #
-#   deploy/demo.sh [--check] RECORDING      (run by `make demo`; --check looks at RECORDING and does nothing else)
+#   deploy/demo.sh [--check] [RECORDING]      (run by `make demo`; --check looks at RECORDING and does nothing else)
 #
-# BIN: folder with mapserver and locclient (default .venv/bin). OUT: where everything is left (default out/demo).
+# BIN: folder with the commands (default .venv/bin). OUT: where everything is left (default out/demo). SEED: of the warehouse.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 BIN=${BIN:-.venv/bin}
 OUT=${OUT:-out/demo}
+SEED=${SEED:-1}
+ROBOTS=(tote-1 tote-2)
 READY_WITHIN_S=60
 server_pid=
+robots_pid=
 
 say() { printf '\n== %s (%d s)\n' "$*" "$SECONDS"; }
 
@@ -20,17 +24,8 @@ fail() {
 }
 
 check_recording() {
-  if [[ -z ${1:-} ]]; then
-    printf '%s\n' >&2 \
-      "demo: which recording? make demo RECORDING=PATH" \
-      "  PATH is a folder (EuRoC: the parent of mav0; TUM-VI, KITTI, 7-Scenes) or an .mcap file." \
-      "  None at hand? Two commands simulate a warehouse and record a drive through it:" \
-      "    make .venv/.installed-run" \
-      "    .venv/bin/fleetsim record small-loop --out warehouse.mcap"
-    exit 2
-  fi
-  if [[ ! -e $1 ]]; then
-    printf 'demo: RECORDING=%s does not exist; pass a folder or an .mcap file\n' "$1" >&2
+  if [[ -n ${1:-} && ! -e $1 ]]; then
+    printf 'demo: RECORDING=%s does not exist; pass a folder (EuRoC: the parent of mav0; TUM-VI, KITTI, 7-Scenes) or an .mcap file\n' "$1" >&2
     exit 2
   fi
 }
@@ -62,35 +57,69 @@ if [[ ${1:-} == --check ]]; then
 fi
 recording=${1:-}
 check_recording "$recording"
-trap 'stop_server || true' EXIT
+trap 'stop_server || true; [[ -z $robots_pid ]] || kill "$robots_pid" 2>/dev/null || true' EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM
 rm -rf "$OUT"
 mkdir -p "$OUT"
 
-say "building a map of every second frame of $recording"
-truth=()
-has_truth=$("$BIN/python" deploy/demo_report.py has-truth "$recording")
-[[ $has_truth == no ]] || truth=(--frame-from-ground-truth)
-"$BIN/mapserver" build "$recording" --site demo --store "$OUT/store" --frames 0::2 ${truth[@]+"${truth[@]}"} \
-  --report "$OUT/build.json" --trajectory "$OUT/build.tum" --picture "$OUT/build.png"
+build() {
+  "$BIN/mapserver" build "$@" --site demo --store "$OUT/store" --report "$OUT/build.json" --trajectory "$OUT/build.tum" \
+    --picture "$OUT/build.png"
+  say "publishing it"
+  "$BIN/mapserver" publish --site demo --store "$OUT/store"
+  say "serving it"
+  start_server
+  printf 'http %s, zenoh %s\n' "$http" "$zenoh"
+}
 
-say "publishing it"
-"$BIN/mapserver" publish --site demo --store "$OUT/store"
+replay() {
+  local robot=$1
+  shift
+  "$BIN/locclient" replay "$@" --server "$zenoh" --site demo --robot "$robot" --cache "$OUT/cache-$robot" \
+    --report "$OUT/$robot.json" --trajectory "$OUT/$robot.tum" --picture "$OUT/$robot.png"
+}
 
-say "serving it"
-start_server
-printf 'http %s, zenoh %s\n' "$http" "$zenoh"
+record() {
+  local robot=$1 day=$2
+  "$BIN/fleetsim" record small-loop --out "$OUT/$robot.mcap" --seed "$SEED" --day "$day" --robot "$robot"
+}
 
-say "a robot localizes the other frames in it"
-"$BIN/locclient" replay "$recording" --server "$zenoh" --site demo --robot demo-robot --frames 1::2 --cache "$OUT/cache" \
-  --report "$OUT/replay.json" --trajectory "$OUT/replay.tum" --picture "$OUT/replay.png"
+half_of() {
+  local truth=()
+  say "building a map of every second frame of $1"
+  [[ $("$BIN/python" deploy/demo_report.py has-truth "$1") == no ]] || truth=(--frame-from-ground-truth)
+  build "$1" --frames 0::2 ${truth[@]+"${truth[@]}"}
+  say "a robot localizes the other frames in it"
+  replay demo-robot "$1" --frames 1::2
+  reports=("$OUT/demo-robot.json")
+}
 
-say "what the server knows of the robot"
+warehouse() {
+  local robot
+  say "a survey robot drives through a simulated warehouse (first run: the painter is compiled)"
+  record survey 0
+  say "building a map of the survey; meanwhile it is the next day and two robots drive, stock has moved"
+  (for robot in "${ROBOTS[@]}"; do record "$robot" 1; done) >"$OUT/robots.log" 2>&1 &
+  robots_pid=$!
+  build "$OUT/survey.mcap" --frame-from-ground-truth
+  say "the robots come home with their recordings"
+  wait "$robots_pid" || { cat "$OUT/robots.log" >&2; fail "recording the robots failed"; }
+  reports=()
+  for robot in "${ROBOTS[@]}"; do
+    say "$robot is localized in yesterday's map"
+    replay "$robot" "$OUT/$robot.mcap"
+    reports+=("$OUT/$robot.json")
+  done
+}
+
+if [[ -n $recording ]]; then half_of "$recording"; else warehouse; fi
+
+say "what the server knows of the robots"
 "$BIN/python" deploy/demo_report.py robots "$http/v1/robots"
 
 say "the result"
-"$BIN/python" deploy/demo_report.py table "$OUT/build.json" "$OUT/replay.json"
+"$BIN/python" deploy/demo_report.py table "$OUT/build.json" "${reports[@]}"
 
 stop_server || fail "the server did not end cleanly; see $OUT/server.log"
 printf '\nPictures, reports and trajectories are in %s; all of it took %d s.\n' "$OUT" "$SECONDS"

@@ -58,13 +58,16 @@ def value_at(report: Report, path: str) -> Any:
     return value
 
 
-def table_of(title: str, report: Report, rows: Sequence[tuple[str, str, float, str]]) -> Table:
-    """Two columns, one row per value."""
-    table = Table("", title, title=None)
-    table.columns[1].justify = "right"
+def table_of(titles: Sequence[str], reports: Sequence[Report], rows: Sequence[tuple[str, str, float, str]]) -> Table:
+    """A row per value, a column per report."""
+    table = Table("", *titles)
+    for column in table.columns[1:]:
+        column.justify = "right"
     for name, path, factor, shown in rows:
-        value = value_at(report, path)
-        table.add_row(name, "not known" if value is None else shown.format(value if factor == 1 else value * factor))
+        values = [value_at(report, path) for report in reports]
+        table.add_row(
+            name, *("not known" if v is None else shown.format(v if factor == 1 else v * factor) for v in values)
+        )
     return table
 
 
@@ -94,7 +97,7 @@ def show_robots(console: Console, url: str) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Runs one of: has-truth RECORDING, robots URL, table BUILD.json REPLAY.json."""
+    """Runs one of: has-truth RECORDING, robots URL, table BUILD.json REPLAY.json...."""
     console = Console(width=78)
     match arguments:
         case ["has-truth", recording]:
@@ -107,11 +110,12 @@ def main(arguments: list[str]) -> None:
                 sys.exit(error.exit_status)
         case ["robots", url]:
             show_robots(console, url)
-        case ["table", build, replay]:
-            console.print(table_of("build", json.loads(Path(build).read_text("utf-8")), BUILD_ROWS))
-            console.print(table_of("replay", json.loads(Path(replay).read_text("utf-8")), REPLAY_ROWS))
+        case ["table", build, *replays]:
+            console.print(table_of(["survey"], [json.loads(Path(build).read_text("utf-8"))], BUILD_ROWS))
+            robots = [json.loads(Path(replay).read_text("utf-8")) for replay in replays]
+            console.print(table_of([Path(replay).stem for replay in replays], robots, REPLAY_ROWS))
         case _:
-            sys.exit("usage: demo_report.py has-truth RECORDING | robots URL | table BUILD.json REPLAY.json")
+            sys.exit("usage: demo_report.py has-truth RECORDING | robots URL | table BUILD.json REPLAY.json...")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,9 @@ _STATION_M, _STATION_RAD = 0.5, 0.15
 _CONE_MARGIN = 0.3  # of the tangent: what turning and moving within a station may bring into the picture
 _TABLE = 1 << 16
 _BORDER_PX = 19.0
-_FLOW_BORDER_PX = 7.0
+_FLOW_BORDER_PX = 8.0
+_FLOOR_M = 0.05
+_FINEST_OCTAVES = 4.0  # what the flow's corners are found on
 
 Ids = NDArray[np.uint64]
 
@@ -93,38 +95,47 @@ class EstimatorSession:
             self._sighting = frame, self._look(frame)
         return self._sighting[1]
 
-    def follow(self, frame: int, ids: Ids) -> tuple[Array, NDArray[np.bool_]]:
-        """Landmarks followed by optical flow into a frame: pixels (N, 3) (NaN where lost), and which were not lost."""
+    def follow(self, frame: int, ids: Ids, begun_px: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Landmarks followed by optical flow into a frame: pixels (N, 3) (NaN where lost), and which were not lost.
+
+        begun_px (N, 2): exact pixels where each began to be followed, as `corners` gave them.
+        """
         seen, flow = self.sighting(frame), self._flow
-        at = np.searchsorted(seen.ids, ids)
-        at = np.minimum(at, max(len(seen.ids) - 1, 0))
+        at = np.minimum(np.searchsorted(seen.ids, ids), max(len(seen.ids) - 1, 0))
         kept = seen.ids[at] == ids if len(seen.ids) else np.zeros(len(ids), bool)
         pixels, held = np.full((len(ids), 3), np.nan), np.zeros(int(kept.sum()), bool)
         measured = np.empty((int(kept.sum()), 3))
         estimator_kernels.flow_noise(
-            ids[kept], seen.pixels[at[kept]], frame, self._seed, flow.white_px, flow.slow_px, flow.slow_frames, flow.slip_share,
-            flow.slip_px, flow.lost_share, flow.disparity_known_share, flow.disparity_px, flow.disparity_wrong_share,
+            ids[kept], seen.pixels[at[kept]], begun_px[kept], seen.points_map[at[kept], 2] < _FLOOR_M, frame, self._seed, flow.white_px,
+            flow.lag, flow.along, flow.across, flow.floor_lag, flow.floor_along, flow.slip_share, flow.slip, flow.lost_share, flow.stretch_frames, flow.disparity_known_share, flow.disparity_px,
+            flow.disparity_rough_share, flow.disparity_rough_px, flow.disparity_rough_bias_px, flow.disparity_wrong_share,
             flow.disparity_wrong_px, self._table, measured, held,
         )  # fmt: skip
         pixels[kept] = measured
         kept[kept] = held
         return pixels, kept
 
-    def corners(self, frame: int, taken: Array, count: int, min_distance_px: float) -> Ids:
-        """Up to `count` landmarks to follow from a frame on, spread at least min_distance_px from each other and `taken` (M, 2).
+    def corners(self, frame: int, taken: Array, count: int, min_distance_px: float) -> tuple[Ids, Array]:
+        """Up to `count` landmarks to follow from a frame on, and their exact pixels (N, 2).
 
-        In an order of their own: a strong corner is chosen in every frame.
+        At least min_distance_px from each other and from `taken` (M, 2), in an order of their own: a strong corner is chosen
+        in every frame.
         """
         seen = self.sighting(frame)
-        pixels = seen.pixels[:, :2]
-        inside = (pixels.min(axis=1) > _FLOW_BORDER_PX) if len(pixels) else np.zeros(0, bool)
-        order = np.flatnonzero(inside & (seen.octaves < 4.0))
-        order = order[np.argsort(seen.keys[order, 0] >> np.uint64(20), kind="stable")]
+        pixels, camera = np.ascontiguousarray(seen.pixels[:, :2]), self.camera
+        room = np.minimum(pixels, (camera.width_px - 1, camera.height_px - 1) - pixels).min(axis=1)
+        order = np.flatnonzero((room > _FLOW_BORDER_PX) & (seen.octaves < _FINEST_OCTAVES))
+        order = order[np.argsort(seen.keys[order, 0], kind="stable")]
         chosen = estimator_kernels.spread(
-            pixels, order, np.ascontiguousarray(taken[:, :2]), min_distance_px, count,
-            float(self.camera.width_px), float(self.camera.height_px),
-        )  # fmt: skip
-        return seen.ids[chosen]
+            pixels,
+            order,
+            np.ascontiguousarray(taken[:, :2]),
+            min_distance_px,
+            count,
+            float(camera.width_px),
+            float(camera.height_px),
+        )
+        return seen.ids[chosen], pixels[chosen]
 
     def features(self, frame: int) -> Found:
         """What a detector finds in a frame's left picture, landmarks first, then clutter."""
@@ -134,9 +145,10 @@ class EstimatorSession:
         octaves, words = np.empty(room, np.int8), np.empty((room, 4), np.uint64)
         centre = (self.map_from_body[frame] @ self.body_from_cam)[:3, 3]
         toward = centre - seen.points_map
-        azimuths = np.arctan2(toward[:, 1], toward[:, 0])
+        level = np.hypot(toward[:, 0], toward[:, 1])
+        directions = np.stack([np.arctan2(toward[:, 1], toward[:, 0]), np.arctan2(toward[:, 2], level)], axis=1)
         count = estimator_kernels.detect(
-            seen.keys, seen.pixels, seen.octaves, azimuths, frame, self._seed, model.found_share, model.view_share, model.corner_px, model.octave_sigma,
+            seen.keys, seen.pixels, seen.octaves, directions, frame, self._seed, model.found_share, model.view_share, model.corner_px, model.octave_sigma,
             model.disparity_known_share, model.disparity_px, model.disparity_wrong_share, model.disparity_wrong_px,
             model.dirt_bits, model.view_bits, model.view_step_rad, model.noise_bits, self._table, rows, pixels, octaves, words,
         )  # fmt: skip

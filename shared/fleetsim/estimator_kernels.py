@@ -30,38 +30,45 @@ def slow_normal(key: np.uint64, phase: float, table: Float) -> float:
 
 @kernel
 def flow_noise(
-    ids: Words, exact: Float, frame: int, seed: int, white_px: float, slow_px: float, slow_frames: float, slip_share: float,
-    slip_px: float, lost_share: float, known_share: float, disparity_px: float, wrong_share: float, wrong_px: float,
-    table: Float, pixels: Float, kept: NDArray[np.bool_],
+    ids: Words, exact: Float, begun: Float, is_floor: NDArray[np.bool_], frame: int, seed: int, white_px: float, lag: float,
+    along: float, across: float, floor_lag: float, floor_along: float, slip_share: float, slip: float, lost_share: float, stretch_frames: float, known_share: float, disparity_px: float,
+    rough_share: float, rough_px: float, rough_bias_px: float, wrong_share: float, wrong_px: float, table: Float,
+    pixels: Float, kept: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """What following corners by optical flow makes of exact pixels (N, 3); `kept` is false where the flow loses one.
+    """What following corners by optical flow makes of exact pixels (N, 3) begun at (N, 2); `kept` is false where it loses one.
 
-    A slow error per landmark, larger for the share that slips along edges, plus white noise. Disparities are unknown or
-    wrong for stretches of half the slow time, with an error that is half slow, half white.
+    The error grows with the way since the beginning, along it and across it, by factors of the landmark's own (`slip` for the
+    share that slides along edges; the floor's reflections hold corners back), plus white noise. Disparities are unknown, rough or wrong for stretches of time.
     """
     for n in range(ids.shape[0]):
         own = mixed(ids[n], np.uint64(seed))
         now = mixed(own, np.uint64(frame + 1000))
-        phase = frame / slow_frames + uniform(mixed(own, np.uint64(1)))
-        slow = slip_px if uniform(mixed(own, np.uint64(2))) < slip_share else slow_px
-        for axis in range(2):
-            key = mixed(own, np.uint64(10 + axis))
-            white = white_px * normal(mixed(now, np.uint64(20 + axis)), table)
-            pixels[n, axis] = exact[n, axis] + slow * slow_normal(key, phase, table) + white
+        is_slipping = uniform(mixed(own, np.uint64(2))) < slip_share
+        own_along = slip if is_slipping else floor_along if is_floor[n] else along
+        gain_along = own_along * normal(mixed(own, np.uint64(10)), table) - (floor_lag if is_floor[n] else lag)
+        gain_across = (0.5 * slip if is_slipping else across) * normal(mixed(own, np.uint64(11)), table)
+        du, dv = exact[n, 0] - begun[n, 0], exact[n, 1] - begun[n, 1]
+        white_u, white_v = normal(mixed(now, np.uint64(20)), table), normal(mixed(now, np.uint64(21)), table)
+        pixels[n, 0] = exact[n, 0] + gain_along * du - gain_across * dv + white_px * white_u
+        pixels[n, 1] = exact[n, 1] + gain_along * dv + gain_across * du + white_px * white_v
         kept[n] = uniform(mixed(now, np.uint64(3))) >= lost_share
-        stretch = mixed(own, np.uint64(int(phase * 2.0) + 100))
+        phase = frame / stretch_frames + uniform(mixed(own, np.uint64(1)))
+        stretch = mixed(own, np.uint64(int(phase) + 100))
+        draw = uniform(mixed(stretch, np.uint64(5)))
         disparity = exact[n, 0] - exact[n, 2]
-        error = 0.7 * slow_normal(mixed(own, np.uint64(12)), phase, table) + 0.7 * normal(mixed(now, np.uint64(22)), table)
-        disparity += disparity_px * error
-        if uniform(mixed(stretch, np.uint64(5))) < wrong_share:
+        if draw < wrong_share:
             disparity += wrong_px * (2.0 * uniform(mixed(stretch, np.uint64(6))) - 1.0)
+        elif draw < wrong_share + rough_share:
+            disparity += rough_bias_px + rough_px * normal(mixed(stretch, np.uint64(7)), table)
+        slow, white = slow_normal(mixed(own, np.uint64(12)), phase, table), normal(mixed(now, np.uint64(22)), table)
+        disparity += disparity_px * 0.7071 * (slow + white)
         is_known = uniform(mixed(stretch, np.uint64(4))) < known_share
         pixels[n, 2] = pixels[n, 0] - disparity if is_known else np.nan
 
 
 @kernel
 def detect(
-    keys: Words, exact: Float, exact_octaves: Float, azimuths: Float, frame: int, seed: int, found_share: float, view_share: float, corner_px: float,
+    keys: Words, exact: Float, exact_octaves: Float, directions: Float, frame: int, seed: int, found_share: float, view_share: float, corner_px: float,
     octave_sigma: float, known_share: float, disparity_px: float, wrong_share: float, wrong_px: float, dirt_bits: int, view_bits: int, view_step_rad: float,
     noise_bits: float, table: Float, rows: NDArray[np.int32], pixels: Float, octaves: NDArray[np.int8], words: Words,
 ) -> int:  # fmt: skip
@@ -75,8 +82,10 @@ def detect(
         now = mixed(own, np.uint64(frame + 5000))
         if uniform(mixed(now, np.uint64(1))) >= found_share:
             continue
-        step = int(math.floor(azimuths[n] / view_step_rad + uniform(mixed(keys[n, 0], np.uint64(41)))))
-        view = mixed(mixed(keys[n, 0], np.uint64(42)), np.uint64(step + 1000))
+        view = mixed(keys[n, 0], np.uint64(42))
+        for axis in range(2):
+            offset = uniform(mixed(keys[n, 0], np.uint64(41 + 10 * axis)))
+            view = mixed(view, np.uint64(int(math.floor(directions[n, axis] / view_step_rad + offset)) + 1000))
         if uniform(mixed(view, keys[n, 1])) >= view_share:
             continue
         octave = int(round(exact_octaves[n] + octave_sigma * normal(mixed(now, np.uint64(2)), table)))
@@ -96,7 +105,9 @@ def detect(
             words[count, word] = state
         change_bits(words, count, mixed(keys[n, 0], keys[n, 1]), dirt_bits)
         change_bits(words, count, view, view_bits)
-        change_bits(words, count, mixed(now, np.uint64(43)), int(noise_bits * 2.0 * uniform(mixed(now, np.uint64(44))) + 0.5))
+        change_bits(
+            words, count, mixed(now, np.uint64(43)), int(noise_bits * 2.0 * uniform(mixed(now, np.uint64(44))) + 0.5)
+        )
         octaves[count] = octave
         rows[count] = n
         count += 1
@@ -142,7 +153,13 @@ def add_clutter(
 
 @kernel
 def spread(
-    pixels: Float, order: NDArray[np.int64], taken: Float, min_distance_px: float, count: int, width_px: float, height_px: float
+    pixels: Float,
+    order: NDArray[np.int64],
+    taken: Float,
+    min_distance_px: float,
+    count: int,
+    width_px: float,
+    height_px: float,
 ) -> NDArray[np.int64]:
     """Up to `count` of the pixels (N, 2) at `order`, first come first served, none nearer than min_distance_px to another."""
     cell = min_distance_px

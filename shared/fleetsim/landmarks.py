@@ -36,7 +36,9 @@ class Landmarks:
 
     def take(self, rows: NDArray[np.integer]) -> "Landmarks":
         """Those rows, as one piece."""
-        return Landmarks(self.points_map[rows], self.normals_map[rows], self.sizes_m[rows], self.keys[rows], np.zeros(1, np.int64))
+        return Landmarks(
+            self.points_map[rows], self.normals_map[rows], self.sizes_m[rows], self.keys[rows], np.zeros(1, np.int64)
+        )
 
 
 class LandmarkField:
@@ -134,7 +136,9 @@ class _Solids:
 def _joined(parts: list[Landmarks]) -> Landmarks:
     """All of them by rising id."""
     if not parts:
-        return Landmarks(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3), np.uint64), np.zeros(1, np.int64))
+        return Landmarks(
+            np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3), np.uint64), np.zeros(1, np.int64)
+        )
     keys = np.concatenate([part.keys for part in parts])
     order = np.argsort(keys[:, 2], kind="stable")
     points = np.concatenate([part.points_map for part in parts])[order]

@@ -65,12 +65,13 @@ def cpu_s(work: Callable[[], object]) -> float:
 
 def measure_everything(session: EstimatorSession) -> None:
     """Every frame's flow and features, the way a robot would ask for them."""
-    ids, pixels = np.zeros(0, np.uint64), np.zeros((0, 3))
+    ids, begun = np.zeros(0, np.uint64), np.zeros((0, 2))
     for frame in range(len(session)):
-        pixels, kept = session.follow(frame, ids)
-        ids, pixels = ids[kept], pixels[kept]
+        pixels, kept = session.follow(frame, ids, begun)
+        ids, begun = ids[kept], begun[kept]
         if len(ids) < 150:
-            ids = np.union1d(ids, session.corners(frame, pixels, 180 - len(ids), 22.0))
+            fresh, fresh_begun = session.corners(frame, pixels[kept], 180 - len(ids), 22.0)
+            ids, begun = np.concatenate([ids, fresh]), np.concatenate([begun, fresh_begun])
         session.features(frame)
 
 
@@ -108,7 +109,9 @@ def main() -> None:
         session.renderer.close()
     survey, robot_session = prepare(Order("small-loop")), prepare(Order("small-loop", robot="tote-1", day=1))
     result["times_real_time"] = speeds(EstimatorSession(robot_session), EstimatorSession(survey))
-    print("\ntimes real time on one core:", {name: round(value, 1) for name, value in result["times_real_time"].items()})  # type: ignore[attr-defined]
+    print(
+        "\ntimes real time on one core:", {name: round(value, 1) for name, value in result["times_real_time"].items()}
+    )  # type: ignore[attr-defined]
     survey.renderer.close()
     robot_session.renderer.close()
     if options.out is not None:

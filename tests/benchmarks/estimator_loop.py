@@ -35,13 +35,17 @@ class EstimatorTracker(Tracker):
         fields = {name: getattr(settings, name) for name in settings.__struct_fields__}
         super().__init__(camera, TrackerSettings(**(fields | {"max_gap_s": _NEVER_S})))
         self._session = session
+        self._begun_px: dict[int, Array] = {}
 
-    def track(self, frame: RectifiedFrame, motion_since: MotionSince, rotation_sigma_rad: float | None = None) -> Tracked:
+    def track(
+        self, frame: RectifiedFrame, motion_since: MotionSince, rotation_sigma_rad: float | None = None
+    ) -> Tracked:
         """As the tracker's; frames must come one by one from the session's first."""
         return super().track(frame, motion_since, rotation_sigma_rad)
 
     def _measure(self, ids: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
-        return self._session.follow(self._frame_index, ids.astype(np.uint64))
+        begun = np.array([self._begun_px[number] for number in ids.tolist()]).reshape(-1, 2)
+        return self._session.follow(self._frame_index, ids.astype(np.uint64), begun)
 
     def _flow(self, frame: RectifiedFrame, predicted: Array) -> tuple[Array, NDArray[np.bool_]]:
         pixels, kept = self._measure(self._points.ids)
@@ -55,8 +59,12 @@ class EstimatorTracker(Tracker):
         missing = self._settings.max_points - len(self._points.ids)
         if missing < 0.15 * self._settings.max_points:
             return
-        wanted = self._session.corners(self._frame_index, self._points.pixels, missing, self._settings.min_distance_px)
-        ids = np.setdiff1d(wanted.astype(np.int64), self._points.ids)
+        distance_px = self._settings.min_distance_px
+        wanted, begun = self._session.corners(self._frame_index, self._points.pixels, missing, distance_px)
+        is_new = ~np.isin(wanted.astype(np.int64), self._points.ids)
+        ids = wanted[is_new].astype(np.int64)
+        held = {number: self._begun_px[number] for number in self._points.ids.tolist()}
+        self._begun_px = held | dict(zip(ids.tolist(), begun[is_new], strict=True))
         pixels, kept = self._measure(ids)
         self._points = type(self._points)(
             np.concatenate([self._points.ids, ids[kept]]), np.concatenate([self._points.pixels, pixels[kept]])
@@ -99,7 +107,9 @@ class _Observed:
     descriptors: list[NDArray[np.uint8]] = field(default_factory=list)
 
 
-def survey_map(session: EstimatorSession, rng: np.random.Generator, *, every_m: float = 0.4, sigma_m: float = 0.01) -> tuple[list[Tile], Vocabulary]:
+def survey_map(
+    session: EstimatorSession, rng: np.random.Generator, *, every_m: float = 0.4, sigma_m: float = 0.01
+) -> tuple[list[Tile], Vocabulary]:
     """A map as a survey would have left it: landmarks found at least twice, with an error of sigma_m, a place each every_m.
 
     The vocabulary is trained on its descriptors.
@@ -135,7 +145,9 @@ def _as_tile(
     entries = [observed[landmark] for landmark in kept]
     directions = np.array([np.mean(entry.directions, axis=0) for entry in entries])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    half = [np.arccos(np.clip((np.array(e.directions) @ d).min(), -1, 1)) for e, d in zip(entries, directions, strict=True)]
+    half = [
+        np.arccos(np.clip((np.array(e.directions) @ d).min(), -1, 1)) for e, d in zip(entries, directions, strict=True)
+    ]
     points = np.array([entry.point_map for entry in entries]) + rng.normal(0.0, sigma_m, (len(entries), 3))
     descriptors = np.array([entry.descriptors[len(entry.descriptors) // 2] for entry in entries])
     lists = tuple(np.array(sorted({number[i] for i in members if i in number}), np.uint32) for _, members in places)
@@ -152,7 +164,11 @@ def _as_tile(
 
 
 def run_localizer(
-    session: EstimatorSession, tiles: list[Tile], vocabulary: Vocabulary, prior: PositionPrior | None = None, frames: int | None = None
+    session: EstimatorSession,
+    tiles: list[Tile],
+    vocabulary: Vocabulary,
+    prior: PositionPrior | None = None,
+    frames: int | None = None,
 ) -> list[Estimate]:
     """The localizer's estimates over a session in a map."""
     nominal, settings = session.session.nominal, LocalizerSettings()
@@ -187,4 +203,6 @@ def relative_errors_m(estimates: list[OdometryEstimate], map_from_body: Array, s
 def position_errors_m(estimates: list[Estimate], map_from_body: Array) -> Array:
     """(N,) distances from the truth of the estimates that are there."""
     pairs = zip(estimates, map_from_body, strict=False)
-    return np.array([np.linalg.norm(e.map_from_body[:3, 3] - truth[:3, 3]) for e, truth in pairs if e.map_from_body is not None])
+    return np.array(
+        [np.linalg.norm(e.map_from_body[:3, 3] - truth[:3, 3]) for e, truth in pairs if e.map_from_body is not None]
+    )

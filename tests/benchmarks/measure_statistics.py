@@ -124,11 +124,16 @@ def compare(camera: StereoCamera, one: View, other: View, sums: SeenSums) -> Non
     away = np.linalg.norm(points[rows] - other.map_from_cam[:3, 3], axis=1)
     closer = np.log(np.linalg.norm(points[rows] - one.map_from_cam[:3, 3], axis=1) / away) / np.log(orb.SCALE_FACTOR)
     wanted_octave = first.octaves[rows] + closer
-    rows, wanted_octave = rows[(wanted_octave > -0.5) & (wanted_octave < 7.5)], wanted_octave[(wanted_octave > -0.5) & (wanted_octave < 7.5)]
+    rows, wanted_octave = (
+        rows[(wanted_octave > -0.5) & (wanted_octave < 7.5)],
+        wanted_octave[(wanted_octave > -0.5) & (wanted_octave < 7.5)],
+    )
     off = second.pixels[None] - expected[rows, None, :2]
     distance = np.linalg.norm(off, axis=2) / orb.SCALE_FACTOR ** second.octaves[None]
     candidate = (distance < 3.0) & (np.abs(second.octaves[None] - wanted_octave[:, None]) < 2.5)
-    differing = np.bitwise_count(first.descriptors[rows][:, None] ^ second.descriptors[None]).sum(axis=2, dtype=np.int64)
+    differing = np.bitwise_count(first.descriptors[rows][:, None] ^ second.descriptors[None]).sum(
+        axis=2, dtype=np.int64
+    )
     best = np.argmin(np.where(candidate, differing, 999), axis=1)
     hit = candidate.any(axis=1) & (differing[np.arange(len(rows)), best] < 80)
     sums.found.append(float(hit.mean()))
@@ -147,15 +152,21 @@ def _sigma(values: Array) -> float:
 
 def report_flow(name: str, sums: FlowSums) -> None:
     """Prints the statistics of tracks."""
-    print(f"{name}: {np.mean(sums.counts):.0f} tracks, {np.mean(sums.survived):.3f} survive a frame, inlier share {np.mean(sums.shares):.3f}")
+    print(
+        f"{name}: {np.mean(sums.counts):.0f} tracks, {np.mean(sums.survived):.3f} survive a frame, inlier share {np.mean(sums.shares):.3f}"
+    )
     for age in AGES:
         errors = np.array(sums.errors_px[age])
         if len(errors):
             wrong = float((np.linalg.norm(errors, axis=1) > WRONG_PX).mean())
-            print(f"  after {age:2d} frames: sigma {_sigma(errors.ravel()):.3f} px, {wrong:.3f} more than {WRONG_PX} px off, {len(errors)} tracks")
+            print(
+                f"  after {age:2d} frames: sigma {_sigma(errors.ravel()):.3f} px, {wrong:.3f} more than {WRONG_PX} px off, {len(errors)} tracks"
+            )
     disparity = np.concatenate(sums.disparity_errors_px)
     known = disparity[np.isfinite(disparity)]
-    print(f"  disparity: {np.mean(sums.disparity_known):.3f} known, sigma {_sigma(known):.3f} px, {float((np.abs(known) > 1.5).mean()):.3f} more than 1.5 px off")
+    print(
+        f"  disparity: {np.mean(sums.disparity_known):.3f} known, sigma {_sigma(known):.3f} px, {float((np.abs(known) > 1.5).mean()):.3f} more than 1.5 px off"
+    )
 
 
 def report_seen(name: str, sums: SeenSums) -> None:
@@ -163,8 +174,13 @@ def report_seen(name: str, sums: SeenSums) -> None:
     bits, errors = np.concatenate(sums.bits), np.concatenate(sums.errors_px)
     octaves, steps = np.concatenate(sums.octaves), np.concatenate(sums.octave_steps)
     spread = " ".join(f"{np.percentile(bits, p):.0f}" for p in (10, 25, 50, 75, 90))
-    print(f"{name}: {np.mean(sums.found):.3f} found again, bits apart 10..90 % {spread}, octave step sigma {np.std(steps):.2f}")
-    print("  pixel sigma at each octave's own scale: " + " ".join(f"{_sigma(errors[octaves == o].ravel()):.2f}" for o in range(8) if (octaves == o).sum() > 20))
+    print(
+        f"{name}: {np.mean(sums.found):.3f} found again, bits apart 10..90 % {spread}, octave step sigma {np.std(steps):.2f}"
+    )
+    print(
+        "  pixel sigma at each octave's own scale: "
+        + " ".join(f"{_sigma(errors[octaves == o].ravel()):.2f}" for o in range(8) if (octaves == o).sum() > 20)
+    )
     print(f"  all octaves: {_sigma(errors.ravel()):.2f}")
 
 
@@ -178,7 +194,10 @@ def main() -> None:
             follow(camera, views, sums)
         report_flow(f"{robot}, {light}", sums)
         features = [orb.detect(view.frame.left, orb.OrbSettings()) for view in views[::10]]
-        known = [np.isfinite(stereo.disparities(v.frame, camera, f.pixels, stereo.StereoSettings())[:, 0]).mean() for v, f in zip(views[::10], features, strict=True)]
+        known = [
+            np.isfinite(stereo.disparities(v.frame, camera, f.pixels, stereo.StereoSettings())[:, 0]).mean()
+            for v, f in zip(views[::10], features, strict=True)
+        ]
         print(f"  features: {np.mean([len(f) for f in features]):.0f}, stereo known {np.mean(known):.3f}")
         session.renderer.close()
     survey, later = prepare(Order("small-loop")), prepare(Order("small-loop", day=1))

@@ -67,7 +67,7 @@ def test_gradient_and_hessian_agree_with_numeric_derivatives() -> None:
 
     step = 1e-5
     numeric = [(at(d, 4.0)[0] - at(-d, 4.0)[0]) / (2 * step) for d in step * np.eye(6)]
-    np.testing.assert_allclose(-at(np.zeros(6), 4.0)[1], numeric, rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(-at(np.zeros(6), 4.0)[1], numeric, rtol=1e-4, atol=1e-3)
     # on clean pixels and without robust weight the Gauss-Newton Hessian is the cost's own
     pixels[:] = np.where(np.isnan(pixels), np.nan, CAMERA.pixel_from_point(transform_points(CAM_FROM_MAP, points)))
     curvature = [-(at(d, 1e6)[1] - at(-d, 1e6)[1]) / (2 * step) for d in step * np.eye(6)]
@@ -76,7 +76,10 @@ def test_gradient_and_hessian_agree_with_numeric_derivatives() -> None:
 
 
 def test_covariance_is_the_scatter_of_many_solutions() -> None:
-    """Mean normalised error squared per dof of 150 solutions: 900 dof, so 1 within 0.14 at three sigmas, plus robustness."""
+    """Mean normalised error squared per dof of 150 solutions, 900 dof.
+
+    The robust weight of good residuals is 0.75 on average, so the covariance is that much too wide; never too narrow.
+    """
     rng = np.random.default_rng(4)
     nees = []
     for _ in range(150):
@@ -85,7 +88,7 @@ def test_covariance_is_the_scatter_of_many_solutions() -> None:
         assert found is not None
         off = error(found.cam_from_source)
         nees.append(off @ np.linalg.solve(found.cov_rot_trans, off) / 6)
-    assert 0.8 < np.mean(nees) < 1.25
+    assert 0.65 < np.mean(nees) < 1.1
 
 
 def test_gross_outliers_do_not_pull() -> None:

@@ -195,9 +195,22 @@ def test_a_wide_prior_only_narrows_the_search(robot: Robot) -> None:
     assert robot.error_m(said[-1]) < 1e-6
 
 
-def test_a_fix_outside_a_tight_prior_is_not_believed(robot: Robot) -> None:
+def test_a_fix_outside_a_tight_prior_is_not_believed_until_the_way_may_have_led_there(robot: Robot) -> None:
+    """3 m off with 0.3 m of doubt: never while standing; after metres of way the prior says nothing against it."""
     robot.localizer.handle_prior(prior(robot, 0.3, off(3.0)))
-    assert {e.status for e in robot.ride(8, 0.4)} == {Status.INITIALISING}
+    assert {e.status for e in robot.ride(8, 0.0)} == {Status.INITIALISING}
+    said = robot.ride(12, 0.4)
+    assert said[0].status is Status.INITIALISING
+    assert said[-1].status is Status.TRACKING
+    assert robot.error_m(said[-1]) < 1e-6
+
+
+def test_a_prior_is_no_longer_tight_after_some_way(robot: Robot) -> None:
+    """Two metres without a fix: the next ones must be confirmed as anywhere else."""
+    robot.localizer.handle_prior(prior(robot, 0.5))
+    robot.ride(6, 0.4, NO_FIX)
+    said = [e.status for e in robot.ride(4, 0.6)]
+    assert said == [Status.INITIALISING] * 2 + [Status.TRACKING] * 2
 
 
 def test_two_places_that_fit_are_ambiguous_until_motion_decides(robot: Robot) -> None:

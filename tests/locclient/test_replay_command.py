@@ -126,3 +126,6 @@ def test_files_that_cannot_be_written_are_told_before_the_work(
     to_store = ("--site", "lab", "--store", store)
     assert status(monkeypatch, "replay", walk, *to_store, option, tmp_path / "missing/file.png") == 2
     assert option in capsys.readouterr().err
+    if option == "--picture":
+        assert status(monkeypatch, "replay", walk, *to_store, option, tmp_path / "picture.txt") == 2
+        assert option in capsys.readouterr().err

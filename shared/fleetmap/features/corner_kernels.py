@@ -41,18 +41,19 @@ def select_spread(
 ) -> NDArray[np.int64]:
     """Indices of up to `count` pixels, best first as `order` says, no two within `cell_px` of each other or of `taken`.
 
-    One pixel for a cell and its neighbours nearer than cell_px: a greedy suppression on a grid of cells.
+    Greedy suppression on a grid of cells, each with a chain of what it holds.
     """
     columns, rows = int(width / cell_px) + 1, int(height / cell_px) + 1
-    slots = 4
-    held = np.zeros((rows, columns), np.int64)
-    places = np.zeros((rows, columns, slots, 2))
+    newest = np.full((rows, columns), -1, np.int64)
+    earlier = np.full(len(taken) + count, -1, np.int64)
+    places = np.empty((len(taken) + count, 2))
+    held = 0
     for n in range(len(taken)):
-        c, r = int(taken[n, 0] / cell_px), int(taken[n, 1] / cell_px)
-        if 0 <= c < columns and 0 <= r < rows and held[r, c] < slots:
-            places[r, c, held[r, c], 0] = taken[n, 0]
-            places[r, c, held[r, c], 1] = taken[n, 1]
-            held[r, c] += 1
+        c, r = int(np.floor(taken[n, 0] / cell_px)), int(np.floor(taken[n, 1] / cell_px))
+        if 0 <= c < columns and 0 <= r < rows:
+            places[held, 0], places[held, 1] = taken[n, 0], taken[n, 1]
+            earlier[held], newest[r, c] = newest[r, c], held
+            held += 1
     chosen = np.empty(count, np.int64)
     found = 0
     for k in range(len(order)):
@@ -60,20 +61,20 @@ def select_spread(
             break
         x, y = pixels[order[k], 0], pixels[order[k], 1]
         c, r = int(x / cell_px), int(y / cell_px)
-        free = held[r, c] < slots
+        free = True
         for rr in range(max(r - 1, 0), min(r + 2, rows)):
             for cc in range(max(c - 1, 0), min(c + 2, columns)):
-                for s in range(held[rr, cc]):
-                    dx, dy = places[rr, cc, s, 0] - x, places[rr, cc, s, 1] - y
-                    if dx * dx + dy * dy < cell_px * cell_px:
-                        free = False
-        if not free:
-            continue
-        places[r, c, held[r, c], 0] = x
-        places[r, c, held[r, c], 1] = y
-        held[r, c] += 1
-        chosen[found] = order[k]
-        found += 1
+                other = newest[rr, cc]
+                while free and other >= 0:
+                    dx, dy = places[other, 0] - x, places[other, 1] - y
+                    free = dx * dx + dy * dy >= cell_px * cell_px
+                    other = earlier[other]
+        if free:
+            places[held, 0], places[held, 1] = x, y
+            earlier[held], newest[r, c] = newest[r, c], held
+            held += 1
+            chosen[found] = order[k]
+            found += 1
     return chosen[:found]
 
 

@@ -165,8 +165,7 @@ def match_rows(
         whole, score, second = _search(left, right, xi, yi, first, last, wide, scores)
         if score < min_correlation:
             continue
-        start = whole + (x - xi) * 0.0
-        d_wide, _ = _refine(left, right, x, y, start, wide, window)
+        d_wide, _ = _refine(left, right, x, y, float(whole), wide, window)
         if np.isnan(d_wide):
             continue
         d_narrow, sigma_narrow = _refine(left, right, x, y, d_wide, narrow, window)

@@ -42,7 +42,7 @@ def test_overlap_is_counted_against_the_last_keyframe() -> None:
     [
         ({"yaw_deg": 5.0}, 3),  # more than 12 degrees
         ({"x_m": 0.5}, 3),  # more than 0.12 of 10 m
-        ({"yaw_deg": 2.0, "x_m": 0.2}, 7),
+        ({"yaw_deg": 1.9, "x_m": 0.19}, 7),
     ],
 )
 def test_motion_makes_keyframes(kind: dict[str, float], steps: int) -> None:

@@ -1,4 +1,4 @@
-"""Landmarks from pairs: joined as a brute-force twin joins them, observed to a fraction of a pixel in rendered views."""
+"""Landmarks from pairs: joined as a brute-force twin joins them, observed to a fraction of a pixel."""
 
 from functools import lru_cache
 

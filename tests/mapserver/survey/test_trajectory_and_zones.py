@@ -1,5 +1,7 @@
 """Every frame's place between adjusted keyframes, and hard zones."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ def walk(count: int, seed: int) -> Array:
     rng = np.random.default_rng(seed)
     out = [se3_exp(rng.normal(0, 1, 6))]
     for _ in range(count - 1):
-        out.append(out[-1] @ se3_exp(rng.normal(0, 0.05, 6) + [0, 0, 0, 0.2, 0, 0]))
+        out.append(out[-1] @ se3_exp(rng.normal([0, 0, 0, 0.2, 0, 0], 0.05)))
     return np.array(out)
 
 
@@ -44,7 +46,7 @@ def test_a_correction_is_spread_over_time_without_a_jump() -> None:
     assert yaws == pytest.approx([0.0, 0.01, 0.02, 0.06, 0.1], abs=1e-9)
     off = found[:, 0, 3] - odometry[:, 0, 3]
     assert off == pytest.approx([0.0, 0.02, 0.04, 0.12, 0.2], abs=0.01)
-    for before, after in zip(found[:-1], found[1:], strict=True):
+    for before, after in pairwise(found):
         step = se3_inverse(before) @ after
         assert rotation_angle_rad(step[:3, :3]) < 0.05
 

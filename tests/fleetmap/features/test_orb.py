@@ -1,0 +1,90 @@
+"""Grid ORB: spread, orientation, scale and determinism."""
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fleetmap.features import EXTRACTORS, orb
+from fleetmap.features.matching import match_mutual
+from synthetic_texture import picture, pixel_grid, smooth_texture
+
+WIDTH, HEIGHT = 320, 240
+
+
+@pytest.fixture(scope="module")
+def image() -> NDArray[np.uint8]:
+    """Strong texture in the left quarter, weak elsewhere: where plain ORB piles up its features."""
+    u, v = pixel_grid(WIDTH, HEIGHT)
+    texture = smooth_texture(np.random.default_rng(1), shortest_px=5.0, longest_px=40.0)
+    contrast = np.where(u < WIDTH / 4, 1.0, 0.35)
+    return np.rint(128 + contrast * (texture(u, v) - 128)).astype(np.uint8)
+
+
+def occupied(pixels: NDArray[np.floating]) -> int:
+    """How many cells of 32 pixels hold a feature."""
+    return len({(int(x) // 32, int(y) // 32) for x, y in pixels})
+
+
+def test_features_spread_better_than_plain_orb(image: NDArray[np.uint8]) -> None:
+    features = orb.detect(image, orb.OrbSettings(count=300))
+    plain = cv2.ORB.create(nfeatures=300).detect(image, None)
+    assert 200 < len(features) <= 310
+    assert occupied(features.pixels) > 1.3 * occupied(np.array([k.pt for k in plain]))
+
+
+def test_arrays_belong_together(image: NDArray[np.uint8]) -> None:
+    features = orb.detect(image, orb.OrbSettings(count=200))
+    count = len(features)
+    assert features.pixels.shape == (count, 2)
+    assert features.descriptors.shape == (count, 32)
+    assert features.octaves.shape == features.angles_deg.shape == (count,)
+    assert set(features.octaves.tolist()) == set(range(8))
+    taken = features.take(np.array([5, 3]))
+    np.testing.assert_array_equal(taken.pixels, features.pixels[[5, 3]])
+    np.testing.assert_array_equal(taken.descriptors, features.descriptors[[5, 3]])
+
+
+@pytest.mark.parametrize(("scale", "angle_deg"), [(1.0, 40.0), (1.44, 0.0)])
+def test_features_are_found_again_in_a_turned_or_larger_picture(scale: float, angle_deg: float) -> None:
+    """Matches land where the known similarity says, with the octave and the angle that it predicts."""
+    u, v = pixel_grid(WIDTH, HEIGHT)
+    texture = smooth_texture(np.random.default_rng(4), shortest_px=6.0, longest_px=80.0)
+    turn = np.radians(angle_deg)
+    second_from_first = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    centre = np.array([WIDTH / 2, HEIGHT / 2])
+    first_uv = (np.stack([u, v], -1) - centre) @ np.linalg.inv(second_from_first).T + centre
+    first = orb.detect(picture(texture, u, v), orb.OrbSettings(count=400))
+    second = orb.detect(picture(texture, first_uv[..., 0], first_uv[..., 1]), orb.OrbSettings(count=400))
+    pairs = match_mutual(first.descriptors, second.descriptors, 60, 0.85)
+    expected = (first.pixels[pairs[:, 0]] - centre) @ second_from_first.T + centre
+    good = np.linalg.norm(expected - second.pixels[pairs[:, 1]], axis=1) < 4.0
+    assert good.sum() > 40
+    assert good.mean() > 0.8
+    pairs = pairs[good]
+    step = second.octaves[pairs[:, 1]].astype(float) - first.octaves[pairs[:, 0]]
+    assert abs(np.median(step) - np.log(scale) / np.log(orb.SCALE_FACTOR)) <= 0.5
+    turned = (second.angles_deg[pairs[:, 1]] - first.angles_deg[pairs[:, 0]] - angle_deg + 180) % 360 - 180
+    assert abs(np.median(turned)) < 4.0
+
+
+def test_given_pixels_are_described_as_detected_ones(image: NDArray[np.uint8]) -> None:
+    """At level 0 the descriptor of a detected feature is that of its pixel."""
+    features = orb.detect(image, orb.OrbSettings(count=300))
+    level0 = features.take(np.flatnonzero(features.octaves == 0))
+    pixels = np.vstack([[[2.0, 2.0]], level0.pixels])  # the first is too near the border to be described
+    described, index = orb.describe_pixels(image, pixels, orb.OrbSettings())
+    assert index.tolist() == list(range(1, len(pixels)))
+    np.testing.assert_array_equal(described.descriptors, level0.descriptors)
+    np.testing.assert_array_equal(described.pixels, level0.pixels)
+
+
+@pytest.mark.parametrize("name", EXTRACTORS)
+def test_every_extractor_is_deterministic_and_calm_on_nothing(name: str, image: NDArray[np.uint8]) -> None:
+    detect = EXTRACTORS[name]
+    first, second = detect(image, orb.OrbSettings(count=150)), detect(image.copy(), orb.OrbSettings(count=150))
+    np.testing.assert_array_equal(first.pixels, second.pixels)
+    np.testing.assert_array_equal(first.descriptors, second.descriptors)
+    assert len(detect(np.full((HEIGHT, WIDTH), 7, np.uint8), orb.OrbSettings())) == 0
+    described, index = orb.describe_pixels(image, np.zeros((0, 2)), orb.OrbSettings())
+    assert len(described) == len(index) == 0

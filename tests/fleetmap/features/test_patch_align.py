@@ -1,0 +1,116 @@
+"""Patch alignment on warps that are known exactly."""
+
+import numpy as np
+import pytest
+
+from fleetmap.features import orb, patch_align
+from fleetmap.features.corners import spread_corners
+from fleetmap.geometry import Array, se3_exp, transform_points
+from fleetmap.rectification import StereoCamera
+from synthetic_texture import Texture, picture, pixel_grid, smooth_texture
+
+WIDTH, HEIGHT = 320, 240
+CENTRE = np.array([160.0, 120.0])
+SETTINGS = patch_align.AlignSettings()
+
+
+@pytest.fixture(scope="module")
+def texture() -> Texture:
+    return smooth_texture(np.random.default_rng(11), shortest_px=9.0)
+
+
+def warped_pair(texture: Texture, current_from_reference: Array, gain: float = 1.0) -> tuple[Array, Array]:
+    """Reference and current picture; offsets from the centre map by current_from_reference (2, 2)."""
+    u, v = pixel_grid(WIDTH, HEIGHT)
+    reference_uv = (np.stack([u, v], -1) - CENTRE) @ np.linalg.inv(current_from_reference).T + CENTRE
+    current = 0.5 * (1 - gain) * 255 + gain * texture(reference_uv[..., 0], reference_uv[..., 1])
+    return picture(texture, u, v), np.rint(current).astype(np.uint8)
+
+
+def similarity(scale: float, angle_deg: float) -> Array:
+    turn = np.radians(angle_deg)
+    return scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+
+
+@pytest.mark.parametrize(
+    "current_from_reference",
+    [np.eye(2), similarity(1.0, 30.0), similarity(1.15, -10.0), np.array([[1.1, 0.1], [-0.05, 0.9]])],
+    ids=["none", "turned", "turned-and-larger", "sheared"],
+)
+def test_known_warps_are_recovered(texture: Texture, current_from_reference: Array) -> None:
+    """Starting a pixel off, under another gain and offset, the median error is below 0.05 px."""
+    reference, current = warped_pair(texture, current_from_reference, gain=0.8)
+    pixels = spread_corners(reference, 120, min_distance_px=10.0, border_px=50).astype(np.float64)
+    expected = (pixels - CENTRE) @ current_from_reference.T + CENTRE
+    start = expected + np.random.default_rng(1).uniform(-1.0, 1.0, expected.shape)
+    level0 = np.zeros(len(pixels), np.int8)
+    warp = np.repeat(np.linalg.inv(current_from_reference)[None], len(pixels), axis=0)
+    found = patch_align.refine_matches(
+        patch_align.half_pyramid(reference), patch_align.half_pyramid(current), pixels, level0, start, level0, warp, SETTINGS
+    )
+    error = np.linalg.norm(found[:, :2] - expected, axis=1)
+    assert np.isfinite(error).mean() > 0.8
+    assert np.nanmedian(error) < 0.05
+    assert np.nanpercentile(error, 90) < 0.15
+    assert (np.abs(np.nanmean(found[:, :2] - expected, axis=0)) < 0.03).all()
+
+
+def test_features_of_different_octaves_meet_across_scales() -> None:
+    """The current picture is 1.9 times larger: octave 4 there matches octave 0 or 1 here (1.2^4 = 2.07)."""
+    texture = smooth_texture(np.random.default_rng(12), shortest_px=16.0, longest_px=80.0)
+    reference, current = warped_pair(texture, similarity(1.9, 0.0))
+    pixels = spread_corners(reference, 60, min_distance_px=8.0, border_px=75).astype(np.float64)
+    expected = (pixels - CENTRE) * 1.9 + CENTRE
+    count = len(pixels)
+    warp = np.repeat(similarity(1 / 1.9, 0.0)[None], count, axis=0)
+    found = patch_align.refine_matches(
+        patch_align.half_pyramid(reference), patch_align.half_pyramid(current), pixels, np.zeros(count, np.int8),
+        expected + 0.7, np.full(count, 4, np.int8), warp, SETTINGS,
+    )  # fmt: skip
+    error = np.linalg.norm(found[:, :2] - expected, axis=1)
+    assert np.isfinite(error).mean() > 0.5
+    assert np.nanmedian(error) < 0.15
+
+
+def test_patches_that_do_not_agree_are_refused(texture: Texture) -> None:
+    u, v = pixel_grid(WIDTH, HEIGHT)
+    reference, other = picture(texture, u, v), picture(smooth_texture(np.random.default_rng(77)), u, v)
+    pixels = spread_corners(reference, 120, min_distance_px=10.0, border_px=30).astype(np.float64)
+    level0, warp = np.zeros(len(pixels), np.int8), np.repeat(np.eye(2)[None], len(pixels), axis=0)
+    for current in (other, np.full_like(reference, 90)):
+        found = patch_align.refine_matches(
+            patch_align.half_pyramid(reference), patch_align.half_pyramid(current), pixels, level0, pixels, level0, warp, SETTINGS
+        )
+        assert np.isfinite(found[:, 0]).mean() < 0.12
+
+
+def test_border_pixels_are_refused(texture: Texture) -> None:
+    reference, _ = warped_pair(texture, np.eye(2))
+    pixels = np.array([[0.0, 0.0], [2.0, 100.0], [WIDTH - 1.0, 50.0], [100.0, HEIGHT - 2.0]])
+    level0, warp = np.zeros(4, np.int8), np.repeat(np.eye(2)[None], 4, axis=0)
+    pyramid = patch_align.half_pyramid(reference)
+    found = patch_align.refine_matches(pyramid, pyramid, pixels, level0, pixels, level0, warp, SETTINGS)
+    assert np.isnan(found).all()
+
+
+def test_warp_from_octaves_and_angles() -> None:
+    """A feature found larger and turned clockwise: offsets there map back smaller and turned back."""
+    warp = patch_align.similarity_from_features(
+        np.array([1], np.int8), np.array([20.0]), np.array([3], np.int8), np.array([50.0])
+    )
+    np.testing.assert_allclose(warp[0], np.linalg.inv(similarity(orb.SCALE_FACTOR**2, 30.0)), atol=1e-12)
+
+
+def test_warp_from_motion_is_the_derivative_of_the_reprojection() -> None:
+    camera = StereoCamera(300.0, 160.0, 120.0, 0.1, WIDTH, HEIGHT)
+    points = np.array([[0.2, -0.1, 2.0], [-1.0, 0.5, 4.0]])
+    current_from_reference = se3_exp(np.array([0.05, -0.1, 0.2, 0.1, 0.05, -0.3]))
+    warp = patch_align.similarity_from_motion(camera, points, current_from_reference)
+    for k, point in enumerate(points):
+        shifts = 1e-4 * point[2] / camera.focal_px * np.eye(3)[:2]
+        moved = np.concatenate([point + shifts, point - shifts])
+        pixels = camera.pixel_from_point(transform_points(current_from_reference, moved))[:, :2]
+        current_from_reference_px = ((pixels[:2] - pixels[2:]) / 2e-4).T
+        np.testing.assert_allclose(warp[k] @ current_from_reference_px, np.eye(2), atol=0.02)
+    behind = patch_align.similarity_from_motion(camera, np.array([[0.0, 0.0, -1.0]]), current_from_reference)
+    assert np.isnan(behind).all()
