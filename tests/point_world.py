@@ -65,7 +65,9 @@ def error_of(state: NavState, truth: NavState) -> Array:
     )
 
 
-def noisy_imu(rng: np.random.Generator, duration_s: float, noise: ImuNoise, gyro_bias: Array, accel_bias: Array) -> ImuSamples:
+def noisy_imu(
+    rng: np.random.Generator, duration_s: float, noise: ImuNoise, gyro_bias: Array, accel_bias: Array
+) -> ImuSamples:
     """The analytic motion's samples with white noise and constant biases."""
     clean = sample_motion(rate_hz=IMU_RATE_HZ, duration_s=duration_s)
     root_rate = np.sqrt(IMU_RATE_HZ)
@@ -116,7 +118,7 @@ class Run:
 
 def run_filter(
     rng: np.random.Generator, nav_covariance: Array, start_error: Array, *, duration_s: float, noise: ImuNoise = NOISE,
-    gyro_bias: Array | None = None, accel_bias: Array | None = None, imu_minus_cam_s: float = 0.0, points_per_frame: int = 25,
+    gyro_bias: Array | None = None, accel_bias: Array | None = None, imu_minus_cam_s: float = 0.0, settings: FilterSettings = SETTINGS,
 ) -> Run:  # fmt: skip
     """A filter along the motion; every few frames a share of the points serves, each observation once.
 
@@ -128,7 +130,7 @@ def run_filter(
     begin_s = 0.05  # so that no picture is stamped before the state begins
     truth = true_state(begin_s, gyro_bias, accel_bias)
     start = perturbed(truth, so3_exp(start_error[:3]), start_error)
-    estimate = InvariantFilter(start, nav_covariance, SETTINGS, CAMERA, BODY_FROM_CAM)
+    estimate = InvariantFilter(start, nav_covariance, settings, CAMERA, BODY_FROM_CAM)
     points = room(rng)
     seen: dict[int, Array] = {}
     state_ns, accepted, offered = round(begin_s * 1e9), 0, 0
@@ -141,7 +143,7 @@ def run_filter(
         estimate.add_clone(index, rate)
         seen[index] = observe(points, time_s, rng)
         if index % 5 == 4:
-            used = estimate.update(tracks_of(seen, rng.choice(len(points), 12 * points_per_frame, replace=False)))
+            used = estimate.update(tracks_of(seen, rng.choice(len(points), 300, replace=False)))
             accepted, offered = accepted + int((used == 1).sum()), offered + len(used)
             for old in list(seen)[:-1]:
                 estimate.remove_clone(old)

@@ -55,7 +55,9 @@ def localised(frames: Frames) -> list[bool]:
     """For each frame: TRACKING, or a fix of its own where the recording is so sparse that frames are over a second apart."""
     out = []
     for index, frame in enumerate(frames):
-        neighbours = [abs(frames[k].stamp_ns - frame.stamp_ns) * 1e-9 for k in (index - 1, index + 1) if 0 <= k < len(frames)]
+        neighbours = [
+            abs(frames[k].stamp_ns - frame.stamp_ns) * 1e-9 for k in (index - 1, index + 1) if 0 <= k < len(frames)
+        ]
         sparse = bool(neighbours) and max(neighbours) > SPARSE_S
         out.append(frame.status is Status.TRACKING or (sparse and frame.has_fix))
     return out
@@ -91,7 +93,9 @@ def frame_wall_ms(frames: Frames) -> dict[str, float] | None:
 def stage_ms(frames: Frames) -> dict[str, float]:
     """Mean CPU milliseconds per frame and stage, after the warm-up frames."""
     rows = [f.stage_s for f in frames[WARM_UP_FRAMES:]]
-    return {name: 1e3 * float(np.mean([r.get(name, 0.0) for r in rows])) for name in sorted({n for r in rows for n in r})}
+    return {
+        name: 1e3 * float(np.mean([r.get(name, 0.0) for r in rows])) for name in sorted({n for r in rows for n in r})
+    }
 
 
 def error_m(frames: Frames) -> dict[str, float] | None:
@@ -102,7 +106,9 @@ def error_m(frames: Frames) -> dict[str, float] | None:
 
 def error_deg(frames: Frames) -> dict[str, float] | None:
     """Unaligned orientation errors of localised frames with a truth."""
-    values = [f.error_rad for f, good in zip(frames, localised(frames), strict=True) if good and f.error_rad is not None]
+    values = [
+        f.error_rad for f, good in zip(frames, localised(frames), strict=True) if good and f.error_rad is not None
+    ]
     return _spread([float(np.degrees(v)) for v in values if v is not None], ("median", "p99"))
 
 
@@ -125,7 +131,11 @@ def position_failures(frames: Frames) -> int:
     """
     start = first_fix(frames)
     after = list(frames[start:]) if start is not None else []
-    spans = _episodes(frames, _is_silent, SILENT_S) + _episodes(after, _is_blind, BLIND_S) + _episodes(frames, _is_overconfident, SILENT_S)
+    spans = (
+        _episodes(frames, _is_silent, SILENT_S)
+        + _episodes(after, _is_blind, BLIND_S)
+        + _episodes(frames, _is_overconfident, SILENT_S)
+    )
     count, until = 0, -(2**63)
     for begin, end in sorted(spans):
         if begin > until + GOOD_S * 1e9 or count == 0:
@@ -155,7 +165,9 @@ def _is_overconfident(frame: FrameRecord, is_localised: bool) -> bool:
     return float(frame.error_map_m @ np.linalg.solve(frame.cov_rot_trans[3:, 3:], frame.error_map_m)) > CHI2_3_0999
 
 
-def _episodes(frames: Frames, is_bad: Callable[[FrameRecord, bool], bool], longer_than_s: float) -> list[tuple[int, int]]:
+def _episodes(
+    frames: Frames, is_bad: Callable[[FrameRecord, bool], bool], longer_than_s: float
+) -> list[tuple[int, int]]:
     """(begin, end) stamps of stretches that are bad for longer than so many seconds.
 
     A stretch lasts until the next frame that is not bad: between two frames nothing better is known. It is over only after 5 s

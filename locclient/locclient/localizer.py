@@ -94,7 +94,9 @@ class Localizer:
         self._camera, self._body_from_cam = camera, body_from_cam
         self._cam_from_body = se3_inverse(body_from_cam)
         self._base_from_body = calibration.base_from_body
-        self._odometry = Odometry(calibration, camera, body_from_cam, imu_minus_cam_s, settings.odometry, settings.stereo)
+        self._odometry = Odometry(
+            calibration, camera, body_from_cam, imu_minus_cam_s, settings.odometry, settings.stereo
+        )
         self._relocalizer: Relocalizer | None = None
         self._map_version: int | None = None
         self._prior: PositionPrior | None = None
@@ -113,7 +115,9 @@ class Localizer:
         """A coarse place at this moment; used for the search until a fix has been confirmed, widened by the way since."""
         self._prior, self._way_since_prior_m = prior, 0.0
 
-    def handle_version(self, version: int, tiles: Iterable[Tile], vocabulary: Vocabulary, survey_focal_px: float) -> None:
+    def handle_version(
+        self, version: int, tiles: Iterable[Tile], vocabulary: Vocabulary, survey_focal_px: float
+    ) -> None:
         """The tiles around, of one version; takes the place of what was held."""
         self._relocalizer = Relocalizer(MapView(tiles, vocabulary, survey_focal_px), self._camera, self._settings)
         self._map_version = version
@@ -154,14 +158,20 @@ class Localizer:
         else:
             distance = float(np.linalg.norm(motion[0][:3, 3]))
             floor = np.diag([0.0] * 3 + [(settings.drift_floor_m + settings.drift_share * distance) ** 2] * 3)
-            anchor.now_map_from_body, anchor.now_cov = _compose(anchor.map_from_body, anchor.cov_rot_trans, motion[0], motion[1] + floor)
+            anchor.now_map_from_body, anchor.now_cov = _compose(
+                anchor.map_from_body, anchor.cov_rot_trans, motion[0], motion[1] + floor
+            )
         if motion is None or anchor.frame_index == self._odometry.oldest_frame_index:
             anchor.frame_index = odometry.frame_index
             anchor.map_from_body, anchor.cov_rot_trans = anchor.now_map_from_body, anchor.now_cov
 
     def _is_due(self, stamp_ns: int, odometry: OdometryEstimate) -> bool:
         last = self._last_look_ns
-        return last is None or odometry.after_gap or (stamp_ns - last) * 1e-9 >= 0.999 * self._settings.track.fix_interval_s
+        return (
+            last is None
+            or odometry.after_gap
+            or (stamp_ns - last) * 1e-9 >= 0.999 * self._settings.track.fix_interval_s
+        )
 
     # --- looking at the map ----------------------------------------------------------------------------------------------
 
@@ -189,7 +199,9 @@ class Localizer:
         fixes: list[Fix] = []
         for candidate in self._candidates:
             map_from_body, covariance = candidate.now_map_from_body, candidate.now_cov
-            fix = relocalizer.near(seen, map_from_body @ self._body_from_cam, self._at_camera(map_from_body, covariance))
+            fix = relocalizer.near(
+                seen, map_from_body @ self._body_from_cam, self._at_camera(map_from_body, covariance)
+            )
             if fix is not None:
                 fixes.append(fix)
         known = None
@@ -231,7 +243,11 @@ class Localizer:
         innovation = float(error @ np.linalg.solve(spread, error))
         if innovation > self._settings.track.innovation_limit:
             self._consider_kidnapping(fix, odometry)
-            return None, f"the fix is {np.linalg.norm(error[3:]):.2f} m off, more than its covariance admits", innovation
+            return (
+                None,
+                f"the fix is {np.linalg.norm(error[3:]):.2f} m off, more than its covariance admits",
+                innovation,
+            )
         gain = np.linalg.solve(spread, covariance).T
         corrected = _apply(gain @ error, map_from_body)
         rest = np.eye(6) - gain
@@ -266,7 +282,11 @@ class Localizer:
         if not fixes:
             return None, "nothing in the map agrees with this frame", None
         best = max(self._candidates, key=lambda c: c.support)
-        rivals = [c for c in self._candidates if c is not best and c.support >= self._settings.track.rival_share * best.support]
+        rivals = [
+            c
+            for c in self._candidates
+            if c is not best and c.support >= self._settings.track.rival_share * best.support
+        ]
         if not rivals and self._is_confirmed(best):
             self._anchor, self._candidates, self._prior = best, [], None
             self._ever_tracked = True
@@ -281,8 +301,12 @@ class Localizer:
         for candidate in self._candidates:
             predicted, covariance = candidate.now_map_from_body, candidate.now_cov
             error = _difference(measured, predicted)
-            close = np.linalg.norm(error[3:]) < settings.hypothesis_distance_m + 3 * np.sqrt(np.trace(covariance[3:, 3:]))
-            if close and np.linalg.norm(error[:3]) < np.radians(settings.hypothesis_angle_deg) + 3 * np.sqrt(np.trace(covariance[:3, :3])):
+            close = np.linalg.norm(error[3:]) < settings.hypothesis_distance_m + 3 * np.sqrt(
+                np.trace(covariance[3:, 3:])
+            )
+            if close and np.linalg.norm(error[:3]) < np.radians(settings.hypothesis_angle_deg) + 3 * np.sqrt(
+                np.trace(covariance[:3, :3])
+            ):
                 if candidate.misses:  # at most one vote a frame
                     candidate.support, candidate.misses = candidate.support + 1, 0
                 candidate.frame_index, candidate.stamp_ns = odometry.frame_index, odometry.stamp_ns
@@ -293,8 +317,13 @@ class Localizer:
 
     def _is_confirmed(self, candidate: _Anchor) -> bool:
         settings = self._settings.track
-        tight = self._prior is not None and np.sqrt(np.linalg.eigvalsh(self._prior_cov_m2())[-1]) <= settings.tight_prior_sigma_m
-        enough = candidate.support >= settings.confirming_fixes and candidate.travelled_m >= settings.confirming_distance_m
+        tight = (
+            self._prior is not None
+            and np.sqrt(np.linalg.eigvalsh(self._prior_cov_m2())[-1]) <= settings.tight_prior_sigma_m
+        )
+        enough = (
+            candidate.support >= settings.confirming_fixes and candidate.travelled_m >= settings.confirming_distance_m
+        )
         return bool(tight or enough)
 
     def _new_anchor(self, map_from_body: Array, covariance: Array, odometry: OdometryEstimate) -> _Anchor:
@@ -302,7 +331,9 @@ class Localizer:
 
     # --- output ----------------------------------------------------------------------------------------------------------
 
-    def _estimate(self, odometry: OdometryEstimate, fix: Fix | None, refused: str, innovation: float | None) -> Estimate:
+    def _estimate(
+        self, odometry: OdometryEstimate, fix: Fix | None, refused: str, innovation: float | None
+    ) -> Estimate:
         settings = self._settings.track
         if self._anchor is not None:
             map_from_body, covariance = self._anchor.now_map_from_body, self._anchor.now_cov
@@ -346,7 +377,9 @@ class Localizer:
 def _moved(cov_rot_trans: Array, lever_m: Array) -> Array:
     """The covariance of a point at `lever_m` from the one it was given for, on the same rigid thing; map axes."""
     carry = np.eye(6)
-    carry[3:, :3] = -np.array([[0, -lever_m[2], lever_m[1]], [lever_m[2], 0, -lever_m[0]], [-lever_m[1], lever_m[0], 0]])
+    carry[3:, :3] = -np.array(
+        [[0, -lever_m[2], lever_m[1]], [lever_m[2], 0, -lever_m[0]], [-lever_m[1], lever_m[0], 0]]
+    )
     return np.asarray(carry @ cov_rot_trans @ carry.T)
 
 

@@ -56,7 +56,9 @@ class MapView:
         places, _ = self._index.query(vector, allowed, top)
         return places
 
-    def visible(self, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float) -> tuple[Rows, Array, Array]:
+    def visible(
+        self, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float
+    ) -> tuple[Rows, Array, Array]:
         """Rows (V,) of landmarks that a camera there should see, their pixels (V, 3) and expected octaves (V,)."""
         near = np.linalg.norm(self.points_map - map_from_cam[:3, 3], axis=1)
         reach = self.max_distances_m * (camera.focal_px / self._survey_focal_px)

@@ -51,7 +51,12 @@ def _plan(canvas: Canvas, result: ReplayResult) -> None:
     _text(canvas, f"{metre:g} m", (int(50 + metre * scale), _SIZE[0] - 15))
     share = result.report()["localised_share"]
     title = f"{result.manifest.site} version {result.manifest.version}: {len(result.frames)} frames, localised "
-    _text(canvas, title + ("never" if not isinstance(share, float) else f"{100 * share:.1f} % after the first fix"), (40, 36), 0.7)
+    _text(
+        canvas,
+        title + ("never" if not isinstance(share, float) else f"{100 * share:.1f} % after the first fix"),
+        (40, 36),
+        0.7,
+    )
     _text(canvas, f"green 0 .. red {_FULL_SCALE_M * 1000:.0f} mm of error; violet: not localised", (40, 60))
 
 
@@ -60,7 +65,12 @@ def _errors(canvas: Canvas, result: ReplayResult) -> None:
     start = result.frames[0].stamp_ns
     length = max((result.frames[-1].stamp_ns - start) * 1e-9, 1e-3)
     values = [f.error_m for f in result.frames if f.error_m is not None]
-    _text(canvas, "position error, unaligned [mm], over time [s]" if values else "no ground truth in the map's frame", (left, 60), 0.6)
+    _text(
+        canvas,
+        "position error, unaligned [mm], over time [s]" if values else "no ground truth in the map's frame",
+        (left, 60),
+        0.6,
+    )
     cv2.rectangle(canvas, (left, top), (right, bottom), _GREY, 1)
     if not values:
         return

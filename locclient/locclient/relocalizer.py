@@ -11,7 +11,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.pose_solver import Resection, ransac_resection, refine_resection, resection_with_rotation
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from locclient.map_view import MapView
-from locclient.settings import FixSettings, LocalizerSettings
+from locclient.settings import LocalizerSettings
 
 _NEIGHBOURHOOD_M = 3.0
 
@@ -75,15 +75,18 @@ class Relocalizer:
     def _at_place(self, seen: Seen, place: int, rotation: Array | None) -> Fix | None:
         settings = self._settings.fix
         rows = self.view.neighbourhood(place, _NEIGHBOURHOOD_M)
-        pairs = match_mutual(self.view.descriptors[rows], seen.features.descriptors, settings.max_distance, settings.ratio)
+        pairs = match_mutual(
+            self.view.descriptors[rows], seen.features.descriptors, settings.max_distance, settings.ratio
+        )
         if len(pairs) < settings.min_inliers // 2:
             return None
         points, pixels = self.view.points_map[rows[pairs[:, 0]]], seen.pixels[pairs[:, 1]]
         sigmas = self._sigmas(seen, pairs[:, 1], rows[pairs[:, 0]], points, None)
+        wide_px = 2 * settings.ransac_px + settings.rotation_sigma_rad * self._camera.focal_px
         found: Resection | None = None
         if rotation is not None:
             found = resection_with_rotation(
-                self._camera, points, pixels, sigmas, rotation.T, threshold_px=2 * settings.ransac_px + settings.rotation_sigma_rad * self._camera.focal_px,
+                self._camera, points, pixels, sigmas, rotation.T, threshold_px=wide_px,
                 min_inliers=settings.min_inliers // 2, rotation_sigma_rad=settings.rotation_sigma_rad,
             )  # fmt: skip
         if found is None:
@@ -136,17 +139,26 @@ class Relocalizer:
             return None
         map_from_cam = se3_inverse(found.cam_from_source)
         rotation = map_from_cam[:3, :3]
-        carry = np.zeros((6, 6))  # left perturbation in camera axes -> rotation about the camera's place and its position, map axes
+        carry = np.zeros(
+            (6, 6)
+        )  # left perturbation in camera axes -> rotation about the camera's place and its position, map axes
         carry[:3, :3] = carry[3:, 3:] = -rotation
         covariance = settings.covariance_scale * carry @ found.cov_rot_trans @ carry.T
         covariance += np.diag([settings.floor_rad**2] * 3 + [settings.floor_m**2] * 3)
         return Fix(map_from_cam, covariance, int(found.inliers.sum()), cells)
 
     def _sigmas(
-        self, seen: Seen, features: NDArray[np.int64], rows: NDArray[np.int64], points: Array, map_from_cam: Array | None
+        self,
+        seen: Seen,
+        features: NDArray[np.int64],
+        rows: NDArray[np.int64],
+        points: Array,
+        map_from_cam: Array | None,
     ) -> Array:
         """(N, 2): of pixels by octave, widened by the landmark's own uncertainty; of disparities."""
-        base = self._settings.fix.feature_sigma_px * orb.SCALE_FACTOR ** np.minimum(seen.features.octaves[features], 5).astype(np.float64)
+        base = self._settings.fix.feature_sigma_px * orb.SCALE_FACTOR ** np.minimum(
+            seen.features.octaves[features], 5
+        ).astype(np.float64)
         if map_from_cam is not None:
             distance = np.linalg.norm(points - map_from_cam[:3, 3], axis=1)
             base = np.hypot(base, np.minimum(self._camera.focal_px * self.view.sigmas_m[rows] / distance, 10.0))
@@ -160,7 +172,9 @@ class Relocalizer:
         depth = float(np.median(np.linalg.norm(self.view.points_map[rows] - map_from_cam[:3, 3], axis=1)))
         position = float(np.sqrt(np.linalg.eigvalsh(cov_rot_trans[3:, 3:])[-1]))
         angle = float(np.sqrt(np.linalg.eigvalsh(cov_rot_trans[:3, :3])[-1]))
-        return max(self._settings.fix.guided_radius_px, 3.0 * self._camera.focal_px * (position / max(depth, 0.5) + angle))
+        return max(
+            self._settings.fix.guided_radius_px, 3.0 * self._camera.focal_px * (position / max(depth, 0.5) + angle)
+        )
 
 
 def _same(a: Fix, b: Fix) -> bool:

@@ -59,7 +59,11 @@ class ReplayResult:
 
     def trajectory(self) -> Trajectory:
         """map_from_body of the localised frames."""
-        kept = [e for e, good in zip(self.estimates, localised(self.frames), strict=True) if good and e.map_from_body is not None]
+        kept = [
+            e
+            for e, good in zip(self.estimates, localised(self.frames), strict=True)
+            if good and e.map_from_body is not None
+        ]
         stamps = np.array([e.stamp_ns for e in kept], np.int64)
         return Trajectory(stamps, np.array([e.map_from_body for e in kept]).reshape(-1, 4, 4))
 
@@ -73,13 +77,23 @@ def replay(
     manifest = link.source.manifest(link.source.wanted())
     tiles = link.source.tiles(manifest)
     if not tiles.tiles:
-        raise LinkError(f"none of the {len(manifest.tiles)} tiles of version {manifest.version} is usable: {tiles.refused}")
+        raise LinkError(
+            f"none of the {len(manifest.tiles)} tiles of version {manifest.version} is usable: {tiles.refused}"
+        )
     rectifier = Rectifier(source.calibration, has_depth=source.recording.sensor_set is SensorSet.RGBD)
     localizer = Localizer(
-        source.calibration, rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s, settings, time.process_time
+        source.calibration,
+        rectifier.camera,
+        rectifier.body_from_cam,
+        rectifier.imu_minus_cam_s,
+        settings,
+        time.process_time,
     )
     localizer.handle_version(
-        manifest.version, tiles.tiles.values(), decode_vocabulary(link.source.vocabulary(manifest)), manifest.camera.focal_px
+        manifest.version,
+        tiles.tiles.values(),
+        decode_vocabulary(link.source.vocabulary(manifest)),
+        manifest.camera.focal_px,
     )
     if prior is not None:
         localizer.handle_prior(prior)
@@ -112,13 +126,23 @@ def replay(
     return result
 
 
-def _record(estimate: Estimate, truth: Array | None, cpu_s: float, wall_s: float, stages: dict[str, float]) -> FrameRecord:
+def _record(
+    estimate: Estimate, truth: Array | None, cpu_s: float, wall_s: float, stages: dict[str, float]
+) -> FrameRecord:
     error, angle = None, None
     if truth is not None and estimate.map_from_body is not None:
         error = estimate.map_from_body[:3, 3] - truth[:3, 3]
         angle = rotation_angle_rad(estimate.map_from_body[:3, :3].T @ truth[:3, :3])
     return FrameRecord(
-        estimate.stamp_ns, estimate.status, estimate.fix is not None, estimate.cov_rot_trans, error, angle, cpu_s, wall_s, stages
+        estimate.stamp_ns,
+        estimate.status,
+        estimate.fix is not None,
+        estimate.cov_rot_trans,
+        error,
+        angle,
+        cpu_s,
+        wall_s,
+        stages,
     )
 
 
@@ -134,10 +158,16 @@ class _Reporter:
 
     def after_frame(self, estimate: Estimate, base_from_body: Array) -> None:
         """Publishes what is due."""
-        if estimate.map_from_body is not None and estimate.cov_rot_trans is not None and self._due(estimate.stamp_ns, self._pose_ns, _POSE_EVERY_S):
+        if (
+            estimate.map_from_body is not None
+            and estimate.cov_rot_trans is not None
+            and self._due(estimate.stamp_ns, self._pose_ns, _POSE_EVERY_S)
+        ):
             self._pose_ns = estimate.stamp_ns
             map_from_base = estimate.map_from_body @ se3_inverse(base_from_body)
-            message = PoseMessage.of(estimate.stamp_ns, map_from_base, estimate.cov_rot_trans, estimate.status, estimate.map_version)
+            message = PoseMessage.of(
+                estimate.stamp_ns, map_from_base, estimate.cov_rot_trans, estimate.status, estimate.map_version
+            )
             self._send(lambda to: to.publish_pose(message))
         if self._due(estimate.stamp_ns, self._health_ns, _HEALTH_EVERY_S):
             self._health_ns = estimate.stamp_ns

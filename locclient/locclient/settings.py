@@ -10,7 +10,6 @@ class FixSettings(Section, frozen=True):
     """How one frame is placed in the map."""
 
     min_inliers: int = 15
-    min_inliers_alone: int = 25
     min_cells: int = 6
     top_places: int = 8
     max_distance: int = 75

@@ -1,7 +1,8 @@
 """A run without pictures: what an estimator would measure, landmark by landmark, at many times real time.
 
-The world, its stock, the motion, IMU, wheels, priors and dropped frames are those of the rendered run; the landmarks lie on the
-same surfaces and hide behind the same boxes. Movers and faults of the pictures other than darkness have no effect here.
+The world, its stock, the motion, IMU, wheels, priors and dropped frames are those of the rendered run; the landmarks
+lie on the same surfaces and hide behind the same boxes. Movers and faults of the pictures other than darkness have no
+effect here.
 """
 
 from dataclasses import dataclass
@@ -31,8 +32,8 @@ Ids = NDArray[np.uint64]
 class Sighting:
     """Landmarks in one picture, exactly, by rising id.
 
-    ids (N,); points_map, normals_map (N, 3); pixels (N, 3): rectified u_left v u_right; octaves (N,): at which they appear,
-    in fractions; distances_m (N,).
+    ids (N,); points_map, normals_map (N, 3); keys (N, 3) as in Landmarks; pixels (N, 3): rectified u_left v u_right;
+    octaves (N,): at which they appear, in fractions; distances_m (N,).
     """
 
     ids: Ids
@@ -48,8 +49,8 @@ class Sighting:
 class Found:
     """Features of one picture as a detector would report them.
 
-    rows (N,): of the sighting, -1 for clutter; pixels (N, 3), the third NaN where the disparity is unknown; octaves (N,);
-    descriptors (N, 32) uint8.
+    rows (N,): of the sighting, -1 for clutter; pixels (N, 3), the third NaN where the disparity is unknown; octaves
+    (N,); descriptors (N, 32) uint8.
     """
 
     rows: NDArray[np.int32]
@@ -59,9 +60,10 @@ class Found:
 
 
 class EstimatorSession:
-    """Measurements of a prepared session, frame by frame in any order (rising order is fastest). Equal arguments, equal bits.
+    """Measurements of a prepared session, frame by frame in any order; rising order is fastest.
 
-    flow, features: statistics of the measurements. field: share it among sessions of one world to make its landmarks once.
+    Equal arguments give equal bits. flow, features: statistics of the measurements. field: share it among sessions of
+    one world to make its landmarks once.
     """
 
     def __init__(
@@ -105,11 +107,13 @@ class EstimatorSession:
         kept = seen.ids[at] == ids if len(seen.ids) else np.zeros(len(ids), bool)
         pixels, held = np.full((len(ids), 3), np.nan), np.zeros(int(kept.sum()), bool)
         measured = np.empty((int(kept.sum()), 3))
+        exact, is_floor = seen.pixels[at[kept]], seen.points_map[at[kept], 2] < _FLOOR_M
         estimator_kernels.flow_noise(
-            ids[kept], seen.pixels[at[kept]], begun_px[kept], seen.points_map[at[kept], 2] < _FLOOR_M, frame, self._seed, flow.white_px,
-            flow.lag, flow.along, flow.across, flow.floor_lag, flow.floor_along, flow.slip_share, flow.slip, flow.lost_share, flow.stretch_frames, flow.disparity_known_share, flow.disparity_px,
-            flow.disparity_rough_share, flow.disparity_rough_px, flow.disparity_rough_bias_px, flow.disparity_wrong_share,
-            flow.disparity_wrong_px, self._table, measured, held,
+            ids[kept], exact, begun_px[kept], is_floor, frame, self._seed, flow.white_px, flow.lag, flow.along,
+            flow.across, flow.floor_lag, flow.floor_along, flow.slip_share, flow.slip, flow.lost_share,
+            flow.stretch_frames, flow.disparity_known_share, flow.disparity_px, flow.disparity_rough_share,
+            flow.disparity_rough_px, flow.disparity_rough_bias_px, flow.disparity_wrong_share, flow.disparity_wrong_px,
+            self._table, measured, held,
         )  # fmt: skip
         pixels[kept] = measured
         kept[kept] = held
@@ -118,8 +122,8 @@ class EstimatorSession:
     def corners(self, frame: int, taken: Array, count: int, min_distance_px: float) -> tuple[Ids, Array]:
         """Up to `count` landmarks to follow from a frame on, and their exact pixels (N, 2).
 
-        At least min_distance_px from each other and from `taken` (M, 2), in an order of their own: a strong corner is chosen
-        in every frame.
+        At least min_distance_px from each other and from `taken` (M, 2), in an order of their own: a strong corner is
+        chosen in every frame.
         """
         seen = self.sighting(frame)
         pixels, camera = np.ascontiguousarray(seen.pixels[:, :2]), self.camera
@@ -148,9 +152,10 @@ class EstimatorSession:
         level = np.hypot(toward[:, 0], toward[:, 1])
         directions = np.stack([np.arctan2(toward[:, 1], toward[:, 0]), np.arctan2(toward[:, 2], level)], axis=1)
         count = estimator_kernels.detect(
-            seen.keys, seen.pixels, seen.octaves, directions, frame, self._seed, model.found_share, model.view_share, model.corner_px, model.octave_sigma,
-            model.disparity_known_share, model.disparity_px, model.disparity_wrong_share, model.disparity_wrong_px,
-            model.dirt_bits, model.view_bits, model.view_step_rad, model.noise_bits, self._table, rows, pixels, octaves, words,
+            seen.keys, seen.pixels, seen.octaves, directions, frame, self._seed, model.found_share, model.view_share,
+            model.corner_px, model.octave_sigma, model.disparity_known_share, model.disparity_px,
+            model.disparity_wrong_share, model.disparity_wrong_px, model.dirt_bits, model.view_bits,
+            model.view_step_rad, model.noise_bits, self._table, rows, pixels, octaves, words,
         )  # fmt: skip
         count = min(count, model.count)
         total = model.count if len(seen.ids) else 0

@@ -30,15 +30,17 @@ def slow_normal(key: np.uint64, phase: float, table: Float) -> float:
 
 @kernel
 def flow_noise(
-    ids: Words, exact: Float, begun: Float, is_floor: NDArray[np.bool_], frame: int, seed: int, white_px: float, lag: float,
-    along: float, across: float, floor_lag: float, floor_along: float, slip_share: float, slip: float, lost_share: float, stretch_frames: float, known_share: float, disparity_px: float,
-    rough_share: float, rough_px: float, rough_bias_px: float, wrong_share: float, wrong_px: float, table: Float,
-    pixels: Float, kept: NDArray[np.bool_],
+    ids: Words, exact: Float, begun: Float, is_floor: NDArray[np.bool_], frame: int, seed: int, white_px: float,
+    lag: float, along: float, across: float, floor_lag: float, floor_along: float, slip_share: float, slip: float,
+    lost_share: float, stretch_frames: float, known_share: float, disparity_px: float, rough_share: float,
+    rough_px: float, rough_bias_px: float, wrong_share: float, wrong_px: float, table: Float, pixels: Float,
+    kept: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """What following corners by optical flow makes of exact pixels (N, 3) begun at (N, 2); `kept` is false where it loses one.
+    """What following corners by optical flow makes of exact pixels (N, 3) begun at (N, 2).
 
-    The error grows with the way since the beginning, along it and across it, by factors of the landmark's own (`slip` for the
-    share that slides along edges; the floor's reflections hold corners back), plus white noise. Disparities are unknown, rough or wrong for stretches of time.
+    `kept` is false where the flow loses one. The error grows with the way since the beginning, along it and across it,
+    by factors of the landmark's own (`slip` for the share that slides along edges; the floor's reflections hold corners
+    back), plus white noise. Disparities are unknown, rough or wrong for stretches of time.
     """
     for n in range(ids.shape[0]):
         own = mixed(ids[n], np.uint64(seed))
@@ -68,12 +70,14 @@ def flow_noise(
 
 @kernel
 def detect(
-    keys: Words, exact: Float, exact_octaves: Float, directions: Float, frame: int, seed: int, found_share: float, view_share: float, corner_px: float,
-    octave_sigma: float, known_share: float, disparity_px: float, wrong_share: float, wrong_px: float, dirt_bits: int, view_bits: int, view_step_rad: float,
-    noise_bits: float, table: Float, rows: NDArray[np.int32], pixels: Float, octaves: NDArray[np.int8], words: Words,
+    keys: Words, exact: Float, exact_octaves: Float, directions: Float, frame: int, seed: int, found_share: float,
+    view_share: float, corner_px: float, octave_sigma: float, known_share: float, disparity_px: float,
+    wrong_share: float, wrong_px: float, dirt_bits: int, view_bits: int, view_step_rad: float, noise_bits: float,
+    table: Float, rows: NDArray[np.int32], pixels: Float, octaves: NDArray[np.int8], words: Words,
 ) -> int:  # fmt: skip
-    """Features that a detector finds at exact pixels (N, 3): their number; rows, pixels, octaves, descriptors (N, 4) words.
+    """Number of features that a detector finds at exact pixels (N, 3).
 
+    rows, pixels, octaves and descriptors (N, 4) are filled so far. directions (N, 2): azimuth and elevation of the view.
     A descriptor follows from the look, with bits changed by the dirt, by the direction of view (in steps), by noise.
     """
     count = 0
@@ -105,9 +109,8 @@ def detect(
             words[count, word] = state
         change_bits(words, count, mixed(keys[n, 0], keys[n, 1]), dirt_bits)
         change_bits(words, count, view, view_bits)
-        change_bits(
-            words, count, mixed(now, np.uint64(43)), int(noise_bits * 2.0 * uniform(mixed(now, np.uint64(44))) + 0.5)
-        )
+        noise = int(noise_bits * 2.0 * uniform(mixed(now, np.uint64(44))) + 0.5)
+        change_bits(words, count, mixed(now, np.uint64(43)), noise)
         octaves[count] = octave
         rows[count] = n
         count += 1

@@ -77,7 +77,8 @@ def test_rigid_transforms_are_the_matrix_exponential_and_come_back(rot_trans: Ar
 def test_left_jacobian_is_the_derivative_of_the_exponential(rotvec: Array) -> None:
     step = 1e-6
     columns = [
-        (so3_log(so3_exp(rotvec + d) @ so3_exp(rotvec).T) - so3_log(so3_exp(rotvec - d) @ so3_exp(rotvec).T)) / (2 * step)
+        (so3_log(so3_exp(rotvec + d) @ so3_exp(rotvec).T) - so3_log(so3_exp(rotvec - d) @ so3_exp(rotvec).T))
+        / (2 * step)
         for d in step * np.eye(3)
     ]
     np.testing.assert_allclose(so3_left_jacobian(rotvec), np.stack(columns, axis=1), atol=1e-7)

@@ -95,7 +95,9 @@ def test_points_come_back_from_pixel_and_disparity() -> None:
 
 
 def test_a_rig_that_is_rectified_already_keeps_its_pictures() -> None:
-    pinhole = CameraCalibration("radial-tangential", WIDTH, HEIGHT, np.array([200.0, 200, 160, 120]), np.zeros(4), np.eye(4))
+    pinhole = CameraCalibration(
+        "radial-tangential", WIDTH, HEIGHT, np.array([200.0, 200, 160, 120]), np.zeros(4), np.eye(4)
+    )
     second = CameraCalibration(
         "radial-tangential", WIDTH, HEIGHT, pinhole.intrinsics_px, np.zeros(4), se3(np.eye(3), np.array([0.5, 0, 0]))
     )

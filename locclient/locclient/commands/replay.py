@@ -15,18 +15,30 @@ def replay(
     site: Annotated[str | None, typer.Option(help="Name of the site.")] = None,
     robot: Annotated[str | None, typer.Option(help="Name under which the robot reports.")] = None,
     frames: Annotated[str | None, typer.Option(help="Which frames, as a Python slice A:B:C.")] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Calibration file that goes before the recording's own.")] = None,
-    prior: Annotated[str | None, typer.Option(help="Where the robot starts: X,Y,YAW,SIGMA_M (metres, radians).")] = None,
-    reverse: Annotated[bool | None, typer.Option("--reverse", help="Play backwards, with new stamps and without IMU.")] = None,
-    realtime: Annotated[bool | None, typer.Option("--realtime", help="As fast as it was recorded, not as fast as possible.")] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration file that goes before the recording's own.")
+    ] = None,
+    prior: Annotated[
+        str | None, typer.Option(help="Where the robot starts: X,Y,YAW,SIGMA_M (metres, radians).")
+    ] = None,
+    reverse: Annotated[
+        bool | None, typer.Option("--reverse", help="Play backwards, with new stamps and without IMU.")
+    ] = None,
+    realtime: Annotated[
+        bool | None, typer.Option("--realtime", help="As fast as it was recorded, not as fast as possible.")
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="Write the report here, JSON.")] = None,
     trajectory: Annotated[Path | None, typer.Option(help="Write the localised frames here, TUM format.")] = None,
     picture: Annotated[Path | None, typer.Option(help="Write a top-down picture here, PNG.")] = None,
     cache: Annotated[Path | None, typer.Option(help="Folder of the tile cache (default: the user's cache).")] = None,
-    config: Annotated[Path | None, typer.Option(help="TOML file with these options and the localizer's settings.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="TOML file with these options and the localizer's settings.")
+    ] = None,
 ) -> None:
     """Fetches the site's map, localises every frame in it, and reports what the run was worth."""
-    given = {name: value for name, value in locals().items() if name not in ("recording", "config") and value is not None}
+    given = {
+        name: value for name, value in locals().items() if name not in ("recording", "config") and value is not None
+    }
     from fleetmap.config import load_toml
     from locclient.config import LocclientConfig
 
@@ -36,6 +48,11 @@ def replay(
         raise UsageError("--site NAME is missing: which site's map?")
     if (options["server"] is None) == (options["store"] is None):
         raise UsageError("give either --server tcp/HOST:PORT or --store DIR")
+    for name in ("report", "trajectory", "picture"):
+        if options[name] is not None and not Path(options[name]).parent.is_dir():
+            raise UsageError(
+                f"--{name} {options[name]}: the folder {Path(options[name]).parent} does not exist; make it first"
+            )
     _run(recording, options, loaded)
 
 
@@ -72,7 +89,14 @@ def _run(path: Path, options: dict[str, Any], config: Any) -> None:
             console.print(f"note: {loss.what} {loss.detail}".rstrip())
         source = ReplaySource.of(recording, selection, reverse=options["reverse"])
         task = bar.add_task("replay", total=len(source))
-        result = play(source, link, config.localizer, prior, realtime=options["realtime"], progress=lambda n: bar.update(task, completed=n + 1))
+        result = play(
+            source,
+            link,
+            config.localizer,
+            prior,
+            realtime=options["realtime"],
+            progress=lambda n: bar.update(task, completed=n + 1),
+        )
     built = result.report()
     if options["report"] is not None:
         Path(options["report"]).write_text(json.dumps(msgspec.to_builtins(built), indent=2) + "\n")
@@ -95,8 +119,8 @@ def _prior(text: str | None) -> Any:
         x_m, y_m, yaw_rad, sigma_m = (float(part) for part in text.split(","))
     except ValueError as error:
         raise UsageError(f"--prior {text!r} is not X,Y,YAW,SIGMA_M: four numbers, metres and radians") from error
-    if not sigma_m > 0:
-        raise UsageError(f"--prior {text!r}: SIGMA_M must be positive metres")
+    if not np.isfinite([x_m, y_m, yaw_rad, sigma_m]).all() or not sigma_m > 0:
+        raise UsageError(f"--prior {text!r}: all four must be finite numbers and SIGMA_M positive metres")
     covariance = np.diag([np.inf, np.inf, np.inf, sigma_m**2, sigma_m**2, np.inf])
     return PositionPrior(0, se3(so3_exp(np.array([0.0, 0.0, yaw_rad])), np.array([x_m, y_m, 0.0])), covariance)
 
@@ -107,9 +131,13 @@ def _print_table(report: dict[str, object]) -> None:
 
     table = Table("measure", "value")
     for name, value in report.items():
-        if isinstance(value, dict):
-            value = "  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in value.items())
-        elif isinstance(value, float):
-            value = f"{value:.4g}"
-        table.add_row(name, "-" if value is None or value in ("", []) else str(value))
+        table.add_row(name, _shown(value))
     Console().print(table)
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, dict):
+        return "  ".join(f"{k} {_shown(v)}" for k, v in value.items()) or "-"
+    if value is None or value in ("", []):
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

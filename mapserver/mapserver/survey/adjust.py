@@ -49,7 +49,9 @@ class SurveyState:
         return np.asarray(se3_inverse(map_from_cam[0]) @ map_from_cam[1])
 
 
-def adjust(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_] | None = None, rounds: int = 3) -> BundleResult:
+def adjust(
+    state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_] | None = None, rounds: int = 3
+) -> BundleResult:
     """Adjusts `state` in place; outlying observations are dropped between rounds. `free` (K,) limits it to a window."""
     for round_number in range(rounds):
         problem = _problem(state, settings, free)
@@ -105,7 +107,11 @@ def _local(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_]
     result = optimize(_problem(part, settings, free[keyframes]), settings.bundle)
     state.map_from_body[keyframes] = result.map_from_body
     marks.points_map[touched] = result.points_map
-    if result.velocities_map_mps is not None and result.gyro_bias_radps is not None and result.accel_bias_mps2 is not None:
+    if (
+        result.velocities_map_mps is not None
+        and result.gyro_bias_radps is not None
+        and result.accel_bias_mps2 is not None
+    ):
         motion.velocities_mps[keyframes] = result.velocities_map_mps
         motion.gyro_bias_radps[keyframes] = result.gyro_bias_radps
         motion.accel_bias_mps2[keyframes] = result.accel_bias_mps2
@@ -136,7 +142,13 @@ def _inertial(state: SurveyState, settings: SurveySettings, held: NDArray[np.boo
         if held is not None and held[k] and held[k + 1]:
             continue
         start, end = int(state.stamps_ns[k]) + offset_ns, int(state.stamps_ns[k + 1]) + offset_ns
-        edges.append((k, k + 1, preintegrate(motion.imu, start, end, motion.gyro_bias_radps[k], motion.accel_bias_mps2[k], noise)))
+        edges.append(
+            (
+                k,
+                k + 1,
+                preintegrate(motion.imu, start, end, motion.gyro_bias_radps[k], motion.accel_bias_mps2[k], noise),
+            )
+        )
     return InertialTerms(motion.velocities_mps, motion.gyro_bias_radps, motion.accel_bias_mps2, edges, fixed=held)
 
 
@@ -154,7 +166,11 @@ def widened(noise: ImuNoise, settings: SurveySettings) -> ImuNoise:
 def _take(state: SurveyState, result: BundleResult) -> None:
     state.map_from_body = result.map_from_body
     state.landmarks.points_map = result.points_map
-    if result.velocities_map_mps is not None and result.gyro_bias_radps is not None and result.accel_bias_mps2 is not None:
+    if (
+        result.velocities_map_mps is not None
+        and result.gyro_bias_radps is not None
+        and result.accel_bias_mps2 is not None
+    ):
         state.motion.velocities_mps = result.velocities_map_mps
         state.motion.gyro_bias_radps = result.gyro_bias_radps
         state.motion.accel_bias_mps2 = result.accel_bias_mps2

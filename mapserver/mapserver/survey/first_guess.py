@@ -36,7 +36,12 @@ def run_odometry(
 ) -> FirstGuess:  # fmt: skip
     """Feeds frames (in order) and the IMU up to each into the odometry; progress is called with each frame's number."""
     odometry = Odometry(
-        calibration, rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s, settings.odometry, settings.stereo
+        calibration,
+        rectifier.camera,
+        rectifier.body_from_cam,
+        rectifier.imu_minus_cam_s,
+        settings.odometry,
+        settings.stereo,
     )
     policy = KeyframePolicy(settings.keyframes)
     estimates: list[OdometryEstimate] = []
@@ -69,7 +74,12 @@ def run_odometry(
 
 def _summary(frame: RectifiedFrame, estimate: OdometryEstimate) -> FrameSummary:
     return FrameSummary(
-        frame.stamp_ns, estimate.odom_from_body, estimate.track_ids, estimate.scene_depth_m, sharpness(frame), estimate.after_gap
+        frame.stamp_ns,
+        estimate.odom_from_body,
+        estimate.track_ids,
+        estimate.scene_depth_m,
+        sharpness(frame),
+        estimate.after_gap,
     )
 
 

@@ -17,8 +17,9 @@ from mapserver.survey.pose_graph import PoseEdge, adjoint
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.zones import Zones
 
-CHI2_6_0999 = 22.458
-_CORRELATION = 3.0  # matched points share calibration and depth errors: a pair's own covariance is too narrow by about this
+_CORRELATION = (
+    3.0  # matched points share calibration and depth errors: a pair's own covariance is too narrow by about this
+)
 
 
 class Verdict(StrEnum):
@@ -94,11 +95,15 @@ class LoopCloser:
         """Looks for revisits of keyframe i among those before it, then adds it to the index. To be called in order."""
         settings = self._settings.loops
         ids = self._index.place_ids
-        new = np.array([(j, i) not in self._matched and i - j >= settings.min_gap_keyframes for j in ids.tolist()], bool)
+        new = np.array(
+            [(j, i) not in self._matched and i - j >= settings.min_gap_keyframes for j in ids.tolist()], bool
+        )
         if new.any():
             found, scores = self._index.query(self._vectors[i], new, settings.top)
             believed = [
-                edge for j, score in zip(found.tolist(), scores.tolist(), strict=True) if (edge := self._judge(i, j, score)) is not None
+                edge
+                for j, score in zip(found.tolist(), scores.tolist(), strict=True)
+                if (edge := self._judge(i, j, score)) is not None
             ]
             self._decide(i, believed)
         self._index.add(i, self._vectors[i])
@@ -132,8 +137,10 @@ class LoopCloser:
             return refuse(Verdict.REJECTED, f"{count} matches in {cells} of 48 cells are too few or too crowded", count)
         edge = self._edge(match)
         innovation = self._marginals.innovation_squared(edge)
-        if innovation > CHI2_6_0999:
-            return refuse(Verdict.GATED_OUT, f"matches, but from where the robot cannot be (innovation {innovation:.0f})", count)
+        if innovation > self._settings.loops.max_innovation:
+            return refuse(
+                Verdict.GATED_OUT, f"matches, but from where the robot cannot be (innovation {innovation:.0f})", count
+            )
         supported = self._neighbours_agree(match)
         if supported is False or (supported is None and count < self._settings.loops.alone_inliers):
             return refuse(Verdict.REJECTED, "neighbouring keyframes do not confirm it", count)
@@ -141,7 +148,9 @@ class LoopCloser:
 
     def _verify(self, i: int, j: int) -> PairMatch | None:
         """Match of j (as reference) with i; the graph's rotation is used where it is known well enough."""
-        predicted = self._cam_from_body @ se3_inverse(self._map_from_body[i]) @ self._map_from_body[j] @ self._body_from_cam
+        predicted = (
+            self._cam_from_body @ se3_inverse(self._map_from_body[i]) @ self._map_from_body[j] @ self._body_from_cam
+        )
         sigma = float(np.sqrt(np.trace(self._marginals.relative_cov(i, j)[:3, :3])))
         known = max(sigma, 0.02) if sigma < self._settings.loops.rotation_sigma_limit_rad else None
         return match_pair(j, i, self._keyframes, self._camera, predicted, known, self._settings.pairs)
@@ -160,9 +169,13 @@ class LoopCloser:
         for n in sorted(self._neighbours.get(j, []), key=lambda n: abs(n - j))[:4]:
             if n == i:
                 continue
-            j_from_n = self._cam_from_body @ se3_inverse(self._map_from_body[j]) @ self._map_from_body[n] @ self._body_from_cam
+            j_from_n = (
+                self._cam_from_body @ se3_inverse(self._map_from_body[j]) @ self._map_from_body[n] @ self._body_from_cam
+            )
             predicted = match.j_from_i @ j_from_n
-            other = match_pair(n, i, self._keyframes, self._camera, predicted, None, self._settings.pairs, is_known=True)
+            other = match_pair(
+                n, i, self._keyframes, self._camera, predicted, None, self._settings.pairs, is_known=True
+            )
             if other is None:
                 continue
             tried += 1
@@ -175,14 +188,19 @@ class LoopCloser:
         """Accepts what is left, unless the candidates exclude each other: then none is."""
         places = [self._map_from_body[e.j] @ se3_inverse(e.i_from_j) for e, _ in believed]
         spread = max((float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a in places for b in places), default=0.0)
-        tolerance = 0.3 + max(
-            (3.0 * float(np.sqrt(np.trace(self._marginals.relative_cov(a.j, b.j)[3:, 3:]))) for a, _ in believed for b, _ in believed if a.j != b.j),
-            default=0.0,
-        )  # fmt: skip
+        between = [self._marginals.relative_cov(a.j, b.j) for a, _ in believed for b, _ in believed if a.j != b.j]
+        tolerance = 0.3 + max((3.0 * float(np.sqrt(np.trace(c[3:, 3:]))) for c in between), default=0.0)
         for edge, record in believed:
             if spread > tolerance:
                 self.loops.records.append(
-                    LoopRecord(i, record.j, record.score, Verdict.AMBIGUOUS, f"candidates {spread:.2f} m apart exclude each other", record.inliers)
+                    LoopRecord(
+                        i,
+                        record.j,
+                        record.score,
+                        Verdict.AMBIGUOUS,
+                        f"candidates {spread:.2f} m apart exclude each other",
+                        record.inliers,
+                    )
                 )
                 continue
             self.loops.records.append(record)

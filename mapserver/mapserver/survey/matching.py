@@ -18,7 +18,9 @@ _MAX_VIEW_ANGLE_DEG = 75.0
 class PairFinder:
     """Matches keyframes that should see the same things, given where they are."""
 
-    def __init__(self, keyframes: list[Keyframe], camera: StereoCamera, body_from_cam: Array, settings: SurveySettings) -> None:
+    def __init__(
+        self, keyframes: list[Keyframe], camera: StereoCamera, body_from_cam: Array, settings: SurveySettings
+    ) -> None:
         self._keyframes, self._camera, self._body_from_cam, self._settings = keyframes, camera, body_from_cam, settings
         self._depths = np.array([median_depth_m(k) for k in keyframes])
 
@@ -41,7 +43,10 @@ class PairFinder:
             )
             closest = earlier[near][np.argsort(distance[near], kind="stable")][:_NEAR_CANDIDATES]
             cam_j_from_map = se3_inverse(map_from_cam[j])
-            overlap = [(view_overlap(self._keyframes[i], self._camera, cam_j_from_map @ map_from_cam[i]), int(i)) for i in closest]
+            overlap = [
+                (view_overlap(self._keyframes[i], self._camera, cam_j_from_map @ map_from_cam[i]), int(i))
+                for i in closest
+            ]
             best = sorted(overlap, reverse=True)[: settings.covisible]
             chosen |= {i for share, i in best if share > settings.min_overlap}
             found.extend((i, j) for i in sorted(chosen))
@@ -57,7 +62,14 @@ class PairFinder:
         for number, (i, j) in enumerate(candidates):
             predicted = se3_inverse(map_from_cam[j]) @ map_from_cam[i]
             match = match_pair(
-                i, j, self._keyframes, self._camera, predicted, rotation_sigma_rad, self._settings.pairs, is_known=is_known
+                i,
+                j,
+                self._keyframes,
+                self._camera,
+                predicted,
+                rotation_sigma_rad,
+                self._settings.pairs,
+                is_known=is_known,
             )
             if match is not None and _agrees(match.j_from_i, predicted, allowed_m(i, j)):
                 matches.append(match)

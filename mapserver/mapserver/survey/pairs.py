@@ -57,7 +57,12 @@ def _sigmas(keyframe: Keyframe, index: Indices, settings: PairSettings) -> Array
 
 
 def _from_descriptors(
-    a: Keyframe, b: Keyframe, camera: StereoCamera, j_from_i: Array | None, rotation_sigma_rad: float | None, settings: PairSettings
+    a: Keyframe,
+    b: Keyframe,
+    camera: StereoCamera,
+    j_from_i: Array | None,
+    rotation_sigma_rad: float | None,
+    settings: PairSettings,
 ) -> Resection | None:
     known = np.flatnonzero(np.isfinite(a.disparities[:, 0]))
     pairs = match_mutual(a.features.descriptors[known], b.features.descriptors, settings.max_distance, settings.ratio)
@@ -84,7 +89,10 @@ def _project_match(
     points_b = transform_points(b_from_a, a.points_cam[known])
     predicted = camera.pixel_from_point(points_b)[:, :2]
     inside = (
-        (predicted[:, 0] > 0) & (predicted[:, 1] > 0) & (predicted[:, 0] < camera.width_px) & (predicted[:, 1] < camera.height_px)
+        (predicted[:, 0] > 0)
+        & (predicted[:, 1] > 0)
+        & (predicted[:, 0] < camera.width_px)
+        & (predicted[:, 1] < camera.height_px)
     )
     predicted[~inside] = np.nan
     ratio = np.clip(a.points_cam[known, 2] / np.maximum(points_b[:, 2], 0.05), 0.1, 10.0)
@@ -120,13 +128,19 @@ def _complete(
         if len(forward) < settings.min_inliers:
             return None
         again = refine_resection(
-            camera, a.points_cam[forward[:, 0]], _measured(b, forward[:, 1]), _sigmas(b, forward[:, 1], settings), found.cam_from_source
+            camera,
+            a.points_cam[forward[:, 0]],
+            _measured(b, forward[:, 1]),
+            _sigmas(b, forward[:, 1], settings),
+            found.cam_from_source,
         )
         if again is None or again.inliers.sum() < settings.min_inliers:
             return None
         found = again
     forward = forward[found.inliers]
-    backward = _project_match(b, a, camera, se3_inverse(found.cam_from_source), settings, settings.guided_radius_px)[:, ::-1]
+    backward = _project_match(b, a, camera, se3_inverse(found.cam_from_source), settings, settings.guided_radius_px)[
+        :, ::-1
+    ]
     fresh = ~np.isin(backward[:, 0], forward[:, 0]) & ~np.isin(backward[:, 1], forward[:, 1])
     return PairMatch(i, j, np.vstack([forward, backward[fresh]]), found.cam_from_source, found.cov_rot_trans)
 
@@ -138,6 +152,8 @@ def view_overlap(a: Keyframe, camera: StereoCamera, b_from_a: Array) -> float:
         return 0.0
     seen = transform_points(b_from_a, points)
     pixels = camera.pixel_from_point(seen)
-    inside = (pixels[:, 0] > 0) & (pixels[:, 1] > 0) & (pixels[:, 0] < camera.width_px) & (pixels[:, 1] < camera.height_px)
+    inside = (
+        (pixels[:, 0] > 0) & (pixels[:, 1] > 0) & (pixels[:, 0] < camera.width_px) & (pixels[:, 1] < camera.height_px)
+    )
     ratio = seen[:, 2] / points[:, 2]
     return float((inside & (ratio > 0.4) & (ratio < 2.5)).mean())

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,14 +48,20 @@ def survey(
     vocabulary: Vocabulary | None, settings: SurveySettings, zones: Zones, progress: Progress,
 ) -> Survey:  # fmt: skip
     """Maps one recording. Raises SurveyError where it holds too little to map."""
-    guess = run_odometry(frames, imu, calibration, rectifier, settings, lambda n: progress("odometry", n + 1, frame_count))
+    guess = run_odometry(
+        frames, imu, calibration, rectifier, settings, lambda n: progress("odometry", n + 1, frame_count)
+    )
     keyframes = guess.keyframes
     if len(keyframes) < _MIN_KEYFRAMES:
-        raise SurveyError(f"{frame_count} frames gave {len(keyframes)} keyframe(s); a map needs motion, at least {_MIN_KEYFRAMES}")
+        raise SurveyError(
+            f"{frame_count} frames gave {len(keyframes)} keyframe(s); a map needs motion, at least {_MIN_KEYFRAMES}"
+        )
     state = _first_state(guess, imu, calibration, rectifier, settings)
     finder = PairFinder(keyframes, rectifier.camera, rectifier.body_from_cam, settings)
     pairs = _match_neighbours(guess, state, finder, settings, progress)
-    state.landmarks = build_landmarks(keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings)
+    state.landmarks = build_landmarks(
+        keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings
+    )
     if len(state.landmarks.points_map) < _MIN_LANDMARKS:
         raise SurveyError(
             f"{len(keyframes)} keyframes share only {len(state.landmarks.points_map)} landmarks; look at the recording with "
@@ -69,7 +76,9 @@ def survey(
     for round_number in range(2):
         progress("global adjustment", round_number, 2)
         pairs = _match_all(state, finder, settings, progress)
-        state.landmarks = build_landmarks(keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings)
+        state.landmarks = build_landmarks(
+            keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings
+        )
         adjust(state, settings)
     progress("global adjustment", 2, 2)
     return Survey(summarise(state, guess, settings), vocabulary, loops, guess)
@@ -95,9 +104,11 @@ def _first_state(
 def _odometry_terms(guess: FirstGuess, numbers: list[int]) -> list[RelativeTerm]:
     """Without an IMU, neighbours are held by odometry: weakly, so that it decides only where landmarks do not."""
     terms = []
-    for k, (a, b) in enumerate(zip(numbers, numbers[1:], strict=False)):
+    for k, (a, b) in enumerate(pairwise(numbers)):
         i_from_j = se3_inverse(guess.odom_from_body[a]) @ guess.odom_from_body[b]
-        terms.append(RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(25.0 * _edge_covariance(guess, a, b)).astype(np.float64)))
+        terms.append(
+            RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(25.0 * _edge_covariance(guess, a, b)).astype(np.float64))
+        )
     return terms
 
 
@@ -117,7 +128,9 @@ def _match_neighbours(
     guess: FirstGuess, state: SurveyState, finder: PairFinder, settings: SurveySettings, progress: Progress
 ) -> list[PairMatch]:
     candidates = finder.candidates(
-        state.map_from_body, previous=settings.pairs.previous, only_near=max(settings.loops.min_gap_keyframes, settings.pairs.previous)
+        state.map_from_body,
+        previous=settings.pairs.previous,
+        only_near=max(settings.loops.min_gap_keyframes, settings.pairs.previous),
     )
     covariances = guess.covariances[[k.frame_index for k in guess.keyframes]]
     return finder.match(
@@ -170,7 +183,7 @@ def _close_loops(
 def _chain_edges(guess: FirstGuess, state: SurveyState) -> list[PoseEdge]:
     edges = []
     numbers = [k.frame_index for k in guess.keyframes]
-    for k, (a, b) in enumerate(zip(numbers, numbers[1:], strict=False)):
+    for k, (a, b) in enumerate(pairwise(numbers)):
         i_from_j = se3_inverse(state.map_from_body[k]) @ state.map_from_body[k + 1]
         edges.append(PoseEdge(k, k + 1, i_from_j, _edge_covariance(guess, a, b), is_loop=False))
     return edges

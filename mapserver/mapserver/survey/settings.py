@@ -43,7 +43,7 @@ class LoopSettings(Section, frozen=True):
 
     top: int = 8
     min_gap_keyframes: int = 8
-    chi_square_share: float = 0.999
+    max_innovation: float = 22.458  # 0.999 of chi-square with 6 degrees of freedom
     view_range_depths: float = 1.0
     min_inliers: int = 15
     alone_inliers: int = 30

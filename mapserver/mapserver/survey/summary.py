@@ -21,7 +21,9 @@ _MIN_TIED = 8
 def summarise(state: SurveyState, guess: FirstGuess, settings: SurveySettings) -> SurveyMap:
     """The SurveyMap of an adjusted survey, in the survey's own frame."""
     marks, keyframes = state.landmarks, guess.keyframes
-    octaves = np.array([keyframes[k].features.octaves[f] for k, f in zip(marks.obs_keyframe, marks.obs_feature, strict=True)], np.int8)
+    octaves = np.array(
+        [keyframes[k].features.octaves[f] for k, f in zip(marks.obs_keyframe, marks.obs_feature, strict=True)], np.int8
+    )
     frame_stamps = np.array([e.stamp_ns for e in guess.estimates], np.int64)
     numbers = [k.frame_index for k in keyframes]
     map_from_body = frame_trajectory(frame_stamps, guess.odom_from_body, numbers, state.map_from_body)
@@ -47,7 +49,9 @@ def summarise(state: SurveyState, guess: FirstGuess, settings: SurveySettings) -
 
 def _descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
     """(N, 32): of each landmark's descriptors the one nearest to all others (their medoid)."""
-    rows = np.array([keyframes[k].features.descriptors[f] for k, f in zip(marks.obs_keyframe, marks.obs_feature, strict=True)])
+    rows = np.array(
+        [keyframes[k].features.descriptors[f] for k, f in zip(marks.obs_keyframe, marks.obs_feature, strict=True)]
+    )
     out = np.zeros((len(marks.points_map), 32), np.uint8)
     starts = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map) + 1))
     words = packed(rows) if len(rows) else np.zeros((0, 4), np.uint64)

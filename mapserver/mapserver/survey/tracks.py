@@ -88,7 +88,9 @@ def build_landmarks(
         return Landmarks(np.zeros((0, 3)), nothing, nothing, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)))
     table = np.array(rows, np.int64)
     pixels, sigmas = _observe(keyframes, table, map_from_cam, camera, settings)
-    return Landmarks(np.array(points), table[:, 0].astype(np.int32), table[:, 1].astype(np.int32), table[:, 2], pixels, sigmas)
+    return Landmarks(
+        np.array(points), table[:, 0].astype(np.int32), table[:, 1].astype(np.int32), table[:, 2], pixels, sigmas
+    )
 
 
 def _reference(keyframes: list[Keyframe], group: list[tuple[int, int]]) -> tuple[int, int] | None:
@@ -96,11 +98,18 @@ def _reference(keyframes: list[Keyframe], group: list[tuple[int, int]]) -> tuple
     usable = [(k, f) for k, f in group if np.isfinite(keyframes[k].disparities[f, 0])]
     if not usable:
         return None
-    return min(usable, key=lambda node: (keyframes[node[0]].features.octaves[node[1]], -keyframes[node[0]].disparities[node[1], 0]))
+    return min(
+        usable,
+        key=lambda node: (keyframes[node[0]].features.octaves[node[1]], -keyframes[node[0]].disparities[node[1], 0]),
+    )
 
 
 def _observe(
-    keyframes: list[Keyframe], table: NDArray[np.int64], map_from_cam: Array, camera: StereoCamera, settings: SurveySettings
+    keyframes: list[Keyframe],
+    table: NDArray[np.int64],
+    map_from_cam: Array,
+    camera: StereoCamera,
+    settings: SurveySettings,
 ) -> tuple[Array, Array]:
     """Pixels (M, 3) and sigmas (M, 2) of observations (keyframe, landmark, feature), references first in each landmark."""
     noise = settings.noise

@@ -46,7 +46,14 @@ def test_known_warps_are_recovered(texture: Texture, current_from_reference: Arr
     level0 = np.zeros(len(pixels), np.int8)
     warp = np.repeat(np.linalg.inv(current_from_reference)[None], len(pixels), axis=0)
     found = patch_align.refine_matches(
-        patch_align.half_pyramid(reference), patch_align.half_pyramid(current), pixels, level0, start, level0, warp, SETTINGS
+        patch_align.half_pyramid(reference),
+        patch_align.half_pyramid(current),
+        pixels,
+        level0,
+        start,
+        level0,
+        warp,
+        SETTINGS,
     )
     error = np.linalg.norm(found[:, :2] - expected, axis=1)
     assert np.isfinite(error).mean() > 0.8
@@ -79,7 +86,14 @@ def test_patches_that_do_not_agree_are_refused(texture: Texture) -> None:
     level0, warp = np.zeros(len(pixels), np.int8), np.repeat(np.eye(2)[None], len(pixels), axis=0)
     for current in (other, np.full_like(reference, 90)):
         found = patch_align.refine_matches(
-            patch_align.half_pyramid(reference), patch_align.half_pyramid(current), pixels, level0, pixels, level0, warp, SETTINGS
+            patch_align.half_pyramid(reference),
+            patch_align.half_pyramid(current),
+            pixels,
+            level0,
+            pixels,
+            level0,
+            warp,
+            SETTINGS,
         )
         assert np.isfinite(found[:, 0]).mean() < 0.12
 

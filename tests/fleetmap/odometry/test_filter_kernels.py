@@ -155,7 +155,9 @@ def test_vision_says_nothing_about_where_the_world_is() -> None:
     points = room(rng, 150)
     starts, clones, pixels, first = [0], [], [], []
     for point in points:
-        seen = np.array([CAMERA.pixel_from_point(transform_points(se3_inverse(b @ BODY_FROM_CAM), point[None]))[0] for b in bodies])
+        seen = np.array(
+            [CAMERA.pixel_from_point(transform_points(se3_inverse(b @ BODY_FROM_CAM), point[None]))[0] for b in bodies]
+        )
         if not np.isfinite(seen).all() or np.abs(seen[:, 0] - 320).max() > 300:
             continue
         clones += list(range(5))

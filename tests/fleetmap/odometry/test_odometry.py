@@ -1,0 +1,177 @@
+"""The odometry on pictures of a painted room, with exact truth."""
+
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+
+from fleetmap.calibration import ImuNoise
+from fleetmap.geometry import Array, se3_inverse, se3_log
+from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings, OdometryStatus
+from fleetmap.odometry.settings import TrackerSettings
+from fleetmap.odometry.tracker import Tracker
+from fleetmap.rectification import RectifiedFrame
+from inertial_motion import analytic_motion
+from point_world import noisy_imu
+from textured_room import BODY_FROM_CAM, CAMERA, black_frame, rig, stereo_frame
+
+IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
+FRAME_NS = 50_000_000
+
+
+def run(frames: Iterable[RectifiedFrame], imu: ImuNoise | None) -> tuple[Odometry, list[OdometryEstimate]]:
+    odometry = Odometry(rig(imu), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    samples = noisy_imu(
+        np.random.default_rng(1), 6.5, IMU, np.array([0.01, -0.02, 0.015]), np.array([0.03, -0.02, 0.04])
+    )
+    estimates, fed_ns = [], 0
+    for frame in frames:
+        odometry.handle_imu(samples.between(fed_ns, frame.stamp_ns + 1))
+        fed_ns = frame.stamp_ns + 1
+        estimates.append(odometry.handle_stereo(frame))
+    return odometry, estimates
+
+
+def truth_between(first_ns: int, second_ns: int) -> Array:
+    first, second = (analytic_motion(s * 1e-9).map_from_body for s in (first_ns, second_ns))
+    return np.asarray(se3_inverse(first) @ second)
+
+
+def relative_error(a: OdometryEstimate, b: OdometryEstimate) -> Array:
+    """(6,) error of the motion between two estimates of the same odom frame."""
+    estimated = se3_inverse(a.odom_from_body) @ b.odom_from_body
+    return se3_log(se3_inverse(truth_between(a.stamp_ns, b.stamp_ns)) @ estimated)
+
+
+def sigma_m(estimate: OdometryEstimate) -> float:
+    return float(np.sqrt(np.trace(estimate.cov_rot_trans[3:, 3:])))
+
+
+@pytest.fixture(scope="module")
+def inertial() -> tuple[Odometry, list[OdometryEstimate]]:
+    return run((stereo_frame(k * FRAME_NS) for k in range(1, 81)), IMU)
+
+
+@pytest.fixture(scope="module")
+def visual() -> tuple[Odometry, list[OdometryEstimate]]:
+    return run((stereo_frame(k * FRAME_NS) for k in range(1, 41)), None)
+
+
+def test_inertial_starts_in_motion_and_follows(inertial: tuple[Odometry, list[OdometryEstimate]]) -> None:
+    _, estimates = inertial
+    started = next(k for k, e in enumerate(estimates) if e.new_odom_from_old_odom is not None)
+    assert started <= 25
+    assert estimates[0].status is OdometryStatus.INITIALISING
+    assert not estimates[started - 1].inertial
+    assert all(e.status is OdometryStatus.TRACKING and e.inertial for e in estimates[started + 1 :])
+    path_m = sum(
+        float(np.linalg.norm(truth_between(a.stamp_ns, b.stamp_ns)[:3, 3]))
+        for a, b in zip(estimates[started:], estimates[started + 1 :], strict=False)
+    )
+    error = relative_error(estimates[started + 1], estimates[-1])
+    assert np.linalg.norm(error[3:]) < 0.012 * path_m
+    assert np.degrees(np.linalg.norm(error[:3])) < 0.5
+
+
+def test_odom_is_level_and_the_velocity_right(inertial: tuple[Odometry, list[OdometryEstimate]]) -> None:
+    _, estimates = inertial
+    last = estimates[-1]
+    truth = analytic_motion(last.stamp_ns * 1e-9)
+    up_body, up_truth = last.odom_from_body[2, :3], truth.map_from_body[2, :3]
+    assert np.degrees(np.linalg.norm(np.cross(up_body, up_truth))) < 0.4
+    velocity_body = last.odom_from_body[:3, :3].T @ last.velocity_odom_mps
+    np.testing.assert_allclose(velocity_body, truth.map_from_body[:3, :3].T @ truth.velocity_map_mps, atol=0.06)
+    np.testing.assert_allclose(last.gyro_bias_radps, [0.01, -0.02, 0.015], atol=0.004)
+
+
+def test_redefining_odom_carries_the_past_along(inertial: tuple[Odometry, list[OdometryEstimate]]) -> None:
+    _, estimates = inertial
+    started = next(k for k, e in enumerate(estimates) if e.new_odom_from_old_odom is not None)
+    change = estimates[started].new_odom_from_old_odom
+    assert change is not None
+    carried = change @ estimates[started - 1].odom_from_body
+    moved = se3_inverse(carried) @ estimates[started].odom_from_body
+    off = se3_log(se3_inverse(truth_between(estimates[started - 1].stamp_ns, estimates[started].stamp_ns)) @ moved)
+    assert np.linalg.norm(off[3:]) < 0.02
+
+
+def test_stereo_alone_follows_too(visual: tuple[Odometry, list[OdometryEstimate]]) -> None:
+    odometry, estimates = visual
+    assert all(e.status is OdometryStatus.TRACKING and not e.inertial for e in estimates)
+    error = relative_error(estimates[0], estimates[-1])
+    assert np.linalg.norm(error[3:]) < 0.06
+    assert np.degrees(np.linalg.norm(error[:3])) < 1.0
+    assert sigma_m(estimates[-1]) < 0.2
+    assert odometry.motion_since(-1) is None
+    since = odometry.motion_since(odometry.oldest_frame_index)
+    assert since is not None
+    oldest = estimates[odometry.oldest_frame_index]
+    off = se3_log(se3_inverse(truth_between(oldest.stamp_ns, estimates[-1].stamp_ns)) @ since[0])
+    assert np.linalg.norm(off[3:]) < 0.06
+
+
+def test_the_same_samples_give_the_same_bits(visual: tuple[Odometry, list[OdometryEstimate]]) -> None:
+    _, again = run((stereo_frame(k * FRAME_NS) for k in range(1, 16)), None)
+    for a, b in zip(visual[1], again, strict=False):
+        np.testing.assert_array_equal(a.odom_from_body, b.odom_from_body)
+
+
+def test_darkness_is_said_and_the_covariance_grows() -> None:
+    """After 2.5 s the pictures go black for a second: DEGRADED, ever less certain, no jump that is not admitted."""
+    frames = [stereo_frame(k * FRAME_NS) if k <= 50 else black_frame(k * FRAME_NS) for k in range(1, 71)]
+    _, estimates = run(frames, IMU)
+    assert estimates[49].status is OdometryStatus.TRACKING
+    dark = estimates[50:]
+    assert all(e.status is OdometryStatus.DEGRADED for e in dark)
+    sigmas = [sigma_m(e) for e in dark]
+    assert (np.diff(sigmas) > 0).all()
+    assert sigmas[-1] > 2 * sigma_m(estimates[49])
+    error = relative_error(estimates[49], dark[-1])
+    assert np.linalg.norm(error[3:]) < 4 * sigmas[-1]
+
+
+def test_a_gap_into_the_unknown_is_said() -> None:
+    """Three quarters of a second later the walls are others: nothing ties the frames together, vision alone is lost."""
+    before = [stereo_frame(k * FRAME_NS) for k in range(1, 16)]
+    after = [stereo_frame((k + 15) * FRAME_NS, seed=2) for k in range(15, 18)]
+    _, estimates = run([*before, *after], None)
+    first = estimates[15]
+    assert first.after_gap
+    assert first.status is OdometryStatus.DEGRADED
+    assert sigma_m(first) > sigma_m(estimates[14]) + 0.5
+    # the walls that came are then followed, but the doubt stays
+    assert estimates[16].status is OdometryStatus.TRACKING
+    assert sigma_m(estimates[16]) > sigma_m(estimates[14]) + 0.5
+
+
+def test_a_gap_over_known_walls_is_bridged() -> None:
+    """Half a second without pictures, then the same room from elsewhere: matched by descriptors."""
+    frames = [stereo_frame(k * FRAME_NS) for k in [*range(1, 12), *range(21, 26)]]
+    _, estimates = run(frames, None)
+    assert estimates[11].after_gap
+    assert estimates[11].status is OdometryStatus.TRACKING
+    error = relative_error(estimates[10], estimates[-1])
+    assert np.linalg.norm(error[3:]) < 0.06
+
+
+def test_tracks_are_where_the_points_went() -> None:
+    """Followed pixels against the reprojection of their first stereo point; ids never repeat."""
+    tracker = Tracker(CAMERA, TrackerSettings())
+    first = tracker.track(stereo_frame(FRAME_NS), lambda _: None)
+    assert len(first.ids) > 60
+    known = np.isfinite(first.pixels[:, 2])
+    assert known.mean() > 0.7
+    points = CAMERA.point_from_pixel(first.pixels[:, :2], first.pixels[:, 0] - first.pixels[:, 2])
+    for k in range(2, 6):
+        tracked = tracker.track(stereo_frame(k * FRAME_NS), lambda _: None)
+        assert len(set(tracked.ids.tolist())) == len(tracked.ids)
+    moved = se3_inverse(truth_between(FRAME_NS, 5 * FRAME_NS))
+    cam_from_first = se3_inverse(BODY_FROM_CAM) @ moved @ BODY_FROM_CAM
+    both, at_first, at_last = np.intersect1d(first.ids, tracked.ids, return_indices=True)
+    assert len(both) > 25
+    expected = CAMERA.pixel_from_point(points[at_first] @ cam_from_first[:3, :3].T + cam_from_first[:3, 3])
+    off = np.linalg.norm((expected - tracked.pixels[at_last])[:, :2], axis=1)
+    assert np.nanmedian(off) < 0.5
+    assert tracked.cam_from_previous is not None
+    step = se3_inverse(BODY_FROM_CAM) @ se3_inverse(truth_between(4 * FRAME_NS, 5 * FRAME_NS)) @ BODY_FROM_CAM
+    assert np.linalg.norm(se3_log(tracked.cam_from_previous @ se3_inverse(step))[3:]) < 0.01
