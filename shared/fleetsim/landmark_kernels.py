@@ -53,8 +53,8 @@ def seed_landmarks(
             dirt = mixed(np.uint64(values[f, 3]) * np.uint64(1024) + np.uint64(values[f, 4]), np.uint64(7))
             nx, ny, nz = vy * uz - vz * uy, vz * ux - vx * uz, vx * uy - vy * ux
             scale = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
-            for j in range(int(math.ceil(length_v / cell))):
-                for i in range(int(math.ceil(length_u / cell))):
+            for j in range(math.ceil(length_v / cell)):
+                for i in range(math.ceil(length_u / cell)):
                     look = mixed(np.uint64(numbers[f, 1]), np.uint64((level * 65536 + j) * 65536 + i))
                     if numbers[f, 0] == 1:  # concrete does not repeat from face to face
                         look = mixed(look, dirt)

@@ -77,7 +77,7 @@ def measure_prototype() -> dict[str, float] | None:
 
 def _measure_prototype_in(folder: Path) -> dict[str, float]:
     names: dict[str, object] = {}
-    before, arguments = os.getcwd(), sys.argv
+    before, arguments = Path.cwd(), sys.argv
     sys.path.insert(0, str(folder))
     try:
         os.chdir(folder)

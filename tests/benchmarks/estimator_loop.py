@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary, train_vocabulary
 from fleetmap.features import orb
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.mapformat import Tile
 from fleetmap.odometry import Odometry, OdometrySettings
 from fleetmap.odometry.odometry import OdometryEstimate
@@ -16,7 +16,7 @@ from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracker import MotionSince, Tracked, Tracker
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import PositionPrior
-from fleetsim.estimator import EstimatorSession
+from fleetsim.estimator import EstimatorSession, Found
 from locclient.localizer import Estimate, Localizer
 from locclient.relocalizer import Seen
 from locclient.settings import LocalizerSettings
@@ -124,10 +124,11 @@ def survey_map(
                 continue
         sighting, found = session.sighting(frame), session.features(frame)
         members = []
+        points = _features_map(session, frame, found)
         for feature in np.flatnonzero(found.rows >= 0).tolist():
             row = int(found.rows[feature])
             landmark = int(sighting.ids[row])
-            entry = observed.setdefault(landmark, _Observed(sighting.points_map[row]))
+            entry = observed.setdefault(landmark, _Observed(points[feature]))
             away = map_from_cam[:3, 3] - sighting.points_map[row]
             entry.directions.append(away / np.linalg.norm(away))
             entry.reaches_m.append(float(sighting.distances_m[row]) * orb.SCALE_FACTOR ** float(found.octaves[feature]))
@@ -135,6 +136,13 @@ def survey_map(
             members.append(landmark)
         places.append((map_from_cam, members))
     return _as_tile(observed, places, rng, sigma_m)
+
+
+def _features_map(session: EstimatorSession, frame: int, found: Found) -> Array:
+    """(N, 3) what features show: at the landmark's true depth, but through the pixel where it was found."""
+    exact = session.sighting(frame).pixels[found.rows]
+    points_cam = session.camera.point_from_pixel(found.pixels[:, :2], exact[:, 0] - exact[:, 2])
+    return transform_points(session.map_from_body[frame] @ session.body_from_cam, points_cam)
 
 
 def _as_tile(

@@ -69,6 +69,17 @@ class FlowSums:
     shares: list[float] = field(default_factory=list)
     disparity_errors_px: list[Array] = field(default_factory=list)
     disparity_known: list[float] = field(default_factory=list)
+    raised_shares: list[tuple[float, float]] = field(default_factory=list)
+    floor_shares: list[tuple[float, float]] = field(default_factory=list)
+
+    def add_way(self, point_map: Array, way_px: Array, error_px: Array) -> None:
+        """The error as shares of the way since the beginning, along it and across it."""
+        squared = float(way_px @ way_px)
+        if squared < 64.0 or error_px @ error_px > 25.0:
+            return
+        across = way_px[0] * error_px[1] - way_px[1] * error_px[0]
+        shares = self.floor_shares if point_map[2] < 0.05 else self.raised_shares
+        shares.append((float(way_px @ error_px) / squared, float(across) / squared))
 
 
 def follow(camera: StereoCamera, views: list[View], sums: FlowSums) -> None:
@@ -96,6 +107,9 @@ def follow(camera: StereoCamera, views: list[View], sums: FlowSums) -> None:
             if track_id in begun and number - begun[track_id][0] in AGES:
                 expected = view.expected(begun[track_id][1][None], camera)[0, :2]
                 sums.errors_px[number - begun[track_id][0]].append(tracked.pixels[row, :2] - expected)
+                if number - begun[track_id][0] >= 4:
+                    first = views[begun[track_id][0]].expected(begun[track_id][1][None], camera)[0, :2]
+                    sums.add_way(begun[track_id][1], expected - first, tracked.pixels[row, :2] - expected)
 
 
 @dataclass
@@ -152,9 +166,8 @@ def _sigma(values: Array) -> float:
 
 def report_flow(name: str, sums: FlowSums) -> None:
     """Prints the statistics of tracks."""
-    print(
-        f"{name}: {np.mean(sums.counts):.0f} tracks, {np.mean(sums.survived):.3f} survive a frame, inlier share {np.mean(sums.shares):.3f}"
-    )
+    survived, share = np.mean(sums.survived), np.mean(sums.shares)
+    print(f"{name}: {np.mean(sums.counts):.0f} tracks, {survived:.3f} survive a frame, inlier share {share:.3f}")
     for age in AGES:
         errors = np.array(sums.errors_px[age])
         if len(errors):
@@ -164,9 +177,19 @@ def report_flow(name: str, sums: FlowSums) -> None:
             )
     disparity = np.concatenate(sums.disparity_errors_px)
     known = disparity[np.isfinite(disparity)]
+    wrong, ends = float((np.abs(known) > 1.5).mean()), np.percentile(known, (5, 95))
     print(
-        f"  disparity: {np.mean(sums.disparity_known):.3f} known, sigma {_sigma(known):.3f} px, {float((np.abs(known) > 1.5).mean()):.3f} more than 1.5 px off"
+        f"  disparity: {np.mean(sums.disparity_known):.3f} known, sigma {_sigma(known):.3f} px, {wrong:.3f} more than 1.5 px off"
     )
+    print(f"  disparity: 90 % within {ends[0]:.2f} and {ends[1]:.2f} px")
+    for what, shares in (("raised", sums.raised_shares), ("floor", sums.floor_shares)):
+        table = np.array(shares)
+        low, high = np.percentile(table[:, 0], (5, 95))
+        print(
+            f"  {what}: of the way, along {np.mean(np.clip(table[:, 0], -0.06, 0.06)):.4f} sigma {_sigma(table[:, 0]):.4f}",
+            end="",
+        )
+        print(f" (90 % within {low:.3f} and {high:.3f}), across sigma {_sigma(table[:, 1]):.4f}")
 
 
 def report_seen(name: str, sums: SeenSums) -> None:
@@ -177,10 +200,8 @@ def report_seen(name: str, sums: SeenSums) -> None:
     print(
         f"{name}: {np.mean(sums.found):.3f} found again, bits apart 10..90 % {spread}, octave step sigma {np.std(steps):.2f}"
     )
-    print(
-        "  pixel sigma at each octave's own scale: "
-        + " ".join(f"{_sigma(errors[octaves == o].ravel()):.2f}" for o in range(8) if (octaves == o).sum() > 20)
-    )
+    sigmas = [_sigma(errors[octaves == octave].ravel()) for octave in range(8) if (octaves == octave).sum() > 20]
+    print("  pixel sigma at each octave's own scale: " + " ".join(f"{sigma:.2f}" for sigma in sigmas))
     print(f"  all octaves: {_sigma(errors.ravel()):.2f}")
 
 
@@ -194,10 +215,10 @@ def main() -> None:
             follow(camera, views, sums)
         report_flow(f"{robot}, {light}", sums)
         features = [orb.detect(view.frame.left, orb.OrbSettings()) for view in views[::10]]
-        known = [
-            np.isfinite(stereo.disparities(v.frame, camera, f.pixels, stereo.StereoSettings())[:, 0]).mean()
-            for v, f in zip(views[::10], features, strict=True)
-        ]
+        known = []
+        for view, found in zip(views[::10], features, strict=True):
+            disparities = stereo.disparities(view.frame, camera, found.pixels, stereo.StereoSettings())
+            known.append(np.isfinite(disparities[:, 0]).mean())
         print(f"  features: {np.mean([len(f) for f in features]):.0f}, stereo known {np.mean(known):.3f}")
         session.renderer.close()
     survey, later = prepare(Order("small-loop")), prepare(Order("small-loop", day=1))

@@ -7,8 +7,8 @@ from fleetsim.layout import Layout
 
 
 def test_corresponding_places_match_as_well_across_aisles_as_across_days() -> None:
-    layout = Layout(aisles=2, bays=4, has_landmarks=False, are_aisles_identical=True)
-    found = measure(layout, (0, 1), (7.0, 9.0))
+    layout = Layout(aisles=4, bays=4, has_landmarks=False, are_aisles_identical=True)
+    found = measure(layout, (1, 2), (7.0, 9.0))
     across_days, across_aisles = found["same aisle, next day"], found["other aisle, same day"]
     assert across_aisles.matched_share > 0.95 * across_days.matched_share
     assert across_aisles.distance_bits <= across_days.distance_bits + 3

@@ -124,6 +124,7 @@ def test_identical_aisles_hold_identical_landmarks_until_stock_moves() -> None:
         chunk = fields[day].chunk(0, row)
         places = np.rint((chunk.points_map - row * shift) * 100).astype(np.int64)
         inside = (places[:, 2] > 30) & (places[:, 0] > 620) & (places[:, 0] < 1600)
+        inside &= np.abs(places[:, 1] - layout.aisle_y_m(0) * 100) < 240
         return {
             (int(key), *place)
             for key, place in zip(chunk.keys[inside, 0].tolist(), places[inside].tolist(), strict=True)

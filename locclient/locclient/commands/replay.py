@@ -53,6 +53,8 @@ def replay(
             raise UsageError(
                 f"--{name} {options[name]}: the folder {Path(options[name]).parent} does not exist; make it first"
             )
+    if options["picture"] is not None and Path(options["picture"]).suffix.lower() != ".png":
+        raise UsageError(f"--picture {options['picture']} must end in .png")
     _run(recording, options, loaded)
 
 

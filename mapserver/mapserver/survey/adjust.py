@@ -77,15 +77,16 @@ def adjust_windows(state: SurveyState, settings: SurveySettings) -> None:
 
 
 def _local(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_]) -> None:
-    """One window with the keyframes that see the same landmarks held; landmarks seen from elsewhere alone stay."""
+    """One window with the earlier keyframes that see the same landmarks held; landmarks seen from elsewhere alone stay."""
     marks = state.landmarks
     inside = free[marks.obs_keyframe]
     touched = np.zeros(len(marks.points_map), bool)
     touched[marks.obs_landmark[inside]] = True
-    rows = np.flatnonzero(touched[marks.obs_landmark])
+    first, last = np.flatnonzero(free)[[0, -1]]
+    # Later keyframes are where odometry left them: held, they would pull the window back to the drift.
+    rows = np.flatnonzero(touched[marks.obs_landmark] & (marks.obs_keyframe <= last))
     used = np.zeros(len(free), bool)
     used[marks.obs_keyframe[rows]] = True
-    first, last = np.flatnonzero(free)[[0, -1]]
     used[max(first - 1, 0) : last + 1] = True
     keyframes = np.flatnonzero(used)
     number = np.cumsum(used) - 1

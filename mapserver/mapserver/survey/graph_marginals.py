@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fleetmap.features.matching_kernels import Indices
 from fleetmap.geometry import Array, se3_inverse, se3_log
@@ -33,8 +34,9 @@ class GraphMarginals:
         """Raises SurveyError as `check_edges`."""
         check_edges(len(map_from_body), edges)
         # Seen from the middle of the site: far from the origin, turns would drown everything else in rounding.
+        self._middle_m = map_from_body[:, :3, 3].mean(axis=0)
         self._map_from_body = map_from_body.copy()
-        self._map_from_body[:, :3, 3] -= map_from_body[:, :3, 3].mean(axis=0)
+        self._map_from_body[:, :3, 3] -= self._middle_m
         joined = self._joined(edges)
         tree = _spanning_tree(len(map_from_body), list(joined))
         self._parents, self._order = _rooted(len(map_from_body), tree)
@@ -50,10 +52,22 @@ class GraphMarginals:
         for i, j in others:
             self._update(i, j, joined[i, j])
 
+    @property
+    def map_from_body(self) -> Array:
+        """(K, 4, 4) where the keyframes are by all edges that were added; to first order."""
+        placed = self._map_from_body.copy()
+        placed[:, :3, 3] += self._middle_m
+        return placed
+
     def add(self, edge: PoseEdge) -> None:
-        """Takes one more edge into account, such as a loop just accepted. The transforms stay as they are."""
+        """Takes one more edge into account, such as a loop just accepted: what it says narrows and moves the graph.
+
+        Narrowing alone would refuse the next true loop of a place whose drift this one has shown.
+        """
         check_edges(len(self._map_from_body), [edge], connected=False)
-        self._update(edge.i, edge.j, self._cov_map(edge))
+        said_map = adjoint(self._map_from_body[edge.i]) @ self._innovation(edge)
+        gain = self._update(edge.i, edge.j, self._cov_map(edge))
+        self._map_from_body = _moved(self._map_from_body, (gain @ said_map).reshape(-1, 6))
 
     def relative_cov(self, i: int, j: int) -> Array:
         """(6, 6) covariance of i_from_j."""
@@ -90,10 +104,14 @@ class GraphMarginals:
 
         The graph must not hold the edge yet. Compare with CHI2_6_0999.
         """
-        j_from_i = se3_inverse(self._map_from_body[edge.j]) @ self._map_from_body[edge.i]
-        innovation = se3_log(edge.i_from_j @ j_from_i)
+        innovation = self._innovation(edge)
         cov = self.relative_cov(edge.i, edge.j) + edge.cov_rot_trans
         return float(innovation @ np.linalg.solve(cov, innovation))
+
+    def _innovation(self, edge: PoseEdge) -> Array:
+        """(6,) what a measured edge says against the graph, in the axes of i."""
+        j_from_i = se3_inverse(self._map_from_body[edge.j]) @ self._map_from_body[edge.i]
+        return se3_log(edge.i_from_j @ j_from_i)
 
     def _cov_map(self, edge: PoseEdge) -> Array:
         """(6, 6) covariance of an edge, of a perturbation in map axes."""
@@ -118,18 +136,33 @@ class GraphMarginals:
             information += np.linalg.inv(carried @ edge.cov_rot_trans @ carried.T)
         return replace(parallel[0], cov_rot_trans=np.asarray(np.linalg.inv(information), np.float64))
 
-    def _update(self, i: int, j: int, cov_map: Array) -> None:
-        """One more measured difference x_j - x_i: the rows that lower every covariance from now on."""
+    def _update(self, i: int, j: int, cov_map: Array) -> Array:
+        """One more measured difference x_j - x_i: the rows that lower every covariance from now on.
+
+        Returns the gain (6 K, 6): how far each keyframe moves by what the measurement says against the graph.
+        """
         known = self._table[: 6 * self._updates]
         ancestors = [common_ancestors(self._parents, self._order, k) for k in (i, j)]
         shared = (self._sums[ancestors[1]] - self._sums[ancestors[0]]).transpose(1, 0, 2).reshape(6, -1)
         shared = shared - (_columns(known, j) - _columns(known, i)).T @ known
         innovation = _columns(shared, j) - _columns(shared, i) + cov_map
-        rows = np.linalg.solve(np.linalg.cholesky(0.5 * (innovation + innovation.T)), shared)
+        root = np.linalg.cholesky(0.5 * (innovation + innovation.T))
+        rows = np.linalg.solve(root, shared)
         if len(self._table) < 6 * (self._updates + 1):
             self._table = np.concatenate([self._table, np.zeros((max(len(self._table), 48), self._table.shape[1]))])
         self._table[6 * self._updates : 6 * (self._updates + 1)] = rows
         self._updates += 1
+        return np.asarray(np.linalg.solve(root.T, rows).T)
+
+
+def _moved(map_from_body: Array, perturbations: Array) -> Array:
+    """Exp(x_k) @ map_from_body (K, 4, 4) for perturbations (K, 6), to second order in the translation."""
+    turns = Rotation.from_rotvec(perturbations[:, :3]).as_matrix()
+    shifts = perturbations[:, 3:] + 0.5 * np.cross(perturbations[:, :3], perturbations[:, 3:])
+    moved = map_from_body.copy()
+    moved[:, :3, :3] = turns @ map_from_body[:, :3, :3]
+    moved[:, :3, 3] = np.einsum("kij,kj->ki", turns, map_from_body[:, :3, 3]) + shifts
+    return moved
 
 
 def _columns(table: Array, k: int) -> Array:

@@ -80,7 +80,7 @@ class LoopCloser:
         map_from_body: Array, marginals: GraphMarginals, matched: set[tuple[int, int]], settings: SurveySettings, zones: Zones,
     ) -> None:  # fmt: skip
         self._keyframes, self._vectors, self._camera = keyframes, vectors, camera
-        self._body_from_cam, self._map_from_body = body_from_cam, map_from_body
+        self._body_from_cam, self._map_from_body = body_from_cam, map_from_body  # moved by every accepted loop
         self._cam_from_body = se3_inverse(body_from_cam)
         self._marginals, self._settings, self._zones = marginals, settings, zones
         self._neighbours: dict[int, list[int]] = {}
@@ -206,6 +206,7 @@ class LoopCloser:
             self.loops.records.append(record)
             self.loops.edges.append(edge)
             self._marginals.add(edge)
+            self._map_from_body = self._marginals.map_from_body
 
 
 def _cells(keyframe: Keyframe, features: NDArray[np.int64], camera: StereoCamera) -> int:

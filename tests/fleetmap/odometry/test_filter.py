@@ -27,16 +27,21 @@ START_SIGMAS = np.repeat([0.02, 0.2, 0.05, 0.005, 0.05], 3)
 
 
 def clones_at(
-    times_s: list[float], seen_by: Array, rng: np.random.Generator | None
+    times_s: list[float], seen_by: Array, rng: np.random.Generator | None, last_body_from_guess: Array | None = None
 ) -> tuple[InvariantFilter, dict[int, Array]]:
-    """A vision-only filter with a clone at each true place, uncertain by 0.1 rad and 1 m between them, and what each saw."""
+    """A vision-only filter with a clone at each true place, uncertain by 0.3 rad and 1.5 m each, and what each saw.
+
+    last_body_from_guess (4, 4) is how far off the last clone is predicted.
+    """
     state = true_state(times_s[0])
     estimate = InvariantFilter(state, 1e-12 * np.eye(15), SETTINGS, CAMERA, BODY_FROM_CAM)
     seen = {}
     for k, time_s in enumerate(times_s):
         if k:
-            before = analytic_motion(times_s[k - 1]).map_from_body
-            estimate.displace(se3_inverse(before) @ analytic_motion(time_s).map_from_body, 0.3, 1.5)
+            step = se3_inverse(analytic_motion(times_s[k - 1]).map_from_body) @ analytic_motion(time_s).map_from_body
+            if last_body_from_guess is not None and k == len(times_s) - 1:
+                step = step @ last_body_from_guess
+            estimate.displace(step, 0.3, 1.5)
         estimate.add_clone(k, np.zeros(3))
         seen[k] = observe(seen_by, time_s, rng)
     return estimate, seen
@@ -104,13 +109,9 @@ def test_iterated_update_recovers_from_a_bad_prediction() -> None:
     """The newest of three clones is predicted 17 degrees and 0.9 m off; vision pulls it to within a centimetre."""
     rng = np.random.default_rng(6)
     points = room(rng)
-    estimate, seen = clones_at([0.0, 0.15, 0.3], points, rng)
+    off = se3_exp(np.array([0.1, -0.2, 0.2, 0.5, -0.6, 0.4]))
+    estimate, seen = clones_at([0.0, 0.15, 0.3], points, rng, last_body_from_guess=off)
     truth = se3_inverse(analytic_motion(0.0).map_from_body) @ analytic_motion(0.3).map_from_body
-    start = estimate.odom_from_clone(2)
-    bad = start @ se3_exp(np.array([0.1, -0.2, 0.2, 0.5, -0.6, 0.4]))
-    estimate.state.rotation, estimate.state.position_m = bad[:3, :3].copy(), bad[:3, 3].copy()
-    estimate._rotations[-1], estimate._positions[-1] = bad[:3, :3].copy(), bad[:3, 3].copy()
-    estimate._quantile = 50.0  # the gate is not what is tested
     estimate.update(tracks_of(seen, np.arange(len(points))), iterations=6)
     moved = se3_inverse(estimate.odom_from_clone(0)) @ estimate.odom_from_clone(2)
     off = se3_log(se3_inverse(truth) @ moved)
@@ -258,3 +259,13 @@ def test_perturbing_and_measuring_errors_are_inverse() -> None:
     error = np.linspace(-0.2, 0.3, 15)
     truth = true_state(0.7)
     np.testing.assert_allclose(error_of(perturbed(truth, so3_exp(error[:3]), error), truth), error, atol=1e-12)
+
+
+def test_a_clone_follows_the_time_offset_as_the_motion_does() -> None:
+    """Its covariance with the offset, against the invariant error between the motion a little later and now."""
+    state, motion, step_s = true_state(1.3), analytic_motion(1.3), 1e-6
+    estimate = InvariantFilter(state, np.zeros((15, 15)), SETTINGS, CAMERA, BODY_FROM_CAM)
+    estimate.add_clone(0, motion.gyro_radps)
+    by_offset = estimate.covariance[16:22, 15] / SETTINGS.time_offset_sigma_s**2
+    numeric = (error_of(state, true_state(1.3 + step_s)) - error_of(state, true_state(1.3 - step_s))) / (2 * step_s)
+    np.testing.assert_allclose(by_offset, numeric[[0, 1, 2, 6, 7, 8]], atol=1e-5)
