@@ -1,7 +1,6 @@
 """The estimator-level simulation against the rendered one: speed, odometry and localization on the same drive.
 
-`python tests/benchmarks/bench_estimator.py [--frames N] [--out FILE.json]`; about two minutes for 150 rendered frames. For the
-localization the map is in both cases the estimator-level survey's recipe, applied to pictures with exact depth.
+`PYTHONPATH=tests python tests/benchmarks/bench_estimator.py [--frames N] [--out FILE.json]`; about two minutes for 150 rendered frames.
 """
 
 import argparse
@@ -89,6 +88,24 @@ def speeds(robot: EstimatorSession, survey: EstimatorSession) -> Figures:
     return {name: duration_s / cpu_s(run) for name, run in runs.items()}
 
 
+def compare_odometry(robot: str, day: int, count: int) -> tuple[Figures, Figures]:
+    """Figures of a robot's first frames, rendered and not."""
+    session = prepare(Order("small-loop", robot=robot, day=day))
+    simulated = EstimatorSession(session)
+    frames = list(rendered_frames(session, count))
+    session.renderer.close()
+    rendered = odometry_figures(rendered_odometry(session, frames), simulated.map_from_body)
+    return rendered, odometry_figures(estimator_loop.run_odometry(simulated, count), simulated.map_from_body)
+
+
+def measure_speeds() -> Figures:
+    """Times real time on one core of the small loop's next-day robot in the survey's map."""
+    sessions = [prepare(Order("small-loop", robot="tote-1", day=1)), prepare(Order("small-loop"))]
+    for session in sessions:
+        session.renderer.close()
+    return speeds(*(EstimatorSession(session) for session in sessions))
+
+
 def main() -> None:
     """Prints both runs' figures side by side; writes them as JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -97,23 +114,14 @@ def main() -> None:
     options = parser.parse_args()
     result: dict[str, object] = {}
     for robot, day in (("survey", 0), ("tote-1", 1)):
-        session = prepare(Order("small-loop", robot=robot, day=day))
-        simulated = EstimatorSession(session)
-        frames = list(rendered_frames(session, options.frames))
-        rendered = odometry_figures(rendered_odometry(session, frames), simulated.map_from_body)
-        without = odometry_figures(estimator_loop.run_odometry(simulated, options.frames), simulated.map_from_body)
+        rendered, simulated = compare_odometry(robot, day, options.frames)
         print(f"\n{robot}: {'rendered':>32s} {'estimator':>10s} {'ratio':>7s}")
         for name, value in rendered.items():
-            print(f"  {name:36s} {value:10.3f} {without[name]:10.3f} {without[name] / value:7.2f}")
-        result[robot] = {"rendered": rendered, "estimator": without}
-        session.renderer.close()
-    survey, robot_session = prepare(Order("small-loop")), prepare(Order("small-loop", robot="tote-1", day=1))
-    result["times_real_time"] = speeds(EstimatorSession(robot_session), EstimatorSession(survey))
-    print(
-        "\ntimes real time on one core:", {name: round(value, 1) for name, value in result["times_real_time"].items()}
-    )  # type: ignore[attr-defined]
-    survey.renderer.close()
-    robot_session.renderer.close()
+            print(f"  {name:36s} {value:10.3f} {simulated[name]:10.3f} {simulated[name] / value:7.2f}")
+        result[robot] = {"rendered": rendered, "estimator": simulated}
+    found = measure_speeds()
+    result["times_real_time"] = found
+    print("\ntimes real time on one core:", {name: round(value, 1) for name, value in found.items()})
     if options.out is not None:
         options.out.write_text(json.dumps(result, indent=2) + "\n")
 

@@ -123,14 +123,19 @@ def bench() -> dict[str, float]:
     return found
 
 
+def show(found: dict[str, float]) -> None:
+    """Prints the figures."""
+    for name, value in found.items():
+        print(f"{name:60s} {value:8.2f}")
+
+
 def main() -> None:
     """Prints the figures; writes them as JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     found = bench()
-    for name, value in found.items():
-        print(f"{name:60s} {value:8.2f}")
+    show(found)
     if options.out is not None:
         options.out.write_text(json.dumps(found, indent=2) + "\n")
 

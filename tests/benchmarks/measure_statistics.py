@@ -172,8 +172,9 @@ def report_flow(name: str, sums: FlowSums) -> None:
         errors = np.array(sums.errors_px[age])
         if len(errors):
             wrong = float((np.linalg.norm(errors, axis=1) > WRONG_PX).mean())
+            sigma = _sigma(errors.ravel())
             print(
-                f"  after {age:2d} frames: sigma {_sigma(errors.ravel()):.3f} px, {wrong:.3f} more than {WRONG_PX} px off, {len(errors)} tracks"
+                f"  after {age:2d} frames: sigma {sigma:.3f} px, {wrong:.3f} more than {WRONG_PX} px off, {len(errors)} tracks"
             )
     disparity = np.concatenate(sums.disparity_errors_px)
     known = disparity[np.isfinite(disparity)]

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log, transform_points
+from fleetmap.geometry import Array, rotation_angle_rad, se3_exp, se3_inverse, se3_log, transform_points
 from fleetmap.pose_solver import ransac_resection, refine_resection, resection_with_rotation
 from fleetmap.pose_solver_kernels import linearize
 from fleetmap.rectification import StereoCamera
@@ -130,6 +130,18 @@ def test_known_rotation_survives_70_percent_outliers() -> None:
     assert found.inliers[:wrong].mean() < 0.1
     assert np.linalg.norm(error(found.cam_from_source)[3:]) < 0.03
     assert np.linalg.norm(error(found.cam_from_source)[:3]) < 0.004
+
+
+@pytest.mark.parametrize("sigma_rad", [1e-5, 0.1])
+def test_known_rotation_is_held_as_firmly_as_it_says(sigma_rad: float) -> None:
+    points, pixels, sigmas = seen(np.random.default_rng(11), 30)
+    given = se3_exp(np.array([0.004, 0, 0, 0, 0, 0]))[:3, :3] @ CAM_FROM_MAP[:3, :3]
+    found = resection_with_rotation(
+        CAMERA, points, pixels, sigmas, given, threshold_px=8.0, min_inliers=8, rotation_sigma_rad=sigma_rad
+    )
+    assert found is not None
+    turned = rotation_angle_rad(found.cam_from_source[:3, :3] @ given.T)
+    assert turned < 0.001 if sigma_rad < 0.01 else turned == pytest.approx(0.004, abs=1e-4)
 
 
 def test_nothing_that_agrees_gives_nothing() -> None:

@@ -109,26 +109,23 @@ def test_motion_tells_gravity_velocity_and_biases(accel_bias: Array) -> None:
 
 
 def test_its_covariance_covers_its_error() -> None:
-    """Gravity, velocity and accelerometer bias of 12 starts stay within what the covariance admits, and it is not absurd."""
+    """Tilt and velocity of 16 starts from shaky vision: mean normalised errors per dof, for a covariance meant wide."""
     tilts, speeds = [], []
-    for seed in range(12):
+    truth = analytic_motion(2.1)
+    for seed in range(16):
         rng = np.random.default_rng(seed)
         imu = noisy_imu(rng, 2.5, NOISE, GYRO_BIAS, 0.04 * rng.normal(size=3))
-        vision, old_from_map = seen_motion(rng, 3e-4, 1e-3)
+        vision, old_from_map = seen_motion(rng, 1e-3, 8e-3)
         start = start_in_motion(vision, imu, NOISE, SETTINGS, FILTER)
         assert start is not None
-        odom_from_map = start.odom_from_old @ old_from_map
-        tilt = np.cross(DOWN, odom_from_map[:3, :3] @ DOWN)[:2]
+        tilt = np.cross(DOWN, start.odom_from_old[:3, :3] @ old_from_map[:3, :3] @ DOWN)[:2]
         tilts.append(tilt @ np.linalg.solve(start.covariance[:2, :2], tilt) / 2)
-        velocity = (
-            start.state.rotation @ analytic_motion(2.1).map_from_body[:3, :3].T @ analytic_motion(2.1).velocity_map_mps
-        )
-        speed = velocity - start.state.velocity_mps
-        carry = np.zeros((3, 15))
-        carry[:, 3:6] = np.eye(3)
-        speeds.append(np.abs(speed).max() / np.sqrt(np.diag(start.covariance)[3:6].max()))
+        # to first order the velocity error in body axes is the invariant one turned into them
+        rotation = start.state.rotation
+        off = truth.map_from_body[:3, :3].T @ truth.velocity_map_mps - rotation.T @ start.state.velocity_mps
+        speeds.append(off @ np.linalg.solve(rotation.T @ start.covariance[3:6, 3:6] @ rotation, off) / 3)
     assert 0.02 < np.mean(tilts) < 2.0
-    assert max(speeds) < 4.0
+    assert 0.02 < np.mean(speeds) < 2.0
 
 
 def test_gravity_of_the_wrong_size_is_refused() -> None:
