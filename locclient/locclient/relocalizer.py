@@ -29,12 +29,17 @@ class Fix:
     cells: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Seen:
-    """Features of one frame and their disparities: pixels (N, 3) u_left v u_right."""
+    """Features of one frame: pixels (N, 3) u_left v u_right, NaN where unknown.
+
+    Depth is measured only for features that match something, while `frame` is held: `asked` (N,) says for which it was tried.
+    """
 
     features: orb.Features
     pixels: Array
+    frame: RectifiedFrame | None = None
+    asked: NDArray[np.bool_] | None = None
 
 
 class Relocalizer:
@@ -48,8 +53,19 @@ class Relocalizer:
     def look(self, frame: RectifiedFrame) -> Seen:
         """What one frame shows."""
         features = orb.detect(frame.left, self._settings.orb)
-        found = stereo.disparities(frame, self._camera, features.pixels, self._settings.stereo)
-        return Seen(features, np.column_stack([features.pixels, features.pixels[:, 0] - found[:, 0]]))
+        pixels = np.column_stack([features.pixels, np.full(len(features), np.nan)])
+        return Seen(features, pixels, frame, np.zeros(len(features), bool))
+
+    def _measured(self, seen: Seen, index: NDArray[np.int64], prior_px: Array | None = None) -> Array:
+        """Pixels (P, 3) of features `index`, depth measured now where it was not asked for before; prior_px (P,) narrows the search."""
+        if seen.frame is not None and seen.asked is not None:
+            new = np.flatnonzero(~seen.asked[index])
+            at = index[new]
+            prior = None if prior_px is None else prior_px[new]
+            found = stereo.disparities(seen.frame, self._camera, seen.features.pixels[at], self._settings.stereo, prior)
+            seen.pixels[at, 2] = seen.pixels[at, 0] - found[:, 0]
+            seen.asked[at] = True
+        return seen.pixels[index]
 
     def near(self, seen: Seen, map_from_cam: Array, cov_rot_trans: Array) -> Fix | None:
         """The fix near a predicted place whose covariance (map axes) sets the search window; None where nothing agrees."""
@@ -80,7 +96,7 @@ class Relocalizer:
         )
         if len(pairs) < settings.min_inliers // 2:
             return None
-        points, pixels = self.view.points_map[rows[pairs[:, 0]]], seen.pixels[pairs[:, 1]]
+        points, pixels = self.view.points_map[rows[pairs[:, 0]]], self._measured(seen, pairs[:, 1])
         sigmas = self._sigmas(seen, pairs[:, 1], rows[pairs[:, 0]], points, None)
         wide_px = 2 * settings.ransac_px + settings.rotation_sigma_rad * self._camera.focal_px
         found: Resection | None = None
@@ -120,7 +136,8 @@ class Relocalizer:
                 return None
             points = self.view.points_map[rows[kept]]
             sigmas = self._sigmas(seen, hit[kept], rows[kept], points, map_from_cam)
-            found = refine_resection(self._camera, points, seen.pixels[hit[kept]], sigmas, se3_inverse(map_from_cam))
+            measured = self._measured(seen, hit[kept], pixels[kept, 0] - pixels[kept, 2])
+            found = refine_resection(self._camera, points, measured, sigmas, se3_inverse(map_from_cam))
             if found is None or found.inliers.sum() < settings.min_inliers:
                 return None
             map_from_cam = se3_inverse(found.cam_from_source)

@@ -88,7 +88,7 @@ def _measure_prototype_in(folder: Path) -> dict[str, float]:
             names,
         )
         pair: Callable[..., object] = names["pair"]  # type: ignore[assignment]
-        last_s = float(names["T"].T) - 1.0  # type: ignore[attr-defined]
+        last_s = float(names["tote"].T) - 1.0  # type: ignore[attr-defined]
         return {
             "sharp": cpu_ms(lambda t: pair(names["S"], t, sub=1, S=2), MOMENTS_S),
             "blurred": cpu_ms(lambda t: pair(names["T"], t), [t for t in MOMENTS_S if t < last_s]),
