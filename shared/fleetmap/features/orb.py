@@ -73,9 +73,12 @@ def describe(image: Image, keypoints: list[cv2.KeyPoint], levels: int) -> Featur
     kept, descriptors = engine.compute(image, keypoints)
     if not kept:
         return Features.empty()
+    octaves = np.array([k.octave for k in kept], np.int8)
+    # OpenCV scales level pixels up from their corners; where they lie in the picture is told from their centres.
+    middle = 0.5 * (SCALE_FACTOR ** octaves.astype(np.float64) - 1.0)
     return Features(
-        np.array([k.pt for k in kept], np.float64).reshape(-1, 2),
-        np.array([k.octave for k in kept], np.int8),
+        np.array([k.pt for k in kept], np.float64).reshape(-1, 2) + middle[:, None],
+        octaves,
         np.array([k.angle for k in kept], np.float32),
         np.asarray(descriptors, np.uint8),
     )
