@@ -136,12 +136,9 @@ def position_failures(frames: Frames) -> int:
         + _episodes(after, _is_blind, BLIND_S)
         + _episodes(frames, _is_overconfident, SILENT_S)
     )
-    count, until = 0, -(2**63)
-    for begin, end in sorted(spans):
-        if begin > until + GOOD_S * 1e9 or count == 0:
-            count += 1
-        until = max(until, end)
-    return count
+    good = localised(frames)
+    bad = [any(test(f, good[k]) for test in (_is_silent, _is_blind, _is_overconfident)) for k, f in enumerate(frames)]
+    return len(_merged(sorted(spans), [(f.stamp_ns, good[k] and not bad[k]) for k, f in enumerate(frames)]))
 
 
 def _is_silent(frame: FrameRecord, is_localised: bool) -> bool:
@@ -184,13 +181,31 @@ def _episodes(
             if frame.stamp_ns - begin > longer_than_s * 1e9:
                 stretches.append((begin, frame.stamp_ns))
             begin = None if not bad else begin
+    return _merged(stretches, [(f.stamp_ns, good[k] and not is_bad(f, good[k])) for k, f in enumerate(frames)])
+
+
+def _merged(stretches: list[tuple[int, int]], fine: list[tuple[int, bool]]) -> list[tuple[int, int]]:
+    """Stretches, sorted by begin, that are not parted by 5 s of good tracking are one. fine: stamp and goodness of each frame."""
     merged: list[tuple[int, int]] = []
-    for start, end in stretches:
-        if merged and start - merged[-1][1] < GOOD_S * 1e9:
-            merged[-1] = (merged[-1][0], end)
+    for begin, end in stretches:
+        if merged and _longest_fine_ns(fine, merged[-1][1], begin) < GOOD_S * 1e9:
+            merged[-1] = (merged[-1][0], max(end, merged[-1][1]))
         else:
-            merged.append((start, end))
+            merged.append((begin, end))
     return merged
+
+
+def _longest_fine_ns(fine: list[tuple[int, bool]], since_ns: int, until_ns: int) -> int:
+    """The longest unbroken stretch of good tracking between two moments, up to the frame that ends it."""
+    longest, begin = 0, None
+    for stamp, is_fine in fine:
+        if since_ns <= stamp <= until_ns:
+            if is_fine and begin is None:
+                begin = stamp
+            if begin is not None:
+                longest = max(longest, stamp - begin)
+                begin = begin if is_fine else None
+    return longest
 
 
 def _spread(values: list[float], names: tuple[str, ...]) -> dict[str, float] | None:

@@ -185,3 +185,12 @@ def test_the_radius_holds_95_percent() -> None:
     inside = np.linalg.norm(samples, axis=1) < frame(0, sigma_m=0.05).radius_95_m
     assert inside.mean() == pytest.approx(0.95, abs=0.005)
     assert frame(0, sigma_m=None).radius_95_m == np.inf
+
+
+def test_a_failure_ends_only_after_five_seconds_of_good_tracking() -> None:
+    """Lost, then six seconds of half-trust, then lost again is one failure; with six good seconds between, two."""
+    half: dict[str, object] = {"status": D, "fix": False, "sigma_m": 0.05}
+    one = sequence((2, GOOD), (3, LOST), (6, half), (3, LOST), (6, GOOD))
+    two = sequence((2, GOOD), (3, LOST), (6, GOOD), (3, LOST), (6, GOOD))
+    assert counts(one)[1] == 1
+    assert counts(two)[1] == 2
