@@ -7,11 +7,14 @@ from numpy.typing import NDArray
 
 from fleetmap.bow import PlaceIndex, Vocabulary
 from fleetmap.features.orb import SCALE_FACTOR
-from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile
 from fleetmap.rectification import StereoCamera
+from locclient import map_view_kernels
 
 Rows = NDArray[np.int64]
+_NEAREST_M = 0.2
+_REACH_SHARE = 1.3  # of the distance up to which a landmark was found: detection does not end sharply
 
 
 class MapView:
@@ -60,26 +63,33 @@ class MapView:
         self, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float
     ) -> tuple[Rows, Array, Array]:
         """Rows (V,) of landmarks that a camera there should see, their pixels (V, 3) and expected octaves (V,)."""
-        near = np.linalg.norm(self.points_map - map_from_cam[:3, 3], axis=1)
-        reach = self.max_distances_m * (camera.focal_px / self._survey_focal_px)
-        rows = np.flatnonzero((near < 1.3 * reach) & (near > 0.2))
-        points_cam = transform_points(se3_inverse(map_from_cam), self.points_map[rows])
-        pixels = camera.pixel_from_point(points_cam)
-        towards = (map_from_cam[:3, 3] - self.points_map[rows]) / near[rows, None]
-        cosine = np.einsum("ni,ni->n", towards, self.view_directions_map[rows].astype(np.float64))
-        limit = np.cos(np.minimum(self.view_half_angles_rad[rows] + max_view_angle_rad, np.pi))
-        inside = (pixels[:, 0] > -margin_px) & (pixels[:, 0] < camera.width_px + margin_px)
-        inside &= (pixels[:, 1] > -margin_px) & (pixels[:, 1] < camera.height_px + margin_px) & (cosine > limit)
-        rows = rows[inside]
-        octaves = np.log(np.maximum(reach[rows] / near[rows], 0.5)) / np.log(SCALE_FACTOR)
-        return rows, pixels[inside], octaves
+        size, reaches_m = len(self), self._reaches_m(camera.focal_px)
+        rows, pixels, distances_m = np.empty(size, np.int64), np.empty((size, 3)), np.empty(size)
+        pinhole = np.array(
+            [camera.focal_px, camera.cx_px, camera.cy_px, camera.focal_px * camera.baseline_m, camera.width_px, camera.height_px]
+        )  # fmt: skip
+        count = map_view_kernels.visible(
+            self.points_map, self.view_directions_map, self.view_half_angles_rad, reaches_m,
+            np.ascontiguousarray(map_from_cam), pinhole, margin_px, max_view_angle_rad, _NEAREST_M, _REACH_SHARE, rows,
+            pixels, distances_m,
+        )  # fmt: skip
+        rows, pixels = rows[:count].copy(), pixels[:count].copy()
+        octaves = np.log(np.maximum(reaches_m[rows] / distances_m[:count], 0.5)) / np.log(SCALE_FACTOR)
+        return rows, pixels, octaves
+
+    def _reaches_m(self, focal_px: float) -> NDArray[np.float32]:
+        """(N,) up to which distance a camera of this focal length finds each landmark."""
+        return np.asarray(self.max_distances_m * np.float32(focal_px / self._survey_focal_px), np.float32)
 
     def neighbourhood(self, place: int, reach_m: float) -> Rows:
         """Rows of all landmarks of places near one place that look a similar way."""
         positions, axes = self.map_from_cam[:, :3, 3], self.map_from_cam[:, :3, 2]
         near = np.linalg.norm(positions - positions[place], axis=1) < reach_m
         near &= axes @ axes[place] > 0.5
-        return np.unique(np.concatenate([self.place_rows[p] for p in np.flatnonzero(near)]))
+        held = np.zeros(len(self), bool)
+        for p in np.flatnonzero(near):
+            held[self.place_rows[p]] = True
+        return np.flatnonzero(held)
 
 
 def _joined(parts: list[NDArray[np.generic]], shape: tuple[int, ...], dtype: type) -> NDArray:  # type: ignore[type-arg]

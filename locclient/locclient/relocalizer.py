@@ -14,6 +14,7 @@ from locclient.map_view import MapView
 from locclient.settings import LocalizerSettings
 
 _NEIGHBOURHOOD_M = 3.0
+_SAME_PLACE_M, _SAME_PLACE_COSINE = 1.2, 0.8  # less than half a bay: no other place looks so much the same so near
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,10 +80,14 @@ class Relocalizer:
     ) -> list[Fix]:
         """Fixes of all places that look like this one and verify, best first, duplicates removed.
 
-        allowed (K,): places that may be considered. map_from_cam_rotation: the orientation, where it is known.
+        allowed (K,): places that may be considered. map_from_cam_rotation: the orientation, where it is known. A place
+        that a fix already stands at is not tried again: it is made of the same landmarks. One further on is, since
+        identical bays and aisles must be able to speak against each other.
         """
         fixes: list[Fix] = []
         for place in self.view.similar_places(seen.features.descriptors, allowed, self._settings.fix.top_places):
+            if any(_stands_at(fix, self.view.map_from_cam[place]) for fix in fixes):
+                continue
             fix = self._at_place(seen, int(place), map_from_cam_rotation)
             if fix is not None and all(not _same(fix, other) for other in fixes):
                 fixes.append(fix)
@@ -192,6 +197,12 @@ class Relocalizer:
         return max(
             self._settings.fix.guided_radius_px, 3.0 * self._camera.focal_px * (position / max(depth, 0.5) + angle)
         )
+
+
+def _stands_at(fix: Fix, map_from_place: Array) -> bool:
+    """Whether a place's neighbourhood is mostly that of a fix."""
+    apart_m = float(np.linalg.norm(fix.map_from_cam[:3, 3] - map_from_place[:3, 3]))
+    return apart_m < _SAME_PLACE_M and bool(fix.map_from_cam[:3, 2] @ map_from_place[:3, 2] > _SAME_PLACE_COSINE)
 
 
 def _same(a: Fix, b: Fix) -> bool:

@@ -153,7 +153,7 @@ class EstimatorSession:
         directions = np.stack([np.arctan2(toward[:, 1], toward[:, 0]), np.arctan2(toward[:, 2], level)], axis=1)
         count = estimator_kernels.detect(
             seen.keys, seen.pixels, seen.octaves, directions, frame, self._seed, model.found_share, model.view_share,
-            model.corner_px, model.octave_bias, model.octave_sigma, model.disparity_known_share, model.disparity_px,
+            model.corner_px, model.slip_share, model.slip_px, model.octave_sigma, model.disparity_known_share, model.disparity_px,
             model.disparity_wrong_share, model.disparity_wrong_px, model.dirt_bits, model.view_bits,
             model.view_step_rad, model.noise_bits, self._table, rows, pixels, octaves, words,
         )  # fmt: skip

@@ -71,8 +71,8 @@ def flow_noise(
 @kernel
 def detect(
     keys: Words, exact: Float, exact_octaves: Float, directions: Float, frame: int, seed: int, found_share: float,
-    view_share: float, corner_px: float, octave_bias: float, octave_sigma: float, known_share: float, disparity_px: float,
-    wrong_share: float, wrong_px: float, dirt_bits: int, view_bits: int, view_step_rad: float, noise_bits: float,
+    view_share: float, corner_px: float, slip_share: float, slip_px: float, octave_sigma: float, known_share: float,
+    disparity_px: float, wrong_share: float, wrong_px: float, dirt_bits: int, view_bits: int, view_step_rad: float, noise_bits: float,
     table: Float, rows: NDArray[np.int32], pixels: Float, octaves: NDArray[np.int8], words: Words,
 ) -> int:  # fmt: skip
     """Number of features that a detector finds at exact pixels (N, 3).
@@ -95,10 +95,10 @@ def detect(
         octave = round(exact_octaves[n] + octave_sigma * normal(mixed(now, np.uint64(2)), table))
         if octave < 0 or octave > 7:
             continue
-        sigma = corner_px * 1.2**octave
+        is_slipping = uniform(mixed(now, np.uint64(7))) < slip_share
+        sigma = (slip_px if is_slipping else corner_px) * 1.2**octave
         for axis in range(2):
-            bias = octave_bias * 0.5 * (1.0 - 1.2**octave)
-            pixels[count, axis] = exact[n, axis] + bias + sigma * normal(mixed(now, np.uint64(10 + axis)), table)
+            pixels[count, axis] = exact[n, axis] + sigma * normal(mixed(now, np.uint64(10 + axis)), table)
         disparity = exact[n, 0] - exact[n, 2] + disparity_px * normal(mixed(now, np.uint64(12)), table)
         if uniform(mixed(now, np.uint64(5))) < wrong_share:
             disparity += wrong_px * (2.0 * uniform(mixed(now, np.uint64(6))) - 1.0)

@@ -23,6 +23,7 @@ from locclient.settings import LocalizerSettings
 
 _TILE_M = 1024.0
 _NEVER_S = 1e9
+_EVERY_M, _EVERY_RAD = 0.4, 0.2
 
 
 class EstimatorTracker(Tracker):
@@ -98,44 +99,53 @@ def run_odometry(session: EstimatorSession, frames: int | None = None) -> list[O
 
 
 @dataclass
-class _Observed:
-    """Sums over the sightings of one landmark."""
+class Observed:
+    """The sightings of one landmark: where it was seen from (unit vectors), up to which distance it would be found, its descriptors."""
 
     point_map: Array
     directions: list[Array] = field(default_factory=list)
     reaches_m: list[float] = field(default_factory=list)
     descriptors: list[NDArray[np.uint8]] = field(default_factory=list)
 
+    def add(self, direction: Array, reach_m: float, descriptor: NDArray[np.uint8]) -> None:
+        """One more sighting."""
+        self.directions.append(direction)
+        self.reaches_m.append(reach_m)
+        self.descriptors.append(descriptor)
+
+
+def is_new_place(last_map_from_cam: Array, map_from_cam: Array, every_m: float = _EVERY_M) -> bool:
+    """Whether a map holds one more place here."""
+    since = se3_inverse(last_map_from_cam) @ map_from_cam
+    return bool(np.linalg.norm(since[:3, 3]) >= every_m or rotation_angle_rad(since[:3, :3]) >= _EVERY_RAD)
+
 
 def survey_map(
-    session: EstimatorSession, rng: np.random.Generator, *, every_m: float = 0.4, sigma_m: float = 0.01
+    session: EstimatorSession, rng: np.random.Generator, *, every_m: float = _EVERY_M, sigma_m: float = 0.01
 ) -> tuple[list[Tile], Vocabulary]:
     """A map as a survey would have left it: landmarks found at least twice, with an error of sigma_m, a place each every_m.
 
     The vocabulary is trained on its descriptors.
     """
-    observed: dict[int, _Observed] = {}
+    observed: dict[int, Observed] = {}
     places: list[tuple[Array, list[int]]] = []
     for frame in range(len(session)):
         map_from_cam = session.map_from_body[frame] @ session.body_from_cam
-        if places:
-            since = se3_inverse(places[-1][0]) @ map_from_cam
-            if np.linalg.norm(since[:3, 3]) < every_m and rotation_angle_rad(since[:3, :3]) < 0.2:
-                continue
+        if places and not is_new_place(places[-1][0], map_from_cam, every_m):
+            continue
         sighting, found = session.sighting(frame), session.features(frame)
         members = []
         points = _features_map(session, frame, found)
         for feature in np.flatnonzero(found.rows >= 0).tolist():
             row = int(found.rows[feature])
             landmark = int(sighting.ids[row])
-            entry = observed.setdefault(landmark, _Observed(points[feature]))
+            entry = observed.setdefault(landmark, Observed(points[feature]))
             away = map_from_cam[:3, 3] - sighting.points_map[row]
-            entry.directions.append(away / np.linalg.norm(away))
-            entry.reaches_m.append(float(sighting.distances_m[row]) * orb.SCALE_FACTOR ** float(found.octaves[feature]))
-            entry.descriptors.append(found.descriptors[feature])
+            reach = float(sighting.distances_m[row]) * orb.SCALE_FACTOR ** float(found.octaves[feature])
+            entry.add(away / np.linalg.norm(away), reach, found.descriptors[feature])
             members.append(landmark)
         places.append((map_from_cam, members))
-    return _as_tile(observed, places, rng, sigma_m)
+    return tile_of(observed, places, rng, sigma_m)
 
 
 def _features_map(session: EstimatorSession, frame: int, found: Found) -> Array:
@@ -145,9 +155,10 @@ def _features_map(session: EstimatorSession, frame: int, found: Found) -> Array:
     return transform_points(session.map_from_body[frame] @ session.body_from_cam, points_cam)
 
 
-def _as_tile(
-    observed: dict[int, _Observed], places: list[tuple[Array, list[int]]], rng: np.random.Generator, sigma_m: float
+def tile_of(
+    observed: dict[int, Observed], places: list[tuple[Array, list[int]]], rng: np.random.Generator, sigma_m: float
 ) -> tuple[list[Tile], Vocabulary]:
+    """The map of all landmarks that were seen at least twice, with an error of sigma_m added to each."""
     kept = sorted(landmark for landmark, entry in observed.items() if len(entry.descriptors) >= 2)
     number = {landmark: index for index, landmark in enumerate(kept)}
     entries = [observed[landmark] for landmark in kept]

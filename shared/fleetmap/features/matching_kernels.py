@@ -56,26 +56,36 @@ def knn2(a: Packed, b: Packed, index: Indices, first: Distances, second: Distanc
 @kernel
 def mutual(a: Packed, b: Packed, max_distance: int, ratio: float) -> Indices:
     """(P, 2) pairs that are each other's nearest and pass both thresholds, by index in a. Ties: lower index."""
-    column_best = np.full(len(b), FAR, np.int32)
-    column_index = np.full(len(b), -1, np.int64)
+    column_best = np.full(len(b), np.int64(FAR) << 32)  # distance, then the row: ties go to the lower one
     index = np.full(len(a), -1, np.int64)
+    words = b.T.copy()  # and distances of one row first, without a branch: both let the compiler use wide registers
+    distances = np.empty(len(b), np.int64)
     for i in range(len(a)):
+        a0, a1, a2, a3 = a[i, 0], a[i, 1], a[i, 2], a[i, 3]
+        for j in range(len(b)):
+            distances[j] = (
+                popcount64(a0 ^ words[0, j])
+                + popcount64(a1 ^ words[1, j])
+                + popcount64(a2 ^ words[2, j])
+                + popcount64(a3 ^ words[3, j])
+            )
+        for j in range(len(b)):
+            column_best[j] = min(column_best[j], (distances[j] << 32) + i)
         best, runner_up, found = FAR, FAR, -1
         for j in range(len(b)):
-            distance = hamming(a, i, b, j)
-            if distance < best:
-                runner_up = best
-                best, found = distance, j
-            elif distance < runner_up:
-                runner_up = distance
-            if distance < column_best[j]:
-                column_best[j], column_index[j] = distance, i
+            distance = distances[j]
+            if distance < runner_up:
+                if distance < best:
+                    runner_up = best
+                    best, found = distance, j
+                else:
+                    runner_up = distance
         if best <= max_distance and best < ratio * runner_up:
             index[i] = found
     pairs = np.empty((len(a), 2), np.int64)
     count = 0
     for i in range(len(a)):
-        if index[i] >= 0 and column_index[index[i]] == i:
+        if index[i] >= 0 and column_best[index[i]] & 0xFFFFFFFF == i:
             pairs[count, 0], pairs[count, 1] = i, index[i]
             count += 1
     return pairs[:count].copy()

@@ -1,0 +1,49 @@
+"""What a robot should see of its map, against plain numpy."""
+
+import numpy as np
+import pytest
+
+from fleetmap.bow import train_vocabulary
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
+from fleetmap.rectification import StereoCamera
+from locclient.map_view import MapView
+from map_samples import random_tile
+
+CAMERA = StereoCamera(420.0, 319.5, 239.5, 0.12, 640, 480)
+SURVEY_FOCAL_PX = 350.0
+
+
+@pytest.fixture(scope="module")
+def view() -> MapView:
+    tile = random_tile(np.random.default_rng(3))
+    vocabulary = train_vocabulary(tile.descriptors, 4, 2, np.random.default_rng(0))
+    return MapView([tile], vocabulary, SURVEY_FOCAL_PX)
+
+
+def expected(view: MapView, map_from_cam: Array, margin_px: float, angle_rad: float) -> set[int]:
+    """Rows by the definition: inside the widened picture, within reach, near a direction that it was mapped from."""
+    away = map_from_cam[:3, 3] - view.points_map
+    distance = np.linalg.norm(away, axis=1)
+    pixels = CAMERA.pixel_from_point(transform_points(se3_inverse(map_from_cam), view.points_map))
+    reach = 1.3 * view.max_distances_m * (CAMERA.focal_px / SURVEY_FOCAL_PX)
+    turned = np.arccos(np.clip(np.einsum("ni,ni->n", away / distance[:, None], view.view_directions_map), -1, 1))
+    seen = (distance > 0.2) & (distance < reach) & (turned < view.view_half_angles_rad + angle_rad)
+    seen &= (pixels[:, 0] > -margin_px) & (pixels[:, 0] < CAMERA.width_px + margin_px)
+    seen &= (pixels[:, 1] > -margin_px) & (pixels[:, 1] < CAMERA.height_px + margin_px)
+    return set(np.flatnonzero(seen).tolist())
+
+
+@pytest.mark.parametrize(("margin_px", "angle_rad"), [(0.0, 1.3), (50.0, np.pi), (12.0, 0.2)])
+def test_visible_landmarks_are_those_of_the_definition(view: MapView, margin_px: float, angle_rad: float) -> None:
+    rng = np.random.default_rng(1)
+    middle = view.points_map.mean(axis=0)
+    total = 0
+    for _ in range(40):
+        map_from_cam = se3(so3_exp(rng.normal(0.0, 1.5, 3)), middle + rng.normal(0.0, 4.0, 3))
+        rows, pixels, octaves = view.visible(map_from_cam, CAMERA, margin_px, angle_rad)
+        assert set(rows.tolist()) == expected(view, map_from_cam, margin_px, angle_rad)
+        there = transform_points(se3_inverse(map_from_cam), view.points_map[rows])
+        np.testing.assert_allclose(pixels, CAMERA.pixel_from_point(there), atol=1e-6)
+        assert np.isfinite(octaves).all()
+        total += len(rows)
+    assert total > 0
