@@ -202,7 +202,8 @@ class Relocalizer:
 def _stands_at(fix: Fix, map_from_place: Array) -> bool:
     """Whether a place's neighbourhood is mostly that of a fix."""
     apart_m = float(np.linalg.norm(fix.map_from_cam[:3, 3] - map_from_place[:3, 3]))
-    return apart_m < _SAME_PLACE_M and bool(fix.map_from_cam[:3, 2] @ map_from_place[:3, 2] > _SAME_PLACE_COSINE)
+    axis, place_axis = fix.map_from_cam[:3, 2], map_from_place[:3, 2]
+    return apart_m < _SAME_PLACE_M and bool(axis @ place_axis > _SAME_PLACE_COSINE)
 
 
 def _same(a: Fix, b: Fix) -> bool:
