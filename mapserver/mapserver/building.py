@@ -20,6 +20,7 @@ from fleetmap.recordings.tum import write_tum
 from fleetmap.rectification import Rectifier
 from fleetmap.samples import SensorSet
 from mapserver.build_report import Accuracy, BuildReport, accuracy, check_truth, full_report, make_report
+from mapserver.picture_files import PictureFile
 from mapserver.progress import ProgressView, StageTimes
 from mapserver.store import DraftDetails, MapStore
 from mapserver.store.archive import encode_archive
@@ -101,7 +102,7 @@ def _survey(
     times = StageTimes(time.perf_counter)
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
     frames = (recording.read_frame(int(index)) for index in indices)
-    with ProgressView(console) as view:
+    with ProgressView(console) as view, PictureFile(order.store) as shelf:
 
         def progress(stage: str, done: int, total: int) -> None:
             times(stage, done, total)
@@ -109,7 +110,7 @@ def _survey(
 
         done = survey(
             frames, len(indices), recording.imu, recording.calibration, rectifier,
-            None if vocabulary is None else decode_vocabulary(vocabulary), settings, zones, progress,
+            None if vocabulary is None else decode_vocabulary(vocabulary), settings, zones, progress, shelf,
         )  # fmt: skip
     times.begin("storing")
     placed = map_from_survey(done.map, recording.priors, recording.calibration.base_from_body)

@@ -10,7 +10,7 @@ from fleetmap.geometry import Array, rotation_between_vectors, se3
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from fleetmap.rectification import RectifiedFrame, Rectifier
 from fleetmap.samples import CameraFrame, ImuSamples
-from mapserver.survey.keyframes import FrameSummary, Keyframe, KeyframePolicy, make_keyframe, sharpness
+from mapserver.survey.keyframes import FrameSummary, Keyframe, KeyframePolicy, PictureShelf, make_keyframe, sharpness
 from mapserver.survey.settings import SurveySettings
 
 
@@ -32,7 +32,7 @@ class FirstGuess:
 
 def run_odometry(
     frames: Iterable[CameraFrame], imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings,
-    progress: Callable[[int], None],
+    progress: Callable[[int], None], shelf: PictureShelf | None = None,
 ) -> FirstGuess:  # fmt: skip
     """Feeds frames (in order) and the IMU up to each into the odometry; progress is called with each frame's number."""
     odometry = Odometry(
@@ -59,7 +59,7 @@ def run_odometry(
         estimates.append(estimate)
         odom_from_body.append(estimate.odom_from_body)
         if policy.wants(_summary(frame, estimate)):
-            keyframes.append(make_keyframe(frame, number, rectifier.camera, settings))
+            keyframes.append(make_keyframe(frame, number, rectifier.camera, settings, shelf))
         progress(number)
     inertial = bool(estimates) and calibration.imu is not None and estimates[-1].inertial
     return FirstGuess(

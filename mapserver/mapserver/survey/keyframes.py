@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -14,28 +15,72 @@ from mapserver.survey.settings import KeyframeSettings, SurveySettings
 
 
 @dataclass(frozen=True, slots=True)
+class Pictures:
+    """What a keyframe looks like: its rectified frame and the left picture's pyramid."""
+
+    frame: RectifiedFrame
+    pyramid: patch_align.Pyramid
+
+
+class PictureShelf(Protocol):
+    """Where the pictures of keyframes wait until they are looked at again: a long survey's do not fit in memory."""
+
+    def put(self, pictures: Pictures) -> int:
+        """The number under which `get` gives them back."""
+
+    def get(self, number: int) -> Pictures:
+        """The pictures as they were put."""
+
+
+class MemoryShelf:
+    """Keeps all pictures as they are."""
+
+    def __init__(self) -> None:
+        self._pictures: list[Pictures] = []
+
+    def put(self, pictures: Pictures) -> int:
+        """See PictureShelf."""
+        self._pictures.append(pictures)
+        return len(self._pictures) - 1
+
+    def get(self, number: int) -> Pictures:
+        """See PictureShelf."""
+        return self._pictures[number]
+
+
+@dataclass(frozen=True, slots=True)
 class Keyframe:
-    """One keyframe: its rectified frame, features (N), disparities (N, 2) with sigma, and image pyramid."""
+    """One keyframe: features (N), disparities (N, 2) with sigma, their points; its pictures wait on a shelf."""
 
     frame_index: int
-    frame: RectifiedFrame
+    stamp_ns: int
     features: orb.Features
     disparities: Array
     points_cam: Array
-    pyramid: patch_align.Pyramid
+    shelf: PictureShelf
+    shelf_number: int
 
     @property
-    def stamp_ns(self) -> int:
-        """Sensor time."""
-        return self.frame.stamp_ns
+    def frame(self) -> RectifiedFrame:
+        """The rectified frame."""
+        return self.shelf.get(self.shelf_number).frame
+
+    @property
+    def pyramid(self) -> patch_align.Pyramid:
+        """The left picture and its halvings."""
+        return self.shelf.get(self.shelf_number).pyramid
 
 
-def make_keyframe(frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings) -> Keyframe:
-    """Detects, describes and stereo-matches one frame."""
+def make_keyframe(
+    frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings, shelf: PictureShelf | None = None
+) -> Keyframe:  # fmt: skip
+    """Detects, describes and stereo-matches one frame; its pictures go to `shelf`, into memory without one."""
     features = orb.detect(frame.left, settings.orb)
     disparities = stereo.disparities(frame, camera, features.pixels, settings.stereo)
     points = camera.point_from_pixel(features.pixels, disparities[:, 0])
-    return Keyframe(frame_index, frame, features, disparities, points, patch_align.half_pyramid(frame.left))
+    kept = MemoryShelf() if shelf is None else shelf
+    number = kept.put(Pictures(frame, patch_align.half_pyramid(frame.left)))
+    return Keyframe(frame_index, frame.stamp_ns, features, disparities, points, kept, number)
 
 
 @dataclass(frozen=True, slots=True)

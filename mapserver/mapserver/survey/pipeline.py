@@ -17,7 +17,7 @@ from mapserver.survey.adjust import Motion, SurveyState, adjust, adjust_windows
 from mapserver.survey.bundle import RelativeTerm
 from mapserver.survey.first_guess import FirstGuess, run_odometry
 from mapserver.survey.graph_marginals import GraphMarginals
-from mapserver.survey.keyframes import Keyframe
+from mapserver.survey.keyframes import Keyframe, PictureShelf
 from mapserver.survey.loops import LoopCloser, Loops
 from mapserver.survey.matching import PairFinder, drift_allowance_m, fixed_allowance_m
 from mapserver.survey.pairs import PairMatch
@@ -35,21 +35,24 @@ _MIN_LANDMARKS = 30
 
 @dataclass(frozen=True)
 class Survey:
-    """What a survey gives: the map, the vocabulary it used, the loops with their reasons, and the first guess it began with."""
+    """What a survey gives: the map, the vocabulary it used, the loops with their reasons, the first guess it began with, and the
+    adjusted state, which still knows which feature each observation is."""
 
     map: SurveyMap
     vocabulary: Vocabulary
     loops: Loops
     first_guess: FirstGuess
+    state: SurveyState
 
 
 def survey(
     frames: Iterable[CameraFrame], frame_count: int, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
     vocabulary: Vocabulary | None, settings: SurveySettings, zones: Zones, progress: Progress,
+    shelf: PictureShelf | None = None,
 ) -> Survey:  # fmt: skip
-    """Maps one recording. Raises SurveyError where it holds too little to map."""
+    """Maps one recording, its keyframes' pictures on `shelf`. Raises SurveyError where it holds too little to map."""
     guess = run_odometry(
-        frames, imu, calibration, rectifier, settings, lambda n: progress("odometry", n + 1, frame_count)
+        frames, imu, calibration, rectifier, settings, lambda n: progress("odometry", n + 1, frame_count), shelf
     )
     keyframes = guess.keyframes
     if len(keyframes) < _MIN_KEYFRAMES:
@@ -81,7 +84,7 @@ def survey(
         )
         adjust(state, settings)
     progress("global adjustment", 2, 2)
-    return Survey(summarise(state, guess, settings), vocabulary, loops, guess)
+    return Survey(summarise(state, guess, settings), vocabulary, loops, guess, state)
 
 
 def _first_state(

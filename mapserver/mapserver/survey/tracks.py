@@ -11,6 +11,7 @@ from fleetmap.rectification import StereoCamera
 from mapserver.survey.keyframes import Keyframe
 from mapserver.survey.pairs import PairMatch
 from mapserver.survey.settings import NoiseSettings, SurveySettings
+from mapserver.survey.tracks_kernels import join as join_kernel
 
 
 @dataclass
@@ -41,30 +42,21 @@ class Landmarks:
 
 def join_tracks(keyframes: list[Keyframe], pairs: list[PairMatch]) -> list[list[tuple[int, int]]]:
     """Groups of (keyframe, feature) that pairs connect, no keyframe twice in a group; strongest pairs are joined first."""
-    parent: dict[tuple[int, int], tuple[int, int]] = {}
-    members: dict[tuple[int, int], dict[int, int]] = {}
-
-    def root(node: tuple[int, int]) -> tuple[int, int]:
-        while parent[node] != node:
-            parent[node] = parent[parent[node]]
-            node = parent[node]
-        return node
-
-    for pair in sorted(pairs, key=lambda p: (-len(p.features), p.i, p.j)):
-        for feature_i, feature_j in pair.features.tolist():
-            nodes = (pair.i, feature_i), (pair.j, feature_j)
-            for node in nodes:
-                if node not in parent:
-                    parent[node] = node
-                    members[node] = {node[0]: node[1]}
-            a, b = root(nodes[0]), root(nodes[1])
-            if a == b or members[a].keys() & members[b].keys():
-                continue
-            if len(members[a]) < len(members[b]):
-                a, b = b, a
-            parent[b] = a
-            members[a].update(members.pop(b))
-    return [sorted(group.items()) for _, group in sorted(members.items()) if len(group) > 1]
+    ordered = sorted(pairs, key=lambda p: (-len(p.features), p.i, p.j))
+    if not ordered:
+        return []
+    sides = [np.concatenate([p.features[:, side] for p in ordered]).astype(np.int64) for side in range(2)]
+    counts = [len(p.features) for p in ordered]
+    owners = [np.repeat(np.array([p.i for p in ordered]), counts), np.repeat(np.array([p.j for p in ordered]), counts)]
+    stride = int(max(sides[0].max(initial=0), sides[1].max(initial=0))) + 1
+    codes = [owner * stride + feature for owner, feature in zip(owners, sides, strict=True)]
+    nodes, links = np.unique(np.concatenate(codes), return_inverse=True)
+    roots = join_kernel(links[: len(codes[0])], links[len(codes[0]) :], nodes // stride)
+    order = np.lexsort((nodes, roots))
+    _, starts, sizes = np.unique(roots[order], return_index=True, return_counts=True)
+    found = nodes[order]
+    members = list(zip((found // stride).tolist(), (found % stride).tolist(), strict=True))
+    return [members[start : start + size] for start, size in zip(starts, sizes, strict=True) if size > 1]
 
 
 def build_landmarks(
@@ -118,7 +110,7 @@ def _observe(
     pixels, sigmas = np.empty((len(table), 3)), np.empty((len(table), 2))
     for k in np.unique(table[:, 0]):
         rows = np.flatnonzero(table[:, 0] == k)
-        own = keyframes[k]
+        own, frame = keyframes[k], keyframes[k].frame
         features = table[rows, 2]
         left, sigma = own.features.pixels[features].copy(), _descriptor_sigma(own, features, noise)
         sigma[is_reference[rows]] = noise.aligned_sigma_px
@@ -132,7 +124,7 @@ def _observe(
             sure = np.isfinite(refined[:, 0])
             left[inner[sure]] = refined[sure, :2]
             sigma[inner[sure]] = np.hypot(noise.aligned_sigma_px, refined[sure, 2])
-        found = stereo.disparities(own.frame, camera, left, settings.stereo, own.disparities[features, 0])
+        found = stereo.disparities(frame, camera, left, settings.stereo, own.disparities[features, 0])
         pixels[rows] = np.column_stack([left, left[:, 0] - found[:, 0]])
         sigmas[rows] = np.column_stack([sigma, np.hypot(noise.disparity_sigma_px, np.nan_to_num(found[:, 1], nan=1.0))])
     return pixels, sigmas
