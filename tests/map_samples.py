@@ -66,7 +66,7 @@ def random_survey(rng: np.random.Generator, *, keyframes: int = 6, landmarks: in
         obs_landmark=obs_landmark.astype(np.int32),
         obs_pixels=rng.uniform(0, 480, (count, 3)),
         obs_octave=rng.integers(0, 8, count).astype(np.int8),
-        obs_sigma_px=rng.uniform(0.2, 2, count),
+        obs_sigma_px=rng.uniform(0.2, 2, (count, 2)),
         trajectory=Trajectory(stamps, map_from_body),
         trajectory_estimated=np.ones(keyframes, bool),
         patches=rng.integers(0, 256, (landmarks, 11, 11), dtype=np.uint8),

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile
+from mapserver.survey.history import history_of
 from mapserver.survey.result import SurveyMap
+from mapserver.survey.views import Views
 
 TILE_SIZE_M = 16.0
-OCTAVE_SCALE = 1.2
 MAX_PLACE_LANDMARKS = 300
 _Ids = NDArray[np.uint32]
 
@@ -21,23 +22,25 @@ def tiles_from_survey(
 ) -> list[Tile]:
     """The survey cut into squares of `tile_size_m`, ordered by x, then y.
 
-    Landmarks lie in the tile of their position, places (all keyframes; their index is their id) in that of their
-    camera's centre. A place lists at most `max_place_landmarks` of the landmarks seen there, those with most
+    Landmarks lie in the tile of their position, places (the keyframes that are offered as such, under their ids) in that
+    of their camera's centre. A place lists at most `max_place_landmarks` of the landmarks seen there, those with most
     observations in the survey. Landmarks that nothing observes are left out: nothing says from where they are seen.
     Raises SurveyError for a survey with values that are not finite.
     """
     map_from_cam = survey.map_from_body @ survey.body_from_cam
     _check_finite(survey, map_from_cam)
-    views = _Views(survey, map_from_cam)
+    views = Views(survey, map_from_cam)
     kept = np.flatnonzero(views.counts > 0)
     kept = kept[np.argsort(survey.landmark_ids[kept], kind="stable")]
     landmark_cells = _cells(survey.points_map[kept], tile_size_m)
     place_cells = _cells(map_from_cam[:, :3, 3], tile_size_m)
     references = _place_landmarks(survey, views.counts, max_place_landmarks)
+    history = history_of(survey)
     tiles = []
-    for cell in sorted({(int(x), int(y)) for x, y in np.concatenate([landmark_cells, place_cells])}):
+    for cell in sorted({(int(x), int(y)) for x, y in np.concatenate([landmark_cells, place_cells[history.is_place]])}):
         rows = kept[(landmark_cells == cell).all(axis=1)]
-        places = np.flatnonzero((place_cells == cell).all(axis=1))
+        places = np.flatnonzero((place_cells == cell).all(axis=1) & history.is_place)
+        places = places[np.argsort(history.keyframe_ids[places], kind="stable")]
         tiles.append(
             Tile(
                 tile_x=cell[0],
@@ -50,7 +53,7 @@ def tiles_from_survey(
                 view_half_angle_rad=views.half_angle_rad[rows].astype(np.float32),
                 max_distance_m=views.max_distance_m[rows].astype(np.float32),
                 sigma_m=survey.point_sigma_m[rows].astype(np.float32),
-                place_ids=places.astype(np.uint32),
+                place_ids=history.keyframe_ids[places],
                 map_from_cam=map_from_cam[places],
                 place_landmark_ids=tuple(references[place] for place in places),
             )
@@ -65,48 +68,6 @@ def _check_finite(survey: SurveyMap, map_from_cam: Array) -> None:
         raise SurveyError(
             f"{points} landmarks and {places} keyframes of the survey are not finite; its adjustment failed"
         )
-
-
-class _Views:
-    """From where each of the N landmarks was seen.
-
-    counts (N,) observations; directions_map (N, 3) unit mean direction towards the cameras; half_angle_rad (N,) the
-    largest angle to it; max_distance_m (N,) median over observations of distance * scale ** octave. Zeros where counts
-    is 0, except directions.
-    """
-
-    def __init__(self, survey: SurveyMap, map_from_cam: Array) -> None:
-        landmark, count = survey.obs_landmark, len(survey.landmark_ids)
-        offsets_map = map_from_cam[survey.obs_keyframe, :3, 3] - survey.points_map[landmark]
-        distances_m = np.linalg.norm(offsets_map, axis=1)
-        rays_map = offsets_map / np.maximum(distances_m, 1e-9)[:, None]
-        self.counts = np.bincount(landmark, minlength=count)
-        self.directions_map = _mean_directions(landmark, rays_map, self.counts)
-        cosines = np.einsum("ij,ij->i", rays_map, self.directions_map[landmark])
-        self.half_angle_rad = np.zeros(count)
-        np.maximum.at(self.half_angle_rad, landmark, np.arccos(np.clip(cosines, -1.0, 1.0)))
-        self.max_distance_m = _medians(landmark, distances_m * OCTAVE_SCALE**survey.obs_octave, self.counts)
-
-
-def _mean_directions(landmark: NDArray[np.int32], rays_map: Array, counts: NDArray[np.intp]) -> Array:
-    sums = np.stack([np.bincount(landmark, rays_map[:, axis], len(counts)) for axis in range(3)], axis=1)
-    # Seen from opposite sides the mean has no direction; any will do, the half angle then includes all others.
-    vague = np.linalg.norm(sums, axis=1) < 1e-6 * np.maximum(counts, 1)
-    first_seen = np.unique(landmark, return_index=True)
-    fallback = np.tile([0.0, 0.0, 1.0], (len(counts), 1))
-    fallback[first_seen[0]] = rays_map[first_seen[1]]
-    sums[vague] = fallback[vague]
-    return np.asarray(sums / np.linalg.norm(sums, axis=1, keepdims=True))
-
-
-def _medians(groups: NDArray[np.int32], values: Array, counts: NDArray[np.intp]) -> Array:
-    """(N,) median (the upper of two middle ones) of the values of each group, 0 for empty ones."""
-    ordered = values[np.lexsort((values, groups))]
-    starts = np.cumsum(counts) - counts
-    medians = np.zeros(len(counts))
-    filled = counts > 0
-    medians[filled] = ordered[(starts + counts // 2)[filled]]
-    return medians
 
 
 def _cells(points_map: Array, size_m: float) -> NDArray[np.int64]:

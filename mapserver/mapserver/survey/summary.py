@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from fleetmap.features.matching import packed
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.rectification import StereoCamera
 from fleetmap.samples import Trajectory
 from mapserver.survey.adjust import SurveyState
 from mapserver.survey.first_guess import FirstGuess
@@ -14,7 +15,7 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.tracks import Landmarks
 from mapserver.survey.trajectory import frame_trajectory
 
-_PATCH_HALF_PX = 5
+_PATCH_HALF_PX = 10  # a 9 px window seen from nearer or turned still finds all of itself
 _MIN_TIED = 8
 
 
@@ -34,20 +35,20 @@ def summarise(state: SurveyState, guess: FirstGuess, settings: SurveySettings) -
         map_from_body=state.map_from_body,
         landmark_ids=np.arange(len(marks.points_map), dtype=np.uint32),
         points_map=marks.points_map,
-        descriptors=_descriptors(marks, keyframes),
-        point_sigma_m=_point_sigmas(state),
+        descriptors=medoid_descriptors(marks, keyframes),
+        point_sigma_m=point_sigmas_m(state),
         obs_keyframe=marks.obs_keyframe,
         obs_landmark=marks.obs_landmark,
         obs_pixels=marks.obs_pixels,
         obs_octave=octaves,
-        obs_sigma_px=marks.obs_sigma_px[:, 0].copy(),
+        obs_sigma_px=marks.obs_sigma_px,
         trajectory=Trajectory(frame_stamps, map_from_body),
         trajectory_estimated=_estimated(state, guess),
-        patches=_patches(marks, keyframes),
+        patches=cut_patches(marks, keyframes),
     )
 
 
-def _descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
+def medoid_descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
     """(N, 32): of each landmark's descriptors the one nearest to all others (their medoid)."""
     rows = np.array(
         [keyframes[k].features.descriptors[f] for k, f in zip(marks.obs_keyframe, marks.obs_feature, strict=True)]
@@ -62,28 +63,40 @@ def _descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint
     return out
 
 
-def _point_sigmas(state: SurveyState) -> Array:
+def point_sigmas_m(state: SurveyState) -> Array:
     """(N,) largest standard deviation of each landmark, keyframes taken as known."""
-    marks, camera = state.landmarks, state.camera
-    cam_from_map = se3_inverse(state.map_from_body @ state.body_from_cam)[marks.obs_keyframe]
+    marks = state.landmarks
+    information = point_information(
+        state.camera, (state.map_from_body @ state.body_from_cam)[marks.obs_keyframe], marks.points_map, marks.obs_landmark,
+        np.isfinite(marks.obs_pixels[:, 2]), marks.obs_sigma_px,
+    )  # fmt: skip
+    weakest = np.linalg.eigvalsh(information)[:, 0]
+    return np.asarray(1.0 / np.sqrt(np.maximum(weakest, 1e-6)))
+
+
+def point_information(
+    camera: StereoCamera, map_from_cam: Array, points_map: Array, obs_landmark: NDArray[np.int32], has_right: NDArray[np.bool_],
+    obs_sigma_px: Array,
+) -> Array:  # fmt: skip
+    """(N, 3, 3) what M observations from known cameras map_from_cam (M, 4, 4) say about N points, in map axes."""
+    cam_from_map = se3_inverse(map_from_cam)
     rotations = cam_from_map[:, :3, :3]
-    seen = np.einsum("mij,mj->mi", rotations, marks.points_map[marks.obs_landmark]) + cam_from_map[:, :3, 3]
+    seen = np.einsum("mij,mj->mi", rotations, points_map[obs_landmark]) + cam_from_map[:, :3, 3]
     z = np.maximum(seen[:, 2], 0.05)
     f = camera.focal_px
     rows = np.zeros((len(z), 3, 3))
     rows[:, 0, 0] = rows[:, 1, 1] = f / z
     rows[:, 0, 2], rows[:, 1, 2] = -f * seen[:, 0] / z**2, -f * seen[:, 1] / z**2
-    rows[:, 2, 2] = np.where(np.isfinite(marks.obs_pixels[:, 2]), -f * camera.baseline_m / z**2, 0.0)
-    sigma = np.column_stack([marks.obs_sigma_px[:, 0], marks.obs_sigma_px[:, 0], marks.obs_sigma_px[:, 1]])
+    rows[:, 2, 2] = np.where(has_right, -f * camera.baseline_m / z**2, 0.0)
+    sigma = np.column_stack([obs_sigma_px[:, 0], obs_sigma_px[:, 0], obs_sigma_px[:, 1]])
     jacobian = (rows / sigma[:, :, None]) @ rotations
-    information = np.zeros((len(marks.points_map), 3, 3))
-    np.add.at(information, marks.obs_landmark, jacobian.transpose(0, 2, 1) @ jacobian)
-    weakest = np.linalg.eigvalsh(information)[:, 0]
-    return np.asarray(1.0 / np.sqrt(np.maximum(weakest, 1e-6)))
+    information = np.zeros((len(points_map), 3, 3))
+    np.add.at(information, obs_landmark, jacobian.transpose(0, 2, 1) @ jacobian)
+    return information
 
 
-def _patches(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
-    """(N, 11, 11) windows around each landmark's first observation, at the halving nearest to its octave."""
+def cut_patches(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
+    """(N, 21, 21) windows around each landmark's first observation, at the halving nearest to its octave."""
     size = 2 * _PATCH_HALF_PX + 1
     out = np.zeros((len(marks.points_map), size, size), np.uint8)
     first = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map)))
