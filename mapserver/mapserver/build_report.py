@@ -127,7 +127,7 @@ def full_report(
     """The stable keys, and with them what helps to understand them; those may change.
 
     loop_records: every candidate, keyframe i against the older j. stage_s: wall seconds of each stage; reading and
-    decoding images are part of odometry.
+    decoding images are part of odometry. pair_turn: see survey/pair_turn.py.
     """
     survey_map = survey.map
     stable: dict[str, Any] = msgspec.to_builtins(report)
@@ -144,6 +144,7 @@ def full_report(
         "point_sigma_median_m": float(np.median(survey_map.point_sigma_m)),
         "ate_max_m": None if found.rigid is None else found.rigid.max_m,
         "sim3_scale": None if found.similarity is None else found.similarity.scale,
+        "pair_turn": msgspec.to_builtins(survey.pair_turn),
         "stage_s": {stage: round(seconds, 3) for stage, seconds in stage_s.items()},
         "loop_records": msgspec.to_builtins(survey.loops.records),
     }

@@ -70,7 +70,7 @@ class Rectifier:
         if not cameras:
             raise CalibrationError("the calibration holds no camera; pass one with --calibration FILE")
         self._sizes = [(c.height_px, c.width_px) for c in cameras[:2]]
-        self._has_depth = has_depth
+        self.has_depth = has_depth
         if has_depth or len(cameras) == 1:
             cam0_from_rect = np.eye(3)
             baseline = RGBD_BASELINE_M if has_depth else 0.0
@@ -92,7 +92,7 @@ class Rectifier:
         left = self._remap(frame.left, 0, frame.stamp_ns)
         right = self._remap(frame.right, 1, frame.stamp_ns) if frame.right is not None and len(self._maps) > 1 else None
         disparity = None
-        if self._has_depth and frame.depth_m is not None:
+        if self.has_depth and frame.depth_m is not None:
             depth = np.where(frame.depth_m > 0, frame.depth_m, np.nan)
             disparity = (self.camera.focal_px * self.camera.baseline_m / depth).astype(np.float32)
             if self._maps[0] is not None:

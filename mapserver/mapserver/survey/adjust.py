@@ -42,6 +42,7 @@ class SurveyState:
     camera: StereoCamera
     motion: Motion
     landmarks: Landmarks
+    is_depth_camera: bool = False
 
     def cam_from_cam(self, j: int, i: int) -> Array:
         """camera j from camera i (4, 4)."""
@@ -50,12 +51,16 @@ class SurveyState:
 
 
 def adjust(
-    state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_] | None = None, rounds: int = 3
-) -> BundleResult:
-    """Adjusts `state` in place; outlying observations are dropped between rounds. `free` (K,) limits it to a window."""
+    state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_] | None = None, rounds: int = 3, *, final: bool = False
+) -> BundleResult:  # fmt: skip
+    """Adjusts `state` in place; outlying observations are dropped between rounds. `free` (K,) limits it to a window.
+
+    final: near the optimum; the last round takes the redescending cost of `final_bundle`.
+    """
     for round_number in range(rounds):
-        problem = _problem(state, settings, free)
-        result = optimize(problem, settings.bundle)
+        problem = bundle_problem(state, settings, free)
+        last = final and round_number + 1 == rounds
+        result = optimize(problem, settings.final_bundle if last else settings.bundle)
         _take(state, result)
         if round_number + 1 < rounds:
             keep = result.squared_sigmas < settings.noise.cut_sigmas**2
@@ -105,7 +110,7 @@ def _local(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_]
             marks.obs_sigma_px[rows],
         ),
     )  # fmt: skip
-    result = optimize(_problem(part, settings, free[keyframes]), settings.bundle)
+    result = optimize(bundle_problem(part, settings, free[keyframes]), settings.bundle)
     state.map_from_body[keyframes] = result.map_from_body
     marks.points_map[touched] = result.points_map
     if (
@@ -118,7 +123,8 @@ def _local(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_]
         motion.accel_bias_mps2[keyframes] = result.accel_bias_mps2
 
 
-def _problem(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_] | None) -> BundleProblem:
+def bundle_problem(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_] | None) -> BundleProblem:
+    """What there is to adjust; `free` (K,) are the keyframes that may move, all for None."""
     marks, motion = state.landmarks, state.motion
     fixed = np.zeros(len(state.stamps_ns), bool) if free is None else ~free
     if not fixed.any():

@@ -20,6 +20,7 @@ from mapserver.survey.graph_marginals import GraphMarginals
 from mapserver.survey.keyframes import Keyframe, PictureShelf
 from mapserver.survey.loops import LoopCloser, Loops
 from mapserver.survey.matching import PairFinder, drift_allowance_m, fixed_allowance_m
+from mapserver.survey.pair_turn import NO_TURN, PairTurn, estimate_turn, without_turn
 from mapserver.survey.pairs import PairMatch
 from mapserver.survey.pose_graph import PoseEdge, optimize_pose_graph
 from mapserver.survey.result import SurveyMap
@@ -35,14 +36,15 @@ _MIN_LANDMARKS = 30
 
 @dataclass(frozen=True)
 class Survey:
-    """What a survey gives: the map, the vocabulary it used, the loops with their reasons, the first guess it began with, and the
-    adjusted state, which still knows which feature each observation is."""
+    """What a survey gives: the map, the vocabulary it used, the loops with their reasons, the first guess it began with, the
+    adjusted state, which still knows which feature each observation is, and what it found out about the pair of cameras."""
 
     map: SurveyMap
     vocabulary: Vocabulary
     loops: Loops
     first_guess: FirstGuess
     state: SurveyState
+    pair_turn: PairTurn
 
 
 def survey(
@@ -76,15 +78,19 @@ def survey(
         adjust(state, settings, rounds=2)
     vocabulary = vocabulary or _train(keyframes, settings)
     loops = _close_loops(guess, state, pairs, vocabulary, settings, zones, progress)
+    turn = NO_TURN
     for round_number in range(2):
         progress("global adjustment", round_number, 2)
         pairs = _match_all(state, finder, settings, progress)
         state.landmarks = build_landmarks(
             keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings
         )
-        adjust(state, settings)
+        state.landmarks = without_turn(state.landmarks, state.camera, turn.correction_px)
+        adjust(state, settings, final=True)
+        if round_number == 0:
+            turn = estimate_turn(state, settings)
     progress("global adjustment", 2, 2)
-    return Survey(summarise(state, guess, settings), vocabulary, loops, guess, state)
+    return Survey(summarise(state, guess, settings), vocabulary, loops, guess, state, turn)
 
 
 def _first_state(
@@ -101,7 +107,9 @@ def _first_state(
     )  # fmt: skip
     nothing = build_landmarks([], [], map_from_body, rectifier.body_from_cam, rectifier.camera, settings)
     stamps = np.array([k.stamp_ns for k in guess.keyframes], np.int64)
-    return SurveyState(stamps, map_from_body.copy(), rectifier.body_from_cam, rectifier.camera, motion, nothing)
+    return SurveyState(
+        stamps, map_from_body.copy(), rectifier.body_from_cam, rectifier.camera, motion, nothing, rectifier.has_depth
+    )
 
 
 def _odometry_terms(guess: FirstGuess, numbers: list[int]) -> list[RelativeTerm]:

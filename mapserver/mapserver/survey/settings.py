@@ -58,6 +58,8 @@ class NoiseSettings(Section, frozen=True):
     descriptor_sigma_px: float = 0.9
     disparity_sigma_px: float = 0.2
     cut_sigmas: float = 4.0
+    turn_floor_px: float = 0.02
+    turn_sigmas: float = 3.0
     accel_noise_scale: float = 5.0
     gyro_noise_scale: float = 2.0
     walk_scale: float = 1.0
@@ -84,6 +86,9 @@ class SurveySettings(Section, frozen=True):
     loops: LoopSettings = LoopSettings()
     noise: NoiseSettings = NoiseSettings()
     bundle: BundleSettings = BundleSettings(max_iterations=20, relative_cost_tolerance=1e-6)
+    final_bundle: BundleSettings = BundleSettings(
+        max_iterations=20, relative_cost_tolerance=1e-6, huber_sigmas=0.7, cutoff_sigmas=2.5
+    )
     vocabulary: VocabularySettings = VocabularySettings()
     local_window: int = 20
     min_observations: int = 2
