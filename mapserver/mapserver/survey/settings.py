@@ -71,6 +71,14 @@ class VocabularySettings(Section, frozen=True):
     max_descriptors: int = 200_000
 
 
+class BudgetSettings(Section, frozen=True):
+    """How much of a survey robots get."""
+
+    landmarks_per_m: float = 65.0
+    min_landmarks: int = 2000
+    tile_landmarks: int = 5500
+
+
 class SurveySettings(Section, frozen=True):
     """All of it."""
 
@@ -85,5 +93,6 @@ class SurveySettings(Section, frozen=True):
     noise: NoiseSettings = NoiseSettings()
     bundle: BundleSettings = BundleSettings(max_iterations=20, relative_cost_tolerance=1e-6)
     vocabulary: VocabularySettings = VocabularySettings()
+    budget: BudgetSettings = BudgetSettings()
     local_window: int = 20
     min_observations: int = 2
