@@ -23,7 +23,7 @@ import numpy as np
 from fleetmap.mapformat import Manifest, Tile, decode_tile, encode_tile
 from fleetmap.messages import WantedVersion
 from fleetmap.recordings import FrameSelection, open_recording
-from locclient.link import FetchedTiles
+from locclient.link import FetchedTiles, ReadyVersion
 from locclient.replay import RobotLink, replay
 from locclient.settings import LocalizerSettings
 from locclient.sources import ReplaySource
@@ -45,8 +45,8 @@ class Cut:
     words: bytes
     cut: list[Tile]
 
-    def wanted(self) -> WantedVersion:
-        return WantedVersion(site=self.made.site, version=self.made.version, manifest_sha256="0" * 64)
+    def ready(self) -> ReadyVersion:
+        return ReadyVersion(WantedVersion(site=self.made.site, version=self.made.version, manifest_sha256="0" * 64))
 
     def manifest(self, _: WantedVersion) -> Manifest:
         return self.made

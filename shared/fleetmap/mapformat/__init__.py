@@ -3,6 +3,7 @@
 from fleetmap.mapformat.container import pack, unpack
 from fleetmap.mapformat.manifest import (
     MANIFEST_FORMAT,
+    MAX_MANIFEST_BYTES,
     BlobEntry,
     CameraEntry,
     Manifest,
@@ -19,6 +20,7 @@ from fleetmap.mapformat.tile_codec import LANDMARK_BYTES, MAX_TILE_PLACES, TILE_
 __all__ = [
     "LANDMARK_BYTES",
     "MANIFEST_FORMAT",
+    "MAX_MANIFEST_BYTES",
     "MAX_TILE_PLACES",
     "PATCH_FORMAT",
     "TILE_FORMAT",
