@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from fleetmap.geometry import Array, quat_wxyz_from_rotation
 
 _RATIO = 32767.0
 
@@ -69,7 +69,16 @@ def rotation_code(rotation: Array) -> tuple[int, NDArray[np.int16]]:
     return index, (np.delete(ratios, index) * np.sign(ratios[index])).astype(np.int16)
 
 
-def rotation_value(index: int, ratios: NDArray[np.int16]) -> Array:
-    """(3, 3) rotation of `rotation_code`'s code."""
-    quat = np.insert(ratios.astype(np.float64) / _RATIO, index, 1.0)
-    return rotation_from_quat_wxyz(quat)
+def rotation_values(indices: NDArray[np.uint8], ratios: NDArray[np.int16]) -> Array:
+    """(K, 3, 3) rotations of `rotation_code`'s codes (K,) and (K, 3)."""
+    count = len(indices)
+    quats = np.ones((count, 4))
+    others = np.arange(4)[None] != indices[:, None]
+    quats[others] = (ratios.astype(np.float64) / _RATIO).ravel()
+    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.asarray(np.moveaxis(np.array(rows), -1, 0))

@@ -24,7 +24,7 @@ LANDMARK_BYTES = 48
 PLACE_BYTES = 27
 REFERENCE_BYTES = 4
 MAX_TILE_PAYLOAD_BYTES = 16 << 20
-MAX_TILE_PLACES = 1 << 16
+MAX_TILE_PLACES = 1 << 14
 _HEAD = struct.Struct("<iidiIII")
 _PLACE_STEPS_PER_M = 65536.0
 
@@ -181,8 +181,7 @@ def _map_from_cam(columns: Columns, places: int) -> Array:
     ratios = np.stack([columns.planes(places, 2).astype(np.uint16).view(np.int16) for _ in range(3)], axis=1)
     map_from_cam = np.tile(np.eye(4), (places, 1, 1))
     map_from_cam[:, :3, 3] = np.stack(centres, axis=1)
-    for row, (index, three) in enumerate(zip(indices, ratios, strict=True)):
-        map_from_cam[row, :3, :3] = quantise.rotation_value(int(index), three)
+    map_from_cam[:, :3, :3] = quantise.rotation_values(indices, ratios)
     return map_from_cam
 
 

@@ -35,7 +35,8 @@ def test_directions_are_good_to_their_step(steps: int, good_to_deg: float) -> No
 
 def _check_rotation(rotation: np.ndarray) -> None:
     code = quantise.rotation_code(rotation)
-    back = quantise.rotation_value(*code)
+    back = quantise.rotation_values(np.array([code[0]], np.uint8), code[1][None])[0]
+    assert np.allclose(back, rotation_from_quat_wxyz(np.insert(code[1] / 32767, code[0], 1.0)), atol=1e-15)
     assert rotation_angle_rad(rotation.T @ back) < 1e-4
     again = quantise.rotation_code(back)
     assert again[0] == code[0]
