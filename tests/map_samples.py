@@ -58,7 +58,7 @@ def random_survey(rng: np.random.Generator, *, keyframes: int = 6, landmarks: in
         body_from_cam=se3_exp(np.array([0.3, -0.2, 0.1, 0.05, -0.02, 0.1])),
         keyframe_stamps_ns=stamps,
         map_from_body=map_from_body,
-        landmark_ids=rng.permutation(1000)[:landmarks].astype(np.uint32),
+        landmark_ids=rng.permutation(max(1000, landmarks))[:landmarks].astype(np.uint32),
         points_map=rng.uniform([-25, -10, -1], [30, 10, 4], (landmarks, 3)),
         descriptors=rng.integers(0, 256, (landmarks, 32), dtype=np.uint8),
         point_sigma_m=rng.uniform(0.002, 0.1, landmarks),

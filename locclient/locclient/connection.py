@@ -11,6 +11,8 @@ from locclient.link import MapLink, StoreFolderLink
 from locclient.replay import RobotLink
 from locclient.tile_cache import StoreFolder, TileCache
 
+_PATIENCE_S = 120.0  # with a server that goes away in the middle of a fetch; one that is restarted is back by then
+
 
 @contextmanager
 def connected(options: dict[str, Any]) -> Iterator[RobotLink]:
@@ -22,7 +24,8 @@ def connected(options: dict[str, Any]) -> Iterator[RobotLink]:
     folder = Path(options["cache"]) if options["cache"] is not None else default_cache_folder()
     bus = ZenohBus.connect(options["server"])
     try:
-        link = MapLink(bus, TileCache(folder, max_bytes=options["cache_bytes"]), site, robot)
+        cache = TileCache(folder, max_bytes=options["cache_bytes"])
+        link = MapLink(bus, cache, site, robot, patience_s=_PATIENCE_S)
         link.announce_presence()
         yield RobotLink(link, link, site, robot)
     finally:

@@ -5,11 +5,13 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from fleetmap.bus import Bus, Handle
-from fleetmap.errors import FleetmapError, LinkError, MapFormatError, UnreachableError
+from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError
 from fleetmap.mapformat import (
+    MAX_MANIFEST_BYTES,
     Manifest,
     Tile,
     TileEntry,
+    apply_patch,
     check_name,
     check_sha256,
     decode_manifest,
@@ -25,9 +27,11 @@ from fleetmap.messages import (
     decode_message,
     encode_message,
     manifest_key,
+    patch_key,
     robot_key,
 )
-from locclient.tile_cache import StoreFolder, TileCache
+from locclient.parts import PartReader
+from locclient.tile_cache import ActiveVersion, StoreFolder, TileCache
 
 
 @dataclass(frozen=True)
@@ -38,11 +42,19 @@ class FetchedTiles:
     refused: dict[tuple[int, int], str] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class ReadyVersion:
+    """The version to run now; note: why it is not the one that is wanted or not whole, empty where it is."""
+
+    wanted: WantedVersion
+    note: str = ""
+
+
 class MapSource(Protocol):
     """What a robot reads its map from."""
 
-    def wanted(self) -> WantedVersion:
-        """The version that this robot should run."""
+    def ready(self) -> ReadyVersion:
+        """The version to run now."""
 
     def manifest(self, wanted: WantedVersion) -> Manifest:
         """The manifest of that version."""
@@ -57,16 +69,25 @@ class MapSource(Protocol):
 class MapLink:
     """A robot's link to the server, through a cache.
 
-    Bytes that are in the cache are not asked for again, so a known version can be read with the server away.
+    Bytes that are in the cache are not asked for again, so a known version can be read with the server away. Of what a robot
+    has in its active version it asks for patches; where there is none, or it does not fit, for the whole.
     """
 
-    def __init__(self, bus: Bus, cache: TileCache, site: str, robot: str, *, timeout_s: float = 5.0) -> None:
-        """Raises UsageError for names that cannot be keys."""
+    def __init__(
+        self, bus: Bus, cache: TileCache, site: str, robot: str, *, timeout_s: float = 5.0, patience_s: float = 0.0
+    ) -> None:
+        """patience_s: how long a server may be away in the middle of a fetch. Raises UsageError for names that cannot be keys."""
         self._bus = bus
         self._cache = cache
         self._site = check_name(site, "site")
         self._robot = check_name(robot, "robot")
         self._timeout_s = timeout_s
+        self._parts = PartReader(bus, timeout_s=timeout_s, patience_s=patience_s)
+
+    @property
+    def received_bytes(self) -> int:
+        """Bytes of maps that came over the bus so far."""
+        return self._parts.received_bytes
 
     def announce_presence(self) -> Handle:
         """Shows the server that this robot is there, until the handle or the bus is closed."""
@@ -85,6 +106,41 @@ class MapLink:
             self._key("wanted"), lambda _, payload: listen(decode_message(payload, WantedVersion))
         )
 
+    def ready(self) -> ReadyVersion:
+        """The wanted version, whole and active; without it the active one; without that the wanted one as far as it comes.
+
+        Raises LinkError where nobody answers and no version is active.
+        """
+        active = self._cache.active(self._site)
+        kept = None if active is None else _wanted_of(self._site, active)
+        try:
+            wanted = self.wanted()
+            if wanted != kept:
+                self.bring(wanted)
+        except (LinkError, MapFormatError, StoreError) as error:
+            if kept is not None:
+                return ReadyVersion(kept, f"version {kept.version} goes on: {error}")
+            if isinstance(error, UnreachableError):
+                raise
+            return ReadyVersion(self.wanted(), str(error))
+        return ReadyVersion(wanted)
+
+    def bring(self, wanted: WantedVersion) -> None:
+        """Fetches all of a version into the cache and, when everything is verified, makes it the active one.
+
+        What came before an error stays in the cache, and the active version what it was. Raises UnreachableError where nobody
+        answers, LinkError and MapFormatError for what cannot be had or is damaged, StoreError where the disk refuses.
+        """
+        manifest = self.manifest(wanted)
+        needed = [wanted.manifest_sha256 or "", manifest.vocabulary.sha256, *(tile.sha256 for tile in manifest.tiles)]
+        self._cache.hold(self._site, needed)
+        self.vocabulary(manifest)
+        bases = self._bases()
+        for entry in manifest.tiles:
+            # Decoded and let go: a large site is larger than a robot's memory.
+            _tile(entry, manifest.tile_size_m, self._blob(entry.sha256, entry.bytes, bases.get((entry.x, entry.y))))
+        self._cache.activate(self._site, manifest.version, needed)
+
     def manifest(self, wanted: WantedVersion) -> Manifest:
         """The wanted version's manifest, from the cache or the server.
 
@@ -94,13 +150,14 @@ class MapLink:
         version, sha256 = _address(wanted)
         data = self._cache.get(sha256)
         if data is None:
-            data = verified(self._bus.get(manifest_key(self._site, version), timeout_s=self._timeout_s), sha256)
-            self._cache.put(sha256, data)
+            active = self._cache.active(self._site)
+            base = None if active is None else active.blobs[0]
+            data = self._fetched(manifest_key(self._site, version), sha256, MAX_MANIFEST_BYTES, base)
         return _checked(decode_manifest(data), wanted)
 
     def vocabulary(self, manifest: Manifest) -> bytes:
         """The version's vocabulary, from the cache or the server; errors as of `manifest`."""
-        return self._blob(manifest.vocabulary.sha256)
+        return self._blob(manifest.vocabulary.sha256, manifest.vocabulary.bytes, None)
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
         """Tiles of the version, from the cache or the server: all, or those of `cells` that it has.
@@ -109,12 +166,13 @@ class MapLink:
         Once nobody answers, only the cache is asked, so that a robot without a network does not wait for every tile.
         """
         silence: list[UnreachableError] = []
+        bases = self._bases()
 
-        def blob(sha256: str) -> bytes:
-            if silence and sha256 not in self._cache:
+        def blob(entry: TileEntry) -> bytes:
+            if silence and entry.sha256 not in self._cache:
                 raise silence[0]
             try:
-                return self._blob(sha256)
+                return self._blob(entry.sha256, entry.bytes, bases.get((entry.x, entry.y)))
             except UnreachableError as error:
                 silence.append(error)
                 raise
@@ -139,12 +197,39 @@ class MapLink:
     def _key(self, what: str) -> str:
         return robot_key(self._site, self._robot, what)
 
-    def _blob(self, sha256: str) -> bytes:
+    def _bases(self) -> dict[tuple[int, int], str]:
+        """The tiles of the active version, which others can be patched from; empty where its manifest is not to be had."""
+        active = self._cache.active(self._site)
+        data = None if active is None else self._cache.get(active.blobs[0])
+        try:
+            return {} if data is None else {(tile.x, tile.y): tile.sha256 for tile in decode_manifest(data).tiles}
+        except MapFormatError:
+            return {}
+
+    def _blob(self, sha256: str, size: int, base: str | None) -> bytes:
         data = self._cache.get(sha256)
+        return data if data is not None else self._fetched(blob_key(self._site, sha256), sha256, size, base)
+
+    def _fetched(self, key: str, sha256: str, max_bytes: int, base: str | None) -> bytes:
+        """The verified bytes of an address, patched where that works; kept in the cache."""
+        data = None if base is None or base == sha256 else self._patched(base, sha256, max_bytes)
         if data is None:
-            data = verified(self._bus.get(blob_key(self._site, sha256), timeout_s=self._timeout_s), sha256)
-            self._cache.put(sha256, data)
+            data = verified(self._parts.read(key, max_bytes=max_bytes), sha256)
+        self._cache.put(sha256, data)
         return data
+
+    def _patched(self, base: str, sha256: str, max_bytes: int) -> bytes | None:
+        """The same by way of a patch; None where there is none, or it does not lead there."""
+        old = self._cache.get(base)
+        if old is None:
+            return None
+        try:
+            patch = self._parts.read(patch_key(self._site, base, sha256), max_bytes=max_bytes)
+            return verified(apply_patch(old, patch), sha256)
+        except UnreachableError:
+            raise
+        except (LinkError, MapFormatError):
+            return None
 
 
 class StoreFolderLink:
@@ -154,6 +239,10 @@ class StoreFolderLink:
         """Raises UsageError for a name that no site can have."""
         self._folder = folder
         self._site = check_name(site, "site")
+
+    def ready(self) -> ReadyVersion:
+        """The site's current version."""
+        return ReadyVersion(self.wanted())
 
     def wanted(self) -> WantedVersion:
         """The site's current version."""
@@ -173,7 +262,11 @@ class StoreFolderLink:
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
         """Tiles of the version, as `MapLink.tiles`."""
-        return _collect(manifest, cells, self._folder.blob)
+        return _collect(manifest, cells, lambda entry: self._folder.blob(entry.sha256))
+
+
+def _wanted_of(site: str, active: ActiveVersion) -> WantedVersion:
+    return WantedVersion(site=site, version=active.version, manifest_sha256=active.blobs[0])
 
 
 def _address(wanted: WantedVersion) -> tuple[int, str]:
@@ -190,14 +283,16 @@ def _checked(manifest: Manifest, wanted: WantedVersion) -> Manifest:
     return manifest
 
 
-def _collect(manifest: Manifest, cells: Iterable[tuple[int, int]] | None, blob: Callable[[str], bytes]) -> FetchedTiles:
+def _collect(
+    manifest: Manifest, cells: Iterable[tuple[int, int]] | None, blob: Callable[[TileEntry], bytes]
+) -> FetchedTiles:
     fetched = FetchedTiles()
     asked = None if cells is None else set(cells)
     for entry in manifest.tiles:
         cell = (entry.x, entry.y)
         if asked is None or cell in asked:
             try:
-                fetched.tiles[cell] = _tile(entry, manifest.tile_size_m, blob(entry.sha256))
+                fetched.tiles[cell] = _tile(entry, manifest.tile_size_m, blob(entry))
             except FleetmapError as error:
                 # The reason is the result: one bad tile must not cost a robot the rest of its map.
                 fetched.refused[cell] = str(error)

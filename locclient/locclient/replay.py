@@ -74,7 +74,8 @@ def replay(
 ) -> ReplayResult:  # fmt: skip
     """Plays the source; raises LinkError where no map can be had, RecordingError for frames that cannot be read."""
     cv2.setNumThreads(1)  # one robot, one thread: figures are then those of the board's core
-    manifest = link.source.manifest(link.source.wanted())
+    ready = link.source.ready()
+    manifest = link.source.manifest(ready.wanted)
     tiles = link.source.tiles(manifest)
     if not tiles.tiles:
         raise LinkError(
@@ -97,7 +98,7 @@ def replay(
     )
     if prior is not None:
         localizer.handle_prior(prior)
-    result = ReplayResult([], [], [], manifest, tiles)
+    result = ReplayResult([], [], [], manifest, tiles, [ready.note] if ready.note else [])
     reporter = _Reporter(link, result)
     begun_s, first_ns = time.monotonic(), None
     for number, imu in enumerate(source.imu_before_each()):

@@ -2,16 +2,29 @@
 
 import os
 import secrets
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
+
+import msgspec
 
 from fleetmap.errors import MapFormatError, StoreError
-from fleetmap.mapformat import blob_path, check_sha256, current_path, verified
+from fleetmap.mapformat import blob_path, check_name, check_sha256, current_path, verified
 
 DEFAULT_MAX_BYTES = 2_000_000_000
 
 
+class ActiveVersion(msgspec.Struct, frozen=True):
+    """The version of a site that this robot has whole; blobs: addresses of all its bytes, that of its manifest first."""
+
+    version: Annotated[int, msgspec.Meta(ge=1)]
+    blobs: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
+
+
 class TileCache:
-    """Files below one folder; the least recently used go first when `max_bytes` is exceeded.
+    """Files below one folder; the least recently used go first when `max_bytes` is exceeded, but never what is in use.
+
+    In use is what the active version of a site consists of, and the version that is on its way.
 
     Nothing here trusts the disk: bytes are verified whenever they are read. A disk that refuses costs the cache, not
     the robot's map: what went wrong is told by `take_faults`. Not for several threads at once. One process at a time
@@ -23,9 +36,11 @@ class TileCache:
         self._folder = folder
         self._max_bytes = max_bytes
         self._faults: list[str] = []
+        self._on_the_way: dict[str, frozenset[str]] = {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._sizes = self._scan()
+            self._active = self._read_active()
         except OSError as error:
             raise StoreError(f"the cache {folder} cannot be used ({error.strerror}); choose another folder") from error
 
@@ -60,22 +75,37 @@ class TileCache:
         Raises MapFormatError for bytes of another address. A disk that refuses is told as a fault.
         """
         verified(data, sha256)
-        path = self._path(sha256)
-        temporary = path.with_name(f".{sha256[:16]}.{secrets.token_hex(8)}.tmp")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with temporary.open("xb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
-        except OSError as error:
-            self._faults.append(f"{path} cannot be written ({error.strerror}); make space for the cache")
-            self._try_unlink(temporary)
+        if not self._write(self._path(sha256), data):
             return
         self._sizes.pop(sha256, None)
         self._sizes[sha256] = len(data)
         self._make_room(keep=sha256)
+
+    def hold(self, site: str, blobs: Sequence[str]) -> None:
+        """Keeps these from being removed until the site's next version is held or active: they are on their way."""
+        self._on_the_way[site] = frozenset(blobs)
+
+    def activate(self, site: str, version: int, blobs: Sequence[str]) -> None:
+        """Makes a version the active one, whole or not at all. blobs: all it consists of, the manifest's address first.
+
+        Raises StoreError where one of them is missing or the disk refuses; what was active stays so.
+        """
+        missing = [sha256 for sha256 in blobs if sha256 not in self._sizes]
+        if missing:
+            raise StoreError(
+                f"version {version} of {site} is not whole: {len(missing)} of {len(blobs)} pieces are missing, "
+                f"{missing[0]} first; {'; '.join(self._faults[-1:]) or 'fetch them again'}"
+            )
+        record = ActiveVersion(version, tuple(blobs))
+        if not self._write(self._active_path(site), msgspec.json.encode(record)):
+            raise StoreError(f"version {version} of {site} cannot be made active: {self._faults[-1]}")
+        self._active[site] = record
+        self._on_the_way.pop(site, None)
+        self._make_room(keep="")
+
+    def active(self, site: str) -> ActiveVersion | None:
+        """The site's version that this robot has whole, None before the first one."""
+        return self._active.get(site)
 
     def take_faults(self) -> list[str]:
         """What went wrong with the disk since the last call, in words."""
@@ -84,23 +114,57 @@ class TileCache:
 
     def _scan(self) -> dict[str, int]:
         found = []
+        for leftover in self._folder.glob("*/*/.*.tmp"):
+            leftover.unlink(missing_ok=True)  # by a process that died while writing
         for path in self._folder.glob("blobs/??/*"):
-            if path.suffix == ".tmp":
-                # Left by a process that died while writing.
-                path.unlink(missing_ok=True)
-            elif len(path.name) == 64:
+            if len(path.name) == 64:
                 status = path.stat()
                 found.append((status.st_mtime_ns, path.name, status.st_size))
         return {name: size for _, name, size in sorted(found)}
 
+    def _read_active(self) -> dict[str, ActiveVersion]:
+        found = {}
+        for path in self._folder.glob("sites/*/active"):
+            try:
+                record = msgspec.json.decode(path.read_bytes(), type=ActiveVersion)
+                found[path.parent.name] = msgspec.structs.replace(
+                    record, blobs=tuple(check_sha256(sha256) for sha256 in record.blobs)
+                )
+            except (msgspec.MsgspecError, UnicodeDecodeError, MapFormatError) as error:
+                self._faults.append(f"{path} is damaged ({error}); the version has to be fetched again")
+        return found
+
     def _make_room(self, keep: str) -> None:
         total = self.total_bytes
+        if total <= self._max_bytes:
+            return
+        used = {keep}.union(*self._on_the_way.values(), *(record.blobs for record in self._active.values()))
         for sha256 in list(self._sizes):
             if total <= self._max_bytes:
                 return
-            if sha256 != keep:
+            if sha256 not in used:
                 total -= self._sizes[sha256]
                 self._remove(sha256)
+
+    def _write(self, path: Path, data: bytes) -> bool:
+        """Whether `data` is under `path` now, whole and on the disk; if not, what was there before is, and a fault is kept."""
+        temporary = path.with_name(f".{path.name[:16]}.{secrets.token_hex(8)}.tmp")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with temporary.open("xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+            _sync_folder(path.parent)
+        except OSError as error:
+            self._faults.append(f"{path} cannot be written ({error.strerror}); make space for the cache")
+            self._try_unlink(temporary)
+            return False
+        return True
+
+    def _active_path(self, site: str) -> Path:
+        return self._folder / "sites" / check_name(site, "site") / "active"
 
     def _remove(self, sha256: str) -> None:
         self._sizes.pop(sha256, None)
@@ -114,6 +178,15 @@ class TileCache:
 
     def _path(self, sha256: str) -> Path:
         return self._folder / blob_path(sha256)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Makes names in a folder survive a loss of power."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 class StoreFolder:

@@ -20,6 +20,7 @@ from fleetmap.recordings.tum import write_tum
 from fleetmap.rectification import Rectifier
 from fleetmap.samples import SensorSet
 from mapserver.build_report import Accuracy, BuildReport, accuracy, check_truth, full_report, make_report
+from mapserver.landmark_budget import within_budget
 from mapserver.picture_files import PictureFile
 from mapserver.progress import ProgressView, StageTimes
 from mapserver.store import DraftDetails, MapStore
@@ -128,7 +129,7 @@ def _survey(
 
 
 def _keep(order: BuildOrder, recording: Recording, built: _Built, settings: SurveySettings, maps: MapStore) -> str:
-    tiles = tiles_from_survey(built.survey.map)
+    tiles = tiles_from_survey(within_budget(built.survey.map, settings.budget, TILE_SIZE_M))
     archive = encode_archive(built.survey.map)
     vocabulary = encode_vocabulary(built.survey.vocabulary)
     content_hash = recording.content_hash()

@@ -1,11 +1,11 @@
-"""The server's side of the bus: answers for versions, manifests and bytes, hears the robots, announces new versions."""
+"""The server's side of the bus: answers for versions, manifests, bytes and patches, hears the robots, announces versions."""
 
 import logging
 from collections.abc import Callable
 
 from fleetmap.bus import Bus, Handle
-from fleetmap.errors import FleetmapError, LinkError
-from fleetmap.mapformat import check_name
+from fleetmap.errors import FleetmapError, LinkError, MapFormatError
+from fleetmap.mapformat import check_name, make_patch
 from fleetmap.messages import (
     PoseMessage,
     RobotAck,
@@ -14,20 +14,30 @@ from fleetmap.messages import (
     decode_message,
     encode_message,
     manifest_key,
+    part_of,
+    patch_key,
     robot_key,
     split_key,
 )
 from mapserver.fleet import Fleet
+from mapserver.recent_bytes import RecentBytes
 from mapserver.store import MapStore
 
 Count = Callable[[str, str, int], None]
 """Counts for metrics: (what, "ok" or "refused", bytes sent)."""
 
 _log = logging.getLogger(__name__)
+_RECENT_BYTES = 64_000_000
+_RECENT_PATCHES_BYTES = 32_000_000
+_PATCH_SHARE = 0.7  # of the whole, above which a patch is not worth its work
+_PATCHED_KINDS = {"tile", "manifest"}
 
 
 class TileService:
-    """Serves a store on a bus from its making to `close`. Reads what other processes publish meanwhile."""
+    """Serves a store on a bus from its making to `close`. Reads what other processes publish meanwhile.
+
+    Bytes go out in parts; what was sent last is kept in memory, because robots ask for the same things at the same time.
+    """
 
     def __init__(self, store: MapStore, fleet: Fleet, bus: Bus, count: Count) -> None:
         self._store = store
@@ -35,10 +45,13 @@ class TileService:
         self._bus = bus
         self._count = count
         self._announced: dict[str, str | None] = {}
+        self._recent = RecentBytes(_RECENT_BYTES)
+        self._patches = RecentBytes(_RECENT_PATCHES_BYTES)
         self._handles: list[Handle] = [
             bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
-            bus.queryable(manifest_key("*", "*"), self._counted("manifest", self._manifest)),
-            bus.queryable(blob_key("*", "*"), self._counted("blob", self._blob)),
+            bus.queryable(manifest_key("*", "*"), self._counted("manifest", self._parts(self._manifest))),
+            bus.queryable(blob_key("*", "*"), self._counted("blob", self._parts(self._blob))),
+            bus.queryable(patch_key("*", "*", "*"), self._counted("patch", self._parts(self._patch))),
             *(bus.subscribe(robot_key("*", "*", what), self._hear) for what in ("ack", "health", "pose")),
         ]
 
@@ -76,24 +89,52 @@ class TileService:
 
         return counted
 
+    def _parts(self, whole: Callable[[str], bytes]) -> Callable[[str, bytes], bytes]:
+        return lambda key, question: part_of(whole(key), question)
+
     def _wanted(self, key: str, _: bytes) -> bytes:
         site, robot, _what = split_key(key)
         return encode_message(self._fleet.take_question(site, check_name(robot, "robot")))
 
-    def _manifest(self, key: str, _: bytes) -> bytes:
+    def _manifest(self, key: str) -> bytes:
         site, _what, number = split_key(key)
         if not number.isdecimal() or len(number) > 10:
             raise LinkError(f"{number[:80]!r} is no version number; ask {manifest_key(site, 'NUMBER')}")
         info = self._store.version(site, int(number))
         if info.state == "draft":
             raise LinkError(f"version {number} of site {site} is a draft; robots get published versions only")
-        return self._store.blob(info.manifest_sha256)
+        return self._read(info.manifest_sha256)
 
-    def _blob(self, key: str, _: bytes) -> bytes:
+    def _blob(self, key: str) -> bytes:
         site, _what, sha256 = split_key(key)
         if self._store.served_kind(sha256, site) is None:
             raise LinkError(f"site {site} has no published bytes {sha256}; fetch its current manifest again")
-        return self._store.blob(sha256)
+        return self._read(sha256)
+
+    def _patch(self, key: str) -> bytes:
+        """What makes one published thing of a site out of another; refused where it would not be much smaller."""
+        site, _what, addresses = split_key(key)
+        base, _, result = addresses.partition("-")
+        kinds = {self._store.served_kind(sha256, site) for sha256 in (base, result)}
+        if len(kinds) != 1 or not kinds <= _PATCHED_KINDS:
+            raise LinkError(f"site {site} has no published pair {addresses[:160]} of one kind; fetch the whole")
+        patch = self._patches.get(addresses, lambda: self._made_patch(base, result))
+        if not patch:
+            raise LinkError(f"a patch from {base} is not much smaller than {result}; fetch the whole")
+        return patch
+
+    def _made_patch(self, base: str, result: str) -> bytes:
+        """The patch; nothing where it is not worth it, which is kept as well."""
+        whole = self._read(result)
+        try:
+            patch = make_patch(self._read(base), whole)
+        except MapFormatError as error:
+            _log.info("no patch from %s to %s: %s", base, result, error)
+            return b""
+        return patch if len(patch) <= _PATCH_SHARE * len(whole) else b""
+
+    def _read(self, sha256: str) -> bytes:
+        return self._recent.get(sha256, lambda: self._store.blob(sha256))
 
     def _hear(self, key: str, payload: bytes) -> None:
         what = key.rpartition("/")[2]

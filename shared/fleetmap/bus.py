@@ -23,6 +23,8 @@ Answer = Callable[[str, bytes], bytes]
 Listen = Callable[[str, bytes], None]
 """Takes (key, payload) of what was published. Runs on a thread of the bus."""
 
+MAX_MESSAGE_BYTES = 1 << 20  # whatever is larger travels in parts: one large message stops all others behind it
+
 _log = logging.getLogger(__name__)
 _RETRY_S = 0.05
 
@@ -45,7 +47,10 @@ class Handle:
 
 
 class Bus(ABC):
-    """One participant. Must be closed, best as a context manager."""
+    """One participant. Must be closed, best as a context manager. Messages hold at most MAX_MESSAGE_BYTES.
+
+    Questions, answers and publications block while the network is full, rather than being lost, unless they may be.
+    """
 
     @abstractmethod
     def queryable(self, key_expr: str, answer: Answer) -> Handle:
@@ -110,12 +115,21 @@ def _chunks_match(pattern: list[str], chunks: list[str]) -> bool:
 def _answered(answer: Answer, key: str, payload: bytes) -> tuple[bytes | None, str]:
     """The answer, or None and the reason. A fault in the handler must reach the asker, who waits, and the log."""
     try:
-        return answer(key, payload), ""
+        return _small(answer(key, payload), key), ""
     except FleetmapError as error:
         return None, str(error)
     except Exception as error:
         _log.exception("answering %s failed", key)
         return None, f"internal error of the other side ({type(error).__name__}); its log says more"
+
+
+def _small(payload: bytes, key: str) -> bytes:
+    """`payload` itself; raises LinkError for one that no message holds."""
+    if len(payload) > MAX_MESSAGE_BYTES:
+        raise LinkError(
+            f"{len(payload)} bytes under {key} are more than the {MAX_MESSAGE_BYTES} of a message; use parts"
+        )
+    return payload
 
 
 def _heard(listen: Listen, key: str, payload: bytes) -> None:
@@ -152,6 +166,7 @@ class MemoryBus(Bus):
 
     def get(self, key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
         """See Bus; never waits."""
+        _small(payload, key)
         with self._hub.lock:
             answers = [answer for key_expr, answer in self._hub.queryables if key_matches(key_expr, key)]
         if not self._hub.reachable or not answers:
@@ -163,6 +178,7 @@ class MemoryBus(Bus):
 
     def publish(self, key: str, payload: bytes, *, may_drop: bool = False) -> None:
         """See Bus."""
+        _small(payload, key)
         with self._hub.lock:
             listeners = [listen for key_expr, listen in self._hub.subscribers if key_matches(key_expr, key)]
         for listen in listeners if self._hub.reachable else []:
@@ -264,6 +280,7 @@ class ZenohBus(Bus):
 
     def get(self, key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
         """See Bus. Asks again until the time is over, because before a connection stands zenoh answers with silence."""
+        _small(payload, key)
         deadline = time.monotonic() + timeout_s
         while (left_s := deadline - time.monotonic()) > 0:
             # The answer travels with the question's congestion control; what may be dropped would lose large answers.
@@ -283,7 +300,7 @@ class ZenohBus(Bus):
     def publish(self, key: str, payload: bytes, *, may_drop: bool = False) -> None:
         """See Bus."""
         control = zenoh.CongestionControl.DROP if may_drop else zenoh.CongestionControl.BLOCK
-        self._guarded(lambda: self._session.put(key, payload, congestion_control=control))
+        self._guarded(lambda: self._session.put(key, _small(payload, key), congestion_control=control))
 
     def subscribe(self, key_expr: str, listen: Listen) -> Handle:
         """See Bus."""

@@ -5,8 +5,9 @@ fleetmap/{site}/robots/{robot}/ack       published by the robot: RobotAck
 fleetmap/{site}/robots/{robot}/health    published by the robot: RobotHealth
 fleetmap/{site}/robots/{robot}/pose      published by the robot: PoseMessage
 fleetmap/{site}/robots/{robot}/alive     liveliness token of the robot
-fleetmap/{site}/manifests/{version}      asked by the robot: manifest bytes
-fleetmap/{site}/blobs/{sha256}           asked by the robot: bytes of a tile or vocabulary
+fleetmap/{site}/manifests/{version}      asked by the robot, PartQuestion: Part of a manifest
+fleetmap/{site}/blobs/{sha256}           asked by the robot, PartQuestion: Part of a tile, vocabulary or manifest
+fleetmap/{site}/patches/{base}-{sha256}  asked by the robot, PartQuestion: Part of what makes a tile or manifest out of `base`
 """
 
 from typing import Annotated, Any, Self, TypeVar
@@ -18,6 +19,7 @@ from fleetmap.errors import LinkError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 
 MAX_MESSAGE_BYTES = 1 << 20
+PART_BYTES = 256 << 10  # small enough to come within seconds over a poor radio, and to be asked for again
 _ROOT = "fleetmap"
 
 Name = Annotated[str, msgspec.Meta(max_length=64)]
@@ -25,6 +27,21 @@ Text = Annotated[str, msgspec.Meta(max_length=2000)]
 Version = Annotated[int, msgspec.Meta(ge=1, le=(1 << 31))]
 Metrics = Annotated[dict[Name, float | int | str | bool | None], msgspec.Meta(max_length=256)]
 Flags = Annotated[tuple[Name, ...], msgspec.Meta(max_length=64)]
+
+
+class PartQuestion(msgspec.Struct, frozen=True, kw_only=True):
+    """Asks for at most max_bytes from offset on; an empty payload asks for the first part."""
+
+    offset: Annotated[int, msgspec.Meta(ge=0, le=1 << 40)] = 0
+    max_bytes: Annotated[int, msgspec.Meta(ge=1, le=PART_BYTES)] = PART_BYTES
+
+
+class Part(msgspec.Struct, frozen=True, kw_only=True):
+    """Some of total_bytes, from offset on; empty only beyond their end."""
+
+    total_bytes: Annotated[int, msgspec.Meta(ge=0, le=1 << 40)]
+    offset: Annotated[int, msgspec.Meta(ge=0, le=1 << 40)]
+    data: bytes
 
 
 class WantedVersion(msgspec.Struct, frozen=True, kw_only=True):
@@ -91,8 +108,8 @@ class PoseMessage(msgspec.Struct, frozen=True, kw_only=True):
         return se3(rotation_from_quat_wxyz(np.array(self.quat_wxyz)), np.array(self.position_map_m))
 
 
-Message = WantedVersion | RobotAck | RobotHealth | PoseMessage
-M = TypeVar("M", WantedVersion, RobotAck, RobotHealth, PoseMessage)
+Message = WantedVersion | RobotAck | RobotHealth | PoseMessage | PartQuestion | Part
+M = TypeVar("M", WantedVersion, RobotAck, RobotHealth, PoseMessage, PartQuestion, Part)
 
 
 def encode_message(message: Message) -> bytes:
@@ -110,6 +127,13 @@ def decode_message(data: bytes, message_type: type[M]) -> M:
         raise LinkError(
             f"{len(data)} bytes are no {message_type.__name__} ({error}); do both sides run the same fleetmap?"
         ) from error
+
+
+def part_of(data: bytes, question: bytes) -> bytes:
+    """The encoded Part of `data` that an encoded PartQuestion asks for; raises LinkError as `decode_message`."""
+    asked = decode_message(question, PartQuestion) if question else PartQuestion()
+    part = data[asked.offset : asked.offset + asked.max_bytes]
+    return encode_message(Part(total_bytes=len(data), offset=asked.offset, data=part))
 
 
 def report_dict(message: Message) -> dict[str, Any]:
@@ -133,11 +157,16 @@ def blob_key(site: str, sha256: str) -> str:
     return f"{_ROOT}/{site}/blobs/{sha256}"
 
 
+def patch_key(site: str, base_sha256: str, sha256: str) -> str:
+    """Key of the patch that makes one address out of another; '*' for any."""
+    return f"{_ROOT}/{site}/patches/{base_sha256}-{sha256}" if base_sha256 != "*" else f"{_ROOT}/{site}/patches/*"
+
+
 def split_key(key: str) -> tuple[str, str, str]:
-    """Site, robot (or 'manifests', 'blobs') and last chunk of a key made above; raises LinkError for any other."""
+    """Site, robot (or 'manifests', 'blobs', 'patches') and last chunk of a key made above; raises LinkError for any other."""
     chunks = key.split("/")
     if len(chunks) == 5 and chunks[0] == _ROOT and chunks[2] == "robots":
         return chunks[1], chunks[3], chunks[4]
-    if len(chunks) == 4 and chunks[0] == _ROOT and chunks[2] in {"manifests", "blobs"}:
+    if len(chunks) == 4 and chunks[0] == _ROOT and chunks[2] in {"manifests", "blobs", "patches"}:
         return chunks[1], chunks[2], chunks[3]
     raise LinkError(f"key {key[:200]!r} is none of fleetmap's; its keys are listed in fleetmap.messages")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from fleetmap.bus import Bus, MemoryBus, MemoryHub, ZenohBus, check_endpoint, key_matches
+from fleetmap.bus import MAX_MESSAGE_BYTES, Bus, MemoryBus, MemoryHub, ZenohBus, check_endpoint, key_matches
 from fleetmap.errors import LinkError, StoreError, UnreachableError, UsageError
 
 
@@ -38,9 +38,9 @@ def test_questions_are_answered(pair: tuple[Bus, Bus]) -> None:
     server, robot = pair
     server.queryable("site/*/blobs/*", lambda key, payload: key.encode() + b"|" + payload)
     assert robot.get("site/a/blobs/b", b"why") == b"site/a/blobs/b|why"
-    big = bytes(range(256)) * 8192
+    big = bytes(range(256)) * 4096
     server.queryable("big", lambda *_: big)
-    assert robot.get("big") == big
+    assert robot.get("big", big) == big
     assert eventually(robot.connected)
 
 
@@ -59,6 +59,18 @@ def test_refusals_and_faults_reach_the_asker(pair: tuple[Bus, Bus], caplog: pyte
     with pytest.raises(LinkError, match=r"internal error.*ZeroDivisionError"):
         robot.get("ask/fault")
     assert "answering ask/fault failed" in caplog.text
+
+
+def test_no_message_exceeds_a_mebibyte(pair: tuple[Bus, Bus]) -> None:
+    server, robot = pair
+    larger = bytes(MAX_MESSAGE_BYTES + 1)
+    server.queryable("larger", lambda *_: larger)
+    with pytest.raises(LinkError, match="1048577 bytes under larger"):
+        robot.get("larger")
+    with pytest.raises(LinkError, match="parts"):
+        robot.get("larger", larger)
+    with pytest.raises(LinkError, match="parts"):
+        server.publish("a", larger)
 
 
 def test_silence_is_an_error(pair: tuple[Bus, Bus]) -> None:

@@ -1,13 +1,14 @@
 """The robot's cache trusts neither its disk nor its size."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from fleetmap.errors import MapFormatError, StoreError
 from fleetmap.mapformat import blob_path, sha256_hex
-from locclient.tile_cache import StoreFolder, TileCache
+from locclient.tile_cache import ActiveVersion, StoreFolder, TileCache
 
 
 def put(cache: TileCache, data: bytes) -> str:
@@ -97,3 +98,104 @@ def test_a_damaged_current_file_is_told(tmp_path: Path) -> None:
         folder.current_manifest("lab")
     with pytest.raises(StoreError, match="incomplete"):
         folder.blob("0" * 64)
+
+
+def test_what_is_in_use_is_not_removed(tmp_path: Path) -> None:
+    cache = TileCache(tmp_path, max_bytes=300)
+    a, b = put(cache, b"a" * 100), put(cache, b"b" * 100)
+    cache.activate("lab", 1, [a, b])
+    c, d, e = (put(cache, letter * 100) for letter in (b"c", b"d", b"e"))
+    assert [sha256 in cache for sha256 in (a, b, c, d, e)] == [True, True, False, False, True]
+    # The next version on its way: nothing of both goes, even where that is more than the limit.
+    later = [sha256_hex(letter * 100) for letter in (b"f", b"g")]
+    cache.hold("lab", [a, *later])
+    put(cache, b"f" * 100)
+    put(cache, b"g" * 100)
+    assert [sha256 in cache for sha256 in (a, b, e, *later)] == [True, True, False, True, True]
+    assert cache.total_bytes == 400
+    cache.activate("lab", 2, [a, *later])
+    assert b not in cache
+    again = TileCache(tmp_path, max_bytes=100)
+    assert again.active("lab") == ActiveVersion(2, (a, *later))
+    put(again, b"h" * 50)
+    assert all(sha256 in again for sha256 in (a, *later))
+
+
+def test_a_version_with_a_missing_piece_is_not_activated(tmp_path: Path) -> None:
+    cache = TileCache(tmp_path)
+    a = put(cache, b"a")
+    cache.activate("lab", 1, [a])
+    with pytest.raises(StoreError, match=r"not whole: 1 of 2"):
+        cache.activate("lab", 2, [a, "0" * 64])
+    assert TileCache(tmp_path).active("lab").version == 1
+
+
+def test_a_disk_that_refuses_leaves_the_old_version_active(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache = TileCache(tmp_path)
+    a, b = put(cache, b"a"), put(cache, b"b")
+    cache.activate("lab", 1, [a])
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("locclient.tile_cache.os.fsync", full)
+    with pytest.raises(StoreError, match="No space left"):
+        cache.activate("lab", 2, [b])
+    assert cache.active("lab").version == 1
+    assert TileCache(tmp_path).active("lab").version == 1
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+@pytest.mark.parametrize(
+    "text", [b"", b"{}", b'{"version":0,"blobs":["a"]}', b'{"version":1,"blobs":["../../x"]}', b"\xff"]
+)
+def test_a_damaged_record_is_told_and_forgotten(tmp_path: Path, text: bytes) -> None:
+    cache = TileCache(tmp_path)
+    cache.activate("lab", 1, [put(cache, b"a")])
+    (tmp_path / "sites/lab/active").write_bytes(text)
+    again = TileCache(tmp_path)
+    assert again.active("lab") is None
+    assert "damaged" in again.take_faults()[0]
+
+
+class Dying:
+    """Lets so many calls through, then ends the process, as far as the callers can see."""
+
+    def __init__(self, calls: int) -> None:
+        self.left = calls
+
+    def wrap(self, real: Callable[..., object]) -> Callable[..., object]:
+        def call(*arguments: object, **options: object) -> object:
+            self.left -= 1
+            if self.left < 0:
+                raise KeyboardInterrupt
+            return real(*arguments, **options)
+
+        return call
+
+
+def test_a_death_at_any_moment_leaves_a_whole_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every call to the file system in turn is the last one; a half-written name is never there."""
+    for calls in range(60):
+        folder = tmp_path / str(calls)
+        cache = TileCache(folder)
+        cache.activate("lab", 1, [put(cache, b"old")])
+        dying, finished = Dying(calls), False
+        with monkeypatch.context() as patch:
+            for owner, name in ((os, "fsync"), (os, "open"), (Path, "open"), (Path, "replace"), (Path, "mkdir")):
+                patch.setattr(owner, name, dying.wrap(getattr(owner, name)))
+            try:
+                cache.activate("lab", 2, [put(cache, b"new"), put(cache, b"more")])
+                finished = True
+            except KeyboardInterrupt:
+                pass
+        again = TileCache(folder)
+        record = again.active("lab")
+        assert record.version in {1, 2}
+        assert all(again.get(sha256) for sha256 in record.blobs)
+        assert again.take_faults() == []
+        if finished:
+            assert record.version == 2
+            assert calls > 10
+            return
+    pytest.fail("never finished")

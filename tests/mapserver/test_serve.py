@@ -7,20 +7,21 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
 
 from fleetmap.bus import ZenohBus
-from fleetmap.errors import GateRefusedError, StoreError, UsageError
+from fleetmap.errors import GateRefusedError, StoreError, UnreachableError, UsageError
 from fleetmap.messages import RobotHealth, WantedVersion
 from locclient.link import MapLink
 from locclient.tile_cache import TileCache
-from map_samples import draft_details, save_sample_draft
+from map_samples import draft_details, random_tile, save_sample_draft
 from mapserver.commands.inspect import inspect
 from mapserver.commands.publish import publish
 from mapserver.commands.serve import serve
@@ -31,10 +32,10 @@ PROGRAM = "import sys, typer; from mapserver.commands.serve import serve; typer.
 
 
 @contextmanager
-def serving(store: Path) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
+def serving(store: Path, endpoint: str = "tcp/127.0.0.1:0") -> Iterator[tuple[subprocess.Popen[str], str, str]]:
     """A running server and its HTTP and zenoh addresses."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    arguments = ["--store", str(store), "--http", "127.0.0.1:0", "--zenoh", "tcp/127.0.0.1:0"]
+    arguments = ["--store", str(store), "--http", "127.0.0.1:0", "--zenoh", endpoint]
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, *arguments], env=environment, stdout=subprocess.PIPE, text=True
     )
@@ -79,6 +80,41 @@ def test_a_robot_gets_its_map_and_is_seen(tmp_path: Path, number: signal.Signals
         assert link.manifest(heard[-1]).version == 2
         process.send_signal(number)
         assert process.wait(timeout=20) == 0
+
+
+def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        tiles = [random_tile(rng, landmarks=5000, cell=(x, 0)) for x in range(6)]
+        store.save_draft("lab", tiles=tiles, vocabulary=b"words", details=draft_details())
+        store.publish("lab")
+    with ExitStack() as servers:
+        process, _, zenoh = servers.enter_context(serving(tmp_path / "store"))
+        bus = servers.enter_context(ZenohBus.connect(zenoh))
+        through, asked, failed = bus.get, [], []
+
+        def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+            asked.append(key)
+            if len(asked) == 6:
+                process.kill()
+                process.wait()
+            if len(failed) == 2 and len(asked) < 100:
+                asked.extend(["back"] * 100)
+                servers.enter_context(serving(tmp_path / "store", zenoh))
+            try:
+                return through(key, payload, timeout_s=timeout_s)
+            except UnreachableError:
+                failed.append(key)
+                raise
+
+        bus.get = get
+        cache = TileCache(tmp_path / "cache")
+        link = MapLink(bus, cache, "lab", "r1", timeout_s=0.5, patience_s=60)
+        assert link.ready().wanted.version == 1
+        assert len(failed) >= 2
+        assert cache.active("lab").version == 1
+        # Nothing that had come was fetched again.
+        assert link.received_bytes == sum(len(cache.get(sha256)) for sha256 in cache.active("lab").blobs)
 
 
 def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:

@@ -73,6 +73,14 @@ class VocabularySettings(Section, frozen=True):
     max_descriptors: int = 200_000
 
 
+class BudgetSettings(Section, frozen=True):
+    """How much of a survey robots get."""
+
+    landmarks_per_m: float = 65.0
+    min_landmarks: int = 2000
+    tile_landmarks: int = 5500
+
+
 class SurveySettings(Section, frozen=True):
     """All of it."""
 
@@ -90,5 +98,6 @@ class SurveySettings(Section, frozen=True):
         max_iterations=20, relative_cost_tolerance=1e-6, huber_sigmas=0.7, cutoff_sigmas=2.5
     )
     vocabulary: VocabularySettings = VocabularySettings()
+    budget: BudgetSettings = BudgetSettings()
     local_window: int = 20
     min_observations: int = 2

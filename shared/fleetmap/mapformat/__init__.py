@@ -1,8 +1,9 @@
-"""The map as bytes: tiles, manifests, and the names that address them. Pure; described byte by byte in `tile_codec`."""
+"""The map as bytes: tiles, manifests, and the names that address them. Pure; docs/map_format.md describes them byte by byte."""
 
 from fleetmap.mapformat.container import pack, unpack
 from fleetmap.mapformat.manifest import (
     MANIFEST_FORMAT,
+    MAX_MANIFEST_BYTES,
     BlobEntry,
     CameraEntry,
     Manifest,
@@ -12,12 +13,16 @@ from fleetmap.mapformat.manifest import (
     encode_manifest,
 )
 from fleetmap.mapformat.names import blob_path, check_name, check_sha256, current_path, sha256_hex, verified
+from fleetmap.mapformat.patch_codec import PATCH_FORMAT, apply_patch, make_patch
 from fleetmap.mapformat.tile import Tile
-from fleetmap.mapformat.tile_codec import LANDMARK_BYTES, TILE_FORMAT, decode_tile, encode_tile
+from fleetmap.mapformat.tile_codec import LANDMARK_BYTES, MAX_TILE_PLACES, TILE_FORMAT, decode_tile, encode_tile
 
 __all__ = [
     "LANDMARK_BYTES",
     "MANIFEST_FORMAT",
+    "MAX_MANIFEST_BYTES",
+    "MAX_TILE_PLACES",
+    "PATCH_FORMAT",
     "TILE_FORMAT",
     "BlobEntry",
     "CameraEntry",
@@ -25,6 +30,7 @@ __all__ = [
     "RecordingEntry",
     "Tile",
     "TileEntry",
+    "apply_patch",
     "blob_path",
     "check_name",
     "check_sha256",
@@ -33,6 +39,7 @@ __all__ = [
     "decode_tile",
     "encode_manifest",
     "encode_tile",
+    "make_patch",
     "pack",
     "sha256_hex",
     "unpack",

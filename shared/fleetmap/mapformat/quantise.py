@@ -3,11 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from fleetmap.geometry import Array, quat_wxyz_from_rotation
 
-_OCTAHEDRON = 127.0
 _RATIO = 32767.0
-HALF_ANGLE_STEP_RAD = np.pi / 255
 
 
 def log_code(values: NDArray[np.float32], smallest: float, steps_per_octave: int) -> NDArray[np.uint8]:
@@ -21,35 +19,38 @@ def log_value(codes: NDArray[np.uint8], smallest: float, steps_per_octave: int) 
     return (smallest * np.exp2(codes.astype(np.float64) / steps_per_octave)).astype(np.float32)
 
 
-def half_angle_code(angles_rad: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Codes of angles from 0 to pi in steps of pi / 255."""
-    return np.clip(np.round(angles_rad.astype(np.float64) / HALF_ANGLE_STEP_RAD), 0, 255).astype(np.uint8)
+def half_angle_code(angles_rad: NDArray[np.float32], steps: int) -> NDArray[np.uint8]:
+    """Codes of angles from 0 to pi in steps of pi / `steps`, at most 255 of them."""
+    return np.clip(np.round(angles_rad.astype(np.float64) * (steps / np.pi)), 0, steps).astype(np.uint8)
 
 
-def half_angle_value(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Angles in radians of codes."""
-    return (codes * HALF_ANGLE_STEP_RAD).astype(np.float32)
+def half_angle_value(codes: NDArray[np.uint8], steps: int) -> NDArray[np.float32]:
+    """Angles in radians of codes; those above `steps` mean pi."""
+    return (np.minimum(codes, steps) * (np.pi / steps)).astype(np.float32)
 
 
-def direction_code(directions: NDArray[np.float32]) -> NDArray[np.int8]:
-    """(N, 2) octahedral codes of directions (N, 3), about one degree apart. Source: Meyer et al. 2010."""
+def direction_code(directions: NDArray[np.float32], steps: int) -> NDArray[np.int8]:
+    """(N, 2) octahedral codes of directions (N, 3), from -steps to steps. Source: Meyer et al. 2010.
+
+    Neighbouring codes are about 1.0 degree apart with 127 steps, 2.9 with 42.
+    """
     # Twice, because the folded edge of the octahedron has two codes for one direction: the second pass picks one.
-    return _direction_code(direction_value(_direction_code(directions)))
+    return _direction_code(direction_value(_direction_code(directions, steps), steps), steps)
 
 
-def _direction_code(directions: NDArray[np.float32]) -> NDArray[np.int8]:
+def _direction_code(directions: NDArray[np.float32], steps: int) -> NDArray[np.int8]:
     vectors = directions.astype(np.float64)
     vectors = vectors / np.abs(vectors).sum(axis=1, keepdims=True)
     upper = vectors[:, :2]
     signs = np.where(upper >= 0, 1.0, -1.0)
     folded = (1.0 - np.abs(upper[:, ::-1])) * signs
     plane = np.where(vectors[:, 2:] < 0, folded, upper)
-    return np.asarray(np.clip(np.round(plane * _OCTAHEDRON), -127, 127), np.int8)
+    return np.asarray(np.clip(np.round(plane * steps), -steps, steps), np.int8)
 
 
-def direction_value(codes: NDArray[np.int8]) -> NDArray[np.float32]:
+def direction_value(codes: NDArray[np.int8], steps: int) -> NDArray[np.float32]:
     """(N, 3) unit directions of octahedral codes (N, 2)."""
-    plane = np.maximum(codes.astype(np.float64), -127) / _OCTAHEDRON
+    plane = np.clip(codes.astype(np.float64), -steps, steps) / steps
     z = 1.0 - np.abs(plane).sum(axis=1, keepdims=True)
     signs = np.where(plane >= 0, 1.0, -1.0)
     folded = (1.0 - np.abs(plane[:, ::-1])) * signs
@@ -68,7 +69,16 @@ def rotation_code(rotation: Array) -> tuple[int, NDArray[np.int16]]:
     return index, (np.delete(ratios, index) * np.sign(ratios[index])).astype(np.int16)
 
 
-def rotation_value(index: int, ratios: NDArray[np.int16]) -> Array:
-    """(3, 3) rotation of `rotation_code`'s code."""
-    quat = np.insert(ratios.astype(np.float64) / _RATIO, index, 1.0)
-    return rotation_from_quat_wxyz(quat)
+def rotation_values(indices: NDArray[np.uint8], ratios: NDArray[np.int16]) -> Array:
+    """(K, 3, 3) rotations of `rotation_code`'s codes (K,) and (K, 3)."""
+    count = len(indices)
+    quats = np.ones((count, 4))
+    others = np.arange(4)[None] != indices[:, None]
+    quats[others] = (ratios.astype(np.float64) / _RATIO).ravel()
+    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.asarray(np.moveaxis(np.array(rows), -1, 0))

@@ -3,6 +3,7 @@
 from itertools import permutations, product
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -10,29 +11,32 @@ from fleetmap.geometry import rotation_angle_rad, rotation_from_quat_wxyz, so3_e
 from fleetmap.mapformat import quantise
 
 
-def test_every_direction_code_is_stable() -> None:
-    axis = np.arange(-127, 128)
+@pytest.mark.parametrize("steps", [127, 42])
+def test_every_direction_code_is_stable(steps: int) -> None:
+    axis = np.arange(-steps, steps + 1)
     codes = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2).astype(np.int8)
-    first = quantise.direction_code(quantise.direction_value(codes))
-    assert np.array_equal(quantise.direction_code(quantise.direction_value(first)), first)
+    first = quantise.direction_code(quantise.direction_value(codes, steps), steps)
+    assert np.array_equal(quantise.direction_code(quantise.direction_value(first, steps), steps), first)
     # Only codes on the folded edge have a second spelling.
     changed = (first != codes).any(axis=1)
-    assert (np.abs(codes[changed].astype(int)).max(axis=1) == 127).all()
+    assert (np.abs(codes[changed].astype(int)).max(axis=1) == steps).all()
 
 
-def test_directions_are_good_to_about_a_degree() -> None:
+@pytest.mark.parametrize(("steps", "good_to_deg"), [(127, 1.0), (42, 3.0)])
+def test_directions_are_good_to_their_step(steps: int, good_to_deg: float) -> None:
     rng = np.random.default_rng(1)
     directions = rng.normal(size=(20_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    back = quantise.direction_value(quantise.direction_code(directions.astype(np.float32)))
+    back = quantise.direction_value(quantise.direction_code(directions.astype(np.float32), steps), steps)
     cosines = np.clip((directions * back).sum(axis=1), -1, 1)
-    assert np.degrees(np.arccos(cosines)).max() < 1.0
+    assert np.degrees(np.arccos(cosines)).max() < good_to_deg
     assert np.allclose(np.linalg.norm(back, axis=1), 1, atol=1e-6)
 
 
 def _check_rotation(rotation: np.ndarray) -> None:
     code = quantise.rotation_code(rotation)
-    back = quantise.rotation_value(*code)
+    back = quantise.rotation_values(np.array([code[0]], np.uint8), code[1][None])[0]
+    assert np.allclose(back, rotation_from_quat_wxyz(np.insert(code[1] / 32767, code[0], 1.0)), atol=1e-15)
     assert rotation_angle_rad(rotation.T @ back) < 1e-4
     again = quantise.rotation_code(back)
     assert again[0] == code[0]
@@ -60,3 +64,12 @@ def test_log_codes_clip_and_are_within_half_a_step() -> None:
     assert np.abs(np.log2(back / values)).max() <= 0.5 / 20 + 1e-6
     assert np.array_equal(quantise.log_code(back, 0.1, 20), codes)
     assert quantise.log_code(np.array([0.0, 1e9], np.float32), 0.1, 20).tolist() == [0, 255]
+
+
+def test_half_angles_clip_and_are_within_half_a_step() -> None:
+    angles = np.linspace(0, np.pi, 500).astype(np.float32)
+    codes = quantise.half_angle_code(angles, 60)
+    back = quantise.half_angle_value(codes, 60)
+    assert np.abs(back - angles).max() <= np.pi / 120 + 1e-6
+    assert np.array_equal(quantise.half_angle_code(back, 60), codes)
+    assert quantise.half_angle_value(np.array([60, 255], np.uint8), 60).tolist() == [np.float32(np.pi)] * 2

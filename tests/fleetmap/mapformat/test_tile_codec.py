@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fleetmap.errors import MapFormatError, NewerFormatError
 from fleetmap.geometry import rotation_angle_rad, se3
-from fleetmap.mapformat import LANDMARK_BYTES, Tile, decode_tile, encode_tile, pack, sha256_hex, unpack
+from fleetmap.mapformat import LANDMARK_BYTES, MAX_TILE_PLACES, Tile, decode_tile, encode_tile, pack, sha256_hex, unpack
 from map_samples import random_tile
 
 LIMIT = 64 << 20
@@ -39,8 +39,8 @@ def golden_tile() -> Tile:
 
 
 def golden_payload() -> bytes:
-    """The same tile written by hand from the documentation of the format, not by the code under test."""
-    q = 4096
+    """The same tile written by hand from docs/map_format.md, not by the code under test."""
+    q = 512
     landmark_planes = bytes([7, 37, 0, 1, 0, 0, 0, 0])  # 7, then 300 - 7 = 293 = 0x125
     x = [0, int(15.5 * q)]
     y = [int(0.5 * q), 15 * q]
@@ -52,10 +52,10 @@ def golden_payload() -> bytes:
             *(bytes(value >> shift & 255 for value in axis) for axis in (x, y) for shift in (0, 8)),
             *(bytes(value >> shift & 255 for value in z) for shift in (0, 8, 16)),
             bytes(range(64)),
-            bytes([127, 0, 0, 0]),
-            bytes([0, 255]),
-            bytes([20, 140]),  # 0.1 m * 2 ** (20 / 20), 0.1 m * 2 ** (140 / 20)
-            bytes([0, 64]),  # 0.1 mm * 2 ** (64 / 16)
+            bytes([42, 0, 0, 0]),
+            bytes([0, 60]),
+            bytes([8, 56]),  # 0.1 m * 2 ** (8 / 8), 0.1 m * 2 ** (56 / 8)
+            bytes([0, 16]),  # 0.1 mm * 2 ** (16 / 4)
             bytes([5, 0, 0, 0]),
             struct.pack("<iii", int(-8.0 * 65536), int(40.25 * 65536), 65536),
             bytes([0]),
@@ -67,15 +67,17 @@ def golden_payload() -> bytes:
 
 
 def test_layout_is_the_documented_one() -> None:
-    number, payload = unpack(b"FMTL", 1, encode_tile(golden_tile()), "tile", LIMIT)
-    assert number == 1
+    number, payload = unpack(b"FMTL", 2, encode_tile(golden_tile()), "tile", LIMIT)
+    assert number == 2
     assert payload == golden_payload()
 
 
-def test_a_file_of_format_1_stays_readable() -> None:
-    # Written by the first release; never to be changed.
-    data = bytes.fromhex(GOLDEN_HEX)
-    assert sha256_hex(data) == GOLDEN_SHA256
+@pytest.mark.parametrize("number", [1, 2])
+def test_files_of_every_format_stay_readable(number: int) -> None:
+    # Written by the release that brought the format; never to be changed.
+    data = bytes.fromhex(GOLDEN_HEX[number])
+    assert sha256_hex(data) == GOLDEN_SHA256[number]
+    assert data[4] == number
     tile, expected = decode_tile(data), golden_tile()
     for field in expected.__dataclass_fields__:
         found, wanted = getattr(tile, field), getattr(expected, field)
@@ -97,7 +99,7 @@ def test_round_trip_loses_only_what_is_documented(seed: int, landmarks: int, pla
     assert np.array_equal(back.descriptors, tile.descriptors)
     assert np.array_equal(back.place_ids, tile.place_ids)
     assert [ids.tolist() for ids in back.place_landmark_ids] == [ids.tolist() for ids in tile.place_landmark_ids]
-    quantum_m = size_m / 65536
+    quantum_m = size_m / 8192
     # Half a quantum, except at the far edge, where the last code must do for the last whole quantum.
     assert np.abs(back.points_map - tile.points_map).max(initial=0) <= quantum_m
     assert np.quantile(np.abs(back.points_map - tile.points_map), 0.9) <= quantum_m / 2 + 1e-12 if landmarks else True
@@ -108,7 +110,7 @@ def test_round_trip_loses_only_what_is_documented(seed: int, landmarks: int, pla
 
 def test_landmarks_take_48_bytes_before_compression() -> None:
     sizes = [
-        len(unpack(b"FMTL", 1, encode_tile(random_tile(np.random.default_rng(0), landmarks=n, places=0)), "", LIMIT)[1])
+        len(unpack(b"FMTL", 2, encode_tile(random_tile(np.random.default_rng(0), landmarks=n, places=0)), "", LIMIT)[1])
         for n in (0, 1000)
     ]
     assert sizes[1] - sizes[0] == 1000 * LANDMARK_BYTES == 48_000
@@ -116,7 +118,7 @@ def test_landmarks_take_48_bytes_before_compression() -> None:
 
 def test_a_newer_format_is_refused_by_its_number() -> None:
     newer = pack(b"FMTL", 7, golden_payload())
-    with pytest.raises(NewerFormatError, match=r"format 7.*up to 1"):
+    with pytest.raises(NewerFormatError, match=r"format 7.*up to 2"):
         decode_tile(newer)
 
 
@@ -144,7 +146,7 @@ def test_hostile_payloads_are_refused_or_decoded(body: bytes, count: int, places
     size = count * 48 + places * 27 + references * 4
     payload = head + (body * (size // max(len(body), 1) + 1))[:size]
     try:
-        decode_tile(pack(b"FMTL", 1, payload, level=1))
+        decode_tile(pack(b"FMTL", 1 + count % 2, payload, level=1))
     except MapFormatError as error:
         assert str(error)
 
@@ -183,10 +185,29 @@ def test_tiles_that_break_their_own_rules_are_not_written() -> None:
             encode_tile(replace(tile, **change))
 
 
-GOLDEN_HEX = (
-    "464d544c01000000a700000028b52ffd24a75d04004407ff0200304000f001000000030000000725000100f8000008f0"
-    "000000300000000102030405060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f20212223242526272829"
-    "2a2b2c2d2e2f303132333435363738393a3b3c3d3e3f7f00000000ff148c004005ff004028000001000000080034037c"
-    "24c04552968787e98e3f7310402000d85a30caa5"
-)
-GOLDEN_SHA256 = "d0346ce18229f33cf3bde5e090af33d269b7573348ea42106ca1357a5366b92e"
+def test_many_places_cannot_take_long() -> None:
+    places = MAX_TILE_PLACES + 1
+    head = struct.pack("<iidiIII", 0, 0, 16.0, 0, 0, places, 0)
+    with pytest.raises(MapFormatError, match="places"):
+        decode_tile(pack(b"FMTL", 2, head + bytes(27 * places), level=1))
+
+
+GOLDEN_HEX = {
+    1: (
+        "464d544c01000000a700000028b52ffd24a75d04004407ff0200304000f001000000030000000725000100f8000008f0"
+        "000000300000000102030405060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f20212223242526272829"
+        "2a2b2c2d2e2f303132333435363738393a3b3c3d3e3f7f00000000ff148c004005ff004028000001000000080034037c"
+        "24c04552968787e98e3f7310402000d85a30caa5"
+    ),
+    2: (
+        "464d544c02000000a700000028b52ffd24a7000100ffffffff02000000000000000000304000feffff02000000010000"
+        "000300000040000007250001000000002000000000001f2000000000011e300000000000060000000200000102030405"
+        "060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f202122232425262728292a2b2c2d2e2f303132333435"
+        "363738393a3b3c3d3e3f2000002a000000100000003c10000008381000000010d80000050000000000f8ff0040280000"
+        "0001000000000000000003000000600000072500000100000001000000010000725fc30a"
+    ),
+}
+GOLDEN_SHA256 = {
+    1: "d0346ce18229f33cf3bde5e090af33d269b7573348ea42106ca1357a5366b92e",
+    2: "05ff2dcc7afce05f4111cf83bb2446d5e7977aa3ddd9fbfebe2898af40f97fd3",
+}

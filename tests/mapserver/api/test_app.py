@@ -9,7 +9,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from fleetmap.bus import MemoryBus, MemoryHub
-from fleetmap.mapformat import blob_path, decode_manifest, decode_tile, sha256_hex
+from fleetmap.mapformat import TILE_FORMAT, blob_path, decode_manifest, decode_tile, sha256_hex
 from fleetmap.messages import RobotAck, RobotHealth
 from map_samples import save_sample_draft
 from mapserver.api.app import create_app
@@ -187,7 +187,7 @@ def test_robots(server: Server) -> None:
 def test_service_endpoints(server: Server) -> None:
     assert server.client.get("/healthz").json() == {"status": "ok"}
     assert server.client.get("/readyz").json() == {"status": "ok"}
-    assert server.client.get("/version").json()["tile_format"] == 1
+    assert server.client.get("/version").json()["tile_format"] == TILE_FORMAT
     server.bus.close()
     check_problem(server.client.get("/readyz"), 503, "bus")
 

@@ -1,0 +1,41 @@
+"""Bytes that were used last, up to a number of them."""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+
+_ENTRY_BYTES = 200  # what an entry takes beside its bytes, so that empty ones are bounded too
+
+
+class RecentBytes:
+    """For several threads. Holds at most `max_bytes`; the least recently used go first."""
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self._held: OrderedDict[str, bytes] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    @property
+    def total_bytes(self) -> int:
+        """What is held, the entries' own size included."""
+        with self._lock:
+            return self._bytes
+
+    def get(self, key: str, make: Callable[[], bytes]) -> bytes:
+        """The bytes of `key`, made where they are not held; what `make` raises passes through and is not kept."""
+        with self._lock:
+            data = self._held.get(key)
+            if data is not None:
+                self._held.move_to_end(key)
+                return data
+        # Outside of the lock: two threads may both make them, which costs time and no harm.
+        data = make()
+        with self._lock:
+            if key not in self._held and len(data) + _ENTRY_BYTES <= self._max_bytes:
+                self._held[key] = data
+                self._bytes += len(data) + _ENTRY_BYTES
+                while self._bytes > self._max_bytes:
+                    _, old = self._held.popitem(last=False)
+                    self._bytes -= len(old) + _ENTRY_BYTES
+        return data

@@ -1,0 +1,48 @@
+"""How maps reach a fleet: bytes, time, what the server costs, and what no input can do; run by `make bench`."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import bench_map_budget, bench_map_fuzz, bench_service
+from realdata import real_data
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+
+
+def test_three_hundred_robots_fetch_a_site_and_a_delta() -> None:
+    rows = bench_service.bench(clients=300, site_mb=50, outage_s=60)
+    print(json.dumps(rows))
+    whole, delta, nothing = (rows[name] for name in ("whole", "delta", "nothing moved"))
+    assert whole["robots"] == delta["robots"] == 300
+    assert delta["bytes_per_robot"] <= 0.15 * whole["bytes_per_robot"]
+    assert nothing["bytes_per_robot"] <= 0.01 * whole["bytes_per_robot"]
+    assert whole["http_p99_ms"] < 50
+    assert max(row["rss_max_mb"] for row in (whole, delta, nothing)) < 500
+
+
+def test_a_hundred_thousand_hostile_inputs() -> None:
+    before_mb = bench_map_fuzz.peak_mb()
+    found = bench_map_fuzz.fuzz(100_000, seed=0)
+    bench_map_fuzz.show(found)
+    assert sum(figures["inputs"] for figures in found.values()) > 99_000
+    assert max(figures["slowest_ms"] for figures in found.values()) < 2000
+    assert bench_map_fuzz.peak_mb() - before_mb < 300
+
+
+def test_the_default_budget_costs_little(tmp_path: Path) -> None:
+    recording = real_data("euroc_v101_keyframes")
+    program = "from mapserver.cli import main; main()"
+    arguments = ["build", str(recording), "--site", "bench", "--store", str(tmp_path), "--frames", "0::2"]
+    subprocess.run(
+        [sys.executable, "-c", program, *arguments, "--frame-from-ground-truth"],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, check=True,
+    )  # fmt: skip
+    default, full, *_ = bench_map_budget.measure(tmp_path, "bench", None, recording, "1::2")
+    assert float(default["bytes_per_m"]) <= 3000  # type: ignore[arg-type]
+    assert int(default["largest_tile_bytes"]) <= 256_000  # type: ignore[call-overload]
+    assert float(default["localised_share"]) >= float(full["localised_share"]) - 0.02  # type: ignore[arg-type]

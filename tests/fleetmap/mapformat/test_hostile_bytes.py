@@ -1,0 +1,70 @@
+"""Map bytes from an attacker: never anything but the project's own errors, and little time and memory for the worst."""
+
+import struct
+import time
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from benchmarks.bench_map_fuzz import fuzz
+from fleetmap.errors import MapFormatError
+from fleetmap.mapformat import MAX_TILE_PLACES, apply_patch, decode_tile, encode_tile, pack, sha256_hex, unpack
+from map_samples import random_tile
+
+_LIMIT = 16 << 20
+
+
+def test_thousands_of_damaged_and_hostile_inputs() -> None:
+    found = fuzz(4400, 1)
+    assert sum(figures["inputs"] for figures in found.values()) == 4400
+    for name in ("tile, hostile payload", "manifest patch, hostile payload"):
+        assert found[name]["read"] > 0, "all were refused at the door: the decoder itself was not tried"
+
+
+def steps_of_one(count: int) -> bytes:
+    """`count` increasing ids as differences in planes."""
+    return b"\1" * count + bytes(3 * count)
+
+
+def fullest_tile(kind: str) -> bytes:
+    """As much as the limits allow, in a few hundred bytes of zstd."""
+    if kind == "landmarks":
+        count = _LIMIT // 48 - 1
+        return struct.pack("<iidiIII", 0, 0, 16.0, 0, count, 0, 0) + steps_of_one(count) + bytes(44 * count)
+    places = MAX_TILE_PLACES
+    each = (_LIMIT // 4 - 7 * places - 8) // places if kind == "references" else 0
+    head = struct.pack("<iidiIII", 0, 0, 16.0, 0, 0, places, places * each)
+    counts = np.full(places, each, "<u4").view(np.uint8).reshape(-1, 4).T.tobytes()
+    return head + steps_of_one(places) + bytes(19 * places) + counts + steps_of_one(places * each)
+
+
+@pytest.mark.parametrize("kind", ["landmarks", "places", "references"])
+def test_the_fullest_tile_takes_little(kind: str) -> None:
+    data = pack(b"FMTL", 2, fullest_tile(kind), level=1)
+    assert len(data) < 2000
+    started_s = time.process_time()
+    decode_tile(data)
+    assert time.process_time() - started_s < 3  # a tenth of it, measured
+
+
+def test_the_fullest_tile_takes_little_memory() -> None:
+    data = pack(b"FMTL", 2, fullest_tile("landmarks"), level=1)
+    tracemalloc.start()
+    decode_tile(data)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 12 * _LIMIT
+
+
+def test_the_fullest_patch_takes_little() -> None:
+    base = encode_tile(random_tile(np.random.default_rng(0)))
+    payload = unpack(b"FMTL", 2, base, "tile", _LIMIT)[1]
+    count = _LIMIT // 48 - 101
+    news = struct.pack("<iidiIII", 0, 0, 16.0, 0, count, 0, 0) + steps_of_one(count) + bytes(44 * count)
+    head = struct.pack("<32s32sBBHII", bytes.fromhex(sha256_hex(base)), bytes(32), 1, 2, 0, 0, 0)
+    patch = pack(b"FMPT", 1, head + news, level=1, prefix=payload)
+    started_s = time.process_time()
+    with pytest.raises(MapFormatError):
+        apply_patch(base, patch)
+    assert time.process_time() - started_s < 10

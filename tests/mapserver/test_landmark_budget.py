@@ -1,0 +1,159 @@
+"""The budget: kept where it must be, the choice against a plain greedy loop, and what it is chosen by."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleetmap.mapformat import encode_tile
+from map_samples import random_survey
+from mapserver import landmark_budget_kernels as kernels
+from mapserver.landmark_budget import path_m, within_budget
+from mapserver.survey.result import SurveyMap
+from mapserver.survey.settings import BudgetSettings
+from mapserver.tiling import tiles_from_survey
+
+
+def exactly(count: int, tile_landmarks: int = 1 << 30) -> BudgetSettings:
+    return BudgetSettings(landmarks_per_m=0.0, min_landmarks=count, tile_landmarks=tile_landmarks)
+
+
+def plain_greedy(
+    bins: list[list[int]], weights: np.ndarray, cells: np.ndarray, room: list[int], limit: int
+) -> set[int]:
+    """The best one next, all values computed anew each time."""
+    counts: dict[int, int] = {}
+    chosen: list[int] = []
+    room = list(room)
+    while len(chosen) < limit:
+        gains = {
+            n: weights[n] * sum(1.0 / (1.0 + counts.get(b, 0)) for b in bins[n])
+            for n in range(len(bins))
+            if n not in chosen and room[cells[n]] > 0
+        }
+        if not gains:
+            break
+        best = max(gains, key=lambda n: (gains[n], -n))
+        chosen.append(best)
+        room[cells[best]] -= 1
+        for b in bins[best]:
+            counts[b] = counts.get(b, 0) + 1
+    return set(chosen)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_lazy_choice_is_the_plain_one(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    bins = [rng.integers(0, 12, rng.integers(1, 6)).tolist() for _ in range(40)]
+    weights = rng.choice([0.5, 1.0, 1.5], 40)  # many ties
+    cells, room = rng.integers(0, 3, 40), np.array([5, 30, 4])
+    expected = plain_greedy(bins, weights, cells, room.tolist(), 20)
+    starts = np.concatenate([[0], np.cumsum([len(b) for b in bins])]).astype(np.int64)
+    chosen = np.zeros(40, bool)
+    taken = kernels.choose(
+        np.arange(40), starts, np.concatenate(bins).astype(np.int64), weights, cells.astype(np.int64),
+        room.astype(np.int64), 20, np.zeros(12, np.int64), chosen,
+    )  # fmt: skip
+    assert taken == len(expected)
+    assert set(np.flatnonzero(chosen)) == expected
+
+
+def seen_per_view(survey: SurveyMap) -> np.ndarray:
+    return np.bincount(survey.obs_keyframe, minlength=len(survey.map_from_body))
+
+
+def test_every_view_keeps_its_share() -> None:
+    survey = random_survey(np.random.default_rng(1), keyframes=20, landmarks=800)
+    cut = within_budget(survey, exactly(100), 16.0)
+    assert len(cut.landmark_ids) == 100
+    counts = seen_per_view(cut)
+    assert counts.min() > 0.7 * counts.mean()
+    kept = np.isin(survey.landmark_ids, cut.landmark_ids)
+    for field in ("points_map", "descriptors", "point_sigma_m", "patches"):
+        np.testing.assert_array_equal(getattr(cut, field), getattr(survey, field)[kept])
+    pairs = {
+        (int(k), int(survey.landmark_ids[n])) for k, n in zip(survey.obs_keyframe, survey.obs_landmark, strict=True)
+    }
+    left = {(int(k), int(cut.landmark_ids[n])) for k, n in zip(cut.obs_keyframe, cut.obs_landmark, strict=True)}
+    assert left == {(k, n) for k, n in pairs if n in set(cut.landmark_ids.tolist())}
+
+
+def test_a_lonely_view_is_served_before_crowded_ones_get_more() -> None:
+    survey = random_survey(np.random.default_rng(2), keyframes=10, landmarks=400)
+    # Keyframe 9 sees 25 landmarks that nobody else sees.
+    own = np.arange(375, 400)
+    other = ~np.isin(survey.obs_landmark, own) & (survey.obs_keyframe != 9)
+    survey = replace(
+        survey,
+        obs_keyframe=np.append(survey.obs_keyframe[other], np.full(25, 9)).astype(np.int32),
+        obs_landmark=np.append(survey.obs_landmark[other], own).astype(np.int32),
+        obs_pixels=np.concatenate([survey.obs_pixels[other], survey.obs_pixels[:25]]),
+        obs_octave=np.append(survey.obs_octave[other], np.zeros(25, np.int8)),
+        obs_sigma_px=np.append(survey.obs_sigma_px[other], np.ones(25)),
+    )
+    cut = within_budget(survey, exactly(120), 16.0)
+    # All others are seen several times: by how often they are seen alone, none of these would be kept.
+    assert np.bincount(survey.obs_landmark)[np.isin(np.arange(400), own)].max() == 1
+    assert 5 <= seen_per_view(cut)[9] < 25
+
+
+def test_the_path_sets_the_budget_and_breaks_do_not_count() -> None:
+    survey = random_survey(np.random.default_rng(3), keyframes=50, landmarks=500)
+    assert path_m(survey) == pytest.approx(
+        np.linalg.norm(np.diff(survey.map_from_body[:, :3, 3], axis=0), axis=1).sum()
+    )
+    settings = BudgetSettings(landmarks_per_m=2.0, min_landmarks=10)
+    assert len(within_budget(survey, settings, 16.0).landmark_ids) == int(2.0 * path_m(survey))
+    broken = survey.map_from_body.copy()
+    broken[25:, 0, 3] += 1000.0
+    assert path_m(replace(survey, map_from_body=broken)) < path_m(survey)
+
+
+def test_what_is_published_is_kept_first() -> None:
+    survey = random_survey(np.random.default_rng(4), keyframes=20, landmarks=600)
+    worst = np.setdiff1d(survey.landmark_ids, within_budget(survey, exactly(500), 16.0).landmark_ids)[:60]
+    again = within_budget(survey, exactly(100), 16.0, published=worst)
+    seen = survey.landmark_ids[np.unique(survey.obs_landmark)]
+    assert set(again.landmark_ids) >= set(worst) & set(seen)
+    assert len(again.landmark_ids) == 100
+    # Nothing else changed, so nothing changes.
+    once_more = within_budget(survey, exactly(100), 16.0, published=again.landmark_ids)
+    assert set(once_more.landmark_ids) == set(again.landmark_ids)
+
+
+def test_tiles_stay_below_their_limit() -> None:
+    survey = random_survey(np.random.default_rng(5), keyframes=10, landmarks=900)
+    tiles = tiles_from_survey(within_budget(survey, exactly(800, tile_landmarks=70), 16.0), 16.0)
+    assert max(len(tile) for tile in tiles) == 70
+
+
+def test_a_full_tile_of_the_default_budget_fits_in_256_kb() -> None:
+    """Random descriptors and places that see 300 landmarks each: harder to compress than any real tile."""
+    rng = np.random.default_rng(6)
+    settings = BudgetSettings()
+    survey = random_survey(rng, keyframes=60, landmarks=settings.tile_landmarks + 500)
+    survey = replace(
+        survey,
+        points_map=rng.uniform([0, 0, 0], [16, 16, 8], (len(survey.points_map), 3)),
+        landmark_ids=np.sort(rng.choice(1 << 20, len(survey.landmark_ids), replace=False)).astype(np.uint32),
+    )
+    map_from_body = survey.map_from_body.copy()
+    map_from_body[:, :2, 3] = rng.uniform(1, 15, (60, 2))
+    survey = replace(survey, map_from_body=map_from_body)
+    cut = within_budget(survey, exactly(10_000, settings.tile_landmarks), 16.0)
+    largest = max(tiles_from_survey(cut, 16.0), key=len)
+    assert len(largest) == settings.tile_landmarks
+    assert len(encode_tile(largest)) <= 256_000
+
+
+def test_nothing_comes_of_nothing() -> None:
+    survey = random_survey(np.random.default_rng(7))
+    nobody = replace(
+        survey,
+        obs_keyframe=survey.obs_keyframe[:0],
+        obs_landmark=survey.obs_landmark[:0],
+        obs_pixels=survey.obs_pixels[:0],
+        obs_octave=survey.obs_octave[:0],
+        obs_sigma_px=survey.obs_sigma_px[:0],
+    )
+    assert len(within_budget(nobody, BudgetSettings(), 16.0).landmark_ids) == 0
