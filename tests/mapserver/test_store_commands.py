@@ -40,7 +40,7 @@ def test_a_life_of_versions(run, tmp_path: Path) -> None:
     assert [(event["kind"], event["actor"]) for event in shown["history"]][-1] == ("rolled_back", "ada")
     assert "gate: accepted" in run("inspect", *where, "--version", 1)
     changed = json.loads(run("diff", *where, 1, 2, "--json"))
-    assert (changed["tiles_changed"], changed["quality"]["path_m"]) == (2, [12.5, 12.5])
+    assert (changed["tiles_changed"], changed["quality"]["path_m"]) == (2, {"before": 12.5, "after": 12.5})
     assert "fetches" in run("diff", *where, 1, 2)
     assert "version 2 is in" in run("export", *where, tmp_path / "lab.fmex")
     assert "(draft)" in run("import", tmp_path / "lab.fmex", "--store", tmp_path / "other")

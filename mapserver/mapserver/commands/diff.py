@@ -54,6 +54,6 @@ def _print_tables(found: "Difference") -> None:
     share = found.fetch_bytes / max(1, found.full_bytes)
     console.print(f"a robot with version {found.before} fetches {found.fetch_bytes} bytes ({share:.1%} of everything)")
     quality = Table("quality", str(found.before), str(found.after))
-    for key, (old, new) in found.quality.items():
-        quality.add_row(key, "" if old is None else str(old), "" if new is None else str(new))
+    for key, both in found.quality.items():
+        quality.add_row(key, *("" if figure is None else str(figure) for figure in (both.before, both.after)))
     console.print(quality)

@@ -12,12 +12,20 @@ TileReader = Callable[[str], Tile]
 
 
 @dataclass(frozen=True, slots=True)
+class SideBySide:
+    """A figure of the builds' reports; None where a report does not have it."""
+
+    before: Any
+    after: Any
+
+
+@dataclass(frozen=True, slots=True)
 class Difference:
     """From version `before` to version `after` of a site.
 
     Tiles are counted by their cell, landmarks by their id. landmarks_moved: with other coordinates; moved_median_m and
     moved_max_m say how far, None where none moved. fetch_bytes: manifest, tiles and vocabulary that a robot with all
-    of `before` downloads; full_bytes: what a robot with nothing does. quality: by key of the builds' reports, both.
+    of `before` downloads; full_bytes: what a robot with nothing does. quality: by key of the builds' reports.
     """
 
     site: str
@@ -36,7 +44,7 @@ class Difference:
     fetch_bytes: int
     full_bytes: int
     vocabulary_changed: bool
-    quality: dict[str, tuple[Any, Any]]
+    quality: dict[str, SideBySide]
 
 
 def difference(before: Manifest, after: Manifest, after_manifest_bytes: int, read_tile: TileReader) -> Difference:
@@ -72,7 +80,7 @@ def difference(before: Manifest, after: Manifest, after_manifest_bytes: int, rea
         full_bytes=after_manifest_bytes + after.tile_bytes + after.vocabulary.bytes,
         vocabulary_changed=vocabulary_changed,
         quality={
-            key: (before.report.get(key), after.report.get(key))
+            key: SideBySide(before.report.get(key), after.report.get(key))
             for key in sorted(before.report.keys() | after.report.keys())
         },
     )

@@ -11,7 +11,7 @@ Bytes are on the disk before the transaction that mentions them, so a crash leav
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Self
 
@@ -60,9 +60,9 @@ class MapStore(StoreRecords):
 
         Raises StoreError where there is none or it cannot be opened, NewerFormatError for one made by a newer fleetmap.
         """
-        if not (path / "store.sqlite3").is_file() and not create:
-            raise StoreError(f"{path} holds no map store; check --store, or make one with `mapserver build`")
         try:
+            if not (path / "store.sqlite3").is_file() and not create:
+                raise StoreError(f"{path} holds no map store; check --store, or make one with `mapserver build`")
             make_folder(path / "sites")
             store = cls(path, clock_ns)
         except (OSError, sqlite3.Error) as error:
@@ -185,7 +185,8 @@ class MapStore(StoreRecords):
 
     def verify(self) -> Findings:
         """What is wrong with the store; reads all of it."""
-        return verify(self._root, self._ledger, self._blobs)
+        with self._disk_told():
+            return verify(self._root, self._ledger, self._blobs)
 
     def collect_garbage(
         self, retention: Retention = _USUAL_RETENTION, *, dry_run: bool = False, actor: Actor = NOBODY
@@ -297,10 +298,12 @@ class MapStore(StoreRecords):
 
     @contextmanager
     def _locked(self, *, shared: bool) -> Iterator[None]:
-        path = self._root / "lock"
-        with ExitStack() as stack:
-            try:
-                stack.enter_context(locked(path, shared=shared))
-            except OSError as error:
-                raise StoreError(f"{path} cannot be opened ({error.strerror}); check the folder's rights") from error
+        with self._disk_told(), locked(self._root / "lock", shared=shared):
             yield
+
+    @contextmanager
+    def _disk_told(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise StoreError(f"{error.filename or self._root}: {error.strerror}; check the store's disk") from error

@@ -278,7 +278,7 @@ def test_a_difference_names_bytes_and_quality(server: Server) -> None:
     found = server.client.get("/v1/sites/lab/versions/1/diff/2").json()
     assert (found["tiles_changed"], found["tiles_kept"]) == (2, 0)
     assert found["fetch_bytes"] + 250 == found["full_bytes"]  # all but the vocabulary
-    assert found["quality"] == {"path_m": [12.5, 12.5]}
+    assert found["quality"] == {"path_m": {"before": 12.5, "after": 12.5}}
 
 
 TOKEN = "a-token-of-some-length"

@@ -14,6 +14,7 @@ from fleetmap.mapformat import blob_path, current_path
 from map_samples import draft_details, random_tile, save_sample_draft
 from mapserver.gate import GateSettings
 from mapserver.store import Actor, MapStore, Retention
+from mapserver.store.differences import SideBySide
 from mapserver.store.files import locked
 
 ADA = Actor("ada", "a test")
@@ -139,7 +140,7 @@ def test_a_difference_counts_tiles_landmarks_and_bytes(store: MapStore) -> None:
     info = store.version("lab", 2)
     assert found.fetch_bytes == info.manifest_bytes + entries[1, 0].bytes + entries[3, 0].bytes
     assert found.full_bytes == info.map_bytes + info.vocabulary_bytes
-    assert found.quality == {"path_m": (10.0, 11.0)}
+    assert found.quality == {"path_m": SideBySide(10.0, 11.0)}
     same = store.difference("lab", 2, 2)
     assert (same.tiles_kept, same.landmarks_kept, same.moved_max_m) == (3, info.landmarks, None)
 
