@@ -9,14 +9,24 @@ from fleetmap.errors import FleetmapError
 from mapserver.commands.build import build
 from mapserver.commands.config_option import ConfigFile
 from mapserver.commands.convert import convert
+from mapserver.commands.diff import diff
 from mapserver.commands.doctor import doctor
 from mapserver.commands.evaluate import evaluate
+from mapserver.commands.export import export
+from mapserver.commands.gc import gc
+from mapserver.commands.import_ import import_
 from mapserver.commands.inspect import inspect
+from mapserver.commands.promote import promote
 from mapserver.commands.publish import publish
+from mapserver.commands.rollback import rollback
 from mapserver.commands.serve import serve
+from mapserver.commands.verify import verify
 from mapserver.commands.versions import versions
 
-COMMANDS = (build, publish, versions, inspect, serve, convert, doctor, evaluate)
+COMMANDS = (
+    build, publish, promote, rollback, versions, inspect, diff, serve, verify, gc, export, import_,
+    convert, doctor, evaluate,
+)  # fmt: skip
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -30,7 +40,7 @@ def mapserver(config: ConfigFile = None) -> None:
 
 
 for _command in COMMANDS:
-    app.command()(_command)
+    app.command(_command.__name__.rstrip("_"))(_command)
 
 
 # Before anything imports numpy: many small products, for which a second BLAS thread costs more than it brings.

@@ -1,4 +1,5 @@
-"""The configuration file of `mapserver`: one section for each command, and [survey] for how maps are made.
+"""The configuration file of `mapserver`: one section for each command, [survey] for how maps are made, and
+[gate] for which drafts are refused.
 
 A command's section holds its options under their names, with `_` for `-`. Paths are relative to the working directory,
 as on the command line.
@@ -10,6 +11,7 @@ from typing import Any
 import msgspec
 
 from fleetmap.config import Section, load_toml, to_dict
+from mapserver.gate import GateSettings
 from mapserver.survey.settings import SurveySettings
 
 
@@ -27,13 +29,64 @@ class BuildSection(Section, frozen=True):
     frame_from_ground_truth: bool | None = None
 
 
+class PublishSection(Section, frozen=True):
+    """Options of `mapserver publish`."""
+
+    site: str | None = None
+    store: str | None = None
+    version: int | None = None
+    force: bool | None = None
+    actor: str | None = None
+    reason: str | None = None
+
+
+class ActSection(Section, frozen=True):
+    """Options of `mapserver promote` and `rollback`."""
+
+    site: str | None = None
+    store: str | None = None
+    actor: str | None = None
+    reason: str | None = None
+
+
 class StoreSection(Section, frozen=True):
-    """Options of `mapserver publish`, `versions` and `inspect` that make sense in a file."""
+    """Options of `mapserver versions`, `inspect`, `diff` and `verify` that make sense in a file."""
 
     site: str | None = None
     store: str | None = None
     version: int | None = None
     json: bool | None = None
+
+
+class GcSection(Section, frozen=True):
+    """Options of `mapserver gc`."""
+
+    store: str | None = None
+    keep_versions: int | None = None
+    keep_drafts: int | None = None
+    keep_days: float | None = None
+    robot_days: float | None = None
+    dry_run: bool | None = None
+    json: bool | None = None
+    actor: str | None = None
+    reason: str | None = None
+
+
+class ExportSection(Section, frozen=True):
+    """Options of `mapserver export`."""
+
+    site: str | None = None
+    store: str | None = None
+    version: int | None = None
+    without_archive: bool | None = None
+
+
+class ImportSection(Section, frozen=True):
+    """Options of `mapserver import`."""
+
+    store: str | None = None
+    actor: str | None = None
+    reason: str | None = None
 
 
 class ServeSection(Section, frozen=True):
@@ -42,6 +95,7 @@ class ServeSection(Section, frozen=True):
     store: str | None = None
     http: str | None = None
     zenoh: str | None = None
+    token_file: str | None = None
 
 
 class ConvertSection(Section, frozen=True):
@@ -65,14 +119,22 @@ class EvaluateSection(Section, frozen=True):
     json: bool | None = None
 
 
-class MapserverConfig(Section, frozen=True):
+class MapserverConfig(Section, frozen=True, rename={"import_": "import"}):
     """The whole file."""
 
     build: BuildSection = BuildSection()
     survey: SurveySettings = SurveySettings()
-    publish: StoreSection = StoreSection()
+    gate: GateSettings = GateSettings()
+    publish: PublishSection = PublishSection()
+    promote: ActSection = ActSection()
+    rollback: ActSection = ActSection()
     versions: StoreSection = StoreSection()
     inspect: StoreSection = StoreSection()
+    diff: StoreSection = StoreSection()
+    verify: StoreSection = StoreSection()
+    gc: GcSection = GcSection()
+    export: ExportSection = ExportSection()
+    import_: ImportSection = ImportSection()
     serve: ServeSection = ServeSection()
     convert: ConvertSection = ConvertSection()
     doctor: DoctorSection = DoctorSection()
@@ -86,8 +148,10 @@ def read_config(path: Path | None) -> MapserverConfig:
 
 def command_defaults(config: MapserverConfig) -> dict[str, dict[str, Any]]:
     """By command, the options that the file sets."""
-    commands = (name for name in msgspec.structs.asdict(config) if name != "survey")
+    commands = (name for name in msgspec.structs.asdict(config) if name not in {"survey", "gate"})
     return {
-        name: {option: value for option, value in to_dict(getattr(config, name)).items() if value is not None}
+        name.rstrip("_"): {
+            option: value for option, value in to_dict(getattr(config, name)).items() if value is not None
+        }
         for name in commands
     }

@@ -2,6 +2,7 @@
 
 FleetmapError                      exit status 3
 ├── UsageError                     exit status 2: a command line or setting that cannot be right
+│   └── StateError                 what is asked for does not fit the state that something is in
 ├── RecordingError                 a recording that cannot be read or contradicts itself
 │   └── CalibrationError           missing or impossible calibration
 ├── SurveyError                    a recording from which no honest map can be made
@@ -27,6 +28,10 @@ class UsageError(FleetmapError):
     """A command line or a setting that cannot be right."""
 
     exit_status = 2
+
+
+class StateError(UsageError):
+    """Something that does not fit the state of what it is asked of, such as promoting a draft."""
 
 
 class RecordingError(FleetmapError):

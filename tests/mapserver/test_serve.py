@@ -22,6 +22,7 @@ from fleetmap.messages import RobotHealth, WantedVersion
 from locclient.link import MapLink
 from locclient.tile_cache import TileCache
 from map_samples import draft_details, random_tile, save_sample_draft
+from mapserver import cli
 from mapserver.commands.inspect import inspect
 from mapserver.commands.publish import publish
 from mapserver.commands.serve import serve
@@ -118,14 +119,19 @@ def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path
 
 
 def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:
+    context = typer.Context(typer.main.get_command(cli.app))
     with pytest.raises(UsageError, match="--http 'nonsense'"):
-        serve(tmp_path, "nonsense", "tcp/127.0.0.1:0")
+        serve(context, tmp_path, "nonsense", "tcp/127.0.0.1:0")
     with pytest.raises(UsageError, match="endpoint"):
-        serve(tmp_path, "127.0.0.1:0", "nonsense")
+        serve(context, tmp_path, "127.0.0.1:0", "nonsense")
     with pytest.raises(StoreError, match="no map store"):
-        serve(tmp_path, "127.0.0.1:0", "tcp/127.0.0.1:0")
+        serve(context, tmp_path, "127.0.0.1:0", "tcp/127.0.0.1:0")
     with pytest.raises(UsageError, match="cannot listen"):
-        serve(tmp_path, "192.0.2.1:80", "tcp/127.0.0.1:0")
+        serve(context, tmp_path, "192.0.2.1:80", "tcp/127.0.0.1:0")
+    (tmp_path / "token").write_text("short")
+    for file, words in ((tmp_path / "token", "at least 16"), (tmp_path / "nothing", "cannot be read")):
+        with pytest.raises(UsageError, match=words):
+            serve(context, tmp_path, "127.0.0.1:0", "tcp/127.0.0.1:0", file)
 
 
 def run(command: object, *arguments: str) -> str:

@@ -12,29 +12,63 @@ from starlette.exceptions import HTTPException
 
 from fleetmap.bus import Bus
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT
-from mapserver.api import problems
+from mapserver.api import describe, problems
 from mapserver.api.bytes_response import bytes_response
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
-from mapserver.api.views import RobotList, ServerVersion, SiteList, SiteView, State, VersionList, VersionView
+from mapserver.api.pages import Limit, NameCursor, NumberCursor, RobotCursor, page
+from mapserver.api.parameters import Sha256, Site, SiteFilter, Version
+from mapserver.api.version_routes import install_version_routes
+from mapserver.api.views import (
+    EventList,
+    JobList,
+    RobotList,
+    ServerVersion,
+    SiteList,
+    SiteView,
+    State,
+    VersionList,
+    VersionView,
+)
+from mapserver.api.writers import Writers
 from mapserver.fleet import Fleet
-from mapserver.store import MapStore
+from mapserver.gate import GateSettings
+from mapserver.store import JobInfo, MapStore
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
-Site = Annotated[str, Path(max_length=64)]
-Version = Annotated[int, Path(ge=1, le=1 << 31)]
-Sha256 = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
+ONLY_LOOPBACK = Writers()
+USUAL_GATE = GateSettings()
 
 
 def create_app(
-    store: MapStore, fleet: Fleet, metrics: Metrics, bus: Bus | None, lifespan: Lifespan | None = None
+    store: MapStore,
+    fleet: Fleet,
+    metrics: Metrics,
+    bus: Bus | None,
+    lifespan: Lifespan | None = None,
+    *,
+    writers: Writers = ONLY_LOOPBACK,
+    gate: GateSettings = USUAL_GATE,
 ) -> FastAPI:
-    """The application over an open store; `bus` is looked at for readiness only, None where none is served."""
-    app = FastAPI(title="fleetmap", version=fleetmap_version(), docs_url=None, redoc_url=None, lifespan=lifespan)
+    """The application over an open store; `bus` is looked at for readiness only, None where none is served.
+
+    writers: who may change something. gate: what publishing over HTTP refuses.
+    """
+    app = FastAPI(
+        title="fleetmap",
+        description="Versions of maps, the robots that use them, and the jobs that make them.",
+        version=fleetmap_version(),
+        docs_url=None,
+        redoc_url=None,
+        lifespan=lifespan,
+        responses=problems.PROBLEM_RESPONSES,
+    )
     problems.install(app)
     _install_metrics(app, metrics)
     _install_service_routes(app, store, metrics, bus)
+    _install_list_routes(app, store, fleet)
     _install_map_routes(app, store)
-    _install_robot_routes(app, fleet)
+    install_version_routes(app, store, writers, gate)
+    describe.install(app)
     return app
 
 
@@ -71,17 +105,48 @@ def _install_service_routes(app: FastAPI, store: MapStore, metrics: Metrics, bus
         return Response(metrics.text(), headers={"Content-Type": CONTENT_TYPE})
 
 
-def _install_map_routes(app: FastAPI, store: MapStore) -> None:
+def _install_list_routes(app: FastAPI, store: MapStore, fleet: Fleet) -> None:
     @app.get("/v1/sites")
-    def sites() -> SiteList:
-        """All sites."""
-        return SiteList([SiteView.of(info) for info in store.sites()])
+    def sites(limit: Limit = 100, cursor: NameCursor = None) -> SiteList:
+        """Sites by name."""
+        found = [info for info in store.sites() if cursor is None or info.site > cursor]
+        shown, following = page(found, limit, lambda info: info.site)
+        return SiteList([SiteView.of(info) for info in shown], following)
 
     @app.get("/v1/sites/{site}/versions")
-    def versions(site: Site) -> VersionList:
-        """All versions of a site, drafts too."""
-        return VersionList([VersionView.of(info) for info in store.versions(site)])
+    def versions(site: Site, limit: Limit = 100, cursor: NumberCursor = None) -> VersionList:
+        """Versions of a site, oldest first, drafts too."""
+        found = store.versions(site, after=cursor or 0, limit=limit + 1)
+        shown, following = page(found, limit, lambda info: str(info.version))
+        return VersionList([VersionView.of(info) for info in shown], following)
 
+    @app.get("/v1/sites/{site}/events")
+    def events(site: Site, limit: Limit = 100, cursor: NumberCursor = None) -> EventList:
+        """What happened to a site, oldest first: who did what, when and why."""
+        store.current(site)  # an unknown site is not an empty one
+        found = store.events(site, after=cursor or 0, limit=limit + 1)
+        return EventList(*page(found, limit, lambda event: str(event.id)))
+
+    @app.get("/v1/jobs")
+    def jobs(site: SiteFilter = None, limit: Limit = 100, cursor: NumberCursor = None) -> JobList:
+        """Jobs (of a site), newest first."""
+        found = store.jobs(site, before=cursor, limit=limit + 1)
+        return JobList(*page(found, limit, lambda job: str(job.id)))
+
+    @app.get("/v1/jobs/{job}")
+    def job(job: Annotated[int, Path(ge=1, le=1 << 62)]) -> JobInfo:
+        """One job."""
+        return store.job(job)
+
+    @app.get("/v1/robots")
+    def robots(site: SiteFilter = None, limit: Limit = 100, cursor: RobotCursor = None) -> RobotList:
+        """Robots (of a site) by site and name: the version that each runs and should run, and its last messages."""
+        found = [robot for robot in fleet.robots(site) if cursor is None or f"{robot.site}/{robot.robot}" > cursor]
+        found.sort(key=lambda robot: f"{robot.site}/{robot.robot}")
+        return RobotList(*page(found, limit, lambda robot: f"{robot.site}/{robot.robot}"))
+
+
+def _install_map_routes(app: FastAPI, store: MapStore) -> None:
     @app.get("/v1/sites/{site}/versions/{version}", response_class=Response)
     def manifest(request: Request, site: Site, version: Version) -> Response:
         """The manifest of a version, byte by byte as robots verify it."""
@@ -107,13 +172,6 @@ def _install_map_routes(app: FastAPI, store: MapStore) -> None:
     def vocabulary(request: Request, sha256: Sha256) -> Response:
         """The bytes of a vocabulary."""
         return _blob(request, store, sha256, "vocabulary")
-
-
-def _install_robot_routes(app: FastAPI, fleet: Fleet) -> None:
-    @app.get("/v1/robots")
-    def robots(site: str | None = None) -> RobotList:
-        """All robots (of a site): the version that each runs and should run, and its last messages."""
-        return RobotList(fleet.robots(site))
 
 
 def _blob(request: Request, store: MapStore, sha256: str, kind: str) -> Response:

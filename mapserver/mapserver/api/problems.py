@@ -2,22 +2,37 @@
 
 import logging
 from http import HTTPStatus
+from typing import Any
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from fleetmap.errors import FleetmapError, GateRefusedError, MapFormatError, StoreError, UsageError
+from fleetmap.errors import FleetmapError, GateRefusedError, MapFormatError, StateError, StoreError, UsageError
 
 _log = logging.getLogger(__name__)
 
 _STATUS: tuple[tuple[type[FleetmapError], HTTPStatus], ...] = (
+    (StateError, HTTPStatus.CONFLICT),
     (UsageError, HTTPStatus.NOT_FOUND),  # the path named a site or version that is not there
     (GateRefusedError, HTTPStatus.CONFLICT),
     (StoreError, HTTPStatus.SERVICE_UNAVAILABLE),
     (MapFormatError, HTTPStatus.INTERNAL_SERVER_ERROR),  # bytes in our own store are damaged
 )
+
+
+PROBLEM_RESPONSES: dict[int | str, dict[str, Any]] = {
+    "4XX": {
+        "description": "What was asked for is not there, not right or not allowed.",
+        "content": {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}},
+    },
+    "5XX": {
+        "description": "The store cannot be read or written; the server's log says more.",
+        "content": {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}},
+    },
+}
+"""What every endpoint may answer instead, for the OpenAPI document."""
 
 
 def problem(status: int, detail: str, path: str, headers: dict[str, str] | None = None) -> JSONResponse:

@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mapserver.commands.print_json import print_json
+
 if TYPE_CHECKING:
     from fleetmap.mapformat import Manifest
-    from mapserver.store import MapStore, VersionInfo
+    from mapserver.store import Event, MapStore, VerdictRow, VersionInfo
 
 
 def inspect(
@@ -24,10 +26,12 @@ def inspect(
     with MapStore.open(store) as maps:
         info = _chosen(maps, site, version)
         manifest = maps.manifest(site, info.version)
+        verdicts = maps.verdicts(site, info.version)
+        history = [event for event in maps.events(site) if event.version == info.version]
     if json:
-        _print_json(info, manifest)
+        _print_json(info, manifest, verdicts, history)
     else:
-        _print_tables(info, manifest)
+        _print_tables(info, manifest, verdicts, history)
 
 
 def _chosen(maps: "MapStore", site: str, version: int | None) -> "VersionInfo":
@@ -47,7 +51,9 @@ def bytes_per_m(info: "VersionInfo", manifest: "Manifest") -> float | None:
     return info.map_bytes / path_m if isinstance(path_m, int | float) and path_m > 0 else None
 
 
-def _print_json(info: "VersionInfo", manifest: "Manifest") -> None:
+def _print_json(
+    info: "VersionInfo", manifest: "Manifest", verdicts: "list[VerdictRow]", history: "list[Event]"
+) -> None:
     import msgspec
 
     built: dict[str, Any] = msgspec.to_builtins(manifest)
@@ -56,12 +62,16 @@ def _print_json(info: "VersionInfo", manifest: "Manifest") -> None:
         "manifest_sha256": info.manifest_sha256,
         "map_bytes": info.map_bytes,
         "bytes_per_m": bytes_per_m(info, manifest),
+        "verdicts": verdicts,
+        "history": history,
         "manifest": built,
     }
-    typer.echo(msgspec.json.format(msgspec.json.encode(shown), indent=2).decode())
+    print_json(shown)
 
 
-def _print_tables(info: "VersionInfo", manifest: "Manifest") -> None:
+def _print_tables(
+    info: "VersionInfo", manifest: "Manifest", verdicts: "list[VerdictRow]", history: "list[Event]"
+) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -87,3 +97,16 @@ def _print_tables(info: "VersionInfo", manifest: "Manifest") -> None:
     for key, value in manifest.report.items():
         report.add_row(key, str(value))
     console.print(report)
+    for verdict in verdicts:
+        word = "accepted" if verdict.accepted else "forced" if verdict.forced else "refused"
+        console.print(f"gate: {word}" + "".join(f"; {reason}" for reason in verdict.reasons))
+    for event in history:
+        who = f" by {event.actor}" if event.actor else ""
+        why = f" ({event.reason})" if event.reason else ""
+        console.print(f"{_moment(event.stamp_ns)} {event.kind}{who}{why}: {event.detail}")
+
+
+def _moment(stamp_ns: int) -> str:
+    from datetime import UTC, datetime
+
+    return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(timespec="seconds")

@@ -6,39 +6,56 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mapserver.commands.config_option import ConfigFile, config_path
+
 if TYPE_CHECKING:
     import socket
 
     from fastapi import FastAPI
 
     from fleetmap.bus import ZenohBus
+    from mapserver.api.writers import Writers
+    from mapserver.gate import GateSettings
     from mapserver.store import MapStore
     from mapserver.tile_service import TileService
 
 _ANNOUNCE_EVERY_S = 1.0
 _STOP_WITHIN_S = 5
+_MIN_TOKEN = 16
 
 
 def serve(
+    context: typer.Context,
     store: Annotated[Path, typer.Option(help="Folder of the map store.")],
     http: Annotated[str, typer.Option(help="Where to listen for HTTP; port 0 takes a free one.")] = "127.0.0.1:8080",
     zenoh: Annotated[
         str, typer.Option(help="Where to listen for robots; port 0 takes a free one.")
     ] = "tcp/127.0.0.1:7447",
+    token_file: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="File with the token that changes over HTTP need.")
+    ] = None,
+    config: ConfigFile = None,
 ) -> None:
     """Serve maps to robots and operators; prints the addresses when ready, ends with status 0 on SIGTERM or SIGINT."""
     host, port = _host_and_port(http)
+    token = None if token_file is None else _token(token_file)
     from fleetmap.bus import ZenohBus, check_endpoint
 
     check_endpoint(zenoh)
+    from mapserver.api.writers import Writers, is_loopback_name
+    from mapserver.config import read_config
     from mapserver.store import MapStore
 
+    writers = Writers(token, is_loopback_name(host))
+    gate = read_config(config_path(context)).gate
     # The sockets come before the store is read, so that a wrong address is told at once.
     with _listening(host, port) as listener, MapStore.open(store) as maps, ZenohBus.listen(zenoh) as bus:
-        _run(maps, bus, listener)
+        _run(maps, bus, listener, writers, gate)
 
 
-def _run(maps: "MapStore", bus: "ZenohBus", listener: "socket.socket") -> None:
+def _run(
+    maps: "MapStore", bus: "ZenohBus", listener: "socket.socket", writers: "Writers", gate: "GateSettings"
+) -> None:
     import logging
     import signal
     from contextlib import asynccontextmanager
@@ -68,7 +85,7 @@ def _run(maps: "MapStore", bus: "ZenohBus", listener: "socket.socket") -> None:
         announcing.cancel()
         await asyncio.gather(announcing, return_exceptions=True)
 
-    app = create_app(maps, fleet, metrics, bus, lifespan)
+    app = create_app(maps, fleet, metrics, bus, lifespan, writers=writers, gate=gate)
     config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=_STOP_WITHIN_S)
     # uvicorn stops on these signals by itself and afterwards raises them again for the handlers that were there before:
     # the default ones would end the process with a status that says it was killed.
@@ -103,6 +120,20 @@ def _host_and_port(address: str) -> tuple[str, int]:
     if not host or not port.isdecimal() or int(port) > 65535:
         raise UsageError(f"--http {address!r}: write it like 127.0.0.1:8080")
     return host.strip("[]"), int(port)
+
+
+def _token(path: Path) -> str:
+    from fleetmap.errors import UsageError
+
+    try:
+        token = path.read_text("utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"--token-file {path} cannot be read ({error}); check the path and its rights") from error
+    if len(token) < _MIN_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
+        raise UsageError(
+            f"--token-file {path}: a token is one line of at least {_MIN_TOKEN} ASCII signs without spaces"
+        )
+    return token
 
 
 def _listening(host: str, port: int) -> "socket.socket":

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from mapserver.commands.print_json import print_json
+
 
 def versions(
     site: Annotated[str, typer.Option(help="Name of the site.")],
@@ -12,7 +14,6 @@ def versions(
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """List the versions of a site with their states, oldest first."""
-    import msgspec
     from rich.console import Console
     from rich.table import Table
 
@@ -21,7 +22,7 @@ def versions(
     with MapStore.open(store) as maps:
         infos = maps.versions(site)
     if json:
-        typer.echo(msgspec.json.format(msgspec.json.encode(infos), indent=2).decode())
+        print_json(infos)
         return
     table = Table("version", "state", "parent", "created", "tiles", "landmarks", "bytes")
     for info in infos:

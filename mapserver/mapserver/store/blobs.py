@@ -1,49 +1,15 @@
-"""Files that are written whole or not at all, and the folder of them that is addressed by content."""
+"""The folder of files that are addressed by their content."""
 
+import hashlib
 import os
-import secrets
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from fleetmap.errors import StoreError
+from fleetmap.errors import MapFormatError, StoreError
 from fleetmap.mapformat import blob_path, sha256_hex, verified
+from mapserver.store.files import TEMPORARY_SUFFIX, make_folder, read_chunks, read_file, sync_folder, write_atomically
 
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """The file at `path` holds `data` afterwards, or what it held before.
-
-    Temporary file, fsync, rename, fsync of the folder.
-
-    Raises OSError where the disk refuses.
-    """
-    temporary = path.with_name(f".{path.name[:16]}.{secrets.token_hex(8)}.tmp")
-    try:
-        with temporary.open("xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
-
-
-def sync_folder(folder: Path) -> None:
-    """Makes the names in `folder` survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def make_folder(folder: Path) -> None:
-    """`folder` and its parents exist afterwards, also after a power cut."""
-    missing = [folder, *folder.parents]
-    missing = missing[: next(i for i, parent in enumerate(missing) if parent.is_dir())]
-    for parent in reversed(missing):
-        parent.mkdir(exist_ok=True)
-        sync_folder(parent.parent)
+_FOLDER = "blobs"
 
 
 class BlobFolder:
@@ -55,29 +21,105 @@ class BlobFolder:
     def put(self, data: bytes) -> str:
         """The address of `data`, which is on the disk when this returns. Raises StoreError where the disk refuses."""
         sha256 = sha256_hex(data)
-        path = self.path(sha256)
-        try:
-            # A file of that name may be damaged; comparing it costs less than writing it.
-            if not (path.is_file() and path.read_bytes() == data):
-                make_folder(path.parent)
-                write_atomically(path, data)
-        except OSError as error:
-            raise StoreError(
-                f"{path} cannot be written ({error.strerror}); check the disk's space and rights"
-            ) from error
+        self._keep(sha256, len(data), [data])
         return sha256
+
+    def put_chunks(self, chunks: Iterable[bytes], sha256: str, size_bytes: int) -> None:
+        """As `put`, for bytes that come in pieces and must be `size_bytes` with this address.
+
+        Raises MapFormatError for other bytes, StoreError where the disk refuses.
+        """
+        self._keep(sha256, size_bytes, _checked(chunks, sha256, size_bytes))
 
     def get(self, sha256: str) -> bytes:
         """The bytes of an address; raises StoreError for missing ones, MapFormatError for damaged ones."""
+        return verified(self._reading(sha256), sha256)
+
+    def chunks(self, sha256: str) -> Iterator[bytes]:
+        """The bytes of an address in pieces, unverified; raises StoreError for missing ones."""
         path = self.path(sha256)
         try:
-            data = path.read_bytes()
+            yield from read_chunks(path)
         except OSError as error:
-            raise StoreError(
-                f"{path} cannot be read ({error.strerror}); the store is incomplete, restore it"
-            ) from error
-        return verified(data, sha256)
+            raise _unreadable(path, error) from error
+
+    def is_whole(self, sha256: str) -> bool:
+        """Whether the bytes of an address are there and are what it says; reads them in pieces."""
+        digest = hashlib.sha256()
+        try:
+            for chunk in read_chunks(self.path(sha256)):
+                digest.update(chunk)
+        except OSError:
+            return False
+        return digest.hexdigest() == sha256
 
     def path(self, sha256: str) -> Path:
         """The file of an address."""
         return self._root / blob_path(sha256)
+
+    def addresses(self) -> set[str]:
+        """The addresses of all files, whatever they hold."""
+        return {path.name for path in self._files() if _is_address(path)}
+
+    def strangers(self) -> list[Path]:
+        """Files that are no blobs, such as what a killed process left behind."""
+        return sorted(path for path in self._files() if not _is_address(path))
+
+    def remove(self, sha256: str) -> int:
+        """Removes the file of an address and returns its size; raises StoreError where the disk refuses."""
+        return self.remove_file(self.path(sha256))
+
+    def remove_file(self, path: Path) -> int:
+        """Removes a file and returns its size; raises StoreError where the disk refuses."""
+        try:
+            size = path.stat().st_size
+            os.unlink(path)  # noqa: PTH108
+        except OSError as error:
+            raise StoreError(f"{path} cannot be removed ({error.strerror}); check the folder's rights") from error
+        return size
+
+    def _keep(self, sha256: str, size_bytes: int, chunks: Iterable[bytes]) -> None:
+        path = self.path(sha256)
+        try:
+            # A file of that name may be damaged; reading it costs less than writing it.
+            if path.is_file() and path.stat().st_size == size_bytes and self.is_whole(sha256):
+                # Who wrote it may have died before its name was on the disk.
+                sync_folder(path.parent)
+                make_folder(path.parent)
+                make_folder(path.parent.parent)
+            else:
+                make_folder(path.parent)
+                make_folder(path.parent.parent)
+                write_atomically(path, chunks)
+        except OSError as error:
+            raise StoreError(
+                f"{path} cannot be written ({error.strerror}); check the disk's space and rights"
+            ) from error
+
+    def _reading(self, sha256: str) -> bytes:
+        path = self.path(sha256)
+        try:
+            return read_file(path)
+        except OSError as error:
+            raise _unreadable(path, error) from error
+
+    def _files(self) -> Iterator[Path]:
+        return (path for path in (self._root / _FOLDER).glob("*/*") if path.is_file())
+
+
+def _is_address(path: Path) -> bool:
+    return len(path.name) == 64 and not path.name.endswith(TEMPORARY_SUFFIX) and path.name[:2] == path.parent.name
+
+
+def _unreadable(path: Path, error: OSError) -> StoreError:
+    return StoreError(f"{path} cannot be read ({error.strerror}); the store is incomplete, restore it")
+
+
+def _checked(chunks: Iterable[bytes], sha256: str, size_bytes: int) -> Iterator[bytes]:
+    digest, size = hashlib.sha256(), 0
+    for chunk in chunks:
+        digest.update(chunk)
+        size += len(chunk)
+        yield chunk
+    if size != size_bytes or digest.hexdigest() != sha256:
+        raise MapFormatError(f"{size} bytes that should be {size_bytes} with SHA-256 {sha256}; they were damaged")

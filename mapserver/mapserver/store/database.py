@@ -2,61 +2,16 @@
 
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sqlite_utils import Database
 
 from fleetmap.errors import NewerFormatError, StoreError
+from mapserver.store.migrations import MIGRATIONS
 
 APPLICATION_ID = 0x464D4150  # "FMAP": says whose file this is
 _BUSY_TIMEOUT_MS = 30_000
-
-MIGRATIONS: tuple[tuple[str, ...], ...] = (
-    (
-        """CREATE TABLE sites (
-            site TEXT PRIMARY KEY,
-            vocabulary_sha256 TEXT)""",
-        """CREATE TABLE versions (
-            site TEXT NOT NULL REFERENCES sites(site),
-            version INTEGER NOT NULL CHECK (version >= 1),
-            state TEXT NOT NULL CHECK (state IN ('draft', 'published', 'current', 'retired')),
-            parent INTEGER,
-            created TEXT NOT NULL,
-            published_ns INTEGER,
-            manifest_sha256 TEXT NOT NULL,
-            manifest_bytes INTEGER NOT NULL,
-            tiles INTEGER NOT NULL,
-            tile_bytes INTEGER NOT NULL,
-            landmarks INTEGER NOT NULL,
-            vocabulary_sha256 TEXT NOT NULL,
-            vocabulary_bytes INTEGER NOT NULL,
-            archive_sha256 TEXT,
-            PRIMARY KEY (site, version))""",
-        "CREATE UNIQUE INDEX one_current_per_site ON versions(site) WHERE state = 'current'",
-        """CREATE TABLE version_blobs (
-            site TEXT NOT NULL,
-            version INTEGER NOT NULL,
-            kind TEXT NOT NULL CHECK (kind IN ('manifest', 'tile', 'vocabulary', 'archive')),
-            sha256 TEXT NOT NULL,
-            PRIMARY KEY (site, version, kind, sha256),
-            FOREIGN KEY (site, version) REFERENCES versions(site, version)) WITHOUT ROWID""",
-        "CREATE INDEX version_blobs_by_address ON version_blobs(sha256)",
-        """CREATE TABLE robots (
-            site TEXT NOT NULL,
-            robot TEXT NOT NULL,
-            version INTEGER,
-            last_seen_ns INTEGER NOT NULL,
-            last_report TEXT NOT NULL,
-            PRIMARY KEY (site, robot)) WITHOUT ROWID""",
-        """CREATE TABLE events (
-            id INTEGER PRIMARY KEY,
-            stamp_ns INTEGER NOT NULL,
-            site TEXT NOT NULL,
-            kind TEXT NOT NULL,
-            detail TEXT NOT NULL)""",
-    ),
-)
 
 
 def open_database(path: Path) -> Database:
@@ -90,7 +45,8 @@ def transaction(database: Database, *, durable: bool = True) -> Iterator[sqlite3
         connection.execute("COMMIT")
     except BaseException:
         if connection.in_transaction:
-            connection.execute("ROLLBACK")
+            with suppress(sqlite3.Error):  # the first error says more
+                connection.execute("ROLLBACK")
         raise
 
 

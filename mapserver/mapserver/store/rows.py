@@ -26,6 +26,8 @@ class VersionInfo:
     vocabulary_sha256: str
     vocabulary_bytes: int
     archive_sha256: str | None
+    saved_ns: int
+    retired_ns: int | None
 
     @property
     def map_bytes(self) -> int:
@@ -55,13 +57,53 @@ class RobotInfo:
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
-    """Something that happened to a site."""
+class Actor:
+    """Who acts, and why; empty where the program acts by itself."""
 
+    name: str = ""
+    reason: str = ""
+
+
+NOBODY = Actor()
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened to a site, by whom and why."""
+
+    id: int
     stamp_ns: int
     site: str
     kind: str
     detail: str
+    version: int | None
+    actor: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictRow:
+    """What the gate said about a version: reasons to refuse it (none if accepted), and what it looked at."""
+
+    stamp_ns: int
+    accepted: bool
+    forced: bool
+    reasons: tuple[str, ...]
+    report: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class JobInfo:
+    """One run of a job. state: running, done or failed; started and finished are ISO 8601 in UTC."""
+
+    id: int
+    site: str
+    kind: str
+    state: str
+    started: str
+    finished: str | None
+    message: str
+    report: dict[str, Any]
 
 
 class DraftDetails(msgspec.Struct, frozen=True, kw_only=True):

@@ -5,15 +5,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.mapformat import TILE_FORMAT, blob_path, decode_manifest, decode_tile, sha256_hex
 from fleetmap.messages import RobotAck, RobotHealth
-from map_samples import save_sample_draft
+from map_samples import draft_details, random_tile, save_sample_draft
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
+from mapserver.api.writers import Writers
 from mapserver.fleet import Fleet
 from mapserver.store import MapStore
 
@@ -39,7 +41,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
         save_sample_draft(store, seed=2)
         fleet = Fleet(store)
         app = create_app(store, fleet, Metrics(store, fleet), bus)
-        with TestClient(app, raise_server_exceptions=False) as client:
+        with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
             yield Server(client, store, fleet, bus, tmp_path)
 
 
@@ -133,7 +135,7 @@ def test_problems(server: Server) -> None:
     get = server.client.get
     check_problem(get("/v1/sites/nowhere/versions"), 404, "no site nowhere")
     check_problem(get("/v1/sites/..%2Fetc/current"), 404, "")
-    check_problem(get("/v1/sites/Lab/current"), 404, "site name")
+    check_problem(get("/v1/sites/Lab/current"), 422, "site")
     check_problem(get("/v1/sites/lab/versions/9"), 404, "no version 9")
     check_problem(get("/v1/sites/lab/versions/x"), 422, "version")
     check_problem(get("/v1/tiles/zz"), 422, "sha256")
@@ -174,14 +176,14 @@ def test_an_unexpected_fault_is_a_problem_too(server: Server, monkeypatch: pytes
 
 
 def test_robots(server: Server) -> None:
-    assert server.client.get("/v1/robots").json() == {"robots": []}
+    assert server.client.get("/v1/robots").json() == {"robots": [], "next": None}
     server.fleet.take_ack("lab", "r1", RobotAck(site="lab", robot="r1", stamp_ns=1, version=1))
     server.fleet.take_health("lab", "r1", RobotHealth(site="lab", robot="r1", stamp_ns=2, version=1, status="TRACKING"))
     (robot,) = server.client.get("/v1/robots").json()["robots"]
     assert (robot["robot"], robot["site"], robot["version"], robot["wanted_version"]) == ("r1", "lab", 1, 1)
     assert robot["last_health"]["status"] == "TRACKING"
     assert 0 <= robot["seconds_since"] < 60
-    assert server.client.get("/v1/robots?site=other").json() == {"robots": []}
+    assert server.client.get("/v1/robots?site=other").json() == {"robots": [], "next": None}
 
 
 def test_service_endpoints(server: Server) -> None:
@@ -208,5 +210,109 @@ def test_no_page_names_an_address_outside(server: Server) -> None:
     assert server.client.get("/docs").status_code == 404
     assert server.client.get("/redoc").status_code == 404
     document = server.client.get("/openapi.json")
-    assert "http" not in document.text.replace("HTTPValidationError", "")
+    assert "http" not in document.text.replace('"type":"http"', "")
     assert "/v1/tiles/{sha256}" in document.json()["paths"]
+
+
+ADA = {"actor": "ada", "reason": "aisle 3"}
+
+
+def test_an_operator_publishes_promotes_and_rolls_back(server: Server) -> None:
+    post = server.client.post
+    assert post("/v1/sites/lab/versions/2/publish", json=ADA).json()["state"] == "current"
+    assert post("/v1/sites/lab/versions/1/promote", json=ADA).json()["state"] == "current"
+    assert server.store.current("lab").version == 1
+    assert post("/v1/sites/lab/rollback", json=ADA).json()["version"] == 2
+    events = server.client.get("/v1/sites/lab/events").json()["events"]
+    assert [(event["kind"], event["version"], event["actor"], event["reason"]) for event in events[-3:]] == [
+        ("published", 2, "ada", "aisle 3"),
+        ("promoted", 1, "ada", "aisle 3"),
+        ("rolled_back", 2, "ada", "aisle 3"),
+    ]
+    check_problem(post("/v1/sites/lab/versions/1/publish", json=ADA), 409, "only a draft")
+    check_problem(post("/v1/sites/lab/versions/9/promote", json=ADA), 404, "no version 9")
+    check_problem(post("/v1/sites/lab/rollback", json={}), 422, "actor")
+    check_problem(post("/v1/sites/lab/rollback", json=ADA | {"also": 1}), 422, "also")
+
+
+def test_a_refused_draft_stays_with_its_reasons_and_can_be_forced(server: Server) -> None:
+    thin = random_tile(np.random.default_rng(5), landmarks=10, cell=(0, 0))
+    server.store.save_draft("lab", tiles=[thin], vocabulary=b"words" * 50, details=draft_details(path_m=9.0))
+    url = "/v1/sites/lab/versions/3"
+    check_problem(server.client.post(f"{url}/publish", json=ADA), 409, "landmarks_share")
+    quality = server.client.get(f"{url}/quality").json()
+    assert (quality["state"], quality["report"]) == ("draft", {"path_m": 9.0})
+    (verdict,) = quality["verdicts"]
+    assert not verdict["accepted"] and len(verdict["reasons"]) == 2
+    assert "held_out_frames" in verdict["report"]["not_judged"]
+    check_problem(server.client.post(f"{url}/publish", json={"actor": "ada", "force": True}), 422, "reason")
+    assert server.client.post(f"{url}/publish", json=ADA | {"force": True}).json()["state"] == "current"
+    assert server.client.get(f"{url}/quality").json()["verdicts"][-1]["forced"]
+
+
+def test_lists_come_in_pages(server: Server) -> None:
+    for seed in range(3, 6):
+        save_sample_draft(server.store, seed=seed)
+    save_sample_draft(server.store, site="hall")
+    for number in range(3):
+        server.store.update_job(server.store.begin_job("lab", "nightly"), "done", f"night {number}", {})
+    for name, path in (("sites", "/v1/sites"), ("versions", "/v1/sites/lab/versions"), ("jobs", "/v1/jobs")):
+        whole = server.client.get(path).json()
+        assert whole["next"] is None
+        got, cursor = [], None
+        while cursor is not None or not got:
+            question = {"limit": 2} | ({} if cursor is None else {"cursor": cursor})
+            answer = server.client.get(path, params=question).json()
+            assert len(answer[name]) <= 2
+            got += answer[name]
+            cursor = answer["next"]
+        assert got == whole[name]
+    jobs = server.client.get("/v1/jobs?site=lab").json()["jobs"]
+    assert [job["message"] for job in jobs] == ["night 2", "night 1", "night 0"]
+    assert server.client.get(f"/v1/jobs/{jobs[0]['id']}").json() == jobs[0]
+    check_problem(server.client.get("/v1/jobs/99"), 404, "no job 99")
+    check_problem(server.client.get("/v1/sites?limit=0"), 422, "limit")
+
+
+def test_a_difference_names_bytes_and_quality(server: Server) -> None:
+    found = server.client.get("/v1/sites/lab/versions/1/diff/2").json()
+    assert (found["tiles_changed"], found["tiles_kept"]) == (2, 0)
+    assert found["fetch_bytes"] + 250 == found["full_bytes"]  # all but the vocabulary
+    assert found["quality"] == {"path_m": {"before": 12.5, "after": 12.5}}
+
+
+TOKEN = "a-token-of-some-length"
+
+
+@pytest.mark.parametrize(
+    ("writers", "headers", "status"),
+    [
+        (Writers(), {}, 200),
+        (Writers(), {"Host": "rebound.example"}, 403),
+        (Writers(), {"Host": "[::1]:8080"}, 200),
+        (Writers(None, is_loopback=False), {}, 403),
+        (Writers(TOKEN, is_loopback=False), {}, 401),
+        (Writers(TOKEN), {"Authorization": "Bearer wrong"}, 401),
+        (Writers(TOKEN), {"Authorization": f"Bearer {TOKEN}"}, 200),
+        (Writers(TOKEN, is_loopback=False), {"Authorization": f"Bearer {TOKEN}", "Host": "maps.example"}, 200),
+    ],
+)
+def test_only_those_write_who_may(server: Server, writers: Writers, headers: dict[str, str], status: int) -> None:
+    app = create_app(server.store, server.fleet, Metrics(server.store, server.fleet), None, writers=writers)
+    with TestClient(app, "http://127.0.0.1") as client:
+        response = client.post("/v1/sites/lab/versions/2/publish", json=ADA, headers=headers)
+        assert response.status_code == status
+        assert server.store.current("lab").version == (2 if status == 200 else 1)
+        assert client.get("/v1/sites", headers={"Host": "maps.example"}).status_code == 200
+
+
+def test_the_document_has_examples(server: Server) -> None:
+    paths = server.client.get("/openapi.json").json()["paths"]
+    for path, operations in paths.items():
+        for operation in operations.values():
+            assert "4XX" in operation["responses"] and "422" not in operation["responses"]
+            for parameter in operation.get("parameters", []):
+                shown = parameter.get("example") or parameter["schema"].get("examples")
+                assert parameter["in"] != "path" or shown, f"{path}: {parameter['name']} has no example"
+    for path in ("/v1/sites", "/v1/jobs", "/v1/sites/{site}/current"):
+        assert "example" in paths[path]["get"]["responses"]["200"]["content"]["application/json"]

@@ -14,8 +14,7 @@ import pytest
 from fleetmap.errors import GateRefusedError, MapFormatError, NewerFormatError, StoreError, UsageError
 from fleetmap.mapformat import blob_path, current_path, decode_tile, sha256_hex
 from map_samples import draft_details, random_tile, save_sample_draft
-from mapserver.store import MapStore
-from mapserver.store import map_store as map_store_module
+from mapserver.store import MapStore, records
 from mapserver.store.database import MIGRATIONS
 
 
@@ -49,7 +48,7 @@ def test_a_draft_becomes_current_and_the_next_one_replaces_it(store: MapStore, t
     text = (tmp_path / "store" / current_path("lab")).read_text()
     assert text == info.manifest_sha256 + "\n"
     assert store.archive("lab", 2) == b"archive"
-    assert [event.kind for event in store.events("lab")] == ["published", "published"]
+    assert [event.kind for event in store.events("lab")] == ["saved", "published"] * 2
     assert [(s.site, s.current_version, s.versions) for s in store.sites()] == [("lab", 2, 2)]
 
 
@@ -248,4 +247,4 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(store: MapStore, tm
 
 def test_the_module_names_every_served_kind() -> None:
     kinds = "".join(MIGRATIONS[0])
-    assert all(f"'{kind}'" in kinds for kind in map_store_module._SERVED_KINDS)
+    assert all(f"'{kind}'" in kinds for kind in records._SERVED_KINDS)

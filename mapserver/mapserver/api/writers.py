@@ -1,0 +1,54 @@
+"""Who may change something over HTTP: everybody on the server's own machine, elsewhere whoever shows the token."""
+
+import hmac
+from collections.abc import Callable
+from dataclasses import dataclass
+from ipaddress import ip_address
+
+from fastapi import Request
+from starlette.exceptions import HTTPException
+
+
+@dataclass(frozen=True, slots=True)
+class Writers:
+    """token: what requests must show as a bearer token; without one only loopback may write.
+
+    is_loopback: whether the server listens on loopback alone.
+    """
+
+    token: str | None = None
+    is_loopback: bool = True
+
+    def check(self, request: Request) -> None:
+        """Raises HTTPException 401 for a missing or wrong token, 403 where nobody may write."""
+        if self.token is not None:
+            shown = request.headers.get("authorization", "").encode("latin-1", "replace")
+            if not hmac.compare_digest(shown, f"Bearer {self.token}".encode()):
+                raise HTTPException(401, "this needs the server's token", {"WWW-Authenticate": "Bearer"})
+        elif not self.is_loopback:
+            raise HTTPException(403, "the server listens beyond loopback without a token; start it with --token-file")
+        elif not is_loopback_name(_host_of(request)):
+            # A page from elsewhere may reach loopback under a name of its own (DNS rebinding).
+            raise HTTPException(403, "ask the server under its loopback address to change something without a token")
+
+
+def is_loopback_name(host: str) -> bool:
+    """Whether a host's name or address is the machine itself."""
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def checked_by(writers: Writers) -> Callable[[Request], None]:
+    """The dependency of endpoints that change something."""
+
+    def check(request: Request) -> None:
+        writers.check(request)
+
+    return check
+
+
+def _host_of(request: Request) -> str:
+    host = request.headers.get("host", "")
+    return host[1:].partition("]")[0] if host.startswith("[") else host.partition(":")[0]

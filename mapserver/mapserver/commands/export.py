@@ -1,0 +1,32 @@
+"""`mapserver export`: a version as one file."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleetmap.errors import UsageError
+
+
+def export(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write; replaced where it exists.")],
+    site: Annotated[str, typer.Option(help="Name of the site.")],
+    store: Annotated[Path, typer.Option(help="Folder of the map store.")],
+    version: Annotated[int | None, typer.Option(min=1, help="Version; the current one if left out.")] = None,
+    without_archive: Annotated[
+        bool, typer.Option("--without-archive", help="Leave out what only a later survey needs.")
+    ] = False,
+) -> None:
+    """Write a version into FILE, which `mapserver import` takes into another store."""
+    if file.is_dir() or not file.parent.is_dir():
+        raise UsageError(f"{file}: name a file in a folder that exists")
+    from mapserver.store import MapStore
+
+    with MapStore.open(store) as maps:
+        if version is None:
+            current = maps.current(site)
+            if current is None:
+                raise UsageError(f"site {site} has no current version; name one with --version")
+            version = current.version
+        size = maps.export_version(site, version, file, archive=not without_archive)
+    typer.echo(f"site {site}: version {version} is in {file} ({size} bytes)")

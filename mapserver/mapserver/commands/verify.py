@@ -1,0 +1,32 @@
+"""`mapserver verify`: whether a store is whole."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mapserver.commands.print_json import print_json
+
+EXIT_STATUS_FAULTS = 3
+
+
+def verify(
+    store: Annotated[Path, typer.Option(help="Folder of the map store.")],
+    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of sentences.")] = False,
+) -> None:
+    """Check every hash and every reference of a store, and its database; ends with status 3 where something is wrong."""
+    from mapserver.store import MapStore
+
+    with MapStore.open(store) as maps:
+        found = maps.verify()
+    if json:
+        print_json(found)
+    else:
+        typer.echo(f"{found.sites} sites, {found.versions} versions, {found.blobs} blobs of {found.blob_bytes} bytes")
+        if found.orphans or found.leftovers:
+            typer.echo(f"{found.orphans + found.leftovers} files that nothing mentions; `mapserver gc` removes them")
+        for fault in found.faults:
+            typer.echo(f"fault: {fault}")
+        typer.echo("clean" if not found.faults else f"{len(found.faults)} faults; import the versions again or restore")
+    if found.faults:
+        raise typer.Exit(EXIT_STATUS_FAULTS)

@@ -1,0 +1,111 @@
+"""Files that survive a kill and a power cut. Every call goes through `os`, where tests make it fail."""
+
+import fcntl
+import os
+import secrets
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from fleetmap.errors import StoreError
+
+_CHUNK_BYTES = 1 << 20
+_LOCK_WITHIN_S = 60.0
+TEMPORARY_SUFFIX = ".tmp"
+
+
+def write_atomically(path: Path, chunks: Iterable[bytes]) -> None:
+    """The file at `path` holds the chunks afterwards, or what it held before.
+
+    Temporary file, fsync, rename, fsync of the folder. An error of the iterable leaves nothing behind either.
+
+    Raises OSError where the disk refuses.
+    """
+    temporary = path.with_name(f".{path.name[:16]}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+    try:
+        try:
+            for chunk in chunks:
+                _write_all(descriptor, chunk)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        os.replace(temporary, path)  # noqa: PTH105
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(temporary)  # noqa: PTH108
+        raise
+    sync_folder(path.parent)
+
+
+def read_chunks(path: Path) -> Iterator[bytes]:
+    """The bytes of a file, a piece at a time. Raises OSError as `os.read`."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        while chunk := os.read(descriptor, _CHUNK_BYTES):
+            yield chunk
+    finally:
+        os.close(descriptor)
+
+
+def read_file(path: Path) -> bytes:
+    """All bytes of a file. Raises OSError as `os.read`."""
+    return b"".join(read_chunks(path))
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes the names in `folder` survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def make_folder(folder: Path) -> None:
+    """`folder` and its parents exist afterwards, also after a power cut.
+
+    The nearest parent that was there is synced too: who made it may have died before doing so.
+    """
+    missing = [folder, *folder.parents]
+    missing = missing[: next(i for i, parent in enumerate(missing) if parent.is_dir())]
+    for parent in reversed(missing):
+        with suppress(FileExistsError):
+            os.mkdir(parent)  # noqa: PTH102
+        sync_folder(parent.parent)
+    if not missing:
+        sync_folder(folder.parent)
+
+
+@contextmanager
+def locked(path: Path, *, shared: bool) -> Iterator[None]:
+    """Holds the lock file at `path` during the block: by many if shared, else alone. A dead process holds nothing.
+
+    Raises StoreError when the lock is not free within a minute, OSError where the file cannot be made.
+    """
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        _take_lock(descriptor, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, path)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _take_lock(descriptor: int, kind: int, path: Path) -> None:
+    give_up_s = time.monotonic() + _LOCK_WITHIN_S
+    while True:
+        try:
+            fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            if time.monotonic() > give_up_s:
+                raise StoreError(f"{path} is held by another process for {_LOCK_WITHIN_S:.0f} s; try later") from error
+            time.sleep(0.05)
+        else:
+            return
+
+
+def _write_all(descriptor: int, chunk: bytes) -> None:
+    view = memoryview(chunk)
+    while view:
+        view = view[os.write(descriptor, view) :]

@@ -1,0 +1,63 @@
+"""The database of an open store: reading, write transactions, the log of who did what. Used by the store's parts."""
+
+import sqlite3
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from fleetmap.errors import StoreError
+from mapserver.store.database import open_database, transaction
+from mapserver.store.rows import Actor
+
+
+class Ledger:
+    """Methods may be called from any thread: one lock orders them."""
+
+    def __init__(self, path: Path, clock_ns: Callable[[], int]) -> None:
+        self.now_ns = clock_ns
+        self._path = path
+        self._lock = threading.RLock()
+        self._database = open_database(path)
+
+    def close(self) -> None:
+        """Closes the database; the ledger must not be used afterwards."""
+        with self._lock:
+            self._database.close()
+
+    @contextmanager
+    def write(self, *, durable: bool = True) -> Iterator[sqlite3.Connection]:
+        """One transaction: all of the block or nothing. Raises StoreError where the disk refuses."""
+        with self._lock:
+            try:
+                with transaction(self._database, durable=durable) as connection:
+                    yield connection
+            except sqlite3.Error as error:
+                raise StoreError(f"the store {self._path} refuses to be written ({error}); check its disk") from error
+
+    def query(self, sql: str, values: tuple[object, ...] = ()) -> list[dict[str, Any]]:
+        """The rows by column. Raises StoreError where the disk refuses."""
+        with self._lock:
+            try:
+                return list(self._database.query(sql, values))
+            except sqlite3.Error as error:
+                raise StoreError(f"the store {self._path} cannot be read ({error}); check its disk") from error
+
+    def log(
+        self,
+        connection: sqlite3.Connection,
+        site: str,
+        kind: str,
+        detail: str,
+        *,
+        version: int | None = None,
+        actor: Actor | None = None,
+    ) -> None:
+        """One line of a site's history, within a transaction."""
+        who = actor or Actor()
+        connection.execute(
+            """INSERT INTO events (stamp_ns, site, kind, detail, version, actor, reason)
+               VALUES (?, ?, ?, ?, ?, ?, ?)""",
+            (self.now_ns(), site, kind, detail, version, who.name, who.reason),
+        )

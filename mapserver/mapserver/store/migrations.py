@@ -1,0 +1,95 @@
+"""The tables of the database, as numbered steps. A step that was released is never changed."""
+
+MIGRATIONS: tuple[tuple[str, ...], ...] = (
+    (
+        """CREATE TABLE sites (
+            site TEXT PRIMARY KEY,
+            vocabulary_sha256 TEXT)""",
+        """CREATE TABLE versions (
+            site TEXT NOT NULL REFERENCES sites(site),
+            version INTEGER NOT NULL CHECK (version >= 1),
+            state TEXT NOT NULL CHECK (state IN ('draft', 'published', 'current', 'retired')),
+            parent INTEGER,
+            created TEXT NOT NULL,
+            published_ns INTEGER,
+            manifest_sha256 TEXT NOT NULL,
+            manifest_bytes INTEGER NOT NULL,
+            tiles INTEGER NOT NULL,
+            tile_bytes INTEGER NOT NULL,
+            landmarks INTEGER NOT NULL,
+            vocabulary_sha256 TEXT NOT NULL,
+            vocabulary_bytes INTEGER NOT NULL,
+            archive_sha256 TEXT,
+            PRIMARY KEY (site, version))""",
+        "CREATE UNIQUE INDEX one_current_per_site ON versions(site) WHERE state = 'current'",
+        """CREATE TABLE version_blobs (
+            site TEXT NOT NULL,
+            version INTEGER NOT NULL,
+            kind TEXT NOT NULL CHECK (kind IN ('manifest', 'tile', 'vocabulary', 'archive')),
+            sha256 TEXT NOT NULL,
+            PRIMARY KEY (site, version, kind, sha256),
+            FOREIGN KEY (site, version) REFERENCES versions(site, version)) WITHOUT ROWID""",
+        "CREATE INDEX version_blobs_by_address ON version_blobs(sha256)",
+        """CREATE TABLE robots (
+            site TEXT NOT NULL,
+            robot TEXT NOT NULL,
+            version INTEGER,
+            last_seen_ns INTEGER NOT NULL,
+            last_report TEXT NOT NULL,
+            PRIMARY KEY (site, robot)) WITHOUT ROWID""",
+        """CREATE TABLE events (
+            id INTEGER PRIMARY KEY,
+            stamp_ns INTEGER NOT NULL,
+            site TEXT NOT NULL,
+            kind TEXT NOT NULL,
+            detail TEXT NOT NULL)""",
+    ),
+    (
+        "ALTER TABLE sites ADD COLUMN last_version INTEGER NOT NULL DEFAULT 0",
+        """UPDATE sites SET last_version =
+            coalesce((SELECT max(version) FROM versions WHERE versions.site = sites.site), 0)""",
+        "ALTER TABLE versions ADD COLUMN saved_ns INTEGER NOT NULL DEFAULT 0",
+        "ALTER TABLE versions ADD COLUMN retired_ns INTEGER",
+        "UPDATE versions SET saved_ns = coalesce(published_ns, 0)",
+        # What was current, in that order: rolling back takes the last row away.
+        """CREATE TABLE currents (
+            id INTEGER PRIMARY KEY,
+            site TEXT NOT NULL,
+            version INTEGER NOT NULL,
+            since_ns INTEGER NOT NULL,
+            FOREIGN KEY (site, version) REFERENCES versions(site, version))""",
+        """INSERT INTO currents (site, version, since_ns)
+            SELECT site, version, published_ns FROM versions
+            WHERE state IN ('published', 'current') AND published_ns IS NOT NULL
+            ORDER BY site, state = 'current', published_ns, version""",
+        """CREATE TABLE verdicts (
+            id INTEGER PRIMARY KEY,
+            site TEXT NOT NULL,
+            version INTEGER NOT NULL,
+            stamp_ns INTEGER NOT NULL,
+            accepted INTEGER NOT NULL CHECK (accepted IN (0, 1)),
+            forced INTEGER NOT NULL CHECK (forced IN (0, 1)),
+            reasons TEXT NOT NULL,
+            report TEXT NOT NULL,
+            FOREIGN KEY (site, version) REFERENCES versions(site, version))""",
+        "CREATE INDEX verdicts_by_version ON verdicts(site, version)",
+        """CREATE TABLE jobs (
+            id INTEGER PRIMARY KEY,
+            site TEXT NOT NULL,
+            kind TEXT NOT NULL,
+            state TEXT NOT NULL CHECK (state IN ('running', 'done', 'failed')),
+            started TEXT NOT NULL,
+            finished TEXT,
+            message TEXT NOT NULL,
+            report TEXT NOT NULL)""",
+        "CREATE INDEX jobs_by_site ON jobs(site)",
+        "ALTER TABLE events ADD COLUMN version INTEGER",
+        "ALTER TABLE events ADD COLUMN actor TEXT NOT NULL DEFAULT ''",
+        "ALTER TABLE events ADD COLUMN reason TEXT NOT NULL DEFAULT ''",
+        "CREATE INDEX events_by_site ON events(site)",
+        """CREATE TRIGGER events_are_kept BEFORE DELETE ON events
+            BEGIN SELECT RAISE(ABORT, 'the log of events is never shortened'); END""",
+        """CREATE TRIGGER events_stay_as_they_are BEFORE UPDATE ON events
+            BEGIN SELECT RAISE(ABORT, 'the log of events is never changed'); END""",
+    ),
+)

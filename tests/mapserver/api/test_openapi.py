@@ -1,0 +1,57 @@
+"""The OpenAPI document holds: whatever is asked as it allows (or not), the answers are as it says and never 500."""
+
+from pathlib import Path
+
+import schemathesis
+from hypothesis import HealthCheck, given, settings
+from schemathesis.checks import not_a_server_error
+from schemathesis.specs.openapi.checks import (
+    content_type_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+)
+
+from map_samples import save_sample_draft
+from mapserver.api.app import create_app
+from mapserver.api.metrics import Metrics
+from mapserver.fleet import Fleet
+from mapserver.store import MapStore
+
+CHECKS = (not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance)
+
+
+def ask_operation(operation: schemathesis.APIOperation) -> list[int]:
+    """The statuses of the answers to questions made up after the document, some of them about what is there."""
+    statuses: list[int] = []
+
+    @settings(max_examples=8, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
+    @given(case=operation.as_strategy())
+    def ask(case: schemathesis.Case) -> None:
+        number, path = len(statuses), case.path_parameters
+        if number % 2 and "site" in path:
+            path["site"] = "hall"
+            path |= {name: 1 + number % 3 for name in ("version", "before", "after") if name in path}
+        path |= {"job": 1} if number % 2 and "job" in path else {}
+        response = case.call(base_url="http://127.0.0.1")
+        case.validate_response(response, checks=list(CHECKS))
+        statuses.append(response.status_code)
+
+    ask()
+    return statuses
+
+
+def test_no_question_breaks_the_server(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        for seed in range(2):
+            save_sample_draft(store, site="hall", seed=seed)
+            store.publish("hall")
+        save_sample_draft(store, site="hall", seed=2)
+        store.update_job(store.begin_job("hall", "nightly"), "done", "version 2 is published", {})
+        fleet = Fleet(store)
+        app = create_app(store, fleet, Metrics(store, fleet), None)
+        schema = schemathesis.openapi.from_asgi("/openapi.json", app)
+        asked = {operation.ok().label: ask_operation(operation.ok()) for operation in schema.get_all_operations()}
+        assert sum(len(statuses) for statuses in asked.values()) >= 100
+        for label, statuses in asked.items():
+            assert "v1" not in label or "{sha256}" in label or 200 in statuses, f"{label}: {statuses}"
+        assert store.verify().faults == []

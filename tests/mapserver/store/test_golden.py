@@ -1,0 +1,103 @@
+"""Files of every released format are read by the code of today; newer ones are refused by naming what reads them."""
+
+import json
+import shutil
+import sqlite3
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import NewerFormatError
+from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_manifest, decode_tile, encode_manifest, pack
+from mapserver.store import Actor, MapStore
+from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
+from mapserver.store.migrations import MIGRATIONS
+from mapserver.store.transfer import EXPORT_FORMAT
+
+GOLDEN = Path(__file__).parents[2] / "golden"
+
+
+def test_every_released_format_has_its_file() -> None:
+    for name, newest in (("version-{}.fmex", EXPORT_FORMAT), ("store-{}.sqlite3", len(MIGRATIONS))):
+        for number in range(1, newest + 1):
+            assert (GOLDEN / name.format(number)).is_file()
+    for name in ("tile-1.fmtl", "manifest-1.json", "archive-1.fmar"):
+        assert (GOLDEN / name).is_file()
+
+
+@pytest.mark.parametrize("file", sorted(GOLDEN.glob("tile-*.fmtl")), ids=lambda file: file.stem)
+def test_tiles(file: Path) -> None:
+    tile = decode_tile(file.read_bytes())
+    wanted = json.loads(file.with_suffix(".json").read_text())
+    assert [tile.tile_x, tile.tile_y] == wanted["cell"]
+    assert tile.size_m == wanted["size_m"]
+    assert tile.landmark_ids.tolist() == wanted["landmark_ids"]
+    assert tile.points_map.tolist() == wanted["points_map"]
+    assert [bytes(row).hex() for row in tile.descriptors] == wanted["descriptors"]
+    assert tile.place_ids.tolist() == wanted["place_ids"]
+    np.testing.assert_allclose(tile.map_from_cam, wanted["map_from_cam"], atol=1e-12)
+
+
+def test_manifests() -> None:
+    data = (GOLDEN / "manifest-1.json").read_bytes()
+    manifest = decode_manifest(data)
+    assert (manifest.site, len(manifest.tiles), manifest.landmarks) == ("lab", 2, 16)
+    assert manifest.report == {"path_m": 12.5}
+    if MANIFEST_FORMAT == 1:
+        assert encode_manifest(manifest) == data
+
+
+def test_archives() -> None:
+    survey = decode_archive((GOLDEN / "archive-1.fmar").read_bytes())
+    assert len(survey.landmark_ids) == 8
+    assert survey.map_from_body.shape == (3, 4, 4)
+
+
+def test_exports(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        info = store.import_version(GOLDEN / "version-1.fmex", actor=Actor("ada"))
+        assert (info.site, info.version, info.state, info.tiles) == ("lab", 1, "draft", 2)
+        assert store.archive("lab", 1) == b"archive 1"
+        assert store.publish("lab") == 1
+        assert store.verify().faults == []
+
+
+@pytest.mark.parametrize("number", range(1, len(MIGRATIONS) + 1))
+def test_databases_of_every_format_open_whole(tmp_path: Path, number: int) -> None:
+    shutil.copy(GOLDEN / f"store-{number}.sqlite3", tmp_path / "store.sqlite3")
+    shutil.copytree(GOLDEN / "store-blobs", tmp_path / "blobs")
+    with MapStore.open(tmp_path) as store:
+        assert store.verify().faults == []
+        assert [robot.robot for robot in store.robots("lab")] == ["r1"]
+        states = [info.state for info in store.versions("lab")]
+        assert states == (["published", "current", "draft"] if number == 1 else ["current", "retired", "draft"])
+        if number == 1:
+            assert store.rollback("lab") == 1
+        assert store.publish("lab") == 3
+        assert store.rollback("lab") == 1
+        assert store.verify().faults == []
+        if number >= 2:
+            assert [job.state for job in store.jobs()] == ["done"]
+
+
+def test_newer_formats_are_refused_by_number(tmp_path: Path) -> None:
+    with pytest.raises(NewerFormatError, match=f"format {TILE_FORMAT + 1}.*up to {TILE_FORMAT}"):
+        decode_tile(pack(b"FMTL", TILE_FORMAT + 1, b""))
+    with pytest.raises(NewerFormatError, match=f"format {ARCHIVE_FORMAT + 1}.*up to {ARCHIVE_FORMAT}"):
+        decode_archive(pack(b"FMAR", ARCHIVE_FORMAT + 1, b""))
+    with pytest.raises(NewerFormatError, match=f"format {MANIFEST_FORMAT + 1}.*up to {MANIFEST_FORMAT}"):
+        decode_manifest(b'{"format_version": %d}' % (MANIFEST_FORMAT + 1))
+    export = bytearray((GOLDEN / "version-1.fmex").read_bytes())
+    struct.pack_into("<H", export, 4, EXPORT_FORMAT + 1)
+    (tmp_path / "newer.fmex").write_bytes(export)
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        with pytest.raises(NewerFormatError, match=f"format {EXPORT_FORMAT + 1}.*up to {EXPORT_FORMAT}"):
+            store.import_version(tmp_path / "newer.fmex")
+        assert store.sites() == []
+    connection = sqlite3.connect(tmp_path / "store" / "store.sqlite3")
+    connection.execute(f"PRAGMA user_version = {len(MIGRATIONS) + 1}")
+    connection.close()
+    with pytest.raises(NewerFormatError, match=f"format {len(MIGRATIONS) + 1}.*up to {len(MIGRATIONS)}"):
+        MapStore.open(tmp_path / "store")

@@ -1,0 +1,272 @@
+"""Promoting, rolling back, comparing, verifying, collecting garbage, carrying versions to another store."""
+
+import os
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import FleetmapError, GateRefusedError, MapFormatError, StateError, StoreError, UsageError
+from fleetmap.mapformat import blob_path, current_path
+from map_samples import draft_details, random_tile, save_sample_draft
+from mapserver.gate import GateSettings
+from mapserver.store import Actor, MapStore, Retention
+from mapserver.store.differences import SideBySide
+from mapserver.store.files import locked
+
+ADA = Actor("ada", "a test")
+DAY_NS = 86_400_000_000_000
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_ns = DAY_NS * 20_000
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def store(tmp_path: Path, clock: Clock):
+    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as opened:
+        yield opened
+
+
+def publish_samples(store: MapStore, count: int) -> None:
+    for seed in range(count):
+        save_sample_draft(store, seed=seed)
+        store.publish("lab")
+
+
+def states(store: MapStore) -> dict[int, str]:
+    return {info.version: info.state for info in store.versions("lab")}
+
+
+def test_rollback_goes_back_step_by_step_and_promote_forth(store: MapStore, tmp_path: Path) -> None:
+    publish_samples(store, 3)
+    assert store.rollback("lab", actor=ADA) == 2
+    assert states(store) == {1: "published", 2: "current", 3: "retired"}
+    assert (tmp_path / "store" / current_path("lab")).read_text().strip() == store.version("lab", 2).manifest_sha256
+    assert store.rollback("lab") == 1
+    with pytest.raises(StateError, match="no version that was current before"):
+        store.rollback("lab")
+    store.promote("lab", 3, actor=ADA)
+    store.promote("lab", 3)  # is current already
+    assert states(store) == {1: "published", 2: "retired", 3: "current"}
+    assert store.rollback("lab") == 1
+    logged = [(event.kind, event.version, event.actor, event.reason) for event in store.events("lab")]
+    assert logged[6:9] == [
+        ("rolled_back", 2, "ada", "a test"),
+        ("rolled_back", 1, "", ""),
+        ("promoted", 3, "ada", "a test"),
+    ]
+    save_sample_draft(store, seed=9)
+    with pytest.raises(StateError, match="is a draft"):
+        store.promote("lab", 4)
+    assert store.verify().faults == []
+
+
+def test_the_log_is_never_changed(store: MapStore, tmp_path: Path) -> None:
+    publish_samples(store, 1)
+    connection = sqlite3.connect(tmp_path / "store" / "store.sqlite3")
+    for statement in ("DELETE FROM events", "UPDATE events SET actor = 'nobody'"):
+        with pytest.raises(sqlite3.IntegrityError, match="never"):
+            connection.execute(statement)
+    connection.close()
+
+
+def test_a_bad_version_is_not_gone_back_to(store: MapStore, tmp_path: Path) -> None:
+    publish_samples(store, 2)
+    tile = store.manifest("lab", 1).tiles[0].sha256
+    (tmp_path / "store" / blob_path(tile)).unlink()
+    for go_back in (lambda: store.rollback("lab"), lambda: store.promote("lab", 1)):
+        with pytest.raises(StoreError, match="incomplete"):
+            go_back()
+    assert store.current("lab").version == 2
+
+
+def test_the_gate_compares_with_the_current_version(store: MapStore) -> None:
+    publish_samples(store, 1)
+    small = [random_tile(np.random.default_rng(3), landmarks=70, cell=(0, 0))]
+    store.save_draft("lab", tiles=small, vocabulary=b"words" * 50, details=draft_details())
+    with pytest.raises(GateRefusedError, match=r"coverage_share 0\.50 of version 1"):
+        store.publish("lab", actor=ADA)
+    with pytest.raises(UsageError, match="--reason"):
+        store.publish("lab", actor=Actor("ada"), force=True)
+    assert states(store) == {1: "current", 2: "draft"}
+    (refused,) = store.verdicts("lab", 2)
+    assert (refused.accepted, refused.forced, len(refused.reasons)) == (False, False, 1)
+    assert store.publish("lab", actor=ADA, force=True) == 2
+    assert [(event.kind, event.actor) for event in store.events("lab")][-3:] == [
+        ("refused", "ada"),
+        ("forced", "ada"),
+        ("published", "ada"),
+    ]
+    save_sample_draft(store, seed=4)
+    assert store.publish("lab", gate=GateSettings(max_bytes_share=100)) == 3
+
+
+def test_hard_limits_are_not_forced(store: MapStore) -> None:
+    store.save_draft("lab", tiles=[], vocabulary=b"v", details=draft_details())
+    with pytest.raises(GateRefusedError, match="cannot be forced"):
+        store.publish("lab", actor=ADA, force=True)
+
+
+def test_a_difference_counts_tiles_landmarks_and_bytes(store: MapStore) -> None:
+    rng = np.random.default_rng(0)
+    kept, old, gone, come = (random_tile(rng, cell=(x, 0)) for x in range(4))
+    shifted = old.points_map.copy()
+    shifted[:5, 2] += 0.5
+    new = type(old)(**{name: getattr(old, name) for name in old.__dataclass_fields__} | {"points_map": shifted})
+    for tiles, path_m in (([kept, old, gone], 10.0), ([kept, new, come], 11.0)):
+        store.save_draft("lab", tiles=tiles, vocabulary=b"v", details=draft_details(path_m=path_m))
+    found = store.difference("lab", 1, 2)
+    assert (found.tiles_added, found.tiles_changed, found.tiles_removed, found.tiles_kept) == (1, 1, 1, 1)
+    shared = np.intersect1d(gone.landmark_ids, come.landmark_ids)
+    only_old = np.union1d(old.landmark_ids, gone.landmark_ids)
+    only_new = np.union1d(old.landmark_ids, come.landmark_ids)
+    assert found.landmarks_added == len(np.setdiff1d(only_new, only_old))
+    assert found.landmarks_removed == len(np.setdiff1d(only_old, only_new))
+    assert 5 <= found.landmarks_moved <= 5 + len(shared)
+    entries = {(tile.x, tile.y): tile for tile in store.manifest("lab", 2).tiles}
+    info = store.version("lab", 2)
+    assert found.fetch_bytes == info.manifest_bytes + entries[1, 0].bytes + entries[3, 0].bytes
+    assert found.full_bytes == info.map_bytes + info.vocabulary_bytes
+    assert found.quality == {"path_m": SideBySide(10.0, 11.0)}
+    same = store.difference("lab", 2, 2)
+    assert (same.tiles_kept, same.landmarks_kept, same.moved_max_m) == (3, info.landmarks, None)
+
+
+def test_verify_names_what_is_wrong(store: MapStore, tmp_path: Path) -> None:
+    publish_samples(store, 2)
+    assert store.verify().faults == []
+    root = tmp_path / "store"
+    first, second = (tile.sha256 for tile in store.manifest("lab", 2).tiles)
+    (root / blob_path(first)).write_bytes(b"other")
+    (root / blob_path(second)).unlink()
+    (root / current_path("lab")).write_text("wrong")
+    (root / "blobs" / first[:2] / ".leftover.tmp").write_bytes(b"x")
+    connection = sqlite3.connect(root / "store.sqlite3")
+    connection.execute("UPDATE versions SET landmarks = 7 WHERE version = 1")
+    connection.execute("DELETE FROM version_blobs WHERE version = 1 AND kind = 'tile'")
+    connection.commit()
+    connection.close()
+    found = store.verify()
+    text = "\n".join(found.faults)
+    for words in (f"{first} is damaged", f"{second} is missing", "does not name the current", "the database says"):
+        assert words in text
+    assert "does not mention exactly" in text
+    assert (found.leftovers, found.orphans) == (1, 2)
+
+
+def test_garbage_goes_in_steps_and_nothing_that_is_used(store: MapStore, tmp_path: Path, clock: Clock) -> None:
+    publish_samples(store, 5)
+    for seed in range(10, 14):
+        save_sample_draft(store, seed=seed)
+    store.record_robot_report("lab", "r1", {}, 2)
+    keep = Retention(keep_versions=1, keep_drafts=1, keep_days=7)
+    dry = store.collect_garbage(keep, dry_run=True)
+    garbage = store.collect_garbage(keep, actor=ADA)
+    assert (dry.retired, dry.removed, dry.files) == (garbage.retired, garbage.removed, garbage.files)
+    assert (sorted(garbage.retired), garbage.removed) == ([("lab", 1), ("lab", 3)], [])
+    assert states(store)[2] == "published"  # a robot runs it
+    clock.now_ns += 8 * DAY_NS
+    garbage = store.collect_garbage(keep)
+    assert garbage.removed == [("lab", v) for v in (1, 3, 6, 7, 8)]
+    assert states(store) == {2: "published", 4: "published", 5: "current", 9: "draft"}
+    assert garbage.files > 0
+    assert garbage.freed_bytes > 0
+    found = store.verify()
+    assert (found.faults, found.orphans) == ([], 0)
+    assert save_sample_draft(store, seed=14) == 10  # numbers are never used again
+    assert store.rollback("lab") == 4
+    clock.now_ns += 40 * DAY_NS
+    assert ("lab", 2) not in store.collect_garbage(keep).removed  # what a rollback would go to
+    assert store.rollback("lab") == 2
+    assert store.verify().faults == []
+
+
+def test_leftovers_are_removed(store: MapStore, tmp_path: Path) -> None:
+    publish_samples(store, 1)
+    folder = next((tmp_path / "store" / "blobs").iterdir())
+    (folder / f".{'ab' * 8}.0011.tmp").write_bytes(b"half")
+    store._blobs.put(b"nobody mentions this")
+    found = store.verify()
+    assert (found.faults, found.orphans, found.leftovers) == ([], 1, 1)
+    garbage = store.collect_garbage()
+    assert (garbage.files, garbage.freed_bytes) == (2, 24)
+
+
+def test_garbage_waits_for_those_who_bring_bytes(store: MapStore, tmp_path: Path, monkeypatch) -> None:
+    publish_samples(store, 1)
+    monkeypatch.setattr("mapserver.store.files._LOCK_WITHIN_S", 0.1)
+    with locked(tmp_path / "store" / "lock", shared=True):
+        save_sample_draft(store, seed=7)
+        with pytest.raises(StoreError, match="held by another process"):
+            store.collect_garbage()
+    # A process that was killed holds nothing.
+    program = (
+        "import os, sys\nfrom pathlib import Path\nfrom mapserver.store.files import locked\n"
+        "with locked(Path(sys.argv[1]), shared=False): os._exit(9)\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    lock = str(tmp_path / "store" / "lock")
+    done = subprocess.run([sys.executable, "-c", program, lock], env=environment, check=False, timeout=60)
+    assert done.returncode == 9
+    store.collect_garbage()
+
+
+@pytest.mark.parametrize("archive", [True, False])
+def test_a_version_travels_in_one_file(store: MapStore, tmp_path: Path, archive: bool) -> None:
+    publish_samples(store, 2)
+    file = tmp_path / "lab-2.fmex"
+    assert store.export_version("lab", 2, file, archive=archive) == file.stat().st_size
+    with MapStore.open(tmp_path / "other", create=True) as other:
+        info = other.import_version(file, actor=ADA)
+        assert (info.version, info.state, info.manifest_sha256) == (2, "draft", store.version("lab", 2).manifest_sha256)
+        assert other.archive("lab", 2) == (b"archive" if archive else None)
+        assert other.publish("lab") == 2
+        assert other.import_version(file).state == "current"
+        assert save_sample_draft(other, seed=5) == 3
+        assert other.verify().faults == []
+        save_sample_draft(store, seed=6)
+        store.export_version("lab", 3, file)
+        with pytest.raises(StateError, match="another version 3"):
+            other.import_version(file)
+
+
+def test_exports_that_are_not_whole_are_refused(store: MapStore, tmp_path: Path) -> None:
+    publish_samples(store, 1)
+    file = tmp_path / "lab.fmex"
+    store.export_version("lab", 1, file)
+    data = file.read_bytes()
+    with MapStore.open(tmp_path / "other", create=True) as other:
+        for position in range(0, len(data), 61):
+            file.write_bytes(data[:position] + bytes([data[position] ^ 0x55]) + data[position + 1 :])
+            with pytest.raises(MapFormatError):
+                other.import_version(file)
+        for damaged in (b"", data[:-1], data + b"x", data[: len(data) // 2]):
+            file.write_bytes(damaged)
+            with pytest.raises(MapFormatError):
+                other.import_version(file)
+        with pytest.raises(StoreError, match="cannot be read"):
+            other.import_version(tmp_path / "nothing")
+        assert other.sites() == []
+        assert other.verify().orphans == 0
+
+
+def test_a_damaged_version_is_not_exported(store: MapStore, tmp_path: Path) -> None:
+    publish_samples(store, 1)
+    path = tmp_path / "store" / blob_path(store.manifest("lab", 1).tiles[0].sha256)
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    with pytest.raises(FleetmapError, match="verify"):
+        store.export_version("lab", 1, tmp_path / "lab.fmex")
+    assert list(tmp_path.glob("*lab*")) == []
