@@ -167,7 +167,7 @@ def _close_loops(
 ) -> Loops:  # fmt: skip
     """Finds loops, and moves the keyframes to where the pose graph with them says."""
     keyframes = guess.keyframes
-    chain = _chain_edges(guess, state)
+    chain = chain_edges(guess, state)
     vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in keyframes]
     closer = LoopCloser(
         keyframes, vectors, vocabulary.word_count, state.camera, state.body_from_cam, state.map_from_body,
@@ -183,7 +183,8 @@ def _close_loops(
     return closer.loops
 
 
-def _chain_edges(guess: FirstGuess, state: SurveyState) -> list[PoseEdge]:
+def chain_edges(guess: FirstGuess, state: SurveyState) -> list[PoseEdge]:
+    """Each keyframe from the one before, where the adjustment put it, as surely as odometry knows."""
     edges = []
     numbers = [k.frame_index for k in guess.keyframes]
     for k, (a, b) in enumerate(pairwise(numbers)):

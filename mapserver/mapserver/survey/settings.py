@@ -71,6 +71,32 @@ class VocabularySettings(Section, frozen=True):
     max_descriptors: int = 200_000
 
 
+class SessionSettings(Section, frozen=True):
+    """How a survey is found in the map, what may move there, and when landmarks come and go."""
+
+    fix_keyframes: int = 60
+    top_places: int = 6
+    min_inliers: int = 20
+    min_cells: int = 6
+    min_fixes: int = 4
+    agreement_m: float = 0.3
+    agreement_share: float = 0.02  # of the way between two fixes: what the survey's own shape may be off by
+    agreement_deg: float = 3.0
+    rival_share: float = 0.5
+    search_px: float = 15.0
+    guided_px: float = 6.0
+    max_view_angle_deg: float = 35.0
+    anchor_sigma_m: float = 0.01
+    anchor_sigma_deg: float = 0.1
+    still_m: float = 0.005
+    significance: float = 16.266  # 0.999 of chi-square with 3 degrees of freedom
+    fade_probability: float = 0.001
+    look_weight: float = 0.7  # looks of one survey resemble each other: each counts for less than one
+    min_confirmations: int = 3
+    covered_share: float = 0.2
+    new_place_landmarks: int = 40
+
+
 class SurveySettings(Section, frozen=True):
     """All of it."""
 
@@ -85,5 +111,6 @@ class SurveySettings(Section, frozen=True):
     noise: NoiseSettings = NoiseSettings()
     bundle: BundleSettings = BundleSettings(max_iterations=20, relative_cost_tolerance=1e-6)
     vocabulary: VocabularySettings = VocabularySettings()
+    sessions: SessionSettings = SessionSettings()
     local_window: int = 20
     min_observations: int = 2
