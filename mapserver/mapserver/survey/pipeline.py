@@ -15,6 +15,7 @@ from fleetmap.rectification import Rectifier
 from fleetmap.samples import CameraFrame, ImuSamples
 from mapserver.survey.adjust import Motion, SurveyState, adjust, adjust_windows
 from mapserver.survey.bundle import RelativeTerm
+from mapserver.survey.culling import Culled
 from mapserver.survey.first_guess import FirstGuess, run_odometry
 from mapserver.survey.graph_marginals import GraphMarginals
 from mapserver.survey.keyframes import Keyframe, PictureShelf
@@ -36,13 +37,14 @@ _MIN_LANDMARKS = 30
 @dataclass(frozen=True)
 class Survey:
     """What a survey gives: the map, the vocabulary it used, the loops with their reasons, the first guess it began with, and the
-    adjusted state, which still knows which feature each observation is."""
+    adjusted state, which still knows which feature each observation is, and what was culled."""
 
     map: SurveyMap
     vocabulary: Vocabulary
     loops: Loops
     first_guess: FirstGuess
     state: SurveyState
+    culled: Culled
 
 
 def survey(
@@ -84,7 +86,8 @@ def survey(
         )
         adjust(state, settings)
     progress("global adjustment", 2, 2)
-    return Survey(summarise(state, guess, settings), vocabulary, loops, guess, state)
+    survey_map, culled = summarise(state, guess, settings)
+    return Survey(survey_map, vocabulary, loops, guess, state, culled)
 
 
 def _first_state(

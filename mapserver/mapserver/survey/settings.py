@@ -71,6 +71,16 @@ class VocabularySettings(Section, frozen=True):
     max_descriptors: int = 200_000
 
 
+class CullSettings(Section, frozen=True):
+    """What a finished survey does not hand on."""
+
+    duplicate_m: float = 0.05
+    duplicate_distance: int = 50
+    min_parallax_deg: float = 0.5
+    redundant_share: float = 0.9
+    redundant_observers: int = 3
+
+
 class SessionSettings(Section, frozen=True):
     """How a survey is found in the map, what may move there, and when landmarks come and go."""
 
@@ -111,6 +121,7 @@ class SurveySettings(Section, frozen=True):
     noise: NoiseSettings = NoiseSettings()
     bundle: BundleSettings = BundleSettings(max_iterations=20, relative_cost_tolerance=1e-6)
     vocabulary: VocabularySettings = VocabularySettings()
+    cull: CullSettings = CullSettings()
     sessions: SessionSettings = SessionSettings()
     local_window: int = 20
     min_observations: int = 2

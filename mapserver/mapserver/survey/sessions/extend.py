@@ -12,7 +12,7 @@ from mapserver.survey.result import SurveyMap
 from mapserver.survey.sessions.base_map import BaseMap
 from mapserver.survey.sessions.joint import Joint, adjust_jointly, free_observations
 from mapserver.survey.sessions.life import count_looks, faded, shifts
-from mapserver.survey.sessions.merge import Change, chosen, joined, merged, resighted
+from mapserver.survey.sessions.merge import Change, chosen, fewer_keyframes, joined, merged, resighted
 from mapserver.survey.sessions.novelty import new_landmarks
 from mapserver.survey.sessions.placing import find_fixes, follow_fixes, place_survey
 from mapserver.survey.sessions.sightings import Sighting, sight
@@ -85,11 +85,10 @@ def extend(
 def _look(
     base: BaseMap, survey: Survey, map_from_body: Array, radius_px: float, settings: SurveySettings
 ) -> list[Sighting | None]:
-    found: list[Sighting | None] = []
-    for keyframe, place in zip(survey.first_guess.keyframes, map_from_body, strict=True):
-        seen = sight(base, keyframe, place @ survey.state.body_from_cam, radius_px, settings)
-        found.append(None if seen is None else seen[0])
-    return found
+    return [
+        sight(base, keyframe, place @ survey.state.body_from_cam, radius_px, settings)
+        for keyframe, place in zip(survey.first_guess.keyframes, map_from_body, strict=True)
+    ]
 
 
 def _compare(
@@ -97,7 +96,7 @@ def _compare(
 ) -> Extension:
     state, guess = survey.state, survey.first_guess
     map_from_cam = joint.map_from_body @ state.body_from_cam
-    looks = count_looks(base, guess.keyframes, map_from_cam, joint.sightings, settings)
+    looks = count_looks(base, guess.keyframes, map_from_cam, joint.sightings)
     gone = faded(base, looks, settings) if anchored else np.zeros(len(base.points_map), bool)
     change, moved_keyframes, moved_landmarks = _change(base, survey, joint, gone, settings, anchored)
     keyframe_frames = [k.frame_index for k in guess.keyframes]
@@ -160,7 +159,9 @@ def _change(
     free = free_observations(marks, joint.sightings)
     fresh = new_landmarks(base, survey.first_guess.keyframes, marks, joint, free, settings.sessions)
     again = resighted(base, judged.rows[alone], judged.points_map[alone], joint.sightings)
-    added = joined(again, chosen(marks, joint.own_points_map, fresh, free))
+    added = fewer_keyframes(
+        joined(again, chosen(marks, joint.own_points_map, fresh, free)), settings.sessions.min_confirmations
+    )
     ids = np.r_[base.map.landmark_ids[judged.rows[alone]].astype(np.int64), np.full(fresh.sum(), -1)]
     moved = int(alone.sum() + carried.sum())
     return Change(keep, points, places, added, ids, map_from_cam), int(shifted.sum()), moved

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from fleetmap.features import stereo
 from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.keyframes import Keyframe
 from mapserver.survey.sessions.base_map import BaseMap, Rows
@@ -15,9 +15,11 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.summary import point_information
 
 _EDGE_PX = 12.0
+_BESIDE_PX = 25.0  # so near a measured corner, what lies far behind it is hidden by the same thing
 _WIDER_VIEW_RAD = 0.17
 _MAX_OCTAVE = 7.0
 _PRIOR_LOOKS = 4.0  # what the whole survey's rate of being seen counts for, where a landmark has no history
+_TYPICAL, _TYPICAL_CHI2 = 0.9, 6.251  # nine landmarks in ten stand still; 0.9 of chi-square with 3 degrees of freedom
 _MIN_SIGHTINGS = 3  # below which nothing is said about a landmark's place
 
 
@@ -36,7 +38,7 @@ class Looks:
 
 
 def count_looks(
-    base: BaseMap, keyframes: Sequence[Keyframe], map_from_cam: Array, sightings: Sequence[Sighting | None], settings: SurveySettings
+    base: BaseMap, keyframes: Sequence[Keyframe], map_from_cam: Array, sightings: Sequence[Sighting | None]
 ) -> Looks:  # fmt: skip
     """Counts over keyframes (K) at map_from_cam (K, 4, 4); those without a sighting say nothing."""
     expected, seen = np.zeros(len(base.points_map), np.int64), np.zeros(len(base.points_map), np.int64)
@@ -44,23 +46,25 @@ def count_looks(
         if sighting is None:
             continue
         due = np.zeros(len(expected), bool)
-        due[_due(base, keyframe, place, settings)] = True
+        due[_due(base, keyframe, place)] = True
         due[sighting.rows] = True
         expected += due
         seen[sighting.rows] += 1
     return Looks(expected, seen)
 
 
-def _due(base: BaseMap, keyframe: Keyframe, map_from_cam: Array, settings: SurveySettings) -> Rows:
-    """Landmarks that this keyframe should see: inside their cone and reach, and nothing measured in front of them."""
+def _due(base: BaseMap, keyframe: Keyframe, map_from_cam: Array) -> Rows:
+    """Landmarks that this keyframe should see: inside their cone and reach, and no corner beside them that is much nearer."""
     rows, pixels, octaves = base.visible(map_from_cam, -_EDGE_PX, _WIDER_VIEW_RAD)
     fits = (octaves > 0.0) & (octaves < _MAX_OCTAVE)
     rows, pixels = rows[fits], pixels[fits]
-    measured = stereo.disparities(keyframe.frame, base.camera, pixels[:, :2], settings.stereo)[:, 0]
-    disparity = pixels[:, 0] - pixels[:, 2]
-    with np.errstate(invalid="ignore"):
-        hidden = measured > disparity + np.maximum(2.0, 0.15 * disparity)
-    return rows[~hidden]
+    known = np.flatnonzero(np.isfinite(keyframe.disparities[:, 0]))
+    if not len(known) or not len(rows):
+        return rows
+    away_px, nearest = cKDTree(keyframe.features.pixels[known]).query(pixels[:, :2])
+    measured, disparity = keyframe.disparities[known[nearest], 0], pixels[:, 0] - pixels[:, 2]
+    hidden = (away_px < _BESIDE_PX) & (measured > disparity + np.maximum(2.0, 0.15 * disparity))
+    return np.asarray(rows[~hidden])
 
 
 def missed_since(base: BaseMap, looks: Looks) -> NDArray[np.int64]:
@@ -122,7 +126,9 @@ def shifts(base: BaseMap, map_from_cam: Array, sightings: Sequence[Sighting | No
     spread = np.linalg.inv(old + slack) + np.linalg.inv(info + slack) + settings.sessions.still_m**2 * np.eye(3)
     off = new - base.points_map[rows]
     squared = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0])
-    return Shift(rows, new, squared > settings.sessions.significance)
+    # What all landmarks share (places of keyframes, light, focus) widens the survey's differences: they judge themselves.
+    common = max(1.0, float(np.quantile(squared, _TYPICAL)) / _TYPICAL_CHI2)
+    return Shift(rows, new, squared > common * settings.sessions.significance)
 
 
 def _triangulated(

@@ -74,6 +74,20 @@ def chosen(marks: Landmarks, points_map: Array, keep: NDArray[np.bool_], free: N
     )  # fmt: skip
 
 
+def fewer_keyframes(marks: Landmarks, enough: int) -> Landmarks:
+    """The same landmarks with observations by fewer keyframes: taken in greedily until each has `enough`, or all it had."""
+    needed = np.minimum(np.bincount(marks.obs_landmark, minlength=len(marks.points_map)), enough)
+    taken: list[int] = []
+    left = np.unique(marks.obs_keyframe).tolist()
+    rows = {k: np.flatnonzero(marks.obs_keyframe == k) for k in left}
+    while needed.any():
+        best = max(left, key=lambda k: (int((needed[marks.obs_landmark[rows[k]]] > 0).sum()), -k))
+        needed[marks.obs_landmark[rows[best]]] = np.maximum(needed[marks.obs_landmark[rows[best]]] - 1, 0)
+        taken.append(best)
+        left.remove(best)
+    return marks.keep_observations(np.isin(marks.obs_keyframe, taken), 1)
+
+
 def merged(
     base: BaseMap, change: Change, looks: Looks, keyframes: list[Keyframe], trajectory: Trajectory,
     estimated: NDArray[np.bool_], min_place_landmarks: int,

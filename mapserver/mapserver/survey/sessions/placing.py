@@ -12,7 +12,7 @@ from fleetmap.pose_solver import Resection, ransac_resection
 from mapserver.survey.keyframes import Keyframe
 from mapserver.survey.pose_graph import PoseEdge, adjoint, optimize_pose_graph
 from mapserver.survey.sessions.base_map import BaseMap
-from mapserver.survey.sessions.sightings import sight
+from mapserver.survey.sessions.sightings import locate
 from mapserver.survey.settings import SessionSettings, SurveySettings
 
 _CORRELATION = 3.0  # as of loops: what matched points share makes a fix worse than its own covariance says
@@ -94,8 +94,8 @@ def _fix_at(base: BaseMap, keyframe: Keyframe, place: int, settings: SurveySetti
     )  # fmt: skip
     if found is None or found.inliers.sum() < 0.15 * len(pairs):
         return None
-    seen = sight(base, keyframe, se3_inverse(found.cam_from_source), settings.sessions.search_px, settings)
-    return None if seen is None else seen[1]
+    seen = locate(base, keyframe, se3_inverse(found.cam_from_source), settings.sessions.search_px, settings)
+    return None if seen is None else seen[2]
 
 
 def place_survey(

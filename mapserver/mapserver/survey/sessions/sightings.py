@@ -30,15 +30,14 @@ class Sighting:
         return Sighting(self.rows[keep], self.features[keep], self.pixels[keep], self.sigmas_px[keep])
 
 
-def sight(
+def locate(
     base: BaseMap, keyframe: Keyframe, map_from_cam: Array, radius_px: float, settings: SurveySettings
-) -> tuple[Sighting, Resection] | None:
-    """The landmarks that a keyframe near `map_from_cam` sees, and where that puts its camera; None where too few agree."""
+) -> tuple[Rows, Rows, Resection] | None:
+    """Where a keyframe near `map_from_cam` is, by landmarks (P,) seen as features (P,); None where too few agree."""
     s = settings.sessions
-    found = _match(base, keyframe, map_from_cam, radius_px, settings)
-    if len(found[0]) < s.min_inliers:
+    rows, features = _match(base, keyframe, map_from_cam, radius_px, settings)
+    if len(rows) < s.min_inliers:
         return None
-    rows, features = found
     pixels = keyframe.features.pixels[features]
     measured = np.column_stack([pixels, pixels[:, 0] - keyframe.disparities[features, 0]])
     scale = SCALE_FACTOR ** np.minimum(keyframe.features.octaves[features], 4).astype(np.float64)
@@ -49,9 +48,15 @@ def sight(
     if solved is None or solved.inliers.sum() < s.min_inliers or solved.inliers.mean() < 0.35:
         return None
     rows, features = rows[solved.inliers], features[solved.inliers]
-    if _cells(base, keyframe, features) < s.min_cells:
-        return None
-    return _refined(base, keyframe, rows, features, solved.cam_from_source, settings), solved
+    return (rows, features, solved) if _cells(base, keyframe, features) >= s.min_cells else None
+
+
+def sight(
+    base: BaseMap, keyframe: Keyframe, map_from_cam: Array, radius_px: float, settings: SurveySettings
+) -> Sighting | None:
+    """The landmarks that a keyframe near `map_from_cam` sees, to a fraction of a pixel; None where too few agree."""
+    found = locate(base, keyframe, map_from_cam, radius_px, settings)
+    return None if found is None else _refined(base, keyframe, found[0], found[1], found[2].cam_from_source, settings)
 
 
 def _match(
