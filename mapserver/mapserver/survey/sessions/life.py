@@ -19,7 +19,7 @@ _BESIDE_PX = 25.0  # so near a measured corner, what lies far behind it is hidde
 _WIDER_VIEW_RAD = 0.17
 _MAX_OCTAVE = 7.0
 _PRIOR_LOOKS = 4.0  # what the whole survey's rate of being seen counts for, where a landmark has no history
-_TYPICAL, _TYPICAL_CHI2 = 0.9, 6.251  # nine landmarks in ten stand still; 0.9 of chi-square with 3 degrees of freedom
+_AGAINST = 7.815  # 0.95 of chi-square with 3 degrees of freedom: an observation that speaks against a place
 _MIN_SIGHTINGS = 3  # below which nothing is said about a landmark's place
 
 
@@ -99,7 +99,8 @@ class Shift:
 def shifts(base: BaseMap, map_from_cam: Array, sightings: Sequence[Sighting | None], settings: SurveySettings) -> Shift:
     """Each landmark placed by its sightings alone, from cameras map_from_cam (K, 4, 4), against where the map has it.
 
-    The difference is judged by both covariances, keyframes taken as known, and `still_m` for what those leave out.
+    The difference is judged by both covariances, keyframes taken as known, and `still_m` for what those leave out; and most
+    sightings must speak against the old place each for itself: what none of them can tell apart does robots no harm.
     """
     seen = [(k, s) for k, s in enumerate(sightings) if s is not None]
     landmark = np.concatenate([s.rows for _, s in seen]) if seen else np.zeros(0, np.int64)
@@ -126,9 +127,27 @@ def shifts(base: BaseMap, map_from_cam: Array, sightings: Sequence[Sighting | No
     spread = np.linalg.inv(old + slack) + np.linalg.inv(info + slack) + settings.sessions.still_m**2 * np.eye(3)
     off = new - base.points_map[rows]
     squared = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0])
-    # What all landmarks share (places of keyframes, light, focus) widens the survey's differences: they judge themselves.
-    common = max(1.0, float(np.quantile(squared, _TYPICAL)) / _TYPICAL_CHI2)
-    return Shift(rows, new, squared > common * settings.sessions.significance)
+    against = _squared(base, base.points_map[rows], cameras, numbers, pixels, sigmas)
+    doubted = np.bincount(numbers, against > _AGAINST, len(rows)) > 0.5 * np.bincount(numbers, minlength=len(rows))
+    return Shift(rows, new, doubted & (squared > settings.sessions.significance))
+
+
+def _squared(
+    base: BaseMap, points_map: Array, map_from_cam: Array, landmark: NDArray[np.int32], pixels: Array, sigmas_px: Array
+) -> Array:
+    """(M,) squared residuals of observations in sigmas."""
+    cam_from_map = se3_inverse(map_from_cam)
+    seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points_map[landmark]) + cam_from_map[:, :3, 3]
+    residual = _residuals(base, seen, pixels) / sigmas_px[:, [0, 0, 1]]
+    return np.asarray(np.square(np.nan_to_num(residual)).sum(axis=1))
+
+
+def _residuals(base: BaseMap, points_cam: Array, pixels: Array) -> Array:
+    """(M, 3) of u, v and disparity; NaN without a right match."""
+    predicted = base.camera.pixel_from_point(np.column_stack([points_cam[:, :2], np.maximum(points_cam[:, 2], 0.05)]))
+    return np.column_stack(
+        [pixels[:, :2] - predicted[:, :2], pixels[:, 0] - pixels[:, 2] - predicted[:, 0] + predicted[:, 2]]
+    )
 
 
 def _triangulated(
@@ -139,10 +158,7 @@ def _triangulated(
     cam_from_map = se3_inverse(map_from_cam)
     for _ in range(4):
         seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points[landmark]) + cam_from_map[:, :3, 3]
-        predicted = camera.pixel_from_point(np.column_stack([seen[:, :2], np.maximum(seen[:, 2], 0.05)]))
-        residual = np.column_stack([pixels[:, :2], pixels[:, 0] - pixels[:, 2]]) - np.column_stack(
-            [predicted[:, :2], predicted[:, 0] - predicted[:, 2]]
-        )
+        residual = _residuals(base, seen, pixels)
         z, f = np.maximum(seen[:, 2], 0.05), camera.focal_px
         rows = np.zeros((len(z), 3, 3))
         rows[:, 0, 0] = rows[:, 1, 1] = f / z
