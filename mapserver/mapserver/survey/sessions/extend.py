@@ -67,14 +67,15 @@ def extend(
     state, guess = survey.state, survey.first_guess
     base = BaseMap(base_map, state.camera, state.body_from_cam)
     fixes = find_fixes(base, guess.keyframes, state.body_from_cam, survey.vocabulary, settings)
-    placed = place_survey(fixes, state.map_from_body, map_from_survey, settings.sessions)
+    survey_from_body = state.map_from_body  # the survey's own frame, named `map` before there was another
+    placed = place_survey(fixes, survey_from_body, map_from_survey, settings.sessions)
     if isinstance(placed, str):
         if map_from_survey is None:
             return NotJoined(placed)
-        map_from_body, believed = map_from_survey @ state.map_from_body, 0
+        map_from_body, believed = map_from_survey @ survey_from_body, 0
     else:
         chain = [*chain_edges(guess, state), *survey.loops.edges]
-        map_from_body, believed = follow_fixes(placed, state.map_from_body, chain)
+        map_from_body, believed = follow_fixes(placed, survey_from_body, chain)
     sightings = _look(base, survey, map_from_body, settings.sessions.search_px, settings)
     joint = adjust_jointly(base, state, map_from_body, sightings, settings, anchored=anchored)
     sightings = _look(base, survey, joint.map_from_body, settings.sessions.guided_px, settings)
