@@ -1,5 +1,7 @@
 """What a build says about itself. Pure; the keys of `BuildReport` are stable, the README lists their meanings."""
 
+from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -8,12 +10,12 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.samples import Trajectory
 from mapserver.evaluation import AteResult, absolute_trajectory_error, paired
-from mapserver.survey.loops import Loops
 from mapserver.survey.pipeline import Survey
 from mapserver.survey.result import SurveyMap
+from mapserver.survey.sessions.joining import Joined
 
 if TYPE_CHECKING:
-    from fleetmap.recordings import Recording
+    from mapserver.surveying import Surveyed
 
 MIN_MATCHED = 3  # stamps with a truth, below which no alignment is defined
 
@@ -28,6 +30,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     ate_rmse_m, ate_sim3_rmse_m: root mean square position error of every selected frame that has an estimate and a
     known truth, after one rigid (similarity) alignment; evaluated_share: their share of the selected frames. All three
     are None without ground truth. peak_rss_mb: most memory the process held, in 10^6 bytes.
+    culled: what the surveys did not hand on. sessions: what became of every recording, and of the map's landmarks by it.
     """
 
     recordings: list[str]
@@ -44,6 +47,8 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     ate_sim3_rmse_m: float | None
     evaluated_share: float | None
     peak_rss_mb: float
+    culled: dict[str, int]
+    sessions: list[dict[str, Any]]
 
 
 class Accuracy(msgspec.Struct, frozen=True):
@@ -91,60 +96,72 @@ def path_length_m(trajectory: Trajectory) -> float:
 
 
 def make_report(
-    name: str,
-    survey_map: SurveyMap,
-    loops: Loops,
-    found: Accuracy,
-    vocabulary_bytes: int,
-    seconds: float,
+    names: list[str], joined: Joined, surveys: Sequence[Survey], found: Accuracy, vocabulary_bytes: int, seconds: float,
     peak_rss_mb: float,
-) -> BuildReport:
-    """The report of a finished survey, map_bytes still unknown."""
-    stamps_ns = survey_map.trajectory.stamps_ns
-    duration_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
+) -> BuildReport:  # fmt: skip
+    """The report of finished surveys (those that were joined), map_bytes and sessions still unknown."""
+    survey_map = joined.map
+    duration_s = sum(float(t.stamps_ns[-1] - t.stamps_ns[0]) * 1e-9 for t in joined.trajectories)
+    loops = [survey.loops.counts() for survey in surveys]
+    culled = [asdict(survey.culled) for survey in surveys]
     return BuildReport(
-        recordings=[name],
+        recordings=names,
         duration_s=round(duration_s, 6),
         seconds=round(seconds, 3),
         realtime_factor=round(duration_s / max(seconds, 1e-9), 4),
-        path_m=round(path_length_m(survey_map.trajectory), 4),
+        path_m=round(sum(path_length_m(t) for t in joined.trajectories), 4),
         keyframes=len(survey_map.keyframe_stamps_ns),
         landmarks=len(survey_map.landmark_ids),
         map_bytes=None,
         vocabulary_bytes=vocabulary_bytes,
-        loops=loops.counts(),
+        loops={key: sum(count[key] for count in loops) for key in loops[0]},
         ate_rmse_m=None if found.rigid is None else found.rigid.rmse_m,
         ate_sim3_rmse_m=None if found.similarity is None else found.similarity.rmse_m,
         evaluated_share=found.evaluated_share,
         peak_rss_mb=round(peak_rss_mb, 1),
+        culled={key: sum(count[key] for count in culled) for key in culled[0]},
+        sessions=[],
     )
 
 
+def sessions_report(names: list[str], joined: Joined) -> list[dict[str, Any]]:
+    """What became of every recording, in their order."""
+    return [
+        {"recording": names[o.number], "joined": o.joined, "reason": o.reason}
+        | ({} if o.counts is None else asdict(o.counts))
+        for o in joined.outcomes
+    ]
+
+
 def full_report(
-    report: BuildReport, site: str, version: int, recording: "Recording", survey: Survey, found: Accuracy,
+    report: BuildReport, site: str, version: int, surveyed: "Sequence[Surveyed]", joined: Joined, found: Accuracy,
     stage_s: dict[str, float],
 ) -> dict[str, Any]:  # fmt: skip
     """The stable keys, and with them what helps to understand them; those may change.
 
-    loop_records: every candidate, keyframe i against the older j. stage_s: wall seconds of each stage; reading and
-    decoding images are part of odometry. pair_turn: see survey/pair_turn.py.
+    loop_records: every candidate, keyframe i against the older j of one recording. stage_s: wall seconds of each stage; reading
+    and decoding images are part of odometry. pair_turn: see survey/pair_turn.py.
     """
-    survey_map = survey.map
+    survey_map, first = joined.map, surveyed[0]
     stable: dict[str, Any] = msgspec.to_builtins(report)
     return stable | {
         "site": site,
         "version": version,
-        "format": recording.format,
-        "sensor_set": recording.sensor_set.value,
-        "inertial": survey.first_guess.inertial,
-        "losses": [{"what": loss.what, "detail": loss.detail} for loss in recording.losses],
+        "format": first.format,
+        "sensor_set": first.sensor_set.value,
+        "inertial": all(s.survey.first_guess.inertial for s in surveyed),
+        "losses": [{"what": loss.what, "detail": loss.detail} for s in surveyed for loss in s.losses],
         "frames": len(survey_map.trajectory),
         "estimated_frames": int(survey_map.trajectory_estimated.sum()),
         "observations": len(survey_map.obs_landmark),
         "point_sigma_median_m": float(np.median(survey_map.point_sigma_m)),
         "ate_max_m": None if found.rigid is None else found.rigid.max_m,
         "sim3_scale": None if found.similarity is None else found.similarity.scale,
-        "pair_turn": msgspec.to_builtins(survey.pair_turn),
+        "pair_turn": [msgspec.to_builtins(s.survey.pair_turn) for s in surveyed],
         "stage_s": {stage: round(seconds, 3) for stage, seconds in stage_s.items()},
-        "loop_records": msgspec.to_builtins(survey.loops.records),
+        "loop_records": [
+            {"recording": s.entry.name} | record
+            for s in surveyed
+            for record in msgspec.to_builtins(s.survey.loops.records)
+        ],
     }

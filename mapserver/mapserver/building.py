@@ -1,4 +1,4 @@
-"""The rim around the survey: opens the recording and the store, runs the survey, writes draft, report and pictures."""
+"""The rim around a build: surveys the recordings, joins them to the site's map, writes draft, report and pictures."""
 
 import resource
 import time
@@ -6,44 +6,43 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 from rich.console import Console
 
-from fleetmap.bow import decode_vocabulary, encode_vocabulary
+from fleetmap.bow import Vocabulary, decode_vocabulary, encode_vocabulary
 from fleetmap.config import to_dict
-from fleetmap.errors import RecordingError, StoreError
-from fleetmap.mapformat import CameraEntry, RecordingEntry
-from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
+from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError
+from fleetmap.mapformat import CameraEntry
 from fleetmap.recordings.tum import write_tum
-from fleetmap.rectification import Rectifier
-from fleetmap.samples import SensorSet
-from mapserver.build_report import Accuracy, BuildReport, accuracy, check_truth, full_report, make_report
+from fleetmap.rectification import StereoCamera
+from fleetmap.samples import Trajectory
+from mapserver.build_report import Accuracy, BuildReport, accuracy, full_report, make_report, sessions_report
 from mapserver.landmark_budget import within_budget
 from mapserver.picture_files import PictureFile
 from mapserver.progress import ProgressView, StageTimes
 from mapserver.store import DraftDetails, MapStore
-from mapserver.store.archive import encode_archive
+from mapserver.store.archive import decode_archive, encode_archive
+from mapserver.survey.loops import Loops
 from mapserver.survey.moving import moved
-from mapserver.survey.pipeline import Survey, survey
-from mapserver.survey.placing import map_from_survey
+from mapserver.survey.result import SurveyMap
+from mapserver.survey.sessions.joining import Joined, Session, chained, join_sessions
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.zones import Zones
+from mapserver.surveying import Surveyed, check_recordings, survey_all, survey_recording
 from mapserver.tiling import TILE_SIZE_M, tiles_from_survey
 from mapserver.zones_file import read_zones
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+_NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled")
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fleetmap")
 
 
 @dataclass(frozen=True, slots=True)
 class BuildOrder:
-    """What `mapserver build` was asked for; frames is an A:B:C slice, absent files are not written."""
+    """What `mapserver build` was asked for; frames is an A:B:C slice of each recording, absent files are not written."""
 
-    recording: Path
+    recordings: tuple[Path, ...]
     site: str
     store: Path
     frames: str = "::"
@@ -57,102 +56,134 @@ class BuildOrder:
 
 @dataclass(frozen=True)
 class _Built:
-    """A finished survey, in its final frame, and how good it is."""
+    """The surveys and what became of them: the map in its final frame, and how good it is."""
 
-    survey: Survey
+    surveyed: list[Surveyed]
+    joined: Joined
     accuracy: Accuracy
     zones: Zones
-    frames: int
     times: StageTimes
     started_s: float
+
+    @property
+    def taken(self) -> list[Surveyed]:
+        """The recordings that found their place in the map."""
+        return [s for s, outcome in zip(self.surveyed, self.joined.outcomes, strict=True) if outcome.joined]
 
 
 def run_build(order: BuildOrder, settings: SurveySettings) -> str:
     """Does it; the sentence says what there is now. Raises FleetmapErrors, before the survey where possible."""
     started_s = time.perf_counter()
     console = Console(stderr=True)
-    selection = FrameSelection.parse(order.frames)
     zones = Zones() if order.zones is None else read_zones(order.zones)
-    with open_recording(order.recording, OpenOptions(calibration_file=order.calibration)) as recording:
-        for loss in recording.losses:
-            console.print(f"loss: {loss.what}: {loss.detail}", markup=False)
-        indices = selection.apply(recording)
-        _check(recording, indices, order)
-        with MapStore.open(order.store, create=True) as maps:
-            built = _survey(
-                order, recording, indices, zones, maps.site_vocabulary(order.site), settings, console, started_s
-            )
-            return _keep(order, recording, built, settings, maps)
+    check_recordings(order.recordings, order.frames, order.calibration, needs_truth=order.frame_from_ground_truth)
+    with MapStore.open(order.store, create=True) as maps:
+        parent, base = _parent(order, maps)
+        built = _survey(order, zones, base, maps.site_vocabulary(order.site), settings, console, started_s)
+        return _keep(order, built, parent, settings, maps)
 
 
-def _check(recording: Recording, indices: "NDArray[Any]", order: BuildOrder) -> None:
-    """Refuses before the work what could not end well."""
-    if recording.sensor_set in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
-        raise RecordingError(
-            f"{recording.path} is {recording.sensor_set}: a survey needs a second camera or a depth sensor; "
-            "record with one"
-        )
+def _parent(order: BuildOrder, maps: MapStore) -> tuple[int | None, SurveyMap | None]:
+    """The site's current version and all that is known of it, to build on; None for a site without one."""
+    current = maps.current(order.site) if order.site in {info.site for info in maps.sites()} else None
+    if current is None:
+        return None, None
     if order.frame_from_ground_truth:
-        check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
+        raise UsageError(
+            f"site {order.site} has version {current.version}, whose frame stays; build without --frame-from-ground-truth, "
+            "or name another --site"
+        )
+    archive = maps.archive(order.site, current.version)
+    if archive is None:
+        raise StoreError(
+            f"version {current.version} of site {order.site} has no archive to build on; survey the site anew under another name"
+        )
+    return current.version, decode_archive(archive)
 
 
 def _survey(
-    order: BuildOrder, recording: Recording, indices: "NDArray[Any]", zones: Zones, vocabulary: bytes | None,
-    settings: SurveySettings, console: Console, started_s: float,
+    order: BuildOrder, zones: Zones, base: SurveyMap | None, vocabulary: bytes | None, settings: SurveySettings,
+    console: Console, started_s: float,
 ) -> _Built:  # fmt: skip
     times = StageTimes(time.perf_counter)
-    rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
-    frames = (recording.read_frame(int(index)) for index in indices)
     with ProgressView(console) as view, PictureFile(order.store) as shelf:
 
         def progress(stage: str, done: int, total: int) -> None:
             times(stage, done, total)
             view(stage, done, total)
 
-        done = survey(
-            frames, len(indices), recording.imu, recording.calibration, rectifier,
-            None if vocabulary is None else decode_vocabulary(vocabulary), settings, zones, progress, shelf,
+        def survey_one(path: Path, pinhole: StereoCamera | None, words: Vocabulary | None) -> Surveyed:
+            return survey_recording(
+                path, order.frames, order.calibration, pinhole, words, settings, zones, progress, shelf, console
+            )
+
+        surveyed = survey_all(
+            order.recordings, survey_one, None if base is None else base.camera,
+            None if vocabulary is None else decode_vocabulary(vocabulary),
         )  # fmt: skip
+        progress("joining", 0, 1)
+        joined = join_sessions(base, [Session(s.survey, s.placed) for s in surveyed], settings)
     times.begin("storing")
-    placed = map_from_survey(done.map, recording.priors, recording.calibration.base_from_body)
-    if placed is not None:
-        done = replace(done, map=moved(done.map, placed))
-    found = accuracy(done.map, recording.ground_truth)
+    _say_left_out(order, surveyed, joined, console)
+    found = accuracy(joined.map, _truth(surveyed, joined))
     if order.frame_from_ground_truth:
         if found.rigid is None:
             raise RecordingError(
-                f"{recording.path}: too few estimated frames have a ground truth; build without "
+                f"{order.recordings[0]}: too few estimated frames have a ground truth; build without "
                 "--frame-from-ground-truth"
             )
-        done = replace(done, map=moved(done.map, found.rigid.frame_from_estimate))
-    return _Built(done, found, zones, len(indices), times, started_s)
+        joined = replace(joined, map=moved(joined.map, found.rigid.frame_from_estimate))
+    return _Built(surveyed, joined, found, zones, times, started_s)
 
 
-def _keep(order: BuildOrder, recording: Recording, built: _Built, settings: SurveySettings, maps: MapStore) -> str:
-    tiles = tiles_from_survey(within_budget(built.survey.map, settings.budget, TILE_SIZE_M))
-    archive = encode_archive(built.survey.map)
-    vocabulary = encode_vocabulary(built.survey.vocabulary)
-    content_hash = recording.content_hash()
+def _say_left_out(order: BuildOrder, surveyed: list[Surveyed], joined: Joined, console: Console) -> None:
+    """Names the recordings that could not be joined; raises SurveyError where none could."""
+    left = [(s, o) for s, o in zip(surveyed, joined.outcomes, strict=True) if not o.joined]
+    for recording, outcome in left:
+        console.print(f"left out: {recording.entry.name}: {outcome.reason}", markup=False)
+    if len(left) == len(surveyed):
+        reasons = "; ".join(f"{s.entry.name}: {o.reason}" for s, o in left)
+        raise SurveyError(
+            f"nothing could be joined to the current version of site {order.site} ({reasons}); drive through places that are "
+            "in the map, pass its docks, or survey the area as another --site"
+        )
+
+
+def _truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
+    """The truth of the joined recordings on one clock, None where one of them has none."""
+    truths = [s.truth for s, o in zip(surveyed, joined.outcomes, strict=True) if o.joined]
+    known = [truth for truth in truths if truth is not None]
+    return chained(known, joined.trajectories) if len(known) == len(truths) else None
+
+
+def _keep(order: BuildOrder, built: _Built, parent: int | None, settings: SurveySettings, maps: MapStore) -> str:
+    survey_map = built.joined.map
+    tiles = tiles_from_survey(within_budget(survey_map, settings.budget, TILE_SIZE_M))
+    archive = encode_archive(survey_map)
+    vocabulary = encode_vocabulary(built.surveyed[0].survey.vocabulary)
     report = make_report(
-        recording.name, built.survey.map, built.survey.loops, built.accuracy, len(vocabulary),
+        [s.entry.name for s in built.taken], built.joined, [s.survey for s in built.taken], built.accuracy, len(vocabulary),
         time.perf_counter() - built.started_s, _peak_rss_mb(),
     )  # fmt: skip
+    report = msgspec.structs.replace(
+        report, sessions=sessions_report([s.entry.name for s in built.surveyed], built.joined)
+    )
     details = DraftDetails(
         created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
         tile_size_m=TILE_SIZE_M,
-        camera=_camera_entry(built.survey),
-        recordings=(RecordingEntry(name=recording.name, sha256=content_hash, frames=built.frames),),
+        camera=_camera_entry(survey_map.camera),
+        recordings=tuple(s.entry for s in built.taken),
         configuration=_configuration(order, built.zones, settings),
         libraries=_library_versions(),
         # A robot downloads the manifest: what it says about the build is short.
-        report={key: value for key, value in msgspec.to_builtins(report).items() if key != "map_bytes"},
+        report={key: value for key, value in msgspec.to_builtins(report).items() if key not in _NOT_FOR_ROBOTS},
     )
     version = maps.save_draft(order.site, tiles=tiles, vocabulary=vocabulary, details=details, archive=archive)
     info = maps.version(order.site, version)
     report = msgspec.structs.replace(report, map_bytes=info.map_bytes)
     built.times.begin("writing")
-    _write_files(order, recording, built, report, version)
-    return _sentence(order.site, version, report)
+    _write_files(order, built, parent, report, version)
+    return _sentence(order.site, version, parent, report)
 
 
 def _configuration(order: BuildOrder, zones: Zones, settings: SurveySettings) -> dict[str, Any]:
@@ -166,8 +197,7 @@ def _configuration(order: BuildOrder, zones: Zones, settings: SurveySettings) ->
     }
 
 
-def _camera_entry(done: Survey) -> CameraEntry:
-    camera = done.map.camera
+def _camera_entry(camera: StereoCamera) -> CameraEntry:
     return CameraEntry(
         focal_px=camera.focal_px, width_px=camera.width_px, height_px=camera.height_px, baseline_m=camera.baseline_m
     )
@@ -187,16 +217,19 @@ def _peak_rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
-def _write_files(order: BuildOrder, recording: Recording, built: _Built, report: BuildReport, version: int) -> None:
+def _write_files(order: BuildOrder, built: _Built, parent: int | None, report: BuildReport, version: int) -> None:
     if order.trajectory is not None:
-        write_tum(order.trajectory, built.survey.map.trajectory)
+        write_tum(order.trajectory, built.joined.map.trajectory)
     if order.picture is not None:
         from mapserver.pictures import draw_survey
 
         title = f"{order.site}, version {version}"
-        _write(order.picture, draw_survey(title, built.survey, built.accuracy, report))
+        # Loops name keyframes of their own survey, which are the map's only where nothing was joined or culled.
+        alone = parent is None and len(built.taken) == 1
+        loops = built.taken[0].survey.loops if alone else Loops()
+        _write(order.picture, draw_survey(title, built.joined.map, loops, built.accuracy, report))
     if order.report is not None:
-        full = full_report(report, order.site, version, recording, built.survey, built.accuracy, built.times.seconds)
+        full = full_report(report, order.site, version, built.taken, built.joined, built.accuracy, built.times.seconds)
         _write(order.report, msgspec.json.format(msgspec.json.encode(full), indent=2) + b"\n")
 
 
@@ -207,10 +240,13 @@ def _write(path: Path, data: bytes) -> None:
         raise StoreError(f"{path} cannot be written ({error.strerror}); the draft is stored all the same") from error
 
 
-def _sentence(site: str, version: int, report: BuildReport) -> str:
+def _sentence(site: str, version: int, parent: int | None, report: BuildReport) -> str:
     ate = "" if report.ate_rmse_m is None else f", ATE {report.ate_rmse_m:.4f} m"
     sizes = f"{report.map_bytes} bytes, {report.loops['accepted']} loops{ate}, in {report.seconds:.1f} s"
+    built_on = "" if parent is None else f" on version {parent}"
+    left = [s["recording"] for s in report.sessions if not s["joined"]]
+    left_out = f"; left out, they could not be joined: {', '.join(left)}" if left else ""
     return (
-        f"site {site}: draft {version} of {report.keyframes} keyframes and {report.landmarks} landmarks over "
-        f"{report.path_m:.1f} m, {sizes}; make it current with `mapserver publish --site {site}`"
+        f"site {site}: draft {version}{built_on} of {report.keyframes} keyframes and {report.landmarks} landmarks over "
+        f"{report.path_m:.1f} m, {sizes}{left_out}; make it current with `mapserver publish --site {site}`"
     )

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from fleetmap.geometry import Array
 from mapserver.build_report import Accuracy, BuildReport
 from mapserver.survey.loops import Loops, Verdict
-from mapserver.survey.pipeline import Survey
+from mapserver.survey.result import SurveyMap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,12 +28,12 @@ _DPI = 150
 _FLAT_AXES = {(2, 1): (0, 1), (2, -1): (1, 0), (1, 1): (2, 0), (1, -1): (0, 2), (0, 1): (1, 2), (0, -1): (2, 1)}
 
 
-def draw_survey(title: str, survey: Survey, found: Accuracy, report: BuildReport) -> bytes:
+def draw_survey(title: str, survey_map: SurveyMap, loops: Loops, found: Accuracy, report: BuildReport) -> bytes:
     """A PNG: the map from above and, where the truth is known, position errors over time beside it."""
     with mpl.rc_context({"font.size": 9, "axes.edgecolor": _GRID, "axes.labelcolor": _INK, "text.color": _INK}):
-        plan = _Plan(survey)
+        plan = _Plan(survey_map)
         figure, above, beside = _layout(plan, has_errors=found.rigid is not None)
-        _draw_map(above, plan, survey.loops)
+        _draw_map(above, plan, loops)
         if beside is not None:
             _draw_errors(beside, found, int(plan.stamps_ns[0]))
         _write_titles(figure, title, report)
@@ -45,9 +45,8 @@ def draw_survey(title: str, survey: Survey, found: Accuracy, report: BuildReport
 class _Plan:
     """A survey from above: path (F, 2), places of keyframes (K, 2), landmarks (N, 2), corners low and high (2,)."""
 
-    def __init__(self, survey: Survey) -> None:
-        survey_map = survey.map
-        flat = list(_FLAT_AXES[_up_axis(survey)])
+    def __init__(self, survey_map: SurveyMap) -> None:
+        flat = list(_FLAT_AXES[_up_axis(survey_map)])
         self.labels = tuple(f"{'xyz'[axis]}, m" for axis in flat)
         self.path = survey_map.trajectory.positions_m[:, flat]
         self.places = survey_map.map_from_body[:, flat, 3]
@@ -75,11 +74,9 @@ def _view(path: Array, landmarks: Array) -> tuple[Array, Array]:
     return middle - 0.5 * wanted, middle + 0.5 * wanted
 
 
-def _up_axis(survey: Survey) -> tuple[int, int]:
-    """Axis of the map that points up, and its sense: z where an IMU measured it, else what is up in most images."""
-    if survey.first_guess.inertial:
-        return 2, 1
-    map_from_cam = survey.map.map_from_body @ survey.map.body_from_cam
+def _up_axis(survey_map: SurveyMap) -> tuple[int, int]:
+    """Axis of the map that points up, and its sense: what is up in most images, as an IMU has it too."""
+    map_from_cam = survey_map.map_from_body @ survey_map.body_from_cam
     up_map = -map_from_cam[:, :3, 1].mean(axis=0)
     axis = int(np.argmax(np.abs(up_map)))
     return axis, 1 if up_map[axis] > 0 else -1
@@ -200,7 +197,7 @@ def _tidy(axes: "Axes") -> None:
 def _write_titles(figure: Figure, title: str, report: BuildReport) -> None:
     loops = report.loops
     numbers = [
-        f"{report.recordings[0]}: {report.path_m:.1f} m in {report.duration_s:.0f} s",
+        f"{', '.join(report.recordings)}: {report.path_m:.1f} m in {report.duration_s:.0f} s",
         f"{report.keyframes} keyframes, {report.landmarks:,} landmarks",
         f"{loops['accepted']} of {loops['candidates']} loops accepted",
     ]

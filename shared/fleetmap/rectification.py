@@ -5,7 +5,7 @@ left and at u - f b/z on the right, same row. An RGB-D frame becomes the same th
 single camera has baseline 0.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.samples import CameraFrame, Image
 
+_MAX_ZOOM = 1.5  # beyond it one rig sees corners that the other cannot
 RGBD_BASELINE_M = 0.08  # a depth sensor's triangulation base: turns depth noise into disparity noise
 
 
@@ -63,9 +64,15 @@ class RectifiedFrame:
 
 
 class Rectifier:
-    """Turns recorded frames of one rig into rectified ones; holds the look-up tables."""
+    """Turns recorded frames of one rig into rectified ones; holds the look-up tables.
 
-    def __init__(self, calibration: RigCalibration, *, has_depth: bool = False) -> None:
+    pinhole: the camera to rectify to, all but its baseline, so that rigs of one site see alike; one that suits the rig
+    without it. Raises CalibrationError where its focal length is too far from the rig's.
+    """
+
+    def __init__(
+        self, calibration: RigCalibration, *, has_depth: bool = False, pinhole: StereoCamera | None = None
+    ) -> None:
         cameras = calibration.cameras
         if not cameras:
             raise CalibrationError("the calibration holds no camera; pass one with --calibration FILE")
@@ -79,6 +86,8 @@ class Rectifier:
             cam0_from_rect, baseline = _rectifying_rotation(cameras[0], cameras[1])
             used = cameras[:2]
         self.camera = _common_pinhole(used, baseline)
+        if pinhole is not None:
+            self.camera = _as_pinhole(pinhole, self.camera)
         self.body_from_cam = cameras[0].body_from_cam @ se3(cam0_from_rect, np.zeros(3))
         self.imu_minus_cam_s = cameras[0].imu_minus_cam_s
         self._maps = []
@@ -140,6 +149,16 @@ def _common_pinhole(cameras: tuple[CameraCalibration, ...], baseline_m: float) -
     return StereoCamera(focal, float(cx), float(cy), baseline_m, cameras[0].width_px, cameras[0].height_px)
 
 
+def _as_pinhole(pinhole: StereoCamera, own: StereoCamera) -> StereoCamera:
+    ratio = own.focal_px / pinhole.focal_px
+    if not 1 / _MAX_ZOOM < ratio < _MAX_ZOOM:
+        raise CalibrationError(
+            f"a camera of focal length {own.focal_px:.1f} px cannot be joined to a map made at {pinhole.focal_px:.1f} px; "
+            "survey the site with cameras that are alike, or as a site of its own"
+        )
+    return replace(pinhole, baseline_m=own.baseline_m)
+
+
 def _remap_tables(
     rectified: StereoCamera, camera: CameraCalibration, cam_from_rect: Array
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]] | None:
@@ -151,7 +170,8 @@ def _remap_tables(
         [(u - rectified.cx_px) / rectified.focal_px, (v - rectified.cy_px) / rectified.focal_px, np.ones_like(u)], -1
     )
     pixels = camera.pixel_from_ray(rays.reshape(-1, 3) @ cam_from_rect.T).reshape(*u.shape, 2)
-    if np.nanmax(np.hypot(pixels[..., 0] - u, pixels[..., 1] - v)) < 0.02 and np.isfinite(pixels).all():
+    same_size = (rectified.width_px, rectified.height_px) == (camera.width_px, camera.height_px)
+    if same_size and np.nanmax(np.hypot(pixels[..., 0] - u, pixels[..., 1] - v)) < 0.02 and np.isfinite(pixels).all():
         return None
     pixels = np.nan_to_num(pixels, nan=-1e4).astype(np.float32)
     first, second = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)

@@ -1,5 +1,6 @@
 """Commands, options, endpoints, metrics, bus keys and report keys stand in the documents, and no table row is stale."""
 
+import dataclasses
 import importlib
 import inspect
 import re
@@ -15,6 +16,7 @@ from contracts_documents import REPOSITORY, code_words, rows, section, text
 from fleetmap import messages
 from locclient.health import METRICS
 from mapserver.build_report import BuildReport
+from mapserver.survey.sessions.extend import Counts
 
 COMMANDS = "docs/command_line.md"
 SERVICE = "docs/service.md"
@@ -91,6 +93,11 @@ def test_bus_keys_are_documented() -> None:
 def test_build_report_keys_are_documented() -> None:
     keys = {field.name for field in msgspec.structs.fields(BuildReport)}
     assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Build"))} == keys
+
+
+def test_session_keys_are_documented() -> None:
+    keys = {"recording", "joined", "reason"} | {field.name for field in dataclasses.fields(Counts)}
+    assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Sessions"))} == keys
 
 
 def test_replay_report_keys_are_documented() -> None:

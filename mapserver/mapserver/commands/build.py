@@ -1,4 +1,4 @@
-"""`mapserver build`: a recording becomes a draft in the store."""
+"""`mapserver build`: recordings become a draft in the store."""
 
 from pathlib import Path
 from typing import Annotated
@@ -27,9 +27,7 @@ def build(
     ] = False,
     config: ConfigFile = None,
 ) -> None:
-    """Survey RECORDING and store the map as a draft version of the site."""
-    if len(recordings) != 1:
-        raise UsageError(f"{len(recordings)} recordings: one recording per build; joining several comes with sessions")
+    """Survey the recordings, join them to the site's current version, and store the map as a draft."""
     for option, path in (("--report", report), ("--trajectory", trajectory), ("--picture", picture)):
         if path is not None and (path.is_dir() or not path.parent.is_dir()):
             raise UsageError(f"{option} {path}: name a file in a folder that exists")
@@ -42,6 +40,6 @@ def build(
     from mapserver.config import read_config
 
     order = BuildOrder(
-        recordings[0], site, store, frames, calibration, zones, report, trajectory, picture, frame_from_ground_truth
+        tuple(recordings), site, store, frames, calibration, zones, report, trajectory, picture, frame_from_ground_truth
     )
     typer.echo(run_build(order, read_config(config_path(context)).survey))

@@ -1,8 +1,8 @@
 """The archive of a version: all of a survey, from which a later one can optimise again. Stays on the server.
 
-Format 1, magic FMAR, in the envelope of `fleetmap.mapformat.container`. The payload: u32 length of a JSON head (the
-camera, then name, dtype and shape of every array), the head, and the arrays' bytes one after the other in that order,
-little-endian.
+Format 2, magic FMAR, in the envelope of `fleetmap.mapformat.container`. The payload: u32 length of a JSON head (the
+camera, the next free ids, then name, dtype and shape of every array), the head, and the arrays' bytes one after the
+other in that order, little-endian. Format 1 knew no history and one sigma for each observation.
 """
 
 import struct
@@ -18,10 +18,11 @@ from fleetmap.geometry import AnyArray
 from fleetmap.mapformat import pack, unpack
 from fleetmap.rectification import StereoCamera
 from fleetmap.samples import Trajectory
-from mapserver.survey.result import SurveyMap
+from mapserver.survey.history import history_of
+from mapserver.survey.result import History, SurveyMap
 
 ARCHIVE_MAGIC = b"FMAR"
-ARCHIVE_FORMAT = 1
+ARCHIVE_FORMAT = 2
 MAX_ARCHIVE_PAYLOAD_BYTES = (1 << 32) - 1
 _LEVEL = 3  # written once, hardly ever read, and large: speed counts more than size
 _HEAD_SIZE = struct.Struct("<I")
@@ -43,6 +44,14 @@ _DTYPES = {
     "trajectory_stamps_ns": "<i8",
     "trajectory_frame_from_body": "<f8",
 }
+_HISTORY_DTYPES = {
+    "keyframe_ids": "<u4",
+    "is_place": "|b1",
+    "landmark_expected": "<u4",
+    "landmark_seen": "<u4",
+    "landmark_missed": "<u4",
+}
+_ALL_DTYPES = {1: _DTYPES, 2: _DTYPES | _HISTORY_DTYPES}
 
 
 class _ArrayHead(msgspec.Struct, frozen=True):
@@ -54,15 +63,20 @@ class _ArrayHead(msgspec.Struct, frozen=True):
 class _Head(msgspec.Struct, frozen=True):
     camera: StereoCamera
     arrays: tuple[_ArrayHead, ...]
+    next_keyframe_id: int = 0
+    next_landmark_id: int = 0
 
 
 def encode_archive(survey: SurveyMap) -> bytes:
     """The survey's bytes, without loss."""
-    arrays = {name: np.ascontiguousarray(values, _DTYPES[name]) for name, values in _arrays(survey).items()}
+    dtypes, history = _ALL_DTYPES[ARCHIVE_FORMAT], history_of(survey)
+    arrays = {name: np.ascontiguousarray(values, dtypes[name]) for name, values in _arrays(survey, history).items()}
     head = msgspec.json.encode(
         {
             "camera": asdict(survey.camera),
-            "arrays": [{"name": n, "dtype": _DTYPES[n], "shape": list(a.shape)} for n, a in arrays.items()],
+            "next_keyframe_id": history.next_keyframe_id,
+            "next_landmark_id": history.next_landmark_id,
+            "arrays": [{"name": n, "dtype": dtypes[n], "shape": list(a.shape)} for n, a in arrays.items()],
         }
     )
     body = [array.tobytes() for array in arrays.values()]
@@ -80,11 +94,12 @@ def decode_archive(data: bytes) -> SurveyMap:
 
     Raises NewerFormatError for a newer format, MapFormatError for bytes that are not a whole archive.
     """
-    _, payload = unpack(ARCHIVE_MAGIC, ARCHIVE_FORMAT, data, "archive", MAX_ARCHIVE_PAYLOAD_BYTES)
+    number, payload = unpack(ARCHIVE_MAGIC, ARCHIVE_FORMAT, data, "archive", MAX_ARCHIVE_PAYLOAD_BYTES)
     head, offset = _read_head(payload)
+    dtypes = _ALL_DTYPES[number]
     arrays: dict[str, AnyArray] = {}
     for entry in head.arrays:
-        if _DTYPES.get(entry.name) != entry.dtype or entry.name in arrays:
+        if dtypes.get(entry.name) != entry.dtype or entry.name in arrays:
             raise MapFormatError(
                 f"archive: array {entry.name!r} of {entry.dtype!r} is none of ours; the bytes are damaged"
             )
@@ -94,22 +109,31 @@ def decode_archive(data: bytes) -> SurveyMap:
             raise MapFormatError(f"archive: array {entry.name} of {entry.shape} does not fit in {len(payload)} bytes")
         arrays[entry.name] = np.frombuffer(payload, entry.dtype, count, offset).reshape(entry.shape).copy()
         offset = end
-    if offset != len(payload) or len(arrays) != len(_DTYPES):
-        missing = sorted(set(_DTYPES) - set(arrays))
+    if offset != len(payload) or len(arrays) != len(dtypes):
+        missing = sorted(set(dtypes) - set(arrays))
         raise MapFormatError(
             f"archive: {len(payload) - offset} bytes too many, arrays missing: {missing}; it is damaged"
         )
     trajectory = Trajectory(arrays.pop("trajectory_stamps_ns"), arrays.pop("trajectory_frame_from_body"))
-    fields: dict[str, Any] = {"camera": head.camera, "trajectory": trajectory, **arrays}
+    if number == 1:
+        arrays["obs_sigma_px"] = np.repeat(arrays["obs_sigma_px"][:, None], 2, axis=1)
+    fields: dict[str, Any] = {"camera": head.camera, "trajectory": trajectory}
+    fields |= {name: values for name, values in arrays.items() if name not in _HISTORY_DTYPES}
+    remembered: dict[str, Any] = {name: values for name, values in arrays.items() if name in _HISTORY_DTYPES}
+    if remembered:
+        fields["history"] = History(
+            **remembered, next_keyframe_id=head.next_keyframe_id, next_landmark_id=head.next_landmark_id
+        )
     return SurveyMap(**fields)
 
 
-def _arrays(survey: SurveyMap) -> dict[str, AnyArray]:
+def _arrays(survey: SurveyMap, history: History) -> dict[str, AnyArray]:
     arrays = {name: getattr(survey, name) for name in _DTYPES if not name.startswith("trajectory_")}
     return arrays | {
         "trajectory_estimated": survey.trajectory_estimated,
         "trajectory_stamps_ns": survey.trajectory.stamps_ns,
         "trajectory_frame_from_body": survey.trajectory.frame_from_body,
+        **{name: getattr(history, name) for name in _HISTORY_DTYPES},
     }
 
 

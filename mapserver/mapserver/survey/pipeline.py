@@ -15,6 +15,7 @@ from fleetmap.rectification import Rectifier
 from fleetmap.samples import CameraFrame, ImuSamples
 from mapserver.survey.adjust import Motion, SurveyState, adjust, adjust_windows
 from mapserver.survey.bundle import RelativeTerm
+from mapserver.survey.culling import Culled
 from mapserver.survey.first_guess import FirstGuess, run_odometry
 from mapserver.survey.graph_marginals import GraphMarginals
 from mapserver.survey.keyframes import Keyframe, PictureShelf
@@ -37,13 +38,15 @@ _MIN_LANDMARKS = 30
 @dataclass(frozen=True)
 class Survey:
     """What a survey gives: the map, the vocabulary it used, the loops with their reasons, the first guess it began with, the
-    adjusted state, which still knows which feature each observation is, and what it found out about the pair of cameras."""
+    adjusted state, which still knows which feature each observation is, what was culled, and what was found out about the pair of
+    cameras."""
 
     map: SurveyMap
     vocabulary: Vocabulary
     loops: Loops
     first_guess: FirstGuess
     state: SurveyState
+    culled: Culled
     pair_turn: PairTurn
 
 
@@ -90,7 +93,8 @@ def survey(
         if round_number == 0:
             turn = estimate_turn(state, settings)
     progress("global adjustment", 2, 2)
-    return Survey(summarise(state, guess, settings), vocabulary, loops, guess, state, turn)
+    survey_map, culled = summarise(state, guess, settings)
+    return Survey(survey_map, vocabulary, loops, guess, state, culled, turn)
 
 
 def _first_state(
@@ -175,7 +179,7 @@ def _close_loops(
 ) -> Loops:  # fmt: skip
     """Finds loops, and moves the keyframes to where the pose graph with them says."""
     keyframes = guess.keyframes
-    chain = _chain_edges(guess, state)
+    chain = chain_edges(guess, state)
     vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in keyframes]
     closer = LoopCloser(
         keyframes, vectors, vocabulary.word_count, state.camera, state.body_from_cam, state.map_from_body,
@@ -191,7 +195,8 @@ def _close_loops(
     return closer.loops
 
 
-def _chain_edges(guess: FirstGuess, state: SurveyState) -> list[PoseEdge]:
+def chain_edges(guess: FirstGuess, state: SurveyState) -> list[PoseEdge]:
+    """Each keyframe from the one before, where the adjustment put it, as surely as odometry knows."""
     edges = []
     numbers = [k.frame_index for k in guess.keyframes]
     for k, (a, b) in enumerate(pairwise(numbers)):

@@ -81,6 +81,42 @@ class BudgetSettings(Section, frozen=True):
     tile_landmarks: int = 5500
 
 
+class CullSettings(Section, frozen=True):
+    """What a finished survey does not hand on."""
+
+    duplicate_m: float = 0.05
+    duplicate_distance: int = 50
+    min_parallax_deg: float = 0.5
+    redundant_share: float = 0.9
+    redundant_observers: int = 3
+
+
+class SessionSettings(Section, frozen=True):
+    """How a survey is found in the map, what may move there, and when landmarks come and go."""
+
+    fix_keyframes: int = 60
+    top_places: int = 6
+    min_inliers: int = 20
+    min_cells: int = 6
+    min_fixes: int = 4
+    agreement_m: float = 0.3
+    agreement_share: float = 0.02  # of the way between two fixes: what the survey's own shape may be off by
+    agreement_deg: float = 3.0
+    rival_share: float = 0.5
+    search_px: float = 15.0
+    guided_px: float = 6.0
+    max_view_angle_deg: float = 35.0
+    anchor_sigma_m: float = 0.01
+    anchor_sigma_deg: float = 0.1
+    still_m: float = 0.005
+    significance: float = 16.266  # 0.999 of chi-square with 3 degrees of freedom
+    fade_probability: float = 0.001
+    look_weight: float = 0.7  # looks of one survey resemble each other: each counts for less than one
+    min_confirmations: int = 3
+    covered_share: float = 0.2
+    new_place_landmarks: int = 40
+
+
 class SurveySettings(Section, frozen=True):
     """All of it."""
 
@@ -99,5 +135,7 @@ class SurveySettings(Section, frozen=True):
     )
     vocabulary: VocabularySettings = VocabularySettings()
     budget: BudgetSettings = BudgetSettings()
+    cull: CullSettings = CullSettings()
+    sessions: SessionSettings = SessionSettings()
     local_window: int = 20
     min_observations: int = 2

@@ -1,5 +1,7 @@
 """From the adjusted state to the finished map: descriptors, patches, uncertainties, trajectory."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,6 +10,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.rectification import StereoCamera
 from fleetmap.samples import Trajectory
 from mapserver.survey.adjust import SurveyState
+from mapserver.survey.culling import Culled, cull
 from mapserver.survey.first_guess import FirstGuess
 from mapserver.survey.keyframes import Keyframe
 from mapserver.survey.result import SurveyMap
@@ -19,24 +22,30 @@ _PATCH_HALF_PX = 10  # a 9 px window seen from nearer or turned still finds all 
 _MIN_TIED = 8
 
 
-def summarise(state: SurveyState, guess: FirstGuess, settings: SurveySettings) -> SurveyMap:
-    """The SurveyMap of an adjusted survey, in the survey's own frame."""
-    marks, keyframes = state.landmarks, guess.keyframes
+def summarise(state: SurveyState, guess: FirstGuess, settings: SurveySettings) -> tuple[SurveyMap, Culled]:
+    """The SurveyMap of an adjusted survey, in the survey's own frame, and what was left out of it."""
+    every_sigma = point_sigmas_m(state)
+    marks, kept, culled = cull(state, guess.keyframes, every_sigma, settings.cull)
+    keyframes = [k for k, keep in zip(guess.keyframes, kept, strict=True) if keep]
+    marks = replace(marks, obs_keyframe=(np.cumsum(kept) - 1)[marks.obs_keyframe].astype(np.int32))
     octaves = np.array(
         [keyframes[k].features.octaves[f] for k, f in zip(marks.obs_keyframe, marks.obs_feature, strict=True)], np.int8
     )
     frame_stamps = np.array([e.stamp_ns for e in guess.estimates], np.int64)
-    numbers = [k.frame_index for k in keyframes]
+    numbers = [k.frame_index for k in guess.keyframes]
     map_from_body = frame_trajectory(frame_stamps, guess.odom_from_body, numbers, state.map_from_body)
-    return SurveyMap(
+    handed_on = replace(
+        state, stamps_ns=state.stamps_ns[kept], map_from_body=state.map_from_body[kept], landmarks=marks
+    )
+    survey_map = SurveyMap(
         camera=state.camera,
         body_from_cam=state.body_from_cam,
-        keyframe_stamps_ns=state.stamps_ns,
-        map_from_body=state.map_from_body,
+        keyframe_stamps_ns=handed_on.stamps_ns,
+        map_from_body=handed_on.map_from_body,
         landmark_ids=np.arange(len(marks.points_map), dtype=np.uint32),
         points_map=marks.points_map,
         descriptors=medoid_descriptors(marks, keyframes),
-        point_sigma_m=point_sigmas_m(state),
+        point_sigma_m=point_sigmas_m(handed_on),
         obs_keyframe=marks.obs_keyframe,
         obs_landmark=marks.obs_landmark,
         obs_pixels=marks.obs_pixels,
@@ -46,6 +55,7 @@ def summarise(state: SurveyState, guess: FirstGuess, settings: SurveySettings) -
         trajectory_estimated=_estimated(state, guess),
         patches=cut_patches(marks, keyframes),
     )
+    return survey_map, culled
 
 
 def medoid_descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:

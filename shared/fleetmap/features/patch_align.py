@@ -79,7 +79,7 @@ def refine_matches(
     Each feature is aligned on the halving of the pyramid nearest to the scale at which it was found.
     """
     out = np.full((len(reference_pixels), 3), np.nan)
-    level_ref, level_cur = _halvings(reference_octaves), _halvings(current_octaves)
+    level_ref, level_cur = halvings(reference_octaves), halvings(current_octaves)
     for a in range(_LEVELS):
         for b in range(_LEVELS):
             index = np.flatnonzero((level_ref == a) & (level_cur == b))
@@ -96,5 +96,6 @@ def refine_matches(
     return out
 
 
-def _halvings(octaves: NDArray[np.int8]) -> NDArray[np.int64]:
+def halvings(octaves: NDArray[np.int8]) -> NDArray[np.int64]:
+    """(N,) the level of `half_pyramid` nearest to the scale of each octave."""
     return np.asarray(np.clip(np.rint(octaves * np.log2(SCALE_FACTOR)), 0, _LEVELS - 1), np.int64)

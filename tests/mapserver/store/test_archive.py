@@ -26,6 +26,10 @@ def test_round_trip_is_exact_and_deterministic() -> None:
     np.testing.assert_array_equal(back.trajectory.stamps_ns, survey.trajectory.stamps_ns)
     np.testing.assert_array_equal(back.trajectory.frame_from_body, survey.trajectory.frame_from_body)
     assert back.points_map.flags.writeable
+    assert back.history is not None
+    np.testing.assert_array_equal(back.history.keyframe_ids, np.arange(6))
+    assert back.history.is_place.all()
+    assert (back.history.next_keyframe_id, back.history.next_landmark_id) == (6, survey.landmark_ids.max() + 1)
 
 
 def test_damaged_archives_are_refused() -> None:
@@ -35,8 +39,8 @@ def test_damaged_archives_are_refused() -> None:
         damaged[position] ^= 0xFF
         with pytest.raises(MapFormatError):
             decode_archive(bytes(damaged))
-    with pytest.raises(NewerFormatError, match="format 2"):
-        decode_archive(pack(b"FMAR", 2, b""))
+    with pytest.raises(NewerFormatError, match="format 3"):
+        decode_archive(pack(b"FMAR", 3, b""))
     for payload in (b"", b"\xff\xff\xff\xff{}", b"\x02\0\0\0{}"):
         with pytest.raises(MapFormatError):
             decode_archive(pack(b"FMAR", 1, payload))

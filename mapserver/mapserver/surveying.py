@@ -1,0 +1,86 @@
+"""The rim around surveys: opens recordings one after the other and surveys each."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from fleetmap.bow import Vocabulary
+from fleetmap.errors import RecordingError
+from fleetmap.geometry import Array
+from fleetmap.mapformat import RecordingEntry
+from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
+from fleetmap.rectification import Rectifier, StereoCamera
+from fleetmap.samples import Loss, SensorSet, Trajectory
+from mapserver.build_report import check_truth
+from mapserver.survey.keyframes import PictureShelf
+from mapserver.survey.pipeline import Progress, Survey, survey
+from mapserver.survey.placing import map_from_survey
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.zones import Zones
+
+
+@dataclass(frozen=True)
+class Surveyed:
+    """One recording and its survey. placed: map_from_survey (4, 4) by its position priors, None without any."""
+
+    entry: RecordingEntry
+    format: str
+    sensor_set: SensorSet
+    losses: tuple[Loss, ...]
+    truth: Trajectory | None
+    survey: Survey
+    placed: Array | None
+
+
+def check_recordings(paths: Sequence[Path], frames: str, calibration: Path | None, *, needs_truth: bool) -> None:
+    """Refuses before the work what could not end well."""
+    for path in paths:
+        with open_recording(path, OpenOptions(calibration_file=calibration)) as recording:
+            _check(recording, FrameSelection.parse(frames).apply(recording), needs_truth)
+
+
+def _check(recording: Recording, indices: NDArray[np.int64], needs_truth: bool) -> None:
+    if recording.sensor_set in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
+        raise RecordingError(
+            f"{recording.path} is {recording.sensor_set}: a survey needs a second camera or a depth sensor; "
+            "record with one"
+        )
+    if needs_truth:
+        check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
+
+
+def survey_recording(
+    path: Path, frames: str, calibration: Path | None, pinhole: StereoCamera | None, vocabulary: Vocabulary | None,
+    settings: SurveySettings, zones: Zones, progress: Progress, shelf: PictureShelf, console: Console,
+) -> Surveyed:  # fmt: skip
+    """Surveys one recording as if `pinhole` (or what suits it) had seen it."""
+    with open_recording(path, OpenOptions(calibration_file=calibration)) as recording:
+        for loss in recording.losses:
+            console.print(f"loss: {loss.what}: {loss.detail}", markup=False)
+        indices = FrameSelection.parse(frames).apply(recording)
+        rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
+        done = survey(
+            (recording.read_frame(int(index)) for index in indices), len(indices), recording.imu, recording.calibration,
+            rectifier, vocabulary, settings, zones, progress, shelf,
+        )  # fmt: skip
+        placed = map_from_survey(done.map, recording.priors, recording.calibration.base_from_body)
+        entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices))
+        return Surveyed(
+            entry, recording.format, recording.sensor_set, recording.losses, recording.ground_truth, done, placed
+        )
+
+
+def survey_all(
+    paths: Sequence[Path], survey_one: Callable[[Path, StereoCamera | None, Vocabulary | None], Surveyed],
+    pinhole: StereoCamera | None, vocabulary: Vocabulary | None,
+) -> list[Surveyed]:  # fmt: skip
+    """Surveys of all recordings through one camera and with one vocabulary: the first one's, where the site has none."""
+    done: list[Surveyed] = []
+    for path in paths:
+        done.append(survey_one(path, pinhole, vocabulary))
+        pinhole, vocabulary = pinhole or done[0].survey.state.camera, vocabulary or done[0].survey.vocabulary
+    return done

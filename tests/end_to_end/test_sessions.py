@@ -1,0 +1,226 @@
+"""Several recordings of one room: joined in one build, and night after night on the version before."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+import box_room
+from box_room import out_and_back, ride_sample
+from fleetmap.errors import SurveyError, UsageError
+from fleetmap.geometry import Array
+from fleetmap.mapformat import Tile, decode_tile
+from mapserver.cli import app
+from mapserver.store import MapStore
+from mapserver.store.archive import decode_archive
+from recording_samples import Sample, make_sample, write_euroc
+
+FRAME_S = 0.1
+WALL = 3  # the face at y = 3 that all rides look at
+POSTER_M = np.array([[-0.8, -0.7], [0.8, 0.7]])  # x and z of its corners
+FIELDS = ("points_map", "descriptors", "view_directions_map", "view_half_angle_rad", "max_distance_m", "sigma_m")
+
+
+def invoke(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def run(*arguments: object) -> str:
+    result = invoke(*arguments)
+    if result.exception is not None:
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@contextmanager
+def poster(seed: int) -> Iterator[None]:
+    """Another picture on part of the wall for as long as this lasts."""
+    texture = box_room._texture(WALL)
+    before = texture.copy()
+    (left, low), (right, high) = np.rint((POSTER_M - box_room.ROOM_M[0, [0, 2]]) / 0.01).astype(int)
+    rng = np.random.default_rng(seed)
+    patch = np.full((high - low, right - left), 120.0)
+    for _ in range(120):
+        x, y, w, h = (int(v) for v in (*rng.integers(0, 150, 2), *rng.integers(6, 30, 2)))
+        patch[y : y + h, x : x + w] = rng.uniform(20, 235)
+    texture[low:high, left:right] = cv2.GaussianBlur(patch, (0, 0), 1.2)
+    try:
+        yield
+    finally:
+        texture[:] = before
+
+
+def second_ride(seed: int) -> Sample:
+    """Past the same wall on another line, with other noise."""
+    return ride_sample(out_and_back(4.4, reach_m=2.2, start_m=(-1.1, 0.5, 0.1)), 44, FRAME_S, seed=seed)
+
+
+class Nights:
+    """A store with version 1 in the truth's frame, version 2 from another ride past the same wall, 3 and 4 with a poster on it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.store = folder, folder / "store"
+        write_euroc(folder / "night1", ride_sample(out_and_back(5.0), 50, FRAME_S))
+        self.samples = {2: second_ride(2)}
+        with poster(7):
+            self.samples |= {3: second_ride(3), 4: second_ride(4)}
+        for night, sample in self.samples.items():
+            write_euroc(folder / f"night{night}", sample)
+        self.said = {
+            night: self.build(night, "--frame-from-ground-truth" if night == 1 else None) for night in range(1, 5)
+        }
+
+    def build(self, night: int, option: str | None) -> str:
+        """Builds and publishes one night's version."""
+        files = ["--report", self.folder / f"r{night}.json", "--trajectory", self.folder / f"t{night}.tum"]
+        options = [option] if option else []
+        said = run("build", self.folder / f"night{night}", "--site", "lab", "--store", self.store, *files, *options)
+        run("publish", "--site", "lab", "--store", self.store)
+        return said
+
+    def session(self, night: int) -> dict[str, Any]:
+        """What the report says of the night's only recording."""
+        found: dict[str, Any] = json.loads((self.folder / f"r{night}.json").read_text())["sessions"][0]
+        return found
+
+    def landmarks(self, version: int) -> dict[int, tuple[Any, ...]]:
+        """By id, all that a robot is told about a landmark."""
+        found: dict[int, tuple[Any, ...]] = {}
+        for tile in self.tiles(version):
+            rows = (tuple(getattr(tile, field)[n].tobytes() for field in FIELDS) for n in range(len(tile)))
+            found |= dict(zip(tile.landmark_ids.tolist(), rows, strict=True))
+        return found
+
+    def tiles(self, version: int) -> list[Tile]:
+        """The version's tiles, decoded."""
+        with MapStore.open(self.store) as maps:
+            return [decode_tile(maps.blob(tile.sha256)) for tile in maps.manifest("lab", version).tiles]
+
+    def points(self, version: int) -> dict[int, Array]:
+        """By id, where a landmark is."""
+        return {i: p for t in self.tiles(version) for i, p in zip(t.landmark_ids.tolist(), t.points_map, strict=True)}
+
+
+@pytest.fixture(scope="module")
+def nights(tmp_path_factory: pytest.TempPathFactory) -> Nights:
+    return Nights(tmp_path_factory.mktemp("nights"))
+
+
+def on_poster(points_map: Array, margin_m: float = 0.0) -> Any:
+    """(N,) which points lie on the poster's part of the wall, or within the margin of it."""
+    low, high = POSTER_M + np.array([[-margin_m], [margin_m]])
+    inside = ((points_map[:, [0, 2]] > low) & (points_map[:, [0, 2]] < high)).all(axis=1)
+    return inside & (points_map[:, 1] > 2.8)
+
+
+def test_a_second_night_is_placed_in_the_first_ones_frame(nights: Nights) -> None:
+    """Without any truth: the frames of the second night are where the truth of the first night's frame has them."""
+    assert "draft 2 on version 1" in nights.said[2]
+    with MapStore.open(nights.store) as maps:
+        assert [maps.manifest("lab", v).parent for v in (1, 2, 3, 4)] == [None, 1, 2, 3]
+    for night in (2, 3, 4):
+        positions = np.loadtxt(nights.folder / f"t{night}.tum", comments="#")[:, 1:4]
+        truth = np.array(nights.samples[night].world_from_body)[:, :3, 3]
+        assert np.linalg.norm(positions - truth, axis=1).max() < 0.015
+        assert nights.session(night)["believed_fixes"] >= 4
+
+
+def test_what_did_not_change_keeps_its_bytes(nights: Nights) -> None:
+    first, second = nights.landmarks(1), nights.landmarks(2)
+    same = sum(second.get(i) == fields for i, fields in first.items())
+    assert same / len(first) > 0.98
+    assert len(set(second) - set(first)) / len(first) < 0.02
+    session = nights.session(2)
+    assert session["landmarks_kept"] >= same
+    assert session["seen_rate"] > 0.2
+
+
+def test_a_changed_wall_changes_its_own_landmarks_and_no_others(nights: Nights) -> None:
+    """New landmarks come where the poster hangs; those that it hides fade within two nights, those beside it do not.
+
+    A corner is described by the 31 pixels around it, on coarse octaves by more: half a metre of the wall from where it is seen.
+    """
+    before, after = nights.points(2), nights.points(4)
+    added = np.array([p for i, p in after.items() if i not in before])
+    gone = np.array([p for i, p in before.items() if i not in after])
+    assert len(added) > 20
+    assert on_poster(added, 0.3).mean() > 0.9
+    assert len(gone) > 20
+    assert on_poster(gone, 0.3).mean() > 0.9
+    hidden = on_poster(np.array(list(before.values())))
+    assert len(gone) > 0.3 * hidden.sum()
+
+
+def test_ids_are_never_given_twice(nights: Nights) -> None:
+    """A landmark that came in a later version has an id above all that there were before."""
+    for version in (2, 3, 4):
+        before, now = nights.landmarks(version - 1), nights.landmarks(version)
+        new = set(now) - set(before)
+        assert not new or min(new) > max(before)
+        places = [t.place_ids for t in nights.tiles(version)]
+        assert len(np.unique(np.concatenate(places))) == sum(len(ids) for ids in places)
+
+
+def test_the_archive_remembers_what_was_expected_and_seen(nights: Nights) -> None:
+    with MapStore.open(nights.store) as maps:
+        archives = [maps.archive("lab", version) for version in (1, 2)]
+    first, second = (decode_archive(data) for data in archives if data is not None)
+    assert first.history is not None
+    assert second.history is not None
+    assert first.history.landmark_expected.sum() == 0
+    session = nights.session(2)
+    assert (second.history.landmark_seen > 0).sum() >= session["landmarks_seen"] - session["landmarks_moved"]
+    assert (second.history.landmark_seen <= second.history.landmark_expected).all()
+    seen = second.history.landmark_seen > 0
+    assert (second.history.landmark_missed[seen] == 0).all()
+
+
+def test_the_same_night_again_gives_the_same_tiles(nights: Nights) -> None:
+    """On the same version, the same recording ends in the same bytes."""
+    hashes = []
+    for _ in range(2):
+        run("build", nights.folder / "night4", "--site", "lab", "--store", nights.store)
+        with MapStore.open(nights.store) as maps:
+            newest = maps.versions("lab")[-1].version
+            hashes.append([tile.sha256 for tile in maps.manifest("lab", newest).tiles])
+    assert hashes[0] == hashes[1]
+
+
+def test_the_frame_of_a_site_stays(nights: Nights) -> None:
+    common = [nights.folder / "night2", "--site", "lab", "--store", nights.store]
+    error = invoke("build", *common, "--frame-from-ground-truth").exception
+    assert isinstance(error, UsageError)
+    assert "frame stays" in str(error)
+
+
+def test_recordings_are_joined_and_a_foreign_one_is_left_out(nights: Nights, tmp_path: Path) -> None:
+    """Two rides past one wall become one map; a ride through another world is named, with the reason."""
+    write_euroc(tmp_path / "foreign", make_sample(20))
+    rides = [nights.folder / "night1", tmp_path / "foreign", nights.folder / "night2"]
+    files = ["--report", tmp_path / "r.json", "--trajectory", tmp_path / "t.tum", "--picture", tmp_path / "p.png"]
+    said = run("build", *rides, "--site", "hall", "--store", tmp_path / "store", "--frame-from-ground-truth", *files)
+    assert "left out" in said
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert [s["joined"] for s in report["sessions"]] == [True, False, True]
+    assert "fixes" in report["sessions"][1]["reason"]
+    assert report["recordings"] == ["night1", "night2"]
+    assert report["frames"] == 50 + 44
+    assert report["evaluated_share"] == 1.0
+    assert report["ate_rmse_m"] < 0.008
+    assert report["duration_s"] == pytest.approx(4.9 + 4.3)
+    with MapStore.open(tmp_path / "store") as maps:
+        assert [r.name for r in maps.manifest("hall", 1).recordings] == ["night1", "night2"]
+
+
+def test_a_site_takes_no_map_of_another_place(nights: Nights, tmp_path: Path) -> None:
+    write_euroc(tmp_path / "foreign", make_sample(20))
+    error = invoke("build", tmp_path / "foreign", "--site", "lab", "--store", nights.store).exception
+    assert isinstance(error, SurveyError)
+    assert "nothing could be joined" in str(error)
