@@ -8,51 +8,52 @@ from fleetmap.kernel import kernel
 
 
 @kernel
-def _bilinear(image: NDArray[np.uint8], x: float, y: float) -> float:
+def _sample(image: NDArray[np.uint8], x: float, y: float, half: int, rim: int, window: Array) -> None:
+    """Fills window with the (2 half + 1) rows of (2 (half + rim) + 1) pixels around (x, y), bilinear; all must lie inside.
+
+    Pixels of one window are whole steps apart, so that the four weights are the same for all of them.
+    """
     c, r = int(x), int(y)
     a, b = x - c, y - r
-    top = (1.0 - a) * image[r, c] + a * image[r, c + 1]
-    return float((1.0 - b) * top + b * ((1.0 - a) * image[r + 1, c] + a * image[r + 1, c + 1]))
-
-
-@kernel
-def _correlation(left: NDArray[np.uint8], right: NDArray[np.uint8], xl: int, xr: int, y: int, half: int) -> float:
-    """Zero-mean normalised cross correlation of two whole-pixel windows in one row."""
-    count = (2 * half + 1) * (2 * half + 1)
-    sl, sr, sll, srr, slr = 0.0, 0.0, 0.0, 0.0, 0.0
-    for v in range(y - half, y + half + 1):
-        for k in range(-half, half + 1):
-            a, b = float(left[v, xl + k]), float(right[v, xr + k])
-            sl += a
-            sr += b
-            sll += a * a
-            srr += b * b
-            slr += a * b
-    variance = (sll - sl * sl / count) * (srr - sr * sr / count)
-    if variance < 1e-6:
-        return -1.0
-    return float((slr - sl * sr / count) / np.sqrt(variance))
+    w00, w01, w10, w11 = (1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b
+    columns = 2 * (half + rim) + 1
+    first = c - half - rim
+    for dv in range(2 * half + 1):
+        upper, lower, out = image[r - half + dv], image[r - half + dv + 1], window[dv * columns : (dv + 1) * columns]
+        for k in range(columns):
+            out[k] = (
+                w00 * upper[first + k]
+                + w01 * upper[first + k + 1]
+                + w10 * lower[first + k]
+                + w11 * lower[first + k + 1]
+            )
 
 
 @kernel
 def _refine(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], x: float, y: float, disparity: float, half: int, window: Array
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    x: float,
+    y: float,
+    disparity: float,
+    half: int,
+    window: Array,
+    strip: Array,
 ) -> tuple[float, float]:
     """Disparity and its standard deviation by Gauss-Newton with a free offset and gain; NaN where it does not settle.
 
-    `window` is scratch of at least (2 half + 1)^2. Source: Lucas and Kanade 1981, along the row alone.
+    `window` is scratch of at least (2 half + 1)^2, `strip` of (2 half + 1) (2 half + 3). Source: Lucas and Kanade 1981, along the
+    row alone.
     """
     height, width = right.shape
-    count = (2 * half + 1) * (2 * half + 1)
+    size = 2 * half + 1
+    count = size * size
     if x - half < 1 or y - half < 1 or x + half + 2 >= width or y + half + 2 >= height:
         return np.nan, np.nan
+    _sample(left, x, y, half, 0, window)
     mean = 0.0
-    n = 0
-    for dv in range(-half, half + 1):
-        for du in range(-half, half + 1):
-            window[n] = _bilinear(left, x + du, y + dv)
-            mean += window[n]
-            n += 1
+    for n in range(count):
+        mean += window[n]
     mean /= count
     energy = 0.0
     for n in range(count):
@@ -60,38 +61,32 @@ def _refine(
         energy += window[n] * window[n]
     if energy < count:
         return np.nan, np.nan
-    sigma = np.nan
     for _ in range(12):
         xr = x - disparity
         if xr - half < 2 or xr + half + 3 >= width:
             return np.nan, np.nan
-        mean_right, n = 0.0, 0
-        for dv in range(-half, half + 1):
-            for du in range(-half, half + 1):
-                mean_right += _bilinear(right, xr + du, y + dv)
-        mean_right /= count
-        cross, power = 0.0, 0.0
-        n = 0
-        for dv in range(-half, half + 1):
-            for du in range(-half, half + 1):
-                b = _bilinear(right, xr + du, y + dv) - mean_right
-                cross += window[n] * b
-                power += b * b
-                n += 1
-        gain = cross / max(power, 1e-9)
+        _sample(right, xr, y, half, 1, strip)
+        total, power, cross = 0.0, 0.0, 0.0
+        for row in range(size):
+            ours, theirs = window[row * size : (row + 1) * size], strip[row * (size + 2) : (row + 1) * (size + 2)]
+            for k in range(size):
+                value = theirs[k + 1]
+                total += value
+                power += value * value
+                cross += ours[k] * value  # `ours` has no mean, so that theirs does not count
+        mean_right = total / count
+        gain = cross / max(power - total * mean_right, 1e-9)
         if gain < 0.4 or gain > 2.5:
             return np.nan, np.nan
         jj, jr, rr = 0.0, 0.0, 0.0
-        n = 0
-        for dv in range(-half, half + 1):
-            for du in range(-half, half + 1):
-                b = _bilinear(right, xr + du, y + dv) - mean_right
-                slope = 0.5 * gain * (_bilinear(right, xr + du + 1, y + dv) - _bilinear(right, xr + du - 1, y + dv))
-                r = window[n] - gain * b
+        for row in range(size):
+            ours, theirs = window[row * size : (row + 1) * size], strip[row * (size + 2) : (row + 1) * (size + 2)]
+            for k in range(size):
+                slope = 0.5 * gain * (theirs[k + 2] - theirs[k])
+                r = ours[k] - gain * (theirs[k + 1] - mean_right)
                 jj += slope * slope
                 jr += slope * r
                 rr += r * r
-                n += 1
         if jj < 10.0 * count:
             return np.nan, np.nan
         step = jr / jj
@@ -99,35 +94,91 @@ def _refine(
         if abs(step) > 2.0:
             return np.nan, np.nan
         if abs(step) < 0.005:
-            if rr > 0.3 * energy:
-                return np.nan, np.nan
-            sigma = np.sqrt((rr / count + 4.0) / jj)
-            break
-    return (np.nan, np.nan) if np.isnan(sigma) else (disparity, sigma)
+            return (np.nan, np.nan) if rr > 0.3 * energy else (disparity, np.sqrt((rr / count + 4.0) / jj))
+    return np.nan, np.nan
+
+
+@kernel
+def _correlate(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    xl: int,
+    y: int,
+    x_first: int,
+    count: int,
+    half: int,
+    scores: Array,
+    cross: NDArray[np.int32],
+    sums: NDArray[np.int32],
+) -> None:
+    """scores[:count]: zero-mean normalised cross correlation of the left window with those at x_first, x_first + 1, ...
+
+    All windows must lie inside. cross (C,) and sums (2, C) are scratch, C >= count + 2 half. Whole numbers, all columns of a row at
+    once: that is what processors do fast.
+    """
+    size = 2 * half + 1
+    area, columns = size * size, count + 2 * half
+    cross[:count] = 0
+    sums[:, :columns] = 0
+    sl, sll = 0, 0
+    plain, squared = sums[0], sums[1]
+    for v in range(y - half, y + half + 1):
+        row = right[v, x_first - half : x_first - half + columns]
+        for k in range(columns):
+            value = np.int32(row[k])
+            plain[k] += value
+            squared[k] += value * value
+        for k in range(size):
+            a = np.int32(left[v, xl - half + k])
+            sl += a
+            sll += a * a
+            part = row[k : k + count]
+            for n in range(count):
+                cross[n] += a * np.int32(part[n])
+    spread = sll - sl * sl / area
+    sr, srr = 0, 0
+    for k in range(size - 1):
+        sr += plain[k]
+        srr += squared[k]
+    for n in range(count):
+        sr += plain[n + size - 1]
+        srr += squared[n + size - 1]
+        variance = spread * (srr - sr * sr / area)
+        scores[n] = -1.0 if variance < 1e-6 else (cross[n] - sl * sr / area) / np.sqrt(variance)
+        sr -= plain[n]
+        srr -= squared[n]
 
 
 @kernel
 def _search(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], xl: int, y: int, first: int, last: int, half: int, scores: Array
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    xl: int,
+    y: int,
+    first: int,
+    last: int,
+    half: int,
+    scores: Array,
+    cross: NDArray[np.int32],
+    sums: NDArray[np.int32],
 ) -> tuple[int, float, float]:
     """Best whole-pixel disparity in [first, last], its correlation, and the best one that is not its neighbour."""
     height, width = left.shape
-    best, best_score = -1, -1.0
     if y < half or y + half >= height or xl < half or xl + half >= width:
         return -1, -1.0, -1.0
-    for d in range(first, last + 1):
-        scores[d - first] = -1.0
-        xr = xl - d
-        if xr < half or xr + half >= width:
-            continue
-        scores[d - first] = _correlation(left, right, xl, xr, y, half)
-        if scores[d - first] > best_score:
-            best, best_score = d, scores[d - first]
-    second = -1.0
-    for d in range(first, last + 1):
-        if abs(d - best) > 2 and scores[d - first] > second:
-            second = scores[d - first]
-    return best, best_score, second
+    x_first, x_last = max(xl - last, half), min(xl - first, width - 1 - half)
+    count = x_last - x_first + 1
+    if count <= 0:
+        return -1, -1.0, -1.0
+    _correlate(left, right, xl, y, x_first, count, half, scores, cross, sums)
+    best, best_score, second = -1, -1.0, -1.0
+    for n in range(count - 1, -1, -1):
+        if scores[n] > best_score:
+            best, best_score = n, scores[n]
+    for n in range(count):
+        if abs(n - best) > 2 and scores[n] > second:
+            second = scores[n]
+    return (xl - (x_first + best) if best >= 0 else -1), best_score, second
 
 
 @kernel
@@ -147,8 +198,9 @@ def match_rows(
 ) -> Array:
     """(N, 2) disparity and its standard deviation, NaN where no trustworthy match is on the row."""
     out = np.full((len(pixels), 2), np.nan)
-    scores = np.empty(int(max_disparity_px) + 16)
-    window = np.empty((2 * wide + 1) * (2 * wide + 1))
+    room = int(max_disparity_px) + 16 + 2 * wide
+    scores, cross, sums = np.empty(room), np.empty(room, np.int32), np.empty((2, room), np.int32)
+    window, strip = np.empty((2 * wide + 1) * (2 * wide + 1)), np.empty((2 * wide + 1) * (2 * wide + 3))
     for n in range(len(pixels)):
         x, y = pixels[n, 0], pixels[n, 1]
         xi, yi = int(x + 0.5), int(y + 0.5)
@@ -157,18 +209,18 @@ def match_rows(
             last = first + 6
         else:
             coarse, score, second = _search(
-                left_half, right_half, xi // 2, yi // 2, 0, int(max_disparity_px / 2), 4, scores
+                left_half, right_half, xi // 2, yi // 2, 0, int(max_disparity_px / 2), 4, scores, cross, sums
             )
             if score < min_correlation or second > uniqueness * score:
                 continue
             first, last = max(2 * coarse - 3, 0), 2 * coarse + 3
-        whole, score, second = _search(left, right, xi, yi, first, last, wide, scores)
+        whole, score, second = _search(left, right, xi, yi, first, last, wide, scores, cross, sums)
         if score < min_correlation:
             continue
-        d_wide, _ = _refine(left, right, x, y, float(whole), wide, window)
+        d_wide, _ = _refine(left, right, x, y, float(whole), wide, window, strip)
         if np.isnan(d_wide):
             continue
-        d_narrow, sigma_narrow = _refine(left, right, x, y, d_wide, narrow, window)
+        d_narrow, sigma_narrow = _refine(left, right, x, y, d_wide, narrow, window, strip)
         if np.isnan(d_narrow) or abs(d_wide - d_narrow) > agreement_px:
             continue
         out[n, 0] = d_narrow
