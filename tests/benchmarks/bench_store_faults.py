@@ -8,6 +8,7 @@ import argparse
 import json
 import platform
 import resource
+import shutil
 import sqlite3
 import sys
 import tempfile
@@ -19,7 +20,7 @@ TESTS = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(TESTS), *(str(TESTS.parent / part) for part in ("shared", "mapserver", "locclient"))]
 
 from fuzzed_formats import FORMATS, fuzz  # noqa: E402
-from store_faults import MODES, run  # noqa: E402
+from store_faults import MODES, TRACED, run  # noqa: E402
 
 
 def machine() -> dict[str, str]:
@@ -41,9 +42,10 @@ def fuzz_all(inputs: int) -> dict[str, dict[str, float]]:
 def show_faults(found: dict[str, Any]) -> None:
     """The table of tries."""
     print(f"{found['points']} injection points in {found['seconds']} s, {len(found['wrong'])} of them with a fault")
-    print("".join(f"{word:>22}" for word in ("", *MODES)))
-    for name, counts in found["tries"].items():
-        print(f"{name:>22}" + "".join(f"{counts[mode]:>22}" for mode in MODES))
+    names = list(found["tries"])
+    print(f"{'':>22}" + "".join(f"{name:>20}" for name in names))
+    for mode in found["tries"][names[0]]:
+        print(f"{mode:>22}" + "".join(f"{found['tries'][name][mode]:>20}" for name in names))
     for fault in found["wrong"][:20]:
         print(fault)
 
@@ -59,7 +61,10 @@ def main() -> int:
     fuzzed = fuzz_all(arguments.inputs)
     for name, figures in fuzzed.items():
         print(f"{name:>10}: " + ", ".join(f"{key} {value:.4g}" for key, value in figures.items()))
-    found = run(list(MODES), arguments.every, within_s=arguments.within_s)
+    modes = [*MODES, *TRACED] if shutil.which("strace") else list(MODES)
+    if modes == list(MODES):
+        print("NO STRACE HERE: the kernel's own calls are not struck, only those that the store and SQLite's VFS make")
+    found = run(modes, arguments.every, within_s=arguments.within_s)
     show_faults(found)
     if arguments.out is not None:
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
