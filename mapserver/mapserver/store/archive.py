@@ -143,5 +143,5 @@ def _read_head(payload: bytes) -> tuple[_Head, int]:
     end = _HEAD_SIZE.size + int(_HEAD_SIZE.unpack_from(payload)[0])
     try:
         return msgspec.json.decode(payload[_HEAD_SIZE.size : end], type=_Head), end
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise MapFormatError(f"archive: head {error}; the bytes are damaged") from error

@@ -54,10 +54,15 @@ def refusal(draft: VersionInfo, verdict: Verdict) -> GateRefusedError:
     return GateRefusedError(f"draft {draft.version} of {draft.site} is refused: {reasons}; {way_out}")
 
 
-def publish(ledger: Ledger, draft: VersionInfo, actor: Actor) -> None:
-    """Makes a draft current; raises StateError where someone else was faster."""
+def publish(ledger: Ledger, draft: VersionInfo, judged_against: int | None, actor: Actor) -> None:
+    """Makes a draft current that was compared with version `judged_against`; StateError where someone was faster."""
     with ledger.write() as connection:
         left = _leave_current(connection, draft.site, "published")
+        if left != judged_against:
+            raise StateError(
+                f"version {left} of site {draft.site} became current while draft {draft.version} was compared with "
+                f"{judged_against}; publish again"
+            )
         done = connection.execute(
             """UPDATE versions SET state = 'current', published_ns = ?
                WHERE site = ? AND version = ? AND state = 'draft'""",

@@ -146,7 +146,7 @@ class MapStore(StoreRecords):
         lifecycle.record_verdict(self._ledger, draft, verdict, forced=forced, actor=actor)
         if not verdict.accepted and not forced:
             raise lifecycle.refusal(draft, verdict)
-        lifecycle.publish(self._ledger, draft, actor)
+        lifecycle.publish(self._ledger, draft, None if current is None else current.version, actor)
         self._write_current_file(site)
         return draft.version
 

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from store_faults import MODES
+
 TESTS = Path(__file__).resolve().parents[2]
 
 
-@pytest.mark.parametrize("every", [31])
+@pytest.mark.parametrize("every", [53])
 def test_a_store_survives_whatever_happens_to_its_process_or_disk(every: int) -> None:
     """A process of its own, because what it does to `os` and SQLite cannot be undone."""
     command = [sys.executable, str(TESTS / "store_faults.py"), "--every", str(every)]
@@ -18,8 +20,9 @@ def test_a_store_survives_whatever_happens_to_its_process_or_disk(every: int) ->
     assert done.stdout, done.stderr[-3000:]
     found = json.loads(done.stdout)
     assert found["wrong"] == [], done.stderr[-3000:]
-    assert found["points"] >= 150
-    assert all(all(counts.values()) for counts in found["tries"].values())
+    assert found["points"] >= 90
+    for mode in MODES:
+        assert sum(counts[mode] for counts in found["tries"].values()) >= 3, mode
 
 
 @pytest.mark.parametrize("forgotten", ["sync", "sync_folder"])

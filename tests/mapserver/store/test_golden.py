@@ -19,12 +19,20 @@ from mapserver.store.transfer import EXPORT_FORMAT
 GOLDEN = Path(__file__).parents[2] / "golden"
 
 
-def test_every_released_format_has_its_file() -> None:
-    for name, newest in (("version-{}.fmex", EXPORT_FORMAT), ("store-{}.sqlite3", len(MIGRATIONS))):
-        for number in range(1, newest + 1):
-            assert (GOLDEN / name.format(number)).is_file()
-    for name in ("tile-1.fmtl", "manifest-1.json", "archive-1.fmar"):
-        assert (GOLDEN / name).is_file()
+@pytest.mark.parametrize(
+    ("name", "newest"),
+    [
+        ("tile-{}.fmtl", TILE_FORMAT),
+        ("tile-{}.json", TILE_FORMAT),
+        ("manifest-{}.json", MANIFEST_FORMAT),
+        ("archive-{}.fmar", ARCHIVE_FORMAT),
+        ("version-{}.fmex", EXPORT_FORMAT),
+        ("store-{}.sqlite3", len(MIGRATIONS)),
+    ],
+)
+def test_every_format_has_its_file(name: str, newest: int) -> None:
+    missing = [name.format(number) for number in range(1, newest + 1) if not (GOLDEN / name.format(number)).is_file()]
+    assert missing == [], "python tests/golden/add.py adds the newest"
 
 
 @pytest.mark.parametrize("file", sorted(GOLDEN.glob("tile-*.fmtl")), ids=lambda file: file.stem)
@@ -40,17 +48,19 @@ def test_tiles(file: Path) -> None:
     np.testing.assert_allclose(tile.map_from_cam, wanted["map_from_cam"], atol=1e-12)
 
 
-def test_manifests() -> None:
-    data = (GOLDEN / "manifest-1.json").read_bytes()
+@pytest.mark.parametrize("file", sorted(GOLDEN.glob("manifest-*.json")), ids=lambda file: file.stem)
+def test_manifests(file: Path) -> None:
+    data = file.read_bytes()
     manifest = decode_manifest(data)
     assert (manifest.site, len(manifest.tiles), manifest.landmarks) == ("lab", 2, 16)
     assert manifest.report == {"path_m": 12.5}
-    if MANIFEST_FORMAT == 1:
+    if manifest.format_version == MANIFEST_FORMAT:
         assert encode_manifest(manifest) == data
 
 
-def test_archives() -> None:
-    survey = decode_archive((GOLDEN / "archive-1.fmar").read_bytes())
+@pytest.mark.parametrize("file", sorted(GOLDEN.glob("archive-*.fmar")), ids=lambda file: file.stem)
+def test_archives(file: Path) -> None:
+    survey = decode_archive(file.read_bytes())
     assert len(survey.landmark_ids) == 8
     assert survey.map_from_body.shape == (3, 4, 4)
 

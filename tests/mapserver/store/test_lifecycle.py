@@ -13,7 +13,7 @@ from fleetmap.errors import FleetmapError, GateRefusedError, MapFormatError, Sta
 from fleetmap.mapformat import blob_path, current_path
 from map_samples import draft_details, random_tile, save_sample_draft
 from mapserver.gate import GateSettings
-from mapserver.store import Actor, MapStore, Retention
+from mapserver.store import Actor, MapStore, Retention, lifecycle
 from mapserver.store.differences import SideBySide
 from mapserver.store.files import locked
 
@@ -112,6 +112,24 @@ def test_the_gate_compares_with_the_current_version(store: MapStore) -> None:
     ]
     save_sample_draft(store, seed=4)
     assert store.publish("lab", gate=GateSettings(max_bytes_share=100)) == 3
+
+
+def test_a_draft_is_not_published_against_another_version_than_it_was_judged_by(store: MapStore, monkeypatch) -> None:
+    publish_samples(store, 1)
+    save_sample_draft(store, seed=2)
+    save_sample_draft(store, seed=3)
+    record = lifecycle.record_verdict
+
+    def slow(*args, **more) -> None:
+        monkeypatch.setattr(lifecycle, "record_verdict", record)
+        record(*args, **more)
+        store.publish("lab", 2)
+
+    monkeypatch.setattr(lifecycle, "record_verdict", slow)
+    with pytest.raises(StateError, match="compared with 1"):
+        store.publish("lab", 3)
+    assert states(store) == {1: "published", 2: "current", 3: "draft"}
+    assert store.publish("lab", 3) == 3
 
 
 def test_hard_limits_are_not_forced(store: MapStore) -> None:

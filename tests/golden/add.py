@@ -1,0 +1,76 @@
+"""Adds the files of formats that have none yet; never writes one again. `python tests/golden/add.py`, once for each new format."""
+
+import json
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+GOLDEN = Path(__file__).resolve().parent
+sys.path[:0] = [str(GOLDEN.parent), *(str(GOLDEN.parents[1] / part) for part in ("shared", "mapserver", "locclient"))]
+
+import numpy as np  # noqa: E402
+
+from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_tile, encode_tile  # noqa: E402
+from map_samples import draft_details, random_survey, random_tile  # noqa: E402
+from mapserver.store import MapStore  # noqa: E402
+from mapserver.store.archive import ARCHIVE_FORMAT, encode_archive  # noqa: E402
+from mapserver.store.migrations import MIGRATIONS  # noqa: E402
+from mapserver.store.transfer import EXPORT_FORMAT  # noqa: E402
+
+
+def write_store(folder: Path) -> None:
+    """Versions 1 to 3 of site lab: current again, retired, draft; and one job."""
+    with MapStore.open(folder, create=True, clock_ns=lambda: 1_767_323_045_000_000_000) as store:
+        for seed in (1, 2, 3):
+            rng = np.random.default_rng(seed)
+            tiles = [random_tile(rng, landmarks=8, places=1, cell=(x, 0)) for x in range(2)]
+            details = draft_details(path_m=12.5)
+            store.save_draft(
+                "lab", tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive %d" % seed
+            )
+            if seed < 3:
+                store.publish("lab")
+        store.record_robot_report("lab", "r1", {"status": "TRACKING"}, 1)
+        store.rollback("lab")
+        store.update_job(store.begin_job("lab", "nightly"), "done", "version 2 is published", {"drafts": 1})
+
+
+def write_tile(path: Path) -> None:
+    """A tile, and beside it what its bytes mean."""
+    data = encode_tile(random_tile(np.random.default_rng(7), landmarks=5, places=2))
+    tile = decode_tile(data)
+    meaning = {
+        "cell": [tile.tile_x, tile.tile_y],
+        "size_m": tile.size_m,
+        "landmark_ids": tile.landmark_ids.tolist(),
+        "points_map": tile.points_map.tolist(),
+        "descriptors": [bytes(row).hex() for row in tile.descriptors],
+        "place_ids": tile.place_ids.tolist(),
+        "map_from_cam": tile.map_from_cam.tolist(),
+    }
+    path.write_bytes(data)
+    path.with_suffix(".json").write_text(json.dumps(meaning, indent=1) + "\n")
+
+
+def add_from_store(folder: Path) -> None:
+    """Manifest, export and database."""
+    write_store(folder)
+    with MapStore.open(folder) as store:
+        if not (path := GOLDEN / f"manifest-{MANIFEST_FORMAT}.json").exists():
+            path.write_bytes(store.blob(store.version("lab", 1).manifest_sha256))
+        if not (path := GOLDEN / f"version-{EXPORT_FORMAT}.fmex").exists():
+            store.export_version("lab", 1, path)
+    if not (path := GOLDEN / f"store-{len(MIGRATIONS)}.sqlite3").exists():
+        shutil.copy(folder / "store.sqlite3", path)
+        shutil.copytree(folder / "blobs", GOLDEN / "store-blobs", dirs_exist_ok=True)
+
+
+if __name__ == "__main__":
+    if not (tile_path := GOLDEN / f"tile-{TILE_FORMAT}.fmtl").exists():
+        write_tile(tile_path)
+    if not (archive_path := GOLDEN / f"archive-{ARCHIVE_FORMAT}.fmar").exists():
+        survey = random_survey(np.random.default_rng(3), keyframes=3, landmarks=8)
+        archive_path.write_bytes(encode_archive(survey))
+    with tempfile.TemporaryDirectory() as made:
+        add_from_store(Path(made) / "store")

@@ -1,0 +1,14 @@
+"""Hostile manifests, tiles, archives and exports are read or refused; `make bench` tries many more."""
+
+from pathlib import Path
+
+import pytest
+
+from fuzzed_formats import FORMATS, fuzz
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_nothing_from_outside_breaks_the_reader(name: str, tmp_path: Path) -> None:
+    found = fuzz(name, 300, tmp_path)
+    assert found["inputs"] >= 250
+    assert found["refused"] > found["inputs"] / 4
