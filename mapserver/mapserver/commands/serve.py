@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _ANNOUNCE_EVERY_S = 1.0
 _STOP_WITHIN_S = 5
+_SWITCH_INTERVAL_S = 0.001
 
 
 def serve(
@@ -41,6 +42,7 @@ def serve(
 def _run(maps: "MapStore", bus: "ZenohBus", listener: "socket.socket") -> None:
     import logging
     import signal
+    import sys
     from contextlib import asynccontextmanager
 
     import uvicorn
@@ -50,6 +52,8 @@ def _run(maps: "MapStore", bus: "ZenohBus", listener: "socket.socket") -> None:
     from mapserver.fleet import Fleet
     from mapserver.tile_service import TileService
 
+    # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     fleet = Fleet(maps)
     metrics = Metrics(maps, fleet)
