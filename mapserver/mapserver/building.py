@@ -20,7 +20,7 @@ from fleetmap.recordings.tum import write_tum
 from fleetmap.rectification import Rectifier
 from fleetmap.samples import SensorSet
 from mapserver.build_report import Accuracy, BuildReport, accuracy, check_truth, full_report, make_report
-from mapserver.landmark_budget import within_budget
+from mapserver.landmark_budget import choose_landmarks
 from mapserver.progress import ProgressView, StageTimes
 from mapserver.store import DraftDetails, MapStore
 from mapserver.store.archive import encode_archive
@@ -128,7 +128,8 @@ def _survey(
 
 
 def _keep(order: BuildOrder, recording: Recording, built: _Built, settings: SurveySettings, maps: MapStore) -> str:
-    tiles = tiles_from_survey(within_budget(built.survey.map, settings.budget, TILE_SIZE_M))
+    chosen = choose_landmarks(built.survey.map, settings.budget, TILE_SIZE_M)
+    tiles = tiles_from_survey(built.survey.map, chosen=chosen)
     archive = encode_archive(built.survey.map)
     vocabulary = encode_vocabulary(built.survey.vocabulary)
     content_hash = recording.content_hash()

@@ -224,10 +224,14 @@ class Fleet:
 def measure_fleet(folder: Path, clients: int, processes: int) -> dict[str, dict[str, float]]:
     """Everybody fetches the whole site, the delta of a night, a night in which nothing moved, and the whole site again.
 
-    The last one shows whether the server's memory grows once its caches are full.
+    The first row is the server alone. The last one shows whether the server's memory grows once its caches are full.
     """
     rows = {}
     with serving(folder) as (process, http, endpoint):
+        with measured(process.pid, http) as load:
+            time.sleep(10.0)
+        rows["idle"] = load.figures()
+        show("idle", rows["idle"])
         fleet = Fleet(endpoint, clients, processes)
         try:
             for name in ("whole", "delta", "nothing moved", "whole again"):
