@@ -19,7 +19,7 @@ from fleetmap.recordings.tum import write_tum
 from fleetmap.rectification import StereoCamera
 from fleetmap.samples import Trajectory
 from mapserver.build_report import Accuracy, BuildReport, accuracy, full_report, make_report, sessions_report
-from mapserver.landmark_budget import within_budget
+from mapserver.landmark_budget import choose_landmarks
 from mapserver.picture_files import PictureFile
 from mapserver.progress import ProgressView, StageTimes
 from mapserver.store import DraftDetails, MapStore
@@ -158,7 +158,8 @@ def _truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
 
 def _keep(order: BuildOrder, built: _Built, parent: int | None, settings: SurveySettings, maps: MapStore) -> str:
     survey_map = built.joined.map
-    tiles = tiles_from_survey(within_budget(survey_map, settings.budget, TILE_SIZE_M))
+    chosen = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M)
+    tiles = tiles_from_survey(survey_map, chosen=chosen)
     archive = encode_archive(survey_map)
     vocabulary = encode_vocabulary(built.surveyed[0].survey.vocabulary)
     report = make_report(

@@ -6,8 +6,6 @@ spread over the picture and over near and far, before any gets more. Landmarks t
 that are known well count for more, because they will be found again.
 """
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,18 +18,19 @@ _COLUMNS, _ROWS, _DEPTHS = 4, 3, 2
 _LONGEST_STEP_M = 10.0  # between keyframes; beyond it lies a break, not a path
 _CLOSE_BASELINES = 40.0
 _WIDE_RAD = np.radians(20.0)
+_SAME_WAY_M, _SAME_WAY_AFTER_M, _SAME_WAY_COSINE = 1.0, 5.0, 0.5
 
 
-def within_budget(
+def choose_landmarks(
     survey: SurveyMap, settings: BudgetSettings, tile_size_m: float, published: NDArray[np.uint32] | None = None
-) -> SurveyMap:
-    """The survey with the landmarks that robots get; keyframes and trajectory stay.
+) -> NDArray[np.bool_]:
+    """(N,) which landmarks of the survey robots get.
 
-    At most settings.landmarks_per_m for every metre of the keyframes' path (min_landmarks are always allowed: a short survey
+    At most settings.landmarks_per_m for every metre of `covered_path_m` (min_landmarks are always allowed: a short survey
     covers a whole room), and tile_landmarks in a tile. Landmarks whose ids are in `published` come before all others, so that
-    robots do not fetch another choice of equal worth every night.
+    robots do not fetch another choice of equal worth every night. What nothing observes is not chosen.
     """
-    limit = max(settings.min_landmarks, int(settings.landmarks_per_m * path_m(survey)))
+    limit = max(settings.min_landmarks, int(settings.landmarks_per_m * covered_path_m(survey)))
     starts, bins, weights = _views(survey)
     cells, room = _cells(survey, tile_size_m, settings.tile_landmarks)
     counts = np.zeros(int(bins.max(initial=-1)) + 1, np.int64)
@@ -41,13 +40,25 @@ def within_budget(
     for mask in (first, seen & ~first):
         if mask.any() and limit > 0:
             limit -= kernels.choose(np.flatnonzero(mask), starts, bins, weights, cells, room, limit, counts, chosen)
-    return _only(survey, chosen)
+    return chosen
 
 
-def path_m(survey: SurveyMap) -> float:
-    """Metres from keyframe to keyframe, breaks left out."""
-    steps_m = np.linalg.norm(np.diff(survey.map_from_body[:, :3, 3], axis=0), axis=1)
-    return float(steps_m[steps_m < _LONGEST_STEP_M].sum())
+def covered_path_m(survey: SurveyMap) -> float:
+    """Metres from keyframe to keyframe, without breaks and what was driven before the same way.
+
+    Without the latter every night would add to a site's budget though its aisles are no longer than before.
+    """
+    map_from_cam = survey.map_from_body @ survey.body_from_cam
+    places, axes = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]
+    steps_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    way_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    total_m = 0.0
+    for k in np.flatnonzero(steps_m < _LONGEST_STEP_M) + 1:
+        before = int(np.searchsorted(way_m, way_m[k] - _SAME_WAY_AFTER_M))
+        near = np.linalg.norm(places[:before] - places[k], axis=1) < _SAME_WAY_M
+        if not (near & (axes[:before] @ axes[k] > _SAME_WAY_COSINE)).any():
+            total_m += float(steps_m[k - 1])
+    return total_m
 
 
 def _views(survey: SurveyMap) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
@@ -95,21 +106,3 @@ def _cells(survey: SurveyMap, size_m: float, limit: int) -> tuple[NDArray[np.int
     squares = np.floor(survey.points_map[:, :2] / size_m)
     names, cells = np.unique(squares, axis=0, return_inverse=True)
     return cells.reshape(-1).astype(np.int64), np.full(len(names), limit, np.int64)
-
-
-def _only(survey: SurveyMap, chosen: NDArray[np.bool_]) -> SurveyMap:
-    rows = np.cumsum(chosen) - 1
-    kept = chosen[survey.obs_landmark]
-    return replace(
-        survey,
-        landmark_ids=survey.landmark_ids[chosen],
-        points_map=survey.points_map[chosen],
-        descriptors=survey.descriptors[chosen],
-        point_sigma_m=survey.point_sigma_m[chosen],
-        patches=survey.patches[chosen],
-        obs_keyframe=survey.obs_keyframe[kept],
-        obs_landmark=rows[survey.obs_landmark[kept]].astype(np.int32),
-        obs_pixels=survey.obs_pixels[kept],
-        obs_octave=survey.obs_octave[kept],
-        obs_sigma_px=survey.obs_sigma_px[kept],
-    )

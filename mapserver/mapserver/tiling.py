@@ -18,23 +18,28 @@ _Ids = NDArray[np.uint32]
 
 
 def tiles_from_survey(
-    survey: SurveyMap, tile_size_m: float = TILE_SIZE_M, max_place_landmarks: int = MAX_PLACE_LANDMARKS
+    survey: SurveyMap,
+    tile_size_m: float = TILE_SIZE_M,
+    max_place_landmarks: int = MAX_PLACE_LANDMARKS,
+    chosen: NDArray[np.bool_] | None = None,
 ) -> list[Tile]:
     """The survey cut into squares of `tile_size_m`, ordered by x, then y.
 
     Landmarks lie in the tile of their position, places (the keyframes that are offered as such, under their ids) in that
     of their camera's centre. A place lists at most `max_place_landmarks` of the landmarks seen there, those with most
     observations in the survey. Landmarks that nothing observes are left out: nothing says from where they are seen.
+    chosen (N,): the landmarks that robots get, all if None.
     Raises SurveyError for a survey with values that are not finite.
     """
     map_from_cam = survey.map_from_body @ survey.body_from_cam
     _check_finite(survey, map_from_cam)
     views = Views(survey, map_from_cam)
-    kept = np.flatnonzero(views.counts > 0)
+    chosen = np.ones(len(survey.landmark_ids), bool) if chosen is None else chosen
+    kept = np.flatnonzero((views.counts > 0) & chosen)
     kept = kept[np.argsort(survey.landmark_ids[kept], kind="stable")]
     landmark_cells = _cells(survey.points_map[kept], tile_size_m)
     place_cells = _cells(map_from_cam[:, :3, 3], tile_size_m)
-    references = _place_landmarks(survey, views.counts, max_place_landmarks)
+    references = _place_landmarks(survey, views.counts, max_place_landmarks, chosen)
     history = history_of(survey)
     tiles = []
     for cell in sorted({(int(x), int(y)) for x, y in np.concatenate([landmark_cells, place_cells[history.is_place]])}):
@@ -74,10 +79,11 @@ def _cells(points_map: Array, size_m: float) -> NDArray[np.int64]:
     return np.asarray(np.floor(points_map[:, :2] / size_m), np.int64)
 
 
-def _place_landmarks(survey: SurveyMap, counts: NDArray[np.intp], limit: int) -> list[_Ids]:
-    """For each keyframe the sorted ids of the best observed landmarks seen in it."""
+def _place_landmarks(survey: SurveyMap, counts: NDArray[np.intp], limit: int, chosen: NDArray[np.bool_]) -> list[_Ids]:
+    """For each keyframe the sorted ids of the best observed of the chosen landmarks seen in it."""
     ids = survey.landmark_ids
     order = np.lexsort((ids[survey.obs_landmark], -counts[survey.obs_landmark], survey.obs_keyframe))
+    order = order[chosen[survey.obs_landmark[order]]]
     bounds = np.searchsorted(survey.obs_keyframe[order], np.arange(len(survey.map_from_body) + 1))
     lists = []
     for start, end in pairwise(bounds):

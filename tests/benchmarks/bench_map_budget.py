@@ -19,6 +19,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.mapformat import Manifest, Tile, decode_tile, encode_tile
 from fleetmap.messages import WantedVersion
@@ -27,7 +28,7 @@ from locclient.link import FetchedTiles, ReadyVersion
 from locclient.replay import RobotLink, replay
 from locclient.settings import LocalizerSettings
 from locclient.sources import ReplaySource
-from mapserver.landmark_budget import within_budget
+from mapserver.landmark_budget import choose_landmarks
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
 from mapserver.survey.result import SurveyMap
@@ -59,16 +60,18 @@ class Cut:
         return FetchedTiles({(tile.tile_x, tile.tile_y): tile for tile in self.cut})
 
 
-def row(name: str, survey: SurveyMap, made: Manifest, words: bytes, source: ReplaySource) -> dict[str, object]:
+def row(
+    name: str, survey: SurveyMap, chosen: NDArray[np.bool_], made: Manifest, words: bytes, source: ReplaySource
+) -> dict[str, object]:
     """Bytes and quality of one budget."""
-    encoded = [encode_tile(tile) for tile in tiles_from_survey(survey, made.tile_size_m)]
+    encoded = [encode_tile(tile) for tile in tiles_from_survey(survey, made.tile_size_m, chosen=chosen)]
     link = RobotLink(Cut(made, words, [decode_tile(data) for data in encoded]), None, made.site, "bench")
     begun_s = time.process_time()
     report = replay(source, link, LocalizerSettings(), None, realtime=False, progress=lambda _: None).report()
     size = sum(len(data) for data in encoded)
     return {
         "budget": name,
-        "landmarks": len(survey.landmark_ids),
+        "landmarks": int(chosen.sum()),
         "bytes": size,
         "bytes_per_m": size / float(made.report["path_m"]),
         "largest_tile_bytes": max(len(data) for data in encoded),
@@ -87,15 +90,15 @@ def measure(store: Path, site: str, version: int | None, recording: Path, frames
         assert archive is not None, f"version {number} of {site} has no archive"
         words, survey = maps.blob(made.vocabulary.sha256), decode_archive(archive)
     seen = len(np.unique(survey.obs_landmark))
-    cuts = {"default": within_budget(survey, BudgetSettings(), made.tile_size_m)}
+    cuts = {"default": choose_landmarks(survey, BudgetSettings(), made.tile_size_m)}
     for share in SHARES:
         exactly = BudgetSettings(landmarks_per_m=0.0, min_landmarks=round(share * seen), tile_landmarks=1 << 30)
-        cuts[f"{share:g} of the map"] = within_budget(survey, exactly, made.tile_size_m)
+        cuts[f"{share:g} of the map"] = choose_landmarks(survey, exactly, made.tile_size_m)
     rows = []
     with open_recording(recording) as opened:
         for name, cut in cuts.items():
             source = ReplaySource.of(opened, FrameSelection.parse(frames), reverse=False)
-            rows.append(row(name, cut, made, words, source))
+            rows.append(row(name, survey, cut, made, words, source))
             show(rows[-1])
     return rows
 

@@ -139,7 +139,7 @@ def fuzz(inputs: int, seed: int) -> dict[str, dict[str, float]]:
     for name, (make, read) in kinds.items():
         counts: Counter[str] = Counter()
         slowest_s, total_s = 0.0, 0.0
-        for number in range(inputs // len(kinds)):
+        for number in range(-(-inputs // len(kinds))):
             data = make(np.random.default_rng([seed, number]))
             begun_s = time.perf_counter()
             try:

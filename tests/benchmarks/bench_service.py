@@ -54,7 +54,7 @@ class Load:
     http_ms: list[float] = field(default_factory=list)
 
     def figures(self) -> dict[str, float]:
-        """For the report. rss_mb: at the start, the most, at the end."""
+        """For the report. Memory of the server: at the start, the most, at the end."""
         http = np.percentile(self.http_ms, [50, 99]) if self.http_ms else [np.nan, np.nan]
         return {
             "wall_s": self.wall_s, "server_cpu_s": self.cpu_s, "server_cores": self.cpu_s / self.wall_s,
@@ -197,11 +197,11 @@ class Fleet:
             assert process.stdout is not None
             assert process.stdout.readline() == "ready\n"
 
-    def fetch(self) -> dict[str, float]:
-        """All robots fetch the wanted version at once; fails where a single byte of one is wrong."""
+    def fetch(self, *, anew: bool) -> dict[str, float]:
+        """All robots fetch the wanted version at once, as if they had none where `anew`; fails where a single byte is wrong."""
         for process in self._processes:
             assert process.stdin is not None
-            process.stdin.write("go\n")
+            process.stdin.write("anew\n" if anew else "go\n")
             process.stdin.flush()
         phases = []
         for process in self._processes:
@@ -222,12 +222,19 @@ class Fleet:
 
 
 def measure_fleet(folder: Path, clients: int, processes: int) -> dict[str, dict[str, float]]:
-    """Everybody fetches the whole site, then the delta of a night, then a night in which nothing moved."""
+    """Everybody fetches the whole site, the delta of a night, a night in which nothing moved, and the whole site again.
+
+    The first row is the server alone. The last one shows whether the server's memory grows once its caches are full.
+    """
     rows = {}
     with serving(folder) as (process, http, endpoint):
+        with measured(process.pid, http) as load:
+            time.sleep(10.0)
+        rows["idle"] = load.figures()
+        show("idle", rows["idle"])
         fleet = Fleet(endpoint, clients, processes)
         try:
-            for name in ("whole", "delta", "nothing moved"):
+            for name in ("whole", "delta", "nothing moved", "whole again"):
                 if name == "delta":
                     publish(folder, next_night(folder))
                 elif name == "nothing moved":
@@ -235,7 +242,7 @@ def measure_fleet(folder: Path, clients: int, processes: int) -> dict[str, dict[
                         republish(store)
                 time.sleep(2.0)  # announcements
                 with measured(process.pid, http) as load:
-                    found = fleet.fetch()
+                    found = fleet.fetch(anew=name == "whole again")
                 rows[name] = found | load.figures()
                 show(name, rows[name])
         finally:

@@ -68,6 +68,10 @@ class Robot:
         received = self._parts.received_bytes - begun_bytes
         self.phases.append({"seconds": time.monotonic() - begun_s, "bytes": received})
 
+    def forget(self) -> None:
+        """As a robot with an empty disk."""
+        self._manifest = None
+
     def close(self) -> None:
         self._bus.close()
 
@@ -107,7 +111,10 @@ def main() -> None:
     shared = Shared()
     robots = [Robot(endpoint, f"robot-{first + number}", shared) for number in range(count)]
     print("ready", flush=True)
-    for _ in sys.stdin:
+    for line in sys.stdin:
+        if line.strip() == "anew":
+            for robot in robots:
+                robot.forget()
         together(robots)
         print(json.dumps([robot.phases[-1] for robot in robots]), flush=True)
     for robot in robots:

@@ -22,14 +22,16 @@ def test_three_hundred_robots_fetch_a_site_and_a_delta() -> None:
     assert delta["bytes_per_robot"] <= 0.15 * whole["bytes_per_robot"]
     assert nothing["bytes_per_robot"] <= 0.01 * whole["bytes_per_robot"]
     assert whole["http_p99_ms"] < 50
-    assert max(row["rss_max_mb"] for row in (whole, delta, nothing)) < 500
+    # Once the server's caches are full, another 15 GB cost no more memory.
+    assert rows["whole again"]["rss_max_mb"] < 1.1 * rows["whole again"]["rss_begin_mb"]
+    assert rows["whole again"]["rss_max_mb"] < 500
 
 
 def test_a_hundred_thousand_hostile_inputs() -> None:
     before_mb = bench_map_fuzz.peak_mb()
     found = bench_map_fuzz.fuzz(100_000, seed=0)
     bench_map_fuzz.show(found)
-    assert sum(figures["inputs"] for figures in found.values()) > 99_000
+    assert sum(figures["inputs"] for figures in found.values()) >= 100_000
     assert max(figures["slowest_ms"] for figures in found.values()) < 2000
     assert bench_map_fuzz.peak_mb() - before_mb < 300
 

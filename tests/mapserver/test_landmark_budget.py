@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fleetmap.geometry import se3_exp
 from fleetmap.mapformat import encode_tile
 from map_samples import random_survey
 from mapserver import landmark_budget_kernels as kernels
-from mapserver.landmark_budget import path_m, within_budget
+from mapserver.landmark_budget import choose_landmarks, covered_path_m
 from mapserver.survey.result import SurveyMap
 from mapserver.survey.settings import BudgetSettings
 from mapserver.tiling import tiles_from_survey
@@ -58,24 +59,27 @@ def test_the_lazy_choice_is_the_plain_one(seed: int) -> None:
     assert set(np.flatnonzero(chosen)) == expected
 
 
-def seen_per_view(survey: SurveyMap) -> np.ndarray:
-    return np.bincount(survey.obs_keyframe, minlength=len(survey.map_from_body))
+def seen_per_view(survey: SurveyMap, chosen: np.ndarray) -> np.ndarray:
+    return np.bincount(survey.obs_keyframe[chosen[survey.obs_landmark]], minlength=len(survey.map_from_body))
 
 
 def test_every_view_keeps_its_share() -> None:
     survey = random_survey(np.random.default_rng(1), keyframes=20, landmarks=800)
-    cut = within_budget(survey, exactly(100), 16.0)
-    assert len(cut.landmark_ids) == 100
-    counts = seen_per_view(cut)
+    chosen = choose_landmarks(survey, exactly(100), 16.0)
+    assert chosen.sum() == 100
+    counts = seen_per_view(survey, chosen)
     assert counts.min() > 0.7 * counts.mean()
-    kept = np.isin(survey.landmark_ids, cut.landmark_ids)
-    for field in ("points_map", "descriptors", "point_sigma_m", "patches"):
-        np.testing.assert_array_equal(getattr(cut, field), getattr(survey, field)[kept])
-    pairs = {
-        (int(k), int(survey.landmark_ids[n])) for k, n in zip(survey.obs_keyframe, survey.obs_landmark, strict=True)
-    }
-    left = {(int(k), int(cut.landmark_ids[n])) for k, n in zip(cut.obs_keyframe, cut.obs_landmark, strict=True)}
-    assert left == {(k, n) for k, n in pairs if n in set(cut.landmark_ids.tolist())}
+
+
+def test_tiles_hold_what_was_chosen() -> None:
+    survey = random_survey(np.random.default_rng(1), keyframes=20, landmarks=800)
+    chosen = choose_landmarks(survey, exactly(100), 16.0)
+    tiles = tiles_from_survey(survey, 16.0, chosen=chosen)
+    ids = set(survey.landmark_ids[chosen].tolist())
+    assert {int(i) for tile in tiles for i in tile.landmark_ids} == ids
+    listed = {int(i) for tile in tiles for place in tile.place_landmark_ids for i in place}
+    assert listed == ids
+    assert sum(len(tile.place_ids) for tile in tiles) == 20
 
 
 def test_a_lonely_view_is_served_before_crowded_ones_get_more() -> None:
@@ -91,40 +95,51 @@ def test_a_lonely_view_is_served_before_crowded_ones_get_more() -> None:
         obs_octave=np.append(survey.obs_octave[other], np.zeros(25, np.int8)),
         obs_sigma_px=np.append(survey.obs_sigma_px[other], np.ones(25)),
     )
-    cut = within_budget(survey, exactly(120), 16.0)
+    chosen = choose_landmarks(survey, exactly(120), 16.0)
     # All others are seen several times: by how often they are seen alone, none of these would be kept.
     assert np.bincount(survey.obs_landmark)[np.isin(np.arange(400), own)].max() == 1
-    assert 5 <= seen_per_view(cut)[9] < 25
+    assert 5 <= seen_per_view(survey, chosen)[9] < 25
 
 
 def test_the_path_sets_the_budget_and_breaks_do_not_count() -> None:
     survey = random_survey(np.random.default_rng(3), keyframes=50, landmarks=500)
-    assert path_m(survey) == pytest.approx(
-        np.linalg.norm(np.diff(survey.map_from_body[:, :3, 3], axis=0), axis=1).sum()
-    )
+    whole_m = np.linalg.norm(np.diff((survey.map_from_body @ survey.body_from_cam)[:, :3, 3], axis=0), axis=1).sum()
+    assert covered_path_m(survey) == pytest.approx(whole_m)
     settings = BudgetSettings(landmarks_per_m=2.0, min_landmarks=10)
-    assert len(within_budget(survey, settings, 16.0).landmark_ids) == int(2.0 * path_m(survey))
+    assert choose_landmarks(survey, settings, 16.0).sum() == int(2.0 * whole_m)
     broken = survey.map_from_body.copy()
     broken[25:, 0, 3] += 1000.0
-    assert path_m(replace(survey, map_from_body=broken)) < path_m(survey)
+    assert whole_m - 5 < covered_path_m(replace(survey, map_from_body=broken)) < whole_m
+
+
+def test_the_same_way_again_adds_no_budget_and_the_way_back_does() -> None:
+    survey = random_survey(np.random.default_rng(3), keyframes=50)
+    once_m = covered_path_m(survey)
+    twice = np.concatenate([survey.map_from_body, survey.map_from_body + 0.1 * np.eye(4)[:, 3] * [[1], [1], [0], [0]]])
+    assert covered_path_m(replace(survey, map_from_body=twice)) == pytest.approx(once_m, abs=5.0)
+    turned = survey.map_from_body[::-1] @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    tilt = se3_exp(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))  # the camera looks along x, and back
+    there_and_back = np.concatenate([survey.map_from_body, turned]) @ tilt
+    assert covered_path_m(replace(survey, map_from_body=there_and_back, body_from_cam=np.eye(4))) > 1.8 * once_m
 
 
 def test_what_is_published_is_kept_first() -> None:
     survey = random_survey(np.random.default_rng(4), keyframes=20, landmarks=600)
-    worst = np.setdiff1d(survey.landmark_ids, within_budget(survey, exactly(500), 16.0).landmark_ids)[:60]
-    again = within_budget(survey, exactly(100), 16.0, published=worst)
-    seen = survey.landmark_ids[np.unique(survey.obs_landmark)]
-    assert set(again.landmark_ids) >= set(worst) & set(seen)
-    assert len(again.landmark_ids) == 100
+    ids = survey.landmark_ids
+    worst = ids[~choose_landmarks(survey, exactly(500), 16.0)][:60]
+    again = choose_landmarks(survey, exactly(100), 16.0, published=worst)
+    seen = ids[np.unique(survey.obs_landmark)]
+    assert set(ids[again]) >= set(worst) & set(seen)
+    assert again.sum() == 100
     # Nothing else changed, so nothing changes.
-    once_more = within_budget(survey, exactly(100), 16.0, published=again.landmark_ids)
-    assert set(once_more.landmark_ids) == set(again.landmark_ids)
+    once_more = choose_landmarks(survey, exactly(100), 16.0, published=ids[again])
+    np.testing.assert_array_equal(once_more, again)
 
 
 def test_tiles_stay_below_their_limit() -> None:
     survey = random_survey(np.random.default_rng(5), keyframes=10, landmarks=900)
-    tiles = tiles_from_survey(within_budget(survey, exactly(800, tile_landmarks=70), 16.0), 16.0)
-    assert max(len(tile) for tile in tiles) == 70
+    chosen = choose_landmarks(survey, exactly(800, tile_landmarks=70), 16.0)
+    assert max(len(tile) for tile in tiles_from_survey(survey, 16.0, chosen=chosen)) == 70
 
 
 def test_a_full_tile_of_the_default_budget_fits_in_256_kb() -> None:
@@ -132,16 +147,16 @@ def test_a_full_tile_of_the_default_budget_fits_in_256_kb() -> None:
     rng = np.random.default_rng(6)
     settings = BudgetSettings()
     survey = random_survey(rng, keyframes=60, landmarks=settings.tile_landmarks + 500)
+    map_from_body = survey.map_from_body.copy()
+    map_from_body[:, :2, 3] = rng.uniform(1, 15, (60, 2))
     survey = replace(
         survey,
         points_map=rng.uniform([0, 0, 0], [16, 16, 8], (len(survey.points_map), 3)),
         landmark_ids=np.sort(rng.choice(1 << 20, len(survey.landmark_ids), replace=False)).astype(np.uint32),
+        map_from_body=map_from_body,
     )
-    map_from_body = survey.map_from_body.copy()
-    map_from_body[:, :2, 3] = rng.uniform(1, 15, (60, 2))
-    survey = replace(survey, map_from_body=map_from_body)
-    cut = within_budget(survey, exactly(10_000, settings.tile_landmarks), 16.0)
-    largest = max(tiles_from_survey(cut, 16.0), key=len)
+    chosen = choose_landmarks(survey, exactly(10_000, settings.tile_landmarks), 16.0)
+    largest = max(tiles_from_survey(survey, 16.0, chosen=chosen), key=len)
     assert len(largest) == settings.tile_landmarks
     assert len(encode_tile(largest)) <= 256_000
 
@@ -156,4 +171,4 @@ def test_nothing_comes_of_nothing() -> None:
         obs_octave=survey.obs_octave[:0],
         obs_sigma_px=survey.obs_sigma_px[:0],
     )
-    assert len(within_budget(nobody, BudgetSettings(), 16.0).landmark_ids) == 0
+    assert not choose_landmarks(nobody, BudgetSettings(), 16.0).any()

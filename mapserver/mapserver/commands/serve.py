@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 _ANNOUNCE_EVERY_S = 1.0
 _STOP_WITHIN_S = 5
 _MIN_TOKEN = 16
+_SWITCH_INTERVAL_S = 0.001
 
 
 def serve(
@@ -58,6 +59,7 @@ def _run(
 ) -> None:
     import logging
     import signal
+    import sys
     from contextlib import asynccontextmanager
 
     import uvicorn
@@ -67,6 +69,8 @@ def _run(
     from mapserver.fleet import Fleet
     from mapserver.tile_service import TileService
 
+    # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     fleet = Fleet(maps)
     metrics = Metrics(maps, fleet)

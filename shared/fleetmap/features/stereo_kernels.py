@@ -130,8 +130,8 @@ def _correlate(
             squared[k] += value * value
         for k in range(size):
             a = np.int32(left[v, xl - half + k])
-            sl += a
-            sll += a * a
+            sl += int(a)
+            sll += int(a) * int(a)
             part = row[k : k + count]
             for n in range(count):
                 cross[n] += a * np.int32(part[n])

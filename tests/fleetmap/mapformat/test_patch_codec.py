@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleetmap.errors import MapFormatError, NewerFormatError
-from fleetmap.mapformat import Tile, apply_patch, encode_tile, make_patch, pack, sha256_hex, unpack
+from fleetmap.mapformat import Tile, apply_patch, decode_tile, encode_tile, make_patch, pack, sha256_hex, unpack
 from map_samples import random_tile
 
 LIMIT = 64 << 20
@@ -157,3 +157,32 @@ def test_huge_counts_are_refused_at_once() -> None:
     with pytest.raises(MapFormatError):
         apply_patch(base, pack(b"FMPT", 1, head, level=1, prefix=payload))
     assert time.perf_counter() - started < 1
+
+
+def test_patches_of_the_first_release_can_be_applied() -> None:
+    # Written by the release that brought the format; never to be changed. Server and robot may be of different ones.
+    base = bytes.fromhex(GOLDEN_TILE_HEX)
+    result = decode_tile(apply_patch(base, bytes.fromhex(GOLDEN_PATCH_HEX)))
+    assert result.points_map[1].tolist() == [-0.5, 47.0, 3.0]
+    assert [ids.tolist() for ids in result.place_landmark_ids] == [[7, 300]]
+    assert apply_patch(b"the old manifest", bytes.fromhex(GOLDEN_BYTES_PATCH_HEX)) == b"the new manifest"
+
+
+GOLDEN_TILE_HEX = (
+    "464d544c02000000a700000028b52ffd24a7000100ffffffff02000000000000000000304000feffff02000000010000"
+    "000300000040000007250001000000002000000000001f2000000000011e300000000000060000000200000102030405"
+    "060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f202122232425262728292a2b2c2d2e2f303132333435"
+    "363738393a3b3c3d3e3f2000002a000000100000003c10000008381000000010d80000050000000000f8ff0040280000"
+    "0001000000000000000003000000600000072500000100000001000000010000725fc30a"
+)
+GOLDEN_PATCH_HEX = (
+    "464d505401000000bb00000028b52ffd24bb60020005ff2dcc7afce05f4111cf83bb2446d5e7977aa3ddd9fbfebe2898"
+    "af40f97fd39a4eae534f1700f2757837fe75d493278fabbb5d1371dd76ca457ead1d5937cb0102000000000000000000"
+    "006c000010ff060300fbc21ad6d911c3062000002c010000100000001f100000001e18000000000044000008200100cb"
+    "c6080110000000000800003c08000038080000105c000020010000000100c6da00012000002c010100010000902155d8"
+)
+GOLDEN_BYTES_PATCH_HEX = (
+    "464d5054010000005c00000028b52ffd245c4c020024043646805089d04dccd103a08fbb221372224b5a75fda6c1cbc4"
+    "ab982295513222a5ef1f09b5bb7beaf692ab28fd60338d5b6d5800b4ac49e09aef44f055060c6b00000100c206a26c00"
+    "0038746865206e657701005f118c0100009cb57822"
+)
