@@ -38,7 +38,7 @@ def seen_by(table: Array, landmarks: int) -> Landmarks:
 
 
 def test_keyframes_that_repeat_each_other_do_not_all_go() -> None:
-    """Eight keyframes see the same forty landmarks, so each goes while three others are left to see them: three stay, the ends among them."""
+    """Eight keyframes see the same forty landmarks: each goes while three others see them, so three stay, the ends among them."""
     table = np.array([(n, k) for n in range(40) for k in range(8)])
     marks = seen_by(table, 40)
     gone = redundant(marks, np.zeros(len(table), np.int64), np.ones(40, bool), 8, CullSettings())
