@@ -14,7 +14,7 @@ from rich.console import Console
 from fleetmap.bow import Vocabulary, decode_vocabulary, encode_vocabulary
 from fleetmap.config import to_dict
 from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError
-from fleetmap.mapformat import CameraEntry
+from fleetmap.mapformat import CameraEntry, Manifest
 from fleetmap.recordings.tum import write_tum
 from fleetmap.rectification import StereoCamera
 from fleetmap.samples import Trajectory
@@ -83,7 +83,7 @@ def run_build(order: BuildOrder, settings: SurveySettings) -> str:
         return _keep(order, built, parent, settings, maps)
 
 
-def _parent(order: BuildOrder, maps: MapStore) -> tuple[int | None, SurveyMap | None]:
+def _parent(order: BuildOrder, maps: MapStore) -> tuple[Manifest | None, SurveyMap | None]:
     """The site's current version and all that is known of it, to build on; None for a site without one."""
     current = maps.current(order.site) if order.site in {info.site for info in maps.sites()} else None
     if current is None:
@@ -98,7 +98,7 @@ def _parent(order: BuildOrder, maps: MapStore) -> tuple[int | None, SurveyMap | 
         raise StoreError(
             f"version {current.version} of site {order.site} has no archive to build on; survey the site anew under another name"
         )
-    return current.version, decode_archive(archive)
+    return maps.manifest(order.site, current.version), decode_archive(archive)
 
 
 def _survey(
@@ -156,7 +156,7 @@ def _truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
     return chained(known, joined.trajectories) if len(known) == len(truths) else None
 
 
-def _keep(order: BuildOrder, built: _Built, parent: int | None, settings: SurveySettings, maps: MapStore) -> str:
+def _keep(order: BuildOrder, built: _Built, parent: Manifest | None, settings: SurveySettings, maps: MapStore) -> str:
     survey_map = built.joined.map
     chosen = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M)
     tiles = tiles_from_survey(survey_map, chosen=chosen)
@@ -174,7 +174,7 @@ def _keep(order: BuildOrder, built: _Built, parent: int | None, settings: Survey
         tile_size_m=TILE_SIZE_M,
         camera=_camera_entry(survey_map.camera),
         recordings=tuple(s.entry for s in built.taken),
-        configuration=_configuration(order, built.zones, settings),
+        configuration=_configuration(order, parent, built.zones, settings),
         libraries=_library_versions(),
         # A robot downloads the manifest: what it says about the build is short.
         report={key: value for key, value in msgspec.to_builtins(report).items() if key not in _NOT_FOR_ROBOTS},
@@ -187,11 +187,14 @@ def _keep(order: BuildOrder, built: _Built, parent: int | None, settings: Survey
     return _sentence(order.site, version, parent, report)
 
 
-def _configuration(order: BuildOrder, zones: Zones, settings: SurveySettings) -> dict[str, Any]:
-    """What the map depends on besides the recording; no paths, which mean nothing elsewhere."""
+def _configuration(
+    order: BuildOrder, parent: Manifest | None, zones: Zones, settings: SurveySettings
+) -> dict[str, Any]:
+    """What the map depends on besides the recordings; no paths, which mean nothing elsewhere."""
+    kept = parent is not None and bool(parent.configuration.get("frame_from_ground_truth"))
     return {
         "frames": order.frames,
-        "frame_from_ground_truth": order.frame_from_ground_truth,
+        "frame_from_ground_truth": order.frame_from_ground_truth or kept,
         "own_calibration": order.calibration is not None,
         "zones": {name: polygon.tolist() for name, polygon in zones.polygons.items()},
         "survey": to_dict(settings),
@@ -218,7 +221,7 @@ def _peak_rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
-def _write_files(order: BuildOrder, built: _Built, parent: int | None, report: BuildReport, version: int) -> None:
+def _write_files(order: BuildOrder, built: _Built, parent: Manifest | None, report: BuildReport, version: int) -> None:
     if order.trajectory is not None:
         write_tum(order.trajectory, built.joined.map.trajectory)
     if order.picture is not None:
@@ -241,10 +244,10 @@ def _write(path: Path, data: bytes) -> None:
         raise StoreError(f"{path} cannot be written ({error.strerror}); the draft is stored all the same") from error
 
 
-def _sentence(site: str, version: int, parent: int | None, report: BuildReport) -> str:
+def _sentence(site: str, version: int, parent: Manifest | None, report: BuildReport) -> str:
     ate = "" if report.ate_rmse_m is None else f", ATE {report.ate_rmse_m:.4f} m"
     sizes = f"{report.map_bytes} bytes, {report.loops['accepted']} loops{ate}, in {report.seconds:.1f} s"
-    built_on = "" if parent is None else f" on version {parent}"
+    built_on = "" if parent is None else f" on version {parent.version}"
     left = [s["recording"] for s in report.sessions if not s["joined"]]
     left_out = f"; left out, they could not be joined: {', '.join(left)}" if left else ""
     return (

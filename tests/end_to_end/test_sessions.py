@@ -14,11 +14,17 @@ from typer.testing import CliRunner, Result
 import box_room
 from box_room import out_and_back, ride_sample
 from fleetmap.errors import SurveyError, UsageError
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, se3
 from fleetmap.mapformat import Tile, decode_tile
+from fleetmap.recordings import open_recording
+from fleetmap.rectification import Rectifier
 from mapserver.cli import app
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
+from mapserver.survey.pipeline import survey
+from mapserver.survey.sessions.extend import Extension, NotJoined, extend
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.zones import Zones
 from recording_samples import Sample, make_sample, write_euroc
 
 FRAME_S = 0.1
@@ -184,13 +190,11 @@ def test_the_archive_remembers_what_was_expected_and_seen(nights: Nights) -> Non
 
 def test_the_same_night_again_gives_the_same_tiles(nights: Nights) -> None:
     """On the same version, the same recording ends in the same bytes."""
-    hashes = []
-    for _ in range(2):
-        run("build", nights.folder / "night4", "--site", "lab", "--store", nights.store)
-        with MapStore.open(nights.store) as maps:
-            newest = maps.versions("lab")[-1].version
-            hashes.append([tile.sha256 for tile in maps.manifest("lab", newest).tiles])
-    assert hashes[0] == hashes[1]
+    copy = nights.folder / "three_nights"
+    run("build", nights.folder / "night4", "--site", "lab", "--store", copy)
+    with MapStore.open(copy) as again, MapStore.open(nights.store) as maps:
+        assert again.manifest("lab", 4).tiles == maps.manifest("lab", 4).tiles
+        assert again.archive("lab", 4) == maps.archive("lab", 4)
 
 
 def test_the_frame_of_a_site_stays(nights: Nights) -> None:
@@ -217,6 +221,30 @@ def test_recordings_are_joined_and_a_foreign_one_is_left_out(nights: Nights, tmp
     assert report["duration_s"] == pytest.approx(4.9 + 4.3)
     with MapStore.open(tmp_path / "store") as maps:
         assert [r.name for r in maps.manifest("hall", 1).recordings] == ["night1", "night2"]
+
+
+def test_a_prior_joins_what_sees_nothing_of_the_map(nights: Nights, tmp_path: Path) -> None:
+    """A survey of another place whose docks are known comes beside the map, which stays as it is."""
+    with MapStore.open(nights.store) as maps:
+        archive = maps.archive("lab", 1)
+    assert archive is not None
+    base, settings = decode_archive(archive), SurveySettings()
+    with open_recording(write_euroc(tmp_path / "foreign", make_sample(20))) as recording:
+        foreign = survey(
+            (recording.read_frame(n) for n in range(20)), 20, recording.imu, recording.calibration,
+            Rectifier(recording.calibration, pinhole=base.camera), None, settings, Zones(), lambda *_: None,
+        )  # fmt: skip
+    assert isinstance(extend(base, foreign, settings, anchored=True), NotJoined)
+    there = se3(np.eye(3), np.array([30.0, 20.0, 0.0]))
+    both = extend(base, foreign, settings, anchored=True, map_from_survey=there)
+    assert isinstance(both, Extension)
+    assert both.counts.keyframes_in_map == 0
+    assert both.counts.landmarks_kept == len(base.landmark_ids)
+    assert both.counts.landmarks_added > 50
+    np.testing.assert_array_equal(both.map.points_map[: len(base.points_map)], base.points_map)
+    wanted = there @ foreign.map.trajectory.frame_from_body
+    np.testing.assert_allclose(both.map.trajectory.frame_from_body[0], wanted[0], atol=1e-6)
+    assert np.linalg.norm((both.map.trajectory.frame_from_body - wanted)[:, :3, 3], axis=1).max() < 0.05
 
 
 def test_a_site_takes_no_map_of_another_place(nights: Nights, tmp_path: Path) -> None:

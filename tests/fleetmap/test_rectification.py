@@ -1,13 +1,16 @@
 """Rectified pairs against the lens models: dots painted where a lens sees a point must appear where the pinhole says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from fleetmap.calibration import CameraCalibration, RigCalibration
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, transform_points
-from fleetmap.rectification import RGBD_BASELINE_M, Rectifier
+from fleetmap.rectification import RGBD_BASELINE_M, Rectifier, StereoCamera
 from fleetmap.samples import CameraFrame, Image
+from recording_samples import calibration as sample_calibration
 
 WIDTH, HEIGHT = 320, 240
 BODY_FROM_CAM0 = se3_exp(np.array([-1.2, 1.2, -1.2, 0.05, 0.02, 0.01]))
@@ -149,3 +152,26 @@ def test_a_picture_of_another_size_is_refused(side: str) -> None:
     frame = CameraFrame(123, small, good) if side == "left" else CameraFrame(123, good, small)
     with pytest.raises(RecordingError, match=r"at 123 is 160x120.*320x240"):
         rectifier.rectify(frame)
+
+
+def test_a_rig_is_seen_through_the_pinhole_that_is_asked_for() -> None:
+    """A picture whose grey is its column: through another pinhole each pixel shows the column that its ray came from."""
+    straight = sample_calibration()
+    own = Rectifier(straight).camera
+    pinhole = StereoCamera(1.25 * own.focal_px, own.cx_px + 7.0, own.cy_px - 3.0, 0.9, own.width_px - 40, own.height_px)
+    rectifier = Rectifier(straight, pinhole=pinhole)
+    assert rectifier.camera == replace(pinhole, baseline_m=own.baseline_m)
+    columns = np.tile(np.arange(own.width_px) % 200, (own.height_px, 1)).astype(np.uint8)
+    seen = rectifier.rectify(CameraFrame(1, columns, columns)).left
+    assert seen.shape == (pinhole.height_px, pinhole.width_px)
+    x = np.arange(60, 200)
+    wanted = own.cx_px + (x - pinhole.cx_px) / 1.25
+    np.testing.assert_allclose(seen[100, x], wanted, atol=1.0)
+
+
+def test_a_pinhole_far_from_the_rigs_is_refused() -> None:
+    straight = sample_calibration()
+    own = Rectifier(straight).camera
+    for factor in (0.5, 2.0):
+        with pytest.raises(CalibrationError, match="focal length"):
+            Rectifier(straight, pinhole=replace(own, focal_px=factor * own.focal_px))

@@ -3,23 +3,20 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetmap.samples import Trajectory
 from mapserver.survey.pipeline import Survey, chain_edges
 from mapserver.survey.result import SurveyMap
 from mapserver.survey.sessions.base_map import BaseMap
-from mapserver.survey.sessions.joint import Joint, adjust_jointly, free_observations
-from mapserver.survey.sessions.life import count_looks, faded, shifts
-from mapserver.survey.sessions.merge import Change, chosen, fewer_keyframes, joined, merged, resighted
-from mapserver.survey.sessions.novelty import new_landmarks
+from mapserver.survey.sessions.changes import what_changes
+from mapserver.survey.sessions.joint import Joint, adjust_jointly
+from mapserver.survey.sessions.life import count_looks, faded
+from mapserver.survey.sessions.merge import merged
 from mapserver.survey.sessions.placing import find_fixes, follow_fixes, place_survey
 from mapserver.survey.sessions.sightings import Sighting, sight
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.trajectory import frame_trajectory
-
-_KEYFRAME_MOVED = 22.458  # 0.999 of chi-square with 6 degrees of freedom
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +96,7 @@ def _compare(
     map_from_cam = joint.map_from_body @ state.body_from_cam
     looks = count_looks(base, guess.keyframes, map_from_cam, joint.sightings)
     gone = faded(base, looks, settings) if anchored else np.zeros(len(base.points_map), bool)
-    change, moved_keyframes, moved_landmarks = _change(base, survey, joint, gone, settings, anchored)
+    change, moved_keyframes, moved_landmarks = what_changes(base, survey, joint, gone, settings, anchored=anchored)
     keyframe_frames = [k.frame_index for k in guess.keyframes]
     stamps = np.array([e.stamp_ns for e in guess.estimates], np.int64)
     trajectory = Trajectory(
@@ -125,55 +122,3 @@ def _compare(
         seen_rate=round(looks.rate, 4),
     )
     return Extension(result, counts)
-
-
-def _change(
-    base: BaseMap, survey: Survey, joint: Joint, gone: NDArray[np.bool_], settings: SurveySettings, anchored: bool
-) -> tuple[Change, int, int]:
-    """What happens to the map; how many keyframes and landmarks of it moved."""
-    marks = survey.state.landmarks
-    map_from_cam = joint.map_from_body @ survey.state.body_from_cam
-    places, points, shifted = (
-        base.map.map_from_body.copy(),
-        base.points_map.copy(),
-        np.zeros(len(base.map_from_body), bool),
-    )
-    shifted[joint.base_keyframes] = _keyframes_moved(base, joint, settings) if anchored else True
-    back = survey.state.body_from_cam @ np.linalg.inv(base.map.body_from_cam)
-    replace_with = np.zeros_like(places)
-    replace_with[joint.base_keyframes] = joint.base_from_body @ back
-    places[shifted] = replace_with[shifted]
-    with_keyframe = np.zeros(len(points), bool)
-    with_keyframe[base.map.obs_landmark[shifted[base.map.obs_keyframe]]] = True
-    judged = shifts(base, map_from_cam, joint.sightings, settings)
-    alone = judged.significant & ~with_keyframe[judged.rows] & ~gone[judged.rows]
-    carried = np.zeros(len(points), bool)
-    carried[joint.base_rows] = True
-    if anchored:
-        carried[judged.rows[~judged.significant]] = False
-        carried &= with_keyframe
-    now = points.copy()
-    now[joint.base_rows] = joint.base_points_map
-    points[carried] = now[carried]
-    keep = ~gone
-    keep[judged.rows[alone]] = False
-    free = free_observations(marks, joint.sightings)
-    fresh = new_landmarks(base, survey.first_guess.keyframes, marks, joint, free, settings.sessions)
-    again = resighted(base, judged.rows[alone], judged.points_map[alone], joint.sightings)
-    added = fewer_keyframes(
-        joined(again, chosen(marks, joint.own_points_map, fresh, free)), settings.sessions.min_confirmations
-    )
-    ids = np.r_[base.map.landmark_ids[judged.rows[alone]].astype(np.int64), np.full(fresh.sum(), -1)]
-    moved = int(alone.sum() + carried.sum())
-    return Change(keep, points, places, added, ids, map_from_cam), int(shifted.sum()), moved
-
-
-def _keyframes_moved(base: BaseMap, joint: Joint, settings: SurveySettings) -> Array:
-    """(B,) keyframes of the map that the new survey moved by more than their anchors admit."""
-    s = settings.sessions
-    before = base.map_from_body[joint.base_keyframes]
-    shift_m = np.linalg.norm(joint.base_from_body[:, :3, 3] - before[:, :3, 3], axis=1)
-    turns = joint.base_from_body[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1)
-    angle = np.arccos(np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1))
-    squared = (shift_m / s.anchor_sigma_m) ** 2 + (angle / np.radians(s.anchor_sigma_deg)) ** 2
-    return np.asarray(squared > _KEYFRAME_MOVED)

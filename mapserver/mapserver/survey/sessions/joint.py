@@ -40,7 +40,8 @@ def adjust_jointly(
 ) -> Joint:  # fmt: skip
     """Old and new keyframes and landmarks that fit all observations best; map_from_body (K, 4, 4) is where the new ones start.
 
-    anchored: the map is published, its keyframes stay within `anchor_sigma_m`; else only its first one holds it.
+    anchored: the map is published, its keyframes stay within `anchor_sigma_m`; else only its first one holds it. A survey that
+    sees nothing of the map keeps its shape, and its first keyframe its place.
     """
     for _ in range(2):
         problem = _Problem(base, state, map_from_body, sightings, settings, anchored)
@@ -104,7 +105,7 @@ class _Problem:
         first[marks.obs_landmark[::-1]] = marks.obs_keyframe[::-1]  # carried with the keyframe that defines them
         carried = np.einsum("nij,nj->ni", turn[first], marks.points_map) + shift[first]
         fixed = np.zeros(self.old + len(self.start), bool)
-        if not self.anchored and self.old:
+        if not (self.anchored and self.old):  # the map's first keyframe, or the survey's where it sees none of the map
             fixed[0] = True
         problem = BundleProblem(
             base.camera, state.body_from_cam, np.concatenate([base.map_from_body[self.base_keyframes], self.start]), fixed,

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.pose_solver import GATE_SQUARED
 from mapserver.survey.keyframes import Keyframe
 from mapserver.survey.sessions.base_map import BaseMap, Rows
 from mapserver.survey.sessions.sightings import Sighting
@@ -20,6 +21,7 @@ _WIDER_VIEW_RAD = 0.17
 _MAX_OCTAVE = 7.0
 _PRIOR_LOOKS = 4.0  # what the whole survey's rate of being seen counts for, where a landmark has no history
 _AGAINST = 7.815  # 0.95 of chi-square with 3 degrees of freedom: an observation that speaks against a place
+_DOUBTED, _SETTLED = 0.5, 0.8  # shares of sightings: against the old place, in favour of the new one
 _MIN_SIGHTINGS = 3  # below which nothing is said about a landmark's place
 
 
@@ -100,7 +102,8 @@ def shifts(base: BaseMap, map_from_cam: Array, sightings: Sequence[Sighting | No
     """Each landmark placed by its sightings alone, from cameras map_from_cam (K, 4, 4), against where the map has it.
 
     The difference is judged by both covariances, keyframes taken as known, and `still_m` for what those leave out; and most
-    sightings must speak against the old place each for itself: what none of them can tell apart does robots no harm.
+    sightings must speak against the old place each for itself (what none of them can tell apart does robots no harm) and nearly
+    all for the new one: corners where one thing hides another stand nowhere.
     """
     seen = [(k, s) for k, s in enumerate(sightings) if s is not None]
     landmark = np.concatenate([s.rows for _, s in seen]) if seen else np.zeros(0, np.int64)
@@ -127,9 +130,13 @@ def shifts(base: BaseMap, map_from_cam: Array, sightings: Sequence[Sighting | No
     spread = np.linalg.inv(old + slack) + np.linalg.inv(info + slack) + settings.sessions.still_m**2 * np.eye(3)
     off = new - base.points_map[rows]
     squared = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0])
-    against = _squared(base, base.points_map[rows], cameras, numbers, pixels, sigmas)
-    doubted = np.bincount(numbers, against > _AGAINST, len(rows)) > 0.5 * np.bincount(numbers, minlength=len(rows))
-    return Shift(rows, new, doubted & (squared > settings.sessions.significance))
+    counts = np.bincount(numbers, minlength=len(rows))
+    old_squared, new_squared = (
+        _squared(base, p, cameras, numbers, pixels, sigmas) for p in (base.points_map[rows], new)
+    )
+    doubted = np.bincount(numbers, old_squared > _AGAINST, len(rows)) > _DOUBTED * counts
+    settled = np.bincount(numbers, new_squared < GATE_SQUARED, len(rows)) >= _SETTLED * counts
+    return Shift(rows, new, doubted & settled & (squared > settings.sessions.significance))
 
 
 def _squared(
