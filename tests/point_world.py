@@ -15,7 +15,11 @@ from inertial_motion import analytic_motion, sample_motion
 CAMERA = StereoCamera(300.0, 320.0, 240.0, 0.12, 640, 480)
 BODY_FROM_CAM = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.05, 0.03, 0.02]))
 NOISE = ImuNoise(2e-3, 1e-4, 2e-2, 1e-3)
-SETTINGS = FilterSettings(chi_square_share=0.999)
+# white noise of the size that measurements are weighed by, and nothing else
+SETTINGS = FilterSettings(
+    chi_square_share=0.999, noise_share=1.0, slip_along_share=0.0, slip_across_share=0.0, track_disparity_sigma_px=0.0,
+    disparity_offset_sigma_px=0.0, depth_scale_sigma=0.0,
+)  # fmt: skip
 IMU_RATE_HZ = 200.0
 FRAME_S = 0.1
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary, train_vocabulary
+from fleetmap.calibration import RigCalibration
 from fleetmap.features import orb
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.mapformat import Tile
@@ -84,9 +85,12 @@ def blank(session: EstimatorSession, frame: int) -> RectifiedFrame:
     return RectifiedFrame(session.stamps_ns[frame], np.zeros((1, 1), np.uint8), None, None)
 
 
-def run_odometry(session: EstimatorSession, frames: int | None = None) -> list[OdometryEstimate]:
-    """The odometry's estimates over a session."""
-    nominal, settings = session.session.nominal, OdometrySettings()
+def run_odometry(
+    session: EstimatorSession, frames: int | None = None, calibration: RigCalibration | None = None,
+    settings: OdometrySettings | None = None,
+) -> list[OdometryEstimate]:  # fmt: skip
+    """The odometry's estimates over a session; `calibration` in the place of the rig's nominal one."""
+    nominal, settings = calibration or session.session.nominal, settings or OdometrySettings()
     odometry = Odometry(nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s, settings)
     odometry._tracker = EstimatorTracker(session, session.camera, settings.tracker)
     estimates, last_ns = [], 0

@@ -1,5 +1,6 @@
 """The right-invariant multi-state constraint filter: state, propagation, clones, update."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from statistics import NormalDist
 
@@ -10,6 +11,7 @@ from fleetmap.calibration import ImuNoise
 from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log
 from fleetmap.odometry import filter_kernels
 from fleetmap.odometry.settings import FilterSettings
+from fleetmap.odometry.tracks import Track, TrackBatch
 from fleetmap.rectification import StereoCamera
 from fleetmap.samples import ImuSamples
 
@@ -18,21 +20,8 @@ _GRAVITY = np.array([0.0, 0.0, -GRAVITY_MPS2])
 _NAV = 15  # rotation, velocity, position, gyro bias, accelerometer bias
 _OFFSET = 15  # index of the time offset
 _CLONES = 16  # index of the first clone
+_PAIR = 2  # errors of the stereo pair, disparity offset and depth scale, come before all others in the budget
 _POSITION_GATE = 11.345  # 0.99 of chi-square with 3 degrees of freedom
-
-
-@dataclass(frozen=True, slots=True)
-class Track:
-    """Observations of one point: which clones (n,), pixels (n, 3) u_left v u_right.
-
-    A first guess of the point as clone `anchor` sees it is in camera axes (3,), so that it follows the clone when an
-    iterated update moves it.
-    """
-
-    clone_ids: NDArray[np.int64]
-    pixels: Array
-    anchor: int
-    point_cam: Array
 
 
 @dataclass
@@ -50,11 +39,20 @@ class NavState:
         """(4, 4)."""
         return se3(self.rotation, self.position_m)
 
+    def copy(self) -> "NavState":
+        """One that shares nothing."""
+        return NavState(**{name: value.copy() for name, value in vars(self).items()})
+
 
 class InvariantFilter:
     """Keeps the current state and a window of past body transforms (clones) with their joint covariance.
 
     Without an IMU the state moves by `displace` instead of `propagate`; velocity and biases are then idle.
+
+    Two covariances are kept. `covariance` is what measurements are weighed and gated by: noise that is white, the same
+    for all pixels, and wide, which is robust to what no model tells. `budget` is what the same corrections leave of all
+    errors that are known: points that slip along their way, disparities that stay wrong, a pair that is slightly off.
+    It alone is reported. Source: covariance analysis of suboptimal filters, Maybeck 1979, chapter 6.
     """
 
     def __init__(
@@ -64,24 +62,54 @@ class InvariantFilter:
         settings: FilterSettings,
         camera: StereoCamera,
         body_from_cam: Array,
+        budget: Array | None = None,
     ) -> None:
+        """nav_covariance (15, 15) in the filter's error; budget: the same as it really is, where it differs."""
         self.state = state
         self.imu_minus_cam_s = 0.0
         self.clone_ids: list[int] = []
-        self._rotations: list[Array] = []
-        self._positions: list[Array] = []
+        self._rotations, self._positions = np.zeros((0, 3, 3)), np.zeros((0, 3))
         self._settings = settings
         self._camera = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.focal_px * camera.baseline_m])
         self._weights = np.array([1 / settings.pixel_sigma_px, 1 / settings.disparity_sigma_px])
         self._body_from_cam = np.ascontiguousarray(body_from_cam)
+        self._noise = np.array(
+            [
+                settings.noise_share**2,
+                settings.slip_along_share,
+                settings.slip_across_share,
+                settings.track_disparity_sigma_px,
+            ]
+        )
+        self._pair_variance = np.array([settings.disparity_offset_sigma_px, settings.depth_scale_sigma]) ** 2
         self._quantile = NormalDist().inv_cdf(settings.chi_square_share)
         self.covariance = np.zeros((_CLONES, _CLONES))
         self.covariance[:_NAV, :_NAV] = nav_covariance
         self.covariance[_OFFSET, _OFFSET] = settings.time_offset_sigma_s**2
+        self.budget = np.zeros((_PAIR + _CLONES, _PAIR + _CLONES))
+        self.budget[_PAIR:, _PAIR:] = self.covariance
+        if budget is not None:
+            self.budget[_PAIR : _PAIR + _NAV, _PAIR : _PAIR + _NAV] = budget
+        self.budget[range(_PAIR), range(_PAIR)] = self._pair_variance
 
-    def propagate(self, imu: ImuSamples, start_ns: int, end_ns: int, noise: ImuNoise) -> Array:
-        """Moves the state from start_ns to end_ns; returns the last angular rate (3,), bias removed."""
+    def propagate(
+        self, imu: ImuSamples, start_ns: int, end_ns: int, noise: ImuNoise, real_noise: ImuNoise | None = None
+    ) -> Array:
+        """Moves the state from start_ns to end_ns; returns the last angular rate (3,), bias removed.
+
+        noise weighs the prediction; real_noise, where it differs, goes into the budget.
+        """
         steps_s, gyro, accel = imu_intervals(imu, start_ns, end_ns)
+        real_phi, real_process = self._integrate(self.state.copy(), steps_s, gyro, accel, real_noise or noise)
+        phi, process = self._integrate(self.state, steps_s, gyro, accel, noise)
+        self._transition(phi, process, real_process)
+        self._forget_pair(max(end_ns - start_ns, 0) * 1e-9)
+        return gyro[-1] - self.state.gyro_bias_radps if len(gyro) else np.zeros(3)
+
+    def _integrate(
+        self, s: NavState, steps_s: Array, gyro: Array, accel: Array, noise: ImuNoise
+    ) -> tuple[Array, Array]:
+        """Moves `s` in place; returns transition and process noise, (15, 15) each."""
         phi, process = np.eye(_NAV), np.zeros((_NAV, _NAV))
         densities = np.array(
             [
@@ -91,16 +119,16 @@ class InvariantFilter:
                 noise.accel_walk_mps3_rthz,
             ]
         )
-        s = self.state
         if len(steps_s):
             filter_kernels.propagate(
                 s.rotation, s.velocity_mps, s.position_m, s.gyro_bias_radps, s.accel_bias_mps2, _GRAVITY,
                 steps_s, gyro, accel, densities, phi, process,
             )  # fmt: skip
-        self._transition(phi, process)
-        return gyro[-1] - s.gyro_bias_radps if len(gyro) else np.zeros(3)
+        return phi, process
 
-    def displace(self, body_from_next: Array, rotation_sigma_rad: float, translation_sigma_m: float) -> None:
+    def displace(
+        self, body_from_next: Array, rotation_sigma_rad: float, translation_sigma_m: float, duration_s: float = 0.0
+    ) -> None:
         """Moves the state by a relative transform that is known only as well as the sigmas say."""
         s = self.state
         rotation = s.rotation.copy()
@@ -111,7 +139,9 @@ class InvariantFilter:
         shape[6:9, 0:3] = skew(s.position_m) @ s.rotation
         shape[6:9, 3:6] = s.rotation
         sigmas = np.array([rotation_sigma_rad] * 3 + [translation_sigma_m] * 3)
-        self._transition(np.eye(_NAV), (shape * sigmas**2) @ shape.T)
+        process = (shape * sigmas**2) @ shape.T
+        self._transition(np.eye(_NAV), process, process)
+        self._forget_pair(duration_s)
 
     def add_clone(self, clone_id: int, rate_body_radps: Array) -> None:
         """Keeps the current body transform in the window; the rate ties it to the time offset."""
@@ -122,16 +152,11 @@ class InvariantFilter:
         jacobian[3:6, 6:9] = np.eye(3)
         jacobian[0:3, _OFFSET] = turn
         jacobian[3:6, _OFFSET] = s.velocity_mps + np.cross(s.position_m, turn)
-        cross = jacobian @ self.covariance
-        grown = np.empty((size + 6, size + 6))
-        grown[:size, :size] = self.covariance
-        grown[size:, :size] = cross
-        grown[:size, size:] = cross.T
-        grown[size:, size:] = cross @ jacobian.T
-        self.covariance = grown
+        self.covariance = _grown(self.covariance, jacobian)
+        self.budget = _grown(self.budget, np.hstack([np.zeros((6, _PAIR)), jacobian]))
         self.clone_ids.append(clone_id)
-        self._rotations.append(s.rotation.copy())
-        self._positions.append(s.position_m.copy())
+        self._rotations = np.concatenate([self._rotations, s.rotation[None]])
+        self._positions = np.concatenate([self._positions, s.position_m[None]])
 
     def remove_clone(self, clone_id: int) -> None:
         """Forgets a clone (marginalises it)."""
@@ -139,8 +164,11 @@ class InvariantFilter:
         keep = np.ones(len(self.covariance), bool)
         keep[_CLONES + 6 * index : _CLONES + 6 * index + 6] = False
         self.covariance = self.covariance[np.ix_(keep, keep)]
-        for values in (self.clone_ids, self._rotations, self._positions):
-            del values[index]
+        keep = np.concatenate([np.ones(_PAIR, bool), keep])
+        self.budget = self.budget[np.ix_(keep, keep)]
+        del self.clone_ids[index]
+        self._rotations = np.delete(self._rotations, index, axis=0)
+        self._positions = np.delete(self._positions, index, axis=0)
 
     def odom_from_clone(self, clone_id: int) -> Array:
         """(4, 4) odom_from_body of a clone."""
@@ -149,7 +177,7 @@ class InvariantFilter:
 
     def update(
         self,
-        tracks: list[Track],
+        tracks: TrackBatch | Sequence[Track],
         iterations: int = 1,
         newest_odom_from_body: Array | None = None,
         sigma_scale: float = 1.0,
@@ -160,42 +188,48 @@ class InvariantFilter:
         then where the newest clone is linearised first, when vision knows it better than the prediction. It adds no
         information. sigma_scale widens the measurement noise, for matches that are less exact than flow.
         """
-        used = np.zeros(len(tracks), np.int8)
-        if not tracks:
+        batch = tracks if isinstance(tracks, TrackBatch) else TrackBatch.of(tracks)
+        used = np.zeros(len(batch), np.int8)
+        if not len(batch):
             return used
-        index_of = {clone_id: index for index, clone_id in enumerate(self.clone_ids)}
-        starts = np.concatenate([[0], np.cumsum([len(t.clone_ids) for t in tracks])]).astype(np.int64)
-        clones = np.array([index_of[int(c)] for t in tracks for c in t.clone_ids], np.int64)
-        pixels = np.concatenate([t.pixels for t in tracks])
-        points = np.array([t.point_cam for t in tracks])
-        anchors = np.array([index_of[t.anchor] for t in tracks], np.int64)
-        prior = (NavState(**vars(self.state)), list(self._rotations), list(self._positions), self.imu_minus_cam_s)
+        order = np.argsort(self.clone_ids)
+        ids = np.array(self.clone_ids)[order]
+        clones, anchors = (order[np.searchsorted(ids, wanted)] for wanted in (batch.clone_ids, batch.anchors))
+        prior = self._kept()
         size = 6 * len(self.clone_ids)
         inner = np.ascontiguousarray(self.covariance[_CLONES:, _CLONES:])
         moved = np.zeros(size)
         if newest_odom_from_body is not None:
             error = newest_odom_from_body @ se3_inverse(se3(self._rotations[-1], self._positions[-1]))
             moved[-6:] = np.concatenate([so3_log(error[:3, :3]), error[:3, 3]])
-            self._rotations[-1], self._positions[-1] = (
-                newest_odom_from_body[:3, :3].copy(),
-                newest_odom_from_body[:3, 3].copy(),
-            )
+            self._rotations[-1] = newest_odom_from_body[:3, :3]
+            self._positions[-1] = newest_odom_from_body[:3, 3]
         for _ in range(iterations):
-            information, vector = np.zeros((size, size)), np.zeros(size)
+            information, scatter, vector = np.zeros((size, size + 2)), np.zeros((size, size)), np.zeros(size)
             filter_kernels.accumulate_tracks(
-                np.array(self._rotations), np.array(self._positions), self._body_from_cam, starts, clones, pixels,
-                anchors, points, self._camera, self._weights / sigma_scale, inner, moved, self._quantile, information,
-                vector, used,
+                self._rotations, self._positions, self._body_from_cam, batch.starts, clones, batch.pixels, anchors,
+                batch.points_cam, self._camera, self._weights / sigma_scale, self._noise, inner, moved, self._quantile,
+                information, scatter, vector, used,
             )  # fmt: skip
-            gain = np.linalg.solve(np.eye(size) + information @ inner, np.column_stack([vector, information]))
-            correction = self.covariance[:, _CLONES:] @ gain[:, 0]
+            weighing = np.eye(size) + inner @ information[:, _PAIR:].T
+            gain = np.linalg.solve(weighing, self.covariance[_CLONES:]).T
+            correction = gain @ vector
             self._restore(prior)
             self._correct(correction)
             moved = correction[_CLONES:]
-        columns = self.covariance[:, _CLONES:]
-        updated = self.covariance - columns @ gain[:, 1:] @ columns.T
-        self.covariance = 0.5 * (updated + updated.T)
+        self._learn(gain, information, scatter)
         return used
+
+    def _learn(self, gain: Array, information: Array, scatter: Array) -> None:
+        """Both covariances after a correction by gain (n, 6 M), arguments as from `accumulate_tracks`."""
+        learned = gain @ (information[:, _PAIR:] @ self.covariance[_CLONES:])
+        self.covariance = _symmetric(self.covariance - learned)
+        left = np.eye(len(self.budget))
+        left[_PAIR:, :_PAIR] -= gain @ information[:, :_PAIR]
+        left[_PAIR:, _PAIR + _CLONES :] -= gain @ information[:, _PAIR:]
+        self.budget = left @ self.budget @ left.T
+        self.budget[_PAIR:, _PAIR:] += gain @ scatter @ gain.T
+        self.budget = _symmetric(self.budget)
 
     def correct_with(self, jacobian: Array, residual: Array, noise: Array) -> float:
         """A linear measurement residual = jacobian @ error + noise; returns its normalised innovation squared."""
@@ -203,8 +237,12 @@ class InvariantFilter:
         innovation = jacobian @ cross + noise
         gain = np.linalg.solve(innovation, cross.T).T
         self._correct(gain @ residual)
-        updated = self.covariance - gain @ innovation @ gain.T
-        self.covariance = 0.5 * (updated + updated.T)
+        self.covariance = _symmetric(self.covariance - gain @ innovation @ gain.T)
+        left = np.eye(len(self.budget))
+        left[_PAIR:, _PAIR:] -= gain @ jacobian
+        self.budget = left @ self.budget @ left.T
+        self.budget[_PAIR:, _PAIR:] += gain @ noise @ gain.T
+        self.budget = _symmetric(self.budget)
         return float(residual @ np.linalg.solve(innovation, residual))
 
     def open_up(self, clone_id: int, seen_odom_from_body: Array, gap_s: float) -> bool:
@@ -224,8 +262,9 @@ class InvariantFilter:
         if off @ np.linalg.solve(spread, off) < _POSITION_GATE:
             return False
         size = float(np.linalg.norm(off))
-        self.covariance[6:9, 6:9] += size**2 * np.eye(3)
-        self.covariance[3:6, 3:6] += (size / max(gap_s, 0.1)) ** 2 * np.eye(3)
+        for wide in (self.covariance, self.budget[_PAIR:, _PAIR:]):
+            wide[6:9, 6:9] += size**2 * np.eye(3)
+            wide[3:6, 3:6] += (size / max(gap_s, 0.1)) ** 2 * np.eye(3)
         return True
 
     def motion_since(self, clone_id: int) -> tuple[Array, Array]:
@@ -236,7 +275,7 @@ class InvariantFilter:
         """
         at = _CLONES + 6 * self.clone_ids.index(clone_id)
         newest = _CLONES + 6 * (len(self.clone_ids) - 1)
-        c = self.covariance
+        c = self.budget[_PAIR:, _PAIR:]
         difference = c[newest : newest + 6, newest : newest + 6] + c[at : at + 6, at : at + 6]
         difference = difference - c[newest : newest + 6, at : at + 6] - c[at : at + 6, newest : newest + 6]
         earlier_from_odom = se3_inverse(self.odom_from_clone(clone_id))
@@ -253,16 +292,28 @@ class InvariantFilter:
         jacobian[0:3, 0:3] = np.eye(3)
         jacobian[3:6, 0:3] = -skew(self.state.position_m)
         jacobian[3:6, 6:9] = np.eye(3)
-        return np.asarray(jacobian @ self.covariance[:_NAV, :_NAV] @ jacobian.T)
+        return np.asarray(jacobian @ self.budget[_PAIR : _PAIR + _NAV, _PAIR : _PAIR + _NAV] @ jacobian.T)
 
-    def _transition(self, phi: Array, process: Array) -> None:
-        self.covariance[:_NAV, :] = phi @ self.covariance[:_NAV, :]
-        self.covariance[:, :_NAV] = self.covariance[:, :_NAV] @ phi.T
-        self.covariance[:_NAV, :_NAV] += process
+    def _transition(self, phi: Array, process: Array, real_process: Array) -> None:
+        for covariance, at, noise in ((self.covariance, 0, process), (self.budget, _PAIR, real_process)):
+            nav = slice(at, at + _NAV)
+            covariance[nav, :] = phi @ covariance[nav, :]
+            covariance[:, nav] = covariance[:, nav] @ phi.T
+            covariance[nav, nav] += noise
 
-    def _restore(self, kept: tuple[NavState, list[Array], list[Array], float]) -> None:
+    def _forget_pair(self, duration_s: float) -> None:
+        """The pair's errors change with what is in view: they drift back to their prior (Gauss-Markov)."""
+        kept = float(np.exp(-duration_s / self._settings.pair_error_memory_s))
+        self.budget[:_PAIR, :] *= kept
+        self.budget[:, :_PAIR] *= kept
+        self.budget[range(_PAIR), range(_PAIR)] += (1 - kept**2) * self._pair_variance
+
+    def _kept(self) -> tuple[NavState, Array, Array, float]:
+        return NavState(**vars(self.state)), self._rotations.copy(), self._positions.copy(), self.imu_minus_cam_s
+
+    def _restore(self, kept: tuple[NavState, Array, Array, float]) -> None:
         self.state = NavState(**vars(kept[0]))
-        self._rotations, self._positions, self.imu_minus_cam_s = list(kept[1]), list(kept[2]), kept[3]
+        self._rotations, self._positions, self.imu_minus_cam_s = kept[1].copy(), kept[2].copy(), kept[3]
 
     def _correct(self, error: Array) -> None:
         s = self.state
@@ -273,11 +324,23 @@ class InvariantFilter:
         s.gyro_bias_radps = s.gyro_bias_radps + error[9:12]
         s.accel_bias_mps2 = s.accel_bias_mps2 + error[12:15]
         self.imu_minus_cam_s += float(error[_OFFSET])
-        for index in range(len(self.clone_ids)):
-            at = _CLONES + 6 * index
-            turn = so3_exp(error[at : at + 3])
-            self._rotations[index] = turn @ self._rotations[index]
-            self._positions[index] = turn @ self._positions[index] + error[at + 3 : at + 6]
+        filter_kernels.turn_clones(self._rotations, self._positions, error[_CLONES:])
+
+
+def _grown(covariance: Array, jacobian: Array) -> Array:
+    """The covariance with six more errors, which are jacobian (6, n) times those that it has."""
+    size = len(covariance)
+    cross = jacobian @ covariance
+    grown = np.empty((size + 6, size + 6))
+    grown[:size, :size] = covariance
+    grown[size:, :size] = cross
+    grown[:size, size:] = cross.T
+    grown[size:, size:] = cross @ jacobian.T
+    return grown
+
+
+def _symmetric(covariance: Array) -> Array:
+    return np.asarray(0.5 * (covariance + covariance.T))
 
 
 def imu_intervals(imu: ImuSamples, start_ns: int, end_ns: int) -> tuple[Array, Array, Array]:

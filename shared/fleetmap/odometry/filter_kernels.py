@@ -213,19 +213,75 @@ def linearize_track(
 
 
 @kernel
+def add_error_sources(pixels: Array, disparities: Array, weights: Array, columns: Array) -> None:
+    """Fills in how errors that outlive one picture enter the rows of `linearize_track`.
+
+    pixels (n, 3) u_left v u_right (NaN none), disparities (n,) predicted. weights (2,): 1/sigma of pixels, of
+    disparities. columns (3 n, 5) by the rig's disparity offset and depth scale, then by what one track keeps for
+    itself: the shares of its way by which it slips along it and across it, and its disparity's offset.
+    """
+    row = 0
+    for k in range(len(pixels)):
+        way_u, way_v = pixels[k, 0] - pixels[0, 0], pixels[k, 1] - pixels[0, 1]
+        columns[row, 2], columns[row, 3] = way_u * weights[0], -way_v * weights[0]
+        columns[row + 1, 2], columns[row + 1, 3] = way_v * weights[0], way_u * weights[0]
+        row += 2
+        if pixels[k, 2] == pixels[k, 2]:
+            columns[row, 0], columns[row, 1], columns[row, 4] = weights[1], disparities[k] * weights[1], weights[1]
+            row += 1
+
+
+@kernel
+def _disparities_of(
+    point: Array, rotations: Array, positions: Array, seen: NDArray[np.int64], focal_base: float
+) -> Array:
+    out = np.empty(len(seen))
+    for k in range(len(seen)):
+        turn, centre = rotations[seen[k]], positions[seen[k]]
+        depth = 0.0
+        for b in range(3):
+            depth += turn[b, 2] * (point[b] - centre[b])
+        out[k] = focal_base / depth
+    return out
+
+
+@kernel
+def _gather(covariance: Array, index: NDArray[np.int64]) -> Array:
+    out = np.empty((len(index), len(index)))
+    for a in range(len(index)):
+        for b in range(len(index)):
+            out[a, b] = covariance[index[a], index[b]]
+    return out
+
+
+@kernel
+def _columns_of(seen: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where a track's columns lie among the errors: six for each clone, then the rig's two, which come first there."""
+    n = len(seen)
+    index = np.empty(6 * n + 2, np.int64)
+    for k in range(n):
+        for a in range(6):
+            index[6 * k + a] = 2 + 6 * seen[k] + a
+    index[6 * n], index[6 * n + 1] = 0, 1
+    return index
+
+
+@kernel
 def accumulate_tracks(
     odom_from_body_rotations: Array, body_positions: Array, body_from_cam: Array, starts: NDArray[np.int64],
     clones: NDArray[np.int64], pixels: Array, anchors: NDArray[np.int64], first_points: Array, camera: Array,
-    weights: Array, clone_covariance: Array, moved: Array, normal_quantile: float,
-    information: Array, vector: Array, used: NDArray[np.int8],
+    weights: Array, noise: Array, clone_covariance: Array, moved: Array, normal_quantile: float,
+    information: Array, scatter: Array, vector: Array, used: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Adds every track that passes its gate to the normal equations of the clone errors, points projected out.
 
     starts (T + 1,) delimits each track's rows of clones (n,) and pixels (n, 3). first_points (T, 3): where
-    triangulation starts, in the camera of clone anchors (T,). clone_covariance (6 M, 6 M) in the error of this module,
-    order rotation then position. moved (6 M,): how far the clones given here stand from the prior mean, when an
-    iterated filter relinearises. information (6 M, 6 M) and vector (6 M,) are summed into. used (T,) becomes 1 for a
-    track that was taken, 0 for one that could not be triangulated and -1 for one that failed its gate.
+    triangulation starts, in the camera of clone anchors (T,). noise (4,): variance that the whitened rows really have,
+    and sigmas of a track's own errors as in `add_error_sources`. clone_covariance (6 M, 6 M) in the error of this
+    module, order rotation then position. moved (6 M,): how far the clones given here stand from the prior mean, when an
+    iterated filter relinearises. Summed into: vector (6 M,), which is information (6 M, 2 + 6 M) times disparity offset,
+    depth scale and the clones' errors, plus noise that really has the covariance scatter (6 M, 6 M). used (T,) becomes
+    1 for a track that was taken, 0 for one that could not be triangulated and -1 for one that failed its gate.
     """
     count = len(body_positions)
     rotations, positions = np.empty((count, 3, 3)), np.empty((count, 3))
@@ -240,28 +296,27 @@ def accumulate_tracks(
         if not triangulate(rotations, positions, seen, measured, camera, weights, point):
             continue
         n = len(seen)
-        by_clone, by_point, residual = np.zeros((3 * n, 6 * n)), np.zeros((3 * n, 3)), np.zeros(3 * n)
+        by_error, by_point, residual = np.zeros((3 * n, 6 * n + 5)), np.zeros((3 * n, 3)), np.zeros(3 * n)
         rows = linearize_track(
-            point, rotations, positions, seen, measured, camera, weights, by_clone, by_point, residual
+            point, rotations, positions, seen, measured, camera, weights, by_error, by_point, residual
         )
         dof = rows - 3
         if dof < 1:
             continue
-        _project_out(by_point, by_clone, residual, rows)
-        reduced = np.ascontiguousarray(by_clone[3:rows])
+        disparities = _disparities_of(point, rotations, positions, seen, camera[3])
+        add_error_sources(measured, disparities, weights, by_error[:, 6 * n :])
+        _project_out(by_point, by_error, residual, rows)
+        by_clone = np.ascontiguousarray(by_error[3:rows, : 6 * n])
+        by_state = np.ascontiguousarray(by_error[3:rows, : 6 * n + 2])
+        own = np.ascontiguousarray(by_error[3:rows, 6 * n + 2 :])
+        own *= noise[1:]
         left = residual[3:rows].copy()
-        index = np.empty(6 * n, np.int64)
-        for k in range(n):
-            for a in range(6):
-                index[6 * k + a] = 6 * seen[k] + a
-        small = np.empty((6 * n, 6 * n))
-        for a in range(6 * n):
-            for b in range(6 * n):
-                small[a, b] = clone_covariance[index[a], index[b]]
+        index = _columns_of(seen)
         for row in range(dof):
             for a in range(6 * n):
-                left[row] += reduced[row, a] * moved[index[a]]
-        innovation = matmul_nt(matmul(reduced, small), reduced)
+                left[row] += by_clone[row, a] * moved[index[a] - 2]
+        small = _gather(clone_covariance, index[: 6 * n] - 2)
+        innovation = matmul_nt(matmul(by_clone, small), by_clone)
         for a in range(dof):
             innovation[a, a] += 1.0
         whitened = left.copy()
@@ -272,15 +327,18 @@ def accumulate_tracks(
             used[t] = -1
             continue
         used[t] = 1
-        gained = matmul(reduced.T, reduced)
-        pushed = np.zeros(6 * n)
-        for row in range(dof):
-            for a in range(6 * n):
-                pushed[a] += reduced[row, a] * left[row]
+        gained, carried = matmul(by_clone.T, by_state), matmul(by_clone.T, own)
         for a in range(6 * n):
-            vector[index[a]] += pushed[a]
+            to = index[a] - 2
+            for row in range(dof):
+                vector[to] += by_clone[row, a] * left[row]
+            for b in range(6 * n + 2):
+                information[to, index[b]] += gained[a, b]
             for b in range(6 * n):
-                information[index[a], index[b]] += gained[a, b]
+                total = noise[0] * gained[a, b]
+                for k in range(3):
+                    total += carried[a, k] * carried[b, k]
+                scatter[to, index[b] - 2] += total
 
 
 @kernel
@@ -321,3 +379,12 @@ def _project_out(by_point: Array, by_clone: Array, residual: Array, rows: int) -
             dot += v[i] * residual[i]
         for i in range(k, rows):
             residual[i] -= beta * dot * v[i]
+
+
+@kernel
+def turn_clones(rotations: Array, positions: Array, errors: Array) -> None:
+    """Applies errors (6 M,) to the body transforms of M clones, in place."""
+    for m in range(len(positions)):
+        turn = exp_so3(errors[6 * m : 6 * m + 3])
+        rotations[m] = matmul(turn, rotations[m])
+        positions[m] = _rotate(turn, positions[m]) + errors[6 * m + 3 : 6 * m + 6]

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from fleetmap.calibration import ImuNoise, RigCalibration
 from fleetmap.features.stereo import StereoSettings
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.odometry.filter import InvariantFilter, NavState, Track
+from fleetmap.odometry.filter import InvariantFilter, NavState
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
 from fleetmap.odometry.start import Start, start_in_motion, start_steady
 from fleetmap.odometry.tracker import Tracked, Tracker
+from fleetmap.odometry.tracks import Observations
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import ImuSamples, Trajectory
 
-_FAR_DEPTH_M = 20.0
 _IMU_MEMORY_S = 25.0
 _ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
 
@@ -69,6 +69,7 @@ class Odometry:
         settings: OdometrySettings,
         stereo_settings: StereoSettings | None = None,
     ) -> None:
+        self._real_noise = calibration.imu
         self._noise = None if calibration.imu is None else _widened(calibration.imu, settings.filter)
         self._camera, self._body_from_cam = camera, body_from_cam
         self._cam_from_body = se3_inverse(body_from_cam)
@@ -81,7 +82,7 @@ class Odometry:
         self._inertial = False
         self._state_ns = 0
         self._frame_index = 0
-        self._tracks: dict[int, list[tuple[int, Array]]] = {}
+        self._observations = Observations()
         self._vision: list[tuple[int, Array]] = []
         self._last_motion = np.eye(4)
         self._clone_stamps: dict[int, int] = {}
@@ -159,13 +160,14 @@ class Odometry:
         self._state_ns = stamp_ns
 
     def _new_filter(self, state: NavState, covariance: Array) -> InvariantFilter:
-        return InvariantFilter(state, covariance, self._settings.filter, self._camera, self._body_from_cam)
+        budget = self._settings.filter.real_start_share**2 * covariance
+        return InvariantFilter(state, covariance, self._settings.filter, self._camera, self._body_from_cam, budget)
 
     def _install(self, start: Start) -> None:
         self._filter = self._new_filter(start.state, start.covariance)
         self._inertial = True
         self._state_ns = start.stamp_ns
-        self._tracks.clear()
+        self._observations.clear()
 
     def _try_start(self, stamp_ns: int, tracked: Tracked) -> Array | None:
         """Switches to the inertial filter once gravity is known, by rest or by motion.
@@ -201,9 +203,7 @@ class Odometry:
 
     def _seed_tracks(self) -> None:
         """After a restart the tracks go on from the newest frame alone."""
-        ids, pixels = self._newest
-        for track_id, pixel in zip(ids.tolist(), pixels, strict=True):
-            self._tracks[track_id] = [(self._frame_index, pixel)]
+        self._observations.add(self._frame_index, *self._newest)
 
     # --- one frame ---
 
@@ -212,7 +212,7 @@ class Odometry:
         rate = np.zeros(3)
         if self._inertial and self._noise is not None:
             target = stamp_ns + int(self._filter.imu_minus_cam_s * 1e9)
-            rate = self._filter.propagate(self._imu, self._state_ns, target, self._noise)
+            rate = self._filter.propagate(self._imu, self._state_ns, target, self._noise, self._real_noise)
             stamp_ns = max(target, self._state_ns)
         self._state_ns = stamp_ns
         return rate
@@ -241,7 +241,8 @@ class Odometry:
                 self._cam_from_body @ se3_inverse(seen[1]) @ self._filter.state.odom_from_body @ self._body_from_cam
             )
         body_from_next = self._body_from_cam @ se3_inverse(self._last_motion) @ self._cam_from_body
-        self._filter.displace(body_from_next, s.free_rotation_sigma_rad, s.free_translation_sigma_m)
+        duration_s = (self._state_ns - self._clone_stamps[self._frame_index - 1]) * 1e-9
+        self._filter.displace(body_from_next, s.free_rotation_sigma_rad, s.free_translation_sigma_m, duration_s)
 
     def _seen_body(self, tracked: Tracked) -> tuple[int, Array] | None:
         """After a gap: the best matched clone and odom_from_body (4, 4) as vision measured it since then."""
@@ -260,10 +261,8 @@ class Odometry:
 
     def _remember(self, tracked: Tracked) -> None:
         for earlier in tracked.earlier:
-            for track_id, pixel in zip(earlier.ids.tolist(), earlier.pixels, strict=True):
-                self._tracks[track_id] = [(earlier.frame_index, pixel)]
-        for track_id, pixel in zip(tracked.ids.tolist(), tracked.pixels, strict=True):
-            self._tracks.setdefault(track_id, []).append((self._frame_index, pixel))
+            self._observations.add(earlier.frame_index, earlier.ids, earlier.pixels)
+        self._observations.add(self._frame_index, tracked.ids, tracked.pixels)
         self._newest = (tracked.ids, tracked.pixels)
 
     def _consume(self, tracked: Tracked) -> NDArray[np.int8]:
@@ -274,37 +273,15 @@ class Odometry:
         assert self._filter is not None
         settings = self._settings.filter
         chunk = settings.chunk_frames if self._inertial else settings.chunk_frames_without_imu
-        alive = set(tracked.ids.tolist())
-        held = set(self._filter.clone_ids)
-        chosen: list[Track] = []
-        for track_id in list(self._tracks):
-            due = track_id not in alive or tracked.by_descriptors or (self._frame_index + track_id) % chunk == 0
-            if not due:
-                continue
-            observations = [o for o in self._tracks[track_id] if o[0] in held]
-            if track_id not in alive:
-                del self._tracks[track_id]
-            if len(observations) < 2:
-                continue
-            self._tracks.pop(track_id, None)
-            chosen.append(self._track(observations))
+        due = (self._frame_index + tracked.ids) % chunk == 0
+        held = np.array(self._filter.clone_ids)
+        chosen = self._observations.take(tracked.ids, held, due | tracked.by_descriptors, self._camera)
         seen = self._seen_body(tracked)
         if seen is None:
             return self._filter.update(chosen, iterations=1 if self._inertial else 4)
         return self._filter.update(
             chosen, 4, newest_odom_from_body=seen[1], sigma_scale=settings.descriptor_sigma_scale
         )
-
-    def _track(self, observations: list[tuple[int, Array]]) -> Track:
-        """A track with a first guess of its point: stereo from the nearest view, else far along the newest ray."""
-        pixels = np.array([p for _, p in observations])
-        disparities = pixels[:, 0] - pixels[:, 2]
-        best = int(np.nanargmax(disparities)) if np.isfinite(disparities).any() else len(pixels) - 1
-        disparity = disparities[best : best + 1]
-        if not np.isfinite(disparity[0]):
-            disparity = np.array([self._camera.focal_px * max(self._camera.baseline_m, 0.01) / _FAR_DEPTH_M])
-        point_cam = self._camera.point_from_pixel(pixels[best : best + 1, :2], disparity)
-        return Track(np.array([c for c, _ in observations], np.int64), pixels, observations[best][0], point_cam[0])
 
     def _prune(self) -> None:
         """Drops the second newest clone where the robot hardly moved since the one before, else the oldest."""

@@ -164,14 +164,16 @@ def test_vision_says_nothing_about_where_the_world_is() -> None:
         pixels += list(seen + 0.3 * rng.normal(size=seen.shape))
         starts.append(len(clones))
         first.append(transform_points(se3_inverse(wrong[0] @ BODY_FROM_CAM), point[None])[0])
-    information, vector = np.zeros((30, 30)), np.zeros(30)
+    information, scatter, vector = np.zeros((30, 32)), np.zeros((30, 30)), np.zeros(30)
     used = np.zeros(len(first), np.int8)
     filter_kernels.accumulate_tracks(
         np.ascontiguousarray(wrong[:, :3, :3]), np.ascontiguousarray(wrong[:, :3, 3]), BODY_FROM_CAM,
         np.array(starts), np.array(clones), np.array(pixels), np.zeros(len(first), np.int64), np.array(first), INTRINSICS,
-        WEIGHTS, np.eye(30), np.zeros(30), 2.3, information, vector, used,
+        WEIGHTS, np.array([1.0, 0.0, 0.0, 0.0]), np.eye(30), np.zeros(30), 2.3, information, scatter, vector, used,
     )  # fmt: skip
     assert (used == 1).sum() > 10
+    information = information[:, 2:]
+    np.testing.assert_allclose(scatter, information, atol=1e-9 * np.abs(information).max())  # nothing but white noise
     common = np.tile(np.eye(6), (5, 1))
     assert np.abs(information @ common).max() < 1e-9 * np.abs(information).max()
     assert np.linalg.matrix_rank(information, tol=1e-6 * np.abs(information).max()) == 24
