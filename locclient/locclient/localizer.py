@@ -1,6 +1,6 @@
 """The localizer: samples and tiles in, one honest estimate for each frame out. Never touches a file, a socket or a clock."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -13,7 +13,7 @@ from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.mapformat import Tile
 from fleetmap.odometry import Odometry, OdometryEstimate
 from fleetmap.rectification import RectifiedFrame, StereoCamera
-from fleetmap.samples import ImuSamples, PositionPrior
+from fleetmap.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.map_view import MapView
 from locclient.relocalizer import Fix, Relocalizer, Seen
 from locclient.settings import LocalizerSettings
@@ -110,6 +110,10 @@ class Localizer:
     def handle_imu(self, samples: ImuSamples) -> None:
         """IMU samples newer than any before."""
         self._odometry.handle_imu(samples)
+
+    def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
+        """Wheel odometry newer than any before."""
+        self._odometry.handle_wheel(samples)
 
     def handle_prior(self, prior: PositionPrior) -> None:
         """A coarse place at this moment; used for the search until a fix has been confirmed, widened by the way since."""

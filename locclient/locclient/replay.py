@@ -110,6 +110,7 @@ def replay(
             time.sleep(max(0.0, (raw.stamp_ns - first_ns) * 1e-9 - (time.monotonic() - begun_s)))
         wall_s, cpu_s = time.monotonic(), time.process_time()
         localizer.handle_imu(imu)
+        localizer.handle_wheel(source.wheel_before(number))
         for coarse in source.priors_before(number):
             localizer.handle_prior(coarse)
         frame = rectifier.rectify(raw)

@@ -73,6 +73,15 @@ class ReplaySource:
         since = self.recorded_stamp_ns(number - 1) if number else -(2**62)
         return [p for p in self.recording.priors if since < p.stamp_ns <= self.recorded_stamp_ns(number)]
 
+    def wheel_before(self, number: int) -> list[WheelSample]:
+        """Wheel odometry between the frame before and frame `number`; none backwards."""
+        if self.reverse:
+            return []
+        offset_ns = int(self.recording.calibration.cameras[0].imu_minus_cam_s * 1e9)
+        since = self.recorded_stamp_ns(number - 1) + offset_ns if number else -(2**62)
+        until = self.recorded_stamp_ns(number) + offset_ns
+        return [w for w in self.recording.wheel if since < w.stamp_ns <= until]
+
     def truth_map_from_body(self, number: int) -> Array | None:
         """The recording's ground truth at frame `number`, None where there is none."""
         truth = self.recording.ground_truth

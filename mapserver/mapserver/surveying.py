@@ -65,7 +65,7 @@ def survey_recording(
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         done = survey(
             (recording.read_frame(int(index)) for index in indices), len(indices), recording.imu, recording.calibration,
-            rectifier, vocabulary, settings, zones, progress, shelf,
+            rectifier, vocabulary, settings, zones, progress, shelf, recording.wheel,
         )  # fmt: skip
         placed = map_from_survey(done.map, recording.priors, recording.calibration.base_from_body)
         entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices))

@@ -8,7 +8,7 @@ from benchmarks import estimator_loop
 from fleetmap.calibration import RigCalibration
 from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.odometry import OdometryEstimate, OdometrySettings
-from fleetmap.samples import WheelSample
+from fleetmap.odometry.imu_faults import joined
 from fleetsim.estimator import EstimatorSession
 from fleetsim.faults import Fault, FaultPlan
 from fleetsim.landmarks import LandmarkField
@@ -17,7 +17,7 @@ from fleetsim.recorder import Order, Session, prepare
 from fleetsim.robots import nominal_calibration, true_calibration
 from fleetsim.routes import Route
 from fleetsim.scenarios import find_scenario
-from fleetsim.sensors import measure_imu, measure_wheels, sample_times
+from fleetsim.sensors import START_NS, measure_imu, measure_wheels, sample_times
 
 _SCENARIO = "small-loop"
 _SIDEWAYS_M = 0.15  # by which a run's way points are shifted at random
@@ -81,7 +81,10 @@ def figures(session: EstimatorSession, estimates: list[OdometryEstimate], inerti
         turn = so3_log(truth[k, :3, :3] @ estimate[:3, :3].T)
         shift = truth[k, :3, 3] - estimate[:3, 3]
         squares.append(
-            (turn @ np.linalg.solve(covariance[:3, :3], turn) / 3, shift @ np.linalg.solve(covariance[3:, 3:], shift) / 3)
+            (
+                turn @ np.linalg.solve(covariance[:3, :3], turn) / 3,
+                shift @ np.linalg.solve(covariance[3:, 3:], shift) / 3,
+            )
         )
         turns.append(turn)
         shifts.append(shift)
@@ -94,14 +97,21 @@ def figures(session: EstimatorSession, estimates: list[OdometryEstimate], inerti
 
 
 def run(
-    session: EstimatorSession, inertial: bool, frames: int | None = None, settings: OdometrySettings | None = None,
-    wheel: tuple[WheelSample, ...] | None = None,
-) -> tuple[Figures, list[OdometryEstimate]]:  # fmt: skip
+    session: EstimatorSession, inertial: bool, frames: int | None = None, settings: OdometrySettings | None = None
+) -> tuple[Figures, list[OdometryEstimate]]:
     """One run's figures and estimates; without the IMU where not `inertial`."""
     nominal = session.session.nominal
     calibration = nominal if inertial else RigCalibration(nominal.cameras, None, nominal.base_from_body)
     estimates = estimator_loop.run_odometry(session, frames, calibration, settings)
     return figures(session, estimates, inertial), estimates
+
+
+def with_imu_of(session: EstimatorSession, other: EstimatorSession, from_s: float) -> EstimatorSession:
+    """The run with another run's IMU from a time on."""
+    own, foreign = session.session.imu, other.session.imu
+    turn_ns = START_NS + int(from_s * 1e9)
+    mixed = joined([own.between(0, turn_ns), foreign.between(turn_ns, 1 << 62)])
+    return EstimatorSession(replace(session.session, imu=mixed), field=session._field)
 
 
 def _rms(errors: Array) -> float:

@@ -97,6 +97,7 @@ def run_odometry(
     for frame in range(len(session) if frames is None else min(frames, len(session))):
         stamp_ns = session.stamps_ns[frame]
         odometry.handle_imu(session.session.imu.between(last_ns, stamp_ns + 1))
+        odometry.handle_wheel([s for s in session.session.wheel if last_ns <= s.stamp_ns <= stamp_ns])
         last_ns = stamp_ns + 1
         estimates.append(odometry.handle_stereo(blank(session, frame)))
     return estimates

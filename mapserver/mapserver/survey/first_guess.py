@@ -1,6 +1,6 @@
 """Stage 1: odometry over all frames, and the choice of keyframes on the way."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +9,7 @@ from fleetmap.calibration import RigCalibration
 from fleetmap.geometry import Array, rotation_between_vectors, se3
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from fleetmap.rectification import RectifiedFrame, Rectifier
-from fleetmap.samples import CameraFrame, ImuSamples
+from fleetmap.samples import CameraFrame, ImuSamples, WheelSample
 from mapserver.survey.keyframes import FrameSummary, Keyframe, KeyframePolicy, PictureShelf, make_keyframe, sharpness
 from mapserver.survey.settings import SurveySettings
 
@@ -33,8 +33,12 @@ class FirstGuess:
 def run_odometry(
     frames: Iterable[CameraFrame], imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings,
     progress: Callable[[int], None], shelf: PictureShelf | None = None,
+    wheel: Sequence[WheelSample] = (),
 ) -> FirstGuess:  # fmt: skip
-    """Feeds frames (in order) and the IMU up to each into the odometry; progress is called with each frame's number."""
+    """Feeds frames (in order), the IMU and the wheels up to each into the odometry.
+
+    progress is called with each frame's number.
+    """
     odometry = Odometry(
         calibration,
         rectifier.camera,
@@ -52,6 +56,7 @@ def run_odometry(
         frame = rectifier.rectify(raw)
         until_ns = raw.stamp_ns + int(rectifier.imu_minus_cam_s * 1e9) + 10_000_000
         odometry.handle_imu(imu.between(fed_ns, until_ns))
+        odometry.handle_wheel([sample for sample in wheel if fed_ns <= sample.stamp_ns < until_ns])
         fed_ns = until_ns
         estimate = odometry.handle_stereo(frame)
         if estimate.new_odom_from_old_odom is not None:

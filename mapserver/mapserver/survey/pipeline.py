@@ -1,6 +1,6 @@
 """The survey from end to end: the list of its stages."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -12,7 +12,7 @@ from fleetmap.calibration import RigCalibration
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.rectification import Rectifier
-from fleetmap.samples import CameraFrame, ImuSamples
+from fleetmap.samples import CameraFrame, ImuSamples, WheelSample
 from mapserver.survey.adjust import Motion, SurveyState, adjust, adjust_windows
 from mapserver.survey.bundle import RelativeTerm
 from mapserver.survey.culling import Culled
@@ -53,11 +53,11 @@ class Survey:
 def survey(
     frames: Iterable[CameraFrame], frame_count: int, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
     vocabulary: Vocabulary | None, settings: SurveySettings, zones: Zones, progress: Progress,
-    shelf: PictureShelf | None = None,
+    shelf: PictureShelf | None = None, wheel: Sequence[WheelSample] = (),
 ) -> Survey:  # fmt: skip
     """Maps one recording, its keyframes' pictures on `shelf`. Raises SurveyError where it holds too little to map."""
     guess = run_odometry(
-        frames, imu, calibration, rectifier, settings, lambda n: progress("odometry", n + 1, frame_count), shelf
+        frames, imu, calibration, rectifier, settings, lambda n: progress("odometry", n + 1, frame_count), shelf, wheel
     )
     keyframes = guess.keyframes
     if len(keyframes) < _MIN_KEYFRAMES:

@@ -13,14 +13,16 @@ from fleetmap.odometry import filter_kernels
 from fleetmap.odometry.settings import FilterSettings
 from fleetmap.odometry.tracks import Track, TrackBatch
 from fleetmap.rectification import StereoCamera
-from fleetmap.samples import ImuSamples
+from fleetmap.samples import ImuSamples, WheelSample
 
 GRAVITY_MPS2 = 9.81
 _GRAVITY = np.array([0.0, 0.0, -GRAVITY_MPS2])
 _NAV = 15  # rotation, velocity, position, gyro bias, accelerometer bias
 _OFFSET = 15  # index of the time offset
 _CLONES = 16  # index of the first clone
-_PAIR = 2  # errors of the stereo pair, disparity offset and depth scale, come before all others in the budget
+# Before all others the budget has what is allowed for and never estimated: the pair's disparity offset and depth scale,
+# scales of the wheels' speed and yaw rate.
+_PAIR, _ALLOWED = 2, 4
 _POSITION_GATE = 11.345  # 0.99 of chi-square with 3 degrees of freedom
 
 
@@ -86,11 +88,13 @@ class InvariantFilter:
         self.covariance = np.zeros((_CLONES, _CLONES))
         self.covariance[:_NAV, :_NAV] = nav_covariance
         self.covariance[_OFFSET, _OFFSET] = settings.time_offset_sigma_s**2
-        self.budget = np.zeros((_PAIR + _CLONES, _PAIR + _CLONES))
-        self.budget[_PAIR:, _PAIR:] = self.covariance
+        self.budget = np.zeros((_ALLOWED + _CLONES, _ALLOWED + _CLONES))
+        self.budget[_ALLOWED:, _ALLOWED:] = self.covariance
         if budget is not None:
-            self.budget[_PAIR : _PAIR + _NAV, _PAIR : _PAIR + _NAV] = budget
-        self.budget[range(_PAIR), range(_PAIR)] = self._pair_variance
+            self.budget[_ALLOWED : _ALLOWED + _NAV, _ALLOWED : _ALLOWED + _NAV] = budget
+        allowed = [settings.disparity_offset_sigma_px, settings.depth_scale_sigma]
+        allowed += [settings.wheel_speed_scale_sigma, settings.wheel_yaw_scale_sigma]
+        self.budget[range(_ALLOWED), range(_ALLOWED)] = np.array(allowed) ** 2
 
     def propagate(
         self, imu: ImuSamples, start_ns: int, end_ns: int, noise: ImuNoise, real_noise: ImuNoise | None = None
@@ -153,7 +157,7 @@ class InvariantFilter:
         jacobian[0:3, _OFFSET] = turn
         jacobian[3:6, _OFFSET] = s.velocity_mps + np.cross(s.position_m, turn)
         self.covariance = _grown(self.covariance, jacobian)
-        self.budget = _grown(self.budget, np.hstack([np.zeros((6, _PAIR)), jacobian]))
+        self.budget = _grown(self.budget, np.hstack([np.zeros((6, _ALLOWED)), jacobian]))
         self.clone_ids.append(clone_id)
         self._rotations = np.concatenate([self._rotations, s.rotation[None]])
         self._positions = np.concatenate([self._positions, s.position_m[None]])
@@ -164,7 +168,7 @@ class InvariantFilter:
         keep = np.ones(len(self.covariance), bool)
         keep[_CLONES + 6 * index : _CLONES + 6 * index + 6] = False
         self.covariance = self.covariance[np.ix_(keep, keep)]
-        keep = np.concatenate([np.ones(_PAIR, bool), keep])
+        keep = np.concatenate([np.ones(_ALLOWED, bool), keep])
         self.budget = self.budget[np.ix_(keep, keep)]
         del self.clone_ids[index]
         self._rotations = np.delete(self._rotations, index, axis=0)
@@ -225,25 +229,77 @@ class InvariantFilter:
         learned = gain @ (information[:, _PAIR:] @ self.covariance[_CLONES:])
         self.covariance = _symmetric(self.covariance - learned)
         left = np.eye(len(self.budget))
-        left[_PAIR:, :_PAIR] -= gain @ information[:, :_PAIR]
-        left[_PAIR:, _PAIR + _CLONES :] -= gain @ information[:, _PAIR:]
+        left[_ALLOWED:, :_PAIR] -= gain @ information[:, :_PAIR]
+        left[_ALLOWED:, _ALLOWED + _CLONES :] -= gain @ information[:, _PAIR:]
+        self._carry_budget(left, gain, scatter)
+
+    def _carry_budget(self, left: Array, gain: Array, noise: Array) -> None:
         self.budget = left @ self.budget @ left.T
-        self.budget[_PAIR:, _PAIR:] += gain @ scatter @ gain.T
+        self.budget[_ALLOWED:, _ALLOWED:] += gain @ noise @ gain.T
         self.budget = _symmetric(self.budget)
 
-    def correct_with(self, jacobian: Array, residual: Array, noise: Array) -> float:
-        """A linear measurement residual = jacobian @ error + noise; returns its normalised innovation squared."""
-        cross = self.covariance @ jacobian.T
-        innovation = jacobian @ cross + noise
+    def correct_with(
+        self, jacobian: Array, residual: Array, noise: Array, *, gate: float = np.inf, real_noise: Array | None = None,
+        by_allowed: Array | None = None,
+    ) -> float:  # fmt: skip
+        """A linear measurement residual = jacobian @ error + noise; returns its normalised innovation squared.
+
+        noise weighs it; real_noise, where it differs, and by_allowed (n, 4), derivatives by the errors that are allowed
+        for, go into the budget. Nothing is changed where the innovation, by the budget, exceeds the gate.
+        """
+        allowed = np.zeros((len(residual), _ALLOWED)) if by_allowed is None else by_allowed
+        whole = np.zeros((len(residual), len(self.budget)))
+        whole[:, :_ALLOWED], whole[:, _ALLOWED : _ALLOWED + jacobian.shape[1]] = allowed, jacobian
+        real = noise if real_noise is None else real_noise
+        normalised = float(residual @ np.linalg.solve(whole @ self.budget @ whole.T + real, residual))
+        if normalised > gate:
+            return normalised
+        full = whole[:, _ALLOWED:]
+        cross = self.covariance @ full.T
+        innovation = full @ cross + noise
         gain = np.linalg.solve(innovation, cross.T).T
         self._correct(gain @ residual)
         self.covariance = _symmetric(self.covariance - gain @ innovation @ gain.T)
         left = np.eye(len(self.budget))
-        left[_PAIR:, _PAIR:] -= gain @ jacobian
-        self.budget = left @ self.budget @ left.T
-        self.budget[_PAIR:, _PAIR:] += gain @ noise @ gain.T
-        self.budget = _symmetric(self.budget)
-        return float(residual @ np.linalg.solve(innovation, residual))
+        left[_ALLOWED:] -= gain @ whole
+        self._carry_budget(left, gain, real)
+        return normalised
+
+    def stand_still(self, gyro_mean_radps: Array, gyro_sigma_radps: float, gate: float) -> float:
+        """The body neither moves nor turns: velocity zero, the gyro shows its bias alone.
+
+        gyro_mean_radps (3,) over the time since the last frame, known to gyro_sigma_radps. Gated as `correct_with`.
+        """
+        jacobian, s = np.zeros((6, _CLONES)), self.state
+        jacobian[:3, :3], jacobian[:3, 3:6] = -skew(s.velocity_mps), np.eye(3)
+        jacobian[3:, 9:12] = np.eye(3)
+        residual = np.concatenate([-s.velocity_mps, gyro_mean_radps - s.gyro_bias_radps])
+        sigmas = np.array([self._settings.still_sigma_mps] * 3 + [gyro_sigma_radps] * 3)
+        return self.correct_with(jacobian, residual, np.diag(sigmas**2), gate=gate)
+
+    def roll(self, sample: WheelSample, gyro_radps: Array, base_from_body: Array, gate: float) -> float:
+        """What the wheels say of the motion of `base`: forward speed, no other, and yaw rate. Gated as `correct_with`.
+
+        gyro_radps (3,): as measured at the same time.
+        """
+        s, settings = self.state, self._settings
+        turn, base_body = base_from_body[:3, :3], se3_inverse(base_from_body)[:3, 3]
+        rate = gyro_radps - s.gyro_bias_radps
+        back = turn @ s.rotation.T
+        velocity = back @ s.velocity_mps + turn @ np.cross(rate, base_body)
+        jacobian = np.zeros((4, _CLONES))
+        # R^T v with the invariant error changes by R^T nu alone: turning the frame turns both
+        jacobian[:3, 3:6] = back
+        jacobian[:3, 9:12] = turn @ skew(base_body)
+        jacobian[3, 9:12] = -turn[2]
+        residual = np.append(sample.velocity_base_mps - velocity, sample.yaw_rate_radps - (turn @ rate)[2])
+        sigmas = np.array([sample.sigma_mps, settings.wheel_slip_mps, settings.wheel_slip_mps, sample.sigma_radps])
+        allowed = np.zeros((4, _ALLOWED))
+        allowed[0, 2], allowed[3, 3] = velocity[0], (turn @ rate)[2]
+        weighed = np.diag((settings.wheel_sigma_scale * sigmas) ** 2)
+        return self.correct_with(
+            jacobian, residual, weighed, gate=gate, real_noise=np.diag(sigmas**2), by_allowed=allowed
+        )
 
     def open_up(self, clone_id: int, seen_odom_from_body: Array, gap_s: float) -> bool:
         """Widens position and velocity where vision contradicts the prediction since `clone_id` beyond its covariance.
@@ -262,10 +318,15 @@ class InvariantFilter:
         if off @ np.linalg.solve(spread, off) < _POSITION_GATE:
             return False
         size = float(np.linalg.norm(off))
-        for wide in (self.covariance, self.budget[_PAIR:, _PAIR:]):
+        for wide in (self.covariance, self.budget[_ALLOWED:, _ALLOWED:]):
             wide[6:9, 6:9] += size**2 * np.eye(3)
             wide[3:6, 3:6] += (size / max(gap_s, 0.1)) ** 2 * np.eye(3)
         return True
+
+    def doubt_velocity(self, sigma_mps: float) -> None:
+        """The velocity may have changed by so much."""
+        for wide in (self.covariance, self.budget[_ALLOWED:, _ALLOWED:]):
+            wide[3:6, 3:6] += sigma_mps**2 * np.eye(3)
 
     def motion_since(self, clone_id: int) -> tuple[Array, Array]:
         """earlier_from_now (4, 4) between a clone and the newest one, and its covariance (6, 6).
@@ -275,7 +336,7 @@ class InvariantFilter:
         """
         at = _CLONES + 6 * self.clone_ids.index(clone_id)
         newest = _CLONES + 6 * (len(self.clone_ids) - 1)
-        c = self.budget[_PAIR:, _PAIR:]
+        c = self.budget[_ALLOWED:, _ALLOWED:]
         difference = c[newest : newest + 6, newest : newest + 6] + c[at : at + 6, at : at + 6]
         difference = difference - c[newest : newest + 6, at : at + 6] - c[at : at + 6, newest : newest + 6]
         earlier_from_odom = se3_inverse(self.odom_from_clone(clone_id))
@@ -292,10 +353,10 @@ class InvariantFilter:
         jacobian[0:3, 0:3] = np.eye(3)
         jacobian[3:6, 0:3] = -skew(self.state.position_m)
         jacobian[3:6, 6:9] = np.eye(3)
-        return np.asarray(jacobian @ self.budget[_PAIR : _PAIR + _NAV, _PAIR : _PAIR + _NAV] @ jacobian.T)
+        return np.asarray(jacobian @ self.budget[_ALLOWED : _ALLOWED + _NAV, _ALLOWED : _ALLOWED + _NAV] @ jacobian.T)
 
     def _transition(self, phi: Array, process: Array, real_process: Array) -> None:
-        for covariance, at, noise in ((self.covariance, 0, process), (self.budget, _PAIR, real_process)):
+        for covariance, at, noise in ((self.covariance, 0, process), (self.budget, _ALLOWED, real_process)):
             nav = slice(at, at + _NAV)
             covariance[nav, :] = phi @ covariance[nav, :]
             covariance[:, nav] = covariance[:, nav] @ phi.T

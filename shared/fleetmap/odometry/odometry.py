@@ -3,6 +3,7 @@
 Never touches a file, a socket or a clock.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -11,17 +12,23 @@ from numpy.typing import NDArray
 
 from fleetmap.calibration import ImuNoise, RigCalibration
 from fleetmap.features.stereo import StereoSettings
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.odometry.filter import InvariantFilter, NavState
+from fleetmap.odometry.imu_faults import joined, longest_gap_ns, without_spikes
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
-from fleetmap.odometry.start import Start, start_in_motion, start_steady
+from fleetmap.odometry.start import Start, is_steady, start_in_motion, start_steady
 from fleetmap.odometry.tracker import Tracked, Tracker
 from fleetmap.odometry.tracks import Observations
 from fleetmap.rectification import RectifiedFrame, StereoCamera
-from fleetmap.samples import ImuSamples, Trajectory
+from fleetmap.samples import ImuSamples, Trajectory, WheelSample
 
 _IMU_MEMORY_S = 25.0
+_WHEEL_REACH_NS = 30_000_000  # a sample serves a frame within half the period of slow wheel odometry
+_GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of freedom
 _ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
+_IMU_GAP_NS = 50_000_000  # longer without samples than this, and the IMU says nothing of the motion
+_DISAGREEMENT_RAD = 0.02  # between the turn that pictures show from one frame to the next and the gyro's
+_MOST_DISAGREEMENTS = 8  # frames that disagree beyond those that agree, before the IMU is no longer believed
 
 
 class OdometryStatus(StrEnum):
@@ -69,6 +76,10 @@ class Odometry:
         settings: OdometrySettings,
         stereo_settings: StereoSettings | None = None,
     ) -> None:
+        self._disagreements = 0
+        self._base_from_body = calibration.base_from_body
+        self._wheel: list[WheelSample] = []
+        self._looks: list[tuple[int, NDArray[np.int64], Array]] = []
         self._real_noise = calibration.imu
         self._noise = None if calibration.imu is None else _widened(calibration.imu, settings.filter)
         self._camera, self._body_from_cam = camera, body_from_cam
@@ -91,6 +102,11 @@ class Odometry:
         """Takes samples newer than any before; ignored by a rig without IMU noise figures."""
         self._pending.append(samples)
 
+    def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
+        """Takes wheel odometry newer than any before, on the IMU's clock; of use once gravity is known."""
+        if self._settings.filter.use_wheels:
+            self._wheel.extend(samples)
+
     def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
         """The estimate at `frame`, which must be newer than any before.
 
@@ -103,10 +119,14 @@ class Odometry:
         assert self._filter is not None
         rate = self._predict(stamp_ns)
         tracked = self._tracker.track(frame, self._predicted_since, _ROTATION_SIGMA_RAD if self._inertial else None)
+        if self._inertial:
+            self._check_turn(tracked, self._predicted_since(self._frame_index - 1))
         if not self._inertial:
             self._displace(tracked)
         else:
             self._doubt(tracked)
+            self._feel_standing(tracked)
+            self._feel_wheels()
         self._filter.add_clone(self._frame_index, rate)
         self._clone_stamps[self._frame_index] = self._state_ns
         self._remember(tracked)
@@ -138,12 +158,7 @@ class Odometry:
 
     def _absorb_imu(self, stamp_ns: int) -> None:
         if self._pending:
-            parts = [self._imu, *self._pending]
-            self._imu = ImuSamples(
-                np.concatenate([p.stamps_ns for p in parts]),
-                np.concatenate([p.gyro_radps for p in parts]),
-                np.concatenate([p.accel_mps2 for p in parts]),
-            )
+            self._imu = without_spikes(self._imu, joined(self._pending))
             self._pending.clear()
         oldest = min(stamp_ns, self._state_ns or stamp_ns) - int(_IMU_MEMORY_S * 1e9)
         if len(self._imu) and self._imu.stamps_ns[0] < oldest - int(10e9):
@@ -212,10 +227,39 @@ class Odometry:
         rate = np.zeros(3)
         if self._inertial and self._noise is not None:
             target = stamp_ns + int(self._filter.imu_minus_cam_s * 1e9)
+            if longest_gap_ns(self._imu, self._state_ns, target) > _IMU_GAP_NS and len(self._filter.clone_ids) > 1:
+                self._guess_motion(target)
+                return rate
             rate = self._filter.propagate(self._imu, self._state_ns, target, self._noise, self._real_noise)
             stamp_ns = max(target, self._state_ns)
         self._state_ns = stamp_ns
         return rate
+
+    def _guess_motion(self, target_ns: int) -> None:
+        """Without samples: as from the frame before last to the last, as uncertain as without an IMU."""
+        assert self._filter is not None
+        settings = self._settings.filter
+        earlier, last = (self._filter.odom_from_clone(clone) for clone in self._filter.clone_ids[-2:])
+        duration_s = max(target_ns - self._state_ns, 0) * 1e-9
+        self._filter.displace(
+            se3_inverse(earlier) @ last, settings.free_rotation_sigma_rad, settings.free_translation_sigma_m, duration_s
+        )
+        self._filter.doubt_velocity(settings.initial_velocity_sigma_mps)
+        self._state_ns = max(target_ns, self._state_ns)
+
+    def _check_turn(self, tracked: Tracked, predicted: Array | None) -> None:
+        """Counts frames whose pictures turned otherwise than the gyro; an IMU that keeps contradicting is dropped.
+
+        It belongs to another recording, or is mounted otherwise than calibrated. The estimates go on as without an IMU.
+        """
+        if predicted is None or tracked.cam_from_previous is None:
+            return
+        off_rad = rotation_angle_rad(predicted[:3, :3].T @ tracked.cam_from_previous[:3, :3])
+        step = 1 if off_rad > _DISAGREEMENT_RAD else -1
+        self._disagreements = max(self._disagreements + step, 0)
+        if self._disagreements >= _MOST_DISAGREEMENTS:
+            self._inertial, self._noise = False, None
+            self._last_motion = tracked.cam_from_previous
 
     def _predicted_since(self, frame_index: int) -> Array | None:
         """cam_from_earlier (4, 4): from the propagated state, or the last motion again without an IMU."""
@@ -258,6 +302,37 @@ class Odometry:
         seen = self._seen_body(tracked)
         if seen is not None:
             self._filter.open_up(seen[0], seen[1], (self._state_ns - self._clone_stamps[seen[0]]) * 1e-9)
+
+    def _feel_standing(self, tracked: Tracked) -> None:
+        """Zero velocity and turn where for a while neither pictures nor IMU moved."""
+        assert self._filter is not None
+        assert self._real_noise is not None
+        settings, now_ns = self._settings.filter, self._state_ns
+        window_ns = int(settings.still_window_s * 1e9)
+        self._looks = [look for look in self._looks if look[0] >= now_ns - 2 * window_ns]
+        self._looks.append((now_ns, tracked.ids, tracked.pixels))
+        old = [look for look in self._looks if look[0] <= now_ns - window_ns]
+        if not old or not is_picture_still(old[-1][1], old[-1][2], tracked.ids, tracked.pixels, settings.still_flow_px):
+            return
+        window = self._imu.between(old[-1][0], now_ns)
+        since = self._imu.between(self._looks[-2][0], now_ns)
+        if len(window) < 20 or not len(since) or not is_steady(window, self._settings.start):
+            return
+        duration_s = (now_ns - self._looks[-2][0]) * 1e-9
+        sigma_radps = self._real_noise.gyro_noise_radps_rthz / np.sqrt(duration_s)
+        self._filter.stand_still(since.gyro_radps.mean(axis=0), float(sigma_radps), _GATE_6)
+
+    def _feel_wheels(self) -> None:
+        assert self._filter is not None
+        if not self._wheel:
+            return
+        stamps = np.array([sample.stamp_ns for sample in self._wheel])
+        nearest = int(np.abs(stamps - self._state_ns).argmin())
+        sample = self._wheel[nearest]
+        around = self._imu.between(sample.stamp_ns - 5_000_000, sample.stamp_ns + 5_000_001)
+        self._wheel = [s for s in self._wheel if s.stamp_ns > self._state_ns]
+        if abs(sample.stamp_ns - self._state_ns) <= _WHEEL_REACH_NS and len(around):
+            self._filter.roll(sample, around.gyro_radps.mean(axis=0), self._base_from_body, _GATE_4)
 
     def _remember(self, tracked: Tracked) -> None:
         for earlier in tracked.earlier:
@@ -340,3 +415,13 @@ def _widened(noise: ImuNoise, settings: FilterSettings) -> ImuNoise:
         gyro_noise_radps_rthz=noise.gyro_noise_radps_rthz * settings.gyro_noise_scale,
         accel_noise_mps2_rthz=noise.accel_noise_mps2_rthz * settings.accel_noise_scale,
     )
+
+
+def is_picture_still(
+    old_ids: NDArray[np.int64], old_pixels: Array, ids: NDArray[np.int64], pixels: Array, limit_px: float
+) -> bool:
+    """Whether most of at least ten points seen in both pictures, pixels (N, 3), have stayed within the limit."""
+    _, before, now = np.intersect1d(old_ids, ids, assume_unique=True, return_indices=True)
+    if len(before) < 10:
+        return False
+    return bool(np.median(np.linalg.norm(pixels[now, :2] - old_pixels[before, :2], axis=1)) < limit_px)

@@ -1,5 +1,9 @@
 """Settings of the odometry; the same for every recording of a sensor set."""
 
+from typing import Annotated
+
+from msgspec import Meta
+
 from fleetmap.config import Section
 
 
@@ -22,21 +26,30 @@ class TrackerSettings(Section, frozen=True):
 class FilterSettings(Section, frozen=True):
     """Noise and window of the multi-state constraint filter.
 
-    The scales widen the data sheet's densities: vibration above the IMU's bandwidth folds into what it reports.
+    The scales widen the data sheet's densities where measurements are weighed: vibration above the IMU's bandwidth folds
+    into what it reports. noise_share to wheel_yaw_scale_sigma describe the errors as they are, for what is reported.
     """
 
-    clones: int = 11
+    clones: Annotated[int, Meta(ge=3)] = 11
     chunk_frames: int = 9
     chunk_frames_without_imu: int = 3
     pixel_sigma_px: float = 0.6
     disparity_sigma_px: float = 0.35
-    noise_share: float = 0.7
-    slip_along_share: float = 0.027
-    slip_across_share: float = 0.014
-    track_disparity_sigma_px: float = 0.15
-    disparity_offset_sigma_px: float = 0.05
-    depth_scale_sigma: float = 0.005
+    noise_share: float = 0.28
+    slip_along_share: float = 0.021
+    slip_across_share: float = 0.011
+    track_disparity_sigma_px: float = 0.12
+    disparity_offset_sigma_px: float = 0.02
+    depth_scale_sigma: float = 0.003
     pair_error_memory_s: float = 20.0
+    still_sigma_mps: float = 0.01
+    still_flow_px: float = 0.3
+    still_window_s: float = 0.4
+    use_wheels: bool = True
+    wheel_sigma_scale: float = 3.0
+    wheel_slip_mps: float = 0.05
+    wheel_speed_scale_sigma: float = 0.005
+    wheel_yaw_scale_sigma: float = 0.01
     descriptor_sigma_scale: float = 2.5
     chi_square_share: float = 0.99
     gyro_noise_scale: float = 2.0
@@ -46,7 +59,7 @@ class FilterSettings(Section, frozen=True):
     free_rotation_sigma_rad: float = 0.15
     free_translation_sigma_m: float = 1.5
     time_offset_sigma_s: float = 0.002
-    real_start_share: float = 0.3
+    real_start_share: float = 0.2
     initial_velocity_sigma_mps: float = 1.0
     initial_tilt_sigma_rad: float = 0.01
     initial_gyro_bias_sigma_radps: float = 0.005

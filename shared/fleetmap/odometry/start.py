@@ -38,13 +38,13 @@ def start_steady(
     end_ns = until_ns
     while end_ns - window_ns >= first_ns:
         window = imu.between(end_ns - window_ns, end_ns)
-        if len(window) >= 20 and _is_steady(window, settings):
+        if len(window) >= 20 and is_steady(window, settings):
             return _steady_state(window, end_ns, filter_settings)
         end_ns -= window_ns // 4
     return None
 
 
-def _is_steady(window: ImuSamples, settings: StartSettings) -> bool:
+def is_steady(window: ImuSamples, settings: StartSettings) -> bool:
     """Whether the means of tenths of the window agree: vibration averages out, motion that matters does not.
 
     Standing still and rolling at constant speed look alike here; gravity can be read in both, so the speed stays open.

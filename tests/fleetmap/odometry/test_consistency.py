@@ -1,0 +1,86 @@
+"""The odometry without pictures, in the simulator: honest covariance, standing, wheels that slip, faults of the IMU."""
+
+import numpy as np
+import pytest
+
+from benchmarks import consistency, estimator_loop
+from fleetmap.odometry import OdometryEstimate, OdometrySettings
+from fleetmap.odometry.settings import FilterSettings
+from fleetsim.estimator import EstimatorSession
+from fleetsim.faults import Fault
+
+WITHOUT_WHEELS = OdometrySettings(filter=FilterSettings(use_wheels=False))
+
+
+@pytest.fixture(scope="module")
+def site() -> consistency.Site:
+    return consistency.Site()
+
+
+def speed_error_mps(
+    session: EstimatorSession, estimates: list[OdometryEstimate], start_s: float, end_s: float
+) -> float:
+    """The largest error of the estimated speed between two times."""
+    times = np.array(session.session.frame_times_s[: len(estimates)])
+    true = np.linalg.norm(session.session.motion.velocity_body(times), axis=1)
+    off = np.abs(true - [np.linalg.norm(e.velocity_odom_mps) for e in estimates])
+    return float(off[(times >= start_s) & (times < end_s)].max())
+
+
+@pytest.mark.parametrize("inertial", [True, False], ids=["stereo-inertial", "stereo"])
+def test_errors_are_as_large_as_they_are_said_to_be(site: consistency.Site, inertial: bool) -> None:
+    """Mean normalised error squared per dof over 4 runs of 14 s; the bench narrows it down over 100."""
+    runs = [consistency.run(site.session(seed), inertial, 210)[0] for seed in range(2000, 2004)]
+    assert 0.25 < np.mean([r.rotation_nees for r in runs]) < 2.5
+    assert 0.25 < np.mean([r.position_nees for r in runs]) < 2.5
+    assert np.mean([r.final_m / r.way_m for r in runs]) < 0.01
+
+
+def test_a_standing_robot_stays_and_does_not_become_too_sure(site: consistency.Site) -> None:
+    """20 s at rest: velocity is zero, the place holds, and the drive after it is as consistent as any."""
+    session = site.session(2010, "tote-1", rest_s=20.0)
+    estimates = estimator_loop.run_odometry(session, 290)
+    first = next(k for k, e in enumerate(estimates) if e.inertial) + 15
+    places = np.array([e.odom_from_body[:3, 3] for e in estimates[first:]])
+    assert np.linalg.norm(places - places[0], axis=1).max() < 0.003
+    assert max(np.linalg.norm(e.velocity_odom_mps) for e in estimates[first:]) < 0.01
+    sigma_m = np.sqrt(np.trace(estimates[-1].cov_rot_trans[3:, 3:]))
+    assert np.linalg.norm(places[-1] - places[0]) < 3 * sigma_m
+    turned = se3_angle(estimates[first], estimates[-1])
+    assert turned < 3 * np.sqrt(np.trace(estimates[-1].cov_rot_trans[:3, :3]))
+    assert turned < 2e-3
+
+
+def se3_angle(a: OdometryEstimate, b: OdometryEstimate) -> float:
+    turn = a.odom_from_body[:3, :3].T @ b.odom_from_body[:3, :3]
+    return float(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0)))
+
+
+def test_slipping_wheels_are_refused_and_others_help(site: consistency.Site) -> None:
+    """Wheels that turn 1.6 times too fast for three seconds: the speed hardly differs from that without wheels."""
+    slipping = site.session(2020, "tote-1", faults=(Fault("wheel-slip", 6.0, 9.0),))
+    estimates = estimator_loop.run_odometry(slipping, 180)
+    assert speed_error_mps(slipping, estimates, 6.0, 9.0) < 0.1  # the wheels are off by 0.6 of about 1.5 m/s
+    with_wheels, without = [], []
+    for seed in (2021, 2022):
+        session = site.session(seed)
+        with_wheels.append(consistency.run(session, True, 180)[0].position_rms_m)
+        without.append(consistency.run(session, True, 180, WITHOUT_WHEELS)[0].position_rms_m)
+    assert np.mean(with_wheels) < 1.1 * np.mean(without)
+
+
+@pytest.mark.parametrize("fault", ["imu-spike", "imu-gap", "frames-dropped"])
+def test_a_short_fault_leaves_the_speed_alone(site: consistency.Site, fault: str) -> None:
+    session = site.session(2030, "tote-1", faults=(Fault(fault, 6.0, 6.4),))
+    estimates = estimator_loop.run_odometry(session, 150, settings=WITHOUT_WHEELS)
+    assert speed_error_mps(session, estimates, 6.0, 9.0) < 0.15
+    assert consistency.figures(session, estimates, inertial=True).position_rms_m < 0.1
+
+
+def test_the_imu_of_another_run_is_dropped(site: consistency.Site) -> None:
+    """The gyro turns where the pictures do not: the estimates go on without it, and say so."""
+    session, other = site.session(2040, "tote-1"), site.session(2041, "tote-2")
+    foreign = consistency.with_imu_of(session, other, from_s=3.0)
+    estimates = estimator_loop.run_odometry(foreign, 250, settings=WITHOUT_WHEELS)
+    assert any(e.inertial for e in estimates)
+    assert not estimates[-1].inertial
