@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fleetmap.calibration import RigCalibration
 from fleetmap.geometry import Array
 from fleetmap.recordings import FrameSelection, Recording
-from fleetmap.samples import CameraFrame, ImuSamples, PositionPrior
+from fleetmap.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
 
 _IMU_LEAD_NS = 10_000_000  # a frame is handled when the IMU has come a little past it
 

@@ -104,7 +104,7 @@ class InvariantFilter:
         noise weighs the prediction; real_noise, where it differs, goes into the budget.
         """
         steps_s, gyro, accel = imu_intervals(imu, start_ns, end_ns)
-        real_phi, real_process = self._integrate(self.state.copy(), steps_s, gyro, accel, real_noise or noise)
+        _, real_process = self._integrate(self.state.copy(), steps_s, gyro, accel, real_noise or noise)
         phi, process = self._integrate(self.state, steps_s, gyro, accel, noise)
         self._transition(phi, process, real_process)
         self._forget_pair(max(end_ns - start_ns, 0) * 1e-9)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetmap.samples import ImuSamples
@@ -34,12 +35,13 @@ def without_spikes(known: ImuSamples, new: ImuSamples) -> ImuSamples:
     return joined([known, ImuSamples(new.stamps_ns[keep], new.gyro_radps[keep], new.accel_mps2[keep])])
 
 
-def _off_neighbours(values: Array, limit: float) -> Array:
+def _off_neighbours(values: Array, limit: float) -> NDArray[np.bool_]:
     """(N,) whether rows (N, 3) differ from the row before and from the row after by more than the limit."""
-    jumps = np.linalg.norm(np.diff(values, axis=0), axis=1) > limit
+    jumps: NDArray[np.bool_] = np.linalg.norm(np.diff(values, axis=0), axis=1) > limit
     if not len(jumps):
         return np.zeros(len(values), bool)
-    return np.concatenate([[False], jumps]) & np.concatenate([jumps, [True]])
+    ends = np.concatenate([[False], jumps, [True]])
+    return np.asarray(ends[:-1] & ends[1:])
 
 
 def longest_gap_ns(imu: ImuSamples, start_ns: int, end_ns: int) -> int:
