@@ -216,7 +216,7 @@ class InvariantFilter:
                 information, scatter, vector, used,
             )  # fmt: skip
             weighing = np.eye(size) + inner @ information[:, _PAIR:].T
-            gain = np.linalg.solve(weighing, self.covariance[_CLONES:]).T
+            gain = np.asarray(np.linalg.solve(weighing, self.covariance[_CLONES:]).T, np.float64)
             correction = gain @ vector
             self._restore(prior)
             self._correct(correction)
@@ -257,7 +257,7 @@ class InvariantFilter:
         full = whole[:, _ALLOWED:]
         cross = self.covariance @ full.T
         innovation = full @ cross + noise
-        gain = np.linalg.solve(innovation, cross.T).T
+        gain = np.asarray(np.linalg.solve(innovation, cross.T).T, np.float64)
         self._correct(gain @ residual)
         self.covariance = _symmetric(self.covariance - gain @ innovation @ gain.T)
         left = np.eye(len(self.budget))

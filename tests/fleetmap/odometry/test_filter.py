@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from fleetmap.calibration import ImuNoise
 from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log, so3_exp
 from fleetmap.odometry.filter import InvariantFilter, NavState
-from fleetmap.samples import ImuSamples
+from fleetmap.samples import ImuSamples, WheelSample
 from inertial_motion import analytic_motion
 from point_world import (
     BODY_FROM_CAM,
@@ -269,3 +269,28 @@ def test_a_clone_follows_the_time_offset_as_the_motion_does() -> None:
     by_offset = estimate.covariance[16:22, 15] / SETTINGS.time_offset_sigma_s**2
     numeric = (error_of(state, true_state(1.3 + step_s)) - error_of(state, true_state(1.3 - step_s))) / (2 * step_s)
     np.testing.assert_allclose(by_offset, numeric[[0, 1, 2, 6, 7, 8]], atol=1e-5)
+
+
+def test_wheels_and_standing_measure_what_they_say() -> None:
+    """Residuals vanish at the truth, and their derivatives take a small error away."""
+    motion, base_from_body = analytic_motion(1.3), se3_exp(np.array([0.1, -0.2, 0.3, 0.1, 0.2, 0.25]))
+    truth = true_state(1.3)
+    base_body = se3_inverse(base_from_body)[:3, 3]
+    velocity_body = truth.rotation.T @ truth.velocity_mps + np.cross(motion.gyro_radps, base_body)
+    turn = base_from_body[:3, :3]
+    sample = WheelSample(0, turn @ velocity_body, float((turn @ motion.gyro_radps)[2]), 1e-4, 1e-4)
+    settings = replace(SETTINGS, wheel_slip_mps=1e-4, wheel_sigma_scale=1.0, wheel_speed_scale_sigma=0.0)
+    error = np.concatenate([np.zeros(3), 0.02 * np.array([1.0, -2.0, 1.5]), np.zeros(9)])
+    covariance = np.diag(np.repeat([1e-9, 0.05, 1e-9, 1e-9, 1e-9], 3) ** 2)
+    estimate = InvariantFilter(perturbed(truth, np.eye(3), error), covariance, settings, CAMERA, BODY_FROM_CAM)
+    assert estimate.roll(sample, motion.gyro_radps, base_from_body, gate=100.0) < 100.0
+    np.testing.assert_allclose(estimate.state.velocity_mps, truth.velocity_mps, atol=1e-4)
+    slipped = WheelSample(0, 1.6 * sample.velocity_base_mps, sample.yaw_rate_radps, 1e-4, 1e-4)
+    before = estimate.covariance.copy()
+    assert estimate.roll(slipped, motion.gyro_radps, base_from_body, gate=100.0) > 100.0
+    np.testing.assert_array_equal(estimate.covariance, before)
+    standing = NavState(velocity_mps=np.array([0.02, -0.01, 0.03]))
+    estimate = InvariantFilter(standing, np.diag(START_SIGMAS**2), SETTINGS, CAMERA, BODY_FROM_CAM)
+    assert estimate.stand_still(np.array([0.004, 0.0, -0.003]), 1e-5, gate=22.0) < 22.0
+    assert np.linalg.norm(estimate.state.velocity_mps) < 1e-3
+    np.testing.assert_allclose(estimate.state.gyro_bias_radps, [0.004, 0.0, -0.003], atol=1e-5)

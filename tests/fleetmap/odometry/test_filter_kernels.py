@@ -129,6 +129,23 @@ def test_track_jacobians_are_numeric_derivatives(with_mono: bool) -> None:
         np.testing.assert_allclose(by_point[:, k], numeric, atol=1e-4)
 
 
+def test_error_sources_are_what_they_do_to_pixels() -> None:
+    """Columns times an error against what the error makes of the whitened rows, a monocular view among them."""
+    exact = np.array([[300.0, 200.0, 280.0], [310.0, 204.0, np.nan], [330.0, 190.0, 306.0]])
+    disparities = np.array([20.0, 22.0, 24.0])
+    columns = np.zeros((9, 5))
+    filter_kernels.add_error_sources(exact, disparities, WEIGHTS, columns)
+    errors = np.array([0.3, 0.02, 0.05, -0.03, -0.4])
+    rows = []
+    for pixel, disparity in zip(exact, disparities, strict=True):
+        way = pixel[:2] - exact[0, :2]
+        slipped = errors[2] * way + errors[3] * np.array([-way[1], way[0]])
+        rows += list(slipped * WEIGHTS[0])
+        if np.isfinite(pixel[2]):
+            rows.append((errors[0] + errors[1] * disparity + errors[4]) * WEIGHTS[1])
+    np.testing.assert_allclose(columns[:8] @ errors, rows)
+
+
 def test_triangulation_finds_the_point_from_a_poor_start() -> None:
     bodies = np.array([analytic_motion(t).map_from_body for t in (0.0, 0.3, 0.6)])
     cams = bodies @ BODY_FROM_CAM
