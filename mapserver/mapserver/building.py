@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
 from fleetmap.bow import Vocabulary, decode_vocabulary, encode_vocabulary
 from fleetmap.config import to_dict
 from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError
-from fleetmap.mapformat import CameraEntry, Manifest
+from fleetmap.mapformat import CameraEntry, Manifest, decode_tile
 from fleetmap.recordings.tum import write_tum
 from fleetmap.rectification import StereoCamera
 from fleetmap.samples import Trajectory
@@ -136,6 +138,13 @@ def _survey(
     return _Built(surveyed, joined, found, zones, times, started_s)
 
 
+def _published(parent: Manifest | None, maps: MapStore) -> NDArray[np.uint32]:
+    """Ids of the landmarks that robots have of the version that this one builds on."""
+    entries = () if parent is None else parent.tiles
+    ids = [decode_tile(maps.blob(entry.sha256)).landmark_ids for entry in entries]
+    return np.concatenate([np.zeros(0, np.uint32), *ids])
+
+
 def _say_left_out(order: BuildOrder, surveyed: list[Surveyed], joined: Joined, console: Console) -> None:
     """Names the recordings that could not be joined; raises SurveyError where none could."""
     left = [(s, o) for s, o in zip(surveyed, joined.outcomes, strict=True) if not o.joined]
@@ -158,7 +167,7 @@ def _truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
 
 def _keep(order: BuildOrder, built: _Built, parent: Manifest | None, settings: SurveySettings, maps: MapStore) -> str:
     survey_map = built.joined.map
-    chosen = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M)
+    chosen = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M, _published(parent, maps))
     tiles = tiles_from_survey(survey_map, chosen=chosen)
     archive = encode_archive(survey_map)
     vocabulary = encode_vocabulary(built.surveyed[0].survey.vocabulary)
