@@ -67,7 +67,8 @@ def closed(believed_shift_m: Array, sigma_m: float, *, zones: Zones | None = Non
 
 
 def wall_records(loops: Loops) -> list[LoopRecord]:
-    return [r for r in loops.records if r.i in AGAIN and r.j in WALL]
+    every = [replace(r, j=j, also=()) for r in loops.records for j in (r.j, *r.also)]
+    return [r for r in every if r.i in AGAIN and r.j in WALL]
 
 
 def test_a_true_return_is_accepted_with_the_motion_that_was() -> None:
