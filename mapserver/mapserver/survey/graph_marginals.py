@@ -60,6 +60,11 @@ class GraphMarginals:
         placed[:, :3, 3] += self._middle_m
         return placed
 
+    @property
+    def learned(self) -> int:
+        """How many edges count besides those of the spanning tree."""
+        return self._updates
+
     def add(self, edge: PoseEdge) -> None:
         """Takes one more edge into account, such as a loop just accepted: what it says narrows and moves the graph.
 

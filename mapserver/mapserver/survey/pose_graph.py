@@ -190,7 +190,7 @@ def _believed(
     graph: gtsam.NonlinearFactorGraph, loops: list[int], start: gtsam.Values, bound: float, noise: str
 ) -> tuple[Array, gtsam.Values]:
     """(len(loops),) weight of every loop, and where the keyframes are then."""
-    doubtful, certain = [graph.at(n) for n in loops], gtsam.NonlinearFactorGraph()
+    doubtful, certain = [_with_noise(graph.at(n)) for n in loops], gtsam.NonlinearFactorGraph()
     for n in sorted(set(range(graph.size())) - set(loops)):
         certain.push_back(graph.at(n))
     if noise == "given":
@@ -202,6 +202,11 @@ def _believed(
         if scale > 0.5 * last:
             break
     return loop_weights(certain, doubtful, values, bound * scale)
+
+
+def _with_noise(factor: gtsam.NonlinearFactor) -> gtsam.NoiseModelFactor:
+    assert isinstance(factor, gtsam.NoiseModelFactor)
+    return factor
 
 
 def _scale(loops: list[gtsam.NoiseModelFactor], values: gtsam.Values) -> float:

@@ -25,7 +25,8 @@ def loop_weights(
     `bound`. Each step makes the cost a little less convex and takes
     up where the last one ended, so that the whole costs little more than one solve. It begins once near `start`, where
     at least the better half of the loops pulls, and, should that end in disbelief, once more with every loop pulling;
-    the lower truncated cost wins. is_rough: only near `start`. Source: Yang et al. 2020, Graduated non-convexity for robust spatial perception.
+    the lower truncated cost
+    wins. is_rough: only near `start`. Source: Yang et al. 2020, Graduated non-convexity for robust spatial perception.
     """
     squared = squared_residuals(loops, start)
     if (squared <= bound).all():
@@ -75,8 +76,10 @@ def _improved(
         if weight >= 1.0 - _UNSURE:
             graph.push_back(loop)
         elif weight > _UNSURE:
-            root = loop.noiseModel().R() * np.sqrt(weight)
-            graph.push_back(loop.cloneWithNewNoiseModel(gtsam.noiseModel.Gaussian.SqrtInformation(root)))
+            noise = loop.noiseModel()
+            assert isinstance(noise, gtsam.noiseModel.Gaussian)
+            weaker = gtsam.noiseModel.Gaussian.SqrtInformation(noise.R() * np.sqrt(weight))
+            graph.push_back(loop.cloneWithNewNoiseModel(weaker))
     settings = gtsam.LevenbergMarquardtParams()
     settings.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
     settings.setMaxIterations(_STEPS)
