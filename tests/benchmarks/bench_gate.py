@@ -34,7 +34,7 @@ from mapserver.survey.graph_marginals import CHI2_6_0999, GraphMarginals
 from mapserver.survey.keyframes import Keyframe
 from mapserver.survey.loops import LoopCloser, Verdict
 from mapserver.survey.pose_graph import PoseEdge
-from mapserver.survey.settings import SurveySettings
+from mapserver.survey.settings import LoopSettings, SurveySettings
 from mapserver.survey.zones import Zones
 
 NAME = "site-identical"
@@ -100,12 +100,12 @@ def prepare_tour(layout: Layout) -> Session:
 
 
 def chosen_frames(map_from_body: Array, every_m: float) -> list[int]:
-    """Frames that far, or 0.25 rad, apart."""
+    """Frames that far, or 0.4 rad, apart."""
     frames = [0]
     for n in range(1, len(map_from_body)):
         since = se3_inverse(map_from_body[frames[-1]]) @ map_from_body[n]
         turned = np.arccos(np.clip((np.trace(since[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
-        if np.linalg.norm(since[:3, 3]) >= every_m or turned > 0.25:
+        if np.linalg.norm(since[:3, 3]) >= every_m or turned > 0.4:
             frames.append(n)
     return frames
 
@@ -140,7 +140,9 @@ def site_vocabulary(keyframes: list[Keyframe]) -> Vocabulary:
     """Trained on a part of what was seen."""
     some = keyframes[:: max(1, len(keyframes) // 60)]
     images = np.repeat(np.arange(len(some)), [len(k.features) for k in some])
-    return train_vocabulary(np.concatenate([k.features.descriptors for k in some]), 10, 4, np.random.default_rng(0), images)
+    return train_vocabulary(
+        np.concatenate([k.features.descriptors for k in some]), 10, 4, np.random.default_rng(0), images
+    )
 
 
 def true_place(truth: Array, i: int, min_gap: int) -> int | None:
@@ -165,9 +167,9 @@ def holds_one_aisle(marginals: GraphMarginals, truth: Array, i: int, j: int, lay
     return True
 
 
-def bench(bays: int, every_m: float, seed: int = 0) -> Gated:
+def bench(bays: int, every_m: float, per_place: int = 2, seed: int = 0) -> Gated:
     """Drives the tour once."""
-    layout, settings = identical_site(bays), SurveySettings()
+    layout, settings = identical_site(bays), SurveySettings(loops=LoopSettings(per_place=per_place))
     simulated = prepare_tour(layout)
     session = EstimatorSession(simulated)
     frames = chosen_frames(session.map_from_body, every_m)
@@ -238,9 +240,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--bays", type=int, default=70)
     parser.add_argument("--every", type=float, default=2.0)
+    parser.add_argument("--per-place", type=int, default=2)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    found = bench(options.bays, options.every)
+    found = bench(options.bays, options.every, options.per_place)
     show(found)
     if options.out is not None:
         head = {"machine": platform.machine(), "python": platform.python_version(), "closed_share": found.closed_share}

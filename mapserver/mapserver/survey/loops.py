@@ -103,18 +103,28 @@ class LoopCloser:
     def close(self, i: int) -> None:
         """Looks for revisits of keyframe i among those before it, then adds it to the index. To be called in order."""
         ids, scores = self._alike(i)
-        inside, twins = self._gate(i, ids, scores)
-        believed = []
+        inside, others = self._gate(i, ids, scores)
+        believed: list[tuple[PoseEdge, LoopRecord]] = []
         for n in inside:
-            outcome = self._examine(
-                i, int(ids[n]), float(scores[n]), [t for t in twins if _as_alike(scores, t, n)], ids
-            )
+            j, score = int(ids[n]), float(scores[n])
+            same = [edge.j for edge, _ in believed if not self._are_apart(j, np.array([edge.j]))[0]]
+            if len(same) >= self._settings.loops.per_place:
+                reason = f"its place is closed with keyframe {same[0]} already"
+                self.loops.records.append(LoopRecord(i, j, score, Verdict.REJECTED, reason))
+                continue
+            twins = np.array([ids[t] for t in others if scores[t] >= _TWIN_SCORE * score], np.int64)
+            outcome = self._examine(i, j, score, twins)
             if isinstance(outcome, LoopRecord):
                 self.loops.records.append(outcome)
             else:
                 believed.append(outcome)
         self._decide(i, believed)
         self._index.add(i, self._vectors[i])
+
+    def _are_apart(self, j: int, others: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(M,) whether old keyframes are other places than j: they cannot be seen from where it is."""
+        reach_m = self._settings.loops.view_range_depths * np.maximum(self._depths_m[j], self._depths_m[others])
+        return np.asarray(~self._marginals.reachable(j, others, reach_m) & (others != j))
 
     def _alike(self, i: int) -> tuple[NDArray[np.int64], Array]:
         """Ids and scores of old keyframes that share words with i and are not matched with it, the most alike first."""
@@ -127,10 +137,10 @@ class LoopCloser:
         return self._index.query(self._vectors[i], new, settings.depth)
 
     def _gate(self, i: int, ids: NDArray[np.int64], scores: Array) -> tuple[list[int], list[int]]:
-        """Which candidates (numbers along ids) may be seen from where i can be, at most `top`; and which others look alike.
+        """Which candidates (numbers along ids) may be seen from where i can be, at most `top`, and which others are left.
 
         Appearance alone would fill its best places with other aisles where aisles repeat, so the gate goes down the
-        list until enough candidates are left, and records what it refused on the way.
+        list, and records what it refused on the way.
         """
         loops = self._settings.loops
         inside: list[int] = []
@@ -141,16 +151,12 @@ class LoopCloser:
             reach_m = loops.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[js])
             reachable = self._marginals.reachable(i, js, reach_m)
             for n, is_reachable in enumerate(reachable.tolist(), start):
-                if len(inside) == loops.top:
-                    break
                 if not is_reachable:
                     far.append(n)
                 elif not self._zones.compatible(self._map_from_body[i, :3, 3], self._map_from_body[ids[n], :3, 3]):
                     zoned.append(n)
                 else:
                     inside.append(n)
-            if len(inside) == loops.top:
-                break
         for refused, reason in (
             (far, "too far apart to see the same, given how well the way between is known"),
             (zoned, "in different zones"),
@@ -159,10 +165,10 @@ class LoopCloser:
                 first, *others = (int(ids[n]) for n in refused)
                 score = float(scores[refused[0]])
                 self.loops.records.append(LoopRecord(i, first, score, Verdict.GATED_OUT, reason, also=tuple(others)))
-        return inside, far
+        return inside[: loops.top], far + inside[loops.top :]
 
     def _examine(
-        self, i: int, j: int, score: float, twins: list[int], ids: NDArray[np.int64]
+        self, i: int, j: int, score: float, twins: NDArray[np.int64]
     ) -> tuple[PoseEdge, LoopRecord] | LoopRecord:
         """The edge of a candidate that passed every test alone, or why it did not."""
 
@@ -185,7 +191,7 @@ class LoopCloser:
         supported = self._neighbours_agree(match)
         if supported is False or (supported is None and count < self._settings.loops.alone_inliers):
             return refuse(Verdict.REJECTED, "neighbouring keyframes do not confirm it", count)
-        shift_m = self._unseen_twin(edge, ids[twins])
+        shift_m = self._unseen_twin(edge, twins)
         if shift_m is not None:
             reason = (
                 f"places {shift_m:.2f} m apart look the same here, and another such step is as possible as this one"
@@ -196,9 +202,12 @@ class LoopCloser:
     def _unseen_twin(self, edge: PoseEdge, twins: NDArray[np.int64]) -> float | None:
         """How far off the robot could be too if the site repeats as it is seen to, None where it cannot be.
 
-        Twins look like the old keyframe and lie elsewhere. The way to each of them is a step by which the site repeats,
+        Twins look like the old keyframe; those that lie elsewhere count. The way to each of them is a step by which the site repeats,
         perhaps also to a place where no keyframe is yet: a first visit must not be taken for a return.
         """
+        if not len(twins):
+            return None
+        twins = twins[self._are_apart(edge.j, twins)]
         ways = self._map_from_body[twins, :3, 3] - self._map_from_body[edge.j, :3, 3]
         for way in ways[np.argsort(np.linalg.norm(ways, axis=1), kind="stable")]:
             for step in (way, -way):
@@ -270,11 +279,6 @@ class LoopCloser:
             if self._marginals.gain(edge) > _WORTH_LEARNING:
                 self._marginals.add(edge)
                 self._map_from_body = self._marginals.map_from_body
-
-
-def _as_alike(scores: Array, twin: int, candidate: int) -> bool:
-    """Whether a place elsewhere looks the same as a candidate, to go by their scores."""
-    return bool(scores[twin] >= _TWIN_SCORE * scores[candidate])
 
 
 def _cells(keyframe: Keyframe, features: NDArray[np.int64], camera: StereoCamera) -> int:
