@@ -103,17 +103,15 @@ class LoopCloser:
     def close(self, i: int) -> None:
         """Looks for revisits of keyframe i among those before it, then adds it to the index. To be called in order."""
         ids, scores = self._alike(i)
-        inside, others = self._gate(i, ids, scores)
         believed: list[tuple[PoseEdge, LoopRecord]] = []
-        for n in inside:
+        for n in self._gate(i, ids, scores):
             j, score = int(ids[n]), float(scores[n])
             same = [edge.j for edge, _ in believed if not self._are_apart(j, np.array([edge.j]))[0]]
             if len(same) >= self._settings.loops.per_place:
                 reason = f"its place is closed with keyframe {same[0]} already"
                 self.loops.records.append(LoopRecord(i, j, score, Verdict.REJECTED, reason))
                 continue
-            twins = np.array([ids[t] for t in others if scores[t] >= _TWIN_SCORE * score], np.int64)
-            outcome = self._examine(i, j, score, twins)
+            outcome = self._examine(i, j, score, ids[scores >= _TWIN_SCORE * score])
             if isinstance(outcome, LoopRecord):
                 self.loops.records.append(outcome)
             else:
@@ -136,8 +134,8 @@ class LoopCloser:
             return np.zeros(0, np.int64), np.zeros(0)
         return self._index.query(self._vectors[i], new, settings.depth)
 
-    def _gate(self, i: int, ids: NDArray[np.int64], scores: Array) -> tuple[list[int], list[int]]:
-        """Which candidates (numbers along ids) may be seen from where i can be, at most `top`, and which others are left.
+    def _gate(self, i: int, ids: NDArray[np.int64], scores: Array) -> list[int]:
+        """Which candidates (numbers along ids) may be seen from where i can be, at most `top`.
 
         Appearance alone would fill its best places with other aisles where aisles repeat, so the gate goes down the
         list, and records what it refused on the way.
@@ -165,7 +163,7 @@ class LoopCloser:
                 first, *others = (int(ids[n]) for n in refused)
                 score = float(scores[refused[0]])
                 self.loops.records.append(LoopRecord(i, first, score, Verdict.GATED_OUT, reason, also=tuple(others)))
-        return inside[: loops.top], far + inside[loops.top :]
+        return inside[: loops.top]
 
     def _examine(
         self, i: int, j: int, score: float, twins: NDArray[np.int64]
