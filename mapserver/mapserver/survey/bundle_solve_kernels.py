@@ -25,11 +25,12 @@ def fill_lower(
 ) -> None:
     """Adds S to the zeroed dense `lower` (PD, PD); only its lower triangle is complete."""
     count, size = free.shape
+    width = blocks.shape[1]
     for p in range(count):
         for s in range(row_ptr[p], row_ptr[p + 1]):
             q = cols[s]
-            for a in range(6):
-                for b in range(6):
+            for a in range(width):
+                for b in range(width):
                     if free[p, a] and free[q, b]:
                         lower[p * size + a, q * size + b] += blocks[s, a, b]
         for a in range(size):

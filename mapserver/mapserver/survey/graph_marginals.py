@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -59,6 +60,11 @@ class GraphMarginals:
         placed[:, :3, 3] += self._middle_m
         return placed
 
+    @property
+    def learned(self) -> int:
+        """How many edges count besides those of the spanning tree."""
+        return self._updates
+
     def add(self, edge: PoseEdge) -> None:
         """Takes one more edge into account, such as a loop just accepted: what it says narrows and moves the graph.
 
@@ -84,7 +90,7 @@ class GraphMarginals:
         i_from_map = adjoint(se3_inverse(self._map_from_body[i]))
         return np.asarray(i_from_map @ cov_map @ i_from_map.T)
 
-    def reachable(self, i: int, js: Indices, reach_m: float, chi2: float = CHI2_3_0999) -> NDArray[np.bool_]:
+    def reachable(self, i: int, js: Indices, reach_m: float | Array, chi2: float = CHI2_3_0999) -> NDArray[np.bool_]:
         """(M,) whether keyframe j may be within `reach_m` of keyframe i, given how well their distance is known.
 
         True where (distance - reach)^2 / variance of the distance is at most `chi2`: no place inside the reach is
@@ -107,6 +113,10 @@ class GraphMarginals:
         innovation = self._innovation(edge)
         cov = self.relative_cov(edge.i, edge.j) + edge.cov_rot_trans
         return float(innovation @ np.linalg.solve(cov, innovation))
+
+    def gain(self, edge: PoseEdge) -> float:
+        """Largest ratio of what the graph does not know to what the edge does not: below 1 the edge tells little."""
+        return float(np.max(scipy.linalg.eigvalsh(self.relative_cov(edge.i, edge.j), edge.cov_rot_trans)))
 
     def _innovation(self, edge: PoseEdge) -> Array:
         """(6,) what a measured edge says against the graph, in the axes of i."""

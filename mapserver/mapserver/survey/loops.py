@@ -1,13 +1,13 @@
 """Revisits: looked for by words, allowed by position, verified by geometry, and only then believed."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import BowVector, PlaceIndex
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, se3, se3_inverse
 from fleetmap.rectification import StereoCamera
 from mapserver.survey.graph_marginals import GraphMarginals
 from mapserver.survey.keyframes import Keyframe
@@ -22,6 +22,11 @@ _CORRELATION = (
 )
 
 
+_CHUNK = 64  # candidates that are gated at once
+_TWIN_SCORE = 0.7  # of a candidate's score, from which on another place looks the same
+_WORTH_LEARNING = 1.0  # variance against the measurement's: below, a loop changes what the gate knows by less than half
+
+
 class Verdict(StrEnum):
     """What became of a candidate."""
 
@@ -33,7 +38,10 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LoopRecord:
-    """One candidate and its fate: keyframe i (new) against j (old); inliers and the reason in words."""
+    """One candidate and its fate: keyframe i (new) against j (old); inliers and the reason in words.
+
+    also: further old keyframes, less alike than j, refused for the same reason before any was compared in detail.
+    """
 
     i: int
     j: int
@@ -41,6 +49,7 @@ class LoopRecord:
     verdict: Verdict
     reason: str
     inliers: int = 0
+    also: tuple[int, ...] = ()
 
 
 @dataclass
@@ -52,9 +61,9 @@ class Loops:
 
     def counts(self) -> dict[str, int]:
         """candidates, gated_out, rejected, accepted; ambiguous ones count as rejected."""
-        tally = {verdict: sum(r.verdict is verdict for r in self.records) for verdict in Verdict}
+        tally = {verdict: sum(1 + len(r.also) for r in self.records if r.verdict is verdict) for verdict in Verdict}
         return {
-            "candidates": len(self.records),
+            "candidates": sum(tally.values()),
             "gated_out": tally[Verdict.GATED_OUT],
             "rejected": tally[Verdict.REJECTED] + tally[Verdict.AMBIGUOUS],
             "accepted": tally[Verdict.ACCEPTED],
@@ -87,47 +96,83 @@ class LoopCloser:
         for i, j in sorted(matched):
             self._neighbours.setdefault(i, []).append(j)
             self._neighbours.setdefault(j, []).append(i)
-        self._matched = matched
+        self._depths_m = np.array([median_depth_m(keyframe) for keyframe in keyframes])
         self._index = PlaceIndex(word_count)
         self.loops = Loops()
 
     def close(self, i: int) -> None:
         """Looks for revisits of keyframe i among those before it, then adds it to the index. To be called in order."""
-        settings = self._settings.loops
-        ids = self._index.place_ids
-        new = np.array(
-            [(j, i) not in self._matched and i - j >= settings.min_gap_keyframes for j in ids.tolist()], bool
-        )
-        if new.any():
-            found, scores = self._index.query(self._vectors[i], new, settings.top)
-            believed = [
-                edge
-                for j, score in zip(found.tolist(), scores.tolist(), strict=True)
-                if (edge := self._judge(i, j, score)) is not None
-            ]
-            self._decide(i, believed)
+        ids, scores = self._alike(i)
+        believed: list[tuple[PoseEdge, LoopRecord]] = []
+        for n in self._gate(i, ids, scores):
+            j, score = int(ids[n]), float(scores[n])
+            same = [edge.j for edge, _ in believed if not self._are_apart(j, np.array([edge.j]))[0]]
+            if len(same) >= self._settings.loops.per_place:
+                reason = f"its place is closed with keyframe {same[0]} already"
+                self.loops.records.append(LoopRecord(i, j, score, Verdict.REJECTED, reason))
+                continue
+            outcome = self._examine(i, j, score, ids[scores >= _TWIN_SCORE * score])
+            if isinstance(outcome, LoopRecord):
+                self.loops.records.append(outcome)
+            else:
+                believed.append(outcome)
+        self._decide(i, believed)
         self._index.add(i, self._vectors[i])
 
-    def _judge(self, i: int, j: int, score: float) -> tuple[PoseEdge, LoopRecord] | None:
-        """The edge of one candidate that passed every test alone; records the failure of any other."""
+    def _are_apart(self, j: int, others: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(M,) whether old keyframes are other places than j: they cannot be seen from where it is."""
+        reach_m = self._settings.loops.view_range_depths * np.maximum(self._depths_m[j], self._depths_m[others])
+        return np.asarray(~self._marginals.reachable(j, others, reach_m) & (others != j))
 
-        outcome = self._examine(i, j, score)
-        if isinstance(outcome, LoopRecord):
-            self.loops.records.append(outcome)
-            return None
-        return outcome
+    def _alike(self, i: int) -> tuple[NDArray[np.int64], Array]:
+        """Ids and scores of old keyframes that share words with i and are not matched with it, the most alike first."""
+        settings = self._settings.loops
+        ids = self._index.place_ids
+        new = i - ids >= settings.min_gap_keyframes
+        new &= ~np.isin(ids, self._neighbours.get(i, []))
+        if not new.any():
+            return np.zeros(0, np.int64), np.zeros(0)
+        return self._index.query(self._vectors[i], new, settings.depth)
 
-    def _examine(self, i: int, j: int, score: float) -> tuple[PoseEdge, LoopRecord] | LoopRecord:
+    def _gate(self, i: int, ids: NDArray[np.int64], scores: Array) -> list[int]:
+        """Which candidates (numbers along ids) may be seen from where i can be, at most `top`.
+
+        Appearance alone would fill its best places with other aisles where aisles repeat, so the gate goes down the
+        list, and records what it refused on the way.
+        """
+        loops = self._settings.loops
+        inside: list[int] = []
+        far: list[int] = []
+        zoned: list[int] = []
+        for start in range(0, len(ids), _CHUNK):
+            js = ids[start : start + _CHUNK]
+            reach_m = loops.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[js])
+            reachable = self._marginals.reachable(i, js, reach_m)
+            for n, is_reachable in enumerate(reachable.tolist(), start):
+                if not is_reachable:
+                    far.append(n)
+                elif not self._zones.compatible(self._map_from_body[i, :3, 3], self._map_from_body[ids[n], :3, 3]):
+                    zoned.append(n)
+                else:
+                    inside.append(n)
+        for refused, reason in (
+            (far, "too far apart to see the same, given how well the way between is known"),
+            (zoned, "in different zones"),
+        ):
+            if refused:
+                first, *others = (int(ids[n]) for n in refused)
+                score = float(scores[refused[0]])
+                self.loops.records.append(LoopRecord(i, first, score, Verdict.GATED_OUT, reason, also=tuple(others)))
+        return inside[: loops.top]
+
+    def _examine(
+        self, i: int, j: int, score: float, twins: NDArray[np.int64]
+    ) -> tuple[PoseEdge, LoopRecord] | LoopRecord:
+        """The edge of a candidate that passed every test alone, or why it did not."""
+
         def refuse(verdict: Verdict, reason: str, inliers: int = 0) -> LoopRecord:
             return LoopRecord(i, j, score, verdict, reason, inliers)
 
-        reach_m = self._settings.loops.view_range_depths * max(
-            median_depth_m(self._keyframes[i]), median_depth_m(self._keyframes[j])
-        )
-        if not self._marginals.reachable(i, np.array([j]), reach_m)[0]:
-            return refuse(Verdict.GATED_OUT, "too far apart to see the same, given how well the way between is known")
-        if not self._zones.compatible(self._map_from_body[i, :3, 3], self._map_from_body[j, :3, 3]):
-            return refuse(Verdict.GATED_OUT, "in different zones")
         match = self._verify(i, j)
         if match is None:
             return refuse(Verdict.REJECTED, "too few features agree on one motion")
@@ -144,7 +189,31 @@ class LoopCloser:
         supported = self._neighbours_agree(match)
         if supported is False or (supported is None and count < self._settings.loops.alone_inliers):
             return refuse(Verdict.REJECTED, "neighbouring keyframes do not confirm it", count)
+        shift_m = self._unseen_twin(edge, twins)
+        if shift_m is not None:
+            reason = (
+                f"places {shift_m:.2f} m apart look the same here, and another such step is as possible as this one"
+            )
+            return refuse(Verdict.AMBIGUOUS, reason, count)
         return edge, LoopRecord(i, j, score, Verdict.ACCEPTED, "verified", count)
+
+    def _unseen_twin(self, edge: PoseEdge, twins: NDArray[np.int64]) -> float | None:
+        """How far off the robot could be too if the site repeats as it is seen to, None where it cannot be.
+
+        Twins look like the old keyframe; those that lie elsewhere count. The way to each of them is a step by which the site repeats,
+        perhaps also to a place where no keyframe is yet: a first visit must not be taken for a return.
+        """
+        if not len(twins):
+            return None
+        twins = twins[self._are_apart(edge.j, twins)]
+        ways = self._map_from_body[twins, :3, 3] - self._map_from_body[edge.j, :3, 3]
+        for way in ways[np.argsort(np.linalg.norm(ways, axis=1), kind="stable")]:
+            for step in (way, -way):
+                i_from_map = edge.i_from_j @ se3_inverse(self._map_from_body[edge.j])
+                elsewhere = replace(edge, i_from_j=i_from_map @ se3(np.eye(3), -step) @ self._map_from_body[edge.j])
+                if self._marginals.innovation_squared(elsewhere) <= self._settings.loops.max_innovation:
+                    return float(np.linalg.norm(step))
+        return None
 
     def _verify(self, i: int, j: int) -> PairMatch | None:
         """Match of j (as reference) with i; the graph's rotation is used where it is known well enough."""
@@ -205,8 +274,9 @@ class LoopCloser:
                 continue
             self.loops.records.append(record)
             self.loops.edges.append(edge)
-            self._marginals.add(edge)
-            self._map_from_body = self._marginals.map_from_body
+            if self._marginals.gain(edge) > _WORTH_LEARNING:
+                self._marginals.add(edge)
+                self._map_from_body = self._marginals.map_from_body
 
 
 def _cells(keyframe: Keyframe, features: NDArray[np.int64], camera: StereoCamera) -> int:

@@ -2,14 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import gtsam
 import numpy as np
+from scipy.stats import chi2
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_inverse, skew
+from mapserver.survey.pose_graph_robust import loop_weights, squared_residuals
 
 _FIXED_SIGMA = 1e-6
+_FIRST_ITERATIONS = 15  # before another start is considered
+_SCALE_ROUNDS = 6
+_RIGHT_SHARE = 0.7  # of the loops, taken for right where the noise is estimated
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,27 +65,30 @@ def optimize_pose_graph(
     robust: bool = True,
     inlier_probability: float = 0.999,
     max_iterations: int = 100,
+    noise: Literal["given", "estimated"] = "given",
 ) -> PoseGraphResult:
     """The places of K keyframes that fit the edges best, from a start map_from_body (K, 4, 4); `fixed` stays.
 
     robust: loops that contradict the rest are disbelieved, by graduated non-convexity with truncated least squares in
-    which all other edges are known to be true; a loop counts as consistent while its squared residual stays within
-    the `inlier_probability` of chi-square. Raises SurveyError for edges that leave a keyframe without connection,
-    point outside or carry no proper covariance. Source: Yang et al. 2020 (GNC), as gtsam has it.
+    which all other edges are known to be true; a loop counts as consistent while its squared residual stays within the
+    `inlier_probability` of chi-square. noise "estimated": within a bound that goes by the better 0.7 of the
+    loops, for graphs whose covariances are right only up to a common factor. Where the result is less likely than its edges'
+    covariances allow, a second start without any guess (chordal relaxation of the rotations) is tried, and the better
+    result taken. Raises SurveyError for edges that leave a keyframe without connection, point outside or carry no
+    proper covariance. Source: Yang et al. 2020 (GNC); Carlone et al. 2015 (chordal start), as gtsam has it.
     """
     check_edges(len(map_from_body), edges)
-    start = _values(map_from_body)
+    begin = start = _values(map_from_body)
     loops = [index for index, edge in enumerate(edges) if edge.is_loop]
     weights = np.ones(len(loops))
     try:
         if robust and loops:
             graph = _graph(map_from_body, edges, fixed)
-            weights = _robust_weights(graph, start, edges, inlier_probability, max_iterations)[loops]
+            weights, begin = _believed(graph, loops, start, float(chi2.ppf(inlier_probability, 6)), noise)
         believed = dict(zip(loops, weights >= 0.5, strict=True))
         kept = [edge for index, edge in enumerate(edges) if believed.get(index, True)]
         graph = _graph(map_from_body, kept, fixed)
-        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, _solver_settings(max_iterations))
-        optimum = optimizer.optimize()
+        optimum, iterations = _optimum(graph, begin, 6 * (len(kept) - len(map_from_body) + 1), max_iterations)
     except RuntimeError as error:
         raise SurveyError(
             f"the pose graph of {len(map_from_body)} keyframes and {len(edges)} edges cannot be solved "
@@ -88,7 +97,7 @@ def optimize_pose_graph(
     solved = np.array([optimum.atPose3(k).matrix() for k in range(len(map_from_body))])
     solved = map_from_body[fixed] @ se3_inverse(solved[fixed]) @ solved  # the prior leaves 1e-6 of play
     solved[fixed] = map_from_body[fixed]
-    return PoseGraphResult(solved, weights, graph.error(start), graph.error(optimum), int(optimizer.iterations()))
+    return PoseGraphResult(solved, weights, graph.error(start), graph.error(optimum), iterations)
 
 
 def check_edges(count: int, edges: Sequence[PoseEdge], *, connected: bool = True) -> None:
@@ -152,25 +161,54 @@ def _graph(map_from_body: Array, edges: Sequence[PoseEdge], fixed: int) -> gtsam
     return graph
 
 
-def _solver_settings(max_iterations: int) -> gtsam.LevenbergMarquardtParams:
+def _optimum(
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, freedom: int, max_iterations: int
+) -> tuple[gtsam.Values, int]:
+    """The lowest minimum found, and the iterations that led there from the start that reached it."""
+    best, spent = _descend(graph, start, min(max_iterations, _FIRST_ITERATIONS))
+    if 2.0 * graph.error(best) > freedom + 5.0 * np.sqrt(2.0 * max(freedom, 1)):
+        other, other_spent = _descend(
+            graph, gtsam.InitializePose3.initialize(graph), min(max_iterations, _FIRST_ITERATIONS)
+        )
+        if graph.error(other) < graph.error(best):
+            best, spent = other, other_spent
+    if spent < _FIRST_ITERATIONS or spent >= max_iterations:
+        return best, spent
+    best, more = _descend(graph, best, max_iterations - spent)
+    return best, spent + more
+
+
+def _descend(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, iterations: int) -> tuple[gtsam.Values, int]:
     settings = gtsam.LevenbergMarquardtParams()
     settings.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
-    settings.setMaxIterations(max_iterations)
-    return settings
+    settings.setMaxIterations(iterations)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, settings)
+    return optimizer.optimize(), int(optimizer.iterations())
 
 
-def _robust_weights(
-    graph: gtsam.NonlinearFactorGraph,
-    start: gtsam.Values,
-    edges: Sequence[PoseEdge],
-    inlier_probability: float,
-    max_iterations: int,
-) -> Array:
-    """(len(edges),) weight of every edge; 1 for those that are no loops."""
-    settings = gtsam.GncLMParams(_solver_settings(max_iterations))
-    settings.setLossType(gtsam.GncLossType.TLS)
-    settings.setKnownInliers([k for k, edge in enumerate(edges) if not edge.is_loop] + [len(edges)])
-    optimizer = gtsam.GncLMOptimizer(graph, start, settings)
-    optimizer.setInlierCostThresholdsAtProbability(inlier_probability)
-    optimizer.optimize()
-    return np.asarray(optimizer.getWeights(), np.float64)[: len(edges)]
+def _believed(
+    graph: gtsam.NonlinearFactorGraph, loops: list[int], start: gtsam.Values, bound: float, noise: str
+) -> tuple[Array, gtsam.Values]:
+    """(len(loops),) weight of every loop, and where the keyframes are then."""
+    doubtful, certain = [_with_noise(graph.at(n)) for n in loops], gtsam.NonlinearFactorGraph()
+    for n in sorted(set(range(graph.size())) - set(loops)):
+        certain.push_back(graph.at(n))
+    if noise == "given":
+        return loop_weights(certain, doubtful, start, bound)
+    values, scale = start, _scale(doubtful, start)
+    for _ in range(_SCALE_ROUNDS):
+        _, values = loop_weights(certain, doubtful, values, bound * scale, is_rough=True)
+        last, scale = scale, _scale(doubtful, values)
+        if scale > 0.5 * last:
+            break
+    return loop_weights(certain, doubtful, values, bound * scale)
+
+
+def _with_noise(factor: gtsam.NonlinearFactor) -> gtsam.NoiseModelFactor:
+    assert isinstance(factor, gtsam.NoiseModelFactor)
+    return factor
+
+
+def _scale(loops: list[gtsam.NoiseModelFactor], values: gtsam.Values) -> float:
+    """By how much the loops' squared residuals exceed what their covariances say, at a quantile that outliers spare."""
+    return max(float(np.quantile(squared_residuals(loops, values), _RIGHT_SHARE) / chi2.ppf(_RIGHT_SHARE, 6)), 1e-9)

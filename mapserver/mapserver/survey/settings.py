@@ -42,6 +42,8 @@ class LoopSettings(Section, frozen=True):
     """Which revisits are looked for and believed."""
 
     top: int = 8
+    depth: int = 128
+    per_place: int = 8
     min_gap_keyframes: int = 8
     max_innovation: float = 22.458  # 0.999 of chi-square with 6 degrees of freedom
     view_range_depths: float = 1.0

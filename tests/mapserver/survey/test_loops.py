@@ -67,7 +67,8 @@ def closed(believed_shift_m: Array, sigma_m: float, *, zones: Zones | None = Non
 
 
 def wall_records(loops: Loops) -> list[LoopRecord]:
-    return [r for r in loops.records if r.i in AGAIN and r.j in WALL]
+    every = [replace(r, j=j, also=()) for r in loops.records for j in (r.j, *r.also)]
+    return [r for r in every if r.i in AGAIN and r.j in WALL]
 
 
 def test_a_true_return_is_accepted_with_the_motion_that_was() -> None:
@@ -149,6 +150,40 @@ def test_two_places_that_exclude_each_other_are_ambiguous() -> None:
     assert not [e for e in closer.loops.edges if e.i == 20]
     counts = closer.loops.counts()
     assert counts["rejected"] >= len(records)
+
+
+@pytest.mark.parametrize(("sigma_m", "verdict"), [(1.4, Verdict.AMBIGUOUS), (0.5, Verdict.ACCEPTED)])
+def test_where_the_site_repeats_a_first_visit_is_not_taken_for_a_return(sigma_m: float, verdict: Verdict) -> None:
+    """Two aisles 8 m apart, both seen; a third look, 2 m beside the first by odometry, may be of one 8 m to the other side.
+
+    Only where the way there is known too well for that it is the first aisle.
+    """
+    keyframes, places, rectifier, vocabulary = seen()
+    aside = np.array([0, 8.0, 0])
+    path = np.array([*places, *places, *places[:4]])
+    path[10:14, :3, 3] += aside
+    path[20:, :3, 3] -= 0.25 * aside
+    whole = [replace(keyframes[n % 10], frame_index=n) for n in range(24)]
+    sigmas = [0.005] * 19 + [sigma_m] + [0.005] * 3
+    chain = [
+        PoseEdge(k, k + 1, se3_inverse(path[k]) @ path[k + 1], np.diag([1e-8] * 3 + [s**2] * 3), is_loop=False)
+        for k, s in enumerate(sigmas)
+    ]
+    vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in whole]
+    closer = LoopCloser(
+        whole, vectors, vocabulary.word_count, rectifier.camera, rectifier.body_from_cam, path,
+        GraphMarginals(path, chain), {(k, k + 1) for k in range(len(chain))}, SETTINGS, Zones(),
+    )  # fmt: skip
+    for k in range(21):
+        closer.close(k)
+    (record,) = (r for r in closer.loops.records if (r.i, r.j) == (20, 0))
+    assert record.verdict is verdict
+    assert bool([e for e in closer.loops.edges if e.i == 20]) is (verdict is Verdict.ACCEPTED)
+
+
+def test_candidates_refused_together_are_all_counted() -> None:
+    together = LoopRecord(20, 1, 0.5, Verdict.GATED_OUT, "because", also=(2, 3))
+    assert Loops([together]).counts() == {"candidates": 3, "gated_out": 3, "rejected": 0, "accepted": 0}
 
 
 def edge(i: int, j: int) -> PoseEdge:

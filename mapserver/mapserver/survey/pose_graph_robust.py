@@ -1,0 +1,86 @@
+"""Which loops to disbelieve: graduated non-convexity over the loops of a pose graph whose other edges are true."""
+
+import gtsam
+import numpy as np
+
+from fleetmap.geometry import Array
+
+_GROWTH = 1.6  # of the control parameter, from almost convex to truncated
+_STEPS = 2  # Levenberg-Marquardt iterations between two updates of the weights
+_MAX_UPDATES = 150
+_UNSURE = 1e-3  # a weight so near to 0 or 1 counts as decided
+
+
+def loop_weights(
+    certain: gtsam.NonlinearFactorGraph,
+    loops: list[gtsam.NoiseModelFactor],
+    start: gtsam.Values,
+    bound: float,
+    *,
+    is_rough: bool = False,
+) -> tuple[Array, gtsam.Values]:
+    """Weight (len(loops),) of each loop, 1 believed and 0 not, and where the keyframes are then.
+
+    `certain`: all that is taken for true. A loop is consistent while its squared residual stays within
+    `bound`. Each step makes the cost a little less convex and takes
+    up where the last one ended, so that the whole costs little more than one solve. It begins once near `start`, where
+    at least the better half of the loops pulls, and, should that end in disbelief, once more with every loop pulling;
+    the lower truncated cost
+    wins. is_rough: only near `start`. Source: Yang et al. 2020, Graduated non-convexity for robust spatial perception.
+    """
+    squared = squared_residuals(loops, start)
+    if (squared <= bound).all():
+        return np.ones(len(loops)), start
+    reaches = (4.0 * float(np.median(squared)), 2.0 * float(squared.max()))
+    found: list[tuple[float, Array, gtsam.Values]] = []
+    for reach in reaches:
+        found.append(_anneal(certain, loops, start, bound, min(bound / max(reach - bound, bound), 1.0)))
+        if is_rough or found[-1][1].min() > 0.5:
+            break
+    _, weights, values = min(found, key=lambda one: one[0])
+    return weights, values
+
+
+def _anneal(
+    certain: gtsam.NonlinearFactorGraph, loops: list[gtsam.NoiseModelFactor], start: gtsam.Values, bound: float, control: float
+) -> tuple[float, Array, gtsam.Values]:  # fmt: skip
+    """Truncated cost, weights and places, annealed from a control parameter."""
+    values = start
+    for _ in range(_MAX_UPDATES):
+        weights = truncated_weights(squared_residuals(loops, values), bound, control)
+        values = _improved(certain, loops, weights, values)
+        if (np.minimum(weights, 1.0 - weights) < _UNSURE).all() and control > 1.0:
+            break
+        control *= _GROWTH
+    cost = certain.error(values) + 0.5 * float(np.minimum(squared_residuals(loops, values), bound).sum())
+    return cost, weights, values
+
+
+def truncated_weights(squared: Array, bound: float, control: float) -> Array:
+    """Weights of squared residuals under the surrogate of truncated least squares. Source: Yang et al. 2020, eq. 14."""
+    between = np.sqrt(bound * control * (control + 1.0) / np.maximum(squared, 1e-12)) - control
+    weights = np.where(squared >= bound * (control + 1.0) / control, 0.0, between)
+    return np.asarray(np.where(squared <= bound * control / (control + 1.0), 1.0, np.clip(weights, 0.0, 1.0)))
+
+
+def squared_residuals(loops: list[gtsam.NoiseModelFactor], values: gtsam.Values) -> Array:
+    """(len(loops),) squared residuals in sigmas."""
+    return 2.0 * np.array([loop.error(values) for loop in loops])
+
+
+def _improved(
+    certain: gtsam.NonlinearFactorGraph, loops: list[gtsam.NoiseModelFactor], weights: Array, values: gtsam.Values
+) -> gtsam.Values:
+    graph = gtsam.NonlinearFactorGraph(certain)
+    for loop, weight in zip(loops, weights, strict=True):
+        if weight >= 1.0 - _UNSURE:
+            graph.push_back(loop)
+        elif weight > _UNSURE:
+            noise = loop.noiseModel()
+            assert isinstance(noise, gtsam.noiseModel.Gaussian)
+            weaker = gtsam.noiseModel.Gaussian.SqrtInformation(noise.R() * np.sqrt(weight))
+            graph.push_back(loop.cloneWithNewNoiseModel(weaker))
+    settings = gtsam.LevenbergMarquardtParams()
+    settings.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
+    settings.setMaxIterations(_STEPS)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
