@@ -27,7 +27,8 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     site (manifest and tiles), vocabulary apart; None until it is stored. loops: counts of candidates and their fates.
     ate_rmse_m, ate_sim3_rmse_m: root mean square position error of every selected frame that has an estimate and a
     known truth, after one rigid (similarity) alignment; evaluated_share: their share of the selected frames. All three
-    are None without ground truth. peak_rss_mb: most memory the process held, in 10^6 bytes.
+    are None without ground truth. peak_rss_mb: most memory the process held, in 10^6 bytes. findings: by recording, what
+    the doctor found wanting in it, and what was corrected.
     """
 
     recordings: list[str]
@@ -44,6 +45,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     ate_sim3_rmse_m: float | None
     evaluated_share: float | None
     peak_rss_mb: float
+    findings: dict[str, list[str]] = {}
 
 
 class Accuracy(msgspec.Struct, frozen=True):
@@ -126,7 +128,8 @@ def full_report(
 ) -> dict[str, Any]:  # fmt: skip
     """The stable keys, and with them what helps to understand them; those may change.
 
-    loop_records: every candidate, keyframe i against the older j. stage_s: wall seconds of each stage; reading and
+    loop_records: every candidate, keyframe i against the older j. parts: of the survey, the kept one
+    is the map. stage_s: wall seconds of each stage; reading and
     decoding images are part of odometry.
     """
     survey_map = survey.map
@@ -145,5 +148,6 @@ def full_report(
         "ate_max_m": None if found.rigid is None else found.rigid.max_m,
         "sim3_scale": None if found.similarity is None else found.similarity.scale,
         "stage_s": {stage: round(seconds, 3) for stage, seconds in stage_s.items()},
+        "parts": msgspec.to_builtins(survey.parts),
         "loop_records": msgspec.to_builtins(survey.loops.records),
     }

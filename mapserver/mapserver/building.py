@@ -21,6 +21,7 @@ from fleetmap.rectification import Rectifier
 from fleetmap.samples import SensorSet
 from mapserver.build_report import Accuracy, BuildReport, accuracy, check_truth, full_report, make_report
 from mapserver.progress import ProgressView, StageTimes
+from mapserver.recording_checks import checked
 from mapserver.store import DraftDetails, MapStore
 from mapserver.store.archive import encode_archive
 from mapserver.survey.moving import moved
@@ -71,16 +72,26 @@ def run_build(order: BuildOrder, settings: SurveySettings) -> str:
     console = Console(stderr=True)
     selection = FrameSelection.parse(order.frames)
     zones = Zones() if order.zones is None else read_zones(order.zones)
-    with open_recording(order.recording, OpenOptions(calibration_file=order.calibration)) as recording:
-        for loss in recording.losses:
+    with open_recording(order.recording, OpenOptions(calibration_file=order.calibration)) as source:
+        for loss in source.losses:
             console.print(f"loss: {loss.what}: {loss.detail}", markup=False)
-        indices = selection.apply(recording)
-        _check(recording, indices, order)
+        indices = selection.apply(source)
+        _check(source, indices, order)
+        recording, remarks = _examined(source, console)
         with MapStore.open(order.store, create=True) as maps:
             built = _survey(
                 order, recording, indices, zones, maps.site_vocabulary(order.site), settings, console, started_s
             )
-            return _keep(order, recording, built, settings, maps)
+            return _keep(order, recording, built, remarks, settings, maps)
+
+
+def _examined(recording: Recording, console: Console) -> tuple[Recording, list[str]]:
+    """The recording as it is to be surveyed, and the doctor's remarks, which are printed too."""
+    examined = checked(recording)
+    remarks = examined.remarks()
+    for remark in remarks:
+        console.print(f"{recording.name}: {remark}", markup=False)
+    return examined.recording, remarks
 
 
 def _check(recording: Recording, indices: "NDArray[Any]", order: BuildOrder) -> None:
@@ -126,7 +137,9 @@ def _survey(
     return _Built(done, found, zones, len(indices), times, started_s)
 
 
-def _keep(order: BuildOrder, recording: Recording, built: _Built, settings: SurveySettings, maps: MapStore) -> str:
+def _keep(
+    order: BuildOrder, recording: Recording, built: _Built, remarks: list[str], settings: SurveySettings, maps: MapStore
+) -> str:
     tiles = tiles_from_survey(built.survey.map)
     archive = encode_archive(built.survey.map)
     vocabulary = encode_vocabulary(built.survey.vocabulary)
@@ -135,6 +148,8 @@ def _keep(order: BuildOrder, recording: Recording, built: _Built, settings: Surv
         recording.name, built.survey.map, built.survey.loops, built.accuracy, len(vocabulary),
         time.perf_counter() - built.started_s, _peak_rss_mb(),
     )  # fmt: skip
+    remarks = [*remarks, *(part.remark() for part in built.survey.parts if not part.kept)]
+    report = msgspec.structs.replace(report, findings={recording.name: remarks})
     details = DraftDetails(
         created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
         tile_size_m=TILE_SIZE_M,

@@ -62,6 +62,9 @@ class EvaluateSection(Section, frozen=True):
     """Options of `mapserver evaluate`."""
 
     ground_truth: str | None = None
+    covariances: str | None = None
+    from_first: bool | None = None
+    frames: int | None = None
     json: bool | None = None
 
 

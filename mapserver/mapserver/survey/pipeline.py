@@ -21,6 +21,7 @@ from mapserver.survey.keyframes import Keyframe
 from mapserver.survey.loops import LoopCloser, Loops
 from mapserver.survey.matching import PairFinder, drift_allowance_m, fixed_allowance_m
 from mapserver.survey.pairs import PairMatch
+from mapserver.survey.parts import Part, SigmaBetween, find_parts, only_kept
 from mapserver.survey.pose_graph import PoseEdge, optimize_pose_graph
 from mapserver.survey.result import SurveyMap
 from mapserver.survey.settings import SurveySettings
@@ -35,12 +36,13 @@ _MIN_LANDMARKS = 30
 
 @dataclass(frozen=True)
 class Survey:
-    """What a survey gives: the map, the vocabulary it used, the loops with their reasons, and the first guess it began with."""
+    """What a survey gives: the map, the vocabulary it used, the loops with their reasons, the first guess it began with, its parts."""
 
     map: SurveyMap
     vocabulary: Vocabulary
     loops: Loops
     first_guess: FirstGuess
+    parts: list[Part]
 
 
 def survey(
@@ -81,7 +83,9 @@ def survey(
         )
         adjust(state, settings)
     progress("global adjustment", 2, 2)
-    return Survey(summarise(state, guess, settings), vocabulary, loops, guess)
+    done, frames = summarise(state, guess, settings), np.array([k.frame_index for k in keyframes], np.int64)
+    parts = find_parts(done, SigmaBetween(guess.covariances[frames]), settings.join_sigma_m)
+    return Survey(only_kept(done, frames, parts.kept), vocabulary, loops, guess, [*parts.parts, *parts.stray])
 
 
 def _first_state(

@@ -87,3 +87,4 @@ class SurveySettings(Section, frozen=True):
     vocabulary: VocabularySettings = VocabularySettings()
     local_window: int = 20
     min_observations: int = 2
+    join_sigma_m: float = 0.1
