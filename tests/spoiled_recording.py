@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fleetmap.calibration import CameraCalibration
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.recordings import Recording
-from fleetmap.recordings.images import StoredFrame, decode_frame, decode_grey, grey_image
+from fleetmap.recordings.images import StoredFrame, decode_frame, decode_grey, png_image
 from fleetmap.recordings.recording import FrameSource
 from fleetmap.samples import CameraFrame, ImuSamples
 
@@ -75,7 +75,7 @@ def with_darkness(recording: Recording, start_s: float, end_s: float) -> Recordi
         assert frame.right is not None
         rng = np.random.default_rng(frame.stamp_ns)
         shape = decode_grey(frame.left).shape
-        left, right = (grey_image(np.clip(rng.normal(2.0, 0.8, shape), 0, 255).astype(np.uint8)) for _ in range(2))
+        left, right = (png_image(np.clip(rng.normal(2.0, 0.8, shape), 0, 255).astype(np.uint8)) for _ in range(2))
         return StoredFrame(frame.stamp_ns, left, right)
 
     return _with_frames(recording, np.arange(len(recording)), darken)

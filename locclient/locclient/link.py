@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from fleetmap.bus import Bus, Handle
+from fleetmap.default_vocabulary import shipped_vocabulary
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, UnreachableError
 from fleetmap.mapformat import (
     Manifest,
@@ -99,8 +100,9 @@ class MapLink:
         return _checked(decode_manifest(data), wanted)
 
     def vocabulary(self, manifest: Manifest) -> bytes:
-        """The version's vocabulary, from the cache or the server; errors as of `manifest`."""
-        return self._blob(manifest.vocabulary.sha256)
+        """The version's vocabulary: the one that ships, or from the cache or the server; errors as of `manifest`."""
+        sha256 = manifest.vocabulary.sha256
+        return shipped_vocabulary(sha256) or self._blob(sha256)
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
         """Tiles of the version, from the cache or the server: all, or those of `cells` that it has.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from rich.console import Console
 
-from fleetmap.bow import decode_vocabulary, encode_vocabulary
+from fleetmap.bow import encode_vocabulary
 from fleetmap.config import to_dict
 from fleetmap.errors import RecordingError, StoreError
 from fleetmap.mapformat import CameraEntry, RecordingEntry
@@ -30,6 +30,7 @@ from mapserver.survey.placing import map_from_survey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.zones import Zones
 from mapserver.tiling import TILE_SIZE_M, tiles_from_survey
+from mapserver.vocabulary_choice import ChosenVocabulary, choose_vocabulary, judged
 from mapserver.zones_file import read_zones
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ class BuildOrder:
     frames: str = "::"
     calibration: Path | None = None
     zones: Path | None = None
+    vocabulary: Path | None = None
     report: Path | None = None
     trajectory: Path | None = None
     picture: Path | None = None
@@ -60,6 +62,7 @@ class _Built:
 
     survey: Survey
     accuracy: Accuracy
+    vocabulary: ChosenVocabulary
     zones: Zones
     frames: int
     times: StageTimes
@@ -79,9 +82,8 @@ def run_build(order: BuildOrder, settings: SurveySettings) -> str:
         _check(source, indices, order)
         recording, remarks = _examined(source, console)
         with MapStore.open(order.store, create=True) as maps:
-            built = _survey(
-                order, recording, indices, zones, maps.site_vocabulary(order.site), settings, console, started_s
-            )
+            chosen = choose_vocabulary(maps, order.site, order.vocabulary)
+            built = _survey(order, recording, indices, zones, chosen, settings, console, started_s)
             return _keep(order, recording, built, remarks, settings, maps)
 
 
@@ -106,7 +108,7 @@ def _check(recording: Recording, indices: "NDArray[Any]", order: BuildOrder) -> 
 
 
 def _survey(
-    order: BuildOrder, recording: Recording, indices: "NDArray[Any]", zones: Zones, vocabulary: bytes | None,
+    order: BuildOrder, recording: Recording, indices: "NDArray[Any]", zones: Zones, chosen: ChosenVocabulary,
     settings: SurveySettings, console: Console, started_s: float,
 ) -> _Built:  # fmt: skip
     times = StageTimes(time.perf_counter)
@@ -120,8 +122,10 @@ def _survey(
 
         done = survey(
             frames, len(indices), recording.imu, recording.calibration, rectifier,
-            None if vocabulary is None else decode_vocabulary(vocabulary), settings, zones, progress,
+            chosen.vocabulary, settings, zones, progress,
         )  # fmt: skip
+    times.begin("vocabulary")
+    chosen = judged(chosen, done, settings)
     times.begin("storing")
     placed = map_from_survey(done.map, recording.priors, recording.calibration.base_from_body)
     if placed is not None:
@@ -134,7 +138,7 @@ def _survey(
                 "--frame-from-ground-truth"
             )
         done = replace(done, map=moved(done.map, found.rigid.frame_from_estimate))
-    return _Built(done, found, zones, len(indices), times, started_s)
+    return _Built(done, found, chosen, zones, len(indices), times, started_s)
 
 
 def _keep(
@@ -142,10 +146,10 @@ def _keep(
 ) -> str:
     tiles = tiles_from_survey(built.survey.map)
     archive = encode_archive(built.survey.map)
-    vocabulary = encode_vocabulary(built.survey.vocabulary)
+    vocabulary = encode_vocabulary(built.vocabulary.vocabulary)
     content_hash = recording.content_hash()
     report = make_report(
-        recording.name, built.survey.map, built.survey.loops, built.accuracy, len(vocabulary),
+        recording.name, built.survey.map, built.survey.loops, built.accuracy, built.vocabulary.download_bytes(len(vocabulary)),
         time.perf_counter() - built.started_s, _peak_rss_mb(),
     )  # fmt: skip
     remarks = [*remarks, *(part.remark() for part in built.survey.parts if not part.kept)]
@@ -172,6 +176,7 @@ def _configuration(order: BuildOrder, zones: Zones, settings: SurveySettings) ->
     """What the map depends on besides the recording; no paths, which mean nothing elsewhere."""
     return {
         "frames": order.frames,
+        "own_vocabulary": order.vocabulary is not None,
         "frame_from_ground_truth": order.frame_from_ground_truth,
         "own_calibration": order.calibration is not None,
         "zones": {name: polygon.tolist() for name, polygon in zones.polygons.items()},
@@ -210,6 +215,8 @@ def _write_files(order: BuildOrder, recording: Recording, built: _Built, report:
         _write(order.picture, draw_survey(title, built.survey, built.accuracy, report))
     if order.report is not None:
         full = full_report(report, order.site, version, recording, built.survey, built.accuracy, built.times.seconds)
+        full["vocabulary"] = {"source": built.vocabulary.source, "sha256": built.vocabulary.sha256()}
+        full["vocabulary"]["trial"] = msgspec.to_builtins(built.vocabulary.trial)
         _write(order.report, msgspec.json.format(msgspec.json.encode(full), indent=2) + b"\n")
 
 

@@ -14,9 +14,10 @@ from mapserver.commands.evaluate import evaluate
 from mapserver.commands.inspect import inspect
 from mapserver.commands.publish import publish
 from mapserver.commands.serve import serve
+from mapserver.commands.train_vocabulary import train_vocabulary
 from mapserver.commands.versions import versions
 
-COMMANDS = (build, publish, versions, inspect, serve, convert, doctor, evaluate)
+COMMANDS = (build, publish, versions, inspect, serve, convert, doctor, evaluate, train_vocabulary)
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 

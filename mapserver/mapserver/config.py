@@ -21,6 +21,7 @@ class BuildSection(Section, frozen=True):
     frames: str | None = None
     calibration: str | None = None
     zones: str | None = None
+    vocabulary: str | None = None
     report: str | None = None
     trajectory: str | None = None
     picture: str | None = None
@@ -68,6 +69,16 @@ class EvaluateSection(Section, frozen=True):
     json: bool | None = None
 
 
+class TrainVocabularySection(Section, frozen=True):
+    """Options of `mapserver train-vocabulary`."""
+
+    out: str | None = None
+    frames: str | None = None
+    branching: int | None = None
+    levels: int | None = None
+    seed: int | None = None
+
+
 class MapserverConfig(Section, frozen=True):
     """The whole file."""
 
@@ -80,6 +91,7 @@ class MapserverConfig(Section, frozen=True):
     convert: ConvertSection = ConvertSection()
     doctor: DoctorSection = DoctorSection()
     evaluate: EvaluateSection = EvaluateSection()
+    train_vocabulary: TrainVocabularySection = TrainVocabularySection()
 
 
 def read_config(path: Path | None) -> MapserverConfig:
@@ -91,6 +103,8 @@ def command_defaults(config: MapserverConfig) -> dict[str, dict[str, Any]]:
     """By command, the options that the file sets."""
     commands = (name for name in msgspec.structs.asdict(config) if name != "survey")
     return {
-        name: {option: value for option, value in to_dict(getattr(config, name)).items() if value is not None}
+        name.replace("_", "-"): {
+            option: value for option, value in to_dict(getattr(config, name)).items() if value is not None
+        }
         for name in commands
     }

@@ -25,7 +25,7 @@ _NOISE_PX = 0.5
 
 @dataclass(frozen=True, slots=True)
 class DisparityZero:
-    """What must be added to every disparity for a pair of moments to fit one rigid motion, and its standard deviation."""
+    """What must be added to disparities at the right image's middle for two moments to fit one rigid motion, and its sigma."""
 
     offset_px: float
     sigma_px: float
@@ -35,7 +35,8 @@ def disparity_zero(before: RectifiedFrame, after: RectifiedFrame, camera: Stereo
     """The offset by which two moments agree best; None where too little moved or too few points were followed.
 
     Unknown are rotation, translation and the offset: a point at ray r (z = 1) with disparity d is seen along
-    R r + (d + offset) t / (focal baseline) afterwards. Robust least squares, two rows for each point.
+    R r + (d + offset (1 + x^2)) t / (focal baseline) afterwards, x along its ray in the right camera. Robust least squares, two
+    rows for each point.
     """
     pixels, tracked, disparities = followed(before, after)
     if len(pixels) < _MIN_POINTS or np.median(np.hypot(*(tracked - pixels).T)) < _MIN_FLOW_PX:
@@ -43,9 +44,10 @@ def disparity_zero(before: RectifiedFrame, after: RectifiedFrame, camera: Stereo
     if np.subtract(*np.percentile(disparities, [90, 10])) < _MIN_SPREAD_PX:
         return None
     rays = np.column_stack([(pixels - [camera.cx_px, camera.cy_px]) / camera.focal_px, np.ones(len(pixels))])
+    spread = 1.0 + (rays[:, 0] - disparities / camera.focal_px) ** 2  # a turned camera moves the picture's edges most
 
     def residuals(unknowns: Array) -> Array:
-        moved = rays @ so3_exp(unknowns[:3]).T + (disparities + unknowns[6])[:, None] * unknowns[3:6] / 100.0
+        moved = rays @ so3_exp(unknowns[:3]).T + (disparities + unknowns[6] * spread)[:, None] * unknowns[3:6] / 100.0
         seen = camera.focal_px * moved[:, :2] / np.maximum(moved[:, 2:], 1e-3) + [camera.cx_px, camera.cy_px]
         return np.asarray((seen - tracked).ravel() / _NOISE_PX)
 

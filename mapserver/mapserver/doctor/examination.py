@@ -78,7 +78,7 @@ def examine(
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
     seen = _sampled(recording, frames, rectifier, sampled)
     if recording.sensor_set in (SensorSet.STEREO, SensorSet.STEREO_INERTIAL):
-        findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs)]
+        findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
         findings += [stereo_against_motion(seen.zeros, rectifier.camera)]
     turns = _camera_turns(recording, frames, rectifier, turn_frames)
     checked, measured_offset_s = gyro_check(turns, imu, shift_s)

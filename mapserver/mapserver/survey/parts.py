@@ -58,7 +58,7 @@ def find_parts(survey_map: SurveyMap, odometry_sigmas_m: "SigmaBetween", join_si
     """
     count = len(survey_map.keyframe_stamps_ns)
     seeing = np.flatnonzero(np.bincount(survey_map.obs_keyframe, minlength=count) >= _MIN_SEEN)
-    rows, columns = _sharing(survey_map, count)
+    rows, columns = shared_landmarks(survey_map, _MIN_SHARED)
     bridges = [(a, b) for a, b in pairwise(seeing) if odometry_sigmas_m(int(a), int(b)) <= join_sigma_m]
     blind = np.setdiff1d(np.arange(count), seeing)
     for k in blind.tolist():
@@ -115,12 +115,13 @@ def only_kept(survey_map: SurveyMap, keyframe_frames: NDArray[np.int64], kept: N
     )
 
 
-def _sharing(survey_map: SurveyMap, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of keyframes that share enough landmarks."""
+def shared_landmarks(survey_map: SurveyMap, at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of keyframes, the older one first, that share so many landmarks."""
     ones = np.ones(len(survey_map.obs_keyframe), np.int32)
-    seen = csr_matrix((ones, (survey_map.obs_keyframe, survey_map.obs_landmark)), (count, len(survey_map.landmark_ids)))
+    shape = len(survey_map.keyframe_stamps_ns), len(survey_map.landmark_ids)
+    seen = csr_matrix((ones, (survey_map.obs_keyframe, survey_map.obs_landmark)), shape)
     shared = coo_matrix(seen @ seen.T)
-    enough = (shared.data >= _MIN_SHARED) & (shared.row < shared.col)
+    enough = (shared.data >= at_least) & (shared.row < shared.col)
     return shared.row[enough].astype(np.int64), shared.col[enough].astype(np.int64)
 
 

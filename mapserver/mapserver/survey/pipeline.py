@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import Vocabulary, train_vocabulary
+from fleetmap.bow import Vocabulary
 from fleetmap.calibration import RigCalibration
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_inverse
@@ -17,7 +17,6 @@ from mapserver.survey.adjust import Motion, SurveyState, adjust, adjust_windows
 from mapserver.survey.bundle import RelativeTerm
 from mapserver.survey.first_guess import FirstGuess, run_odometry
 from mapserver.survey.graph_marginals import GraphMarginals
-from mapserver.survey.keyframes import Keyframe
 from mapserver.survey.loops import LoopCloser, Loops
 from mapserver.survey.matching import PairFinder, drift_allowance_m, fixed_allowance_m
 from mapserver.survey.pairs import PairMatch
@@ -47,7 +46,7 @@ class Survey:
 
 def survey(
     frames: Iterable[CameraFrame], frame_count: int, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
-    vocabulary: Vocabulary | None, settings: SurveySettings, zones: Zones, progress: Progress,
+    vocabulary: Vocabulary, settings: SurveySettings, zones: Zones, progress: Progress,
 ) -> Survey:  # fmt: skip
     """Maps one recording. Raises SurveyError where it holds too little to map."""
     guess = run_odometry(
@@ -73,7 +72,6 @@ def survey(
     adjust_windows(state, settings)
     if state.motion.inertial:
         adjust(state, settings, rounds=2)
-    vocabulary = vocabulary or _train(keyframes, settings)
     loops = _close_loops(guess, state, pairs, vocabulary, settings, zones, progress)
     for round_number in range(2):
         progress("global adjustment", round_number, 2)
@@ -150,16 +148,6 @@ def _match_all(state: SurveyState, finder: PairFinder, settings: SurveySettings,
         candidates, state.map_from_body, fixed_allowance_m(state.map_from_body), rotation_sigma_rad=0.02, is_known=True,
         progress=lambda n: progress("matching again", n + 1, len(candidates)),
     )  # fmt: skip
-
-
-def _train(keyframes: list[Keyframe], settings: SurveySettings) -> Vocabulary:
-    descriptors = np.concatenate([k.features.descriptors for k in keyframes])
-    images = np.concatenate([np.full(len(k.features), n) for n, k in enumerate(keyframes)])
-    rng = np.random.default_rng(settings.seed)
-    if len(descriptors) > settings.vocabulary.max_descriptors:
-        chosen = np.sort(rng.choice(len(descriptors), settings.vocabulary.max_descriptors, replace=False))
-        descriptors, images = descriptors[chosen], images[chosen]
-    return train_vocabulary(descriptors, settings.vocabulary.branching, settings.vocabulary.levels, rng, images)
 
 
 def _close_loops(
