@@ -12,7 +12,7 @@ from fleetmap.geometry import se3, so3_exp
 from fleetmap.recordings import Recording
 from fleetmap.recordings.images import StoredFrame, decode_frame, decode_grey, png_image
 from fleetmap.recordings.recording import FrameSource
-from fleetmap.samples import CameraFrame, ImuSamples
+from fleetmap.samples import CameraFrame, ImuSamples, SensorSet
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,12 @@ def with_imu(recording: Recording, imu: ImuSamples) -> Recording:
     """With another run's IMU, moved to begin when its own begins."""
     moved_ns = int(recording.imu.stamps_ns[0]) - int(imu.stamps_ns[0])
     return replace(recording, imu=replace(imu, stamps_ns=imu.stamps_ns + moved_ns))
+
+
+def without_imu(recording: Recording) -> Recording:
+    """Cameras alone."""
+    calibration = replace(recording.calibration, imu=None)
+    return replace(recording, imu=ImuSamples.empty(), calibration=calibration, sensor_set=SensorSet.STEREO)
 
 
 def with_camera_turned(recording: Recording, axis: tuple[float, float, float], angle_deg: float) -> Recording:

@@ -80,10 +80,12 @@ def run_build(order: BuildOrder, settings: SurveySettings) -> str:
             console.print(f"loss: {loss.what}: {loss.detail}", markup=False)
         indices = selection.apply(source)
         _check(source, indices, order)
+        times = StageTimes(time.perf_counter)
         recording, remarks = _examined(source, console)
+        times("examination", 1, 1)
         with MapStore.open(order.store, create=True) as maps:
             chosen = choose_vocabulary(maps, order.site, order.vocabulary)
-            built = _survey(order, recording, indices, zones, chosen, settings, console, started_s)
+            built = _survey(order, recording, indices, zones, chosen, settings, console, times, started_s)
             return _keep(order, recording, built, remarks, settings, maps)
 
 
@@ -109,9 +111,8 @@ def _check(recording: Recording, indices: "NDArray[Any]", order: BuildOrder) -> 
 
 def _survey(
     order: BuildOrder, recording: Recording, indices: "NDArray[Any]", zones: Zones, chosen: ChosenVocabulary,
-    settings: SurveySettings, console: Console, started_s: float,
+    settings: SurveySettings, console: Console, times: StageTimes, started_s: float,
 ) -> _Built:  # fmt: skip
-    times = StageTimes(time.perf_counter)
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
     frames = (recording.read_frame(int(index)) for index in indices)
     with ProgressView(console) as view:
