@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from fleetmap.bus import Bus, Handle
+from fleetmap.default_vocabulary import shipped_vocabulary
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError
 from fleetmap.mapformat import (
     MAX_MANIFEST_BYTES,
@@ -156,8 +157,9 @@ class MapLink:
         return _checked(decode_manifest(data), wanted)
 
     def vocabulary(self, manifest: Manifest) -> bytes:
-        """The version's vocabulary, from the cache or the server; errors as of `manifest`."""
-        return self._blob(manifest.vocabulary.sha256, manifest.vocabulary.bytes, None)
+        """The version's vocabulary: the one that ships, or from the cache or the server; errors as of `manifest`."""
+        entry = manifest.vocabulary
+        return shipped_vocabulary(entry.sha256) or self._blob(entry.sha256, entry.bytes, None)
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
         """Tiles of the version, from the cache or the server: all, or those of `cells` that it has.

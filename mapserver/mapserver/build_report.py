@@ -29,7 +29,8 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     site (manifest and tiles), vocabulary apart; None until it is stored. loops: counts of candidates and their fates.
     ate_rmse_m, ate_sim3_rmse_m: root mean square position error of every selected frame that has an estimate and a
     known truth, after one rigid (similarity) alignment; evaluated_share: their share of the selected frames. All three
-    are None without ground truth. peak_rss_mb: most memory the process held, in 10^6 bytes.
+    are None without ground truth. peak_rss_mb: most memory the process held, in 10^6 bytes. findings: by recording, what the
+    doctor found wanting in it, and what was corrected.
     culled: what the surveys did not hand on. sessions: what became of every recording, and of the map's landmarks by it.
     """
 
@@ -49,6 +50,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     peak_rss_mb: float
     culled: dict[str, int]
     sessions: list[dict[str, Any]]
+    findings: dict[str, list[str]] = {}
 
 
 class Accuracy(msgspec.Struct, frozen=True):
@@ -140,7 +142,8 @@ def full_report(
     """The stable keys, and with them what helps to understand them; those may change.
 
     loop_records: every candidate, keyframe i against the older j of one recording. stage_s: wall seconds of each stage; reading
-    and decoding images are part of odometry. pair_turn: see survey/pair_turn.py.
+    and decoding images are part of odometry. pair_turn: see survey/pair_turn.py. parts: of each survey, of which the kept one
+    is in the map.
     """
     survey_map, first = joined.map, surveyed[0]
     stable: dict[str, Any] = msgspec.to_builtins(report)
@@ -159,6 +162,7 @@ def full_report(
         "sim3_scale": None if found.similarity is None else found.similarity.scale,
         "pair_turn": [msgspec.to_builtins(s.survey.pair_turn) for s in surveyed],
         "stage_s": {stage: round(seconds, 3) for stage, seconds in stage_s.items()},
+        "parts": [msgspec.to_builtins(s.survey.parts) for s in surveyed],
         "loop_records": [
             {"recording": s.entry.name} | record
             for s in surveyed

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from fleetmap.bow import Vocabulary, decode_vocabulary, encode_vocabulary
+from fleetmap.bow import Vocabulary, encode_vocabulary
 from fleetmap.config import to_dict
 from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError
 from fleetmap.mapformat import CameraEntry, Manifest, decode_tile
@@ -34,6 +34,7 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.zones import Zones
 from mapserver.surveying import Surveyed, check_recordings, survey_all, survey_recording
 from mapserver.tiling import TILE_SIZE_M, tiles_from_survey
+from mapserver.vocabulary_choice import ChosenVocabulary, choose_vocabulary, judged
 from mapserver.zones_file import read_zones
 
 _NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled")
@@ -50,6 +51,7 @@ class BuildOrder:
     frames: str = "::"
     calibration: Path | None = None
     zones: Path | None = None
+    vocabulary: Path | None = None
     report: Path | None = None
     trajectory: Path | None = None
     picture: Path | None = None
@@ -63,6 +65,7 @@ class _Built:
     surveyed: list[Surveyed]
     joined: Joined
     accuracy: Accuracy
+    vocabulary: ChosenVocabulary
     zones: Zones
     times: StageTimes
     started_s: float
@@ -81,7 +84,8 @@ def run_build(order: BuildOrder, settings: SurveySettings) -> str:
     check_recordings(order.recordings, order.frames, order.calibration, needs_truth=order.frame_from_ground_truth)
     with MapStore.open(order.store, create=True) as maps:
         parent, base = _parent(order, maps)
-        built = _survey(order, zones, base, maps.site_vocabulary(order.site), settings, console, started_s)
+        chosen = choose_vocabulary(maps, order.site, order.vocabulary)
+        built = _survey(order, zones, base, chosen, settings, console, started_s)
         return _keep(order, built, parent, settings, maps)
 
 
@@ -104,7 +108,7 @@ def _parent(order: BuildOrder, maps: MapStore) -> tuple[Manifest | None, SurveyM
 
 
 def _survey(
-    order: BuildOrder, zones: Zones, base: SurveyMap | None, vocabulary: bytes | None, settings: SurveySettings,
+    order: BuildOrder, zones: Zones, base: SurveyMap | None, chosen: ChosenVocabulary, settings: SurveySettings,
     console: Console, started_s: float,
 ) -> _Built:  # fmt: skip
     times = StageTimes(time.perf_counter)
@@ -114,17 +118,19 @@ def _survey(
             times(stage, done, total)
             view(stage, done, total)
 
-        def survey_one(path: Path, pinhole: StereoCamera | None, words: Vocabulary | None) -> Surveyed:
+        def survey_one(path: Path, pinhole: StereoCamera | None, words: Vocabulary) -> Surveyed:
             return survey_recording(
                 path, order.frames, order.calibration, pinhole, words, settings, zones, progress, shelf, console
             )
 
         surveyed = survey_all(
             order.recordings, survey_one, None if base is None else base.camera,
-            None if vocabulary is None else decode_vocabulary(vocabulary),
+            chosen.vocabulary,
         )  # fmt: skip
         progress("joining", 0, 1)
         joined = join_sessions(base, [Session(s.survey, s.placed) for s in surveyed], settings)
+    times.begin("vocabulary")
+    chosen = judged(chosen, surveyed[0].survey, settings)
     times.begin("storing")
     _say_left_out(order, surveyed, joined, console)
     found = accuracy(joined.map, _truth(surveyed, joined))
@@ -135,7 +141,7 @@ def _survey(
                 "--frame-from-ground-truth"
             )
         joined = replace(joined, map=moved(joined.map, found.rigid.frame_from_estimate))
-    return _Built(surveyed, joined, found, zones, times, started_s)
+    return _Built(surveyed, joined, found, chosen, zones, times, started_s)
 
 
 def _published(parent: Manifest | None, maps: MapStore) -> NDArray[np.uint32]:
@@ -167,16 +173,19 @@ def _truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
 
 def _keep(order: BuildOrder, built: _Built, parent: Manifest | None, settings: SurveySettings, maps: MapStore) -> str:
     survey_map = built.joined.map
-    chosen = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M, _published(parent, maps))
-    tiles = tiles_from_survey(survey_map, chosen=chosen)
+    for_robots = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M, _published(parent, maps))
+    tiles = tiles_from_survey(survey_map, chosen=for_robots)
     archive = encode_archive(survey_map)
-    vocabulary = encode_vocabulary(built.surveyed[0].survey.vocabulary)
+    vocabulary = encode_vocabulary(built.vocabulary.vocabulary)
     report = make_report(
-        [s.entry.name for s in built.taken], built.joined, [s.survey for s in built.taken], built.accuracy, len(vocabulary),
+        [s.entry.name for s in built.taken], built.joined, [s.survey for s in built.taken], built.accuracy,
+        built.vocabulary.download_bytes(len(vocabulary)),
         time.perf_counter() - built.started_s, _peak_rss_mb(),
     )  # fmt: skip
     report = msgspec.structs.replace(
-        report, sessions=sessions_report([s.entry.name for s in built.surveyed], built.joined)
+        report,
+        findings={s.entry.name: s.remarks() for s in built.surveyed},
+        sessions=sessions_report([s.entry.name for s in built.surveyed], built.joined),
     )
     details = DraftDetails(
         created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
@@ -203,6 +212,7 @@ def _configuration(
     kept = parent is not None and bool(parent.configuration.get("frame_from_ground_truth"))
     return {
         "frames": order.frames,
+        "own_vocabulary": order.vocabulary is not None,
         "frame_from_ground_truth": order.frame_from_ground_truth or kept,
         "own_calibration": order.calibration is not None,
         "zones": {name: polygon.tolist() for name, polygon in zones.polygons.items()},
@@ -243,6 +253,8 @@ def _write_files(order: BuildOrder, built: _Built, parent: Manifest | None, repo
         _write(order.picture, draw_survey(title, built.joined.map, loops, built.accuracy, report))
     if order.report is not None:
         full = full_report(report, order.site, version, built.taken, built.joined, built.accuracy, built.times.seconds)
+        full["vocabulary"] = {"source": built.vocabulary.source, "sha256": built.vocabulary.sha256()}
+        full["vocabulary"]["trial"] = msgspec.to_builtins(built.vocabulary.trial)
         _write(order.report, msgspec.json.format(msgspec.json.encode(full), indent=2) + b"\n")
 
 

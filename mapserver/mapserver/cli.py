@@ -20,12 +20,13 @@ from mapserver.commands.promote import promote
 from mapserver.commands.publish import publish
 from mapserver.commands.rollback import rollback
 from mapserver.commands.serve import serve
+from mapserver.commands.train_vocabulary import train_vocabulary
 from mapserver.commands.verify import verify
 from mapserver.commands.versions import versions
 
 COMMANDS = (
     build, publish, promote, rollback, versions, inspect, diff, serve, verify, gc, export, import_,
-    convert, doctor, evaluate,
+    convert, doctor, evaluate, train_vocabulary,
 )  # fmt: skip
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
@@ -40,7 +41,7 @@ def mapserver(config: ConfigFile = None) -> None:
 
 
 for _command in COMMANDS:
-    app.command(_command.__name__.rstrip("_"))(_command)
+    app.command(_command.__name__.rstrip("_").replace("_", "-"))(_command)
 
 
 # Before anything imports numpy: many small products, for which a second BLAS thread costs more than it brings.

@@ -23,6 +23,7 @@ class BuildSection(Section, frozen=True):
     frames: str | None = None
     calibration: str | None = None
     zones: str | None = None
+    vocabulary: str | None = None
     report: str | None = None
     trajectory: str | None = None
     picture: str | None = None
@@ -116,7 +117,20 @@ class EvaluateSection(Section, frozen=True):
     """Options of `mapserver evaluate`."""
 
     ground_truth: str | None = None
+    covariances: str | None = None
+    from_first: bool | None = None
+    frames: int | None = None
     json: bool | None = None
+
+
+class TrainVocabularySection(Section, frozen=True):
+    """Options of `mapserver train-vocabulary`."""
+
+    out: str | None = None
+    frames: str | None = None
+    branching: int | None = None
+    levels: int | None = None
+    seed: int | None = None
 
 
 class MapserverConfig(Section, frozen=True, rename={"import_": "import"}):
@@ -139,6 +153,7 @@ class MapserverConfig(Section, frozen=True, rename={"import_": "import"}):
     convert: ConvertSection = ConvertSection()
     doctor: DoctorSection = DoctorSection()
     evaluate: EvaluateSection = EvaluateSection()
+    train_vocabulary: TrainVocabularySection = TrainVocabularySection()
 
 
 def read_config(path: Path | None) -> MapserverConfig:
@@ -150,7 +165,7 @@ def command_defaults(config: MapserverConfig) -> dict[str, dict[str, Any]]:
     """By command, the options that the file sets."""
     commands = (name for name in msgspec.structs.asdict(config) if name not in {"survey", "gate"})
     return {
-        name.rstrip("_"): {
+        name.rstrip("_").replace("_", "-"): {
             option: value for option, value in to_dict(getattr(config, name)).items() if value is not None
         }
         for name in commands

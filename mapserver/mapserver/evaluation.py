@@ -10,6 +10,7 @@ from fleetmap.samples import Stamps, Trajectory
 
 MAX_GAP_NS = 200_000_000
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+SHORT_LENGTHS_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # for runs too short for KITTI's
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +45,12 @@ class RelativeResult:
 
 @dataclass(frozen=True, slots=True)
 class DriftResult:
-    """Mean drift over segments, KITTI style: share of the length, and radians a metre."""
+    """Mean drift over segments, KITTI style: share of the length, and radians a metre; lengths_m of which there were any."""
 
     translation_share: float
     rotation_radpm: float
     segments: int
+    lengths_m: tuple[float, ...]
 
 
 def paired(estimate: Trajectory, truth: Trajectory, max_gap_ns: int = MAX_GAP_NS) -> tuple[Trajectory, Trajectory]:
@@ -138,7 +140,7 @@ def kitti_drift(
         return None
     steps = np.linalg.norm(np.diff(true.positions_m, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    shares, rates = [], []
+    shares, rates, found = [], [], set()
     for start in range(0, len(mine), every):
         for length in lengths_m:
             end = int(np.searchsorted(along, along[start] + length, side="right"))
@@ -147,9 +149,18 @@ def kitti_drift(
             error_m, error_rad = _split_errors(_motion_errors(mine, true, np.array([start]), end - start))
             shares.append(float(error_m[0]) / length)
             rates.append(float(error_rad[0]) / length)
+            found.add(length)
     if not shares:
         return None
-    return DriftResult(float(np.mean(shares)), float(np.mean(rates)), len(shares))
+    return DriftResult(float(np.mean(shares)), float(np.mean(rates)), len(shares), tuple(sorted(found)))
+
+
+def drift(estimate: Trajectory, truth: Trajectory) -> DriftResult | None:
+    """KITTI's drift, over the benchmark's own lengths where the path is long enough for one, else over 1 to 50 m.
+
+    None for paths below a metre.
+    """
+    return kitti_drift(estimate, truth) or kitti_drift(estimate, truth, lengths_m=SHORT_LENGTHS_M, every=1)
 
 
 def _motion_errors(mine: Trajectory, true: Trajectory, starts: Stamps, step: int) -> Array:

@@ -2,21 +2,34 @@
 
 import numpy as np
 
+from fleetmap.recordings.covariances import StampedCovariances
 from fleetmap.samples import Trajectory
-from mapserver.evaluation import absolute_trajectory_error, kitti_drift, relative_trajectory_error, unaligned_errors
+from mapserver.consistency import at_first_stamp, consistency
+from mapserver.evaluation import absolute_trajectory_error, drift, relative_trajectory_error, unaligned_errors
+
+Summary = dict[str, float | int | None]
 
 
-def summary(estimate: Trajectory, truth: Trajectory) -> dict[str, float | int | None]:
+def summary(
+    estimate: Trajectory,
+    truth: Trajectory,
+    *,
+    frames: int | None = None,
+    covariances: StampedCovariances | None = None,
+    from_first: bool = False,
+) -> Summary:
     """Errors by name; raises SurveyError where too few stamps of the estimate have a truth.
 
-    ate_*: after a rigid alignment; ate_sim3_rmse_m and scale: after one with scale; unaligned_*: as they are;
-    rpe_*: of the motion between stamps that follow each other; drift_*: KITTI's, None for paths below 100 m.
+    ate_*: after a rigid alignment; ate_sim3_rmse_m and scale: after one with scale; unaligned_*: as they are, or with
+    `from_first` after placing the first stamp on the truth; rpe_*: of the motion between stamps that follow each other;
+    drift_*: KITTI's, over drift_shortest_m to drift_longest_m, None for paths below a metre; nees_*: of the unaligned errors by
+    their covariances, None without. frames: how many should have had an estimate, the base of evaluated_share.
     """
-    rigid = absolute_trajectory_error(estimate, truth)
+    rigid = absolute_trajectory_error(estimate, truth, frames=frames)
     similarity = absolute_trajectory_error(estimate, truth, with_scale=True)
     relative = relative_trajectory_error(estimate, truth)
-    drift = kitti_drift(estimate, truth)
-    _, errors_m, errors_rad = unaligned_errors(estimate, truth)
+    placed = at_first_stamp(estimate, truth) if from_first else estimate
+    _, errors_m, errors_rad = unaligned_errors(placed, truth)
     return {
         "stamps": len(estimate),
         "matched": rigid.matched,
@@ -32,6 +45,29 @@ def summary(estimate: Trajectory, truth: Trajectory) -> dict[str, float | int | 
         "unaligned_median_rad": float(np.median(errors_rad)),
         "rpe_rmse_m": relative.rmse_m,
         "rpe_rmse_rad": relative.rmse_rad,
-        "drift_translation_share": None if drift is None else drift.translation_share,
-        "drift_rotation_radpm": None if drift is None else drift.rotation_radpm,
+        **_drift(estimate, truth),
+        **_nees(placed, truth, covariances),
+    }
+
+
+def _drift(estimate: Trajectory, truth: Trajectory) -> Summary:
+    found = drift(estimate, truth)
+    return {
+        "drift_translation_share": None if found is None else found.translation_share,
+        "drift_rotation_radpm": None if found is None else found.rotation_radpm,
+        "drift_shortest_m": None if found is None else found.lengths_m[0],
+        "drift_longest_m": None if found is None else found.lengths_m[-1],
+        "drift_segments": 0 if found is None else found.segments,
+    }
+
+
+def _nees(placed: Trajectory, truth: Trajectory, covariances: StampedCovariances | None) -> Summary:
+    found = None if covariances is None else consistency(placed, covariances, truth)
+    return {
+        "nees_position": None if found is None else found.position,
+        "nees_rotation": None if found is None else found.rotation,
+        "nees": None if found is None else found.both,
+        "nees_inside_share": None if found is None else found.inside_share,
+        "nees_position_inside_share": None if found is None else found.position_inside_share,
+        "nees_stamps": 0 if found is None else found.stamps,
     }

@@ -16,6 +16,7 @@ from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_rec
 from fleetmap.rectification import Rectifier, StereoCamera
 from fleetmap.samples import Loss, SensorSet, Trajectory
 from mapserver.build_report import check_truth
+from mapserver.recording_checks import checked
 from mapserver.survey.keyframes import PictureShelf
 from mapserver.survey.pipeline import Progress, Survey, survey
 from mapserver.survey.placing import map_from_survey
@@ -25,7 +26,8 @@ from mapserver.survey.zones import Zones
 
 @dataclass(frozen=True)
 class Surveyed:
-    """One recording and its survey. placed: map_from_survey (4, 4) by its position priors, None without any."""
+    """One recording and its survey. placed: map_from_survey (4, 4) by its position priors, None without any.
+    findings: what the doctor remarked."""
 
     entry: RecordingEntry
     format: str
@@ -34,6 +36,11 @@ class Surveyed:
     truth: Trajectory | None
     survey: Survey
     placed: Array | None
+    findings: tuple[str, ...]
+
+    def remarks(self) -> list[str]:
+        """What was wanting in the recording, what was corrected and what was left out, in words."""
+        return [*self.findings, *(part.remark() for part in self.survey.parts if not part.kept)]
 
 
 def check_recordings(paths: Sequence[Path], frames: str, calibration: Path | None, *, needs_truth: bool) -> None:
@@ -54,13 +61,18 @@ def _check(recording: Recording, indices: NDArray[np.int64], needs_truth: bool) 
 
 
 def survey_recording(
-    path: Path, frames: str, calibration: Path | None, pinhole: StereoCamera | None, vocabulary: Vocabulary | None,
+    path: Path, frames: str, calibration: Path | None, pinhole: StereoCamera | None, vocabulary: Vocabulary,
     settings: SurveySettings, zones: Zones, progress: Progress, shelf: PictureShelf, console: Console,
 ) -> Surveyed:  # fmt: skip
     """Surveys one recording as if `pinhole` (or what suits it) had seen it."""
-    with open_recording(path, OpenOptions(calibration_file=calibration)) as recording:
-        for loss in recording.losses:
+    with open_recording(path, OpenOptions(calibration_file=calibration)) as source:
+        for loss in source.losses:
             console.print(f"loss: {loss.what}: {loss.detail}", markup=False)
+        progress("examination", 0, 1)
+        examined = checked(source)
+        recording, findings = examined.recording, tuple(examined.remarks())
+        for finding in findings:
+            console.print(f"{recording.name}: {finding}", markup=False)
         indices = FrameSelection.parse(frames).apply(recording)
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         done = survey(
@@ -70,17 +82,26 @@ def survey_recording(
         placed = map_from_survey(done.map, recording.priors, recording.calibration.base_from_body)
         entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices))
         return Surveyed(
-            entry, recording.format, recording.sensor_set, recording.losses, recording.ground_truth, done, placed
+            entry,
+            recording.format,
+            recording.sensor_set,
+            recording.losses,
+            recording.ground_truth,
+            done,
+            placed,
+            findings,
         )
 
 
 def survey_all(
-    paths: Sequence[Path], survey_one: Callable[[Path, StereoCamera | None, Vocabulary | None], Surveyed],
-    pinhole: StereoCamera | None, vocabulary: Vocabulary | None,
-) -> list[Surveyed]:  # fmt: skip
-    """Surveys of all recordings through one camera and with one vocabulary: the first one's, where the site has none."""
+    paths: Sequence[Path],
+    survey_one: Callable[[Path, StereoCamera | None, Vocabulary], Surveyed],
+    pinhole: StereoCamera | None,
+    vocabulary: Vocabulary,
+) -> list[Surveyed]:
+    """Surveys of all recordings through one camera and with one vocabulary."""
     done: list[Surveyed] = []
     for path in paths:
         done.append(survey_one(path, pinhole, vocabulary))
-        pinhole, vocabulary = pinhole or done[0].survey.state.camera, vocabulary or done[0].survey.vocabulary
+        pinhole = pinhole or done[0].survey.state.camera
     return done

@@ -40,7 +40,7 @@ def _scripts() -> list[str]:
 
 
 def _documented_commands() -> list[str]:
-    return re.findall(r"^## `(\w+ \w+)`", text(COMMANDS), re.MULTILINE)
+    return re.findall(r"^## `(\w+ [\w-]+)`", text(COMMANDS), re.MULTILINE)
 
 
 def _arguments(command: click.Command) -> set[str]:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from hashlib import sha256
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
 from fleetmap.bow import decode_vocabulary
+from fleetmap.default_vocabulary import DEFAULT_VOCABULARY_SHA256, default_vocabulary_bytes
 from fleetmap.errors import FleetmapError, RecordingError, StoreError, UsageError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import decode_tile
@@ -24,7 +26,7 @@ SAMPLE = make_sample(FRAMES)
 KEYS = [
     *("recordings", "duration_s", "seconds", "realtime_factor", "path_m", "keyframes", "landmarks", "map_bytes"),
     *("vocabulary_bytes", "loops", "ate_rmse_m", "ate_sim3_rmse_m", "evaluated_share", "peak_rss_mb"),
-    *("culled", "sessions"),
+    *("findings", "culled", "sessions"),
 ]
 NOT_FOR_ROBOTS = {"map_bytes", "culled", "sessions"}
 
@@ -89,8 +91,8 @@ def test_the_report_has_the_stable_keys_with_their_meanings(done: Path) -> None:
         manifest_bytes = len(maps.blob(maps.version("lab", 1).manifest_sha256))
         assert report["map_bytes"] == sum(sizes) + manifest_bytes
         assert report["landmarks"] == landmarks > 100
-        assert report["vocabulary_bytes"] == len(maps.blob(manifest.vocabulary.sha256))
-        assert decode_vocabulary(maps.blob(manifest.vocabulary.sha256)).word_count > 10
+        assert report["vocabulary_bytes"] == 0
+        assert decode_vocabulary(maps.blob(manifest.vocabulary.sha256)).word_count == 10_000
         archive = maps.archive("lab", 1)
     assert archive is not None
     assert len(decode_archive(archive).map_from_body) == report["keyframes"]
@@ -145,14 +147,28 @@ def test_building_again_gives_the_same_tiles_with_the_same_vocabulary(euroc: Pat
     assert first.vocabulary == second.vocabulary == other.vocabulary
 
 
-def test_a_site_keeps_its_vocabulary_whatever_is_surveyed(euroc: Path, tmp_path: Path) -> None:
-    built(euroc, "--site", "lab", "--store", tmp_path, "--frames", ":16")
-    built(euroc, "--site", "lab", "--store", tmp_path, "--frames", "6:")
-    built(euroc, "--site", "other", "--store", tmp_path, "--frames", "6:")
-    with MapStore.open(tmp_path) as maps:
+def test_a_site_keeps_its_vocabulary_whatever_is_surveyed(euroc: Path, done: Path, tmp_path: Path) -> None:
+    """A first map speaks the words that ship, or those of a file; the next one the site's."""
+    words = tmp_path / "words.fmvb"
+    said = CliRunner().invoke(
+        app, ["train-vocabulary", str(euroc), "--out", str(words), "--frames", "::4", "--levels", "2"]
+    )
+    assert said.exit_code == 0, said.output
+    lab = [euroc, "--site", "lab", "--store", tmp_path / "store"]
+    built(*lab, "--frames", ":16", "--vocabulary", words)
+    built(*lab, "--frames", "6:", "--report", tmp_path / "r.json")
+    report = json.loads((tmp_path / "r.json").read_text())
+    given = sha256(words.read_bytes()).hexdigest()
+    assert (report["vocabulary"]["source"], report["vocabulary"]["sha256"]) == ("site", given)
+    assert report["vocabulary_bytes"] == words.stat().st_size
+    with MapStore.open(tmp_path / "store") as maps, MapStore.open(done / "store") as shipped:
         assert maps.manifest("lab", 2).vocabulary == maps.manifest("lab", 1).vocabulary
-        assert maps.manifest("other", 1).vocabulary != maps.manifest("lab", 1).vocabulary
+        assert maps.manifest("lab", 1).vocabulary.sha256 == given
         assert maps.manifest("lab", 2).tiles != maps.manifest("lab", 1).tiles
+        assert shipped.manifest("lab", 1).vocabulary.sha256 == DEFAULT_VOCABULARY_SHA256
+        maps.publish("lab", 2)
+    (tmp_path / "shipped.fmvb").write_bytes(default_vocabulary_bytes())
+    assert "has published" in str(refused(*lab, "--vocabulary", tmp_path / "shipped.fmvb"))
 
 
 def test_without_truth_nothing_is_claimed(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from fleetmap.geometry import Array, interpolate_se3, se3_exp, se3_inverse
 from fleetmap.samples import Trajectory
 from mapserver.evaluation import (
     absolute_trajectory_error,
+    drift,
     kitti_drift,
     paired,
     relative_trajectory_error,
@@ -139,3 +140,14 @@ def test_drift_of_a_wrong_scale_on_a_straight_road() -> None:
     assert drift.translation_share == pytest.approx(0.02, rel=0.02)
     assert drift.rotation_radpm < 1e-9
     assert drift.segments == 40 + 20
+
+
+def test_short_runs_drift_over_short_lengths() -> None:
+    frame_from_body = np.tile(np.eye(4), (400, 1, 1))
+    frame_from_body[:, 0, 3] = np.arange(400) * 0.1
+    truth = Trajectory(np.arange(400, dtype=np.int64) * 10**8, frame_from_body)
+    found = drift(Trajectory(truth.stamps_ns, _scaled(truth, 1.03)), truth)
+    assert found is not None
+    assert found.lengths_m == (1.0, 2.0, 5.0, 10.0, 20.0)
+    assert found.translation_share == pytest.approx(0.03, rel=0.05)
+    assert drift(_truth(8), _truth(8)) is None

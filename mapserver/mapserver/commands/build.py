@@ -19,6 +19,9 @@ def build(
     zones: Annotated[
         Path | None, typer.Option(metavar="FILE", help="TOML file with areas that never see each other.")
     ] = None,
+    vocabulary: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Words of `train-vocabulary` for the site's first map.")
+    ] = None,
     report: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the JSON report here.")] = None,
     trajectory: Annotated[Path | None, typer.Option(metavar="FILE.tum", help="Write all frames' poses here.")] = None,
     picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the map from above here.")] = None,
@@ -40,6 +43,16 @@ def build(
     from mapserver.config import read_config
 
     order = BuildOrder(
-        tuple(recordings), site, store, frames, calibration, zones, report, trajectory, picture, frame_from_ground_truth
+        tuple(recordings),
+        site,
+        store,
+        frames,
+        calibration,
+        zones,
+        vocabulary,
+        report,
+        trajectory,
+        picture,
+        frame_from_ground_truth,
     )
     typer.echo(run_build(order, read_config(config_path(context)).survey))

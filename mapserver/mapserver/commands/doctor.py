@@ -41,9 +41,9 @@ def doctor(
 
     with open_recording(recording, OpenOptions(calibration_file=calibration)) as source:
         with Progress(console=Console(stderr=True), transient=True) as progress:
-            wanted = min(SAMPLED_FRAMES, len(source)) + (min(TURN_FRAMES, len(source)) if len(source.imu) else 0)
+            wanted = 2 * min(SAMPLED_FRAMES, len(source)) + (min(TURN_FRAMES, len(source)) if len(source.imu) else 0)
             task = progress.add_task("frames", total=wanted)
-            findings = examine(source, lambda: progress.advance(task))
+            findings = examine(source, lambda: progress.advance(task)).findings
         _print(Console(), source, findings)
         if json_file is not None:
             json_file.write_text(_as_json(source, findings), encoding="utf-8")

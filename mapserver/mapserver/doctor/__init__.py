@@ -3,7 +3,7 @@
 `examination` reads the frames.
 """
 
-from mapserver.doctor.examination import examine
+from mapserver.doctor.examination import Examination, examine
 from mapserver.doctor.findings import Finding, Verdict
 
-__all__ = ["Finding", "Verdict", "examine"]
+__all__ = ["Examination", "Finding", "Verdict", "examine"]

@@ -1,6 +1,7 @@
 """Reads the frames that the checks need and runs all of them."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,13 +12,26 @@ from fleetmap.rectification import RectifiedFrame, Rectifier
 from fleetmap.samples import CameraFrame, SensorSet
 from mapserver.doctor import inertial, timing
 from mapserver.doctor.camera_rotation import rotation_between
+from mapserver.doctor.disparity_zero import DisparityZero, disparity_zero, stereo_against_motion
 from mapserver.doctor.findings import Finding, Verdict
-from mapserver.doctor.gyro_images import CameraTurns, gyro_findings
+from mapserver.doctor.gyro_images import CameraTurns, gyro_check
 from mapserver.doctor.sharpness import laplacian_variance, sharpness
 from mapserver.doctor.stereo import StereoMatches, epipolar_error, match_pair, swapped_cameras
 
 SAMPLED_FRAMES = 40
 TURN_FRAMES = 200
+_MOTION_NS, _LONGEST_MOTION_NS = 250_000_000, 350_000_000  # between the two moments of stereo against motion
+
+
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """All findings, in a fixed order, and the time offset that gyro and images show beyond the calibration's.
+
+    measured_offset_s is None where it was not measured, or hardly.
+    """
+
+    findings: list[Finding]
+    measured_offset_s: float | None
 
 
 class _Frames:
@@ -38,8 +52,17 @@ class _Frames:
             return None
 
 
-def examine(recording: Recording, on_frame: Callable[[], None] = lambda: None) -> list[Finding]:
-    """All findings about a recording, in a fixed order. Reads at most 240 frames; `on_frame` is called after each."""
+def examine(
+    recording: Recording,
+    on_frame: Callable[[], None] = lambda: None,
+    *,
+    sampled: int = SAMPLED_FRAMES,
+    turn_frames: int = TURN_FRAMES,
+) -> Examination:
+    """Everything the checks say about a recording.
+
+    Reads at most twice `sampled` frames, spread over the recording, and a run of `turn_frames`; `on_frame` is called after each.
+    """
     stamps_ns, imu = recording.frame_stamps_ns, recording.imu
     frames = _Frames(recording, on_frame)
     shift_s = recording.calibration.cameras[0].imu_minus_cam_s
@@ -53,32 +76,49 @@ def examine(recording: Recording, on_frame: Callable[[], None] = lambda: None) -
         inertial.gravity_magnitude(imu),
     ]
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
-    pairs, variances = _sampled(recording, frames, rectifier)
+    seen = _sampled(recording, frames, rectifier, sampled)
     if recording.sensor_set in (SensorSet.STEREO, SensorSet.STEREO_INERTIAL):
-        findings += [swapped_cameras(pairs), epipolar_error(pairs)]
-    turns = _camera_turns(recording, frames, rectifier)
-    findings += gyro_findings(turns, imu, shift_s)
-    findings += [sharpness(variances), _readable(frames)]
-    return findings + timing.other_losses(recording.losses)
+        findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
+        findings += [stereo_against_motion(seen.zeros, rectifier.camera)]
+    turns = _camera_turns(recording, frames, rectifier, turn_frames)
+    checked, measured_offset_s = gyro_check(turns, imu, shift_s)
+    findings += [*checked, sharpness(seen.variances), _readable(frames)]
+    return Examination(findings + timing.other_losses(recording.losses), measured_offset_s)
 
 
-def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier) -> tuple[list[StereoMatches], list[float]]:
-    count = min(SAMPLED_FRAMES, len(recording))
-    pairs, variances = [], []
-    for index in np.unique(np.linspace(0, len(recording) - 1, count).round().astype(int)):
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """What frames all over the recording show."""
+
+    pairs: list[StereoMatches]
+    zeros: list[DisparityZero]
+    variances: list[float]
+
+
+def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int) -> _Seen:
+    seen = _Seen([], [], [])
+    stamps_ns = recording.frame_stamps_ns
+    for index in np.unique(np.linspace(0, len(recording) - 1, min(count, len(recording))).round().astype(int)):
         frame = frames.read(int(index))
         if frame is None:
             continue
-        variances.append(laplacian_variance(frame.left))
-        if frame.right is not None:
-            pairs.append(match_pair(rectifier.rectify(frame)))
-    return pairs, variances
+        seen.variances.append(laplacian_variance(frame.left))
+        if frame.right is None:
+            continue
+        rectified = rectifier.rectify(frame)
+        seen.pairs.append(match_pair(rectified))
+        later = int(np.searchsorted(stamps_ns, stamps_ns[index] + _MOTION_NS))
+        if later < len(recording) and stamps_ns[later] - stamps_ns[index] <= _LONGEST_MOTION_NS:
+            after = frames.read(later)
+            zero = None if after is None else disparity_zero(rectified, rectifier.rectify(after), rectifier.camera)
+            seen.zeros.extend([] if zero is None else [zero])
+    return seen
 
 
-def _camera_turns(recording: Recording, frames: _Frames, rectifier: Rectifier) -> CameraTurns:
+def _camera_turns(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int) -> CameraTurns:
     starts, ends, rates = [], [], []
     rotation = rectifier.body_from_cam[:3, :3]
-    for before, after in _consecutive(recording, frames, rectifier):
+    for before, after in _consecutive(recording, frames, rectifier, count):
         before_from_after = rotation_between(before, after, rectifier.camera)
         if before_from_after is None:
             continue
@@ -90,15 +130,15 @@ def _camera_turns(recording: Recording, frames: _Frames, rectifier: Rectifier) -
 
 
 def _consecutive(
-    recording: Recording, frames: _Frames, rectifier: Rectifier
+    recording: Recording, frames: _Frames, rectifier: Rectifier, count: int
 ) -> Iterator[tuple[RectifiedFrame, RectifiedFrame]]:
     """Pairs of rectified frames close in time, from the run of frames in which the gyro is busiest."""
     if len(recording.imu) == 0:
         return
     stamps_ns = recording.frame_stamps_ns
-    first = _busiest_start(recording)
+    first = _busiest_start(recording, count)
     previous: RectifiedFrame | None = None
-    for index in range(first, min(first + TURN_FRAMES, len(recording))):
+    for index in range(first, min(first + count, len(recording))):
         is_close = previous is not None and stamps_ns[index] - previous.stamp_ns < timing.SPARSE_S * 1e9
         has_next = index + 1 < len(recording) and stamps_ns[index + 1] - stamps_ns[index] < timing.SPARSE_S * 1e9
         if not (is_close or has_next):
@@ -110,15 +150,15 @@ def _consecutive(
         previous = current
 
 
-def _busiest_start(recording: Recording) -> int:
+def _busiest_start(recording: Recording, count: int) -> int:
     stamps_ns, imu = recording.frame_stamps_ns, recording.imu
-    if len(stamps_ns) <= TURN_FRAMES:
+    if len(stamps_ns) <= count:
         return 0
     speeds = np.linalg.norm(imu.gyro_radps - np.median(imu.gyro_radps, axis=0), axis=1)
     total = np.concatenate([[0.0], np.cumsum(np.minimum(speeds, 3.0))])
-    starts = np.arange(0, len(stamps_ns) - TURN_FRAMES, max(1, TURN_FRAMES // 4))
+    starts = np.arange(0, len(stamps_ns) - count, max(1, count // 4))
     a = np.searchsorted(imu.stamps_ns, stamps_ns[starts])
-    b = np.searchsorted(imu.stamps_ns, stamps_ns[starts + TURN_FRAMES])
+    b = np.searchsorted(imu.stamps_ns, stamps_ns[starts + count])
     return int(starts[np.argmax(total[b] - total[a])])
 
 

@@ -11,6 +11,7 @@ from mapserver.doctor.findings import Finding, Verdict, judge, not_judged
 _MIN_PAIRS = 20
 _SEARCH_S, _STEP_S = 0.2, 0.002
 _LEAST_RATE_RADPS = 0.05
+_SURE_CORRELATION = 0.9
 _NAMES = ("camera-imu time offset", "gyro scale", "gyro axes")
 
 
@@ -40,11 +41,14 @@ class GyroFit:
     axes_seen: int
 
 
-def gyro_findings(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> list[Finding]:
-    """Time offset (beyond the calibrated one), scale and axes of the gyro; not judged without turns to judge by."""
-    reason = _why_not(turns, imu)
+def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tuple[list[Finding], float | None]:
+    """Time offset (beyond the calibrated one), scale and axes of the gyro; not judged without turns to judge by.
+
+    With them the offset in seconds, where images and gyro agree well enough to correct the calibration by it.
+    """
+    reason = _why_not(turns, imu, imu_minus_cam_s)
     if reason:
-        return [not_judged(name, reason) for name in _NAMES]
+        return [not_judged(name, reason) for name in _NAMES], None
     fit = fit_gyro(turns, imu, imu_minus_cam_s)
     if fit.correlation < 0.6:
         words = f"the images' and the gyro's rates hardly agree (correlation {fit.correlation:.2f} at best)"
@@ -52,8 +56,9 @@ def gyro_findings(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -
         return [
             Finding("gyro axes", Verdict.FAIL, fit.correlation, "fail below correlation 0.6", f"{words}; {advice}"),
             *(not_judged(name, words) for name in _NAMES[:2]),
-        ]
-    return [_offset_finding(fit, imu_minus_cam_s), _scale_finding(fit), _axes_finding(fit)]
+        ], None
+    findings = [_offset_finding(fit, imu_minus_cam_s), _scale_finding(fit), _axes_finding(fit)]
+    return findings, fit.offset_s if fit.correlation > _SURE_CORRELATION else None
 
 
 def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> GyroFit:
@@ -78,14 +83,15 @@ def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> Gyr
     return GyroFit(_peak(offsets_s, scores, offset), body_from_gyro, scale, float(scores[offset]), axes_seen)
 
 
-def _why_not(turns: CameraTurns, imu: ImuSamples) -> str:
+def _why_not(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> str:
     if len(imu) < 10:
         return "there is no IMU"
     if len(turns.starts_ns) < _MIN_PAIRS:
         return f"{len(turns.starts_ns)} pairs of consecutive frames could be compared, {_MIN_PAIRS} are needed"
-    spread = float(np.sqrt(turns.rates_body_radps.var(axis=0).sum()))
-    if spread < _LEAST_RATE_RADPS:
-        return f"the camera hardly turns (rates vary by {spread:.3f} rad/s)"
+    rates = turns.rates_body_radps, _gyro_rates(turns, imu, imu_minus_cam_s)
+    spreads = [float(np.sqrt(seen.var(axis=0).sum())) for seen in rates]  # an IMU that turns alone is another robot's
+    if max(spreads) < _LEAST_RATE_RADPS:
+        return f"the camera hardly turns (rates vary by {spreads[0]:.3f} rad/s)"
     return ""
 
 

@@ -20,10 +20,18 @@ _LARGEST_SHARE_OF_WIDTH = 0.3
 
 @dataclass(frozen=True, slots=True)
 class StereoMatches:
-    """Matched points of one rectified pair: disparities_px (N,) left minus right column, row_errors_px (N,)."""
+    """Matched points of one rectified pair.
+
+    disparities_px (N,) left minus right column, row_errors_px (N,) left minus right row, columns_px (N,) left of the
+    image's middle negative.
+    """
 
     disparities_px: Array
     row_errors_px: Array
+    columns_px: Array
+
+
+_NOTHING = StereoMatches(np.zeros(0), np.zeros(0), np.zeros(0))
 
 
 def match_pair(frame: RectifiedFrame) -> StereoMatches:
@@ -31,7 +39,7 @@ def match_pair(frame: RectifiedFrame) -> StereoMatches:
 
     ORB both ways, refined by Lucas-Kanade, any sign of disparity, rows within 25 px.
     """
-    empty = StereoMatches(np.zeros(0), np.zeros(0))
+    empty = _NOTHING
     if frame.right is None:
         return empty
     orb = cv2.ORB.create(nfeatures=1200, nlevels=4, fastThreshold=8)
@@ -70,23 +78,33 @@ def swapped_cameras(pairs: Sequence[StereoMatches]) -> Finding:
     )
 
 
-def epipolar_error(pairs: Sequence[StereoMatches]) -> Finding:
-    """How far matches are from their row after rectification: median judged, 90 % named."""
+def epipolar_error(pairs: Sequence[StereoMatches], focal_px: float) -> Finding:
+    """How far matches are from their row after rectification: median judged, 90 % and the angles that explain it named."""
     name = "epipolar error"
     errors = np.concatenate([p.row_errors_px for p in pairs]) if pairs else np.zeros(0)
     if len(errors) < _MIN_MATCHES:
         return not_judged(name, f"{len(errors)} stereo matches are too few")
     magnitude = np.abs(errors)
     median, p90 = float(np.median(magnitude)), float(np.percentile(magnitude, 90))
+    columns = np.concatenate([p.columns_px for p in pairs])
+    roll, at_middle_px = np.polyfit(columns, errors, 1)
+    tilt_deg, roll_deg = np.degrees(np.arctan2(at_middle_px, focal_px)), np.degrees(np.arctan(roll))
+    angles = f"the cameras look {tilt_deg:+.2f} degrees apart up and down and are rolled by {roll_deg:+.2f} degrees"
     words = f"rows differ by {median:.2f} px in the median, {p90:.2f} px at 90 %, {np.median(errors):+.2f} px with sign"
     return judge(
-        name, median, 0.5, 1.2, "px (median)", words, f"{words}; calibrate the cameras again, or check their time"
+        name,
+        median,
+        0.5,
+        1.2,
+        "px (median)",
+        words,
+        f"{words}: {angles}; calibrate the cameras again, or check their time",
     )
 
 
 def _refined(frame: RectifiedFrame, left: Array, right: Array) -> StereoMatches:
     if len(left) == 0 or frame.right is None:
-        return StereoMatches(np.zeros(0), np.zeros(0))
+        return _NOTHING
     found, status, _ = cv2.calcOpticalFlowPyrLK(
         frame.left,
         frame.right,
@@ -99,7 +117,8 @@ def _refined(frame: RectifiedFrame, left: Array, right: Array) -> StereoMatches:
     found = found.reshape(-1, 2)
     kept = (status.ravel() == 1) & (np.abs(found - right).max(axis=1) < 3.0)
     offsets = (left - found)[kept].astype(np.float64)
-    return _without_strays(StereoMatches(offsets[:, 0], offsets[:, 1]))
+    columns = left[kept, 0].astype(np.float64) - 0.5 * (frame.left.shape[1] - 1)
+    return _without_strays(StereoMatches(offsets[:, 0], offsets[:, 1], columns))
 
 
 def _without_strays(matches: StereoMatches) -> StereoMatches:
@@ -109,4 +128,4 @@ def _without_strays(matches: StereoMatches) -> StereoMatches:
     centre = np.median(matches.row_errors_px)
     spread = 1.4826 * np.median(np.abs(matches.row_errors_px - centre))
     kept = np.abs(matches.row_errors_px - centre) < max(4 * spread, 1.0)
-    return StereoMatches(matches.disparities_px[kept], matches.row_errors_px[kept])
+    return StereoMatches(matches.disparities_px[kept], matches.row_errors_px[kept], matches.columns_px[kept])

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import Vocabulary, train_vocabulary
+from fleetmap.bow import Vocabulary
 from fleetmap.calibration import RigCalibration
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_inverse
@@ -18,11 +18,12 @@ from mapserver.survey.bundle import RelativeTerm
 from mapserver.survey.culling import Culled
 from mapserver.survey.first_guess import FirstGuess, run_odometry
 from mapserver.survey.graph_marginals import GraphMarginals
-from mapserver.survey.keyframes import Keyframe, PictureShelf
+from mapserver.survey.keyframes import PictureShelf
 from mapserver.survey.loops import LoopCloser, Loops
 from mapserver.survey.matching import PairFinder, drift_allowance_m, fixed_allowance_m
 from mapserver.survey.pair_turn import NO_TURN, PairTurn, estimate_turn, without_turn
 from mapserver.survey.pairs import PairMatch
+from mapserver.survey.parts import Part, SigmaBetween, beside, find_parts, only_kept, seen_by
 from mapserver.survey.pose_graph import PoseEdge, optimize_pose_graph
 from mapserver.survey.result import SurveyMap
 from mapserver.survey.settings import SurveySettings
@@ -38,8 +39,8 @@ _MIN_LANDMARKS = 30
 @dataclass(frozen=True)
 class Survey:
     """What a survey gives: the map, the vocabulary it used, the loops with their reasons, the first guess it began with, the
-    adjusted state, which still knows which feature each observation is, what was culled, and what was found out about the pair of
-    cameras."""
+    adjusted state, which still knows which feature each observation is, what was culled, what was found out about the pair of
+    cameras, and the parts that hang together, of which one is the map."""
 
     map: SurveyMap
     vocabulary: Vocabulary
@@ -48,11 +49,12 @@ class Survey:
     state: SurveyState
     culled: Culled
     pair_turn: PairTurn
+    parts: list[Part]
 
 
 def survey(
     frames: Iterable[CameraFrame], frame_count: int, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
-    vocabulary: Vocabulary | None, settings: SurveySettings, zones: Zones, progress: Progress,
+    vocabulary: Vocabulary, settings: SurveySettings, zones: Zones, progress: Progress,
     shelf: PictureShelf | None = None, wheel: Sequence[WheelSample] = (),
 ) -> Survey:  # fmt: skip
     """Maps one recording, its keyframes' pictures on `shelf`. Raises SurveyError where it holds too little to map."""
@@ -79,7 +81,6 @@ def survey(
     adjust_windows(state, settings)
     if state.motion.inertial:
         adjust(state, settings, rounds=2)
-    vocabulary = vocabulary or _train(keyframes, settings)
     loops = _close_loops(guess, state, pairs, vocabulary, settings, zones, progress)
     turn = NO_TURN
     for round_number in range(2):
@@ -93,8 +94,13 @@ def survey(
         if round_number == 0:
             turn = estimate_turn(state, settings)
     progress("global adjustment", 2, 2)
+    frames_of = np.array([k.frame_index for k in keyframes], np.int64)
+    parts = find_parts(seen_by(state), SigmaBetween(guess.covariances[frames_of]), settings.join_sigma_m)
+    state, guess, loops = only_kept(state, guess, loops, parts.kept)
     survey_map, culled = summarise(state, guess, settings)
-    return Survey(survey_map, vocabulary, loops, guess, state, culled, turn)
+    between = beside(len(survey_map.trajectory), frames_of, parts.kept)
+    survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
+    return Survey(survey_map, vocabulary, loops, guess, state, culled, turn, [*parts.parts, *parts.stray])
 
 
 def _first_state(
@@ -161,16 +167,6 @@ def _match_all(state: SurveyState, finder: PairFinder, settings: SurveySettings,
         candidates, state.map_from_body, fixed_allowance_m(state.map_from_body), rotation_sigma_rad=0.02, is_known=True,
         progress=lambda n: progress("matching again", n + 1, len(candidates)),
     )  # fmt: skip
-
-
-def _train(keyframes: list[Keyframe], settings: SurveySettings) -> Vocabulary:
-    descriptors = np.concatenate([k.features.descriptors for k in keyframes])
-    images = np.concatenate([np.full(len(k.features), n) for n, k in enumerate(keyframes)])
-    rng = np.random.default_rng(settings.seed)
-    if len(descriptors) > settings.vocabulary.max_descriptors:
-        chosen = np.sort(rng.choice(len(descriptors), settings.vocabulary.max_descriptors, replace=False))
-        descriptors, images = descriptors[chosen], images[chosen]
-    return train_vocabulary(descriptors, settings.vocabulary.branching, settings.vocabulary.levels, rng, images)
 
 
 def _close_loops(

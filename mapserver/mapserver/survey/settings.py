@@ -141,3 +141,4 @@ class SurveySettings(Section, frozen=True):
     sessions: SessionSettings = SessionSettings()
     local_window: int = 20
     min_observations: int = 2
+    join_sigma_m: float = 0.1

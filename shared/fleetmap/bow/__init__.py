@@ -3,9 +3,16 @@
 from fleetmap.bow.place_index import PlaceIndex
 from fleetmap.bow.training import train_vocabulary
 from fleetmap.bow.vocabulary import BowVector, Vocabulary
-from fleetmap.bow.vocabulary_codec import VOCABULARY_FORMAT, decode_vocabulary, encode_vocabulary, vocabulary_hash
+from fleetmap.bow.vocabulary_codec import (
+    MAX_NODES,
+    VOCABULARY_FORMAT,
+    decode_vocabulary,
+    encode_vocabulary,
+    vocabulary_hash,
+)
 
 __all__ = [
+    "MAX_NODES",
     "VOCABULARY_FORMAT",
     "BowVector",
     "PlaceIndex",

@@ -22,8 +22,7 @@ def format_tum(trajectory: Trajectory) -> str:
     for stamp, frame_from_body in zip(trajectory.stamps_ns.tolist(), trajectory.frame_from_body, strict=True):
         w, x, y, z = quat_wxyz_from_rotation(frame_from_body[:3, :3])
         numbers = [*frame_from_body[:3, 3], x, y, z, w]
-        sign, (whole, rest) = "-" if stamp < 0 else "", divmod(abs(stamp), _NS)
-        lines.append(f"{sign}{whole}.{rest:09d} " + " ".join(f"{number:.9f}" for number in numbers))
+        lines.append(format_stamp(stamp) + " " + " ".join(f"{number:.9f}" for number in numbers))
     return "\n".join(lines) + "\n"
 
 
@@ -40,7 +39,7 @@ def parse_tum(text: str, what: str = "trajectory") -> Trajectory:
         if not fields or fields[0].startswith("#"):
             continue
         try:
-            stamp = _stamp_ns(fields[0])
+            stamp = parse_stamp_ns(fields[0])
             values = np.array([float(field) for field in fields[1:]])
         except ValueError as error:
             raise RecordingError(f"{what}, line {number}: {line[:80]!r} is not all numbers ({error})") from error
@@ -74,7 +73,13 @@ def read_tum(path: Path) -> Trajectory:
     return parse_tum(text, str(path))
 
 
-def _stamp_ns(field: str) -> int:
+def format_stamp(stamp_ns: int) -> str:
+    """Seconds with nine decimals."""
+    sign, (whole, rest) = "-" if stamp_ns < 0 else "", divmod(abs(stamp_ns), _NS)
+    return f"{sign}{whole}.{rest:09d}"
+
+
+def parse_stamp_ns(field: str) -> int:
     """Nanoseconds of a decimal number of seconds; what is finer is cut off. ValueError for anything else."""
     try:
         seconds = Decimal(field)

@@ -1,0 +1,71 @@
+"""`mapserver train-vocabulary`: words of place recognition from pictures."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleetmap.errors import UsageError
+from mapserver.commands.config_option import ConfigFile, config_path
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from fleetmap.features.orb import OrbSettings
+
+
+def train_vocabulary(
+    context: typer.Context,
+    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folders or .mcap files.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="File to write.")],
+    frames: Annotated[str, typer.Option(metavar="A:B:C", help="Slice of each recording's frames.")] = "::10",
+    branching: Annotated[int, typer.Option(min=2, max=64, help="Children of each node.")] = 10,
+    levels: Annotated[int, typer.Option(min=1, max=6, help="Levels of the tree.")] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Of the clustering.")] = 0,
+    config: ConfigFile = None,
+) -> None:
+    """Make a vocabulary from the pictures of recordings; `build --vocabulary` uses it."""
+    from fleetmap.bow import MAX_NODES
+
+    if not out.parent.is_dir():
+        raise UsageError(f"--out {out}: the folder {out.parent} does not exist; create it first")
+    if branching**levels > MAX_NODES // 2:
+        raise UsageError(
+            f"--branching {branching} --levels {levels}: up to {branching**levels} words are too many; use fewer"
+        )
+    import numpy as np
+
+    from fleetmap.bow import encode_vocabulary, vocabulary_hash
+    from fleetmap.bow import train_vocabulary as train
+    from mapserver.config import read_config
+
+    orb = read_config(config_path(context)).survey.orb
+    pictures = [rows for recording in recordings for rows in _descriptors(recording, frames, orb)]
+    images = np.repeat(np.arange(len(pictures)), [len(rows) for rows in pictures])
+    rows = np.concatenate(pictures)
+    vocabulary = train(rows, branching, levels, np.random.default_rng(seed), images)
+    data = encode_vocabulary(vocabulary)
+    try:
+        out.write_bytes(data)
+    except OSError as error:
+        raise UsageError(f"--out {out} cannot be written ({error.strerror}); check folder and space") from error
+    typer.echo(
+        f"{out}: {vocabulary.word_count} words from {len(rows)} features of {len(pictures)} pictures, {len(data)} bytes, "
+        f"{vocabulary_hash(vocabulary)}"
+    )
+
+
+def _descriptors(path: Path, frames: str, orb: "OrbSettings") -> "Iterator[NDArray[np.uint8]]":
+    """Descriptors (N, 32) of each selected left picture, rectified."""
+    from fleetmap.features.orb import detect
+    from fleetmap.recordings import FrameSelection, open_recording
+    from fleetmap.rectification import Rectifier
+    from fleetmap.samples import SensorSet
+
+    with open_recording(path) as recording:
+        rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
+        for index in FrameSelection.parse(frames).apply(recording):
+            yield detect(rectifier.rectify(recording.read_frame(int(index))).left, orb).descriptors
