@@ -1,6 +1,6 @@
 """Damaged and hostile map bytes in great number: refused or read, never a crash, a hang, or memory without bound.
 
-    python tests/benchmarks/bench_map_fuzz.py [--inputs 100000] [--seed 0] [--out FILE.json]
+    PYTHONPATH=tests python tests/benchmarks/bench_map_fuzz.py [--inputs 100000] [--seed 0] [--out FILE.json]
 
 Inputs are made of real ones of each kind (tiles of both formats, patches of both kinds, manifests): bytes flipped, cut, doubled and
 swapped in the file as it travels, where checksums find nearly all of it; and in the payload before it is packed, as an attacker
