@@ -106,11 +106,11 @@ def sources() -> dict[str, tuple[Maker, Reader]]:
 
     def hostile_patch(rng: np.random.Generator) -> bytes:
         # The base's address stays right, or nothing behind it would be reached.
-        body = patch_payload[:32] + head_damaged(rng, patch_payload[32:], 48)
+        body = patch_payload[:32] + head_damaged(rng, patch_payload[32:], 56)
         return pack(b"FMPT", 1, body, level=1, prefix=payload)
 
     def hostile_text_patch(rng: np.random.Generator) -> bytes:
-        body = text_patch_payload[:32] + head_damaged(rng, text_patch_payload[32:], 48)
+        body = text_patch_payload[:32] + head_damaged(rng, text_patch_payload[32:], 56)
         return pack(b"FMPT", 1, body, level=1, prefix=text)
 
     def noise(rng: np.random.Generator) -> bytes:
