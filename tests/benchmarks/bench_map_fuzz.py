@@ -1,6 +1,6 @@
 """Damaged and hostile map bytes in great number: refused or read, never a crash, a hang, or memory without bound.
 
-    python tests/benchmarks/bench_map_fuzz.py [--inputs 100000] [--seed 0] [--out FILE.json]
+    PYTHONPATH=tests python tests/benchmarks/bench_map_fuzz.py [--inputs 100000] [--seed 0] [--out FILE.json]
 
 Inputs are made of real ones of each kind (tiles of both formats, patches of both kinds, manifests): bytes flipped, cut, doubled and
 swapped in the file as it travels, where checksums find nearly all of it; and in the payload before it is packed, as an attacker
@@ -106,11 +106,11 @@ def sources() -> dict[str, tuple[Maker, Reader]]:
 
     def hostile_patch(rng: np.random.Generator) -> bytes:
         # The base's address stays right, or nothing behind it would be reached.
-        body = patch_payload[:32] + head_damaged(rng, patch_payload[32:], 48)
+        body = patch_payload[:32] + head_damaged(rng, patch_payload[32:], 56)
         return pack(b"FMPT", 1, body, level=1, prefix=payload)
 
     def hostile_text_patch(rng: np.random.Generator) -> bytes:
-        body = text_patch_payload[:32] + head_damaged(rng, text_patch_payload[32:], 48)
+        body = text_patch_payload[:32] + head_damaged(rng, text_patch_payload[32:], 56)
         return pack(b"FMPT", 1, body, level=1, prefix=text)
 
     def noise(rng: np.random.Generator) -> bytes:

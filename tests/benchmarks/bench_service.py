@@ -1,6 +1,6 @@
 """A fleet that fetches a whole site at once, then a night's delta, from one server on loopback; and a server that goes away.
 
-    python tests/benchmarks/bench_service.py [--clients 300] [--site-mb 50] [--outage-s 60] [--out FILE.json]
+    PYTHONPATH=tests python tests/benchmarks/bench_service.py [--clients 300] [--site-mb 50] [--outage-s 60] [--out FILE.json]
 
 Robots are threads of a few processes, each with its own zenoh session, and run the robot's own `PartReader`. Every byte of every
 robot is hashed. Patches are applied, and their results verified, once per process: on real robots that is work of 300 machines.

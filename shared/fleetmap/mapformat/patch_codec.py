@@ -35,7 +35,7 @@ PATCH_MAGIC = b"FMPT"
 PATCH_FORMAT = 1
 MAX_PATCH_PAYLOAD_BYTES = MAX_TILE_PAYLOAD_BYTES
 _TILE, _BYTES = 1, 0
-_HEAD = struct.Struct("<32s32sBBHII")
+_HEAD = struct.Struct("<32s32sBBHIIII")
 _NO_IDS: Ids = np.zeros(0, np.uint32)
 _LANDMARKS = (
     "landmark_ids", "points_map", "descriptors", "view_directions_map", "view_half_angle_rad", "max_distance_m", "sigma_m",
@@ -51,7 +51,7 @@ def make_patch(base: bytes, result: bytes) -> bytes:
     if len(base) + len(result) > MAX_PATCH_PAYLOAD_BYTES:
         raise MapFormatError(f"{len(base)} and {len(result)} bytes are too many for a patch; send them whole")
     if base[:4] != TILE_MAGIC or result[:4] != TILE_MAGIC:
-        head = _HEAD.pack(*addresses, _BYTES, 0, 0, 0, 0)
+        head = _HEAD.pack(*addresses, _BYTES, 0, 0, 0, 0, 0, 0)
         return pack(PATCH_MAGIC, PATCH_FORMAT, [head, result], prefix=_prefix(base))
     old, new = decode_tile(base), decode_tile(result)
     # Its compression is not repeated here, which would be most of the work: a robot that cannot repeat it takes the whole.
@@ -62,10 +62,18 @@ def make_patch(base: bytes, result: bytes) -> bytes:
         )
     gone_landmarks = np.setdiff1d(old.landmark_ids, new.landmark_ids)
     gone_places = np.setdiff1d(old.place_ids, new.place_ids)
-    head = _HEAD.pack(*addresses, _TILE, TILE_FORMAT, 0, len(gone_landmarks), len(gone_places))
-    gone = planes(differences(gone_landmarks), 4) + planes(differences(gone_places), 4)
-    news = tile_columns(_news(old, new))
-    return pack(PATCH_MAGIC, PATCH_FORMAT, [head + gone, *news], prefix=_prefix(base))
+    news, lists = _news(old, new)
+    changes = np.concatenate([_NO_IDS, *lists.values()])
+    counts = (len(gone_landmarks), len(gone_places), len(lists), len(changes))
+    head = _HEAD.pack(*addresses, _TILE, TILE_FORMAT, 0, *counts)
+    columns = [
+        planes(differences(gone_landmarks), 4),
+        planes(differences(gone_places), 4),
+        planes(differences(np.array(list(lists), np.uint32)), 4),
+        planes(np.array([len(ids) for ids in lists.values()], np.uint32), 4),
+        planes(np.concatenate([_NO_IDS, *(differences(ids) for ids in lists.values())]), 4),
+    ]
+    return pack(PATCH_MAGIC, PATCH_FORMAT, [head, *columns, *tile_columns(news)], prefix=_prefix(base))
 
 
 def apply_patch(base: bytes, patch: bytes) -> bytes:
@@ -77,17 +85,25 @@ def apply_patch(base: bytes, patch: bytes) -> bytes:
     _, payload = unpack(PATCH_MAGIC, PATCH_FORMAT, patch, what, MAX_PATCH_PAYLOAD_BYTES, _prefix(base))
     if len(payload) < _HEAD.size:
         raise MapFormatError(f"{what}: {len(payload)} bytes are too few for its header; the bytes are damaged")
-    base_sha, result_sha, kind, number, _, landmarks, places = _HEAD.unpack_from(payload)
+    base_sha, result_sha, kind, number, _, landmarks, places, lists, changes = _HEAD.unpack_from(payload)
     verified(base, base_sha.hex())
     if kind == _BYTES:
         return verified(payload[_HEAD.size :], result_sha.hex())
-    start = _HEAD.size + 4 * (landmarks + places)
+    start = _HEAD.size + 4 * (landmarks + places + 2 * lists + changes)
     if kind != _TILE or number != TILE_FORMAT or start > len(payload):
         raise MapFormatError(f"{what} of kind {kind} for tiles of format {number} cannot be applied; fetch the whole")
     columns = Columns(payload, _HEAD.size, what)
     gone_landmarks, gone_places = columns.increasing(landmarks), columns.increasing(places)
-    news = check_tile(tile_from_payload(payload[start:]))
-    return verified(encode_tile(_merged(decode_tile(base), news, gone_landmarks, gone_places)), result_sha.hex())
+    listed, counts = columns.increasing(lists), columns.planes(lists, 4).astype(np.int64)
+    if counts.sum() != changes:
+        raise MapFormatError(
+            f"{what}: {counts.sum()} changes of lists, the header says {changes}; the bytes are damaged"
+        )
+    toggled = dict(zip(listed.tolist(), columns.increasing_lists(counts), strict=True))
+    news, old = check_tile(tile_from_payload(payload[start:])), decode_tile(base)
+    if not np.isin(listed, old.place_ids).all():
+        raise MapFormatError(f"{what}: changes the list of a place that its base does not have; the bytes are damaged")
+    return verified(encode_tile(_merged(old, news, toggled, gone_landmarks, gone_places)), result_sha.hex())
 
 
 def _prefix(base: bytes) -> bytes:
@@ -95,27 +111,28 @@ def _prefix(base: bytes) -> bytes:
     return tile_payload(base)[0] if base[:4] == TILE_MAGIC else base
 
 
-def _news(old: Tile, new: Tile) -> Tile:
-    """Landmarks and places of `new` that `old` does not have alike, as a tile.
+def _news(old: Tile, new: Tile) -> tuple[Tile, dict[int, Ids]]:
+    """Landmarks and places of `new` that `old` does not have alike, as a tile; and by place what changes in other lists.
 
-    The lists of its places hold what changes in them: the landmarks that are in one of the two and not in the other, those
-    apart that the patch removes anyway.
+    A change of a list, that tile's too, is the landmarks that are in one of the two lists and not in the other, those apart
+    that the patch removes anyway.
     """
     rows = _changed(old.landmark_ids, new.landmark_ids, [(getattr(old, f), getattr(new, f)) for f in _LANDMARKS[1:]])
     kept = _without(old, np.setdiff1d(old.landmark_ids, new.landmark_ids))
-    lists = [
-        np.setxor1d(kept.get(int(place), _NO_IDS), ids).astype(np.uint32)
+    changes = {
+        int(place): np.setxor1d(kept.get(int(place), _NO_IDS), ids).astype(np.uint32)
         for place, ids in zip(new.place_ids, new.place_landmark_ids, strict=True)
-    ]
+    }
     places = _changed(old.place_ids, new.place_ids, [(old.map_from_cam, new.map_from_cam)])
-    places |= np.array([len(ids) > 0 for ids in lists], bool)
-    return replace(
+    moved = new.place_ids[places].tolist()
+    news = replace(
         new,
         **{field: getattr(new, field)[rows] for field in _LANDMARKS},
         place_ids=new.place_ids[places],
         map_from_cam=new.map_from_cam[places],
-        place_landmark_ids=tuple(ids for ids, differs in zip(lists, places, strict=True) if differs),
+        place_landmark_ids=tuple(changes.pop(place) for place in moved),
     )
+    return news, {place: ids for place, ids in changes.items() if len(ids)}
 
 
 def _changed(
@@ -139,7 +156,7 @@ def _without(tile: Tile, gone: Ids) -> dict[int, Ids]:
     }
 
 
-def _merged(old: Tile, news: Tile, gone_landmarks: Ids, gone_places: Ids) -> Tile:
+def _merged(old: Tile, news: Tile, toggled: dict[int, Ids], gone_landmarks: Ids, gone_places: Ids) -> Tile:
     """The inverse of `_news`: the new tile of the old one."""
     kept_rows = ~np.isin(old.landmark_ids, gone_landmarks) & ~np.isin(old.landmark_ids, news.landmark_ids)
     kept_places = ~np.isin(old.place_ids, gone_places) & ~np.isin(old.place_ids, news.place_ids)
@@ -147,8 +164,9 @@ def _merged(old: Tile, news: Tile, gone_landmarks: Ids, gone_places: Ids) -> Til
     place_ids = np.concatenate([old.place_ids[kept_places], news.place_ids])
     order, place_order = np.argsort(ids, kind="stable"), np.argsort(place_ids, kind="stable")
     lists = _without(old, gone_landmarks)
-    for place, toggled in zip(news.place_ids, news.place_landmark_ids, strict=True):
-        lists[int(place)] = np.setxor1d(lists.get(int(place), _NO_IDS), toggled).astype(np.uint32)
+    changes = toggled | dict(zip(news.place_ids.tolist(), news.place_landmark_ids, strict=True))
+    for place, ids_changed in changes.items():
+        lists[place] = np.setxor1d(lists.get(place, _NO_IDS), ids_changed).astype(np.uint32)
     columns: dict[str, Any] = {
         field: np.concatenate([getattr(old, field)[kept_rows], getattr(news, field)])[order] for field in _LANDMARKS
     }

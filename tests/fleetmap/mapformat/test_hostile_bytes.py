@@ -62,7 +62,7 @@ def test_the_fullest_patch_takes_little() -> None:
     payload = unpack(b"FMTL", 2, base, "tile", _LIMIT)[1]
     count = _LIMIT // 48 - 101
     news = struct.pack("<iidiIII", 0, 0, 16.0, 0, count, 0, 0) + steps_of_one(count) + bytes(44 * count)
-    head = struct.pack("<32s32sBBHII", bytes.fromhex(sha256_hex(base)), bytes(32), 1, 2, 0, 0, 0)
+    head = struct.pack("<32s32sBBHIIII", bytes.fromhex(sha256_hex(base)), bytes(32), 1, 2, 0, 0, 0, 0, 0)
     patch = pack(b"FMPT", 1, head + news, level=1, prefix=payload)
     started_s = time.process_time()
     with pytest.raises(MapFormatError):

@@ -140,11 +140,15 @@ def test_what_cannot_be_patched_is_told() -> None:
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.binary(max_size=300), st.integers(0, 9), st.integers(0, 9), st.integers(0, 2), st.integers(0, 3))
-def test_hostile_patches_are_refused(body: bytes, landmarks: int, places: int, kind: int, number: int) -> None:
+@given(st.binary(max_size=300), *[st.integers(0, 9)] * 4, st.integers(0, 2), st.integers(0, 3))
+def test_hostile_patches_are_refused(
+    body: bytes, landmarks: int, places: int, lists: int, changes: int, kind: int, number: int
+) -> None:
     base = encode_tile(random_tile(np.random.default_rng(9)))
     payload = unpack(b"FMTL", 2, base, "tile", LIMIT)[1]
-    head = struct.pack("<32s32sBBHII", bytes.fromhex(sha256_hex(base)), bytes(32), kind, number, 0, landmarks, places)
+    head = struct.pack(
+        "<32s32sBBHIIII", bytes.fromhex(sha256_hex(base)), bytes(32), kind, number, 0, landmarks, places, lists, changes
+    )
     with pytest.raises(MapFormatError):
         apply_patch(base, pack(b"FMPT", 1, head + body, level=1, prefix=payload))
 
@@ -152,7 +156,7 @@ def test_hostile_patches_are_refused(body: bytes, landmarks: int, places: int, k
 def test_huge_counts_are_refused_at_once() -> None:
     base = encode_tile(random_tile(np.random.default_rng(9)))
     payload = unpack(b"FMTL", 2, base, "tile", LIMIT)[1]
-    head = struct.pack("<32s32sBBHII", bytes.fromhex(sha256_hex(base)), bytes(32), 1, 2, 0, 2**32 - 1, 2**32 - 1)
+    head = struct.pack("<32s32sBBHIIII", bytes.fromhex(sha256_hex(base)), bytes(32), 1, 2, 0, *[2**32 - 1] * 4)
     started = time.perf_counter()
     with pytest.raises(MapFormatError):
         apply_patch(base, pack(b"FMPT", 1, head, level=1, prefix=payload))
@@ -176,13 +180,13 @@ GOLDEN_TILE_HEX = (
     "0001000000000000000003000000600000072500000100000001000000010000725fc30a"
 )
 GOLDEN_PATCH_HEX = (
-    "464d505401000000bb00000028b52ffd24bb60020005ff2dcc7afce05f4111cf83bb2446d5e7977aa3ddd9fbfebe2898"
-    "af40f97fd39a4eae534f1700f2757837fe75d493278fabbb5d1371dd76ca457ead1d5937cb0102000000000000000000"
-    "006c000010ff060300fbc21ad6d911c3062000002c010000100000001f100000001e18000000000044000008200100cb"
-    "c6080110000000000800003c08000038080000105c000020010000000100c6da00012000002c010100010000902155d8"
+    "464d505401000000b000000028b52ffd24b0640200140405ff2dcc7afce05f4111cf83bb2446d5e7977aa3ddd9fbfebe"
+    "2898af40f97fd39a4eae534f1700f2757837fe75d493278fabbb5d1371dd76ca457ead1d5937cb010200576c08ce8531"
+    "0320000005000000200000010000002000002c0101006c000010ff060300b8851feb1410ca062000002c010000100000"
+    "001f100000001e18000000000044000008200100dfc6080110000000000800003c08000038080000100100001bcd0a95"
 )
 GOLDEN_BYTES_PATCH_HEX = (
-    "464d5054010000005c00000028b52ffd245c4c020024043646805089d04dccd103a08fbb221372224b5a75fda6c1cbc4"
-    "ab982295513222a5ef1f09b5bb7beaf692ab28fd60338d5b6d5800b4ac49e09aef44f055060c6b00000100c206a26c00"
-    "0038746865206e657701005f118c0100009cb57822"
+    "464d5054010000006400000028b52ffd24644c020024043646805089d04dccd103a08fbb221372224b5a75fda6c1cbc4"
+    "ab982295513222a5ef1f09b5bb7beaf692ab28fd60338d5b6d5800b4ac49e09aef44f055060c6b000001008207a26c00"
+    "0038746865206e6577010067118c0100004ed78027"
 )
