@@ -48,9 +48,9 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     ate_sim3_rmse_m: float | None
     evaluated_share: float | None
     peak_rss_mb: float
+    findings: dict[str, list[str]]
     culled: dict[str, int]
     sessions: list[dict[str, Any]]
-    findings: dict[str, list[str]] = {}
 
 
 class Accuracy(msgspec.Struct, frozen=True):
@@ -122,6 +122,7 @@ def make_report(
         evaluated_share=found.evaluated_share,
         peak_rss_mb=round(peak_rss_mb, 1),
         culled={key: sum(count[key] for count in culled) for key in culled[0]},
+        findings={},
         sessions=[],
     )
 
