@@ -79,9 +79,11 @@ class Nights:
             self.samples |= {3: second_ride(3), 4: second_ride(4)}
         for night, sample in self.samples.items():
             write_euroc(folder / f"night{night}", sample)
-        self.said = {
-            night: self.build(night, "--frame-from-ground-truth" if night == 1 else None) for night in range(1, 5)
+        self.said = {1: self.build(1, "--frame-from-ground-truth")} | {
+            night: self.build(night, None) for night in (2, 3)
         }
+        shutil.copytree(self.store, folder / "three_nights")
+        self.said[4] = self.build(4, None)
 
     def build(self, night: int, option: str | None) -> str:
         """Builds and publishes one night's version."""
