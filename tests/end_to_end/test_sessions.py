@@ -1,6 +1,7 @@
 """Several recordings of one room: joined in one build, and night after night on the version before."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
