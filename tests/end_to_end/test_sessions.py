@@ -113,8 +113,12 @@ class Nights:
             return [decode_tile(maps.blob(tile.sha256)) for tile in maps.manifest("lab", version).tiles]
 
     def points(self, version: int) -> dict[int, Array]:
-        """By id, where a landmark is."""
-        return {i: p for t in self.tiles(version) for i, p in zip(t.landmark_ids.tolist(), t.points_map, strict=True)}
+        """By id, where all landmarks are that the server knows, those among them that robots are not given."""
+        with MapStore.open(self.store) as maps:
+            archive = maps.archive("lab", version)
+        assert archive is not None
+        known = decode_archive(archive)
+        return dict(zip(known.landmark_ids.tolist(), known.points_map, strict=True))
 
 
 @pytest.fixture(scope="module")
