@@ -174,7 +174,7 @@ def test_a_changed_wall_changes_its_own_landmarks_and_no_others(nights: Nights) 
 def test_ids_are_never_given_twice(nights: Nights) -> None:
     """A landmark that came in a later version has an id above all that there were before."""
     for version in (2, 3, 4):
-        before, now = nights.landmarks(version - 1), nights.landmarks(version)
+        before, now = nights.points(version - 1), nights.points(version)
         new = set(now) - set(before)
         assert not new or min(new) > max(before)
         places = [t.place_ids for t in nights.tiles(version)]
