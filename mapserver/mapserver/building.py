@@ -26,6 +26,7 @@ from mapserver.picture_files import PictureFile
 from mapserver.progress import ProgressView, StageTimes
 from mapserver.store import DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
+from mapserver.survey.history import history_of
 from mapserver.survey.loops import Loops
 from mapserver.survey.moving import moved
 from mapserver.survey.result import SurveyMap
@@ -83,17 +84,26 @@ def run_build(order: BuildOrder, settings: SurveySettings) -> str:
     zones = Zones() if order.zones is None else read_zones(order.zones)
     check_recordings(order.recordings, order.frames, order.calibration, needs_truth=order.frame_from_ground_truth)
     with MapStore.open(order.store, create=True) as maps:
-        parent, base = _parent(order, maps)
+        parent = _parent(order, maps)
+        base = None if parent is None else parent.map
         chosen = choose_vocabulary(maps, order.site, order.vocabulary)
         built = _survey(order, zones, base, chosen, settings, console, started_s)
         return _keep(order, built, parent, settings, maps)
 
 
-def _parent(order: BuildOrder, maps: MapStore) -> tuple[Manifest | None, SurveyMap | None]:
-    """The site's current version and all that is known of it, to build on; None for a site without one."""
+@dataclass(frozen=True)
+class _Parent:
+    """The version that is built on, and all that is known of it."""
+
+    manifest: Manifest
+    map: SurveyMap
+
+
+def _parent(order: BuildOrder, maps: MapStore) -> _Parent | None:
+    """The site's current version, to build on; None for a site without one."""
     current = maps.current(order.site) if order.site in {info.site for info in maps.sites()} else None
     if current is None:
-        return None, None
+        return None
     if order.frame_from_ground_truth:
         raise UsageError(
             f"site {order.site} has version {current.version}, whose frame stays; build without --frame-from-ground-truth, "
@@ -104,7 +114,7 @@ def _parent(order: BuildOrder, maps: MapStore) -> tuple[Manifest | None, SurveyM
         raise StoreError(
             f"version {current.version} of site {order.site} has no archive to build on; survey the site anew under another name"
         )
-    return maps.manifest(order.site, current.version), decode_archive(archive)
+    return _Parent(maps.manifest(order.site, current.version), decode_archive(archive))
 
 
 def _survey(
@@ -144,13 +154,6 @@ def _survey(
     return _Built(surveyed, joined, found, chosen, zones, times, started_s)
 
 
-def _published(parent: Manifest | None, maps: MapStore) -> NDArray[np.uint32]:
-    """Ids of the landmarks that robots have of the version that this one builds on."""
-    entries = () if parent is None else parent.tiles
-    ids = [decode_tile(maps.blob(entry.sha256)).landmark_ids for entry in entries]
-    return np.concatenate([np.zeros(0, np.uint32), *ids])
-
-
 def _say_left_out(order: BuildOrder, surveyed: list[Surveyed], joined: Joined, console: Console) -> None:
     """Names the recordings that could not be joined; raises SurveyError where none could."""
     left = [(s, o) for s, o in zip(surveyed, joined.outcomes, strict=True) if not o.joined]
@@ -171,9 +174,9 @@ def _truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
     return chained(known, joined.trajectories) if len(known) == len(truths) else None
 
 
-def _keep(order: BuildOrder, built: _Built, parent: Manifest | None, settings: SurveySettings, maps: MapStore) -> str:
+def _keep(order: BuildOrder, built: _Built, parent: _Parent | None, settings: SurveySettings, maps: MapStore) -> str:
     survey_map = built.joined.map
-    for_robots = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M, _published(parent, maps))
+    for_robots = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M, _wanted_ids(maps, parent, survey_map))
     tiles = tiles_from_survey(survey_map, chosen=for_robots)
     archive = encode_archive(survey_map)
     vocabulary = encode_vocabulary(built.vocabulary.vocabulary)
@@ -205,11 +208,21 @@ def _keep(order: BuildOrder, built: _Built, parent: Manifest | None, settings: S
     return _sentence(order.site, version, parent, report)
 
 
-def _configuration(
-    order: BuildOrder, parent: Manifest | None, zones: Zones, settings: SurveySettings
-) -> dict[str, Any]:
+def _wanted_ids(maps: MapStore, parent: _Parent | None, survey_map: SurveyMap) -> NDArray[np.uint32] | None:
+    """Landmarks that come before others in the budget: those that robots have, and those that the map has just gained.
+
+    The new ones compete with the published ones; what else the archive knows would only take the place of its like.
+    """
+    if parent is None:
+        return None
+    tiles = [decode_tile(maps.blob(tile.sha256)) for tile in parent.manifest.tiles]
+    new = survey_map.landmark_ids[survey_map.landmark_ids >= history_of(parent.map).next_landmark_id]
+    return np.unique(np.concatenate([new, *(tile.landmark_ids for tile in tiles)])).astype(np.uint32)
+
+
+def _configuration(order: BuildOrder, parent: _Parent | None, zones: Zones, settings: SurveySettings) -> dict[str, Any]:
     """What the map depends on besides the recordings; no paths, which mean nothing elsewhere."""
-    kept = parent is not None and bool(parent.configuration.get("frame_from_ground_truth"))
+    kept = parent is not None and bool(parent.manifest.configuration.get("frame_from_ground_truth"))
     return {
         "frames": order.frames,
         "own_vocabulary": order.vocabulary is not None,
@@ -240,7 +253,7 @@ def _peak_rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
-def _write_files(order: BuildOrder, built: _Built, parent: Manifest | None, report: BuildReport, version: int) -> None:
+def _write_files(order: BuildOrder, built: _Built, parent: _Parent | None, report: BuildReport, version: int) -> None:
     if order.trajectory is not None:
         write_tum(order.trajectory, built.joined.map.trajectory)
     if order.picture is not None:
@@ -265,10 +278,10 @@ def _write(path: Path, data: bytes) -> None:
         raise StoreError(f"{path} cannot be written ({error.strerror}); the draft is stored all the same") from error
 
 
-def _sentence(site: str, version: int, parent: Manifest | None, report: BuildReport) -> str:
+def _sentence(site: str, version: int, parent: _Parent | None, report: BuildReport) -> str:
     ate = "" if report.ate_rmse_m is None else f", ATE {report.ate_rmse_m:.4f} m"
     sizes = f"{report.map_bytes} bytes, {report.loops['accepted']} loops{ate}, in {report.seconds:.1f} s"
-    built_on = "" if parent is None else f" on version {parent.version}"
+    built_on = "" if parent is None else f" on version {parent.manifest.version}"
     left = [s["recording"] for s in report.sessions if not s["joined"]]
     left_out = f"; left out, they could not be joined: {', '.join(left)}" if left else ""
     return (

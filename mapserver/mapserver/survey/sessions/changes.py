@@ -36,10 +36,10 @@ def what_changes(
     again = resighted(base, judged.rows[alone], judged.points_map[alone], joint.sightings)
     new = chosen(marks, joint.own_points_map, fresh, free)
     added = fewer_keyframes(joined(again, new), settings.sessions.min_confirmations)
-    ids = np.r_[base.map.landmark_ids[judged.rows[alone]].astype(np.int64), np.full(fresh.sum(), -1)]
+    rows = np.r_[judged.rows[alone], np.full(fresh.sum(), -1)]
     places = base.map.map_from_body.copy()
     places[moved_keyframes] = cameras[moved_keyframes] @ se3_inverse(base.map.body_from_cam)
-    change = Change(keep, points, places, added, ids, map_from_cam)
+    change = Change(keep, points, places, added, rows, map_from_cam)
     return change, int(moved_keyframes.sum()), int(alone.sum() + (moved & keep).sum())
 
 

@@ -106,7 +106,7 @@ def _compare(
         base, change, looks, guess.keyframes, trajectory, survey.map.trajectory_estimated,
         settings.sessions.new_place_landmarks,
     )  # fmt: skip
-    fresh = int((change.added_ids < 0).sum())
+    fresh = int((change.added_rows < 0).sum())
     counts = Counts(
         fixes=fixes[0],
         believed_fixes=fixes[1],

@@ -22,7 +22,8 @@ class Change:
     """What is to happen to a map of N landmarks and K keyframes.
 
     keep (N,): landmarks that stay; points_map (N, 3) and map_from_body (K, 4, 4): where they are from now on. added: landmarks
-    that come, their observations by keyframes of the new survey (sorted by landmark); added_ids: their ids, -1 for a new one.
+    that come, their observations by keyframes of the new survey (sorted by landmark); added_rows: which landmark of the map each
+    takes the place of, with its id and descriptor, -1 for a new one.
     map_from_cam: of the new survey's keyframes.
     """
 
@@ -30,7 +31,7 @@ class Change:
     points_map: Array
     map_from_body: Array
     added: Landmarks
-    added_ids: NDArray[np.int64]
+    added_rows: Rows
     map_from_cam: Array
 
 
@@ -104,13 +105,12 @@ def merged(
     landmark_number = np.cumsum(change.keep) - 1
     pixels, sigmas = as_recorded(base, added.obs_pixels, added.obs_sigma_px)
     octaves = [keyframes[k].features.octaves[f] for k, f in zip(added.obs_keyframe, added.obs_feature, strict=True)]
-    ids = change.added_ids.copy()
-    first_id = base.history.next_landmark_id
-    ids[ids < 0] = first_id + np.arange((ids < 0).sum())
+    rows, is_new = change.added_rows, change.added_rows < 0
+    ids = np.where(is_new, base.history.next_landmark_id + np.cumsum(is_new) - 1, old.landmark_ids[rows])
+    descriptors = medoid_descriptors(added, keyframes)
+    descriptors[~is_new] = old.descriptors[rows[~is_new]]  # it is found by the old one, and robots have that
     cam_from_body = se3_inverse(old.body_from_cam)
-    history = _history(
-        base, change, looks, old_used, per_keyframe[new_used] >= min_place_landmarks, int((change.added_ids < 0).sum())
-    )
+    history = _history(base, change, looks, old_used, per_keyframe[new_used] >= min_place_landmarks, int(is_new.sum()))
     return SurveyMap(
         camera=old.camera,
         body_from_cam=old.body_from_cam,
@@ -118,7 +118,7 @@ def merged(
         map_from_body=np.concatenate([change.map_from_body[old_used], change.map_from_cam[new_used] @ cam_from_body]),
         landmark_ids=np.r_[old.landmark_ids[change.keep], ids].astype(np.uint32),
         points_map=np.concatenate([change.points_map[change.keep], added.points_map]),
-        descriptors=np.concatenate([old.descriptors[change.keep], medoid_descriptors(added, keyframes)]),
+        descriptors=np.concatenate([old.descriptors[change.keep], descriptors]),
         point_sigma_m=np.r_[old.point_sigma_m[change.keep], _sigmas_m(base, change)],
         obs_keyframe=np.r_[old_number[old.obs_keyframe[keep_obs]], new_number[added.obs_keyframe]].astype(np.int32),
         obs_landmark=np.r_[

@@ -27,7 +27,7 @@ def test_noise_moves_nothing_and_what_moved_is_found(seed: int) -> None:
     points[moved] += [0.05, 0.05, 0.04]
     found = shifts(scene.base, scene.map_from_cam, scene.sightings(points, seed), SurveySettings())
     is_moved = moved[found.rows]
-    assert found.significant[is_moved].mean() > 0.9
+    assert found.significant[is_moved].mean() > 0.8
     assert found.significant[~is_moved].mean() < 0.01
     off_m = np.linalg.norm(found.points_map - points[found.rows], axis=1)[is_moved & found.significant]
     assert np.median(off_m) < 0.03
