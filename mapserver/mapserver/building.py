@@ -33,7 +33,7 @@ from mapserver.survey.result import SurveyMap
 from mapserver.survey.sessions.joining import Joined, Session, chained, join_sessions
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.zones import Zones
-from mapserver.surveying import Surveyed, check_recordings, survey_all, survey_recording
+from mapserver.surveying import Admission, Surveyed, admit_recordings, survey_all, survey_recording
 from mapserver.tiling import TILE_SIZE_M, tiles_from_survey
 from mapserver.vocabulary_choice import ChosenVocabulary, choose_vocabulary, judged
 from mapserver.zones_file import read_zones
@@ -82,12 +82,16 @@ def run_build(order: BuildOrder, settings: SurveySettings) -> str:
     started_s = time.perf_counter()
     console = Console(stderr=True)
     zones = Zones() if order.zones is None else read_zones(order.zones)
-    check_recordings(order.recordings, order.frames, order.calibration, needs_truth=order.frame_from_ground_truth)
+    times = StageTimes(time.perf_counter)
+    times.begin("examination")
+    admitted = admit_recordings(
+        order.recordings, order.frames, order.calibration, console, needs_truth=order.frame_from_ground_truth
+    )
     with MapStore.open(order.store, create=True) as maps:
         parent = _parent(order, maps)
         base = None if parent is None else parent.map
         chosen = choose_vocabulary(maps, order.site, order.vocabulary)
-        built = _survey(order, zones, base, chosen, settings, console, started_s)
+        built = _survey(order, admitted, zones, base, chosen, settings, console, times, started_s)
         return _keep(order, built, parent, settings, maps)
 
 
@@ -118,10 +122,9 @@ def _parent(order: BuildOrder, maps: MapStore) -> _Parent | None:
 
 
 def _survey(
-    order: BuildOrder, zones: Zones, base: SurveyMap | None, chosen: ChosenVocabulary, settings: SurveySettings,
-    console: Console, started_s: float,
+    order: BuildOrder, admitted: dict[Path, Admission], zones: Zones, base: SurveyMap | None, chosen: ChosenVocabulary,
+    settings: SurveySettings, console: Console, times: StageTimes, started_s: float,
 ) -> _Built:  # fmt: skip
-    times = StageTimes(time.perf_counter)
     with ProgressView(console) as view, PictureFile(order.store) as shelf:
 
         def progress(stage: str, done: int, total: int) -> None:
@@ -130,7 +133,7 @@ def _survey(
 
         def survey_one(path: Path, pinhole: StereoCamera | None, words: Vocabulary) -> Surveyed:
             return survey_recording(
-                path, order.frames, order.calibration, pinhole, words, settings, zones, progress, shelf, console
+                path, admitted[path], order.frames, order.calibration, pinhole, words, settings, zones, progress, shelf
             )
 
         surveyed = survey_all(

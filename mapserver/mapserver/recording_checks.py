@@ -46,8 +46,15 @@ def checked(recording: Recording, on_frame: Callable[[], None] = lambda: None) -
     offset_s = examination.measured_offset_s
     if offset_s is None or abs(offset_s) < _CORRECTED_FROM_S:
         return CheckedRecording(recording, examination.findings)
+    return CheckedRecording(with_clock(recording, offset_s), examination.findings, offset_s)
+
+
+def with_clock(recording: Recording, correction_s: float) -> Recording:
+    """The recording with so much added to the time between IMU and cameras."""
+    if correction_s == 0.0:
+        return recording
     cameras = tuple(
-        replace(camera, imu_minus_cam_s=camera.imu_minus_cam_s + offset_s) for camera in recording.calibration.cameras
+        replace(camera, imu_minus_cam_s=camera.imu_minus_cam_s + correction_s)
+        for camera in recording.calibration.cameras
     )
-    calibration = replace(recording.calibration, cameras=cameras)
-    return CheckedRecording(replace(recording, calibration=calibration), examination.findings, offset_s)
+    return replace(recording, calibration=replace(recording.calibration, cameras=cameras))

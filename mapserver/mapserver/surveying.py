@@ -16,7 +16,7 @@ from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_rec
 from fleetmap.rectification import Rectifier, StereoCamera
 from fleetmap.samples import Loss, SensorSet, Trajectory
 from mapserver.build_report import check_truth
-from mapserver.recording_checks import checked
+from mapserver.recording_checks import checked, with_clock
 from mapserver.survey.keyframes import PictureShelf
 from mapserver.survey.pipeline import Progress, Survey, survey
 from mapserver.survey.placing import map_from_survey
@@ -43,11 +43,29 @@ class Surveyed:
         return [*self.findings, *(part.remark() for part in self.survey.parts if not part.kept)]
 
 
-def check_recordings(paths: Sequence[Path], frames: str, calibration: Path | None, *, needs_truth: bool) -> None:
-    """Refuses before the work what could not end well."""
+@dataclass(frozen=True, slots=True)
+class Admission:
+    """A recording that may be surveyed: its losses and the doctor's remarks, in words; the correction of its clocks."""
+
+    remarks: tuple[str, ...]
+    correction_s: float
+
+
+def admit_recordings(
+    paths: Sequence[Path], frames: str, calibration: Path | None, console: Console, *, needs_truth: bool
+) -> dict[Path, Admission]:
+    """Examines all of them, and refuses before the work what could not end well."""
+    admitted = {}
     for path in paths:
         with open_recording(path, OpenOptions(calibration_file=calibration)) as recording:
+            for loss in recording.losses:
+                console.print(f"loss: {loss.what}: {loss.detail}", markup=False)
             _check(recording, FrameSelection.parse(frames).apply(recording), needs_truth)
+            examined = checked(recording)
+            for remark in examined.remarks():
+                console.print(f"{recording.name}: {remark}", markup=False)
+            admitted[path] = Admission(tuple(examined.remarks()), examined.correction_s)
+    return admitted
 
 
 def _check(recording: Recording, indices: NDArray[np.int64], needs_truth: bool) -> None:
@@ -61,18 +79,12 @@ def _check(recording: Recording, indices: NDArray[np.int64], needs_truth: bool) 
 
 
 def survey_recording(
-    path: Path, frames: str, calibration: Path | None, pinhole: StereoCamera | None, vocabulary: Vocabulary,
-    settings: SurveySettings, zones: Zones, progress: Progress, shelf: PictureShelf, console: Console,
+    path: Path, admission: Admission, frames: str, calibration: Path | None, pinhole: StereoCamera | None, vocabulary: Vocabulary,
+    settings: SurveySettings, zones: Zones, progress: Progress, shelf: PictureShelf,
 ) -> Surveyed:  # fmt: skip
     """Surveys one recording as if `pinhole` (or what suits it) had seen it."""
     with open_recording(path, OpenOptions(calibration_file=calibration)) as source:
-        for loss in source.losses:
-            console.print(f"loss: {loss.what}: {loss.detail}", markup=False)
-        progress("examination", 0, 1)
-        examined = checked(source)
-        recording, findings = examined.recording, tuple(examined.remarks())
-        for finding in findings:
-            console.print(f"{recording.name}: {finding}", markup=False)
+        recording = with_clock(source, admission.correction_s)
         indices = FrameSelection.parse(frames).apply(recording)
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         done = survey(
@@ -89,7 +101,7 @@ def survey_recording(
             recording.ground_truth,
             done,
             placed,
-            findings,
+            admission.remarks,
         )
 
 
