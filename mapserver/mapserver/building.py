@@ -19,7 +19,7 @@ from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError
 from fleetmap.mapformat import CameraEntry, Manifest, decode_tile
 from fleetmap.recordings.tum import write_tum
 from fleetmap.rectification import StereoCamera
-from fleetmap.samples import Trajectory
+from fleetmap.samples import SensorSet, Trajectory
 from mapserver.build_report import Accuracy, BuildReport, accuracy, full_report, make_report, sessions_report
 from mapserver.landmark_budget import choose_landmarks
 from mapserver.picture_files import PictureFile
@@ -54,6 +54,7 @@ class BuildOrder:
     trajectory: Path | None = None
     picture: Path | None = None
     frame_from_ground_truth: bool = False
+    use: SensorSet | None = None
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,9 @@ def run_build(order: BuildOrder, settings: SurveySettings) -> str:
     started_s = time.perf_counter()
     console = Console(stderr=True)
     zones = Zones() if order.zones is None else read_zones(order.zones)
-    check_recordings(order.recordings, order.frames, order.calibration, needs_truth=order.frame_from_ground_truth)
+    check_recordings(
+        order.recordings, order.frames, order.calibration, order.use, needs_truth=order.frame_from_ground_truth
+    )
     with MapStore.open(order.store, create=True) as maps:
         parent, base = _parent(order, maps)
         built = _survey(order, zones, base, maps.site_vocabulary(order.site), settings, console, started_s)
@@ -116,7 +119,17 @@ def _survey(
 
         def survey_one(path: Path, pinhole: StereoCamera | None, words: Vocabulary | None) -> Surveyed:
             return survey_recording(
-                path, order.frames, order.calibration, pinhole, words, settings, zones, progress, shelf, console
+                path,
+                order.frames,
+                order.calibration,
+                order.use,
+                pinhole,
+                words,
+                settings,
+                zones,
+                progress,
+                shelf,
+                console,
             )
 
         surveyed = survey_all(
@@ -205,6 +218,7 @@ def _configuration(
         "frames": order.frames,
         "frame_from_ground_truth": order.frame_from_ground_truth or kept,
         "own_calibration": order.calibration is not None,
+        "use": None if order.use is None else order.use.value,
         "zones": {name: polygon.tolist() for name, polygon in zones.polygons.items()},
         "survey": to_dict(settings),
     }
@@ -259,6 +273,11 @@ def _sentence(site: str, version: int, parent: Manifest | None, report: BuildRep
     built_on = "" if parent is None else f" on version {parent.version}"
     left = [s["recording"] for s in report.sessions if not s["joined"]]
     left_out = f"; left out, they could not be joined: {', '.join(left)}" if left else ""
+    if report.scale == "unknown":
+        return (
+            f"site {site}: draft {version} of {report.keyframes} keyframes and {report.landmarks} landmarks, {sizes}; its scale is "
+            "unknown, so it can be inspected but not published"
+        )
     return (
         f"site {site}: draft {version}{built_on} of {report.keyframes} keyframes and {report.landmarks} landmarks over "
         f"{report.path_m:.1f} m, {sizes}{left_out}; make it current with `mapserver publish --site {site}`"
