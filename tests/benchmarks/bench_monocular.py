@@ -46,7 +46,8 @@ DRIFT, _EVERY, _PARTS = 0.05, 5, 10
 @dataclass(frozen=True, slots=True)
 class Row:
     """One survey. ATE in metres after a rigid and a similarity alignment, of the survey and of its odometry; scale_error: how much
-    too large (0.01 is 1 %); scale_wander: how far the scale of a tenth of the way is from the whole's; refused: why there is no map.
+    too large (0.01 is 1 %); scale_drift: how much it grows from start to end, before by odometry; scale_residual: how far tenths of
+    the way are from that; refused: why there is no map.
     """
 
     recording: str
@@ -56,24 +57,35 @@ class Row:
     ate_similarity_m: float | None = None
     odometry_similarity_m: float | None = None
     scale_error: float | None = None
-    scale_wander_before: float | None = None
-    scale_wander: float | None = None
+    scale_drift_before: float | None = None
+    scale_drift: float | None = None
+    scale_residual: float | None = None
     evaluated_share: float | None = None
     loops: int = 0
     seconds: float = 0.0
     refused: str = ""
 
 
-def scale_wander(estimate: Trajectory, truth: Trajectory) -> float:
-    """Largest difference between the scale of a tenth of the way and that of the whole, by lengths against the truth's."""
+def scale_along(estimate: Trajectory, truth: Trajectory) -> tuple[float, float]:
+    """How the scale goes by the way, by lengths of tenths of it against the truth's: drift from start to end, and largest residual.
+
+    The drift is that of a straight line through the logarithms; the residual is what noise and bends leave of each tenth.
+    """
     found = [truth.at(int(s)) for s in estimate.stamps_ns]
     known = [n for n, there in enumerate(found) if there is not None]
     mine = estimate.positions_m[known]
     true = np.array([there[:3, 3] for there in found if there is not None])
-    steps = [np.linalg.norm(np.diff(way, axis=0), axis=1) for way in (mine, true)]
+    chosen = [0]  # half a metre apart, so that the noise of single frames adds no length
+    for n in range(1, len(true)):
+        if np.linalg.norm(true[n] - true[chosen[-1]]) > 0.5:
+            chosen.append(n)
+    steps = [np.linalg.norm(np.diff(way[chosen], axis=0), axis=1) for way in (mine, true)]
     edges = np.searchsorted(np.cumsum(steps[1]), np.linspace(0, steps[1].sum(), _PARTS + 1)[1:-1])
     sums = [np.array([part.sum() for part in np.split(way, edges)]) for way in steps]
-    return float(np.abs(sums[0] / sums[1] / (steps[0].sum() / steps[1].sum()) - 1).max())
+    logs = np.log(sums[0] / sums[1])
+    middles = (np.arange(_PARTS) + 0.5) / _PARTS
+    slope, offset = np.polyfit(middles, logs, 1)
+    return float(slope), float(np.abs(logs - offset - slope * middles).max())
 
 
 def quiet(stage: str, done: int, total: int) -> None:
@@ -91,7 +103,7 @@ def judged(name: str, sensors: str, recording: Recording, done: Survey, seconds:
     return Row(
         name, sensors, "metric" if done.map.scale_known else "unknown", found.rigid.rmse_m, found.similarity.rmse_m,
         absolute_trajectory_error(before, truth, with_scale=True).rmse_m, 1 / found.similarity.scale - 1,
-        scale_wander(before, truth), scale_wander(_tied(done.map), truth), found.evaluated_share,
+        scale_along(before, truth)[0], *scale_along(_tied(done.map), truth), found.evaluated_share,
         done.loops.counts()["accepted"], seconds,
     )  # fmt: skip
 
@@ -176,16 +188,17 @@ def machine() -> dict[str, str]:
 def show(rows: Iterable[Row]) -> None:
     """The table."""
     print(
-        f"{'recording':24s} {'sensors':26s} {'scale':8s} {'rigid m':>8s} {'sim3 m':>8s} {'odom m':>8s} {'scale err':>9s} wander %"
+        f"{'recording':24s} {'sensors':26s} {'scale':8s} {'rigid m':>8s} {'sim3 m':>8s} {'odom m':>8s} {'scale err':>9s} drift %"
     )
     for r in rows:
         if r.refused:
             print(f"{r.recording:24s} {r.sensors:26s} refused: {r.refused}")
             continue
+        drift = [100 * (share or 0.0) for share in (r.scale_drift_before, r.scale_drift, r.scale_residual)]
         print(
             f"{r.recording:24s} {r.sensors:26s} {r.scale:8s} {r.ate_rigid_m:8.4f} {r.ate_similarity_m:8.4f} "
-            f"{r.odometry_similarity_m:8.4f} {r.scale_error:+9.4f} {100 * (r.scale_wander_before or 0):5.2f} -> "
-            f"{100 * (r.scale_wander or 0):4.2f}  share {r.evaluated_share:.3f}  {r.loops} loops  {r.seconds:.0f} s"
+            f"{r.odometry_similarity_m:8.4f} {r.scale_error:+9.4f} {drift[0]:+5.2f} -> {drift[1]:+5.2f} (residual {drift[2]:.2f})  "
+            f"share {r.evaluated_share:.3f}  {r.loops} loops  {r.seconds:.0f} s"
         )
 
 
