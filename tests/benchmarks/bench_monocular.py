@@ -75,9 +75,10 @@ def scale_along(estimate: Trajectory, truth: Trajectory) -> tuple[float, float]:
     known = [n for n, there in enumerate(found) if there is not None]
     mine = estimate.positions_m[known]
     true = np.array([there[:3, 3] for there in found if there is not None])
-    chosen = [0]  # half a metre apart, so that the noise of single frames adds no length
+    apart_m = 0.02 * np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
+    chosen = [0]  # a fiftieth of the way apart, so that the noise of single frames adds no length
     for n in range(1, len(true)):
-        if np.linalg.norm(true[n] - true[chosen[-1]]) > 0.5:
+        if np.linalg.norm(true[n] - true[chosen[-1]]) > apart_m:
             chosen.append(n)
     steps = [np.linalg.norm(np.diff(way[chosen], axis=0), axis=1) for way in (mine, true)]
     edges = np.searchsorted(np.cumsum(steps[1]), np.linspace(0, steps[1].sum(), _PARTS + 1)[1:-1])
