@@ -29,8 +29,9 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     site (manifest and tiles), vocabulary apart; None until it is stored. loops: counts of candidates and their fates.
     ate_rmse_m, ate_sim3_rmse_m: root mean square position error of every selected frame that has an estimate and a
     known truth, after one rigid (similarity) alignment; evaluated_share: their share of the selected frames. All three
-    are None without ground truth. peak_rss_mb: most memory the process held, in 10^6 bytes. findings: by recording, what the
-    doctor found wanting in it, and what was corrected.
+    are None without ground truth. scale: metric, or unknown for one camera that nothing told the metres; scale_error: by how much
+    the estimate is too large (0.01 is 1 %), None without ground truth. peak_rss_mb: most memory the process held, in 10^6 bytes.
+    findings: by recording, what the doctor found wanting in it, and what was corrected.
     culled: what the surveys did not hand on. sessions: what became of every recording, and of the map's landmarks by it.
     """
 
@@ -47,6 +48,8 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     ate_rmse_m: float | None
     ate_sim3_rmse_m: float | None
     evaluated_share: float | None
+    scale: str
+    scale_error: float | None
     peak_rss_mb: float
     findings: dict[str, list[str]]
     culled: dict[str, int]
@@ -120,6 +123,8 @@ def make_report(
         ate_rmse_m=None if found.rigid is None else found.rigid.rmse_m,
         ate_sim3_rmse_m=None if found.similarity is None else found.similarity.rmse_m,
         evaluated_share=found.evaluated_share,
+        scale="metric" if survey_map.scale_known else "unknown",
+        scale_error=None if found.similarity is None else 1.0 / found.similarity.scale - 1.0,
         peak_rss_mb=round(peak_rss_mb, 1),
         culled={key: sum(count[key] for count in culled) for key in culled[0]},
         findings={},

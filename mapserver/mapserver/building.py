@@ -19,7 +19,7 @@ from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError
 from fleetmap.mapformat import CameraEntry, Manifest, decode_tile
 from fleetmap.recordings.tum import write_tum
 from fleetmap.rectification import StereoCamera
-from fleetmap.samples import Trajectory
+from fleetmap.samples import SensorSet, Trajectory
 from mapserver.build_report import Accuracy, BuildReport, accuracy, full_report, make_report, sessions_report
 from mapserver.landmark_budget import choose_landmarks
 from mapserver.picture_files import PictureFile
@@ -57,6 +57,7 @@ class BuildOrder:
     trajectory: Path | None = None
     picture: Path | None = None
     frame_from_ground_truth: bool = False
+    use: SensorSet | None = None
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def run_build(order: BuildOrder, settings: SurveySettings) -> str:
     times = StageTimes(time.perf_counter)
     times.begin("examination")
     admitted = admit_recordings(
-        order.recordings, order.frames, order.calibration, console, needs_truth=order.frame_from_ground_truth
+        order.recordings, order.frames, order.calibration, order.use, console, needs_truth=order.frame_from_ground_truth
     )
     with MapStore.open(order.store, create=True) as maps:
         parent = _parent(order, maps)
@@ -133,7 +134,17 @@ def _survey(
 
         def survey_one(path: Path, pinhole: StereoCamera | None, words: Vocabulary) -> Surveyed:
             return survey_recording(
-                path, admitted[path], order.frames, order.calibration, pinhole, words, settings, zones, progress, shelf
+                path,
+                admitted[path],
+                order.frames,
+                order.calibration,
+                order.use,
+                pinhole,
+                words,
+                settings,
+                zones,
+                progress,
+                shelf,
             )
 
         surveyed = survey_all(
@@ -231,6 +242,7 @@ def _configuration(order: BuildOrder, parent: _Parent | None, zones: Zones, sett
         "own_vocabulary": order.vocabulary is not None,
         "frame_from_ground_truth": order.frame_from_ground_truth or kept,
         "own_calibration": order.calibration is not None,
+        "use": None if order.use is None else order.use.value,
         "zones": {name: polygon.tolist() for name, polygon in zones.polygons.items()},
         "survey": to_dict(settings),
     }
@@ -287,6 +299,11 @@ def _sentence(site: str, version: int, parent: _Parent | None, report: BuildRepo
     built_on = "" if parent is None else f" on version {parent.manifest.version}"
     left = [s["recording"] for s in report.sessions if not s["joined"]]
     left_out = f"; left out, they could not be joined: {', '.join(left)}" if left else ""
+    if report.scale == "unknown":
+        return (
+            f"site {site}: draft {version} of {report.keyframes} keyframes and {report.landmarks} landmarks, {sizes}; its scale is "
+            "unknown, so it can be inspected but not published"
+        )
     return (
         f"site {site}: draft {version}{built_on} of {report.keyframes} keyframes and {report.landmarks} landmarks over "
         f"{report.path_m:.1f} m, {sizes}{left_out}; make it current with `mapserver publish --site {site}`"

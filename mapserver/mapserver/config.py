@@ -11,8 +11,11 @@ from typing import Any
 import msgspec
 
 from fleetmap.config import Section, load_toml, to_dict
+from fleetmap.samples import SensorSet
 from mapserver.gate import GateSettings
 from mapserver.survey.settings import SurveySettings
+
+_PRESETS = Path(__file__).parent / "presets"
 
 
 class BuildSection(Section, frozen=True):
@@ -28,6 +31,7 @@ class BuildSection(Section, frozen=True):
     trajectory: str | None = None
     picture: str | None = None
     frame_from_ground_truth: bool | None = None
+    use: str | None = None
 
 
 class PublishSection(Section, frozen=True):
@@ -159,6 +163,21 @@ class MapserverConfig(Section, frozen=True, rename={"import_": "import"}):
 def read_config(path: Path | None) -> MapserverConfig:
     """The settings of the file at `path`, the defaults without one; UsageError as `load_toml`."""
     return MapserverConfig() if path is None else load_toml(path, MapserverConfig)
+
+
+def survey_settings(path: Path | None, sensor_set: SensorSet) -> SurveySettings:
+    """What a survey with these sensors is made by: the preset of the sensor set, and over it the [survey] of the file at `path`."""
+    preset = msgspec.toml.decode((_PRESETS / f"{sensor_set.value}.toml").read_bytes())
+    given: dict[str, Any] = {} if path is None else msgspec.toml.decode(path.read_bytes()).get("survey", {})
+    return msgspec.convert(_over(preset, given), SurveySettings)
+
+
+def _over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(below)
+    for key, value in above.items():
+        old = merged.get(key)
+        merged[key] = _over(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return merged
 
 
 def command_defaults(config: MapserverConfig) -> dict[str, dict[str, Any]]:

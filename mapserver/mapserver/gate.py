@@ -70,6 +70,11 @@ def _hard_reasons(draft: Manifest, site_vocabulary: str | None) -> tuple[str, ..
             f"it uses vocabulary {draft.vocabulary.sha256}, site {draft.site} keeps {site_vocabulary}; build it again "
             "so that it takes the site's"
         )
+    if draft.report.get("scale") == "unknown":
+        reasons.append(
+            "it has a scale of its own: one camera without IMU saw no dock or tag that could tell the metres; record with an IMU, a "
+            "second camera, or past two docks"
+        )
     return tuple(reasons)
 
 

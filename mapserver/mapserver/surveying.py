@@ -1,7 +1,7 @@
 """The rim around surveys: opens recordings one after the other and surveys each."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,17 +9,18 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from fleetmap.bow import Vocabulary
-from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
 from fleetmap.rectification import Rectifier, StereoCamera
-from fleetmap.samples import Loss, SensorSet, Trajectory
+from fleetmap.samples import Loss, PositionPrior, SensorSet, Trajectory
 from mapserver.build_report import check_truth
 from mapserver.recording_checks import checked, with_clock
+from mapserver.sensor_choice import reduced
 from mapserver.survey.keyframes import PictureShelf
+from mapserver.survey.moving import scaled, scaled_state
 from mapserver.survey.pipeline import Progress, Survey, survey
-from mapserver.survey.placing import map_from_survey
+from mapserver.survey.placing import anchored_by_priors, map_from_survey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.zones import Zones
 
@@ -52,12 +53,14 @@ class Admission:
 
 
 def admit_recordings(
-    paths: Sequence[Path], frames: str, calibration: Path | None, console: Console, *, needs_truth: bool
-) -> dict[Path, Admission]:
+    paths: Sequence[Path], frames: str, calibration: Path | None, use: SensorSet | None, console: Console, *,
+    needs_truth: bool
+) -> dict[Path, Admission]:  # fmt: skip
     """Examines all of them, and refuses before the work what could not end well."""
     admitted = {}
     for path in paths:
-        with open_recording(path, OpenOptions(calibration_file=calibration)) as recording:
+        with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
+            recording = reduced(opened, use)
             for loss in recording.losses:
                 console.print(f"loss: {loss.what}: {loss.detail}", markup=False)
             _check(recording, FrameSelection.parse(frames).apply(recording), needs_truth)
@@ -69,29 +72,24 @@ def admit_recordings(
 
 
 def _check(recording: Recording, indices: NDArray[np.int64], needs_truth: bool) -> None:
-    if recording.sensor_set in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
-        raise RecordingError(
-            f"{recording.path} is {recording.sensor_set}: a survey needs a second camera or a depth sensor; "
-            "record with one"
-        )
     if needs_truth:
         check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
 
 
 def survey_recording(
-    path: Path, admission: Admission, frames: str, calibration: Path | None, pinhole: StereoCamera | None, vocabulary: Vocabulary,
-    settings: SurveySettings, zones: Zones, progress: Progress, shelf: PictureShelf,
+    path: Path, admission: Admission, frames: str, calibration: Path | None, use: SensorSet | None, pinhole: StereoCamera | None,
+    vocabulary: Vocabulary, settings: SurveySettings, zones: Zones, progress: Progress, shelf: PictureShelf,
 ) -> Surveyed:  # fmt: skip
-    """Surveys one recording as if `pinhole` (or what suits it) had seen it."""
-    with open_recording(path, OpenOptions(calibration_file=calibration)) as source:
-        recording = with_clock(source, admission.correction_s)
+    """Surveys one recording by the sensors of `use` (or all it has), as if `pinhole` (or what suits it) had seen it."""
+    with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
+        recording = with_clock(reduced(opened, use), admission.correction_s)
         indices = FrameSelection.parse(frames).apply(recording)
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         done = survey(
             (recording.read_frame(int(index)) for index in indices), len(indices), recording.imu, recording.calibration,
             rectifier, vocabulary, settings, zones, progress, shelf, recording.wheel,
         )  # fmt: skip
-        placed = map_from_survey(done.map, recording.priors, recording.calibration.base_from_body)
+        done, placed = _placed(done, recording.priors, recording.calibration.base_from_body)
         entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices))
         return Surveyed(
             entry,
@@ -103,6 +101,17 @@ def survey_recording(
             placed,
             admission.remarks,
         )
+
+
+def _placed(done: Survey, priors: Sequence[PositionPrior], base_from_body: Array) -> tuple[Survey, Array | None]:
+    """The survey, in metres where its priors give a scale that was unknown, and map_from_survey (4, 4) by them, None without any."""
+    if done.map.scale_known:
+        return done, map_from_survey(done.map, priors, base_from_body)
+    anchoring = anchored_by_priors(done.map, priors, base_from_body)
+    if anchoring is None:
+        return done, None
+    in_metres = replace(done, map=scaled(done.map, anchoring.scale), state=scaled_state(done.state, anchoring.scale))
+    return in_metres, anchoring.map_from_survey
 
 
 def survey_all(

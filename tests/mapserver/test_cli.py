@@ -13,7 +13,7 @@ import pytest
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3_exp
 from fleetmap.recordings.tum import write_tum
-from fleetmap.samples import Trajectory
+from fleetmap.samples import SensorSet, Trajectory
 from map_samples import draft_details, save_sample_draft
 from mapserver import cli
 from mapserver.config import MapserverConfig, command_defaults, read_config
@@ -119,6 +119,7 @@ def test_build_takes_its_settings_from_the_file(
     monkeypatch.setattr(
         "mapserver.building.run_build", lambda order, settings: seen.append((order, settings)) or "done"
     )
+    monkeypatch.setattr("mapserver.sensor_choice.sensor_set_of", lambda path, calibration: SensorSet.STEREO)
     file = tmp_path / "site.toml"
     file.write_text(
         f'[build]\nsite = "lab"\nstore = "{tmp_path}"\nframes = "::3"\nframe_from_ground_truth = true\n'

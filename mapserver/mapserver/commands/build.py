@@ -28,6 +28,9 @@ def build(
     frame_from_ground_truth: Annotated[
         bool, typer.Option("--frame-from-ground-truth", help="Place the finished map in the ground truth's frame.")
     ] = False,
+    use: Annotated[
+        str | None, typer.Option(metavar="SENSORS", help="Use only the sensors of this set, of those it has.")
+    ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Survey the recordings, join them to the site's current version, and store the map as a draft."""
@@ -40,8 +43,10 @@ def build(
 
     check_name(site, "site")
     from mapserver.building import BuildOrder, run_build
-    from mapserver.config import read_config
+    from mapserver.config import read_config, survey_settings
+    from mapserver.sensor_choice import named_sensor_set, sensor_set_of
 
+    sensors = None if use is None else named_sensor_set(use)
     order = BuildOrder(
         tuple(recordings),
         site,
@@ -54,5 +59,8 @@ def build(
         trajectory,
         picture,
         frame_from_ground_truth,
+        sensors,
     )
-    typer.echo(run_build(order, read_config(config_path(context)).survey))
+    read_config(config_path(context))
+    settings = survey_settings(config_path(context), sensors or sensor_set_of(recordings[0], calibration))
+    typer.echo(run_build(order, settings))

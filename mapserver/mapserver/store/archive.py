@@ -65,6 +65,7 @@ class _Head(msgspec.Struct, frozen=True):
     arrays: tuple[_ArrayHead, ...]
     next_keyframe_id: int = 0
     next_landmark_id: int = 0
+    scale_known: bool = True
 
 
 def encode_archive(survey: SurveyMap) -> bytes:
@@ -74,6 +75,7 @@ def encode_archive(survey: SurveyMap) -> bytes:
     head = msgspec.json.encode(
         {
             "camera": asdict(survey.camera),
+            "scale_known": survey.scale_known,
             "next_keyframe_id": history.next_keyframe_id,
             "next_landmark_id": history.next_landmark_id,
             "arrays": [{"name": n, "dtype": dtypes[n], "shape": list(a.shape)} for n, a in arrays.items()],
@@ -117,7 +119,7 @@ def decode_archive(data: bytes) -> SurveyMap:
     trajectory = Trajectory(arrays.pop("trajectory_stamps_ns"), arrays.pop("trajectory_frame_from_body"))
     if number == 1:
         arrays["obs_sigma_px"] = np.repeat(arrays["obs_sigma_px"][:, None], 2, axis=1)
-    fields: dict[str, Any] = {"camera": head.camera, "trajectory": trajectory}
+    fields: dict[str, Any] = {"camera": head.camera, "scale_known": head.scale_known, "trajectory": trajectory}
     fields |= {name: values for name, values in arrays.items() if name not in _HISTORY_DTYPES}
     remembered: dict[str, Any] = {name: values for name, values in arrays.items() if name in _HISTORY_DTYPES}
     if remembered:

@@ -1,13 +1,14 @@
 """Stage 1: odometry over all frames, and the choice of keyframes on the way."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.calibration import RigCalibration
 from fleetmap.geometry import Array, rotation_between_vectors, se3
-from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
+from fleetmap.odometry import OdometryEstimate, OdometryStatus, make_odometry
 from fleetmap.rectification import RectifiedFrame, Rectifier
 from fleetmap.samples import CameraFrame, ImuSamples, WheelSample
 from mapserver.survey.keyframes import FrameSummary, Keyframe, KeyframePolicy, PictureShelf, make_keyframe, sharpness
@@ -19,7 +20,8 @@ class FirstGuess:
     """Odometry of F frames and K keyframes.
 
     odom_from_body (F, 4, 4), covariances (F, 6, 6) in odom axes, rotation first; tracked (F,) false where nothing tied the frame
-    to the ones before; inertial: whether gravity was found.
+    to the ones before; inertial: whether gravity was found; scale_known: whether metres are metres. Of one camera's frames only
+    those tracked belong together, and only they give keyframes.
     """
 
     estimates: list[OdometryEstimate]
@@ -28,6 +30,7 @@ class FirstGuess:
     tracked: Array
     keyframes: list[Keyframe]
     inertial: bool
+    scale_known: bool = True
 
 
 def run_odometry(
@@ -39,7 +42,7 @@ def run_odometry(
 
     progress is called with each frame's number.
     """
-    odometry = Odometry(
+    odometry = make_odometry(
         calibration,
         rectifier.camera,
         rectifier.body_from_cam,
@@ -63,18 +66,26 @@ def run_odometry(
             odom_from_body = [estimate.new_odom_from_old_odom @ earlier for earlier in odom_from_body]
         estimates.append(estimate)
         odom_from_body.append(estimate.odom_from_body)
+        for earlier_number, placed in estimate.revised:
+            odom_from_body[earlier_number] = placed
+            estimates[earlier_number] = replace(
+                estimates[earlier_number], odom_from_body=placed, status=OdometryStatus.TRACKING,
+                scale_known=estimate.scale_known,
+            )  # fmt: skip
         if policy.wants(_summary(frame, estimate)):
             keyframes.append(make_keyframe(frame, number, rectifier.camera, settings, shelf))
         progress(number)
     inertial = bool(estimates) and calibration.imu is not None and estimates[-1].inertial
-    return FirstGuess(
+    guess = FirstGuess(
         estimates,
         np.array(odom_from_body),
         np.array([e.cov_rot_trans for e in estimates]),
         np.array([e.status is not OdometryStatus.DEGRADED for e in estimates]),
         keyframes,
         inertial,
+        bool(estimates) and estimates[-1].scale_known,
     )
+    return guess if rectifier.camera.baseline_m > 0 else connected_part(guess, rectifier.body_from_cam)
 
 
 def _summary(frame: RectifiedFrame, estimate: OdometryEstimate) -> FrameSummary:
@@ -88,9 +99,34 @@ def _summary(frame: RectifiedFrame, estimate: OdometryEstimate) -> FrameSummary:
     )
 
 
-def _levelled(odom_from_body: Array, covariances: Array, body_from_cam: Array) -> tuple[Array, Array]:
+def connected_part(guess: FirstGuess, body_from_cam: Array) -> FirstGuess:
+    """One camera's longest run of frames in one frame and scale; without gravity it is turned upright as cameras are.
+
+    With an IMU what follows its start hangs together through gaps in the pictures, without one every gap begins another scale.
+    """
+    same = np.array([e.scale_known == guess.scale_known for e in guess.estimates], bool)
+    placed = same & np.array([e.status is not OdometryStatus.INITIALISING for e in guess.estimates], bool)
+    if not guess.scale_known:
+        placed &= guess.tracked
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], placed, [False]]).astype(np.int8)))
+    runs = edges.reshape(-1, 2)
+    first, end = max(runs.tolist(), key=lambda run: run[1] - run[0], default=[0, 0])
+    inside = np.zeros(len(placed), bool)
+    inside[first:end] = True
+    odom_from_body, covariances = guess.odom_from_body, guess.covariances
+    if not guess.inertial and end > first:
+        odom_from_body, covariances = _levelled(odom_from_body, covariances, body_from_cam, inside)
+    return replace(
+        guess, odom_from_body=odom_from_body, covariances=covariances, tracked=guess.tracked & inside,
+        keyframes=[k for k in guess.keyframes if inside[k.frame_index]],
+    )  # fmt: skip
+
+
+def _levelled(
+    odom_from_body: Array, covariances: Array, body_from_cam: Array, chosen: NDArray[np.bool_]
+) -> tuple[Array, Array]:
     """The same turned so that z points up, where no accelerometer tells: cameras are taken to be upright on the whole."""
-    down = (odom_from_body[:, :3, :3] @ body_from_cam[:3, 1]).mean(axis=0)
+    down = (odom_from_body[chosen, :3, :3] @ body_from_cam[:3, 1]).mean(axis=0)
     if np.linalg.norm(down) < 1e-6:
         return odom_from_body, covariances
     level_from_odom = se3(rotation_between_vectors(down, np.array([0.0, 0.0, -1.0])), np.zeros(3))

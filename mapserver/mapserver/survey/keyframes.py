@@ -50,7 +50,10 @@ class MemoryShelf:
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """One keyframe: features (N), disparities (N, 2) with sigma, their points; its pictures wait on a shelf."""
+    """One keyframe: features (N), disparities (N, 2) with sigma, their points; its pictures wait on a shelf.
+
+    from_views: the disparities come from other keyframes, so they place points but measure nothing of their own.
+    """
 
     frame_index: int
     stamp_ns: int
@@ -59,6 +62,7 @@ class Keyframe:
     points_cam: Array
     shelf: PictureShelf
     shelf_number: int
+    from_views: bool = False
 
     @property
     def frame(self) -> RectifiedFrame:

@@ -48,7 +48,8 @@ def match_pair(
 
 def _measured(keyframe: Keyframe, index: Indices) -> Array:
     pixels = keyframe.features.pixels[index]
-    return np.column_stack([pixels, pixels[:, 0] - keyframe.disparities[index, 0]])
+    measured = np.full(len(pixels), np.nan) if keyframe.from_views else keyframe.disparities[index, 0]
+    return np.column_stack([pixels, pixels[:, 0] - measured])
 
 
 def _sigmas(keyframe: Keyframe, index: Indices, settings: PairSettings) -> Array:
@@ -68,7 +69,7 @@ def _from_descriptors(
     pairs = match_mutual(a.features.descriptors[known], b.features.descriptors, settings.max_distance, settings.ratio)
     index_a, index_b = known[pairs[:, 0]], pairs[:, 1]
     points, measured, sigmas = a.points_cam[index_a], _measured(b, index_b), _sigmas(b, index_b, settings)
-    if j_from_i is not None and rotation_sigma_rad is not None:
+    if j_from_i is not None and rotation_sigma_rad is not None and not b.from_views:
         threshold = max(settings.search_px, 1.5 * rotation_sigma_rad * camera.focal_px)
         return resection_with_rotation(
             camera, points, measured, sigmas, j_from_i[:3, :3], threshold_px=threshold, min_inliers=settings.min_inliers,

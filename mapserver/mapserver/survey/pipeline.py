@@ -26,9 +26,11 @@ from mapserver.survey.pairs import PairMatch
 from mapserver.survey.parts import Part, SigmaBetween, beside, find_parts, only_kept, seen_by
 from mapserver.survey.pose_graph import PoseEdge, optimize_pose_graph
 from mapserver.survey.result import SurveyMap
+from mapserver.survey.scaled_loops import ScaledLoopCloser, gate_covariances, rigid, solve_scaled
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.summary import summarise
 from mapserver.survey.tracks import build_landmarks
+from mapserver.survey.view_depths import ViewDepths, survey_camera
 from mapserver.survey.zones import Zones
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
@@ -61,13 +63,24 @@ def survey(
     guess = run_odometry(
         frames, imu, calibration, rectifier, settings, lambda n: progress("odometry", n + 1, frame_count), shelf, wheel
     )
-    keyframes = guess.keyframes
-    if len(keyframes) < _MIN_KEYFRAMES:
+    return survey_from(guess, imu, calibration, rectifier, vocabulary, settings, zones, progress)
+
+
+def survey_from(
+    guess: FirstGuess, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, vocabulary: Vocabulary,
+    settings: SurveySettings, zones: Zones, progress: Progress,
+) -> Survey:  # fmt: skip
+    """All stages after the first guess."""
+    if len(guess.keyframes) < _MIN_KEYFRAMES:
         raise SurveyError(
-            f"{frame_count} frames gave {len(keyframes)} keyframe(s); a map needs motion, at least {_MIN_KEYFRAMES}"
+            f"{len(guess.estimates)} frames gave {len(guess.keyframes)} keyframe(s) that belong together; a map needs motion, "
+            f"at least {_MIN_KEYFRAMES}"
         )
     state = _first_state(guess, imu, calibration, rectifier, settings)
-    finder = PairFinder(keyframes, rectifier.camera, rectifier.body_from_cam, settings)
+    depths = ViewDepths(guess.keyframes, state.camera, settings) if rectifier.camera.baseline_m == 0 else None
+    guess = _with_depths(guess, state, depths)
+    keyframes = guess.keyframes
+    finder = PairFinder(keyframes, state.camera, rectifier.body_from_cam, settings)
     pairs = _match_neighbours(guess, state, finder, settings, progress)
     state.landmarks = build_landmarks(
         keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings
@@ -81,10 +94,15 @@ def survey(
     adjust_windows(state, settings)
     if state.motion.inertial:
         adjust(state, settings, rounds=2)
+    guess = _with_depths(guess, state, depths)
     loops = _close_loops(guess, state, pairs, vocabulary, settings, zones, progress)
     turn = NO_TURN
     for round_number in range(2):
         progress("global adjustment", round_number, 2)
+        if depths is not None:
+            guess = _with_depths(guess, state, depths)
+            keyframes = guess.keyframes
+            finder = PairFinder(keyframes, state.camera, rectifier.body_from_cam, settings)
         pairs = _match_all(state, finder, settings, progress)
         state.landmarks = build_landmarks(
             keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings
@@ -103,6 +121,13 @@ def survey(
     return Survey(survey_map, vocabulary, loops, guess, state, culled, turn, [*parts.parts, *parts.stray])
 
 
+def _with_depths(guess: FirstGuess, state: SurveyState, depths: ViewDepths | None) -> FirstGuess:
+    """One camera's keyframes with depths by where they are now; the same guess for rigs that measure depth."""
+    if depths is None:
+        return guess
+    return replace(guess, keyframes=depths.placed(state.map_from_body, state.body_from_cam))
+
+
 def _first_state(
     guess: FirstGuess, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings
 ) -> SurveyState:
@@ -113,20 +138,25 @@ def _first_state(
     motion = Motion(
         guess.inertial, imu, calibration.imu, rectifier.imu_minus_cam_s,
         np.array([e.velocity_odom_mps for e in estimates]), np.array([e.gyro_bias_radps for e in estimates]),
-        np.array([e.accel_bias_mps2 for e in estimates]), [] if guess.inertial else _odometry_terms(guess, numbers),
+        np.array([e.accel_bias_mps2 for e in estimates]), [] if guess.inertial else _odometry_terms(guess, map_from_body),
     )  # fmt: skip
-    nothing = build_landmarks([], [], map_from_body, rectifier.body_from_cam, rectifier.camera, settings)
+    camera = survey_camera(rectifier.camera)
+    nothing = build_landmarks([], [], map_from_body, rectifier.body_from_cam, camera, settings)
     stamps = np.array([k.stamp_ns for k in guess.keyframes], np.int64)
     return SurveyState(
-        stamps, map_from_body.copy(), rectifier.body_from_cam, rectifier.camera, motion, nothing, rectifier.has_depth
+        stamps, map_from_body.copy(), rectifier.body_from_cam, camera, motion, nothing, rectifier.has_depth
     )
 
 
-def _odometry_terms(guess: FirstGuess, numbers: list[int]) -> list[RelativeTerm]:
-    """Without an IMU, neighbours are held by odometry: weakly, so that it decides only where landmarks do not."""
+def _odometry_terms(guess: FirstGuess, map_from_body: Array) -> list[RelativeTerm]:
+    """Without an IMU, neighbours are held by odometry: weakly, so that it decides only where landmarks do not.
+
+    For one camera this also holds the scale, which its landmarks leave open.
+    """
+    numbers = [k.frame_index for k in guess.keyframes]
     terms = []
     for k, (a, b) in enumerate(pairwise(numbers)):
-        i_from_j = se3_inverse(guess.odom_from_body[a]) @ guess.odom_from_body[b]
+        i_from_j = se3_inverse(map_from_body[k]) @ map_from_body[k + 1]
         terms.append(
             RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(25.0 * _edge_covariance(guess, a, b)).astype(np.float64))
         )
@@ -175,16 +205,22 @@ def _close_loops(
 ) -> Loops:  # fmt: skip
     """Finds loops, and moves the keyframes to where the pose graph with them says."""
     keyframes = guess.keyframes
-    chain = chain_edges(guess, state)
+    chain, walk = chain_edges(guess, state), settings.monocular.scale_walk
     vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in keyframes]
-    closer = LoopCloser(
+    kind, known = (LoopCloser, chain) if guess.scale_known else (ScaledLoopCloser, gate_covariances(chain, walk))
+    closer = kind(
         keyframes, vectors, vocabulary.word_count, state.camera, state.body_from_cam, state.map_from_body,
-        GraphMarginals(state.map_from_body, chain), {(p.i, p.j) for p in pairs}, settings, zones,
+        GraphMarginals(state.map_from_body, known), {(p.i, p.j) for p in pairs}, settings, zones,
     )  # fmt: skip
     for i in range(len(keyframes)):
         closer.close(i)
         progress("loops", i + 1, len(keyframes))
-    if closer.loops.edges:
+    if closer.loops.edges and isinstance(closer, ScaledLoopCloser):
+        scaled = solve_scaled(state.map_from_body, chain, closer.loops.edges, closer.scales, walk)
+        closer.loops.disbelieve(scaled.loop_weights)
+        _move(state, rigid(scaled))
+        state.motion = replace(state.motion, relative=_odometry_terms(guess, state.map_from_body))
+    elif closer.loops.edges:
         solved = optimize_pose_graph(state.map_from_body, [*chain, *closer.loops.edges])
         closer.loops.disbelieve(solved.loop_weights)
         _move(state, solved.map_from_body)

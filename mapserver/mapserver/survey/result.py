@@ -38,6 +38,7 @@ class SurveyMap:
     observation of each landmark is its reference. trajectory holds all F frames; where trajectory_estimated (F,) is false the transform
     is a guess between neighbours. patches (N, P, P) uint8 are cut from each landmark's reference keyframe at its octave.
     history: None for a survey that no other was compared with yet.
+    scale_known is False for one camera's map whose metres are of the survey's own making.
     """
 
     camera: StereoCamera
@@ -57,3 +58,4 @@ class SurveyMap:
     trajectory_estimated: NDArray[np.bool_]
     patches: NDArray[np.uint8]
     history: History | None = None
+    scale_known: bool = True

@@ -67,6 +67,16 @@ class NoiseSettings(Section, frozen=True):
     walk_scale: float = 1.0
 
 
+class SingleCameraSettings(Section, frozen=True):
+    """How the survey of one camera places features and lets the scale wander."""
+
+    depth_views: int = 5
+    match_sigma_px: float = 1.0
+    min_angle_deg: float = 0.8
+    max_depth_sigma_share: float = 0.12
+    scale_walk: float = 0.01
+
+
 class VocabularySettings(Section, frozen=True):
     """The tree trained on a site's first survey."""
 
@@ -130,6 +140,7 @@ class SurveySettings(Section, frozen=True):
     keyframes: KeyframeSettings = KeyframeSettings()
     pairs: PairSettings = PairSettings()
     loops: LoopSettings = LoopSettings()
+    monocular: SingleCameraSettings = SingleCameraSettings()
     noise: NoiseSettings = NoiseSettings()
     bundle: BundleSettings = BundleSettings(max_iterations=20, relative_cost_tolerance=1e-6)
     final_bundle: BundleSettings = BundleSettings(

@@ -54,6 +54,7 @@ def summarise(state: SurveyState, guess: FirstGuess, settings: SurveySettings) -
         trajectory=Trajectory(frame_stamps, map_from_body),
         trajectory_estimated=_estimated(state, guess),
         patches=cut_patches(marks, keyframes),
+        scale_known=guess.scale_known,
     )
     return survey_map, culled
 

@@ -1,6 +1,14 @@
-"""Stereo-inertial odometry: written once, run live by the robot and as a first guess by the survey."""
+"""Odometry of stereo and single cameras, with and without IMU: written once, run live by the robot and as a first guess by the survey."""
 
+from fleetmap.odometry.monocular import MonocularOdometry, make_odometry
 from fleetmap.odometry.odometry import Odometry, OdometryEstimate, OdometryStatus
 from fleetmap.odometry.settings import OdometrySettings
 
-__all__ = ["Odometry", "OdometryEstimate", "OdometrySettings", "OdometryStatus"]
+__all__ = [
+    "MonocularOdometry",
+    "Odometry",
+    "OdometryEstimate",
+    "OdometrySettings",
+    "OdometryStatus",
+    "make_odometry",
+]

@@ -46,6 +46,8 @@ class OdometryEstimate:
     odom_from_body (4, 4); cov_rot_trans (6, 6) in odom axes; velocity, biases (3,). track_ids (N,) of the points seen;
     after_gap where they had to be matched by descriptors; inertial once gravity is known. new_odom_from_old_odom is
     given when the frame `odom` was redefined (gravity found): earlier estimates must be multiplied by it from the left.
+    scale_known is False for one camera whose scale nothing has shown: lengths are then in a unit of the odometry's own. revised:
+    earlier frames that are placed anew, (frame index, odom_from_body (4, 4)).
     """
 
     stamp_ns: int
@@ -62,6 +64,8 @@ class OdometryEstimate:
     after_gap: bool
     inertial: bool
     new_odom_from_old_odom: Array | None
+    scale_known: bool = True
+    revised: tuple[tuple[int, Array], ...] = ()
 
 
 class Odometry:

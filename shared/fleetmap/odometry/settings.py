@@ -79,9 +79,32 @@ class StartSettings(Section, frozen=True):
     max_gravity_error_mps2: float = 0.6
 
 
+class MonocularSettings(Section, frozen=True):
+    """How one camera alone finds its way, and when the IMU may say how long that way is."""
+
+    first_depth: float = 5.0  # the unit of length: how far away half of what the first two views share is taken to be
+    first_parallax_px: float = 18.0
+    first_min_points: int = 40
+    min_angle_deg: float = 1.0
+    point_angle_deg: float = 0.6
+    view_parallax_px: float = 14.0
+    view_overlap: float = 0.75
+    window_views: int = 8
+    sigma_px: float = 0.6
+    max_error_px: float = 2.5
+    min_points: int = 15
+    drift_share: float = 0.03
+    sample_interval_s: float = 0.2
+    metric_samples: int = 10
+    metric_max_samples: int = 30
+    max_scale_sigma_share: float = 0.08
+    still_px: float = 0.3
+
+
 class OdometrySettings(Section, frozen=True):
     """All of it."""
 
     tracker: TrackerSettings = TrackerSettings()
     filter: FilterSettings = FilterSettings()
     start: StartSettings = StartSettings()
+    monocular: MonocularSettings = MonocularSettings()

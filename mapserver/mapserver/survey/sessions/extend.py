@@ -62,6 +62,10 @@ def extend(
     it is taken as it is.
     """
     state, guess = survey.state, survey.first_guess
+    if not (guess.scale_known and base_map.scale_known):
+        return NotJoined(
+            "a survey by one camera without IMU has no metres of its own: it can begin a map, not join one"
+        )
     base = BaseMap(base_map, state.camera, state.body_from_cam)
     fixes = find_fixes(base, guess.keyframes, state.body_from_cam, survey.vocabulary, settings)
     survey_from_body = state.map_from_body  # the survey's own frame, named `map` before there was another
