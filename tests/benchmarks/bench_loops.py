@@ -16,6 +16,7 @@ from unittest.mock import patch
 import msgspec
 import numpy as np
 
+from fleetmap.default_vocabulary import default_vocabulary
 from fleetmap.recordings import OpenOptions, Recording, open_recording
 from fleetmap.rectification import Rectifier
 from fleetsim.commands import record_order
@@ -88,7 +89,15 @@ def build(recording: Recording, settings: SurveySettings) -> Closed:
     rectifier, count = Rectifier(recording.calibration), len(recording.frame_stamps_ns)
     frames = (recording.read_frame(index) for index in range(count))
     done = survey(
-        frames, count, recording.imu, recording.calibration, rectifier, None, settings, Zones(), lambda *_: None
+        frames,
+        count,
+        recording.imu,
+        recording.calibration,
+        rectifier,
+        default_vocabulary(),
+        settings,
+        Zones(),
+        lambda *_: None,
     )
     seconds = time.perf_counter() - begun
     truth = recording.ground_truth

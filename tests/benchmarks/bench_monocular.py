@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fleetmap.default_vocabulary import default_vocabulary
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
@@ -123,7 +124,15 @@ def one(path: Path, use: SensorSet) -> Row:
         frames = (recording.read_frame(k) for k in range(len(recording)))
         try:
             done = survey(
-                frames, len(recording), recording.imu, recording.calibration, rectifier, None, settings, Zones(), quiet
+                frames,
+                len(recording),
+                recording.imu,
+                recording.calibration,
+                rectifier,
+                default_vocabulary(),
+                settings,
+                Zones(),
+                quiet,
             )
         except SurveyError as error:
             return Row(path.stem, use.value, refused=str(error), seconds=time.perf_counter() - began_s)
@@ -137,7 +146,9 @@ def drifting(path: Path, drift: float, seed: int = 0) -> Row:
         recording = reduced(opened, SensorSet.MONO)
         settings, rectifier = survey_settings(None, SensorSet.MONO), Rectifier(recording.calibration)
         guess = drifting_guess(recording, rectifier, settings, drift, np.random.default_rng(seed))
-        done = survey_from(guess, recording.imu, recording.calibration, rectifier, None, settings, Zones(), quiet)
+        done = survey_from(
+            guess, recording.imu, recording.calibration, rectifier, default_vocabulary(), settings, Zones(), quiet
+        )
         return judged(path.stem, f"mono, {drift:.0%} drift injected", recording, done, time.perf_counter() - began_s)
 
 

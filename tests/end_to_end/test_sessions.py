@@ -14,6 +14,7 @@ from typer.testing import CliRunner, Result
 
 import box_room
 from box_room import out_and_back, ride_sample
+from fleetmap.default_vocabulary import default_vocabulary
 from fleetmap.errors import SurveyError, UsageError
 from fleetmap.geometry import Array, se3
 from fleetmap.mapformat import Tile, decode_tile
@@ -239,7 +240,7 @@ def test_a_prior_joins_what_sees_nothing_of_the_map(nights: Nights, tmp_path: Pa
     with open_recording(write_euroc(tmp_path / "foreign", make_sample(20))) as recording:
         foreign = survey(
             (recording.read_frame(n) for n in range(20)), 20, recording.imu, recording.calibration,
-            Rectifier(recording.calibration, pinhole=base.camera), None, settings, Zones(), lambda *_: None,
+            Rectifier(recording.calibration, pinhole=base.camera), default_vocabulary(), settings, Zones(), lambda *_: None,
         )  # fmt: skip
     assert isinstance(extend(base, foreign, settings, anchored=True), NotJoined)
     there = se3(np.eye(3), np.array([30.0, 20.0, 0.0]))
