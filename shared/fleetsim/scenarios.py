@@ -96,6 +96,15 @@ def _clip() -> Scenario:
     )
 
 
+def _five_aisles() -> Scenario:
+    layout = Layout(aisles=5, bays=4)
+    runs = {
+        "survey": Run("surveyor", (_loop(layout, 0, 4),), is_sharp=True),
+        "tote-1": Run("tote", (_loop(layout, 0, 4, shift_m=0.2),)),
+    }
+    return Scenario("a loop around five aisles, 80 m: what surveys are judged by", layout, runs)
+
+
 def _busy() -> Scenario:
     layout = Layout(aisles=4, bays=9)
     y = [layout.aisle_y_m(aisle) for aisle in range(4)]
@@ -171,6 +180,7 @@ SCENARIOS = {
     "clip": _clip,
     "small-loop": _small_loop,
     "faults": _faulty,
+    "five-aisles": _five_aisles,
     "busy": _busy,
     "identical-aisles": _identical,
     "site": _site,
