@@ -31,6 +31,10 @@ def build(
     use: Annotated[
         str | None, typer.Option(metavar="SENSORS", help="Use only the sensors of this set, of those it has.")
     ] = None,
+    replay: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="RECORDING", help="Earlier recording of the current version to look for in the draft."),
+    ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Survey the recordings, join them to the site's current version, and store the map as a draft."""
@@ -60,6 +64,7 @@ def build(
         picture,
         frame_from_ground_truth,
         sensors,
+        tuple(replay or ()),
     )
     read_config(config_path(context))
     settings = survey_settings(config_path(context), sensors or sensor_set_of(recordings[0], calibration))
