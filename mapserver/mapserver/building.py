@@ -38,6 +38,7 @@ from mapserver.survey.zones import Zones
 from mapserver.surveying import Admission, Surveyed, admit_recordings, survey_all, survey_recording
 from mapserver.tiling import TILE_SIZE_M, tiles_from_survey
 from mapserver.vocabulary_choice import ChosenVocabulary, choose_vocabulary, judged
+from mapserver.worker import open_worker
 from mapserver.zones_file import read_zones
 
 _NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled")
@@ -48,7 +49,8 @@ _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fle
 class BuildOrder:
     """What `mapserver build` was asked for; frames is an A:B:C slice of each recording, absent files are not written.
 
-    replay: earlier recordings of the current version, of which frames are looked for in the draft.
+    replay: earlier recordings of the current version, of which frames are looked for in the draft. threads, scheduler: who does
+    the work, see worker.py.
     """
 
     recordings: tuple[Path, ...]
@@ -65,6 +67,8 @@ class BuildOrder:
     use: SensorSet | None = None
     replay: tuple[Path, ...] = ()
     actor: Actor = NOBODY
+    threads: int | None = None
+    scheduler: str | None = None
 
 
 @dataclass(frozen=True)
@@ -141,7 +145,11 @@ def _survey(
     order: BuildOrder, admitted: dict[Path, Admission], zones: Zones, base: SurveyMap | None, chosen: ChosenVocabulary,
     settings: SurveySettings, console: Console, times: StageTimes, started_s: float, unusable: dict[Path, str] | None,
 ) -> _Built:  # fmt: skip
-    with ProgressView(console) as view, PictureFile(order.store) as shelf:
+    with (
+        ProgressView(console) as view,
+        PictureFile(order.store) as shelf,
+        open_worker(order.threads, order.scheduler) as worker,
+    ):
 
         def progress(stage: str, done: int, total: int) -> None:
             times(stage, done, total)
@@ -160,6 +168,7 @@ def _survey(
                 zones,
                 progress,
                 shelf,
+                worker,
             )
 
         surveyed = survey_all(

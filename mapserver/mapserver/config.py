@@ -33,6 +33,8 @@ class BuildSection(Section, frozen=True):
     frame_from_ground_truth: bool | None = None
     use: str | None = None
     replay: list[str] | None = None
+    threads: int | None = None
+    scheduler: str | None = None
 
 
 class NightlySection(Section, frozen=True):
@@ -46,6 +48,8 @@ class NightlySection(Section, frozen=True):
     calibration: str | None = None
     zones: str | None = None
     report: str | None = None
+    threads: int | None = None
+    scheduler: str | None = None
 
 
 class PublishSection(Section, frozen=True):

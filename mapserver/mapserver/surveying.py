@@ -24,7 +24,9 @@ from mapserver.survey.moving import scaled, scaled_state
 from mapserver.survey.pipeline import Progress, Survey, survey
 from mapserver.survey.placing import anchored_by_priors, map_from_survey
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.work import ALONE, Worker
 from mapserver.survey.zones import Zones
+from mapserver.worker import read_ahead
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,7 @@ def _check(recording: Recording, indices: NDArray[np.int64], needs_truth: bool) 
 def survey_recording(
     path: Path, admission: Admission, frames: str, calibration: Path | None, use: SensorSet | None, pinhole: StereoCamera | None,
     vocabulary: Vocabulary, settings: SurveySettings, zones: Zones, progress: Progress, shelf: PictureShelf,
+    worker: Worker = ALONE,
 ) -> Surveyed:  # fmt: skip
     """Surveys one recording by the sensors of `use` (or all it has), as if `pinhole` (or what suits it) had seen it."""
     with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
@@ -106,8 +109,8 @@ def survey_recording(
         indices = FrameSelection.parse(frames).apply(recording)
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         done = survey(
-            (recording.read_frame(int(index)) for index in indices), len(indices), recording.imu, recording.calibration,
-            rectifier, vocabulary, settings, zones, progress, shelf, recording.wheel,
+            read_ahead(recording.read_frame(int(index)) for index in indices), len(indices), recording.imu, recording.calibration,
+            rectifier, vocabulary, settings, zones, progress, shelf, recording.wheel, worker,
         )  # fmt: skip
         done, placed = _placed(done, recording.priors, recording.calibration.base_from_body)
         entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices))

@@ -25,6 +25,13 @@ def nightly(
         Path | None, typer.Option(metavar="FILE", help="TOML file with areas that never see each other.")
     ] = None,
     report: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the JSON report here.")] = None,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="Threads that survey; as many as there are cores if left out.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Survey on this dask cluster; `local` makes one of processes here."),
+    ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Check, build, judge and publish what came into the inbox; one run at a time for each site.
@@ -46,7 +53,7 @@ def nightly(
 
     FrameSelection.parse(frames)
     settings = read_config(config_path(context))
-    order = NightOrder(site, inbox, store, time.time_ns(), settle_s, frames, calibration, zones)
+    order = NightOrder(site, inbox, store, time.time_ns(), settle_s, frames, calibration, zones, threads, scheduler)
     try:
         sentence = run_night(order, settings.survey, settings.gate, Console(stderr=True))
     except BusyError:

@@ -36,6 +36,8 @@ class NightOrder:
     frames: str = "::"
     calibration: Path | None = None
     zones: Path | None = None
+    threads: int | None = None
+    scheduler: str | None = None
 
 
 @dataclass
@@ -186,6 +188,7 @@ class _Conductor:
         build = BuildOrder(
             tuple(r.path for r in recordings), order.site, order.store, order.frames, order.calibration, order.zones,
             replay=tuple(self._replayed()), actor=Actor(JOB, _reason(self._night.job)),
+            threads=order.threads, scheduler=order.scheduler,
         )  # fmt: skip
         try:
             draft = build_draft(build, self._survey, unusable)

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from box_room import ride_sample
+from fleetmap.bow import decode_vocabulary
 from fleetmap.calibration import RigCalibration
+from fleetmap.default_vocabulary import default_vocabulary_bytes
 from fleetmap.geometry import Array, se3, so3_exp, transform_points
 from fleetmap.mapformat import BlobEntry, CameraEntry, Manifest, Tile, TileEntry, encode_tile
 from fleetmap.rectification import Rectifier
@@ -27,6 +29,7 @@ from recording_samples import calibration
 
 FRAMES, FRAME_S = 44, 0.1
 SETTINGS = SurveySettings()
+WORDS = decode_vocabulary(default_vocabulary_bytes())
 
 
 def two_walls(t_s: float) -> Array:
@@ -45,7 +48,7 @@ def surveyed(rig: RigCalibration) -> tuple[Survey, list[HeldOut]]:
     frames = [CameraFrame(int(s), a, b) for s, a, b in zip(sample.stamps_ns, sample.left, sample.right, strict=True)]
     rectifier = Rectifier(rig)
     imu = ImuSamples(sample.imu_stamps_ns, sample.gyro_radps, sample.accel_mps2)
-    done = survey(iter(frames), FRAMES, imu, rig, rectifier, None, SETTINGS, Zones(), lambda *_: None)
+    done = survey(iter(frames), FRAMES, imu, rig, rectifier, WORDS, SETTINGS, Zones(), lambda *_: None)
     keyframes = [k.frame_index for k in done.first_guess.keyframes]
     numbers = held_out_frames(keyframes, done.map.trajectory_estimated, 40)
     looks = [look_at(rectifier.rectify(frames[n]), rectifier.camera, SETTINGS) for n in numbers]
