@@ -12,6 +12,7 @@ from mapserver.store import MapStore
 from recording_samples import write_euroc
 
 
+@pytest.mark.slow
 def test_two_nights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first has only its own held-out frames to be judged by, the second also the recording and the map of the first."""
     inbox, report = tmp_path / "inbox", tmp_path / "night.json"
