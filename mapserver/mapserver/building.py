@@ -16,15 +16,17 @@ from rich.console import Console
 from fleetmap.bow import Vocabulary, encode_vocabulary
 from fleetmap.config import to_dict
 from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError
-from fleetmap.mapformat import CameraEntry, Manifest, decode_tile
+from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.recordings.tum import write_tum
 from fleetmap.rectification import StereoCamera
 from fleetmap.samples import SensorSet, Trajectory
 from mapserver.build_report import Accuracy, BuildReport, accuracy, full_report, make_report, sessions_report
+from mapserver.examining import Before, examine_draft, replayed_probes
 from mapserver.landmark_budget import choose_landmarks
 from mapserver.picture_files import PictureFile
 from mapserver.progress import ProgressView, StageTimes
-from mapserver.store import DraftDetails, MapStore
+from mapserver.quality.figures import Evidence
+from mapserver.store import NOBODY, Actor, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
 from mapserver.survey.history import history_of
 from mapserver.survey.loops import Loops
@@ -36,6 +38,7 @@ from mapserver.survey.zones import Zones
 from mapserver.surveying import Admission, Surveyed, admit_recordings, survey_all, survey_recording
 from mapserver.tiling import TILE_SIZE_M, tiles_from_survey
 from mapserver.vocabulary_choice import ChosenVocabulary, choose_vocabulary, judged
+from mapserver.worker import open_worker
 from mapserver.zones_file import read_zones
 
 _NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled")
@@ -44,7 +47,11 @@ _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fle
 
 @dataclass(frozen=True, slots=True)
 class BuildOrder:
-    """What `mapserver build` was asked for; frames is an A:B:C slice of each recording, absent files are not written."""
+    """What `mapserver build` was asked for; frames is an A:B:C slice of each recording, absent files are not written.
+
+    replay: earlier recordings of the current version, of which frames are looked for in the draft. threads, scheduler: who does
+    the work, see worker.py.
+    """
 
     recordings: tuple[Path, ...]
     site: str
@@ -58,6 +65,10 @@ class BuildOrder:
     picture: Path | None = None
     frame_from_ground_truth: bool = False
     use: SensorSet | None = None
+    replay: tuple[Path, ...] = ()
+    actor: Actor = NOBODY
+    threads: int | None = None
+    scheduler: str | None = None
 
 
 @dataclass(frozen=True)
@@ -78,33 +89,41 @@ class _Built:
         return [s for s, outcome in zip(self.surveyed, self.joined.outcomes, strict=True) if outcome.joined]
 
 
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """A stored draft, what the build says about it, and by content hash why recordings are not in it."""
+
+    version: int
+    sentence: str
+    report: dict[str, Any]
+    left_out: dict[str, str]
+
+
 def run_build(order: BuildOrder, settings: SurveySettings) -> str:
     """Does it; the sentence says what there is now. Raises FleetmapErrors, before the survey where possible."""
+    return build_draft(order, settings).sentence
+
+
+def build_draft(order: BuildOrder, settings: SurveySettings, unusable: dict[Path, str] | None = None) -> Draft:
+    """As `run_build`. With `unusable` a recording that cannot be surveyed goes in there with its reason, and the others are taken."""
     started_s = time.perf_counter()
     console = Console(stderr=True)
     zones = Zones() if order.zones is None else read_zones(order.zones)
     times = StageTimes(time.perf_counter)
     times.begin("examination")
     admitted = admit_recordings(
-        order.recordings, order.frames, order.calibration, order.use, console, needs_truth=order.frame_from_ground_truth
-    )
+        order.recordings, order.frames, order.calibration, order.use, console,
+        needs_truth=order.frame_from_ground_truth, unusable=unusable,
+    )  # fmt: skip
     with MapStore.open(order.store, create=True) as maps:
         parent = _parent(order, maps)
-        base = None if parent is None else parent.map
+        base = None if parent is None else parent.survey
         chosen = choose_vocabulary(maps, order.site, order.vocabulary)
-        built = _survey(order, admitted, zones, base, chosen, settings, console, times, started_s)
+        built = _survey(order, admitted, zones, base, chosen, settings, console, times, started_s, unusable)
         return _keep(order, built, parent, settings, maps)
 
 
-@dataclass(frozen=True)
-class _Parent:
-    """The version that is built on, and all that is known of it."""
-
-    manifest: Manifest
-    map: SurveyMap
-
-
-def _parent(order: BuildOrder, maps: MapStore) -> _Parent | None:
+def _parent(order: BuildOrder, maps: MapStore) -> Before | None:
     """The site's current version, to build on; None for a site without one."""
     current = maps.current(order.site) if order.site in {info.site for info in maps.sites()} else None
     if current is None:
@@ -119,14 +138,18 @@ def _parent(order: BuildOrder, maps: MapStore) -> _Parent | None:
         raise StoreError(
             f"version {current.version} of site {order.site} has no archive to build on; survey the site anew under another name"
         )
-    return _Parent(maps.manifest(order.site, current.version), decode_archive(archive))
+    return Before.of(maps, maps.manifest(order.site, current.version), decode_archive(archive))
 
 
 def _survey(
     order: BuildOrder, admitted: dict[Path, Admission], zones: Zones, base: SurveyMap | None, chosen: ChosenVocabulary,
-    settings: SurveySettings, console: Console, times: StageTimes, started_s: float,
+    settings: SurveySettings, console: Console, times: StageTimes, started_s: float, unusable: dict[Path, str] | None,
 ) -> _Built:  # fmt: skip
-    with ProgressView(console) as view, PictureFile(order.store) as shelf:
+    with (
+        ProgressView(console) as view,
+        PictureFile(order.store) as shelf,
+        open_worker(order.threads, order.scheduler) as worker,
+    ):
 
         def progress(stage: str, done: int, total: int) -> None:
             times(stage, done, total)
@@ -145,11 +168,12 @@ def _survey(
                 zones,
                 progress,
                 shelf,
+                worker,
             )
 
         surveyed = survey_all(
-            order.recordings, survey_one, None if base is None else base.camera,
-            chosen.vocabulary,
+            list(admitted), survey_one, None if base is None else base.camera,
+            chosen.vocabulary, unusable,
         )  # fmt: skip
         progress("joining", 0, 1)
         joined = join_sessions(base, [Session(s.survey, s.placed) for s in surveyed], settings)
@@ -188,10 +212,13 @@ def _truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
     return chained(known, joined.trajectories) if len(known) == len(truths) else None
 
 
-def _keep(order: BuildOrder, built: _Built, parent: _Parent | None, settings: SurveySettings, maps: MapStore) -> str:
+def _keep(order: BuildOrder, built: _Built, parent: Before | None, settings: SurveySettings, maps: MapStore) -> Draft:
     survey_map = built.joined.map
-    for_robots = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M, _wanted_ids(maps, parent, survey_map))
+    for_robots = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M, _wanted_ids(parent, survey_map))
     tiles = tiles_from_survey(survey_map, chosen=for_robots)
+    built.times.begin("examining")
+    evidence = _examined(order, built, tiles, parent, settings)
+    built.times.begin("storing")
     archive = encode_archive(survey_map)
     vocabulary = encode_vocabulary(built.vocabulary.vocabulary)
     report = make_report(
@@ -214,27 +241,59 @@ def _keep(order: BuildOrder, built: _Built, parent: _Parent | None, settings: Su
         # A robot downloads the manifest: what it says about the build is short.
         report={key: value for key, value in msgspec.to_builtins(report).items() if key not in _NOT_FOR_ROBOTS},
     )
-    version = maps.save_draft(order.site, tiles=tiles, vocabulary=vocabulary, details=details, archive=archive)
+    version = maps.save_draft(
+        order.site,
+        tiles=tiles,
+        vocabulary=vocabulary,
+        details=details,
+        archive=archive,
+        evidence=evidence,
+        actor=order.actor,
+    )
     info = maps.version(order.site, version)
     report = msgspec.structs.replace(report, map_bytes=info.map_bytes)
     built.times.begin("writing")
     _write_files(order, built, parent, report, version)
-    return _sentence(order.site, version, parent, report)
+    outcomes = zip(built.surveyed, built.joined.outcomes, strict=True)
+    return Draft(
+        version,
+        _sentence(order.site, version, parent, report),
+        msgspec.to_builtins(report),
+        {s.entry.sha256: outcome.reason for s, outcome in outcomes if not outcome.joined},
+    )
 
 
-def _wanted_ids(maps: MapStore, parent: _Parent | None, survey_map: SurveyMap) -> NDArray[np.uint32] | None:
+def _examined(
+    order: BuildOrder, built: _Built, tiles: list[Tile], before: Before | None, settings: SurveySettings
+) -> Evidence:
+    replayed = [] if before is None else replayed_probes(
+        order.replay, before, order.frames, order.calibration, order.use, built.joined.map.camera, settings
+    )  # fmt: skip
+    return examine_draft(
+        tiles, before, _map_trajectories(built.joined), [s.held_out for s in built.taken], [s.survey for s in built.taken],
+        replayed, built.vocabulary.vocabulary, settings,
+    )  # fmt: skip
+
+
+def _map_trajectories(joined: Joined) -> list[Trajectory]:
+    """The joined recordings' trajectories in the map's final frame, which the finished map has one after the other."""
+    ends = np.cumsum([len(trajectory) for trajectory in joined.trajectories])
+    parts = np.split(joined.map.trajectory.frame_from_body, ends[:-1])
+    return [Trajectory(t.stamps_ns, part) for t, part in zip(joined.trajectories, parts, strict=True)]
+
+
+def _wanted_ids(parent: Before | None, survey_map: SurveyMap) -> NDArray[np.uint32] | None:
     """Landmarks that come before others in the budget: those that robots have, and those that the map has just gained.
 
     The new ones compete with the published ones; what else the archive knows would only take the place of its like.
     """
     if parent is None:
         return None
-    tiles = [decode_tile(maps.blob(tile.sha256)) for tile in parent.manifest.tiles]
-    new = survey_map.landmark_ids[survey_map.landmark_ids >= history_of(parent.map).next_landmark_id]
-    return np.unique(np.concatenate([new, *(tile.landmark_ids for tile in tiles)])).astype(np.uint32)
+    new = survey_map.landmark_ids[survey_map.landmark_ids >= history_of(parent.survey).next_landmark_id]
+    return np.unique(np.concatenate([new, *(tile.landmark_ids for tile in parent.tiles)])).astype(np.uint32)
 
 
-def _configuration(order: BuildOrder, parent: _Parent | None, zones: Zones, settings: SurveySettings) -> dict[str, Any]:
+def _configuration(order: BuildOrder, parent: Before | None, zones: Zones, settings: SurveySettings) -> dict[str, Any]:
     """What the map depends on besides the recordings; no paths, which mean nothing elsewhere."""
     kept = parent is not None and bool(parent.manifest.configuration.get("frame_from_ground_truth"))
     return {
@@ -268,7 +327,7 @@ def _peak_rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
-def _write_files(order: BuildOrder, built: _Built, parent: _Parent | None, report: BuildReport, version: int) -> None:
+def _write_files(order: BuildOrder, built: _Built, parent: Before | None, report: BuildReport, version: int) -> None:
     if order.trajectory is not None:
         write_tum(order.trajectory, built.joined.map.trajectory)
     if order.picture is not None:
@@ -293,7 +352,7 @@ def _write(path: Path, data: bytes) -> None:
         raise StoreError(f"{path} cannot be written ({error.strerror}); the draft is stored all the same") from error
 
 
-def _sentence(site: str, version: int, parent: _Parent | None, report: BuildReport) -> str:
+def _sentence(site: str, version: int, parent: Before | None, report: BuildReport) -> str:
     ate = "" if report.ate_rmse_m is None else f", ATE {report.ate_rmse_m:.4f} m"
     sizes = f"{report.map_bytes} bytes, {report.loops['accepted']} loops{ate}, in {report.seconds:.1f} s"
     built_on = "" if parent is None else f" on version {parent.manifest.version}"

@@ -16,6 +16,7 @@ from mapserver.commands.export import export
 from mapserver.commands.gc import gc
 from mapserver.commands.import_ import import_
 from mapserver.commands.inspect import inspect
+from mapserver.commands.nightly import nightly
 from mapserver.commands.promote import promote
 from mapserver.commands.publish import publish
 from mapserver.commands.rollback import rollback
@@ -25,7 +26,7 @@ from mapserver.commands.verify import verify
 from mapserver.commands.versions import versions
 
 COMMANDS = (
-    build, publish, promote, rollback, versions, inspect, diff, serve, verify, gc, export, import_,
+    build, nightly, publish, promote, rollback, versions, inspect, diff, serve, verify, gc, export, import_,
     convert, doctor, evaluate, train_vocabulary,
 )  # fmt: skip
 

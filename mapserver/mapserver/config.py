@@ -32,6 +32,24 @@ class BuildSection(Section, frozen=True):
     picture: str | None = None
     frame_from_ground_truth: bool | None = None
     use: str | None = None
+    replay: list[str] | None = None
+    threads: int | None = None
+    scheduler: str | None = None
+
+
+class NightlySection(Section, frozen=True):
+    """Options of `mapserver nightly`."""
+
+    site: str | None = None
+    inbox: str | None = None
+    store: str | None = None
+    settle_s: float | None = None
+    frames: str | None = None
+    calibration: str | None = None
+    zones: str | None = None
+    report: str | None = None
+    threads: int | None = None
+    scheduler: str | None = None
 
 
 class PublishSection(Section, frozen=True):
@@ -143,6 +161,7 @@ class MapserverConfig(Section, frozen=True, rename={"import_": "import"}):
     build: BuildSection = BuildSection()
     survey: SurveySettings = SurveySettings()
     gate: GateSettings = GateSettings()
+    nightly: NightlySection = NightlySection()
     publish: PublishSection = PublishSection()
     promote: ActSection = ActSection()
     rollback: ActSection = ActSection()

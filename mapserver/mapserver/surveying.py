@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from fleetmap.bow import Vocabulary
+from fleetmap.errors import RecordingError, SurveyError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
 from fleetmap.rectification import Rectifier, StereoCamera
 from fleetmap.samples import Loss, PositionPrior, SensorSet, Trajectory
 from mapserver.build_report import check_truth
+from mapserver.examining import HeldOut, held_out_of
 from mapserver.recording_checks import checked, with_clock
 from mapserver.sensor_choice import reduced
 from mapserver.survey.keyframes import PictureShelf
@@ -22,13 +24,16 @@ from mapserver.survey.moving import scaled, scaled_state
 from mapserver.survey.pipeline import Progress, Survey, survey
 from mapserver.survey.placing import anchored_by_priors, map_from_survey
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.work import ALONE, Worker
 from mapserver.survey.zones import Zones
+from mapserver.worker import read_ahead
 
 
 @dataclass(frozen=True)
 class Surveyed:
     """One recording and its survey. placed: map_from_survey (4, 4) by its position priors, None without any.
-    findings: what the doctor remarked."""
+    findings: what the doctor remarked. held_out: frames that the survey did not use.
+    """
 
     entry: RecordingEntry
     format: str
@@ -38,6 +43,7 @@ class Surveyed:
     survey: Survey
     placed: Array | None
     findings: tuple[str, ...]
+    held_out: list[HeldOut]
 
     def remarks(self) -> list[str]:
         """What was wanting in the recording, what was corrected and what was left out, in words."""
@@ -54,21 +60,37 @@ class Admission:
 
 def admit_recordings(
     paths: Sequence[Path], frames: str, calibration: Path | None, use: SensorSet | None, console: Console, *,
-    needs_truth: bool
+    needs_truth: bool, unusable: dict[Path, str] | None = None,
 ) -> dict[Path, Admission]:  # fmt: skip
-    """Examines all of them, and refuses before the work what could not end well."""
-    admitted = {}
+    """Examines all of them, and refuses before the work what could not end well.
+
+    unusable: takes those that are refused, with the reason; without it, or where all are, that is an error.
+    """
+    admitted: dict[Path, Admission] = {}
     for path in paths:
-        with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
-            recording = reduced(opened, use)
-            for loss in recording.losses:
-                console.print(f"loss: {loss.what}: {loss.detail}", markup=False)
-            _check(recording, FrameSelection.parse(frames).apply(recording), needs_truth)
-            examined = checked(recording)
-            for remark in examined.remarks():
-                console.print(f"{recording.name}: {remark}", markup=False)
-            admitted[path] = Admission(tuple(examined.remarks()), examined.correction_s)
+        try:
+            admitted[path] = _admission(path, frames, calibration, use, console, needs_truth)
+        except RecordingError as error:
+            if unusable is None:
+                raise
+            unusable[path] = str(error)
+    if not admitted:
+        raise RecordingError(f"none of {len(paths)} recordings can be used: {'; '.join((unusable or {}).values())}")
     return admitted
+
+
+def _admission(
+    path: Path, frames: str, calibration: Path | None, use: SensorSet | None, console: Console, needs_truth: bool
+) -> Admission:
+    with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
+        recording = reduced(opened, use)
+        for loss in recording.losses:
+            console.print(f"loss: {loss.what}: {loss.detail}", markup=False)
+        _check(recording, FrameSelection.parse(frames).apply(recording), needs_truth)
+        examined = checked(recording)
+        for remark in examined.remarks():
+            console.print(f"{recording.name}: {remark}", markup=False)
+        return Admission(tuple(examined.remarks()), examined.correction_s)
 
 
 def _check(recording: Recording, indices: NDArray[np.int64], needs_truth: bool) -> None:
@@ -79,6 +101,7 @@ def _check(recording: Recording, indices: NDArray[np.int64], needs_truth: bool) 
 def survey_recording(
     path: Path, admission: Admission, frames: str, calibration: Path | None, use: SensorSet | None, pinhole: StereoCamera | None,
     vocabulary: Vocabulary, settings: SurveySettings, zones: Zones, progress: Progress, shelf: PictureShelf,
+    worker: Worker = ALONE,
 ) -> Surveyed:  # fmt: skip
     """Surveys one recording by the sensors of `use` (or all it has), as if `pinhole` (or what suits it) had seen it."""
     with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
@@ -86,11 +109,12 @@ def survey_recording(
         indices = FrameSelection.parse(frames).apply(recording)
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         done = survey(
-            (recording.read_frame(int(index)) for index in indices), len(indices), recording.imu, recording.calibration,
-            rectifier, vocabulary, settings, zones, progress, shelf, recording.wheel,
+            read_ahead(recording.read_frame(int(index)) for index in indices), len(indices), recording.imu, recording.calibration,
+            rectifier, vocabulary, settings, zones, progress, shelf, recording.wheel, worker,
         )  # fmt: skip
         done, placed = _placed(done, recording.priors, recording.calibration.base_from_body)
         entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices))
+        held_out = held_out_of(recording, indices.tolist(), rectifier, done, settings)
         return Surveyed(
             entry,
             recording.format,
@@ -100,6 +124,7 @@ def survey_recording(
             done,
             placed,
             admission.remarks,
+            held_out,
         )
 
 
@@ -119,10 +144,22 @@ def survey_all(
     survey_one: Callable[[Path, StereoCamera | None, Vocabulary], Surveyed],
     pinhole: StereoCamera | None,
     vocabulary: Vocabulary,
+    unusable: dict[Path, str] | None = None,
 ) -> list[Surveyed]:
-    """Surveys of all recordings through one camera and with one vocabulary."""
+    """Surveys of all recordings through one camera and with one vocabulary.
+
+    unusable: takes those that cannot be surveyed, with the reason; without it, or where none can be, that is an error.
+    """
     done: list[Surveyed] = []
     for path in paths:
-        done.append(survey_one(path, pinhole, vocabulary))
+        try:
+            done.append(survey_one(path, pinhole, vocabulary))
+        except (RecordingError, SurveyError) as error:
+            if unusable is None:
+                raise
+            unusable[path] = str(error)
+            continue
         pinhole = pinhole or done[0].survey.state.camera
+    if not done:
+        raise SurveyError(f"none of {len(paths)} recordings can be surveyed: {'; '.join((unusable or {}).values())}")
     return done

@@ -11,7 +11,8 @@ FleetmapError                      exit status 3
 ├── StoreError                     a store that cannot be opened, read or written
 ├── LinkError                      the other side cannot be reached, refuses or answers nonsense
 │   └── UnreachableError           nobody answered in time; asking again later may help
-└── GateRefusedError               exit status 4: the draft is not good enough to publish
+├── GateRefusedError               exit status 4: the draft is not good enough to publish
+└── BusyError                      exit status 5: another process is at the same work
 
 The message holds the offending value and the next step. Caught only in the commands' `main` and the HTTP API.
 "I do not know where I am" is a value with a status, never one of these.
@@ -70,3 +71,9 @@ class GateRefusedError(FleetmapError):
     """The draft is not good enough to publish."""
 
     exit_status = 4
+
+
+class BusyError(FleetmapError):
+    """Another process is at the same work; it ends by itself."""
+
+    exit_status = 5

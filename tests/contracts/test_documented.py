@@ -16,6 +16,8 @@ from contracts_documents import REPOSITORY, code_words, rows, section, text
 from fleetmap import messages
 from locclient.health import METRICS
 from mapserver.build_report import BuildReport
+from mapserver.nightly.night import Night
+from mapserver.quality import figures
 from mapserver.survey.sessions.extend import Counts
 
 COMMANDS = "docs/command_line.md"
@@ -98,6 +100,17 @@ def test_build_report_keys_are_documented() -> None:
 def test_session_keys_are_documented() -> None:
     keys = {"recording", "joined", "reason"} | {field.name for field in dataclasses.fields(Counts)}
     assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Sessions"))} == keys
+
+
+def test_evidence_keys_are_documented() -> None:
+    kinds = (figures.Evidence, figures.Compared, figures.Looks, figures.Aliasing, figures.Motion)
+    keys = {field.name for kind in kinds for field in msgspec.structs.fields(kind)}
+    assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Evidence"))} == keys
+
+
+def test_nightly_report_keys_are_documented() -> None:
+    keys = {"state", "message"} | set(Night(1).report())
+    assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Nightly"))} == keys
 
 
 def test_replay_report_keys_are_documented() -> None:

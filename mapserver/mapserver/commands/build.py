@@ -31,6 +31,17 @@ def build(
     use: Annotated[
         str | None, typer.Option(metavar="SENSORS", help="Use only the sensors of this set, of those it has.")
     ] = None,
+    replay: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="RECORDING", help="Earlier recording of the current version to look for in the draft."),
+    ] = None,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="Threads that survey; as many as there are cores if left out.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Survey on this dask cluster; `local` makes one of processes here."),
+    ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Survey the recordings, join them to the site's current version, and store the map as a draft."""
@@ -60,6 +71,9 @@ def build(
         picture,
         frame_from_ground_truth,
         sensors,
+        tuple(replay or ()),
+        threads=threads,
+        scheduler=scheduler,
     )
     read_config(config_path(context))
     settings = survey_settings(config_path(context), sensors or sensor_set_of(recordings[0], calibration))

@@ -3,10 +3,21 @@
 from mapserver.store.collection import Garbage, Retention
 from mapserver.store.differences import Difference
 from mapserver.store.map_store import MapStore
-from mapserver.store.rows import Actor, DraftDetails, Event, JobInfo, RobotInfo, SiteInfo, VerdictRow, VersionInfo
+from mapserver.store.rows import (
+    NOBODY,
+    Actor,
+    DraftDetails,
+    Event,
+    JobInfo,
+    RobotInfo,
+    SiteInfo,
+    VerdictRow,
+    VersionInfo,
+)
 from mapserver.store.verification import Findings
 
 __all__ = [
+    "NOBODY",
     "Actor",
     "Difference",
     "DraftDetails",

@@ -97,7 +97,7 @@ def _write_down(ledger: Ledger, connection: sqlite3.Connection, garbage: Garbage
         )
         ledger.log(connection, site, "retired", f"version {version}", version=version, actor=actor)
     for site, version in garbage.removed:
-        for table in ("currents", "verdicts", "version_blobs", "versions"):
+        for table in ("currents", "verdicts", "evidence", "version_blobs", "versions"):
             connection.execute(f"DELETE FROM {table} WHERE site = ? AND version = ?", (site, version))
         ledger.log(connection, site, "removed", f"version {version}", version=version, actor=actor)
 

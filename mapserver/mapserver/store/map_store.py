@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Self
 
+import msgspec
+
 from fleetmap.errors import StateError, StoreError, UsageError
 from fleetmap.mapformat import (
     BlobEntry,
@@ -29,6 +31,7 @@ from fleetmap.mapformat import (
     encode_tile,
 )
 from mapserver.gate import GateSettings, judge
+from mapserver.quality.figures import Evidence
 from mapserver.store import lifecycle
 from mapserver.store.collection import Garbage, Retention, collect
 from mapserver.store.differences import Difference, difference
@@ -89,9 +92,10 @@ class MapStore(StoreRecords):
         vocabulary: bytes,
         details: DraftDetails,
         archive: bytes | None = None,
+        evidence: Evidence | None = None,
         actor: Actor = NOBODY,
     ) -> int:
-        """The number of a new draft version of `site`, whole on the disk.
+        """The number of a new draft version of `site`, whole on the disk; evidence: what the gate will judge it by.
 
         Raises MapFormatError for tiles that cannot be encoded, StoreError where the disk refuses.
         """
@@ -113,6 +117,11 @@ class MapStore(StoreRecords):
                     **{name: getattr(details, name) for name in details.__struct_fields__},
                 )
                 self._insert_version(connection, manifest, archive_sha256, f"draft {manifest.version}", actor)
+                if evidence is not None:
+                    connection.execute(
+                        "INSERT INTO evidence (site, version, figures) VALUES (?, ?, ?)",
+                        (site, manifest.version, msgspec.json.encode(evidence).decode()),
+                    )
         return manifest.version
 
     def publish(
@@ -141,6 +150,7 @@ class MapStore(StoreRecords):
             None if current is None else self.manifest(site, current.version),
             next(info.vocabulary_sha256 for info in self.sites() if info.site == site),
             gate,
+            self.evidence(site, draft.version),
         )
         forced = force and bool(verdict.reasons) and not verdict.hard_reasons
         lifecycle.record_verdict(self._ledger, draft, verdict, forced=forced, actor=actor)

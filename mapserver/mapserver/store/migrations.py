@@ -92,4 +92,13 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
         """CREATE TRIGGER events_stay_as_they_are BEFORE UPDATE ON events
             BEGIN SELECT RAISE(ABORT, 'the log of events is never changed'); END""",
     ),
+    (
+        # What was measured of a draft when it was built; the gate judges by it later.
+        """CREATE TABLE evidence (
+            site TEXT NOT NULL,
+            version INTEGER NOT NULL,
+            figures TEXT NOT NULL,
+            PRIMARY KEY (site, version),
+            FOREIGN KEY (site, version) REFERENCES versions(site, version)) WITHOUT ROWID""",
+    ),
 )

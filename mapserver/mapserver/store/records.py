@@ -10,6 +10,7 @@ import msgspec
 
 from fleetmap.errors import UsageError
 from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest
+from mapserver.quality.figures import Evidence
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.ledger import Ledger
 from mapserver.store.rows import NOBODY, Actor, Event, JobInfo, RobotInfo, SiteInfo, VerdictRow, VersionInfo
@@ -112,6 +113,12 @@ class StoreRecords:
             )
             for row in rows
         ]
+
+    def evidence(self, site: str, version: int) -> Evidence | None:
+        """What was measured of a version when it was built, None for one that came without; UsageError as `version`."""
+        self.version(site, version)
+        rows = self._ledger.query("SELECT figures FROM evidence WHERE site = ? AND version = ?", (site, version))
+        return msgspec.json.decode(rows[0]["figures"], type=Evidence) if rows else None
 
     def events(self, site: str, *, after: int = 0, limit: int = -1) -> list[Event]:
         """A site's history, oldest first, behind event `after`."""

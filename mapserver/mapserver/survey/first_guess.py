@@ -11,8 +11,11 @@ from fleetmap.geometry import Array, rotation_between_vectors, se3
 from fleetmap.odometry import OdometryEstimate, OdometryStatus, make_odometry
 from fleetmap.rectification import RectifiedFrame, Rectifier
 from fleetmap.samples import CameraFrame, ImuSamples, WheelSample
-from mapserver.survey.keyframes import FrameSummary, Keyframe, KeyframePolicy, PictureShelf, make_keyframe, sharpness
+from mapserver.survey.keyframes import FrameSummary, Keyframe, KeyframePolicy, PictureShelf, make_keyframes, sharpness
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.work import ALONE, Worker
+
+_TOGETHER = 16  # keyframes whose pictures wait in memory until their features are found
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +39,7 @@ class FirstGuess:
 def run_odometry(
     frames: Iterable[CameraFrame], imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings,
     progress: Callable[[int], None], shelf: PictureShelf | None = None,
-    wheel: Sequence[WheelSample] = (),
+    wheel: Sequence[WheelSample] = (), worker: Worker = ALONE,
 ) -> FirstGuess:  # fmt: skip
     """Feeds frames (in order), the IMU and the wheels up to each into the odometry.
 
@@ -54,6 +57,7 @@ def run_odometry(
     estimates: list[OdometryEstimate] = []
     odom_from_body: list[Array] = []
     keyframes: list[Keyframe] = []
+    chosen: list[tuple[int, RectifiedFrame]] = []
     fed_ns = -(2**62)
     for number, raw in enumerate(frames):
         frame = rectifier.rectify(raw)
@@ -73,8 +77,12 @@ def run_odometry(
                 scale_known=estimate.scale_known,
             )  # fmt: skip
         if policy.wants(_summary(frame, estimate)):
-            keyframes.append(make_keyframe(frame, number, rectifier.camera, settings, shelf))
+            chosen.append((number, frame))
+        if len(chosen) == _TOGETHER:
+            keyframes += make_keyframes(chosen, rectifier.camera, settings, shelf, worker)
+            chosen = []
         progress(number)
+    keyframes += make_keyframes(chosen, rectifier.camera, settings, shelf, worker)
     inertial = bool(estimates) and calibration.imu is not None and estimates[-1].inertial
     guess = FirstGuess(
         estimates,

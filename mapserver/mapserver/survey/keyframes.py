@@ -1,7 +1,8 @@
 """Which frames become keyframes, and what is kept of each."""
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import cv2
@@ -12,6 +13,9 @@ from fleetmap.features import orb, patch_align, stereo
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from mapserver.survey.settings import KeyframeSettings, SurveySettings
+from mapserver.survey.work import ALONE, Worker, in_batches
+
+_BATCH = 4  # frames for one call: a twentieth of a second each
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,12 +83,49 @@ def make_keyframe(
     frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings, shelf: PictureShelf | None = None
 ) -> Keyframe:  # fmt: skip
     """Detects, describes and stereo-matches one frame; its pictures go to `shelf`, into memory without one."""
-    features = orb.detect(frame.left, settings.orb)
-    disparities = stereo.disparities(frame, camera, features.pixels, settings.stereo)
-    points = camera.point_from_pixel(features.pixels, disparities[:, 0])
+    return make_keyframes([(frame_index, frame)], camera, settings, shelf, ALONE)[0]
+
+
+def make_keyframes(
+    frames: Sequence[tuple[int, RectifiedFrame]], camera: StereoCamera, settings: SurveySettings, shelf: PictureShelf | None,
+    worker: Worker,
+) -> list[Keyframe]:  # fmt: skip
+    """The same of several frames, each with its number."""
     kept = MemoryShelf() if shelf is None else shelf
-    number = kept.put(Pictures(frame, patch_align.half_pyramid(frame.left)))
-    return Keyframe(frame_index, frame.stamp_ns, features, disparities, points, kept, number)
+    batches = in_batches([frame for _, frame in frames], _BATCH)
+    extracted = [x for batch in worker.map(_extract, (camera, settings), batches) for x in batch]
+    made = []
+    for (number, frame), (features, disparities) in zip(frames, extracted, strict=True):
+        points = camera.point_from_pixel(features.pixels, disparities[:, 0])
+        place = kept.put(Pictures(frame, patch_align.half_pyramid(frame.left)))
+        made.append(Keyframe(number, frame.stamp_ns, features, disparities, points, kept, place))
+    return made
+
+
+def _extract(
+    shared: tuple[StereoCamera, SurveySettings], frames: list[RectifiedFrame]
+) -> list[tuple[orb.Features, Array]]:
+    """What is found in some frames: features and disparities."""
+    camera, settings = shared
+    found = []
+    for frame in frames:
+        features = orb.detect(frame.left, settings.orb)
+        found.append((features, stereo.disparities(frame, camera, features.pixels, settings.stereo)))
+    return found
+
+
+def with_pictures(keyframe: Keyframe, *, whole: bool) -> Keyframe:
+    """The same keyframe with its pictures in memory; unless `whole`, only the left one's pyramid."""
+    pictures, shelf = keyframe.shelf.get(keyframe.shelf_number), MemoryShelf()
+    if not whole:
+        frame = RectifiedFrame(keyframe.stamp_ns, pictures.pyramid[0], None, None)
+        pictures = Pictures(frame, pictures.pyramid)
+    return replace(keyframe, shelf=shelf, shelf_number=shelf.put(pictures))
+
+
+def without_pictures(keyframe: Keyframe) -> Keyframe:
+    """The same keyframe with nothing on its shelf: what travels where only features are compared."""
+    return replace(keyframe, shelf=MemoryShelf(), shelf_number=0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,17 +1,20 @@
 """Which keyframes are matched with which, and whether a match may be believed."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.rectification import StereoCamera
-from mapserver.survey.keyframes import Keyframe
+from mapserver.survey.keyframes import Keyframe, without_pictures
 from mapserver.survey.pairs import PairMatch, match_pair, view_overlap
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.work import ALONE, Worker, in_batches
 
 _NEAR_CANDIDATES = 40
+_BATCH = 16  # pairs: a tenth of a second of work, so that handing it out costs nothing
 _MAX_VIEW_ANGLE_DEG = 75.0
 
 
@@ -19,9 +22,12 @@ class PairFinder:
     """Matches keyframes that should see the same things, given where they are."""
 
     def __init__(
-        self, keyframes: list[Keyframe], camera: StereoCamera, body_from_cam: Array, settings: SurveySettings
-    ) -> None:
+        self, keyframes: list[Keyframe], camera: StereoCamera, body_from_cam: Array, settings: SurveySettings,
+        worker: Worker = ALONE,
+    ) -> None:  # fmt: skip
         self._keyframes, self._camera, self._body_from_cam, self._settings = keyframes, camera, body_from_cam, settings
+        self._worker = worker
+        self._shared = _Features([without_pictures(k) for k in keyframes], camera, settings)
         self._depths = np.array([median_depth_m(k) for k in keyframes])
 
     def candidates(self, map_from_body: Array, *, previous: int, only_near: int | None = None) -> list[tuple[int, int]]:
@@ -58,23 +64,39 @@ class PairFinder:
     ) -> list[PairMatch]:  # fmt: skip
         """Verified matches whose measured motion agrees with the predicted one to within allowed_m(i, j)."""
         map_from_cam = map_from_body @ self._body_from_cam
-        matches = []
-        for number, (i, j) in enumerate(candidates):
-            predicted = se3_inverse(map_from_cam[j]) @ map_from_cam[i]
-            match = match_pair(
-                i,
-                j,
-                self._keyframes,
-                self._camera,
-                predicted,
-                rotation_sigma_rad,
-                self._settings.pairs,
-                is_known=is_known,
-            )
-            if match is not None and _agrees(match.j_from_i, predicted, allowed_m(i, j)):
-                matches.append(match)
-            progress(number)
+        looks = [(i, j, se3_inverse(map_from_cam[j]) @ map_from_cam[i]) for i, j in candidates]
+        batches = [(looks_there, rotation_sigma_rad, is_known) for looks_there in in_batches(looks, _BATCH)]
+        matches, number = [], 0
+        for (looks_there, _, _), found in zip(
+            batches, self._worker.map(_match_batch, self._shared, batches), strict=True
+        ):
+            for (i, j, predicted), match in zip(looks_there, found, strict=True):
+                if match is not None and _agrees(match.j_from_i, predicted, allowed_m(i, j)):
+                    matches.append(match)
+                progress(number)
+                number += 1
         return matches
+
+
+@dataclass(frozen=True, slots=True)
+class _Features:
+    """What matching looks at of a survey: its keyframes without their pictures."""
+
+    keyframes: list[Keyframe]
+    camera: StereoCamera
+    settings: SurveySettings
+
+
+def _match_batch(
+    features: _Features, batch: tuple[list[tuple[int, int, Array]], float | None, bool]
+) -> list[PairMatch | None]:
+    looks, rotation_sigma_rad, is_known = batch
+    return [
+        match_pair(
+            i, j, features.keyframes, features.camera, predicted, rotation_sigma_rad, features.settings.pairs, is_known=is_known
+        )
+        for i, j, predicted in looks
+    ]  # fmt: skip
 
 
 def _agrees(measured: Array, predicted: Array, allowed_m: float) -> bool:

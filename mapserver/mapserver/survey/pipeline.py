@@ -31,6 +31,7 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.summary import summarise
 from mapserver.survey.tracks import build_landmarks
 from mapserver.survey.view_depths import ViewDepths, survey_camera
+from mapserver.survey.work import ALONE, Worker
 from mapserver.survey.zones import Zones
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
@@ -57,18 +58,19 @@ class Survey:
 def survey(
     frames: Iterable[CameraFrame], frame_count: int, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
     vocabulary: Vocabulary, settings: SurveySettings, zones: Zones, progress: Progress,
-    shelf: PictureShelf | None = None, wheel: Sequence[WheelSample] = (),
+    shelf: PictureShelf | None = None, wheel: Sequence[WheelSample] = (), worker: Worker = ALONE,
 ) -> Survey:  # fmt: skip
     """Maps one recording, its keyframes' pictures on `shelf`. Raises SurveyError where it holds too little to map."""
     guess = run_odometry(
-        frames, imu, calibration, rectifier, settings, lambda n: progress("odometry", n + 1, frame_count), shelf, wheel
-    )
-    return survey_from(guess, imu, calibration, rectifier, vocabulary, settings, zones, progress)
+        frames, imu, calibration, rectifier, settings, lambda n: progress("odometry", n + 1, frame_count), shelf, wheel,
+        worker,
+    )  # fmt: skip
+    return survey_from(guess, imu, calibration, rectifier, vocabulary, settings, zones, progress, worker)
 
 
 def survey_from(
     guess: FirstGuess, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, vocabulary: Vocabulary,
-    settings: SurveySettings, zones: Zones, progress: Progress,
+    settings: SurveySettings, zones: Zones, progress: Progress, worker: Worker = ALONE,
 ) -> Survey:  # fmt: skip
     """All stages after the first guess."""
     if len(guess.keyframes) < _MIN_KEYFRAMES:
@@ -80,10 +82,10 @@ def survey_from(
     depths = ViewDepths(guess.keyframes, state.camera, settings) if rectifier.camera.baseline_m == 0 else None
     guess = _with_depths(guess, state, depths)
     keyframes = guess.keyframes
-    finder = PairFinder(keyframes, state.camera, rectifier.body_from_cam, settings)
+    finder = PairFinder(keyframes, state.camera, rectifier.body_from_cam, settings, worker)
     pairs = _match_neighbours(guess, state, finder, settings, progress)
     state.landmarks = build_landmarks(
-        keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings
+        keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings, worker
     )
     if len(state.landmarks.points_map) < _MIN_LANDMARKS:
         raise SurveyError(
@@ -102,10 +104,10 @@ def survey_from(
         if depths is not None:
             guess = _with_depths(guess, state, depths)
             keyframes = guess.keyframes
-            finder = PairFinder(keyframes, state.camera, rectifier.body_from_cam, settings)
+            finder = PairFinder(keyframes, state.camera, rectifier.body_from_cam, settings, worker)
         pairs = _match_all(state, finder, settings, progress)
         state.landmarks = build_landmarks(
-            keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings
+            keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings, worker
         )
         state.landmarks = without_turn(state.landmarks, state.camera, turn.correction_px)
         adjust(state, settings, final=True)

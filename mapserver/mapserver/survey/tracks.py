@@ -1,5 +1,6 @@
 """Landmarks from verified pairs: features joined across keyframes, one per keyframe, with sub-pixel coordinates."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,10 +9,13 @@ from numpy.typing import NDArray
 from fleetmap.features import patch_align, stereo
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.rectification import StereoCamera
-from mapserver.survey.keyframes import Keyframe
+from mapserver.survey.keyframes import Keyframe, with_pictures
 from mapserver.survey.pairs import PairMatch
 from mapserver.survey.settings import NoiseSettings, SurveySettings
 from mapserver.survey.tracks_kernels import join as join_kernel
+from mapserver.survey.work import ALONE, Worker, in_batches
+
+_BATCH = 16  # keyframes: their sources overlap, so that few pictures travel twice
 
 
 @dataclass
@@ -61,7 +65,7 @@ def join_tracks(keyframes: list[Keyframe], pairs: list[PairMatch]) -> list[list[
 
 def build_landmarks(
     keyframes: list[Keyframe], pairs: list[PairMatch], map_from_body: Array, body_from_cam: Array, camera: StereoCamera,
-    settings: SurveySettings,
+    settings: SurveySettings, worker: Worker = ALONE,
 ) -> Landmarks:  # fmt: skip
     """Tracks of the pairs with a stereo point to start from, each observation's coordinate refined against the reference patch."""
     rows: list[tuple[int, int, int]] = []
@@ -79,7 +83,7 @@ def build_landmarks(
         nothing = np.zeros(0, np.int32)
         return Landmarks(np.zeros((0, 3)), nothing, nothing, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)))
     table = np.array(rows, np.int64)
-    pixels, sigmas = _observe(keyframes, table, map_from_cam, camera, settings)
+    pixels, sigmas = _observe(keyframes, table, map_from_cam, camera, settings, worker)
     return Landmarks(
         np.array(points), table[:, 0].astype(np.int32), table[:, 1].astype(np.int32), table[:, 2], pixels, sigmas
     )
@@ -102,24 +106,57 @@ def _observe(
     map_from_cam: Array,
     camera: StereoCamera,
     settings: SurveySettings,
+    worker: Worker,
 ) -> tuple[Array, Array]:
     """Pixels (M, 3) and sigmas (M, 2) of observations (keyframe, landmark, feature), references first in each landmark."""
-    noise = settings.noise
     is_reference = np.r_[True, table[1:, 1] != table[:-1, 1]]
     reference_row = np.maximum.accumulate(np.where(is_reference, np.arange(len(table)), 0))
+    groups = in_batches(np.unique(table[:, 0]).tolist(), _BATCH)
+    rows_of = [np.flatnonzero(np.isin(table[:, 0], group)) for group in groups]
+
+    def batches() -> Iterator[_Looks]:
+        for group, rows in zip(groups, rows_of, strict=True):
+            references = table[reference_row[rows]]
+            sources = np.unique(references[:, 0]).tolist()
+            known = {k: with_pictures(keyframes[k], whole=k in group) for k in sorted({*group, *sources})}
+            places = {k: map_from_cam[k] for k in known}
+            yield _Looks(table[rows], references, is_reference[rows], known, places)
+
     pixels, sigmas = np.empty((len(table), 3)), np.empty((len(table), 2))
-    for k in np.unique(table[:, 0]):
-        rows = np.flatnonzero(table[:, 0] == k)
+    found = worker.map(_observe_batch, (camera, settings), batches())
+    for rows, (batch_pixels, batch_sigmas) in zip(rows_of, found, strict=True):
+        pixels[rows], sigmas[rows] = batch_pixels, batch_sigmas
+    return pixels, sigmas
+
+
+@dataclass(frozen=True, slots=True)
+class _Looks:
+    """Observations (M, 3) of some keyframes, their references (M, 3), which are references themselves, and all that these need."""
+
+    table: NDArray[np.int64]
+    references: NDArray[np.int64]
+    is_reference: NDArray[np.bool_]
+    keyframes: dict[int, Keyframe]
+    map_from_cam: dict[int, Array]
+
+
+def _observe_batch(shared: tuple[StereoCamera, SurveySettings], looks: _Looks) -> tuple[Array, Array]:
+    """Pixels (M, 3) and sigmas (M, 2) of one batch."""
+    camera, settings = shared
+    noise, keyframes = settings.noise, looks.keyframes
+    pixels, sigmas = np.empty((len(looks.table), 3)), np.empty((len(looks.table), 2))
+    for k in np.unique(looks.table[:, 0]).tolist():
+        rows = np.flatnonzero(looks.table[:, 0] == k)
         own, frame = keyframes[k], keyframes[k].frame
-        features = table[rows, 2]
+        features, references, is_reference = looks.table[rows, 2], looks.references[rows], looks.is_reference[rows]
         left, sigma = own.features.pixels[features].copy(), _descriptor_sigma(own, features, noise)
-        sigma[is_reference[rows]] = noise.aligned_sigma_px
-        for source in np.unique(table[reference_row[rows], 0]):
-            inner = np.flatnonzero((table[reference_row[rows], 0] == source) & ~is_reference[rows])
+        sigma[is_reference] = noise.aligned_sigma_px
+        for source in np.unique(references[:, 0]).tolist():
+            inner = np.flatnonzero((references[:, 0] == source) & ~is_reference)
             if not len(inner):
                 continue
-            theirs = table[reference_row[rows[inner]], 2]
-            own_from_source = se3_inverse(map_from_cam[k]) @ map_from_cam[source]
+            own_from_source = se3_inverse(looks.map_from_cam[k]) @ looks.map_from_cam[source]
+            theirs = references[inner, 2]
             refined = _align(keyframes[source], theirs, own, features[inner], own_from_source, camera, settings)
             sure = np.isfinite(refined[:, 0])
             left[inner[sure]] = refined[sure, :2]

@@ -90,6 +90,9 @@ def test_databases_of_every_format_open_whole(tmp_path: Path, number: int) -> No
         assert store.verify().faults == []
         if number >= 2:
             assert [job.state for job in store.jobs()] == ["done"]
+        evidence = store.evidence("lab", 3)
+        assert (evidence is not None) is (number >= 3)
+        assert evidence is None or evidence.held_out.draft.localised_share == 0.975
 
 
 def test_newer_formats_are_refused_by_number(tmp_path: Path) -> None:

@@ -1,0 +1,137 @@
+"""The folder into which recordings are copied, and where each goes from there. Nothing is ever deleted.
+
+    INBOX/NAME             a recording: an .mcap file, or a folder
+    INBOX/done/HASH-NAME   it is in a version
+    INBOX/held/HASH-NAME   it is sound, but could not be joined, or its draft was refused; move it back to try again
+    INBOX/bad/NAME         it cannot be read, or `doctor` says that it should not be used
+
+Beside what is held or bad lies NAME.reason.txt.
+"""
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from fleetmap.errors import StoreError, UsageError
+from mapserver.store.files import make_folder, sync_folder, write_atomically
+
+DONE, HELD, BAD = "done", "held", "bad"
+_HASH_SIGNS = 12
+_UNFINISHED = (".part", ".partial", ".filepart", ".crdownload", ".tmp")
+_REASON = ".reason.txt"
+
+
+@dataclass(frozen=True, slots=True)
+class Arrivals:
+    """Recordings that are whole, by name, and those that are not yet, with the reason."""
+
+    complete: tuple[Path, ...]
+    waiting: tuple[tuple[Path, str], ...]
+
+
+def arrivals(inbox: Path, settle_s: float, now_ns: int) -> Arrivals:
+    """What is in the inbox now. Hidden names and files that are no .mcap are nobody's.
+
+    A recording is whole when nothing in it changed for `settle_s`, no file in it bears the name of a half copied one, and
+    nobody has one open for writing, as far as the system tells. Raises UsageError where there is no such folder.
+    """
+    if not inbox.is_dir():
+        raise UsageError(f"--inbox {inbox} is no folder; create it, or name the one that recordings are copied into")
+    complete, waiting = [], []
+    for path in sorted(inbox.iterdir()):
+        if path.name.startswith(".") or path.name in (DONE, HELD, BAD):
+            continue
+        if path.suffix in _UNFINISHED or path.is_dir() or path.suffix == ".mcap":
+            reason = _unfinished(path, settle_s, now_ns)
+            if reason is None:
+                complete.append(path)
+            else:
+                waiting.append((path, reason))
+    return Arrivals(tuple(complete), tuple(waiting))
+
+
+def _unfinished(path: Path, settle_s: float, now_ns: int) -> str | None:
+    """Why a recording is not whole yet; None if it is."""
+    newest_ns = 0
+    try:
+        for part in (path, *_parts(path)):
+            if part.suffix in _UNFINISHED:
+                return f"{part.name} is half copied"
+            # Not mtime: copying tools set it back. Nobody can set this one.
+            newest_ns = max(newest_ns, part.stat().st_ctime_ns)
+            if part.is_file() and _is_being_written(part):
+                return f"{part.name} is open for writing"
+    except FileNotFoundError:
+        return "it changes right now"
+    quiet_s = (now_ns - newest_ns) * 1e-9
+    return f"it changed {quiet_s:.0f} s ago, {settle_s:.0f} s are waited" if quiet_s < settle_s else None
+
+
+def _parts(path: Path) -> Iterator[Path]:
+    return path.rglob("*") if path.is_dir() else iter(())
+
+
+def _is_being_written(path: Path) -> bool:
+    """Whether a process has it open for writing; False too where the system does not tell (files of others, network disks)."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except PermissionError:
+        return False
+    try:
+        fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_RDLCK)
+        fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_UNLCK)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> Path:
+    """Moves a recording into a folder of its inbox, the reason beside it; returns where it is now.
+
+    Raises StoreError where the disk refuses; the recording is then where it was.
+    """
+    folder = path.parent / where
+    name = (
+        path.name
+        if sha256 is None or path.name.startswith(sha256[:_HASH_SIGNS])
+        else f"{sha256[:_HASH_SIGNS]}-{path.name}"
+    )
+    try:
+        make_folder(folder)
+        target = _free(folder, name)
+        if reason is not None:
+            write_atomically(folder / f"{target.name}{_REASON}", [f"{reason}\n".encode()])
+        os.replace(path, target)  # noqa: PTH105
+        sync_folder(folder)
+        sync_folder(path.parent)
+    except OSError as error:
+        raise StoreError(
+            f"{path} cannot be moved to {folder} ({error.strerror}); check the rights and space of the inbox"
+        ) from error
+    return target
+
+
+def _free(folder: Path, name: str) -> Path:
+    """The first name that no recording has yet."""
+    number = 1
+    while True:
+        target = folder / (name if number == 1 else f"{number}-{name}")
+        if not target.exists():
+            return target
+        number += 1
+
+
+def kept(inbox: Path, sha256s: list[str]) -> list[Path]:
+    """The recordings of these hashes that are still in the inbox's folder of done ones, in the same order."""
+    found: dict[str, Path] = {}
+    with suppress(FileNotFoundError):
+        for path in sorted((inbox / DONE).iterdir()):
+            found.setdefault(path.name[:_HASH_SIGNS], path)
+    return [found[sha256[:_HASH_SIGNS]] for sha256 in sha256s if sha256[:_HASH_SIGNS] in found]

@@ -1,0 +1,49 @@
+"""What speaks for and against a draft's tiles, as figures; docs/reports.md says what they mean. Light: the store reads them."""
+
+import msgspec
+
+
+class Looks(msgspec.Struct, frozen=True):
+    """How frames fared in one map. Errors and inliers are of the localised ones, None without any."""
+
+    frames: int
+    localised_share: float
+    wrong_share: float
+    median_error_m: float | None
+    p95_error_m: float | None
+    median_inliers: float | None
+    residual_px: float | None
+
+
+class Compared(msgspec.Struct, frozen=True):
+    """The same frames in the draft and in the current version; inliers_share: draft against before, median over frames found in both."""
+
+    draft: Looks
+    before: Looks | None = None
+    inliers_share: float | None = None
+
+
+class Aliasing(msgspec.Struct, frozen=True):
+    """Frames offered with the prior of the place elsewhere that looks most like theirs, and the share that was taken for it."""
+
+    offered: int
+    accepted_share: float
+
+
+class Motion(msgspec.Struct, frozen=True):
+    """Stretches of the survey against odometry: in how many separate places its trajectory is torn, and the worst difference."""
+
+    stretches: int
+    breaks: int
+    worst_m: float
+
+
+class Evidence(msgspec.Struct, frozen=True):
+    """All of it; None where there was nothing to judge by."""
+
+    held_out: Compared | None = None
+    replayed: Compared | None = None
+    last_version: Compared | None = None
+    aliasing: Aliasing | None = None
+    aliasing_before: Aliasing | None = None
+    motion: Motion | None = None

@@ -1,0 +1,52 @@
+"""Two nights of a rendered room from the command line: the second one builds on the first, and is judged by it."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from box_room import out_and_back, ride_sample
+from mapserver import cli
+from mapserver.store import MapStore
+from recording_samples import write_euroc
+
+
+@pytest.mark.slow
+def test_two_nights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first has only its own held-out frames to be judged by, the second also the recording and the map of the first."""
+    inbox, report = tmp_path / "inbox", tmp_path / "night.json"
+    rides = (out_and_back(4.0), out_and_back(3.6, reach_m=2.2, start_m=(-1.1, 0.5, 0.1)))
+    for number, ride in enumerate(rides, 1):
+        write_euroc(inbox / f"ride{number}", ride_sample(ride, 38, 0.1, seed=number))
+        words = [
+            "nightly",
+            "--site",
+            "lab",
+            "--inbox",
+            str(inbox),
+            "--store",
+            str(tmp_path / "store"),
+            "--settle-s",
+            "0",
+        ]
+        monkeypatch.setattr(sys, "argv", ["mapserver", *words, "--report", str(report)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        said = json.loads(report.read_text())
+        assert not end.value.code, said
+        assert (said["published"], [r["fate"] for r in said["recordings"]]) == ([number], ["done"])
+    with MapStore.open(tmp_path / "store") as maps:
+        first, second = (maps.evidence("lab", version) for version in (1, 2))
+        verdict = maps.verdicts("lab", 2)[-1]
+    assert first is not None
+    assert first.held_out is not None
+    assert (first.held_out.before, first.replayed, first.last_version) == (None, None, None)
+    assert second is not None
+    for compared in (second.held_out, second.replayed, second.last_version):
+        assert compared is not None
+        assert compared.before is not None
+        assert compared.draft.frames >= 12
+        assert compared.draft.localised_share > 0.9
+        assert compared.draft.wrong_share == 0.0
+    assert set(verdict.report["not_judged"]) == {"aliasing_probes"}  # the room is too small for another place

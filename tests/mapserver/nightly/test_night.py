@@ -1,0 +1,335 @@
+"""The nightly job, with real recordings, a real store and a build that takes no time: what it does when it is interrupted."""
+
+import fcntl
+import io
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from faulty_disk import Disk, install
+from fleetmap.errors import (
+    BusyError,
+    FleetmapError,
+    GateRefusedError,
+    RecordingError,
+    StoreError,
+    SurveyError,
+    UsageError,
+)
+from fleetmap.mapformat import RecordingEntry
+from fleetmap.recordings import open_recording
+from map_samples import draft_details, random_tile
+from mapserver import cli
+from mapserver.building import BuildOrder, Draft
+from mapserver.gate import GateSettings
+from mapserver.nightly import NightOrder, last_report, night, run_night
+from mapserver.nightly.inbox import arrivals
+from mapserver.store import MapStore
+from mapserver.survey.settings import SurveySettings
+from mapserver.surveying import admit_recordings
+from recording_samples import make_sample, write_euroc
+
+LATER_NS = 3_600 * 10**9
+Build = Callable[..., Draft]
+
+
+def record(inbox: Path, name: str, number: int) -> Path:
+    """A small recording like no other number's."""
+    sample = make_sample(3)
+    sample.left[0][0, :8] = number
+    return write_euroc(inbox / name, sample)
+
+
+def built(order: BuildOrder, _: SurveySettings, unusable: dict[Path, str], *, landmarks: int = 60) -> Draft:
+    """A draft with what a build would say; recordings named "lost" find no place, those named "dark" cannot be surveyed."""
+    entries, left_out = [], {}
+    for path in order.recordings:
+        with open_recording(path) as recording:
+            entry = RecordingEntry(name=path.name, sha256=recording.content_hash(), frames=len(recording))
+        if "dark" in path.name:
+            unusable[path] = "too dark"
+        elif "lost" in path.name:
+            left_out[entry.sha256] = "at most 1 of 3 fixes agree"
+        else:
+            entries.append(entry)
+    if not entries:
+        raise SurveyError("nothing could be joined")
+    details = draft_details()
+    details = type(details)(
+        **{name: getattr(details, name) for name in details.__struct_fields__} | {"recordings": tuple(entries)}
+    )
+    tile = random_tile(np.random.default_rng(len(entries)), landmarks=landmarks, places=2)
+    with MapStore.open(order.store) as maps:
+        version = maps.save_draft(order.site, tiles=[tile], vocabulary=b"words", details=details, actor=order.actor)
+    return Draft(version, f"draft {version}", {"keyframes": 2}, left_out)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(night, "build_draft", built)
+
+
+@pytest.fixture
+def hall(tmp_path: Path) -> Path:
+    """A folder with an inbox of two recordings."""
+    for number, name in enumerate(("monday", "tuesday")):
+        record(tmp_path / "inbox", name, number)
+    return tmp_path
+
+
+def spend(folder: Path) -> str:
+    """One night, some time after everything came in."""
+    order = NightOrder("hall", folder / "inbox", folder / "store", time.time_ns() + LATER_NS)
+    return run_night(order, SurveySettings(), GateSettings(), Console(file=io.StringIO()))
+
+
+def states(folder: Path) -> list[tuple[str, list[str]]]:
+    with MapStore.open(folder / "store") as maps:
+        versions = maps.versions("hall")
+        return [(v.state, sorted(r.name for r in maps.manifest("hall", v.version).recordings)) for v in versions]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name.split("-", 1)[-1] for path in folder.iterdir()) if folder.is_dir() else []
+
+
+def test_what_came_in_becomes_a_version_once(hall: Path) -> None:
+    assert "version 1 published, 2 done" in spend(hall)
+    assert states(hall) == [("current", ["monday", "tuesday"])]
+    assert names(hall / "inbox") == ["done"]
+    assert spend(hall) == "site hall: nothing new"
+    record(hall / "inbox", "monday again", 0)
+    assert spend(hall) == "site hall: nothing new"
+    assert names(hall / "inbox/done") == ["monday", "monday again", "tuesday"]
+    assert len(states(hall)) == 1
+    with MapStore.open(hall / "store") as maps:
+        assert [job.state for job in maps.jobs("hall")] == ["done"] * 3
+        assert [event.actor for event in maps.events("hall") if event.kind == "published"] == ["nightly"]
+
+
+def test_each_recording_goes_where_it_belongs_with_its_reason(hall: Path) -> None:
+    record(hall / "inbox", "lost one", 7)
+    record(hall / "inbox", "dark one", 8)
+    (hall / "inbox/empty").mkdir()
+    (hall / "inbox/notes.txt").write_text("not for the night")
+    assert "2 done, 1 held, 2 bad" in spend(hall)
+    assert names(hall / "inbox/held") == ["lost one", "lost one.reason.txt"]
+    assert names(hall / "inbox/bad") == ["dark one", "dark one.reason.txt", "empty", "empty.reason.txt"]
+    assert "empty folder" in (hall / "inbox/bad/empty.reason.txt").read_text()
+    assert (hall / "inbox/notes.txt").is_file()
+    report = last_report(hall / "store", "hall")
+    assert report is not None
+    assert {r["name"]: r["fate"] for r in report["recordings"]} == {
+        "monday": "done", "tuesday": "done", "lost one": "held", "dark one": "bad", "empty": "bad",
+    }  # fmt: skip
+
+
+def test_a_recording_that_the_doctor_refuses_does_not_stop_the_others(hall: Path) -> None:
+    """Left and right swapped, in a build that may leave recordings out; alone, or where none may be left out, it is an error."""
+    sample = make_sample(6)
+    sample.left, sample.right = sample.right, sample.left
+    swapped, sound = write_euroc(hall / "swapped", sample), write_euroc(hall / "sound", make_sample(6))
+    unusable: dict[Path, str] = {}
+
+    def admit(*paths: Path, unusable: dict[Path, str] | None) -> list[Path]:
+        console = Console(file=io.StringIO())
+        return list(admit_recordings(paths, "::", None, None, console, needs_truth=False, unusable=unusable))
+
+    assert admit(swapped, sound, unusable=unusable) == [sound]
+    assert "left and right" in unusable[swapped]
+    for paths, taken in (((swapped, sound), None), ((swapped,), {})):
+        with pytest.raises(RecordingError, match="left and right"):
+            admit(*paths, unusable=taken)
+
+
+def test_a_refused_night_keeps_the_last_version_and_holds_its_recordings(
+    hall: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spend(hall)
+    record(hall / "inbox", "wednesday", 3)
+    monkeypatch.setattr(night, "build_draft", lambda *a: built(*a, landmarks=10))
+    with pytest.raises(GateRefusedError, match="landmarks_share"):
+        spend(hall)
+    assert states(hall) == [("current", ["monday", "tuesday"]), ("draft", ["wednesday"])]
+    assert names(hall / "inbox/held") == ["wednesday", "wednesday.reason.txt"]
+    report = last_report(hall / "store", "hall")
+    assert report is not None
+    assert report["state"] == "failed"
+    assert "landmarks_share" in report["message"]
+    assert "version 1 stays current" in report["message"]
+    assert spend(hall) == "site hall: nothing new"
+    monkeypatch.setattr(night, "build_draft", built)
+    held = next(path for path in (hall / "inbox/held").iterdir() if path.is_dir())
+    held.rename(hall / "inbox" / held.name)  # somebody looked at it, and wants it tried again
+    assert "version 3 published" in spend(hall)
+
+
+def test_nothing_joined_is_a_failed_night(hall: Path) -> None:
+    spend(hall)
+    record(hall / "inbox", "lost", 5)
+    with pytest.raises(SurveyError, match="nothing could be joined"):
+        spend(hall)
+    assert names(hall / "inbox/held") == ["lost", "lost.reason.txt"]
+    assert len(states(hall)) == 1
+
+
+def test_half_copied_recordings_wait(tmp_path: Path) -> None:
+    inbox = tmp_path / "inbox"
+    record(inbox, "whole", 1)
+    record(inbox, "copied", 2)
+    (inbox / "copied/mav0/cam0/data/image9.png.part").write_bytes(b"half")
+    (inbox / "sent.mcap.filepart").write_bytes(b"half")
+    (inbox / "old.mcap").write_bytes(b"something")
+    now = time.time_ns()
+    assert [path.name for path in arrivals(inbox, 5.0, now + 10 * 10**9).complete] == ["old.mcap", "whole"]
+    assert arrivals(inbox, 60.0, now).complete == ()
+    with (inbox / "old.mcap").open("ab"):
+        found = arrivals(inbox, 5.0, now + 10 * 10**9)
+    assert [path.name for path in found.complete] == ["whole"]
+    assert {path.name: reason for path, reason in found.waiting} == {
+        "copied": "image9.png.part is half copied",
+        "sent.mcap.filepart": "sent.mcap.filepart is half copied",
+        "old.mcap": "old.mcap is open for writing",
+    }
+    with pytest.raises(UsageError, match="no folder"):
+        arrivals(tmp_path / "nowhere", 0.0, now)
+
+
+def test_one_night_at_a_time_and_a_dead_one_holds_nothing(hall: Path) -> None:
+    with MapStore.open(hall / "store", create=True):
+        pass
+    told, tell = os.pipe()
+    child = os.fork()
+    if child == 0:
+        descriptor = os.open(hall / "store/nightly-hall.lock", os.O_RDWR | os.O_CREAT)
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        os.write(tell, b"x")
+        signal.pause()
+        os._exit(0)
+    os.read(told, 1)
+    try:
+        with pytest.raises(BusyError, match="holds"):
+            spend(hall)
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    with MapStore.open(hall / "store") as maps:
+        assert maps.jobs("hall") == []
+    assert "version 1 published" in spend(hall)
+
+
+def in_child(folder: Path, disk: Disk) -> tuple[int, bool]:
+    """How a night on a failing disk ends (0 done, 3 an error that is told, 9 killed), and whether the fault struck."""
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(read)
+        status = 4
+        try:
+            signal.alarm(60)
+            install(disk)
+            spend(folder)
+            status = 0
+        except FleetmapError:
+            status = 3
+        finally:
+            os.write(write, b"1" if disk.struck else b"0")
+            os._exit(status)
+    os.close(write)
+    _, status = os.waitpid(child, 0)
+    struck = os.read(read, 1)
+    os.close(read)
+    return os.waitstatus_to_exitcode(status), struck != b"0"
+
+
+@pytest.mark.parametrize("how", ["kill", "ENOSPC"])
+def test_a_night_that_was_killed_or_ran_out_of_space_is_gone_on_with(hall: Path, how: str, tmp_path_factory) -> None:
+    """At every 23rd file-system call, SQLite's too: the next night makes one version of both recordings, and loses nothing."""
+    import shutil
+
+    number, struck = 4 if how == "kill" else 7, True
+    tries = resumed = 0
+    while struck:
+        folder = tmp_path_factory.mktemp("night")
+        shutil.copytree(hall / "inbox", folder / "inbox")
+        status, struck = in_child(folder, Disk(f"{folder}/", number, how, is_lasting=how == "ENOSPC"))
+        assert status in ((9, 0) if how == "kill" else (3, 0)), (status, number)
+        number += 23
+        if not struck:
+            break
+        tries += 1
+        if (folder / "store/store.sqlite3").is_file():
+            with MapStore.open(folder / "store") as maps:
+                resumed += any(job.state == "running" for job in maps.jobs())
+        spend(folder)
+        assert states(folder) == [("current", ["monday", "tuesday"])], number
+        assert names(folder / "inbox/done") == ["monday", "tuesday"], number
+        assert names(folder / "inbox") == ["done"]
+        with MapStore.open(folder / "store") as maps:
+            assert maps.verify().faults == []
+            assert {job.state for job in maps.jobs("hall")} <= {"done", "failed"}
+    assert tries > 6
+    assert resumed > 2
+
+
+def test_a_draft_that_a_killed_night_left_is_published_without_building_again(
+    hall: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class KilledError(BaseException):
+        pass
+
+    def killed(*_: object, **__: object) -> int:
+        raise KilledError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MapStore, "publish", killed)
+        with pytest.raises(KilledError):
+            spend(hall)
+    monkeypatch.setattr(night, "build_draft", lambda *_: pytest.fail("built again"))
+    assert "version 1 published" in spend(hall)
+    report = last_report(hall / "store", "hall")
+    assert report is not None
+    assert report["resumes"] == [1]
+    with MapStore.open(hall / "store") as maps:
+        assert "was interrupted; job 2 goes on" in maps.job(1).message
+
+
+def test_the_command_says_how_it_ended(
+    hall: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(*more: str) -> int:
+        words = ["nightly", "--site", "hall", "--inbox", str(hall / "inbox"), "--store", str(hall / "store")]
+        monkeypatch.setattr(sys, "argv", ["mapserver", *words, "--settle-s", "0", *more])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        return int(end.value.code or 0)
+
+    assert run("--report", str(hall / "night.json")) == 0
+    assert "version 1 published" in capsys.readouterr().out
+    assert json.loads((hall / "night.json").read_text())["state"] == "done"
+    record(hall / "inbox", "wednesday", 3)
+    monkeypatch.setattr(night, "build_draft", lambda *a: built(*a, landmarks=10))
+    assert run("--report", str(hall / "night.json")) == 4
+    assert json.loads((hall / "night.json").read_text())["state"] == "failed"
+    assert "landmarks_share" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_told(hall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> Draft:
+        raise StoreError("no space left; make space")
+
+    monkeypatch.setattr(night, "build_draft", full)
+    with pytest.raises(StoreError, match="no space"):
+        spend(hall)
+    assert names(hall / "inbox") == ["monday", "tuesday"]
+    report = last_report(hall / "store", "hall")
+    assert report is not None
+    assert "no space left" in report["message"]

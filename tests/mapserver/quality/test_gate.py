@@ -1,0 +1,260 @@
+"""The gate against maps that are wrong in known ways, made of one small build of rendered pictures."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from box_room import ride_sample
+from fleetmap.bow import decode_vocabulary
+from fleetmap.calibration import RigCalibration
+from fleetmap.default_vocabulary import default_vocabulary_bytes
+from fleetmap.geometry import Array, se3, so3_exp, transform_points
+from fleetmap.mapformat import BlobEntry, CameraEntry, Manifest, Tile, TileEntry, encode_tile
+from fleetmap.rectification import Rectifier
+from fleetmap.samples import CameraFrame, ImuSamples, Trajectory
+from mapserver.examining import Before, HeldOut, examine_draft
+from mapserver.gate import GateSettings, Verdict, judge
+from mapserver.quality.evidence import trajectory_breaks
+from mapserver.quality.figures import Evidence
+from mapserver.quality.frames import held_out_frames, look_at
+from mapserver.survey.pipeline import Survey, survey
+from mapserver.survey.result import SurveyMap
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.zones import Zones
+from mapserver.tiling import tiles_from_survey
+from recording_samples import calibration
+
+FRAMES, FRAME_S = 44, 0.1
+SETTINGS = SurveySettings()
+WORDS = decode_vocabulary(default_vocabulary_bytes())
+
+
+def two_walls(t_s: float) -> Array:
+    """Past the wall at y = 3, a turn on the spot, and back past the wall at y = -3: two aisles."""
+    share = min(max(t_s / 4.4, 0.0), 1.0)
+    there = np.clip(share / 0.42, 0, 1) - np.clip((share - 0.58) / 0.42, 0, 1)
+    eased = 6 * there**5 - 15 * there**4 + 10 * there**3
+    turn = np.clip((share - 0.4) / 0.2, 0, 1)
+    yaw = np.pi / 2 + np.pi * (6 * turn**5 - 15 * turn**4 + 10 * turn**3)
+    return se3(so3_exp(np.array([0, 0, yaw])), np.array([-1.2 + 2.4 * eased, 0.0, 0.05 * np.sin(6 * share)]))
+
+
+def surveyed(rig: RigCalibration) -> tuple[Survey, list[HeldOut]]:
+    """The ride, surveyed as if `rig` had recorded it, and what the survey did not use of it."""
+    sample = ride_sample(two_walls, FRAMES, FRAME_S)
+    frames = [CameraFrame(int(s), a, b) for s, a, b in zip(sample.stamps_ns, sample.left, sample.right, strict=True)]
+    rectifier = Rectifier(rig)
+    imu = ImuSamples(sample.imu_stamps_ns, sample.gyro_radps, sample.accel_mps2)
+    done = survey(iter(frames), FRAMES, imu, rig, rectifier, WORDS, SETTINGS, Zones(), lambda *_: None)
+    keyframes = [k.frame_index for k in done.first_guess.keyframes]
+    numbers = held_out_frames(keyframes, done.map.trajectory_estimated, 40)
+    looks = [look_at(rectifier.rectify(frames[n]), rectifier.camera, SETTINGS) for n in numbers]
+    return done, [HeldOut(n, look, rectifier.body_from_cam) for n, look in zip(numbers, looks, strict=True)]
+
+
+@lru_cache(maxsize=1)
+def sound() -> tuple[Survey, list[HeldOut]]:
+    """The ride with the right calibration."""
+    return surveyed(calibration())
+
+
+def manifest(tiles: Sequence[Tile], version: int) -> Manifest:
+    entries = []
+    for tile in tiles:
+        data = encode_tile(tile)
+        entries.append(TileEntry(x=tile.tile_x, y=tile.tile_y, sha256="0" * 64, bytes=len(data), landmarks=len(tile)))
+    return Manifest(
+        site="lab", version=version, parent=None, tiles=tuple(entries), vocabulary=BlobEntry(sha256="1" * 64, bytes=1),
+        created="2026-01-02T03:04:05Z", tile_size_m=16.0, recordings=(), configuration={}, libraries={}, report={},
+        camera=CameraEntry(focal_px=200.0, width_px=320, height_px=240, baseline_m=0.2),
+    )  # fmt: skip
+
+
+def verdict(
+    survey_map: SurveyMap, *, has_current: bool = True, held_out: list[HeldOut] | None = None,
+    trajectory: Trajectory | None = None,
+) -> tuple[Verdict, Evidence]:  # fmt: skip
+    """Of a draft with this map, built by the sound ride; the current version is the sound map."""
+    done, own = sound()
+    tiles, current = tiles_from_survey(survey_map), tiles_from_survey(done.map)
+    before = Before(manifest(current, 1), done.map, current) if has_current else None
+    evidence = examine_draft(
+        tiles, before, [trajectory or done.map.trajectory], [own if held_out is None else held_out], [done], [],
+        done.vocabulary, SETTINGS,
+    )  # fmt: skip
+    said = judge(manifest(tiles, 2), manifest(current, 1) if has_current else None, None, GateSettings(), evidence)
+    return said, evidence
+
+
+def changed(points: Callable[[Array], Array], places: Callable[[Array], Array] = lambda x: x) -> SurveyMap:
+    """The sound map with other landmarks and keyframes."""
+    survey_map = sound()[0].map
+    return replace(survey_map, points_map=points(survey_map.points_map), map_from_body=places(survey_map.map_from_body))
+
+
+def facing() -> Array:
+    """(3,) horizontal unit vector in `map` from the ride's middle towards the first wall."""
+    forward = np.array(sound()[0].map.trajectory.frame_from_body[3, :3, 0])
+    forward[2] = 0.0
+    return np.asarray(forward / np.linalg.norm(forward))
+
+
+def at_first_wall(points_map: Array) -> Array:
+    origin = sound()[0].map.trajectory.positions_m.mean(axis=0)
+    return np.asarray((points_map - origin) @ facing() > 0)
+
+
+def looks_at_first_wall(map_from_body: Array) -> Array:
+    return np.asarray(map_from_body[:, :3, 0] @ facing() > 0)
+
+
+def shift_first_wall(shift_m: Array) -> SurveyMap:
+    def places(map_from_body: Array) -> Array:
+        out = map_from_body.copy()
+        out[looks_at_first_wall(out), :3, 3] += shift_m
+        return out
+
+    return changed(lambda points: points + at_first_wall(points)[:, None] * shift_m, places)
+
+
+def test_a_sound_draft_passes_alone_and_beside_the_same_version() -> None:
+    for has_current in (False, True):
+        said, evidence = verdict(sound()[0].map, has_current=has_current)
+        assert said.accepted, said.reasons
+        assert evidence.held_out is not None
+        assert evidence.held_out.draft.frames >= 12
+        assert evidence.held_out.draft.localised_share > 0.9
+        assert evidence.held_out.draft.median_error_m is not None
+        assert evidence.held_out.draft.median_error_m < 0.01
+        assert ("size_against_last_version" in said.report["not_judged"]) is not has_current
+        assert "yesterdays_recordings" in said.report["not_judged"]
+
+
+@pytest.mark.parametrize("has_current", [False, True])
+def test_an_aisle_shifted_by_half_a_metre_is_refused(has_current: bool) -> None:
+    """Along the wall, landmarks and keyframes together: pictures alone would never tell."""
+    along = np.cross(facing(), [0, 0, 1.0])
+    said, evidence = verdict(shift_first_wall(0.5 * along), has_current=has_current)
+    assert evidence.held_out is not None
+    assert evidence.held_out.draft.wrong_share > 0.2
+    assert any("held_out_frames: wrong_share" in reason for reason in said.reasons)
+    assert any("last_versions_places: wrong_share" in reason for reason in said.reasons) is has_current
+
+
+def test_a_shift_that_the_surveys_own_trajectory_shares_is_seen_by_the_last_version() -> None:
+    """The held-out frames moved along with it: they find nothing wrong."""
+    moved = shift_first_wall(0.5 * np.cross(facing(), [0, 0, 1.0]))
+    frames = moved.trajectory.frame_from_body.copy()
+    frames[looks_at_first_wall(frames), :3, 3] += 0.5 * np.cross(facing(), [0, 0, 1.0])
+    said, _ = verdict(moved, trajectory=Trajectory(moved.trajectory.stamps_ns, frames))
+    assert not any("held_out_frames: wrong_share" in reason for reason in said.reasons)
+    assert any("last_versions_places: wrong_share" in reason for reason in said.reasons)
+
+
+def test_a_draft_that_lost_a_third_of_its_landmarks_is_refused() -> None:
+    survey_map = sound()[0].map
+    lost = np.random.default_rng(1).random(len(survey_map.landmark_ids)) < 1 / 3
+    kept = ~lost[survey_map.obs_landmark]
+    names = ("obs_keyframe", "obs_landmark", "obs_pixels", "obs_octave", "obs_sigma_px")
+    fewer = replace(survey_map, **{name: getattr(survey_map, name)[kept] for name in names})
+    said, evidence = verdict(fewer)
+    assert evidence.last_version is not None
+    assert evidence.last_version.inliers_share is not None
+    assert evidence.last_version.inliers_share < 0.8
+    assert any("landmarks_share" in reason for reason in said.reasons)
+    assert any("inliers_share" in reason for reason in said.reasons)
+
+
+@pytest.mark.parametrize("has_current", [False, True])
+def test_two_aisles_swapped_are_refused(has_current: bool) -> None:
+    """All turned by half a turn about the middle: each wall stands where the other should."""
+    origin = sound()[0].map.trajectory.positions_m.mean(axis=0)
+    turn = so3_exp(np.array([0, 0, np.pi]))
+    swap = se3(turn, origin - turn @ origin)
+    said, _ = verdict(
+        changed(lambda points: transform_points(swap, points), lambda places: swap @ places), has_current=has_current
+    )
+    assert any("held_out_frames: localised_share" in reason for reason in said.reasons)
+
+
+def test_a_site_that_is_in_the_map_twice_is_refused() -> None:
+    """As a survey makes it that missed the loop: the same walls again, twenty metres on."""
+    survey_map = sound()[0].map
+    away = se3(np.eye(3), np.array([20.0, 0.0, 0.0]))
+    count, keyframes = len(survey_map.landmark_ids), len(survey_map.map_from_body)
+    twice = replace(
+        survey_map,
+        map_from_body=np.concatenate([survey_map.map_from_body, away @ survey_map.map_from_body]),
+        keyframe_stamps_ns=np.r_[survey_map.keyframe_stamps_ns, survey_map.keyframe_stamps_ns + 10**12],
+        landmark_ids=np.r_[survey_map.landmark_ids, survey_map.landmark_ids + np.uint32(count)],
+        points_map=np.concatenate([survey_map.points_map, transform_points(away, survey_map.points_map)]),
+        obs_keyframe=np.r_[survey_map.obs_keyframe, survey_map.obs_keyframe + np.int32(keyframes)],
+        obs_landmark=np.r_[survey_map.obs_landmark, survey_map.obs_landmark + np.int32(count)],
+        **{
+            name: np.concatenate([getattr(survey_map, name)] * 2)
+            for name in ("descriptors", "point_sigma_m", "patches", "obs_pixels", "obs_octave", "obs_sigma_px")
+        },
+    )
+    said, evidence = verdict(twice, has_current=False)
+    assert evidence.aliasing is not None
+    assert evidence.aliasing.accepted_share > 0.5
+    assert any("aliasing_probes" in reason for reason in said.reasons)
+
+
+def test_a_map_made_with_a_wrong_calibration_is_refused() -> None:
+    """Six percent of baseline: consistent in itself, but nothing lies where the current version has it."""
+    rig = calibration()
+    right = replace(rig.cameras[1], body_from_cam=rig.cameras[0].body_from_cam @ se3(np.eye(3), np.array([0.23, 0, 0])))
+    done, held_out = surveyed(replace(rig, cameras=(rig.cameras[0], right)))
+    said, _ = verdict(done.map, held_out=held_out, trajectory=done.map.trajectory)
+    assert any("last_versions_places" in reason for reason in said.reasons), said
+
+
+def test_a_torn_trajectory_is_found_and_drift_is_not() -> None:
+    """Twenty metres straight on, five centimetres each frame; the map has half a metre more in the middle, or 2 % drift."""
+    count = 400
+    odom = np.tile(np.eye(4), (count, 1, 1))
+    odom[:, 0, 3] = 0.05 * np.arange(count)
+    covariances = np.array([np.diag([1e-8] * 3 + [1e-6 * n] * 3) for n in range(count)])
+    stamps, tracked = np.arange(count, dtype=np.int64) * 50_000_000, np.ones(count, bool)
+    torn, drifted = odom.copy(), odom.copy()
+    torn[150:250, 1, 3] += 0.5
+    drifted[:, 0, 3] *= 1.02
+    found = trajectory_breaks(stamps, torn, odom, covariances, tracked)
+    assert found is not None
+    assert (found.breaks, found.worst_m) == (2, 0.5)
+    fine = trajectory_breaks(stamps, drifted, odom, covariances, tracked)
+    assert fine is not None
+    assert fine.breaks == 0
+    tracked[[150, 250]] = False  # odometry itself says that it does not know
+    left = trajectory_breaks(stamps, torn, odom, covariances, tracked)
+    assert left is not None
+    assert left.breaks == 0
+
+
+def test_a_torn_survey_is_refused_though_its_tiles_agree_with_it() -> None:
+    odom = np.tile(np.eye(4), (200, 1, 1))
+    odom[:, 0, 3] = 0.1 * np.arange(200)
+    torn = odom.copy()
+    torn[80:130, 1, 3] += 0.5
+    stamps = np.arange(200, dtype=np.int64) * 100_000_000
+    motion = trajectory_breaks(stamps, torn, odom, np.zeros((200, 6, 6)), np.ones(200, bool))
+    evidence = Evidence(motion=motion)
+    tiles = tiles_from_survey(sound()[0].map)
+    said = judge(manifest(tiles, 1), None, None, GateSettings(), evidence)
+    assert any("torn in 2 places" in reason for reason in said.reasons)
+    assert "held_out_frames" in said.report["not_judged"]
+
+
+def test_without_evidence_only_hard_limits_refuse() -> None:
+    tiles = tiles_from_survey(sound()[0].map)
+    said = judge(manifest(tiles, 1), None, None, GateSettings())
+    assert said.accepted
+    assert set(said.report["not_judged"]) == {
+        "held_out_frames", "yesterdays_recordings", "last_versions_places", "aliasing_probes", "motion",
+        "size_against_last_version",
+    }  # fmt: skip
+    assert not judge(manifest([], 1), None, None, GateSettings()).accepted
