@@ -12,7 +12,10 @@ import msgspec
 
 from fleetmap.config import Section, load_toml, to_dict
 from fleetmap.samples import SensorSet
+from mapserver.canary import CanarySettings
 from mapserver.gate import GateSettings
+from mapserver.ingest import IngestSettings
+from mapserver.resurvey import ResurveySettings
 from mapserver.survey.settings import SurveySettings
 
 _PRESETS = Path(__file__).parent / "presets"
@@ -143,6 +146,9 @@ class MapserverConfig(Section, frozen=True, rename={"import_": "import"}):
     build: BuildSection = BuildSection()
     survey: SurveySettings = SurveySettings()
     gate: GateSettings = GateSettings()
+    ingest: IngestSettings = IngestSettings()
+    canary: CanarySettings = CanarySettings()
+    resurvey: ResurveySettings = ResurveySettings()
     publish: PublishSection = PublishSection()
     promote: ActSection = ActSection()
     rollback: ActSection = ActSection()
