@@ -94,7 +94,13 @@ class RobotWatch:
             tally.blind_seen = self._blindness(health.stamp_ns, is_blind, is_tracking)
 
     def _blindness(self, stamp_ns: int, is_blind: bool, is_tracking: bool) -> int:
-        """1 where a stretch of blindness became a failure with this report. It ends after 5 s of good tracking."""
+        """1 where a stretch of blindness became a failure with this report.
+
+        A stretch lasts until the next report that is better, and a failure until 5 s of good tracking.
+        """
+        if self._stamp_ns is None or stamp_ns - self._stamp_ns > MAX_GAP_S * 1e9:
+            self._blind_since_ns = self._good_since_ns = None  # nobody knows what was in between
+        began = self._blind_since_ns is not None and stamp_ns - self._blind_since_ns > BLIND_S * 1e9
         if not is_blind:
             self._blind_since_ns = None
         elif self._blind_since_ns is None:
@@ -103,13 +109,11 @@ class RobotWatch:
             self._good_since_ns = None
         elif self._good_since_ns is None:
             self._good_since_ns = stamp_ns
+        is_new = began and not self._in_failure
+        self._in_failure = self._in_failure or began
         if self._good_since_ns is not None and stamp_ns - self._good_since_ns >= GOOD_S * 1e9:
             self._in_failure = False
-        began = self._blind_since_ns is not None and stamp_ns - self._blind_since_ns > BLIND_S * 1e9
-        if began and not self._in_failure:
-            self._in_failure = True
-            return 1
-        return 0
+        return int(is_new)
 
     def _count_fixes(self, tally: Tally, figures: dict[str, float]) -> None:
         if "first_fix_s" in figures and not self._fix_counted:
