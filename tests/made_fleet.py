@@ -24,7 +24,7 @@ class Known:
     suspected: Counter[tuple[str, str]] = field(default_factory=Counter)
     driving_s: Counter[tuple[str, str]] = field(default_factory=Counter)
     health: int = 0
-    poses: int = 0
+    estimates: int = 0
     reports: int = 0
 
     def count(self, counter: Counter[tuple[str, str]], amount: float, **keys: str) -> None:
@@ -69,7 +69,7 @@ class MadeRobot:
 
     def second(self, now_ns: int) -> list[Message]:
         """What it says within a second that ends now: two poses, one health, and a report where a failure is over."""
-        said: list[Message] = [self._pose(now_ns - NS // 2, 0.5), self._pose(now_ns, 0.5)]
+        said: list[Message] = [self._estimate(now_ns - NS // 2, 0.5), self._estimate(now_ns, 0.5)]
         status = self._fail(now_ns)
         if self._step > 0:
             self._known.count(
@@ -78,7 +78,7 @@ class MadeRobot:
         self._step += 1
         said.append(self._health(now_ns, status))
         self._known.health += 1
-        self._known.poses += 2
+        self._known.estimates += 2
         if self._begun is not None and self._blind == 0:
             said.append(self._report(now_ns))
         return said
@@ -118,7 +118,7 @@ class MadeRobot:
             thumbnails=(Thumbnail(stamp_ns=begun_ns, kind="frame", jpeg=b"\xff\xd8 not quite a picture"),),
         )  # fmt: skip
 
-    def _pose(self, stamp_ns: int, dt_s: float) -> PoseMessage:
+    def _estimate(self, stamp_ns: int, dt_s: float) -> PoseMessage:
         self._way_m += SPEED_MPS * dt_s
         return PoseMessage(
             stamp_ns=stamp_ns, position_map_m=(self.x_m, 1.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0),

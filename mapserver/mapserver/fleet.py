@@ -55,7 +55,7 @@ class _Robot:
     version: int | None = None
     seen_ns: int = 0
     report: dict[str, Any] = field(default_factory=dict)
-    pose: PoseMessage | None = None
+    last_estimate: PoseMessage | None = None
     skew: ClockSkew = field(default_factory=ClockSkew)
     is_present: bool | None = None
 
@@ -122,13 +122,13 @@ class Fleet:
                 entry.skew.take(health.wall_ns, now_ns)
                 entry.report["clock_ahead_s"] = entry.skew.ahead_s
             entry.report["health"] = finite(report_dict(health))
-            self._ingest.take_health(health, entry.pose, now_ns, dict(entry.report), entry.version)
+            self._ingest.take_health(health, entry.last_estimate, now_ns, dict(entry.report), entry.version)
 
     def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
         """Keeps an estimate in memory."""
         now_ns = self._clock_ns()
         with self._lock:
-            self._entry(site, robot, now_ns, message.map_version).pose = message
+            self._entry(site, robot, now_ns, message.map_version).last_estimate = message
             self._ingest.take_pose(site, robot, message)
 
     def take_failure(self, site: str, robot: str, report: FailureReport) -> FailureAck:
@@ -205,7 +205,7 @@ def _status(key: tuple[str, str], robot: _Robot, plan: SitePlan, now_ns: int) ->
         seconds_since=max(0, now_ns - robot.seen_ns) / 1e9,
         last_ack=robot.report.get("ack"),
         last_health=robot.report.get("health"),
-        last_pose=None if robot.pose is None else finite(report_dict(robot.pose)),
+        last_pose=None if robot.last_estimate is None else finite(report_dict(robot.last_estimate)),
     )
 
 

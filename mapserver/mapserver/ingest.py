@@ -91,7 +91,12 @@ class Ingest:
             self._streams.setdefault((site, robot), _Stream()).watch.take_pose(message)
 
     def take_health(
-        self, health: RobotHealth, pose: PoseMessage | None, now_ns: int, report: dict[str, Any], version: int | None
+        self,
+        health: RobotHealth,
+        estimate: PoseMessage | None,
+        now_ns: int,
+        report: dict[str, Any],
+        version: int | None,
     ) -> None:
         """Counts a report; `report` and `version` are what the store shall show of the robot."""
         site, robot, hour = health.site, health.robot, hour_of(now_ns)
@@ -103,7 +108,7 @@ class Ingest:
             self._batch.last_reports[site, robot] = (version, now_ns, report)
             if tally is None:
                 return
-            place = None if pose is None or pose.map_version != health.version else pose.position_map_m
+            place = None if estimate is None or estimate.map_version != health.version else estimate.position_map_m
             for axis, key in _keys(robot, _version_key(health.version, grid), _arm(canary, health.version)):
                 self._batch.add(site, axis, key, hour, tally)
             if grid is not None and place is not None:

@@ -16,6 +16,7 @@ from contracts_documents import REPOSITORY, code_words, rows, section, text
 from fleetmap import messages
 from locclient.health import METRICS
 from mapserver.build_report import BuildReport
+from mapserver.measures import Measures
 from mapserver.survey.sessions.extend import Counts
 
 COMMANDS = "docs/command_line.md"
@@ -107,6 +108,11 @@ def test_session_keys_are_documented() -> None:
 def test_replay_report_keys_are_documented() -> None:
     keys = set(METRICS) | {"peak_rss_mb", "map_version"}
     assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Replay"))} == keys
+
+
+def test_fleet_measures_are_documented() -> None:
+    keys = {field.name for field in dataclasses.fields(Measures)}
+    assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Fleet"))} == keys
 
 
 @pytest.mark.parametrize("document", sorted(str(p.relative_to(REPOSITORY)) for p in REPOSITORY.glob("docs/*.md")))
