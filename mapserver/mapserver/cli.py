@@ -13,6 +13,7 @@ from mapserver.commands.diff import diff
 from mapserver.commands.doctor import doctor
 from mapserver.commands.evaluate import evaluate
 from mapserver.commands.export import export
+from mapserver.commands.fleet import fleet_app
 from mapserver.commands.gc import gc
 from mapserver.commands.import_ import import_
 from mapserver.commands.inspect import inspect
@@ -43,6 +44,7 @@ def mapserver(config: ConfigFile = None) -> None:
 
 for _command in COMMANDS:
     app.command(_command.__name__.rstrip("_").replace("_", "-"))(_command)
+app.add_typer(fleet_app, name="fleet")
 
 
 # Before anything imports numpy: many small products, for which a second BLAS thread costs more than it brings.

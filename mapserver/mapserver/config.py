@@ -1,5 +1,5 @@
-"""The configuration file of `mapserver`: one section for each command, [survey] for how maps are made, and
-[gate] for which drafts are refused.
+"""The configuration file of `mapserver`: one section for each command, [survey] for how maps are made, [gate]
+for which drafts are refused, [ingest], [canary] and [resurvey] for what is made of the robots' reports.
 
 A command's section holds its options under their names, with `_` for `-`. Paths are relative to the working directory,
 as on the command line.
@@ -10,9 +10,12 @@ from typing import Any
 
 import msgspec
 
-from fleetmap.config import Section, load_toml, to_dict
+from fleetmap.config import Section, load_toml
 from fleetmap.samples import SensorSet
+from mapserver.canary import CanarySettings
 from mapserver.gate import GateSettings
+from mapserver.ingest import IngestSettings
+from mapserver.resurvey import ResurveySettings
 from mapserver.survey.settings import SurveySettings
 
 _PRESETS = Path(__file__).parent / "presets"
@@ -64,10 +67,20 @@ class PublishSection(Section, frozen=True):
 
 
 class ActSection(Section, frozen=True):
-    """Options of `mapserver promote` and `rollback`."""
+    """Options of `mapserver rollback`."""
 
     site: str | None = None
     store: str | None = None
+    actor: str | None = None
+    reason: str | None = None
+
+
+class PromoteSection(Section, frozen=True):
+    """Options of `mapserver promote`."""
+
+    site: str | None = None
+    store: str | None = None
+    canary: str | None = None
     actor: str | None = None
     reason: str | None = None
 
@@ -121,6 +134,40 @@ class ServeSection(Section, frozen=True):
     token_file: str | None = None
 
 
+class FleetReportSection(Section, frozen=True):
+    """Options of `mapserver fleet report`."""
+
+    site: str | None = None
+    store: str | None = None
+    hours: int | None = None
+
+
+class FleetExportSection(Section, frozen=True):
+    """Options of `mapserver fleet export`."""
+
+    site: str | None = None
+    store: str | None = None
+    hours: int | None = None
+    kind: str | None = msgspec.field(default=None, name="format")
+
+
+class FleetResurveySection(Section, frozen=True):
+    """Options of `mapserver fleet resurvey`."""
+
+    site: str | None = None
+    store: str | None = None
+    route: str | None = None
+    json: bool | None = None
+
+
+class FleetSection(Section, frozen=True):
+    """The commands of `mapserver fleet`."""
+
+    report: FleetReportSection = FleetReportSection()
+    export: FleetExportSection = FleetExportSection()
+    resurvey: FleetResurveySection = FleetResurveySection()
+
+
 class ConvertSection(Section, frozen=True):
     """Options of `mapserver convert`."""
 
@@ -162,8 +209,11 @@ class MapserverConfig(Section, frozen=True, rename={"import_": "import"}):
     survey: SurveySettings = SurveySettings()
     gate: GateSettings = GateSettings()
     nightly: NightlySection = NightlySection()
+    ingest: IngestSettings = IngestSettings()
+    canary: CanarySettings = CanarySettings()
+    resurvey: ResurveySettings = ResurveySettings()
     publish: PublishSection = PublishSection()
-    promote: ActSection = ActSection()
+    promote: PromoteSection = PromoteSection()
     rollback: ActSection = ActSection()
     versions: StoreSection = StoreSection()
     inspect: StoreSection = StoreSection()
@@ -173,6 +223,7 @@ class MapserverConfig(Section, frozen=True, rename={"import_": "import"}):
     export: ExportSection = ExportSection()
     import_: ImportSection = ImportSection()
     serve: ServeSection = ServeSection()
+    fleet: FleetSection = FleetSection()
     convert: ConvertSection = ConvertSection()
     doctor: DoctorSection = DoctorSection()
     evaluate: EvaluateSection = EvaluateSection()
@@ -200,11 +251,17 @@ def _over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
 
 
 def command_defaults(config: MapserverConfig) -> dict[str, dict[str, Any]]:
-    """By command, the options that the file sets."""
-    commands = (name for name in msgspec.structs.asdict(config) if name not in {"survey", "gate"})
-    return {
-        name.rstrip("_").replace("_", "-"): {
-            option: value for option, value in to_dict(getattr(config, name)).items() if value is not None
-        }
-        for name in commands
-    }
+    """By command (and for commands in groups, by command of the group), the options that the file sets."""
+    settings = {"survey", "gate", "ingest", "canary", "resurvey"}
+    commands = (name for name in msgspec.structs.asdict(config) if name not in settings)
+    return {name.rstrip("_").replace("_", "-"): _set_options(getattr(config, name)) for name in commands}
+
+
+def _set_options(section: Section) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in msgspec.structs.asdict(section).items():
+        if isinstance(value, Section):
+            found[name] = _set_options(value)
+        elif value is not None:
+            found[name] = value
+    return found

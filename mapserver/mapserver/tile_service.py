@@ -7,6 +7,7 @@ from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError
 from fleetmap.mapformat import check_name, make_patch
 from fleetmap.messages import (
+    FailureReport,
     PoseMessage,
     RobotAck,
     RobotHealth,
@@ -44,11 +45,12 @@ class TileService:
         self._fleet = fleet
         self._bus = bus
         self._count = count
-        self._announced: dict[str, str | None] = {}
+        self._announced: dict[tuple[str, str], str | None] = {}
         self._recent = RecentBytes(_RECENT_BYTES)
         self._patches = RecentBytes(_RECENT_PATCHES_BYTES)
         self._handles: list[Handle] = [
             bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
+            bus.queryable(robot_key("*", "*", "failures"), self._counted("failure", self._failure)),
             bus.queryable(manifest_key("*", "*"), self._counted("manifest", self._parts(self._manifest))),
             bus.queryable(blob_key("*", "*"), self._counted("blob", self._parts(self._blob))),
             bus.queryable(patch_key("*", "*", "*"), self._counted("patch", self._parts(self._patch))),
@@ -56,21 +58,24 @@ class TileService:
         ]
 
     def announce_changes(self) -> list[str]:
-        """Tells the known robots of every site whose current version changed since the last call; returns those sites.
+        """Tells every known robot whose wanted version changed since the last call; returns the sites where somebody was told.
 
         The first call tells all of them, because they may have missed what happened while no server ran.
         """
         changed = []
         for info in self._store.sites():
-            current = self._store.current(info.site)
-            address = None if current is None else current.manifest_sha256
-            if info.site not in self._announced or self._announced[info.site] != address:
-                for robot in self._fleet.known_robots(info.site):
-                    wanted = self._fleet.wanted_version(info.site, robot)
+            for robot, wanted in self._fleet.wanted_versions(info.site).items():
+                key, address = (info.site, robot), wanted.manifest_sha256
+                if key not in self._announced or self._announced[key] != address:
                     self._bus.publish(robot_key(info.site, robot, "wanted"), encode_message(wanted))
-                self._announced[info.site] = address
-                changed.append(info.site)
-        return changed
+                    self._announced[key] = address
+                    changed.append(info.site)
+        return sorted(set(changed))
+
+    def look_for_robots(self) -> None:
+        """Notes which robots are present on the bus now."""
+        keys = (split_key(key) for key in self._bus.alive(robot_key("*", "*", "alive")))
+        self._fleet.take_presence((site, robot) for site, robot, _ in keys)
 
     def close(self) -> None:
         """Answers no more."""
@@ -95,6 +100,10 @@ class TileService:
     def _wanted(self, key: str, _: bytes) -> bytes:
         site, robot, _what = split_key(key)
         return encode_message(self._fleet.take_question(site, check_name(robot, "robot")))
+
+    def _failure(self, key: str, payload: bytes) -> bytes:
+        site, robot, _what = split_key(key)
+        return encode_message(self._fleet.take_failure(site, robot, decode_message(payload, FailureReport)))
 
     def _manifest(self, key: str) -> bytes:
         site, _what, number = split_key(key)

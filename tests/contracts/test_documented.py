@@ -16,6 +16,7 @@ from contracts_documents import REPOSITORY, code_words, rows, section, text
 from fleetmap import messages
 from locclient.health import METRICS
 from mapserver.build_report import BuildReport
+from mapserver.measures import Measures
 from mapserver.nightly.night import Night
 from mapserver.quality import figures
 from mapserver.survey.sessions.extend import Counts
@@ -42,7 +43,13 @@ def _scripts() -> list[str]:
 
 
 def _documented_commands() -> list[str]:
-    return re.findall(r"^## `(\w+ [\w-]+)`", text(COMMANDS), re.MULTILINE)
+    return re.findall(r"^## `(\w+(?: [\w-]+)+)`", text(COMMANDS), re.MULTILINE)
+
+
+def _leaves(path: str) -> set[str]:
+    """The command itself, or all commands of a group and its groups."""
+    groups = getattr(_command(path), "commands", None)
+    return {path} if groups is None else {leaf for name in groups for leaf in _leaves(f"{path} {name}")}
 
 
 def _arguments(command: click.Command) -> set[str]:
@@ -53,9 +60,7 @@ def _arguments(command: click.Command) -> set[str]:
 
 @pytest.mark.parametrize("script", _scripts())
 def test_commands_are_documented(script: str) -> None:
-    group = _command(script)
-    commands = {f"{script} {name}" for name in group.commands}  # type: ignore[attr-defined]
-    assert commands == {path for path in _documented_commands() if path.split()[0] == script}
+    assert _leaves(script) == {path for path in _documented_commands() if path.split()[0] == script}
 
 
 @pytest.mark.parametrize("path", _documented_commands())
@@ -116,6 +121,11 @@ def test_nightly_report_keys_are_documented() -> None:
 def test_replay_report_keys_are_documented() -> None:
     keys = set(METRICS) | {"peak_rss_mb", "map_version"}
     assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Replay"))} == keys
+
+
+def test_fleet_measures_are_documented() -> None:
+    keys = {field.name for field in dataclasses.fields(Measures)}
+    assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Fleet"))} == keys
 
 
 @pytest.mark.parametrize("document", sorted(str(p.relative_to(REPOSITORY)) for p in REPOSITORY.glob("docs/*.md")))

@@ -12,11 +12,14 @@ from fleetmap.errors import LinkError, MapFormatError, UnreachableError, UsageEr
 from fleetmap.mapformat import Tile, blob_path, decode_tile
 from fleetmap.messages import (
     PART_BYTES,
+    FailureAck,
+    FailureReport,
     PoseMessage,
     RobotAck,
     RobotHealth,
     WantedVersion,
     blob_key,
+    decode_message,
     encode_message,
     manifest_key,
     part_of,
@@ -27,7 +30,7 @@ from locclient.link import MapLink, StoreFolderLink
 from locclient.tile_cache import StoreFolder, TileCache
 from map_samples import draft_details, random_tile, save_sample_draft
 from mapserver.fleet import Fleet
-from mapserver.store import MapStore
+from mapserver.store import FailureFilter, MapStore
 from mapserver.tile_service import TileService
 
 
@@ -222,13 +225,14 @@ def test_reports_reach_the_fleet_and_survive_a_restart(world: World) -> None:
     assert status.last_ack["refused"] == "tile (0, 0): damaged"
     assert status.last_health["metrics"] == {"matches": 80}
     assert status.last_pose["stamp_ns"] == 7
+    world.fleet.flush()
     (again,) = Fleet(world.store, clock_ns=lambda: 10**18 + 5 * 10**9).robots("lab")
     assert (again.version, again.seconds_since) == (1, 5)
     assert again.last_ack == status.last_ack
     assert Fleet(world.store).robots("other") == []
 
 
-def test_health_is_saved_at_most_every_second(tmp_path: Path) -> None:
+def test_health_is_saved_with_the_next_flush(tmp_path: Path) -> None:
     now = {"ns": 10**18}
     with MapStore.open(tmp_path, create=True, clock_ns=lambda: now["ns"]) as store:
         save_sample_draft(store)
@@ -238,9 +242,41 @@ def test_health_is_saved_at_most_every_second(tmp_path: Path) -> None:
             now["ns"] = 10**18 + step * 100_000_000
             health = RobotHealth(site="lab", robot="r1", stamp_ns=step, version=None, status="LOST")
             fleet.take_health("lab", "r1", health)
+            if step % 10 == 0:
+                fleet.flush()
             saved.append(store.robots()[0].last_report["health"]["stamp_ns"])
         assert sorted(set(saved)) == [0, 10, 20]
         assert fleet.robots()[0].last_health["stamp_ns"] == 29
+
+
+def test_presence_is_what_the_bus_shows(world: World) -> None:
+    world.link.ack(1, stamp_ns=5)
+    assert [robot.is_present for robot in world.fleet.robots()] == [None]
+    handle = world.link.announce_presence()
+    world.service.look_for_robots()
+    assert [robot.is_present for robot in world.fleet.robots()] == [True]
+    handle.close()
+    world.service.look_for_robots()
+    assert [robot.is_present for robot in world.fleet.robots()] == [False]
+
+
+def test_a_failure_is_acknowledged_when_it_is_on_the_disk(world: World) -> None:
+    report = FailureReport(
+        site="lab", robot="r1", id="f-1", stamp_ns=5, wall_ns=10**18 - 1, duration_s=2.5, kind="blind", status="LOST",
+        cause="dark", version=1, tile=(0, 0),
+    )  # fmt: skip
+    key = robot_key("lab", "r1", "failures")
+    for _ in range(2):
+        ack = decode_message(world.robot_bus.get(key, encode_message(report)), FailureAck)
+        assert (ack.id, ack.refused) == ("f-1", "")
+        with MapStore.open(world.folder) as other_process:
+            (row,) = other_process.fleet.failures(FailureFilter())
+            assert (row.failure_id, row.tile, row.version) == ("f-1", "0,0", 1)
+    stolen = robot_key("lab", "r2", "failures")
+    assert "speaks for" in decode_message(world.robot_bus.get(stolen, encode_message(report)), FailureAck).refused
+    with pytest.raises(LinkError, match="FailureReport"):
+        world.robot_bus.get(key, b"nonsense")
+    assert world.counts[-1] == ("failure", "refused", 0)
 
 
 def test_bad_messages_are_counted_and_change_nothing(world: World, caplog: pytest.LogCaptureFixture) -> None:

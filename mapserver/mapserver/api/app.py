@@ -13,7 +13,9 @@ from starlette.exceptions import HTTPException
 from fleetmap.bus import Bus
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT
 from mapserver.api import describe, problems
+from mapserver.api.action_routes import ActionSettings, install_action_routes
 from mapserver.api.bytes_response import bytes_response
+from mapserver.api.fleet_routes import install_fleet_routes
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
 from mapserver.api.pages import Limit, NameCursor, NumberCursor, RobotCursor, page
 from mapserver.api.parameters import Sha256, Site, SiteFilter, Version
@@ -30,13 +32,17 @@ from mapserver.api.views import (
     VersionView,
 )
 from mapserver.api.writers import Writers
+from mapserver.canary import CanarySettings
 from mapserver.fleet import Fleet
 from mapserver.gate import GateSettings
+from mapserver.resurvey import ResurveySettings
 from mapserver.store import JobInfo, MapStore
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
 ONLY_LOOPBACK = Writers()
 USUAL_GATE = GateSettings()
+USUAL_CANARY = CanarySettings()
+USUAL_RESURVEY = ResurveySettings()
 
 
 def create_app(
@@ -48,10 +54,12 @@ def create_app(
     *,
     writers: Writers = ONLY_LOOPBACK,
     gate: GateSettings = USUAL_GATE,
+    canary: CanarySettings = USUAL_CANARY,
+    resurvey: ResurveySettings = USUAL_RESURVEY,
 ) -> FastAPI:
     """The application over an open store; `bus` is looked at for readiness only, None where none is served.
 
-    writers: who may change something. gate: what publishing over HTTP refuses.
+    writers: who may change something. gate: what publishing over HTTP refuses. canary, resurvey: how the fleet's reports are judged.
     """
     app = FastAPI(
         title="fleetmap",
@@ -68,6 +76,8 @@ def create_app(
     _install_list_routes(app, store, fleet)
     _install_map_routes(app, store)
     install_version_routes(app, store, writers, gate)
+    install_fleet_routes(app, store)
+    install_action_routes(app, store, writers, ActionSettings(gate, canary, resurvey))
     describe.install(app)
     return app
 

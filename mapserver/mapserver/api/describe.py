@@ -9,6 +9,7 @@ from mapserver.api.views import Problem
 
 _PARAMETER_EXAMPLES: dict[str, Any] = {
     "site": "hall", "version": 3, "before": 2, "after": 3, "job": 17, "sha256": "5e" * 32, "limit": 100,
+    "number": 12, "place": 1, "hours": 24, "by": "version",
 }  # fmt: skip
 _VERSION = {
     "site": "hall",

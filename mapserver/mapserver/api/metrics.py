@@ -6,6 +6,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessColl
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from mapserver.api.fleet_metrics import FleetCollector
 from mapserver.fleet import Fleet
 from mapserver.store import MapStore
 
@@ -39,6 +40,7 @@ class Metrics:
             "fleetmap_bus_sent_bytes_total", "Bytes sent in answers.", ["what"], registry=self._registry
         )
         self._registry.register(_SiteCollector(store, fleet))
+        self._registry.register(FleetCollector(store, fleet))
 
     def count_http(self, method: str, route: str, status: int, seconds_s: float) -> None:
         """One HTTP request; `route` is the template, not the path, so that paths cannot make new series."""

@@ -13,10 +13,21 @@ def _take_defaults(context: typer.Context, path: Path | None) -> Path | None:
     from mapserver.config import command_defaults, read_config
 
     sections = command_defaults(read_config(path))
-    is_group = context.parent is None
-    context.default_map = sections if is_group else sections.get(context.info_name or "", {})
+    for name in _words(context):
+        sections = sections.get(name, {})
+    context.default_map = sections
     context.meta[META_KEY] = path
     return path
+
+
+def _words(context: typer.Context) -> list[str]:
+    """The command's words behind the program's name: none for the program itself, two for a command of a group."""
+    words: list[str] = []
+    here = context
+    while here.parent is not None:
+        words.insert(0, here.info_name or "")
+        here = here.parent  # type: ignore[assignment]
+    return words
 
 
 def config_path(context: typer.Context) -> Path | None:

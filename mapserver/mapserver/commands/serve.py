@@ -15,11 +15,9 @@ if TYPE_CHECKING:
 
     from fleetmap.bus import ZenohBus
     from mapserver.api.writers import Writers
-    from mapserver.gate import GateSettings
+    from mapserver.config import MapserverConfig
     from mapserver.store import MapStore
-    from mapserver.tile_service import TileService
 
-_ANNOUNCE_EVERY_S = 1.0
 _STOP_WITHIN_S = 5
 _MIN_TOKEN = 16
 _SWITCH_INTERVAL_S = 0.001
@@ -48,14 +46,14 @@ def serve(
     from mapserver.store import MapStore
 
     writers = Writers(token, is_loopback_name(host))
-    gate = read_config(config_path(context)).gate
+    settings = read_config(config_path(context))
     # The sockets come before the store is read, so that a wrong address is told at once.
     with _listening(host, port) as listener, MapStore.open(store) as maps, ZenohBus.listen(zenoh) as bus:
-        _run(maps, bus, listener, writers, gate)
+        _run(maps, bus, listener, writers, settings)
 
 
 def _run(
-    maps: "MapStore", bus: "ZenohBus", listener: "socket.socket", writers: "Writers", gate: "GateSettings"
+    maps: "MapStore", bus: "ZenohBus", listener: "socket.socket", writers: "Writers", settings: "MapserverConfig"
 ) -> None:
     import logging
     import signal
@@ -66,13 +64,14 @@ def _run(
 
     from mapserver.api.app import create_app
     from mapserver.api.metrics import Metrics
+    from mapserver.chores import run_chores, server_chores
     from mapserver.fleet import Fleet
     from mapserver.tile_service import TileService
 
     # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    fleet = Fleet(maps)
+    fleet = Fleet(maps, settings=settings.ingest)
     metrics = Metrics(maps, fleet)
     service = TileService(maps, fleet, bus, metrics.count_bus)
 
@@ -80,16 +79,19 @@ def _run(
     async def lifespan(_: "FastAPI") -> AsyncIterator[None]:
         import asyncio
 
-        announcing = asyncio.create_task(_announce(service))
+        chores = asyncio.create_task(run_chores(server_chores(maps, fleet, service, settings)))
         host, port = listener.getsockname()[:2]
         typer.echo(f"http: http://{f'[{host}]' if ':' in host else host}:{port}")
         typer.echo(f"zenoh: {bus.endpoint}")
         typer.echo("ready")
         yield
-        announcing.cancel()
-        await asyncio.gather(announcing, return_exceptions=True)
+        chores.cancel()
+        await asyncio.gather(chores, return_exceptions=True)
 
-    app = create_app(maps, fleet, metrics, bus, lifespan, writers=writers, gate=gate)
+    app = create_app(
+        maps, fleet, metrics, bus, lifespan, writers=writers, gate=settings.gate, canary=settings.canary,
+        resurvey=settings.resurvey,
+    )  # fmt: skip
     config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=_STOP_WITHIN_S)
     # uvicorn stops on these signals by itself and afterwards raises them again for the handlers that were there before:
     # the default ones would end the process with a status that says it was killed.
@@ -99,22 +101,7 @@ def _run(
         uvicorn.Server(config).run(sockets=[listener])
     finally:
         service.close()
-
-
-async def _announce(service: "TileService") -> None:
-    """Tells robots what other processes publish, about a second later."""
-    import asyncio
-    import logging
-
-    from fleetmap.errors import FleetmapError
-
-    while True:
-        try:
-            await asyncio.to_thread(service.announce_changes)
-        except FleetmapError as error:
-            # Robots also ask by themselves: a store that is busy for a moment must not stop the server.
-            logging.getLogger(__name__).warning("announcing failed: %s", error)
-        await asyncio.sleep(_ANNOUNCE_EVERY_S)
+        fleet.flush()
 
 
 def _host_and_port(address: str) -> tuple[str, int]:

@@ -2,6 +2,17 @@
 
 from mapserver.store.collection import Garbage, Retention
 from mapserver.store.differences import Difference
+from mapserver.store.fleet_records import FleetBatch, FleetRecords, TallyKey, tile_key
+from mapserver.store.fleet_rows import (
+    AXES,
+    CanaryRow,
+    FailureDetail,
+    FailureFilter,
+    FailureRow,
+    FleetRetention,
+    PictureRow,
+    TraceRow,
+)
 from mapserver.store.map_store import MapStore
 from mapserver.store.rows import (
     NOBODY,
@@ -17,18 +28,30 @@ from mapserver.store.rows import (
 from mapserver.store.verification import Findings
 
 __all__ = [
+    "AXES",
     "NOBODY",
     "Actor",
+    "CanaryRow",
     "Difference",
     "DraftDetails",
     "Event",
+    "FailureDetail",
+    "FailureFilter",
+    "FailureRow",
     "Findings",
+    "FleetBatch",
+    "FleetRecords",
+    "FleetRetention",
     "Garbage",
     "JobInfo",
     "MapStore",
+    "PictureRow",
     "Retention",
     "RobotInfo",
     "SiteInfo",
+    "TallyKey",
+    "TraceRow",
     "VerdictRow",
     "VersionInfo",
+    "tile_key",
 ]

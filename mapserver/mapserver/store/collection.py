@@ -38,7 +38,7 @@ class Garbage:
 def collect(ledger: Ledger, blobs: BlobFolder, retention: Retention, *, dry_run: bool, actor: Actor) -> Garbage:
     """Removes versions first, which must be on the disk before the first file goes. The caller holds the lock alone.
 
-    Never touched: current versions, what a rollback would go to, what a robot runs, the vocabularies of sites.
+    Never touched: current versions, those that some robots try, what a rollback would go to, what a robot runs, the vocabularies of sites.
     """
     garbage = Garbage()
     if dry_run:
@@ -85,8 +85,9 @@ def _protected(ledger: Ledger, site: str, seen_since_ns: int) -> set[int]:
         "SELECT DISTINCT version FROM robots WHERE site = ? AND version IS NOT NULL AND last_seen_ns >= ?",
         (site, seen_since_ns),
     )
+    tried = ledger.query("SELECT version FROM canaries WHERE site = ? AND state = 'running'", (site,))
     before = ledger.query(ROLLBACK_TARGET.replace(":site", "?1"), (site,))
-    return {row["version"] for row in (*current, *robots, *before)}
+    return {row["version"] for row in (*current, *robots, *tried, *before)}
 
 
 def _write_down(ledger: Ledger, connection: sqlite3.Connection, garbage: Garbage, actor: Actor) -> None:

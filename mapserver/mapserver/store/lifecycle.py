@@ -10,6 +10,8 @@ import sqlite3
 from fleetmap.errors import GateRefusedError, StateError
 from fleetmap.mapformat import Manifest
 from mapserver.gate import Verdict
+from mapserver.store.canaries import check_running, close_canary
+from mapserver.store.fleet_rows import CanaryRow
 from mapserver.store.ledger import Ledger
 from mapserver.store.rows import Actor, VersionInfo
 
@@ -54,6 +56,19 @@ def refusal(draft: VersionInfo, verdict: Verdict) -> GateRefusedError:
     return GateRefusedError(f"draft {draft.version} of {draft.site} is refused: {reasons}; {way_out}")
 
 
+def admit(ledger: Ledger, draft: VersionInfo, actor: Actor) -> None:
+    """Makes a draft a published version that is not current, for robots that try it first."""
+    with ledger.write() as connection:
+        done = connection.execute(
+            "UPDATE versions SET state = 'published', published_ns = ? WHERE site = ? AND version = ? AND state = 'draft'",
+            (ledger.now_ns(), draft.site, draft.version),
+        ).rowcount
+        if done != 1:
+            raise StateError(f"version {draft.version} of site {draft.site} is no draft any more; look at `versions`")
+        detail = f"version {draft.version}, not current yet"
+        ledger.log(connection, draft.site, "admitted", detail, version=draft.version, actor=actor)
+
+
 def publish(ledger: Ledger, draft: VersionInfo, judged_against: int | None, actor: Actor) -> None:
     """Makes a draft current that was compared with version `judged_against`; StateError where someone was faster."""
     with ledger.write() as connection:
@@ -75,12 +90,16 @@ def publish(ledger: Ledger, draft: VersionInfo, judged_against: int | None, acto
             (draft.vocabulary_sha256, draft.site),
         )
         _enter_current(ledger, connection, draft.site, draft.version)
+        close_canary(ledger, connection, draft.site, draft.version, actor)
         detail = f"version {draft.version}, " + ("the first" if left is None else f"replacing {left}")
         ledger.log(connection, draft.site, "published", detail, version=draft.version, actor=actor)
 
 
-def promote(ledger: Ledger, wanted: VersionInfo, actor: Actor) -> None:
-    """Makes a published or retired version current; raises StateError for a draft, nothing happens to the current."""
+def promote(ledger: Ledger, wanted: VersionInfo, actor: Actor, canary: CanaryRow | None = None) -> None:
+    """Makes a published or retired version current; raises StateError for a draft, nothing happens to the current.
+
+    canary: only while this one runs; StateError where it does not.
+    """
     if wanted.state == "current":
         return
     if wanted.state == "draft":
@@ -89,9 +108,12 @@ def promote(ledger: Ledger, wanted: VersionInfo, actor: Actor) -> None:
             f"{wanted.version}` takes it through the gate"
         )
     with ledger.write() as connection:
+        if canary is not None:
+            check_running(connection, canary)
         left = _leave_current(connection, wanted.site, "published")
         _make_current(connection, wanted.site, wanted.version)
         _enter_current(ledger, connection, wanted.site, wanted.version)
+        close_canary(ledger, connection, wanted.site, wanted.version, actor)
         detail = f"version {wanted.version}, replacing {left}"
         ledger.log(connection, wanted.site, "promoted", detail, version=wanted.version, actor=actor)
 

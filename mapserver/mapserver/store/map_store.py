@@ -30,12 +30,15 @@ from fleetmap.mapformat import (
     encode_manifest,
     encode_tile,
 )
+from mapserver.canary import threshold_for
 from mapserver.gate import GateSettings, judge
 from mapserver.quality.figures import Evidence
 from mapserver.store import lifecycle
+from mapserver.store.canaries import start_canary, take_back_canary
 from mapserver.store.collection import Garbage, Retention, collect
 from mapserver.store.differences import Difference, difference
 from mapserver.store.files import locked, make_folder, read_file, sync_folder, write_atomically
+from mapserver.store.fleet_rows import CanaryRow
 from mapserver.store.records import StoreRecords
 from mapserver.store.rows import NOBODY, Actor, DraftDetails, VersionInfo
 from mapserver.store.transfer import ExportReader, open_export, write_export
@@ -43,6 +46,7 @@ from mapserver.store.verification import Findings, verify
 
 _USUAL_GATE = GateSettings()
 _USUAL_RETENTION = Retention()
+_RECENT_NS = 2 * 86_400_000_000_000  # robots silent for longer do not count as somebody to try a version
 
 
 class MapStore(StoreRecords):
@@ -141,6 +145,14 @@ class MapStore(StoreRecords):
         it), StoreError or MapFormatError for one whose bytes are not all there.
         """
         draft = self._draft(site, version)
+        judged_against = self._pass_gate(draft, actor=actor, force=force, gate=gate)
+        lifecycle.publish(self._ledger, draft, judged_against, actor)
+        self._write_current_file(site)
+        return draft.version
+
+    def _pass_gate(self, draft: VersionInfo, *, actor: Actor, force: bool, gate: GateSettings) -> int | None:
+        """The version that the draft was compared with; errors as of `publish`."""
+        site = draft.site
         if force and not (actor.name and actor.reason):
             raise UsageError("publishing by force needs who and why; name --reason")
         self._check_bytes(draft)
@@ -156,9 +168,7 @@ class MapStore(StoreRecords):
         lifecycle.record_verdict(self._ledger, draft, verdict, forced=forced, actor=actor)
         if not verdict.accepted and not forced:
             raise lifecycle.refusal(draft, verdict)
-        lifecycle.publish(self._ledger, draft, None if current is None else current.version, actor)
-        self._write_current_file(site)
-        return draft.version
+        return None if current is None else current.version
 
     def promote(self, site: str, version: int, *, actor: Actor = NOBODY) -> None:
         """Makes a version that was published before the current one.
@@ -171,12 +181,58 @@ class MapStore(StoreRecords):
         lifecycle.promote(self._ledger, wanted, actor)
         self._write_current_file(site)
 
+    def start_canary(
+        self, site: str, version: int, share: float, *, actor: Actor = NOBODY, gate: GateSettings = _USUAL_GATE
+    ) -> CanaryRow:
+        """Lets a share of the site's robots run a version before the others; a draft goes through the gate first.
+
+        Raises UsageError for an unknown version or a share outside of 0 to 1, StateError where the site has no current version,
+        this is it, or a canary runs already, and what `publish` raises for drafts.
+        """
+        wanted, current = self.version(site, version), self._current_row(site)
+        if not 0 < share < 1:
+            raise UsageError(f"a canary of {share:g} of the robots: name a share between 0 and 1, such as 5%")
+        if current is None or current.version == version:
+            held = "has no current version" if current is None else f"has version {version} as its current one"
+            raise StateError(f"site {site} {held}; a canary is compared with another, current version")
+        if running := self.canaries(site, running=True):
+            raise StateError(f"site {site} tries version {running[0].version} already; `rollback` takes it back")
+        if wanted.state == "draft":
+            self._pass_gate(wanted, actor=actor, force=False, gate=gate)
+            lifecycle.admit(self._ledger, wanted, actor)
+        else:
+            self._check_bytes(wanted)
+        recent_ns = self._clock_ns() - _RECENT_NS
+        robots = [robot.robot for robot in self.robots(site) if robot.last_seen_ns >= recent_ns]
+        threshold = threshold_for(share, site, version, robots)
+        start_canary(self._ledger, self.version(site, version), current.version, share, threshold, actor)
+        return self.canaries(site, running=True)[0]
+
+    def end_canary(self, canary: CanaryRow, *, promote: bool, outcome: str, actor: Actor = NOBODY) -> None:
+        """Makes the canary's version current, or takes it back from the robots that try it, and retires it.
+
+        Raises StateError where it does not run any more, and what `promote` raises.
+        """
+        if promote:
+            wanted = self.version(canary.site, canary.version)
+            self._check_bytes(wanted)
+            lifecycle.promote(self._ledger, wanted, Actor(actor.name, outcome), canary)
+            self._write_current_file(canary.site)
+        else:
+            take_back_canary(self._ledger, canary, outcome, actor)
+
     def rollback(self, site: str, *, actor: Actor = NOBODY) -> int:
         """Makes the version current that was so before and returns its number; the one that is retires.
+
+        While some robots try another version, that is taken back instead, and the current one stays.
 
         Raises StateError where none was current before, StoreError or MapFormatError if its bytes are not all there.
         """
         self._check_site(site)
+        if running := self.canaries(site, running=True):
+            outcome = f"taken back by hand: {actor.reason or 'no reason given'}"
+            self.end_canary(running[0], promote=False, outcome=outcome, actor=actor)
+            return running[0].base_version
         target = self._ledger.query(lifecycle.ROLLBACK_TARGET.replace(":site", "?1"), (site,))
         for row in target:
             self._check_bytes(self.version(site, row["version"]))

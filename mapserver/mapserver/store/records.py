@@ -12,6 +12,9 @@ from fleetmap.errors import UsageError
 from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest
 from mapserver.quality.figures import Evidence
 from mapserver.store.blobs import BlobFolder
+from mapserver.store.canaries import canaries
+from mapserver.store.fleet_records import FleetRecords
+from mapserver.store.fleet_rows import CanaryRow
 from mapserver.store.ledger import Ledger
 from mapserver.store.rows import NOBODY, Actor, Event, JobInfo, RobotInfo, SiteInfo, VerdictRow, VersionInfo
 
@@ -27,6 +30,7 @@ class StoreRecords:
         self._clock_ns = clock_ns
         self._blobs = BlobFolder(root)
         self._ledger = Ledger(root / "store.sqlite3", clock_ns)
+        self.fleet = FleetRecords(self._ledger)
 
     def sites(self) -> list[SiteInfo]:
         """All sites by name."""
@@ -126,6 +130,10 @@ class StoreRecords:
             "SELECT * FROM events WHERE site = ? AND id > ? ORDER BY id LIMIT ?", (site, after, limit)
         )
         return [Event(**row) for row in rows]
+
+    def canaries(self, site: str | None = None, *, running: bool = False) -> list[CanaryRow]:
+        """Versions that some robots (of a site) tried first, the last one first; those that run alone with `running`."""
+        return canaries(self._ledger, site, running=running)
 
     def robots(self, site: str | None = None) -> list[RobotInfo]:
         """What every robot (of a site) said last."""

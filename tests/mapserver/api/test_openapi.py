@@ -11,6 +11,7 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
+from fleetmap.messages import FailureReport, Placement, Thumbnail
 from map_samples import save_sample_draft
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
@@ -18,6 +19,13 @@ from mapserver.fleet import Fleet
 from mapserver.store import MapStore
 
 CHECKS = (not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance)
+
+FAILURE = FailureReport(
+    site="hall", robot="r1", id="f1", stamp_ns=5, wall_ns=6, duration_s=2.5, kind="blind", status="LOST", cause="dark",
+    version=1, tile=(0, 0), innovation=float("nan"), radius_95_m=float("inf"),
+    map_from_base=Placement(position_m=(float("nan"), 1.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0)),
+    thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"jpeg"),),
+)  # fmt: skip
 
 
 def ask_operation(operation: schemathesis.APIOperation) -> list[int]:
@@ -31,7 +39,8 @@ def ask_operation(operation: schemathesis.APIOperation) -> list[int]:
         if number % 2 and "site" in path:
             path["site"] = "hall"
             path |= {name: 1 + number % 3 for name in ("version", "before", "after") if name in path}
-        path |= {"job": 1} if number % 2 and "job" in path else {}
+        path |= {name: 1 for name in ("job", "number") if number % 2 and name in path}
+        path |= {"place": 0} if number % 2 and "place" in path else {}
         response = case.call(base_url="http://127.0.0.1")
         case.validate_response(response, checks=list(CHECKS))
         statuses.append(response.status_code)
@@ -48,6 +57,9 @@ def test_no_question_breaks_the_server(tmp_path: Path) -> None:
         save_sample_draft(store, site="hall", seed=2)
         store.update_job(store.begin_job("hall", "nightly"), "done", "version 2 is published", {})
         fleet = Fleet(store)
+        assert not fleet.take_failure("hall", "r1", FAILURE).refused
+        store.start_canary("hall", 1, 0.05)
+        store.rollback("hall")
         app = create_app(store, fleet, Metrics(store, fleet), None)
         schema = schemathesis.openapi.from_asgi("/openapi.json", app)
         asked = {operation.ok().label: ask_operation(operation.ok()) for operation in schema.get_all_operations()}

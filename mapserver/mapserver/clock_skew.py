@@ -1,0 +1,37 @@
+"""How far a robot's wall clock is ahead of the server's, from the stamps of its messages. Pure."""
+
+_WINDOW_NS = 60_000_000_000
+
+
+class ClockSkew:
+    """The largest of (robot's stamp - server's clock) over the last one to two minutes: the message that travelled fastest.
+
+    What remains is that message's way, some milliseconds on a local network.
+    """
+
+    def __init__(self, ahead_s: float | None = None) -> None:
+        """ahead_s: what was known before, until the first message."""
+        self._known_s = ahead_s if isinstance(ahead_s, int | float) else None
+        self._begun_ns: int | None = None
+        self._best_ns: list[int | None] = [None, None]
+
+    def take(self, robot_ns: int, server_ns: int) -> None:
+        """One message's stamp and when it came."""
+        ahead_ns = robot_ns - server_ns
+        if self._begun_ns is None or server_ns - self._begun_ns >= _WINDOW_NS:
+            self._begun_ns = server_ns
+            self._best_ns = [None, self._best_ns[0]]
+        newest = self._best_ns[0]
+        self._best_ns[0] = ahead_ns if newest is None else max(newest, ahead_ns)
+
+    @property
+    def ahead_s(self) -> float | None:
+        """Seconds that the robot's clock is ahead; negative where it is late, None where nothing is known."""
+        known = [best for best in self._best_ns if best is not None]
+        return max(known) / 1e9 if known else self._known_s
+
+
+def server_time_ns(robot_ns: int, ahead_s: float | None, now_ns: int, oldest_ns: int) -> int:
+    """When something happened by the server's clock: at most now; now where the robot's clock cannot be right."""
+    happened_ns = robot_ns - round((ahead_s or 0.0) * 1e9)
+    return min(now_ns, happened_ns) if happened_ns >= oldest_ns else now_ns

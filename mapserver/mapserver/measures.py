@@ -1,0 +1,186 @@
+"""What a fleet's reports say: sums that can be added up (Tally), and the rates, shares and intervals made of them. Pure.
+
+A robot-day is 16 h of driving. Intervals hold the true rate with 95 %: exact for a Poisson count (Garwood 1936); where nothing
+was seen, one-sided, which is the rule of three. Shares of counts have the exact interval of Clopper and Pearson (1934).
+"""
+
+from dataclasses import astuple, dataclass, fields
+from typing import Self
+
+from scipy.special import betaincinv, gammaincinv
+
+ROBOT_DAY_S = 16 * 3600.0
+HOUR_NS = 3_600_000_000_000
+_TAIL = 0.05
+
+
+@dataclass(slots=True)
+class Tally:
+    """Sums over some reports; two of them add up. Times in milliseconds, so that sums are exact.
+
+    observed, driving: time that reports cover, and of it with the wheels turning; after_fix: since the run's first fix, localised: of
+    it TRACKING; usable: with a position that may be relied upon. failures: reported ones; suspected: those that are estimates of
+    silent ones; blind_seen: stretches of blindness that the server saw in the statuses itself. exceeded: innovations beyond
+    their 99.9 % bound. docks_wrong: arrivals where the estimate was more than 0.30 m off.
+    """
+
+    reports: int = 0
+    observed_ms: int = 0
+    driving_ms: int = 0
+    after_fix_ms: int = 0
+    localised_ms: int = 0
+    usable_ms: int = 0
+    first_fixes: int = 0
+    first_fix_ms: int = 0
+    innovations: int = 0
+    innovation_sum: float = 0.0
+    innovation_m_sum: float = 0.0
+    exceeded: int = 0
+    docks: int = 0
+    docks_wrong: int = 0
+    cpu_reports: int = 0
+    cpu_ms_sum: float = 0.0
+    frames: int = 0
+    frames_dropped: int = 0
+    landmarks_expected: int = 0
+    landmarks_seen: int = 0
+    failures: int = 0
+    suspected: int = 0
+    blind_failures: int = 0
+    blind_seen: int = 0
+
+    def add(self, other: Self) -> None:
+        """Adds what another one holds."""
+        for name in TALLY_COLUMNS:
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+
+    def values(self) -> tuple[float, ...]:
+        """All sums in the order of TALLY_COLUMNS."""
+        return astuple(self)
+
+    @property
+    def robot_days(self) -> float:
+        """Days of 16 h driving."""
+        return self.driving_ms / 1e3 / ROBOT_DAY_S
+
+    @property
+    def silent_estimated(self) -> int:
+        """Silent failures as far as they can be guessed: what robots suspect, and docks that were somewhere else."""
+        return self.suspected + self.docks_wrong
+
+    @property
+    def unreported_blindness(self) -> int:
+        """Stretches of blindness in the statuses for which no failure was reported (yet)."""
+        return max(0, self.blind_seen - self.blind_failures)
+
+    @property
+    def events(self) -> int:
+        """Everything that speaks against a map: failures, blindness not reported, silent ones as estimated."""
+        return self.failures + self.unreported_blindness + self.silent_estimated
+
+
+TALLY_COLUMNS = tuple(field.name for field in fields(Tally))
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """Events per robot-day with the interval that holds the true rate with 95 %; None where nothing was driven."""
+
+    events: int
+    robot_days: float
+    per_robot_day: float | None
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """`hits` of `tries`, with the interval that holds the true share with 95 %; None without tries."""
+
+    hits: int
+    tries: int
+    share: float | None
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Measures:
+    """The figures of one tally; None where nothing speaks for a figure.
+
+    silent_estimated is an estimate, not a count: robots do not know the truth. unreported_blindness: stretches of blindness in the
+    statuses for which no failure was reported (yet).
+    """
+
+    observed_h: float
+    driving_h: float
+    failures: Rate
+    silent_estimated: Rate
+    docks_wrong: Share
+    unreported_blindness: int
+    availability: float | None
+    localised_share: float | None
+    first_fix_mean_s: float | None
+    fix_innovation_mean: float | None
+    fix_innovation_mean_m: float | None
+    fix_innovation_exceeded: Share
+    frame_ms_mean: float | None
+    frame_drop_share: float | None
+    landmarks_seen_share: float | None
+
+
+def measures(tally: Tally) -> Measures:
+    """The figures of a tally."""
+    arrived = tally.frames + tally.frames_dropped
+    return Measures(
+        observed_h=tally.observed_ms / 3.6e6,
+        driving_h=tally.driving_ms / 3.6e6,
+        failures=rate(tally.failures, tally.robot_days),
+        silent_estimated=rate(tally.silent_estimated, tally.robot_days),
+        docks_wrong=share(tally.docks_wrong, tally.docks),
+        unreported_blindness=tally.unreported_blindness,
+        availability=_over(tally.usable_ms, tally.observed_ms),
+        localised_share=_over(tally.localised_ms, tally.after_fix_ms),
+        first_fix_mean_s=_over(tally.first_fix_ms / 1e3, tally.first_fixes),
+        fix_innovation_mean=_over(tally.innovation_sum, tally.innovations),
+        fix_innovation_mean_m=_over(tally.innovation_m_sum, tally.innovations),
+        fix_innovation_exceeded=share(tally.exceeded, tally.innovations),
+        frame_ms_mean=_over(tally.cpu_ms_sum, tally.cpu_reports),
+        frame_drop_share=_over(tally.frames_dropped, arrived),
+        landmarks_seen_share=_over(tally.landmarks_seen, tally.landmarks_expected),
+    )
+
+
+def rate(events: int, robot_days: float) -> Rate:
+    """Events per robot-day with its interval."""
+    if robot_days <= 0:
+        return Rate(events, 0.0, None, None, None)
+    low, high = poisson_interval(events)
+    return Rate(events, robot_days, events / robot_days, low / robot_days, high / robot_days)
+
+
+def poisson_interval(events: int) -> tuple[float, float]:
+    """The means of a Poisson count that `events` does not refute with 95 %; one-sided (0 to 3.0) where none was seen."""
+    if events == 0:
+        return 0.0, float(gammaincinv(1, 1 - _TAIL))
+    return float(gammaincinv(events, _TAIL / 2)), float(gammaincinv(events + 1, 1 - _TAIL / 2))
+
+
+def share(hits: int, tries: int) -> Share:
+    """A share with its interval; one-sided where no try or every try hit."""
+    if tries <= 0:
+        return Share(hits, tries, None, None, None)
+    one_sided = hits in {0, tries}
+    tail = _TAIL if one_sided else _TAIL / 2
+    low = 0.0 if hits == 0 else float(betaincinv(hits, tries - hits + 1, tail))
+    high = 1.0 if hits == tries else float(betaincinv(hits + 1, tries - hits, 1 - tail))
+    return Share(hits, tries, hits / tries, low, high)
+
+
+def hour_of(stamp_ns: int) -> int:
+    """Hours since 1970, the unit in which sums are kept."""
+    return stamp_ns // HOUR_NS
+
+
+def _over(part: float, whole: float) -> float | None:
+    return part / whole if whole > 0 else None

@@ -1,0 +1,146 @@
+"""What one robot's stream of messages adds to the fleet's sums. Pure: time comes with the messages."""
+
+import math
+
+from fleetmap.messages import PoseMessage, RobotHealth
+from mapserver.measures import Tally
+
+MAX_GAP_S = 5.0  # a robot that is silent for longer was not observed meanwhile
+DRIVING_MPS = 0.05
+BLIND_S, GOOD_S, RADIUS_LIMIT_M = 2.0, 5.0, 0.30  # as docs/reports.md defines failures
+WRONG_DOCK_M = 0.30
+CHI2_6_0999 = 22.458  # 99.9 % of a squared Mahalanobis distance of 6 degrees of freedom
+_MAX_COUNT = 1 << 40
+_MAX_FIGURE = 1e15
+
+
+class RobotWatch:
+    """Follows one robot: runs, driving, first fixes, blindness. Reports must come in the order of their stamps."""
+
+    def __init__(self) -> None:
+        self.duplicates = 0
+        self._stamp_ns: int | None = None
+        self._wall_ns: int | None = None
+        self._figures: dict[str, float] = {}
+        self._has_fix = False
+        self._fix_counted = False
+        self._blind_since_ns: int | None = None
+        self._good_since_ns: int | None = None
+        self._in_failure = False
+        self._place: tuple[int, float, float] | None = None
+        self._pose_mps: float | None = None
+
+    def take_pose(self, message: PoseMessage) -> None:
+        """Speed between estimates, for robots that do not report it themselves."""
+        x_m, y_m, _ = message.position_map_m
+        if self._place is not None:
+            dt_s = (message.stamp_ns - self._place[0]) * 1e-9
+            moved_m = math.hypot(x_m - self._place[1], y_m - self._place[2])
+            self._pose_mps = moved_m / dt_s if 0 < dt_s <= MAX_GAP_S and math.isfinite(moved_m) else None
+        self._place = (message.stamp_ns, x_m, y_m)
+
+    def take_health(self, health: RobotHealth) -> Tally | None:
+        """What this report adds; None for one that was taken before."""
+        if self._is_known(health):
+            self.duplicates += 1
+            return None
+        figures = _figures(health)
+        if self._is_new_run(health, figures):
+            self._begin_run()
+        dt_ms = self._elapsed_ms(health.stamp_ns)
+        tally = Tally(reports=1, observed_ms=dt_ms)
+        speed_mps = figures.get("speed_mps", self._pose_mps)
+        tally.driving_ms = dt_ms if speed_mps is not None and abs(speed_mps) >= DRIVING_MPS else 0
+        self._count_status(tally, health, figures, dt_ms)
+        self._count_fixes(tally, figures)
+        self._count_work(tally, figures)
+        self._stamp_ns, self._wall_ns, self._figures = health.stamp_ns, health.wall_ns, figures
+        return tally
+
+    def _is_known(self, health: RobotHealth) -> bool:
+        """A recording that is played again has old stamps, but is sent later."""
+        if self._stamp_ns is None or health.stamp_ns > self._stamp_ns:
+            return False
+        if health.wall_ns is None or self._wall_ns is None:
+            return health.stamp_ns == self._stamp_ns
+        return health.wall_ns <= self._wall_ns
+
+    def _is_new_run(self, health: RobotHealth, figures: dict[str, float]) -> bool:
+        if self._stamp_ns is None:
+            return True
+        went_back = figures.get("frames", math.inf) < self._figures.get("frames", -math.inf)
+        return went_back or health.stamp_ns < self._stamp_ns
+
+    def _begin_run(self) -> None:
+        self._stamp_ns, self._figures = None, {}
+        self._has_fix = self._fix_counted = self._in_failure = False
+        self._blind_since_ns = self._good_since_ns = None
+
+    def _elapsed_ms(self, stamp_ns: int) -> int:
+        if self._stamp_ns is None:
+            return 0
+        dt_ms = (stamp_ns - self._stamp_ns) // 1_000_000
+        return dt_ms if 0 < dt_ms <= MAX_GAP_S * 1e3 else 0
+
+    def _count_status(self, tally: Tally, health: RobotHealth, figures: dict[str, float], dt_ms: int) -> None:
+        is_tracking = health.status == "TRACKING"
+        is_close = figures.get("radius_95_m", math.inf) <= RADIUS_LIMIT_M
+        is_blind = health.status in {"LOST", "AMBIGUOUS"} or (health.status == "DEGRADED" and not is_close)
+        self._has_fix = self._has_fix or is_tracking or "first_fix_s" in figures
+        tally.usable_ms = dt_ms if is_tracking or (health.status == "DEGRADED" and is_close) else 0
+        if self._has_fix:
+            tally.after_fix_ms = dt_ms
+            tally.localised_ms = dt_ms if is_tracking else 0
+            tally.blind_seen = self._blindness(health.stamp_ns, is_blind, is_tracking)
+
+    def _blindness(self, stamp_ns: int, is_blind: bool, is_tracking: bool) -> int:
+        """1 where a stretch of blindness became a failure with this report.
+
+        A stretch lasts until the next report that is better, and a failure until 5 s of good tracking.
+        """
+        if self._stamp_ns is None or stamp_ns - self._stamp_ns > MAX_GAP_S * 1e9:
+            self._blind_since_ns = self._good_since_ns = None  # nobody knows what was in between
+        began = self._blind_since_ns is not None and stamp_ns - self._blind_since_ns > BLIND_S * 1e9
+        if not is_blind:
+            self._blind_since_ns = None
+        elif self._blind_since_ns is None:
+            self._blind_since_ns = stamp_ns
+        if not is_tracking:
+            self._good_since_ns = None
+        elif self._good_since_ns is None:
+            self._good_since_ns = stamp_ns
+        is_new = began and not self._in_failure
+        self._in_failure = self._in_failure or began
+        if self._good_since_ns is not None and stamp_ns - self._good_since_ns >= GOOD_S * 1e9:
+            self._in_failure = False
+        return int(is_new)
+
+    def _count_fixes(self, tally: Tally, figures: dict[str, float]) -> None:
+        if "first_fix_s" in figures and not self._fix_counted:
+            self._fix_counted = True
+            tally.first_fixes, tally.first_fix_ms = 1, round(min(abs(figures["first_fix_s"]), 1e6) * 1e3)
+        innovation = figures.get("fix_innovation")
+        if innovation is not None:
+            tally.innovations, tally.innovation_sum = 1, innovation
+            tally.innovation_m_sum = figures.get("fix_innovation_m", 0.0)
+            tally.exceeded = int(innovation > CHI2_6_0999)
+        dock_m = figures.get("dock_error_m")
+        if dock_m is not None:
+            tally.docks, tally.docks_wrong = 1, int(dock_m > WRONG_DOCK_M)
+
+    def _count_work(self, tally: Tally, figures: dict[str, float]) -> None:
+        if "frame_ms_mean" in figures:
+            tally.cpu_reports, tally.cpu_ms_sum = 1, figures["frame_ms_mean"]
+        for name in ("frames", "frames_dropped", "landmarks_expected", "landmarks_seen"):
+            if name in figures:
+                grown = figures[name] - self._figures.get(name, 0.0 if self._figures else figures[name])
+                setattr(tally, name, int(min(max(0.0, grown), _MAX_COUNT)))
+
+
+def _figures(health: RobotHealth) -> dict[str, float]:
+    """The metrics that are numbers; what is absurd or none was not told."""
+    return {
+        name: float(value)
+        for name, value in health.metrics.items()
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MAX_FIGURE
+    }

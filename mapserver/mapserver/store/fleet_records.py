@@ -1,0 +1,253 @@
+"""The fleet's health in the store: sums by the hour, thinned traces, failures with their pictures."""
+
+import sqlite3
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+
+from fleetmap.errors import UsageError
+from fleetmap.messages import FailureReport
+from mapserver.measures import TALLY_COLUMNS, Tally, hour_of
+from mapserver.store.fleet_rows import (
+    AXES,
+    FailureDetail,
+    FailureFilter,
+    FailureRow,
+    FleetRetention,
+    PictureRow,
+    TraceRow,
+)
+from mapserver.store.ledger import Ledger
+
+TallyKey = tuple[str, str, str, int]
+"""Site, axis, key, hour."""
+
+_DAY_NS = 86_400_000_000_000
+_SUMS = ", ".join(f"sum(t.{name}) {name}" for name in TALLY_COLUMNS)
+_ADD = f"""INSERT INTO tallies (key_id, hour, {", ".join(TALLY_COLUMNS)})
+    VALUES (?, ?, {", ".join("?" * len(TALLY_COLUMNS))})
+    ON CONFLICT DO UPDATE SET {", ".join(f"{name} = {name} + excluded.{name}" for name in TALLY_COLUMNS)}"""
+_FAILURE_COLUMNS = ", ".join(FailureRow.__dataclass_fields__)
+
+
+@dataclass(slots=True)
+class FleetBatch:
+    """What came since the last batch. last_reports: (site, robot) to what it runs and its last report."""
+
+    tallies: dict[TallyKey, Tally] = field(default_factory=dict)
+    traces: list[TraceRow] = field(default_factory=list)
+    last_reports: dict[tuple[str, str], tuple[int | None, int, dict[str, Any]]] = field(default_factory=dict)
+
+    def add(self, site: str, axis: str, key: str, hour: int, tally: Tally) -> None:
+        """Adds to one sum."""
+        self.tallies.setdefault((site, axis, key, hour), Tally()).add(tally)
+
+
+class FleetRecords:
+    """The part of an open store that knows how the fleet does."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        self._ledger = ledger
+        self._key_ids: dict[tuple[str, str, str], int] = {}
+
+    def add(self, batch: FleetBatch) -> None:
+        """Keeps a batch in one transaction. A power cut may lose the last ones, never failures."""
+        with self._ledger.write(durable=False) as connection:
+            keys = [key[:3] for key in batch.tallies] + [(row.site, "robot", row.robot) for row in batch.traces]
+            ids = self._ids(connection, keys)
+            _add_tallies(connection, ids, batch.tallies)
+            connection.executemany(
+                "INSERT OR IGNORE INTO traces VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                [
+                    (
+                        t.hour, ids[t.site, "robot", t.robot], t.stamp_ns, t.status, t.version, t.x_map_m, t.y_map_m,
+                        t.radius_95_m,
+                    )
+                    for t in batch.traces
+                ],
+            )  # fmt: skip
+            connection.executemany(
+                """INSERT INTO robots (site, robot, version, last_seen_ns, last_report) VALUES (?, ?, ?, ?, ?)
+                   ON CONFLICT DO UPDATE SET version = coalesce(excluded.version, version),
+                   last_seen_ns = excluded.last_seen_ns, last_report = excluded.last_report""",
+                [
+                    (site, robot, version, seen_ns, msgspec.json.encode(report).decode())
+                    for (site, robot), (version, seen_ns, report) in batch.last_reports.items()
+                ],
+            )
+        self._key_ids |= ids  # only what was committed
+
+    def add_failure(
+        self, report: FailureReport, *, received_ns: int, happened_ns: int, tallies: Mapping[TallyKey, Tally]
+    ) -> bool:
+        """Keeps a failure and its sums, durably; False (and nothing done) for one that is known already."""
+        place = None if report.map_from_base is None else report.map_from_base.position_m
+        bare = msgspec.msgpack.encode(msgspec.structs.replace(report, thumbnails=()))
+        with self._ledger.write() as connection:
+            done = connection.execute(
+                """INSERT OR IGNORE INTO failures (site, robot, failure_id, received_ns, happened_ns, duration_s, kind,
+                   cause, status, version, tile, x_map_m, y_map_m, report)
+                   VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)""",
+                (
+                    report.site, report.robot, report.id, received_ns, happened_ns, report.duration_s, report.kind,
+                    report.cause, report.status, report.version, tile_key(report.tile),
+                    None if place is None else place[0], None if place is None else place[1], bare,
+                ),
+            )  # fmt: skip
+            if done.rowcount != 1:
+                return False
+            connection.executemany(
+                "INSERT INTO failure_pictures VALUES (?, ?, ?, ?, ?)",
+                [(done.lastrowid, n, t.kind, t.stamp_ns, t.jpeg) for n, t in enumerate(report.thumbnails)],
+            )
+            _add_tallies(connection, self._ids(connection, [key[:3] for key in tallies]), tallies)
+        return True
+
+    def tallies(
+        self, site: str | None, axis: str, *, since_hour: int = 0, until_hour: int = 1 << 60, key: str | None = None
+    ) -> dict[tuple[str, str], Tally]:
+        """Sums by (site, key) of an axis over hours from `since_hour` to before `until_hour`."""
+        rows = self._ledger.query(
+            f"""SELECT k.site, k.key, {_SUMS} FROM tally_keys k JOIN tallies t ON t.key_id = k.id
+                WHERE k.axis = ?1 AND (?2 IS NULL OR k.site = ?2) AND (?3 IS NULL OR k.key = ?3)
+                AND t.hour >= ?4 AND t.hour < ?5 GROUP BY k.id ORDER BY k.site, k.key""",
+            (_axis(axis), site, key, since_hour, until_hour),
+        )
+        return {(row.pop("site"), row.pop("key")): Tally(**row) for row in rows}
+
+    def hours(
+        self, site: str | None, axis: str, *, key: str | None = None, since_hour: int = 0, until_hour: int = 1 << 60
+    ) -> dict[int, Tally]:
+        """Sums of an axis (and key) by the hour."""
+        rows = self._ledger.query(
+            f"""SELECT t.hour, {_SUMS} FROM tally_keys k JOIN tallies t ON t.key_id = k.id
+                WHERE k.axis = ?1 AND (?2 IS NULL OR k.site = ?2) AND (?3 IS NULL OR k.key = ?3)
+                AND t.hour >= ?4 AND t.hour < ?5 GROUP BY t.hour ORDER BY t.hour""",
+            (_axis(axis), site, key, since_hour, until_hour),
+        )
+        return {row.pop("hour"): Tally(**row) for row in rows}
+
+    def failures(self, wanted: FailureFilter, *, before: int | None = None, limit: int = -1) -> list[FailureRow]:
+        """Failures, the last to arrive first, of numbers below `before`."""
+        values = (
+            wanted.site, wanted.robot, wanted.version, wanted.tile, wanted.cause, wanted.kind, wanted.since_ns,
+            wanted.until_ns, before, limit,
+        )  # fmt: skip
+        rows = self._ledger.query(
+            f"""SELECT {_FAILURE_COLUMNS} FROM failures
+                WHERE (?1 IS NULL OR site = ?1) AND (?2 IS NULL OR robot = ?2) AND (?3 IS NULL OR version = ?3)
+                AND (?4 IS NULL OR tile = ?4) AND (?5 IS NULL OR cause = ?5) AND (?6 IS NULL OR kind = ?6)
+                AND (?7 IS NULL OR happened_ns >= ?7) AND (?8 IS NULL OR happened_ns < ?8)
+                AND (?9 IS NULL OR number < ?9) ORDER BY number DESC LIMIT ?10""",
+            values,
+        )
+        return [FailureRow(**row) for row in rows]
+
+    def failure(self, number: int) -> FailureDetail:
+        """One failure with its context; raises UsageError where it does not exist."""
+        rows = self._ledger.query(f"SELECT {_FAILURE_COLUMNS}, report FROM failures WHERE number = ?", (number,))
+        if not rows:
+            raise UsageError(f"there is no failure {number}; the list of failures shows those that are kept")
+        report = msgspec.msgpack.decode(rows[0].pop("report"), type=FailureReport)
+        pictures = self._ledger.query(
+            """SELECT place, kind, stamp_ns, length(jpeg) bytes FROM failure_pictures
+               WHERE number = ? ORDER BY place""",
+            (number,),
+        )
+        return FailureDetail(FailureRow(**rows[0]), report, [PictureRow(**row) for row in pictures])
+
+    def picture(self, number: int, place: int) -> bytes:
+        """The JPEG of a failure; raises UsageError where there is none, or none any more."""
+        rows = self._ledger.query("SELECT jpeg FROM failure_pictures WHERE number = ? AND place = ?", (number, place))
+        if not rows:
+            raise UsageError(f"failure {number} has no picture {place}; old ones go when pictures need too much space")
+        return bytes(rows[0]["jpeg"])
+
+    def trace(self, site: str, robot: str, *, since_hour: int = 0) -> list[TraceRow]:
+        """Where a robot was, oldest first."""
+        rows = self._ledger.query(
+            """SELECT k.site, k.key robot, t.hour, t.stamp_ns, t.status, t.version, t.x_map_m, t.y_map_m, t.radius_95_m
+               FROM traces t JOIN tally_keys k ON k.id = t.key_id
+               WHERE t.hour >= ? AND k.site = ? AND k.axis = 'robot' AND k.key = ? ORDER BY t.hour, t.stamp_ns""",
+            (since_hour, site, robot),
+        )
+        return [TraceRow(**row) for row in rows]
+
+    def prune(self, retention: FleetRetention) -> int:
+        """Removes what is too old or too much; returns how many rows went."""
+        now_ns = self._ledger.now_ns()
+
+        def before_ns(days: float) -> int:
+            return now_ns - int(days * _DAY_NS)
+
+        with self._ledger.write(durable=False) as connection:
+            gone = connection.execute(
+                "DELETE FROM tallies WHERE hour < ?", (hour_of(before_ns(retention.tally_days)),)
+            ).rowcount
+            gone += connection.execute(
+                "DELETE FROM traces WHERE hour < ?", (hour_of(before_ns(retention.trace_days)),)
+            ).rowcount
+            gone += _prune_traces(connection, retention.trace_rows)
+            gone += connection.execute(
+                "DELETE FROM failures WHERE happened_ns < ?", (before_ns(retention.failure_days),)
+            ).rowcount
+            gone += _prune_pictures(connection, retention.picture_bytes)
+        return gone
+
+    def _ids(
+        self, connection: sqlite3.Connection, keys: Iterable[tuple[str, str, str]]
+    ) -> dict[tuple[str, str, str], int]:
+        """Numbers of keys, which are never removed: those in memory stay right."""
+        found = {}
+        for key in set(keys):
+            if key not in self._key_ids:
+                connection.execute("INSERT OR IGNORE INTO tally_keys (site, axis, key) VALUES (?, ?, ?)", key)
+                row = connection.execute("SELECT id FROM tally_keys WHERE site = ? AND axis = ? AND key = ?", key)
+                found[key] = int(row.fetchone()[0])
+            else:
+                found[key] = self._key_ids[key]
+        return found
+
+
+def tile_key(tile: tuple[int, int] | None) -> str | None:
+    """How a tile is written in keys and rows: "x,y"."""
+    return None if tile is None else f"{tile[0]},{tile[1]}"
+
+
+def _axis(axis: str) -> str:
+    if axis not in AXES:
+        raise UsageError(f"nothing is counted by {axis!r}; choose one of {', '.join(AXES)}")
+    return axis
+
+
+def _add_tallies(
+    connection: sqlite3.Connection, ids: Mapping[tuple[str, str, str], int], tallies: Mapping[TallyKey, Tally]
+) -> None:
+    connection.executemany(
+        _ADD, [(ids[key[:3]], key[3], *tally.values()) for key, tally in sorted(tallies.items(), key=lambda kv: kv[0])]
+    )
+
+
+def _prune_traces(connection: sqlite3.Connection, keep: int) -> int:
+    """Whole hours go, the oldest first, until at most `keep` rows stay (the running hour stays whatever it holds)."""
+    hours = connection.execute("SELECT hour, count(*) FROM traces GROUP BY hour ORDER BY hour DESC").fetchall()
+    kept = 0
+    for position, (hour, count) in enumerate(hours):
+        kept += count
+        if kept > keep and position > 0:
+            return connection.execute("DELETE FROM traces WHERE hour <= ?", (hour,)).rowcount
+    return 0
+
+
+def _prune_pictures(connection: sqlite3.Connection, keep_bytes: int) -> int:
+    rows = connection.execute(
+        "SELECT number, sum(length(jpeg)) FROM failure_pictures GROUP BY number ORDER BY number DESC"
+    ).fetchall()
+    kept = 0
+    for number, size in rows:
+        kept += size
+        if kept > keep_bytes:
+            return connection.execute("DELETE FROM failure_pictures WHERE number <= ?", (number,)).rowcount
+    return 0
