@@ -4,6 +4,8 @@ fleetmap/{site}/robots/{robot}/wanted    asked by the robot; published by the se
 fleetmap/{site}/robots/{robot}/ack       published by the robot: RobotAck
 fleetmap/{site}/robots/{robot}/health    published by the robot: RobotHealth
 fleetmap/{site}/robots/{robot}/pose      published by the robot: PoseMessage
+fleetmap/{site}/robots/{robot}/estimate  published by the robot for every frame: EstimateMessage
+fleetmap/{site}/robots/{robot}/failures  asked by the robot, FailureReport: FailureAck, once the server has it on its disk
 fleetmap/{site}/robots/{robot}/alive     liveliness token of the robot
 fleetmap/{site}/manifests/{version}      asked by the robot, PartQuestion: Part of a manifest
 fleetmap/{site}/blobs/{sha256}           asked by the robot, PartQuestion: Part of a tile, vocabulary or manifest
@@ -20,6 +22,7 @@ from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat
 
 MAX_MESSAGE_BYTES = 1 << 20
 PART_BYTES = 256 << 10  # small enough to come within seconds over a poor radio, and to be asked for again
+MAX_THUMBNAIL_BYTES = 64 << 10  # four of them and the rest of a failure's report stay far below a message's limit
 _ROOT = "fleetmap"
 
 Name = Annotated[str, msgspec.Meta(max_length=64)]
@@ -108,8 +111,127 @@ class PoseMessage(msgspec.Struct, frozen=True, kw_only=True):
         return se3(rotation_from_quat_wxyz(np.array(self.quat_wxyz)), np.array(self.position_map_m))
 
 
-Message = WantedVersion | RobotAck | RobotHealth | PoseMessage | PartQuestion | Part
-M = TypeVar("M", WantedVersion, RobotAck, RobotHealth, PoseMessage, PartQuestion, Part)
+class Placement(msgspec.Struct, frozen=True, kw_only=True):
+    """A rigid transform: position in metres, unit quaternion."""
+
+    position_m: tuple[float, float, float]
+    quat_wxyz: tuple[float, float, float, float]
+
+    @classmethod
+    def of(cls, target_from_source: Array) -> Self:
+        """The message part of a transform (4, 4)."""
+        x, y, z = (float(value) for value in target_from_source[:3, 3])
+        qw, qx, qy, qz = (float(value) for value in quat_wxyz_from_rotation(target_from_source[:3, :3]))
+        return cls(position_m=(x, y, z), quat_wxyz=(qw, qx, qy, qz))
+
+    @property
+    def target_from_source(self) -> Array:
+        """(4, 4) transform."""
+        return se3(rotation_from_quat_wxyz(np.array(self.quat_wxyz)), np.array(self.position_m))
+
+
+class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """What the robot's own programs navigate by, frame by frame.
+
+    odom_from_base is continuous; map_from_odom moves with every fix and is None while there is no single place to name.
+    cov_rot_trans: of map_from_base in map axes, rotation first, row by row, None with it. hypotheses: places while AMBIGUOUS.
+    """
+
+    stamp_ns: int
+    status: Name
+    cause: Name = ""
+    map_version: Version | None
+    odom_from_base: Placement
+    map_from_odom: Placement | None
+    cov_rot_trans: Annotated[tuple[float, ...], msgspec.Meta(min_length=36, max_length=36)] | None
+    hypotheses: Annotated[tuple[Placement, ...], msgspec.Meta(max_length=16)] = ()
+
+
+class FixNote(msgspec.Struct, frozen=True, kw_only=True):
+    """One look at the map before a failure.
+
+    position_map_m is None without a fix; refused: why it was not used. innovation: its squared Mahalanobis distance, None
+    where nothing was predicted.
+    """
+
+    stamp_ns: int
+    status: Name
+    position_map_m: tuple[float, float, float] | None = None
+    inliers: int | None = None
+    innovation: float | None = None
+    refused: Text = ""
+
+
+class Thumbnail(msgspec.Struct, frozen=True, kw_only=True):
+    """A small JPEG. kind: `frame`, the left image; `matches`, the same beside the landmarks that the map expects in it."""
+
+    stamp_ns: int
+    kind: Name
+    jpeg: Annotated[bytes, msgspec.Meta(max_length=MAX_THUMBNAIL_BYTES)]
+
+
+class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
+    """A position failure with its context, as docs/reports.md defines failures.
+
+    Sent until it is acknowledged; (site, robot, id) is unique for ever, so that what arrives twice is stored once.
+
+    stamp_ns: when it began, sensor clock; wall_ns: the same moment by the robot's wall clock. duration_s: how long it had lasted
+    when it was written down. kind: `blind` (no place that may be relied upon) or `suspected` (tracking, but fixes contradict it: an
+    estimate of silent failures, not a count). cause: one word or a few, such as `dark`. tile, map_from_base: by the last
+    estimate. exposure: mean brightness of the left image, 0 to 1; sharpness: variance of its Laplacian, 1 is typical for the robot.
+    """
+
+    site: Name
+    robot: Name
+    id: Name
+    stamp_ns: int
+    wall_ns: int
+    duration_s: float
+    kind: Name
+    status: Name
+    cause: Name
+    version: Version | None
+    tile: tuple[int, int] | None = None
+    map_from_base: Placement | None = None
+    radius_95_m: float | None = None
+    innovation: float | None = None
+    inliers: int | None = None
+    exposure: float | None = None
+    sharpness: float | None = None
+    fixes: Annotated[tuple[FixNote, ...], msgspec.Meta(max_length=20)] = ()
+    thumbnails: Annotated[tuple[Thumbnail, ...], msgspec.Meta(max_length=4)] = ()
+
+
+class FailureAck(msgspec.Struct, frozen=True, kw_only=True):
+    """The server has this report on its disk, now or since before. refused: why it never will, so that it is not sent again."""
+
+    id: Name
+    refused: Text = ""
+
+
+Message = (
+    WantedVersion
+    | RobotAck
+    | RobotHealth
+    | PoseMessage
+    | PartQuestion
+    | Part
+    | EstimateMessage
+    | FailureReport
+    | FailureAck
+)
+M = TypeVar(
+    "M",
+    WantedVersion,
+    RobotAck,
+    RobotHealth,
+    PoseMessage,
+    PartQuestion,
+    Part,
+    EstimateMessage,
+    FailureReport,
+    FailureAck,
+)
 
 
 def encode_message(message: Message) -> bytes:
@@ -143,7 +265,7 @@ def report_dict(message: Message) -> dict[str, Any]:
 
 
 def robot_key(site: str, robot: str, what: str) -> str:
-    """Key of a robot's wanted, ack, health, pose or alive; '*' for any site or robot."""
+    """Key of a robot's wanted, ack, health, pose, estimate, failures or alive; '*' for any site or robot."""
     return f"{_ROOT}/{site}/robots/{robot}/{what}"
 
 

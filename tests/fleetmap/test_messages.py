@@ -1,5 +1,6 @@
 """Messages of robots and server."""
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,9 +9,17 @@ from hypothesis import strategies as st
 from fleetmap.errors import LinkError
 from fleetmap.geometry import se3_exp
 from fleetmap.messages import (
+    MAX_MESSAGE_BYTES,
+    MAX_THUMBNAIL_BYTES,
+    EstimateMessage,
+    FailureAck,
+    FailureReport,
+    FixNote,
+    Placement,
     PoseMessage,
     RobotAck,
     RobotHealth,
+    Thumbnail,
     WantedVersion,
     blob_key,
     decode_message,
@@ -28,12 +37,55 @@ SAMPLES = [
         site="lab", robot="r1", stamp_ns=5, version=3, status="TRACKING", flags=("dark",), metrics={"a": 1.5, "b": "x"}
     ),
     PoseMessage.of(7, np.eye(4), np.eye(6), "TRACKING", 3),
+    EstimateMessage(
+        stamp_ns=7,
+        status="AMBIGUOUS",
+        map_version=3,
+        odom_from_base=Placement.of(np.eye(4)),
+        map_from_odom=None,
+        cov_rot_trans=None,
+        hypotheses=(Placement.of(np.eye(4)),),
+    ),
+    FailureReport(
+        site="lab",
+        robot="r1",
+        id="0f" * 16,
+        stamp_ns=5,
+        wall_ns=6,
+        duration_s=2.0,
+        kind="blind",
+        status="LOST",
+        cause="dark",
+        version=3,
+        tile=(-1, 2),
+        map_from_base=Placement.of(np.eye(4)),
+        fixes=(FixNote(stamp_ns=4, status="TRACKING"),),
+        thumbnails=(Thumbnail(stamp_ns=4, kind="frame", jpeg=b"jpeg"),),
+    ),
+    FailureAck(id="0f" * 16),
 ]
 
 
 @pytest.mark.parametrize("message", SAMPLES, ids=lambda message: type(message).__name__)
 def test_round_trip(message: object) -> None:
     assert decode_message(encode_message(message), type(message)) == message
+
+
+def test_a_report_of_a_failure_fits_a_message_with_all_its_pictures() -> None:
+    full = msgspec.structs.replace(
+        SAMPLES[-2], thumbnails=(Thumbnail(stamp_ns=1, kind="frame", jpeg=bytes(MAX_THUMBNAIL_BYTES)),) * 4,
+        fixes=(FixNote(stamp_ns=1, status="LOST", refused="x" * 2000),) * 20,
+    )  # fmt: skip
+    data = encode_message(full)
+    assert len(data) < MAX_MESSAGE_BYTES // 2
+    assert decode_message(data, FailureReport) == full
+    with pytest.raises(LinkError, match="jpeg"):
+        decode_message(
+            encode_message(
+                msgspec.structs.replace(full, thumbnails=(Thumbnail(stamp_ns=1, kind="frame", jpeg=bytes(100_000)),))
+            ),
+            FailureReport,
+        )
 
 
 def test_poses_keep_their_transform() -> None:
@@ -46,7 +98,7 @@ def test_poses_keep_their_transform() -> None:
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.binary(max_size=100), st.sampled_from([WantedVersion, RobotAck, RobotHealth, PoseMessage]))
+@given(st.binary(max_size=100), st.sampled_from([WantedVersion, RobotAck, RobotHealth, PoseMessage, FailureReport]))
 def test_nonsense_is_refused(data: bytes, message_type: type) -> None:
     with pytest.raises(LinkError, match=message_type.__name__):
         decode_message(data, message_type)
