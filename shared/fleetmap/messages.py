@@ -65,14 +65,29 @@ class RobotAck(msgspec.Struct, frozen=True, kw_only=True):
     refused: Text = ""
 
 
+HEALTH_FIGURES = (
+    "speed_mps", "radius_95_m", "frames", "frames_dropped", "frame_ms_mean", "first_fix_s", "fix_innovation",
+    "fix_innovation_m", "dock_error_m", "landmarks_expected", "landmarks_seen",
+)  # fmt: skip
+"""Metrics of RobotHealth that the server counts with; a robot leaves out what it does not know. Since the report before:
+fix_innovation, the largest squared Mahalanobis distance (6 degrees of freedom) between a fix and its prediction,
+fix_innovation_m, the largest such distance in metres, and dock_error_m, the distance between estimate and dock at an arrival.
+Since the run's begin: frames, frames_dropped, landmarks_expected and landmarks_seen (looked for in pictures, and found there),
+first_fix_s, the time to the first fix. The others are of now."""
+
+
 class RobotHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """A robot's last report: status of the localization, flags that are raised, metrics by name."""
+    """A robot's last report: status of the localization, flags that are raised, metrics by name.
+
+    stamp_ns: sensor clock; wall_ns: the robot's wall clock when it sent this, by which the server measures how wrong that is.
+    """
 
     site: Name
     robot: Name
     stamp_ns: int
     version: Version | None
     status: Name
+    wall_ns: int | None = None
     flags: Flags = ()
     metrics: Metrics = {}
 
