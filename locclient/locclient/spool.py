@@ -47,7 +47,9 @@ class Spool:
                 self._set_aside()
                 self._check()
         except (OSError, sqlite3.Error) as error:
-            raise StoreError(f"the spool {path} cannot be used ({error}); choose another file with [run] spool") from error
+            raise StoreError(
+                f"the spool {path} cannot be used ({error}); choose another file with [run] spool"
+            ) from error
 
     def put(self, report: SpooledReport) -> None:
         """Keeps a report; one with an id that waits already is not kept twice. Raises StoreError where the disk refuses."""
@@ -64,7 +66,9 @@ class Spool:
     def done(self, report_id: str) -> None:
         """Lets go of a report that arrived."""
         with self._transaction() as database:
-            self._count(database, "delivered", database.execute("DELETE FROM report WHERE id = ?", (report_id,)).rowcount)
+            self._count(
+                database, "delivered", database.execute("DELETE FROM report WHERE id = ?", (report_id,)).rowcount
+            )
 
     def refused(self, report_id: str) -> None:
         """Lets go of a report that the server will never take."""
