@@ -83,12 +83,13 @@ class Outcome:
 
 @dataclass
 class _Versions:
-    """good: the version whose fixes were confirmed; candidate: the one on trial; is_doubt: the good one is looked at again."""
+    """good: the version whose fixes were confirmed; candidate: the one on trial; is_doubt: the good one is looked at again, because of what was said."""
 
     good: LoadedMap | None = None
     candidate: LoadedMap | None = None
     trial: VersionTrial | None = None
     is_doubt: bool = False
+    said: str = ""
     changes: deque[VersionChange] = field(default_factory=deque)
 
 
@@ -190,7 +191,7 @@ class Robot:
         if versions.candidate is None:
             return
         if versions.trial is None:
-            versions.trial = VersionTrial(self._trial_settings, estimate.stamp_ns)
+            versions.trial = VersionTrial(self._trial_settings, estimate)
             return
         verdict = versions.trial.handle(estimate)
         if verdict is Verdict.UNDECIDED:
@@ -203,19 +204,19 @@ class Robot:
         else:
             assert versions.good is not None
             self._show(versions.good)
-            self._versions = replace(versions, trial=None, is_doubt=True)
+            self._versions = replace(versions, trial=None, is_doubt=True, said=versions.trial.said)
 
     def _end_doubt(self, verdict: Verdict) -> None:
         """The old version gave fixes where the new one gave none, or it did not either."""
         versions = self._versions
         assert versions.candidate is not None
         assert versions.good is not None
-        names = f"version {versions.candidate.version} gave no fixes for {self._trial_settings.patience_s:g} s"
+        said = f"of version {versions.candidate.version} {versions.said}"
         if verdict is Verdict.CONFIRMED:
-            reason = f"{names} where version {versions.good.version} did"
+            reason = f"{said}, where version {versions.good.version} gives fixes"
             versions.changes.append(VersionChange(versions.candidate.wanted, Change.REFUSED, reason))
         else:
-            reason = f"{names}, nor did version {versions.good.version}; it is tried again later"
+            reason = f"{said}, and version {versions.good.version} gives no fixes either; it is tried again later"
             versions.changes.append(VersionChange(versions.candidate.wanted, Change.POSTPONED, reason))
         self._versions = replace(versions, candidate=None, trial=None, is_doubt=False)
 
