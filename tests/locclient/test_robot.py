@@ -42,15 +42,15 @@ def test_the_first_version_is_taken_and_the_robot_finds_itself(store: MapStore) 
 
 
 def test_a_good_version_is_adopted_after_its_fixes(store: MapStore) -> None:
-    robot, moments = robot_world.new_robot(), list(robot_world.moments(140))
+    robot, moments = robot_world.new_robot(), list(robot_world.moments(100))
     robot.use(robot_world.loaded(store))
-    drive(robot, range(100), moments)
+    drive(robot, range(70), moments)
     robot.take_changes()
     robot_world.save(store)
     second = robot_world.loaded(store)
     robot.use(second)
     assert [held.version for held in robot.held] == [1, 2]
-    assert max(drive(robot, range(100, 140), moments)) < 0.05
+    assert max(drive(robot, range(70, 100), moments)) < 0.05
     changes = robot.take_changes()
     assert [(change.change, change.wanted.version) for change in changes] == [(Change.ADOPTED, 2)]
     assert [held.version for held in robot.held] == [2]
@@ -58,14 +58,14 @@ def test_a_good_version_is_adopted_after_its_fixes(store: MapStore) -> None:
 
 def test_a_version_that_slipped_is_refused_and_the_place_kept(store: MapStore) -> None:
     """Status: never wrong; after the trial TRACKING in the old version. Flag: refused, with both versions named."""
-    robot, moments = robot_world.new_robot(), list(robot_world.moments(170))
+    robot, moments = robot_world.new_robot(), list(robot_world.moments(130))
     robot.use(robot_world.loaded(store))
-    drive(robot, range(100), moments)
+    drive(robot, range(70), moments)
     robot.take_changes()
     slipped = robot_world.moved(np.array([2.0, 0.0, 0.0]))
     robot_world.save(store)
     robot.use(robot_world.loaded(store, of=slipped))
-    errors = drive(robot, range(100, 170), moments)
+    errors = drive(robot, range(70, 130), moments)
     changes = robot.take_changes()
     assert [(change.change, change.wanted.version) for change in changes] == [(Change.REFUSED, 2)]
     assert "of version 2 0 fixes and 2 that contradict it" in changes[0].reason
@@ -77,12 +77,12 @@ def test_a_version_that_slipped_is_refused_and_the_place_kept(store: MapStore) -
 
 def test_darkness_is_no_verdict_about_a_version(store: MapStore) -> None:
     robot = robot_world.new_robot()
-    moments = list(robot_world.moments(150, dark=range(101, 150)))
+    moments = list(robot_world.moments(120, dark=range(71, 120)))
     robot.use(robot_world.loaded(store))
-    drive(robot, range(100), moments)
+    drive(robot, range(70), moments)
     robot.take_changes()
     robot_world.save(store)
     robot.use(robot_world.loaded(store))
-    drive(robot, range(100, 150), moments)
+    drive(robot, range(70, 120), moments)
     assert [change.change for change in robot.take_changes()] == [Change.POSTPONED]
     assert [held.version for held in robot.held] == [1]
