@@ -42,6 +42,11 @@ def check_run(config: LocclientConfig) -> tuple[str, str]:
         raise UsageError("[run]: give either server, tcp/HOST:PORT, or store, a folder")
     if run.frame_queue < 1:
         raise UsageError(f"[run] frame_queue = {run.frame_queue}: at least one frame must be able to wait")
+    if not run.trial.contradicting_looks < config.localizer.track.kidnap_fixes:
+        raise UsageError(
+            f"[run.trial] contradicting_looks = {run.trial.contradicting_looks} must be below [localizer.track] kidnap_fixes = "
+            f"{config.localizer.track.kidnap_fixes}: a version must be given up before the robot believes that it was carried away"
+        )
     return check_name(run.site, "site"), check_name(run.robot, "robot")
 
 

@@ -165,7 +165,7 @@ class FailureMonitor:
 
 def is_blind(estimate: Estimate) -> bool:
     """Whether there is no place that may be relied upon: lost, ambiguous, or degraded beyond RADIUS_LIMIT_M."""
-    if estimate.status is Status.TRACKING:
+    if estimate.status in {Status.TRACKING, Status.INITIALISING}:
         return False
     return estimate.status is not Status.DEGRADED or radius_95_m(estimate.cov_rot_trans) > RADIUS_LIMIT_M
 

@@ -144,7 +144,7 @@ class Robot:
             versions.good = loaded
             versions.changes.append(VersionChange(loaded.wanted, Change.ADOPTED))
         else:
-            versions.candidate, versions.trial, versions.is_doubt = loaded, None, False
+            versions.candidate, versions.trial, versions.is_doubt = loaded, self._new_trial(), False
         self._show(loaded)
 
     def handle(self, moment: Moment) -> Outcome | None:
@@ -161,8 +161,7 @@ class Robot:
         estimate = self.localizer.handle_stereo(frame)
         picture = self._judge.judge(frame.left)
         cpu_s = self._clock_s() - begun_s
-        self._try(estimate)
-        self._last = (frame, estimate)
+        self._try(estimate, frame)
         failure = self.monitor.handle(estimate, picture)
         context = None if failure is None else self._context(failure)
         if not self._pictures or estimate.stamp_ns - self._pictures[-1][0] >= _THUMBNAIL_EVERY_NS:
@@ -185,14 +184,18 @@ class Robot:
         focal_px = loaded.manifest.camera.focal_px
         self.localizer.handle_version(loaded.version, loaded.tiles.values(), loaded.vocabulary, focal_px)
 
-    def _try(self, estimate: Estimate) -> None:
+    def _new_trial(self) -> VersionTrial | None:
+        """From the last frame that was looked at with the version before; without any, from the first one to come."""
+        return None if self._last is None else VersionTrial(self._trial_settings, self._last[1])
+
+    def _try(self, estimate: Estimate, frame: RectifiedFrame) -> None:
         """Counts the frame for the trial that is on, if any."""
+        self._last = (frame, estimate)
         versions = self._versions
         if versions.candidate is None:
             return
         if versions.trial is None:
             versions.trial = VersionTrial(self._trial_settings, estimate)
-            return
         verdict = versions.trial.handle(estimate)
         if verdict is Verdict.UNDECIDED:
             return
@@ -204,7 +207,7 @@ class Robot:
         else:
             assert versions.good is not None
             self._show(versions.good)
-            self._versions = replace(versions, trial=None, is_doubt=True, said=versions.trial.said)
+            self._versions = replace(versions, trial=self._new_trial(), is_doubt=True, said=versions.trial.said)
 
     def _end_doubt(self, verdict: Verdict) -> None:
         """The old version gave fixes where the new one gave none, or it did not either."""
