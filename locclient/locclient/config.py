@@ -2,6 +2,9 @@
 
 from fleetmap.config import Section
 from fleetmap.recordings import Topics
+from locclient.live import SourceSection
+from locclient.outputs import OutputSection
+from locclient.run_settings import RunSection
 from locclient.settings import LocalizerSettings
 from locclient.tile_cache import DEFAULT_MAX_BYTES
 
@@ -29,5 +32,8 @@ class LocclientConfig(Section, frozen=True):
     """All of it."""
 
     replay: ReplaySection = ReplaySection()
+    run: RunSection = RunSection()
+    source: SourceSection = SourceSection()
+    output: OutputSection = OutputSection()
     topics: Topics = Topics()
     localizer: LocalizerSettings = LocalizerSettings()

@@ -20,6 +20,8 @@ from fleetmap.mapformat import (
     verified,
 )
 from fleetmap.messages import (
+    EstimateMessage,
+    FailureAck,
     PoseMessage,
     RobotAck,
     RobotHealth,
@@ -127,20 +129,44 @@ class MapLink:
         return ReadyVersion(wanted)
 
     def bring(self, wanted: WantedVersion) -> None:
-        """Fetches all of a version into the cache and, when everything is verified, makes it the active one.
+        """Fetches all of a version into the cache and makes it the active one; errors as of `fetch` and `activate`."""
+        self.activate(self.fetch(wanted), wanted)
+
+    def fetch(self, wanted: WantedVersion) -> Manifest:
+        """Fetches all of a version into the cache, where it is kept until `activate` or the next fetch; returns its manifest.
 
         What came before an error stays in the cache, and the active version what it was. Raises UnreachableError where nobody
         answers, LinkError and MapFormatError for what cannot be had or is damaged, StoreError where the disk refuses.
         """
         manifest = self.manifest(wanted)
-        needed = [wanted.manifest_sha256 or "", manifest.vocabulary.sha256, *(tile.sha256 for tile in manifest.tiles)]
-        self._cache.hold(self._site, needed)
+        self._cache.hold(self._site, _addresses(manifest, wanted))
         self.vocabulary(manifest)
         bases = self._bases()
         for entry in manifest.tiles:
             # Decoded and let go: a large site is larger than a robot's memory.
             _tile(entry, manifest.tile_size_m, self._blob(entry.sha256, entry.bytes, bases.get((entry.x, entry.y))))
-        self._cache.activate(self._site, manifest.version, needed)
+        return manifest
+
+    def activate(self, manifest: Manifest, wanted: WantedVersion) -> None:
+        """Makes a fetched version the one that the robot starts with; raises StoreError where a piece of it is missing."""
+        self._cache.activate(self._site, manifest.version, _addresses(manifest, wanted))
+
+    def active(self) -> WantedVersion | None:
+        """The version that is whole in the cache, None before the first one."""
+        active = self._cache.active(self._site)
+        return None if active is None else _wanted_of(self._site, active)
+
+    def tell_failure(self, payload: bytes) -> FailureAck:
+        """The server's answer to an encoded FailureReport, once it is on its disk; errors as of `wanted`."""
+        return decode_message(self._bus.get(self._key("failures"), payload, timeout_s=self._timeout_s), FailureAck)
+
+    def publish_estimate(self, message: EstimateMessage) -> None:
+        """Sends what the robot's own programs navigate by; it may be lost, because the next one is worth more."""
+        self._bus.publish(self._key("estimate"), encode_message(message), may_drop=True)
+
+    def connected(self) -> bool:
+        """Whether anybody can be reached now."""
+        return self._bus.connected()
 
     def manifest(self, wanted: WantedVersion) -> Manifest:
         """The wanted version's manifest, from the cache or the server.
@@ -234,6 +260,43 @@ class MapLink:
             return None
 
 
+class CachedMap:
+    """The same reading out of the cache alone, without waiting for anybody; for another thread than that of the MapLink.
+
+    Give it a TileCache of its own: it only reads, so that the two do not disturb each other.
+    """
+
+    def __init__(self, cache: TileCache, site: str) -> None:
+        """Raises UsageError for a name that no site can have."""
+        self._cache = cache
+        self._site = check_name(site, "site")
+
+    def ready(self) -> ReadyVersion:
+        """The active version; raises LinkError before the first one."""
+        active = self._cache.active(self._site)
+        if active is None:
+            raise LinkError(f"the cache has no version of site {self._site} yet; it has to come from a server first")
+        return ReadyVersion(_wanted_of(self._site, active))
+
+    def manifest(self, wanted: WantedVersion) -> Manifest:
+        """The wanted version's manifest; LinkError where it is not here, MapFormatError where it is another."""
+        return _checked(decode_manifest(self._blob(_address(wanted)[1])), wanted)
+
+    def vocabulary(self, manifest: Manifest) -> bytes:
+        """The version's vocabulary; LinkError where it is not here."""
+        return self._blob(manifest.vocabulary.sha256)
+
+    def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
+        """Tiles of the version, as `MapLink.tiles`."""
+        return _collect(manifest, cells, lambda entry: self._blob(entry.sha256))
+
+    def _blob(self, sha256: str) -> bytes:
+        data = self._cache.get(sha256)
+        if data is None:
+            raise LinkError(f"{sha256} is not in the cache; it has to be fetched again")
+        return data
+
+
 class StoreFolderLink:
     """The same reading out of a store's folder, for a robot without a server."""
 
@@ -269,6 +332,11 @@ class StoreFolderLink:
 
 def _wanted_of(site: str, active: ActiveVersion) -> WantedVersion:
     return WantedVersion(site=site, version=active.version, manifest_sha256=active.blobs[0])
+
+
+def _addresses(manifest: Manifest, wanted: WantedVersion) -> list[str]:
+    """Of all that a version consists of, its manifest first."""
+    return [wanted.manifest_sha256 or "", manifest.vocabulary.sha256, *(tile.sha256 for tile in manifest.tiles)]
 
 
 def _address(wanted: WantedVersion) -> tuple[int, str]:

@@ -65,8 +65,11 @@ class Bus(ABC):
         """
 
     @abstractmethod
-    def publish(self, key: str, payload: bytes, *, may_drop: bool = False) -> None:
-        """Tells all subscribers; nobody there is no error. `may_drop` loses it rather than wait for a full network."""
+    def publish(self, key: str, payload: bytes, *, may_drop: bool = False, attachment: bytes = b"") -> None:
+        """Tells all subscribers; nobody there is no error. `may_drop` loses it rather than wait for a full network.
+
+        attachment: beside the payload, for what other programs want there; no subscriber of this class is shown it.
+        """
 
     @abstractmethod
     def subscribe(self, key_expr: str, listen: Listen) -> Handle:
@@ -176,7 +179,7 @@ class MemoryBus(Bus):
             raise _refused(key, reason)
         return data
 
-    def publish(self, key: str, payload: bytes, *, may_drop: bool = False) -> None:
+    def publish(self, key: str, payload: bytes, *, may_drop: bool = False, attachment: bytes = b"") -> None:
         """See Bus."""
         _small(payload, key)
         with self._hub.lock:
@@ -297,10 +300,11 @@ class ZenohBus(Bus):
             time.sleep(min(_RETRY_S, max(0.0, deadline - time.monotonic())))
         raise _nobody(key, timeout_s)
 
-    def publish(self, key: str, payload: bytes, *, may_drop: bool = False) -> None:
+    def publish(self, key: str, payload: bytes, *, may_drop: bool = False, attachment: bytes = b"") -> None:
         """See Bus."""
         control = zenoh.CongestionControl.DROP if may_drop else zenoh.CongestionControl.BLOCK
-        self._guarded(lambda: self._session.put(key, _small(payload, key), congestion_control=control))
+        put = partial(self._session.put, key, _small(payload, key), congestion_control=control)
+        self._guarded(partial(put, attachment=attachment) if attachment else put)
 
     def subscribe(self, key_expr: str, listen: Listen) -> Handle:
         """See Bus."""

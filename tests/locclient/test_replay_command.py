@@ -8,7 +8,7 @@ import pytest
 
 from fleetmap.errors import UsageError
 from locclient import cli
-from locclient.commands.replay import _prior
+from locclient.prior_option import parse_prior
 from map_samples import save_sample_draft
 from mapserver.store import MapStore
 from recording_samples import make_sample, write_euroc
@@ -105,18 +105,18 @@ def test_the_file_gives_defaults_and_knows_its_keys(
 
 
 def test_a_prior_is_a_place_of_the_base_with_a_doubt() -> None:
-    prior = _prior("1.5,-2,1.5707963267948966,0.4")
+    prior = parse_prior("1.5,-2,1.5707963267948966,0.4")
     np.testing.assert_allclose(prior.map_from_base[:3, 3], [1.5, -2.0, 0.0])
     np.testing.assert_allclose(prior.map_from_base[:3, :3] @ [1, 0, 0], [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(prior.cov_rot_trans[3:5, 3:5], 0.16 * np.eye(2))
     assert np.isinf(np.diag(prior.cov_rot_trans)[[0, 1, 2, 5]]).all()
-    assert _prior(None) is None
+    assert parse_prior(None) is None
 
 
 @pytest.mark.parametrize("text", ["nan,0,0,1", "0,inf,0,1", "0,0,nan,1", "0,0,0,nan", "0,0,0,inf", "0,0,0,-1", ""])
 def test_numbers_that_are_no_place_are_refused(text: str) -> None:
     with pytest.raises(UsageError):
-        _prior(text)
+        parse_prior(text)
 
 
 @pytest.mark.parametrize("option", ["--report", "--trajectory", "--picture"])

@@ -75,10 +75,11 @@ def _run(path: Path, options: dict[str, Any], config: Any) -> None:
     from fleetmap.recordings.tum import write_tum
     from locclient.connection import connected
     from locclient.pictures import replay_picture
+    from locclient.prior_option import parse_prior
     from locclient.replay import replay as play
     from locclient.sources import ReplaySource
 
-    prior = _prior(options["prior"])
+    prior = parse_prior(options["prior"], "--prior")
     calibration = None if options["calibration"] is None else Path(options["calibration"])
     selection = FrameSelection.parse(options["frames"])
     console = Console(stderr=True)
@@ -107,24 +108,6 @@ def _run(path: Path, options: dict[str, Any], config: Any) -> None:
     if options["picture"] is not None and not cv2.imwrite(str(options["picture"]), replay_picture(result)):
         raise UsageError(f"the picture cannot be written to {options['picture']}; give a path that ends in .png")
     _print_table(built)
-
-
-def _prior(text: str | None) -> Any:
-    if text is None:
-        return None
-    import numpy as np
-
-    from fleetmap.geometry import se3, so3_exp
-    from fleetmap.samples import PositionPrior
-
-    try:
-        x_m, y_m, yaw_rad, sigma_m = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise UsageError(f"--prior {text!r} is not X,Y,YAW,SIGMA_M: four numbers, metres and radians") from error
-    if not np.isfinite([x_m, y_m, yaw_rad, sigma_m]).all() or not sigma_m > 0:
-        raise UsageError(f"--prior {text!r}: all four must be finite numbers and SIGMA_M positive metres")
-    covariance = np.diag([np.inf, np.inf, np.inf, sigma_m**2, sigma_m**2, np.inf])
-    return PositionPrior(0, se3(so3_exp(np.array([0.0, 0.0, yaw_rad])), np.array([x_m, y_m, 0.0])), covariance)
 
 
 def _print_table(report: dict[str, object]) -> None:

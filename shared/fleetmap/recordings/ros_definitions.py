@@ -1,7 +1,8 @@
 """The ROS 2 message definitions (`ros2msg`) of what the project writes, field by field as ROS 2 fixes them."""
 
-_PARTS = {
+DEFINITIONS = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    "std_msgs/String": "string data",
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
     "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
     "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
@@ -42,9 +43,9 @@ _SEPARATOR = "=" * 80
 
 def ros2msg(type_name: str) -> str:
     """The full definition of a message type such as `sensor_msgs/Imu`, with those it is made of behind it."""
-    parts = [_PARTS[type_name]]
+    parts = [DEFINITIONS[type_name]]
     for name in _parts_of(type_name):
-        parts += [_SEPARATOR, f"MSG: {name}", _PARTS[name]]
+        parts += [_SEPARATOR, f"MSG: {name}", DEFINITIONS[name]]
     return "\n".join(parts) + "\n"
 
 
@@ -52,9 +53,9 @@ def _parts_of(type_name: str) -> list[str]:
     found: list[str] = []
     waiting = [type_name]
     while waiting:
-        for line in _PARTS[waiting.pop(0)].splitlines():
+        for line in DEFINITIONS[waiting.pop(0)].splitlines():
             name = line.split()[0].removesuffix("[]")
-            if name in _PARTS and name not in found:
+            if name in DEFINITIONS and name not in found:
                 found.append(name)
                 waiting.append(name)
     return found

@@ -227,6 +227,16 @@ def encode_frame_links(stamp_ns: int, links: Sequence[FrameLink]) -> bytes:
     return writer.message()
 
 
+def encode_text(text: str) -> bytes:
+    """std_msgs/String."""
+    return CdrWriter().text(text).message()
+
+
+def decode_text(data: bytes) -> str:
+    """std_msgs/String."""
+    return CdrReader(data).text()
+
+
 def _target_from_source(position_quat_xyzw: Array) -> Array:
     norm = float(np.linalg.norm(position_quat_xyzw[3:]))
     if not np.isfinite(position_quat_xyzw).all() or abs(norm - 1) > 0.01:

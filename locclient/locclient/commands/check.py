@@ -1,0 +1,25 @@
+"""`locclient check`: calibration, sensors, clock, cache, connection, each with its next step."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def check(
+    config: Annotated[Path, typer.Option(help="The TOML file of `locclient run`.")],
+    seconds: Annotated[float, typer.Option(min=0.0, help="How long to listen to the sensors; 0 does not.")] = 3.0,
+) -> None:
+    """Look over a robot before it drives; status 3 where something must be mended first."""
+    from fleetmap.config import load_toml
+    from locclient.config import LocclientConfig
+
+    settings = load_toml(config, LocclientConfig)
+    from locclient.self_check import FAIL, self_check
+
+    failed = False
+    for finding in self_check(settings, seconds):
+        typer.echo(f"{finding.level:<5} {finding.what}: {finding.text}")
+        failed |= finding.level == FAIL
+    if failed:
+        raise typer.Exit(3)

@@ -1,0 +1,35 @@
+"""`locclient run`: the robot's daemon, until it is told to stop."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def run(
+    config: Annotated[Path, typer.Option(help="TOML file: who the robot is, its sensors, its map, its outputs.")],
+    verbose: Annotated[bool, typer.Option("--verbose", help="Log what goes well too.")] = False,
+) -> None:
+    """Localise a robot from its live sensors all day; ends with status 0 on SIGTERM or SIGINT, or with its recording."""
+    import logging
+    import signal
+
+    from fleetmap.config import load_toml
+    from locclient.config import LocclientConfig
+
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
+    )
+    settings = load_toml(config, LocclientConfig)
+    from locclient.daemon import check_run, daemon_parts
+
+    check_run(settings)
+    from locclient.runtime import Runtime
+    from locclient.service_manager import ServiceManager
+
+    with daemon_parts(settings) as parts:
+        runtime = Runtime(parts, ServiceManager())
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: runtime.stop())
+        typer.echo(f"ready: {parts.robot_name} at {parts.site}, source {settings.source.kind}")
+        runtime.run()

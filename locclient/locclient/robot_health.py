@@ -1,0 +1,83 @@
+"""The figures of a running robot's health report, gathered frame by frame. Pure."""
+
+from collections import deque
+from collections.abc import Mapping
+
+import numpy as np
+
+from fleetmap.messages import RobotHealth
+from locclient.failures import is_blind, radius_95_m
+from locclient.localizer import Status
+from locclient.robot import Outcome
+
+_RECENT = 300
+Figure = float | int | str | bool | None
+
+
+class HealthFigures:
+    """Counts since the start, and the times of the last frames."""
+
+    def __init__(self) -> None:
+        self._frames = self._localised = self._failures = 0
+        self._frame_ms: deque[float] = deque(maxlen=_RECENT)
+        self._first_ns: int | None = None
+        self._first_fix_s: float | None = None
+        self._first_frame_ms: float | None = None
+        self._innovation: float | None = None
+        self._last: Outcome | None = None
+
+    @property
+    def last(self) -> Outcome | None:
+        """The last frame, None before the first."""
+        return self._last
+
+    def handle(self, outcome: Outcome) -> None:
+        """Counts a frame."""
+        estimate = outcome.estimate
+        self._last = outcome
+        self._frame_ms.append(1e3 * outcome.cpu_s)
+        if self._first_ns is None:
+            self._first_ns, self._first_frame_ms = estimate.stamp_ns, 1e3 * outcome.cpu_s
+        if estimate.fix is not None and self._first_fix_s is None:
+            self._first_fix_s = (estimate.stamp_ns - self._first_ns) * 1e-9
+        if self._first_fix_s is not None:
+            self._frames += 1
+            self._localised += estimate.status is Status.TRACKING
+        if estimate.innovation is not None:
+            self._innovation = max(self._innovation or 0.0, float(estimate.innovation))
+
+    def count_failure(self) -> None:
+        """A failure was told."""
+        self._failures += 1
+
+    def report(self, site: str, robot: str, wall_ns: int, more: Mapping[str, Figure], silent: bool) -> RobotHealth:
+        """The message; more: figures of the parts around. silent: whether the source has stopped sending frames."""
+        last = self._last
+        status = Status.INITIALISING.value if last is None else last.estimate.status.value
+        flags = [
+            name
+            for name, raised in (("no_frames", silent), ("blind", last is not None and is_blind(last.estimate)))
+            if raised
+        ]
+        if last is not None and last.picture.fault:
+            flags.append(last.picture.fault)
+        figures: dict[str, Figure] = {
+            "localised_share": self._localised / self._frames if self._frames else None,
+            "first_fix_s": self._first_fix_s,
+            "first_frame_ms": self._first_frame_ms,
+            "frame_ms_mean": float(np.mean(self._frame_ms)) if self._frame_ms else None,
+            "frame_ms_p99": float(np.percentile(self._frame_ms, 99)) if self._frame_ms else None,
+            "fix_innovation": self._innovation,
+            "failures": self._failures,
+        }
+        self._innovation = None
+        if last is not None:
+            figures["speed_mps"] = float(np.linalg.norm(last.estimate.odometry.velocity_odom_mps))
+            radius = radius_95_m(last.estimate.cov_rot_trans)
+            figures["radius_95_m"] = radius if np.isfinite(radius) else None
+            figures["exposure"], figures["sharpness"] = last.picture.exposure, last.picture.sharpness
+        return RobotHealth(
+            site=site, robot=robot, stamp_ns=0 if last is None else last.estimate.stamp_ns, wall_ns=wall_ns,
+            version=None if last is None else last.estimate.map_version, status=status, flags=tuple(flags),
+            metrics={**figures, **more},
+        )  # fmt: skip

@@ -1,0 +1,136 @@
+"""The robot's spool: reports that must reach the server, on the disk until they are acknowledged. SQL of the robot lives here alone."""
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from fleetmap.errors import StoreError
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS report (
+  number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT NOT NULL UNIQUE, payload BLOB NOT NULL
+) STRICT;
+CREATE TABLE IF NOT EXISTS count (name TEXT PRIMARY KEY, value INTEGER NOT NULL) STRICT;
+"""
+_BUSY_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class SpooledReport:
+    """One report as it waits: payload is the encoded message."""
+
+    id: str
+    payload: bytes
+
+
+class Spool:
+    """Reports in the order of their making; the oldest are dropped, and counted, where `max_bytes` is exceeded.
+
+    What `put` returned for survives the death of the process and of the power. A file that is damaged is set aside under another
+    name and begun anew: a robot that cannot report must still drive. For any thread; each call opens the file for itself.
+    """
+
+    def __init__(self, path: Path, *, max_bytes: int) -> None:
+        """Makes the file and its folder; raises StoreError where that is not possible."""
+        self._path = path
+        self._max_bytes = max_bytes
+        self.set_aside: Path | None = None
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                self._check()
+            except sqlite3.DatabaseError as error:
+                if isinstance(error, sqlite3.OperationalError):
+                    raise
+                self._set_aside()
+                self._check()
+        except (OSError, sqlite3.Error) as error:
+            raise StoreError(
+                f"the spool {path} cannot be used ({error}); choose another file with [run] spool"
+            ) from error
+
+    def put(self, report: SpooledReport) -> None:
+        """Keeps a report; one with an id that waits already is not kept twice. Raises StoreError where the disk refuses."""
+        with self._transaction() as database:
+            database.execute("INSERT OR IGNORE INTO report (id, payload) VALUES (?, ?)", (report.id, report.payload))
+            self._make_room(database)
+
+    def waiting(self, limit: int = 1) -> list[SpooledReport]:
+        """The oldest reports."""
+        with self._transaction() as database:
+            rows = database.execute("SELECT id, payload FROM report ORDER BY number LIMIT ?", (limit,)).fetchall()
+        return [SpooledReport(*row) for row in rows]
+
+    def done(self, report_id: str) -> None:
+        """Lets go of a report that arrived."""
+        with self._transaction() as database:
+            self._count(
+                database, "delivered", database.execute("DELETE FROM report WHERE id = ?", (report_id,)).rowcount
+            )
+
+    def refused(self, report_id: str) -> None:
+        """Lets go of a report that the server will never take."""
+        with self._transaction() as database:
+            self._count(database, "refused", database.execute("DELETE FROM report WHERE id = ?", (report_id,)).rowcount)
+
+    def counts(self) -> dict[str, int]:
+        """`waiting` now; `delivered`, `dropped` for want of room and `refused` since the file was made."""
+        with self._transaction() as database:
+            known = dict(database.execute("SELECT name, value FROM count").fetchall())
+            waiting = database.execute("SELECT COUNT(*) FROM report").fetchone()[0]
+        return {"waiting": waiting, **{name: known.get(name, 0) for name in ("delivered", "dropped", "refused")}}
+
+    def _make_room(self, database: sqlite3.Connection) -> None:
+        """Never the newest: it is the one that was just asked to be kept."""
+        query = "SELECT number, LENGTH(payload) FROM report ORDER BY number"
+        rows = database.execute(query).fetchall()
+        total, dropped = sum(size for _, size in rows), 0
+        for number, size in rows[:-1]:
+            if total <= self._max_bytes:
+                break
+            database.execute("DELETE FROM report WHERE number = ?", (number,))
+            total, dropped = total - size, dropped + 1
+        self._count(database, "dropped", dropped)
+
+    def _count(self, database: sqlite3.Connection, name: str, more: int) -> None:
+        if more:
+            database.execute(
+                "INSERT INTO count VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET value = value + excluded.value",
+                (name, more),
+            )
+
+    def _check(self) -> None:
+        with closing(self._open()) as database:
+            database.execute("PRAGMA journal_mode = WAL")
+            database.executescript(_SCHEMA)
+            if database.execute("PRAGMA quick_check").fetchone()[0] != "ok":
+                raise sqlite3.DatabaseError("damaged")
+
+    def _set_aside(self) -> None:
+        aside = self._path.with_name(f"{self._path.name}.damaged")
+        for suffix in ("", "-wal", "-shm"):
+            part = self._path.with_name(self._path.name + suffix)
+            if part.exists():
+                part.replace(aside.with_name(aside.name + suffix))
+        self.set_aside = aside
+
+    def _open(self) -> sqlite3.Connection:
+        database = sqlite3.connect(self._path, timeout=_BUSY_S, isolation_level=None)
+        database.execute("PRAGMA synchronous = FULL")
+        return database
+
+    @contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
+        try:
+            with closing(self._open()) as database:
+                database.execute("BEGIN IMMEDIATE")
+                try:
+                    yield database
+                except BaseException:
+                    database.execute("ROLLBACK")
+                    raise
+                database.execute("COMMIT")
+        except sqlite3.Error as error:
+            raise StoreError(f"the spool {self._path} refused ({error}); is its disk full or damaged?") from error
