@@ -2,6 +2,7 @@
 
 import resource
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib import metadata
@@ -23,6 +24,8 @@ from fleetmap.samples import SensorSet, Trajectory
 from mapserver.build_report import Accuracy, BuildReport, accuracy, full_report, make_report, sessions_report
 from mapserver.examining import Before, examine_draft, replayed_probes
 from mapserver.landmark_budget import choose_landmarks
+from mapserver.loop_places import loop_places
+from mapserver.noted_job import Job, noted_job
 from mapserver.picture_files import PictureFile
 from mapserver.progress import ProgressView, StageTimes
 from mapserver.quality.figures import Evidence
@@ -101,11 +104,16 @@ class Draft:
 
 def run_build(order: BuildOrder, settings: SurveySettings) -> str:
     """Does it; the sentence says what there is now. Raises FleetmapErrors, before the survey where possible."""
-    return build_draft(order, settings).sentence
+    return build_draft(order, settings, noted=True).sentence
 
 
-def build_draft(order: BuildOrder, settings: SurveySettings, unusable: dict[Path, str] | None = None) -> Draft:
-    """As `run_build`. With `unusable` a recording that cannot be surveyed goes in there with its reason, and the others are taken."""
+def build_draft(
+    order: BuildOrder, settings: SurveySettings, unusable: dict[Path, str] | None = None, *, noted: bool = False
+) -> Draft:
+    """As `run_build`; noted: as a job of the store.
+
+    With `unusable` a recording that cannot be surveyed goes in there with its reason, and the others are taken.
+    """
     started_s = time.perf_counter()
     console = Console(stderr=True)
     zones = Zones() if order.zones is None else read_zones(order.zones)
@@ -115,12 +123,18 @@ def build_draft(order: BuildOrder, settings: SurveySettings, unusable: dict[Path
         order.recordings, order.frames, order.calibration, order.use, console,
         needs_truth=order.frame_from_ground_truth, unusable=unusable,
     )  # fmt: skip
-    with MapStore.open(order.store, create=True) as maps:
+    with (
+        MapStore.open(order.store, create=True) as maps,
+        noted_job(maps, order.site, "build") if noted else nullcontext(Job()) as job,
+    ):
         parent = _parent(order, maps)
         base = None if parent is None else parent.survey
         chosen = choose_vocabulary(maps, order.site, order.vocabulary)
         built = _survey(order, admitted, zones, base, chosen, settings, console, times, started_s, unusable)
-        return _keep(order, built, parent, settings, maps)
+        draft = _keep(order, built, parent, settings, maps)
+        places = loop_places([s.entry.name for s in built.taken], [s.survey for s in built.taken], built.joined)
+        job.message, job.report = draft.sentence, draft.report | {"version": draft.version, "loop_places": places}
+        return draft
 
 
 def _parent(order: BuildOrder, maps: MapStore) -> Before | None:
