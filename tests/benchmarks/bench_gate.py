@@ -22,7 +22,7 @@ import numpy as np
 from benchmarks.bench_aliasing import replace_layout
 from benchmarks.estimator_loop import blank
 from fleetmap.bow import Vocabulary, train_vocabulary
-from fleetmap.features import orb, patch_align
+from fleetmap.features import orb
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse
 from fleetsim.estimator import EstimatorSession
 from fleetsim.landmarks import LandmarkField
@@ -31,7 +31,7 @@ from fleetsim.recorder import Order, Session, prepare
 from fleetsim.routes import Route
 from fleetsim.scenarios import SCENARIOS, Run, Scenario, find_scenario
 from mapserver.survey.graph_marginals import CHI2_6_0999, GraphMarginals
-from mapserver.survey.keyframes import Keyframe
+from mapserver.survey.keyframes import Keyframe, MemoryShelf
 from mapserver.survey.loops import LoopCloser, Verdict
 from mapserver.survey.pose_graph import PoseEdge
 from mapserver.survey.settings import LoopSettings, SurveySettings
@@ -119,8 +119,8 @@ def keyframe(session: EstimatorSession, number: int, frame: int) -> Keyframe:
         found.pixels[:, :2].copy(), found.octaves, np.zeros(len(found.rows), np.float32), found.descriptors
     )
     return Keyframe(
-        number, shown, features, np.column_stack([disparity, np.full(len(disparity), 0.2)]),
-        session.camera.point_from_pixel(features.pixels, disparity), patch_align.half_pyramid(shown.left),
+        number, shown.stamp_ns, features, np.column_stack([disparity, np.full(len(disparity), 0.2)]),
+        session.camera.point_from_pixel(features.pixels, disparity), MemoryShelf(), 0,
     )  # fmt: skip
 
 

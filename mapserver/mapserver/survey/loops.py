@@ -25,6 +25,10 @@ _CORRELATION = (
 _CHUNK = 64  # candidates that are gated at once
 _TWIN_SCORE = 0.7  # of a candidate's score, from which on another place looks the same
 _WORTH_LEARNING = 1.0  # variance against the measurement's: below, a loop changes what the gate knows by less than half
+# Known so well, no place can be taken for another: the gate need not learn more. Doubled with every so many loops that it has
+# learned, as they cost memory with their square; what it does not learn leaves it wider, and the next loop can still be learned.
+_WELL_KNOWN_COV = np.diag([0.005**2] * 3 + [0.05**2] * 3)
+_LEARNED_PER_DOUBLING = 64
 
 
 class Verdict(StrEnum):
@@ -274,9 +278,12 @@ class LoopCloser:
                 continue
             self.loops.records.append(record)
             self.loops.edges.append(edge)
-            if self._marginals.gain(edge) > _WORTH_LEARNING:
+            if self._marginals.gain(edge, self._well_known()) > _WORTH_LEARNING:
                 self._marginals.add(edge)
                 self._map_from_body = self._marginals.map_from_body
+
+    def _well_known(self) -> Array:
+        return np.asarray(_WELL_KNOWN_COV * 2.0 ** (self._marginals.learned / _LEARNED_PER_DOUBLING))
 
 
 def _cells(keyframe: Keyframe, features: NDArray[np.int64], camera: StereoCamera) -> int:
