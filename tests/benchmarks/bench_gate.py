@@ -45,6 +45,7 @@ ALIAS_X_M = 3.0
 # Odometry's errors grow with the square root of the way: rad and m after one metre. Roll and pitch are held by gravity.
 WALK = np.array([2e-5, 2e-5, 1.5e-4, 4e-3, 4e-3, 1e-3])
 MIN_ALIASED, MIN_CLOSED_SHARE = 100_000, 0.95
+BAYS, EVERY_M = 70, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,8 +239,8 @@ def show(found: Gated) -> None:
 def main() -> None:
     """Prints the figures; writes them as JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bays", type=int, default=70)
-    parser.add_argument("--every", type=float, default=2.0)
+    parser.add_argument("--bays", type=int, default=BAYS)
+    parser.add_argument("--every", type=float, default=EVERY_M)
     parser.add_argument("--per-place", type=int, default=2)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fleetmap.features.matching_kernels import Indices
-from fleetmap.geometry import Array, se3_inverse, se3_log
+from fleetmap.geometry import Array, se3_inverse, se3_log, so3_left_jacobian
 from mapserver.survey.chain_covariance import ChainCovariance
 from mapserver.survey.pose_graph import PoseEdge, adjoint, check_edges
 
@@ -98,6 +98,17 @@ class GraphMarginals:
         innovation = self._innovation(edge)
         cov = self.relative_cov(edge.i, edge.j) + edge.cov_rot_trans
         return float(innovation @ np.linalg.solve(cov, innovation))
+
+    def innovations_squared_beside(self, edge: PoseEdge, steps_map: Array) -> Array:
+        """(M,) `innovation_squared` had the edge put keyframe i somewhere else: each of steps_map (M, 3) away, turned alike."""
+        innovation = self._innovation(edge)
+        # A step moves the innovation's translation, not its rotation, and its logarithm is linear in that.
+        map_from_j = self._map_from_body[edge.j]
+        away = steps_map @ (edge.i_from_j[:3, :3] @ map_from_j[:3, :3].T).T
+        beside = np.tile(innovation, (len(steps_map), 1))
+        beside[:, 3:] -= np.linalg.solve(so3_left_jacobian(innovation[:3]), away.T).T
+        cov = self.relative_cov(edge.i, edge.j) + edge.cov_rot_trans
+        return np.asarray(np.einsum("ma,am->m", beside, np.linalg.solve(cov, beside.T)))
 
     def gain(self, edge: PoseEdge, enough: Array) -> float:
         """Largest ratio of what the graph does not know to what the edge does not, counting from a cov_rot_trans (6, 6) on

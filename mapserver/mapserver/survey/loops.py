@@ -1,13 +1,13 @@
 """Revisits: looked for by words, allowed by position, verified by geometry, and only then believed."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import BowVector, PlaceIndex
-from fleetmap.geometry import Array, se3, se3_inverse
+from fleetmap.geometry import Array, se3_inverse
 from fleetmap.rectification import StereoCamera
 from mapserver.survey.graph_marginals import GraphMarginals
 from mapserver.survey.keyframes import Keyframe
@@ -211,13 +211,10 @@ class LoopCloser:
             return None
         twins = twins[self._are_apart(edge.j, twins)]
         ways = self._map_from_body[twins, :3, 3] - self._map_from_body[edge.j, :3, 3]
-        for way in ways[np.argsort(np.linalg.norm(ways, axis=1), kind="stable")]:
-            for step in (way, -way):
-                i_from_map = edge.i_from_j @ se3_inverse(self._map_from_body[edge.j])
-                elsewhere = replace(edge, i_from_j=i_from_map @ se3(np.eye(3), -step) @ self._map_from_body[edge.j])
-                if self._marginals.innovation_squared(elsewhere) <= self._settings.loops.max_innovation:
-                    return float(np.linalg.norm(step))
-        return None
+        steps = np.concatenate([ways, -ways])
+        possible = self._marginals.innovations_squared_beside(edge, steps) <= self._settings.loops.max_innovation
+        lengths_m = np.linalg.norm(steps[possible], axis=1)
+        return float(lengths_m.min()) if len(lengths_m) else None
 
     def _verify(self, i: int, j: int) -> PairMatch | None:
         """Match of j (as reference) with i; the graph's rotation is used where it is known well enough."""

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import SurveyError
-from fleetmap.geometry import Array, se3_exp, se3_inverse
+from fleetmap.geometry import Array, se3, se3_exp, se3_inverse
 from mapserver.survey.graph_marginals import CHI2_6_0999, GraphMarginals
 from mapserver.survey.pose_graph import PoseEdge, adjoint
 from pose_graph_scene import LOOP_COV, ODOMETRY_COV, Drive, make_drive, measured
@@ -79,6 +79,20 @@ def test_it_does_not_matter_where_the_site_lies() -> None:
     here, there = GraphMarginals(drive.truth, edges), GraphMarginals(far, edges)
     for j in range(1, 24):
         np.testing.assert_allclose(there.relative_cov(0, j), here.relative_cov(0, j), rtol=1e-5, atol=1e-8)
+
+
+def test_an_edge_beside_is_the_edge_measured_from_there() -> None:
+    rng = np.random.default_rng(5)
+    drive = make_drive(rng, count=24)
+    marginals = GraphMarginals(drive.start, drive.edges)
+    edge = measured(rng, drive.truth, 20, 2, LOOP_COV, is_loop=True)
+    steps = rng.normal(size=(5, 3))
+    wanted = []
+    for step in steps:
+        map_from_j = marginals.map_from_body[2]
+        i_from_map = edge.i_from_j @ se3_inverse(map_from_j) @ se3(np.eye(3), -step)
+        wanted.append(marginals.innovation_squared(PoseEdge(20, 2, i_from_map @ map_from_j, LOOP_COV, True)))
+    np.testing.assert_allclose(marginals.innovations_squared_beside(edge, steps), wanted, rtol=1e-9)
 
 
 def test_right_loops_are_as_far_off_as_chi_square_says_and_wrong_ones_are_not() -> None:
