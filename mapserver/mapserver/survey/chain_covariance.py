@@ -4,7 +4,6 @@ import numpy as np
 
 from fleetmap.features.matching_kernels import Indices
 from fleetmap.geometry import Array
-from mapserver.survey import chain_covariance_kernels as kernels
 
 _FIRST_CAPACITY = 16
 
@@ -31,9 +30,13 @@ class ChainCovariance:
 
     def of_differences(self, i: int, js: Indices) -> Array:
         """(M, 6, 6) covariances of x_j - x_i for each j of js (M,)."""
-        return kernels.difference_covariances(
-            i, js, self._joint, self._sums, self._starts, self._before, self._after, self._shares
-        )
+        crossing = self._crossing(i)[:, : len(self._anchors)]
+        before, after = (crossing[:, slots[js]].transpose(1, 0, 2) for slots in (self._before, self._after))
+        cross = before + (after - before) @ self._shares[js].transpose(0, 2, 1)
+        near = np.flatnonzero(self._starts[js] == self._starts[i])
+        cross[near] += self._bridges(i, js[near])
+        own = self._covariances(np.append(js, i))
+        return np.asarray(own[:-1] + own[-1] - cross - cross.transpose(0, 2, 1))
 
     def measure(self, i: int, j: int, cov: Array) -> Array:
         """Takes a measurement of x_j - x_i with cov (6, 6) into account.
@@ -46,10 +49,37 @@ class ChainCovariance:
         innovation = row[:, b : b + 6] - row[:, a : a + 6] + cov
         root = np.linalg.cholesky(0.5 * (innovation + innovation.T))
         half = np.linalg.solve(root, row)
-        kernels.lower(self._joint[:size, :size], half)
+        self._joint[:size, :size] -= half.T @ half
         gains = np.linalg.solve(root.T, half).T.reshape(-1, 6, 6)
         before, after = gains[self._before], gains[self._after]
         return np.asarray(before + self._shares @ (after - before))
+
+    def _crossing(self, k: int) -> Array:
+        """(6, slots, 6) covariance of place k with every anchor."""
+        rows = self._joint.reshape(-1, 6, self._joint.shape[1])
+        before, after = rows[self._before[k]], rows[self._after[k]]
+        return np.asarray((before + self._shares[k] @ (after - before)).reshape(6, -1, 6))
+
+    def _covariances(self, ks: Indices) -> Array:
+        """(M, 6, 6) of each place on its own."""
+        blocks = self._joint.reshape(len(self._joint) // 6, 6, -1, 6)
+        a, b, shares = self._before[ks], self._after[ks], self._shares[ks]
+        first, last, both = blocks[a, :, a], blocks[b, :, b], blocks[b, :, a]
+        shift = shares @ (both - first)
+        spread = shares @ (last - both - both.transpose(0, 2, 1) + first) @ shares.transpose(0, 2, 1)
+        walked = self._sums[ks] - self._sums[self._starts[ks]]
+        return np.asarray(first + shift + shift.transpose(0, 2, 1) + spread + walked - shares @ walked)
+
+    def _bridges(self, i: int, js: Indices) -> Array:
+        """(M, 6, 6) covariances of place i with places between the same anchors, beyond what the anchors say."""
+        start = self._sums[self._starts[i]]
+        walked_i, walked_j = self._sums[i] - start, self._sums[js] - start
+        ahead = (js >= i)[:, None, None]
+        return np.asarray(
+            np.where(
+                ahead, walked_i - self._shares[i] @ walked_j, walked_j - walked_i @ self._shares[js].transpose(0, 2, 1)
+            )
+        )
 
     def _anchor(self, k: int) -> int:
         """The slot of place k, made an anchor if it is none yet."""
@@ -60,10 +90,7 @@ class ChainCovariance:
             grown = np.zeros((2 * len(self._joint), 2 * len(self._joint)))
             grown[: 6 * slot, : 6 * slot] = self._joint
             self._joint = grown
-        row = kernels.anchor_row(k, self._joint, self._before, self._after, self._shares)[:, : 6 * slot]
-        own = kernels.place_covariance(
-            k, self._joint, self._sums, self._starts, self._before, self._after, self._shares
-        )
+        row, own = self._crossing(k).reshape(6, -1)[:, : 6 * slot], self._covariances(np.array([k]))[0]
         here = slice(6 * slot, 6 * slot + 6)
         self._joint[here, : 6 * slot], self._joint[: 6 * slot, here] = row, row.T
         self._joint[here, here] = 0.5 * (own + own.T)
