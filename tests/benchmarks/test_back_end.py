@@ -1,4 +1,4 @@
-"""The survey's back end beside gtsam and scipy, its loops where aisles repeat, and what spoiled recordings end in; `make bench`."""
+"""The survey's back end beside gtsam and a reference, its loops where aisles repeat, and what spoiled recordings end in; `make bench`."""
 
 import json
 from pathlib import Path
@@ -29,7 +29,7 @@ def test_bundle_adjustment_in_the_large() -> None:
     real_data("pose_graphs")
     figures = bench_solvers.bal()
     print(json.dumps(figures))
-    assert abs(figures["above_scipy"]) <= 1e-3
+    assert abs(figures["above_reference"]) <= 1e-3
     assert abs(figures["above_gtsam"]) <= 1e-3
 
 
