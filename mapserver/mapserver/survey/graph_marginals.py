@@ -1,14 +1,12 @@
 """How well the pose graph knows where one keyframe is seen from another: what the loop gate asks, very often.
 
 Perturbing every keyframe in map axes (map_from_body -> Exp(x_k) @ map_from_body) makes each edge a measurement of the
-plain difference x_j - x_i. The covariance of a difference along a tree of edges is then a difference of sums from the
-root, and every other edge lowers it by a rank-6 update (recursive least squares). So a query costs a few small matrix
-products, with no factorisation, and an accepted loop is added without starting again. First order, exact for the
-linearised graph.
+plain difference x_j - x_i: odometry a chain of independent steps, every other edge a rank-6 update of it (recursive least
+squares). So a query costs a few small matrix products, with no factorisation, and an accepted loop is added without
+starting again. First order, exact for the linearised graph.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import scipy.linalg
@@ -16,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fleetmap.features.matching_kernels import Indices
-from fleetmap.geometry import Array, se3_inverse, se3_log
-from mapserver.survey.graph_marginals_kernels import common_ancestors
+from fleetmap.geometry import Array, se3_inverse, se3_log, so3_left_jacobian
+from mapserver.survey.chain_covariance import ChainCovariance
 from mapserver.survey.pose_graph import PoseEdge, adjoint, check_edges
 
 CHI2_3_0999 = 16.266  # 0.999 of chi-square with 3 degrees of freedom: a place
@@ -28,7 +26,8 @@ class GraphMarginals:
     """Covariances of relative transforms in the graph of `edges`, linearised at map_from_body (K, 4, 4).
 
     All covariances (6, 6) are rotation first, of a perturbation in the axes of i: true i_from_j = Exp(x) @ i_from_j,
-    as in PoseEdge. Loops count in full: pass those that are believed. Takes 288 bytes for each keyframe and loop.
+    as in PoseEdge. Some edge joins every keyframe with the next. Loops count in full: pass those that are believed.
+    Memory goes with the square of the edges beyond the chain, 1.2 kB times, and not with K.
     """
 
     def __init__(self, map_from_body: Array, edges: Sequence[PoseEdge]) -> None:
@@ -38,20 +37,12 @@ class GraphMarginals:
         self._middle_m = map_from_body[:, :3, 3].mean(axis=0)
         self._map_from_body = map_from_body.copy()
         self._map_from_body[:, :3, 3] -= self._middle_m
-        joined = self._joined(edges)
-        tree = _spanning_tree(len(map_from_body), list(joined))
-        self._parents, self._order = _rooted(len(map_from_body), tree)
-        self._sums = np.zeros(
-            (len(map_from_body), 6, 6)
-        )  # covariance of each keyframe against the root, tree edges only
-        for k in self._order[1:]:
-            parent = int(self._parents[k])
-            self._sums[k] = self._sums[parent] + joined[min(k, parent), max(k, parent)]
-        others = [pair for pair in joined if pair not in set(tree)]
-        self._updates = 0
-        self._table = np.zeros((6 * len(others), 6 * len(map_from_body)))
-        for i, j in others:
-            self._update(i, j, joined[i, j])
+        chain, others = _chain_and_others(len(map_from_body), edges)
+        steps = [np.zeros((6, 6)), *(self._cov_map(edge) for edge in chain)]
+        self._covariance = ChainCovariance(np.cumsum(steps, axis=0))
+        self._learned = 0
+        for edge in others:
+            self._measure(edge)
 
     @property
     def map_from_body(self) -> Array:
@@ -62,8 +53,8 @@ class GraphMarginals:
 
     @property
     def learned(self) -> int:
-        """How many edges count besides those of the spanning tree."""
-        return self._updates
+        """How many edges count besides those of the chain."""
+        return self._learned
 
     def add(self, edge: PoseEdge) -> None:
         """Takes one more edge into account, such as a loop just accepted: what it says narrows and moves the graph.
@@ -72,8 +63,7 @@ class GraphMarginals:
         """
         check_edges(len(self._map_from_body), [edge], connected=False)
         said_map = adjoint(self._map_from_body[edge.i]) @ self._innovation(edge)
-        gain = self._update(edge.i, edge.j, self._cov_map(edge))
-        self._map_from_body = _moved(self._map_from_body, (gain @ said_map).reshape(-1, 6))
+        self._map_from_body = _moved(self._map_from_body, self._measure(edge) @ said_map)
 
     def relative_cov(self, i: int, j: int) -> Array:
         """(6, 6) covariance of i_from_j."""
@@ -81,12 +71,7 @@ class GraphMarginals:
 
     def relative_covs(self, i: int, js: Indices) -> Array:
         """(M, 6, 6) covariances of i_from_j for each j of js (M,)."""
-        common = common_ancestors(self._parents, self._order, i)[js]
-        cov_map = self._sums[i] + self._sums[js] - 2.0 * self._sums[common]
-        if self._updates:
-            table = self._table[: 6 * self._updates].reshape(6 * self._updates, -1, 6)
-            learned = (table[:, js] - table[:, [i]]).transpose(1, 2, 0)
-            cov_map -= learned @ learned.transpose(0, 2, 1)
+        cov_map = self._covariance.of_differences(i, js)
         i_from_map = adjoint(se3_inverse(self._map_from_body[i]))
         return np.asarray(i_from_map @ cov_map @ i_from_map.T)
 
@@ -114,9 +99,22 @@ class GraphMarginals:
         cov = self.relative_cov(edge.i, edge.j) + edge.cov_rot_trans
         return float(innovation @ np.linalg.solve(cov, innovation))
 
-    def gain(self, edge: PoseEdge) -> float:
-        """Largest ratio of what the graph does not know to what the edge does not: below 1 the edge tells little."""
-        return float(np.max(scipy.linalg.eigvalsh(self.relative_cov(edge.i, edge.j), edge.cov_rot_trans)))
+    def innovations_squared_beside(self, edge: PoseEdge, steps_map: Array) -> Array:
+        """(M,) `innovation_squared` had the edge put keyframe i somewhere else: each of steps_map (M, 3) away, turned alike."""
+        innovation = self._innovation(edge)
+        # A step moves the innovation's translation, not its rotation, and its logarithm is linear in that.
+        map_from_j = self._map_from_body[edge.j]
+        away = steps_map @ (edge.i_from_j[:3, :3] @ map_from_j[:3, :3].T).T
+        beside = np.tile(innovation, (len(steps_map), 1))
+        beside[:, 3:] -= np.linalg.solve(so3_left_jacobian(innovation[:3]), away.T).T
+        cov = self.relative_cov(edge.i, edge.j) + edge.cov_rot_trans
+        return np.asarray(np.einsum("ma,am->m", beside, np.linalg.solve(cov, beside.T)))
+
+    def gain(self, edge: PoseEdge, enough: Array) -> float:
+        """Largest ratio of what the graph does not know to what the edge does not, counting from a cov_rot_trans (6, 6) on
+        that is known well `enough`: below 1 the edge tells little.
+        """
+        return float(np.max(scipy.linalg.eigvalsh(self.relative_cov(edge.i, edge.j), edge.cov_rot_trans + enough)))
 
     def _innovation(self, edge: PoseEdge) -> Array:
         """(6,) what a measured edge says against the graph, in the axes of i."""
@@ -128,41 +126,24 @@ class GraphMarginals:
         map_from_i = adjoint(self._map_from_body[edge.i])
         return np.asarray(map_from_i @ edge.cov_rot_trans @ map_from_i.T)
 
-    def _joined(self, edges: Sequence[PoseEdge]) -> dict[tuple[int, int], Array]:
-        """Covariance of every pair in map axes, parallel edges made one; pairs with a safe edge come first."""
-        parallel: dict[tuple[int, int], list[PoseEdge]] = {}
-        for edge in sorted(edges, key=lambda edge: edge.is_loop):
-            parallel.setdefault((min(edge.i, edge.j), max(edge.i, edge.j)), []).append(edge)
-        return {pair: self._cov_map(self._one_of(bundle)) for pair, bundle in parallel.items()}
+    def _measure(self, edge: PoseEdge) -> Array:
+        """(K, 6, 6) how far each keyframe moves by what the edge says against the graph, which knows it from now on."""
+        self._learned += 1
+        return self._covariance.measure(edge.i, edge.j, self._cov_map(edge))
 
-    def _one_of(self, parallel: list[PoseEdge]) -> PoseEdge:
-        """One edge that knows what all of them know, in the axes of the first one's i, where numbers are small."""
-        if len(parallel) == 1:
-            return parallel[0]
-        information = np.zeros((6, 6))
-        i_from_map = se3_inverse(self._map_from_body[parallel[0].i])
-        for edge in parallel:
-            carried = adjoint(i_from_map @ self._map_from_body[edge.i])
-            information += np.linalg.inv(carried @ edge.cov_rot_trans @ carried.T)
-        return replace(parallel[0], cov_rot_trans=np.asarray(np.linalg.inv(information), np.float64))
 
-    def _update(self, i: int, j: int, cov_map: Array) -> Array:
-        """One more measured difference x_j - x_i: the rows that lower every covariance from now on.
-
-        Returns the gain (6 K, 6): how far each keyframe moves by what the measurement says against the graph.
-        """
-        known = self._table[: 6 * self._updates]
-        ancestors = [common_ancestors(self._parents, self._order, k) for k in (i, j)]
-        shared = (self._sums[ancestors[1]] - self._sums[ancestors[0]]).transpose(1, 0, 2).reshape(6, -1)
-        shared = shared - (_columns(known, j) - _columns(known, i)).T @ known
-        innovation = _columns(shared, j) - _columns(shared, i) + cov_map
-        root = np.linalg.cholesky(0.5 * (innovation + innovation.T))
-        rows = np.linalg.solve(root, shared)
-        if len(self._table) < 6 * (self._updates + 1):
-            self._table = np.concatenate([self._table, np.zeros((max(len(self._table), 48), self._table.shape[1]))])
-        self._table[6 * self._updates : 6 * (self._updates + 1)] = rows
-        self._updates += 1
-        return np.asarray(np.linalg.solve(root.T, rows).T)
+def _chain_and_others(count: int, edges: Sequence[PoseEdge]) -> tuple[list[PoseEdge], list[PoseEdge]]:
+    """One edge from each keyframe to the next, safe ones first, and all that are left."""
+    chain: dict[int, PoseEdge] = {}
+    others = []
+    for edge in sorted(edges, key=lambda edge: edge.is_loop):
+        first = min(edge.i, edge.j)
+        if abs(edge.i - edge.j) == 1 and first not in chain:
+            chain[first] = edge
+        else:
+            others.append(edge)
+    assert len(chain) == count - 1, f"{len(chain)} of {count - 1} keyframes are joined with the next"
+    return [chain[k] for k in range(count - 1)], others
 
 
 def _moved(map_from_body: Array, perturbations: Array) -> Array:
@@ -173,40 +154,3 @@ def _moved(map_from_body: Array, perturbations: Array) -> Array:
     moved[:, :3, :3] = turns @ map_from_body[:, :3, :3]
     moved[:, :3, 3] = np.einsum("kij,kj->ki", turns, map_from_body[:, :3, 3]) + shifts
     return moved
-
-
-def _columns(table: Array, k: int) -> Array:
-    return table[:, 6 * k : 6 * (k + 1)]
-
-
-def _spanning_tree(count: int, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The first pairs that join all nodes without a ring. Source: Kruskal 1956."""
-    group = list(range(count))
-
-    def group_of(k: int) -> int:
-        while group[k] != k:
-            group[k] = group[group[k]]
-            k = group[k]
-        return k
-
-    tree = []
-    for i, j in pairs:
-        if group_of(i) != group_of(j):
-            group[group_of(i)] = group_of(j)
-            tree.append((i, j))
-    return tree
-
-
-def _rooted(count: int, tree: list[tuple[int, int]]) -> tuple[Indices, Indices]:
-    """Parent of every node (-1 for node 0) and an order in which parents come first."""
-    neighbours: list[list[int]] = [[] for _ in range(count)]
-    for i, j in tree:
-        neighbours[i].append(j)
-        neighbours[j].append(i)
-    parents, order = np.full(count, -1, np.int64), [0]
-    for k in order:  # grows while it is read
-        for other in neighbours[k]:
-            if other != parents[k]:
-                parents[other] = k
-                order.append(other)
-    return parents, np.array(order, np.int64)

@@ -1,13 +1,13 @@
 """Revisits: looked for by words, allowed by position, verified by geometry, and only then believed."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import BowVector, PlaceIndex
-from fleetmap.geometry import Array, se3, se3_inverse
+from fleetmap.geometry import Array, se3_inverse
 from fleetmap.rectification import StereoCamera
 from mapserver.survey.graph_marginals import GraphMarginals
 from mapserver.survey.keyframes import Keyframe
@@ -25,6 +25,10 @@ _CORRELATION = (
 _CHUNK = 64  # candidates that are gated at once
 _TWIN_SCORE = 0.7  # of a candidate's score, from which on another place looks the same
 _WORTH_LEARNING = 1.0  # variance against the measurement's: below, a loop changes what the gate knows by less than half
+# Known so well, no place can be taken for another: the gate need not learn more. Doubled with every so many loops that it has
+# learned, as they cost memory with their square; what it does not learn leaves it wider, and the next loop can still be learned.
+_WELL_KNOWN_COV = np.diag([0.005**2] * 3 + [0.05**2] * 3)
+_LEARNED_PER_DOUBLING = 64
 
 
 class Verdict(StrEnum):
@@ -207,13 +211,10 @@ class LoopCloser:
             return None
         twins = twins[self._are_apart(edge.j, twins)]
         ways = self._map_from_body[twins, :3, 3] - self._map_from_body[edge.j, :3, 3]
-        for way in ways[np.argsort(np.linalg.norm(ways, axis=1), kind="stable")]:
-            for step in (way, -way):
-                i_from_map = edge.i_from_j @ se3_inverse(self._map_from_body[edge.j])
-                elsewhere = replace(edge, i_from_j=i_from_map @ se3(np.eye(3), -step) @ self._map_from_body[edge.j])
-                if self._marginals.innovation_squared(elsewhere) <= self._settings.loops.max_innovation:
-                    return float(np.linalg.norm(step))
-        return None
+        steps = np.concatenate([ways, -ways])
+        possible = self._marginals.innovations_squared_beside(edge, steps) <= self._settings.loops.max_innovation
+        lengths_m = np.linalg.norm(steps[possible], axis=1)
+        return float(lengths_m.min()) if len(lengths_m) else None
 
     def _verify(self, i: int, j: int) -> PairMatch | None:
         """Match of j (as reference) with i; the graph's rotation is used where it is known well enough."""
@@ -274,9 +275,12 @@ class LoopCloser:
                 continue
             self.loops.records.append(record)
             self.loops.edges.append(edge)
-            if self._marginals.gain(edge) > _WORTH_LEARNING:
+            if self._marginals.gain(edge, self._well_known()) > _WORTH_LEARNING:
                 self._marginals.add(edge)
                 self._map_from_body = self._marginals.map_from_body
+
+    def _well_known(self) -> Array:
+        return np.asarray(_WELL_KNOWN_COV * 2.0 ** (self._marginals.learned / _LEARNED_PER_DOUBLING))
 
 
 def _cells(keyframe: Keyframe, features: NDArray[np.int64], camera: StereoCamera) -> int:

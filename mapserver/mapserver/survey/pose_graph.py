@@ -167,15 +167,21 @@ def _optimum(
     """The lowest minimum found, and the iterations that led there from the start that reached it."""
     best, spent = _descend(graph, start, min(max_iterations, _FIRST_ITERATIONS))
     if 2.0 * graph.error(best) > freedom + 5.0 * np.sqrt(2.0 * max(freedom, 1)):
-        other, other_spent = _descend(
-            graph, gtsam.InitializePose3.initialize(graph), min(max_iterations, _FIRST_ITERATIONS)
-        )
-        if graph.error(other) < graph.error(best):
+        other, other_spent = _without_guess(graph, min(max_iterations, _FIRST_ITERATIONS))
+        if other is not None and graph.error(other) < graph.error(best):
             best, spent = other, other_spent
     if spent < _FIRST_ITERATIONS or spent >= max_iterations:
         return best, spent
     best, more = _descend(graph, best, max_iterations - spent)
     return best, spent + more
+
+
+def _without_guess(graph: gtsam.NonlinearFactorGraph, iterations: int) -> tuple[gtsam.Values | None, int]:
+    """What the chordal start leads to, None where the graph is too badly conditioned to have one."""
+    try:
+        return _descend(graph, gtsam.InitializePose3.initialize(graph), iterations)
+    except RuntimeError:
+        return None, 0
 
 
 def _descend(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, iterations: int) -> tuple[gtsam.Values, int]:

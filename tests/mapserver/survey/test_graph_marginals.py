@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import SurveyError
-from fleetmap.geometry import Array, se3_exp, se3_inverse
+from fleetmap.geometry import Array, se3, se3_exp, se3_inverse
 from mapserver.survey.graph_marginals import CHI2_6_0999, GraphMarginals
 from mapserver.survey.pose_graph import PoseEdge, adjoint
 from pose_graph_scene import LOOP_COV, ODOMETRY_COV, Drive, make_drive, measured
@@ -40,10 +40,12 @@ def _gtsam_relative_cov(map_from_body: Array, edges: list[PoseEdge], i: int, j: 
 
 CHAIN = [(k, k + 1) for k in range(23)]
 RINGS = [(0, 20), (3, 17), (5, 6), (17, 3), (10, 22), (1, 23)]
-TREE = [(5, 0), (5, 3), (3, 1), (3, 2), (4, 5), (6, 4), *[(k // 2, k) for k in range(7, 24)]]
+TURNED = [(k + 1, k) if k % 3 else (k, k + 1) for k in range(23)]
 
 
-@pytest.mark.parametrize("pairs", [CHAIN, CHAIN + RINGS, TREE, TREE + RINGS], ids=["chain", "rings", "tree", "both"])
+@pytest.mark.parametrize(
+    "pairs", [CHAIN, CHAIN + RINGS, TURNED, RINGS + TURNED], ids=["chain", "rings", "turned", "all"]
+)
 @pytest.mark.parametrize("is_loop", [False, True])
 def test_relative_covariances_are_gtsams(pairs: list[tuple[int, int]], is_loop: bool) -> None:
     drive = make_drive(np.random.default_rng(1), count=24)
@@ -77,6 +79,20 @@ def test_it_does_not_matter_where_the_site_lies() -> None:
     here, there = GraphMarginals(drive.truth, edges), GraphMarginals(far, edges)
     for j in range(1, 24):
         np.testing.assert_allclose(there.relative_cov(0, j), here.relative_cov(0, j), rtol=1e-5, atol=1e-8)
+
+
+def test_an_edge_beside_is_the_edge_measured_from_there() -> None:
+    rng = np.random.default_rng(5)
+    drive = make_drive(rng, count=24)
+    marginals = GraphMarginals(drive.start, drive.edges)
+    edge = measured(rng, drive.truth, 20, 2, LOOP_COV, is_loop=True)
+    steps = rng.normal(size=(5, 3))
+    wanted = []
+    for step in steps:
+        map_from_j = marginals.map_from_body[2]
+        i_from_map = edge.i_from_j @ se3_inverse(map_from_j) @ se3(np.eye(3), -step)
+        wanted.append(marginals.innovation_squared(PoseEdge(20, 2, i_from_map @ map_from_j, LOOP_COV, True)))
+    np.testing.assert_allclose(marginals.innovations_squared_beside(edge, steps), wanted, rtol=1e-9)
 
 
 def test_right_loops_are_as_far_off_as_chi_square_says_and_wrong_ones_are_not() -> None:

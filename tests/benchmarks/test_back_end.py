@@ -1,0 +1,88 @@
+"""The survey's back end beside gtsam and a reference, its loops where aisles repeat, and what spoiled recordings end in; `make bench`."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks import bench_consistency, bench_gate, bench_hard_cases, bench_loops, bench_solvers, consistency
+from fleetmap.recordings import open_recording
+from fleetsim.commands import record_order
+from fleetsim.recorder import Order
+from realdata import real_data
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+
+
+@pytest.mark.parametrize("name", bench_solvers.GRAPHS)
+def test_pose_graph(name: str) -> None:
+    """From its own start as low as from any other; a tenth of wrong loops hardly bends it."""
+    real_data("pose_graphs")
+    (figures,) = bench_solvers.pose_graphs([name]).values()
+    print(json.dumps({name: figures}))
+    assert figures["above_best"] <= 1e-3
+    assert figures["wrong_kept"] == 0
+    assert figures["off_clean_share_of_extent"] <= 0.02
+
+
+def test_bundle_adjustment_in_the_large() -> None:
+    real_data("pose_graphs")
+    figures = bench_solvers.bal()
+    print(json.dumps(figures))
+    assert abs(figures["above_reference"]) <= 1e-3
+    assert abs(figures["above_gtsam"]) <= 1e-3
+
+
+@pytest.mark.parametrize("section", ["local adjustment", "global adjustment"])
+def test_bundle_adjustment_beside_gtsam(section: str) -> None:
+    figures = bench_solvers.SECTIONS[section]()
+    print(json.dumps({section: figures}))
+    assert isinstance(figures, dict)
+    assert abs(figures["above_gtsam"]) <= 1e-3
+    assert figures["times_faster"] >= 8.0
+
+
+def test_place_query() -> None:
+    figures = bench_solvers.place_query()
+    print(json.dumps(figures))
+    assert figures["ms_median"] < 3.0
+
+
+def test_no_loop_joins_two_aisles_of_a_whole_site() -> None:
+    found = bench_gate.bench(bench_gate.BAYS, bench_gate.EVERY_M)
+    bench_gate.show(found)
+    assert found.aliased >= bench_gate.MIN_ALIASED
+    assert found.wrong == 0
+    assert found.closed_share >= bench_gate.MIN_CLOSED_SHARE
+
+
+def test_rendered_identical_aisles(tmp_path: Path) -> None:
+    found = bench_loops.bench(tmp_path / "aisles.mcap")
+    bench_loops.show(found)
+    gated = found["gate"]
+    assert gated.wrong == 0
+    assert gated.right > 0
+    assert gated.ate_m <= bench_loops.MAX_ATE_M
+
+
+def test_odometry_is_as_sure_as_it_may_be() -> None:
+    site, first = consistency.Site(), bench_consistency.REPORTED_FROM
+    runs = [consistency.run(site.session(first + n), True, 300)[0] for n in range(100)]
+    figures = bench_consistency.summary(runs)
+    print(json.dumps(figures))
+    least, most = bench_consistency.BAND
+    assert least <= figures["rotation_nees_per_dof"] <= most
+    assert least <= figures["position_nees_per_dof"] <= most
+
+
+def test_spoiled_recordings_are_refused_or_right(tmp_path: Path) -> None:
+    files = []
+    for robot in ("survey", "tote-1"):
+        files.append(tmp_path / f"{robot}.mcap")
+        record_order(Order("small-loop", robot=robot), files[-1], "mcap")
+    found = []
+    with open_recording(files[0]) as good, open_recording(files[1]) as other:
+        for case, spoil in bench_hard_cases.CASES.items():
+            found.append(bench_hard_cases.outcome(case, spoil(good, other), "::2"))
+    bench_hard_cases.show(found)
+    assert all(outcome.is_right for outcome in found)
