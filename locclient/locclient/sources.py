@@ -1,6 +1,6 @@
 """Where a replay's samples come from: a recording, forwards, or backwards with new stamps and without IMU."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fleetmap.calibration import RigCalibration
 from fleetmap.geometry import Array
 from fleetmap.recordings import FrameSelection, Recording
-from fleetmap.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
+from fleetmap.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample, wheel_between
 
 _IMU_LEAD_NS = 10_000_000  # a frame is handled when the IMU has come a little past it
 
@@ -73,14 +73,14 @@ class ReplaySource:
         since = self.recorded_stamp_ns(number - 1) if number else -(2**62)
         return [p for p in self.recording.priors if since < p.stamp_ns <= self.recorded_stamp_ns(number)]
 
-    def wheel_before(self, number: int) -> list[WheelSample]:
+    def wheel_before(self, number: int) -> Sequence[WheelSample]:
         """Wheel odometry between the frame before and frame `number`; none backwards."""
         if self.reverse:
             return []
         offset_ns = int(self.recording.calibration.cameras[0].imu_minus_cam_s * 1e9)
         since = self.recorded_stamp_ns(number - 1) + offset_ns if number else -(2**62)
         until = self.recorded_stamp_ns(number) + offset_ns
-        return [w for w in self.recording.wheel if since < w.stamp_ns <= until]
+        return wheel_between(self.recording.wheel, since + 1, until + 1)
 
     def truth_map_from_body(self, number: int) -> Array | None:
         """The recording's ground truth at frame `number`, None where there is none."""

@@ -1,5 +1,7 @@
 """What sensors deliver, as values. Stamps are `stamp_ns` on the sensor clock."""
 
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -70,6 +72,12 @@ class WheelSample:
     yaw_rate_radps: float
     sigma_mps: float
     sigma_radps: float
+
+
+def wheel_between(samples: Sequence[WheelSample], start_ns: int, end_ns: int) -> Sequence[WheelSample]:
+    """Those with start_ns <= stamp < end_ns of samples in order of their stamps."""
+    first = bisect_left(samples, start_ns, key=lambda sample: sample.stamp_ns)
+    return samples[first : bisect_left(samples, end_ns, lo=first, key=lambda sample: sample.stamp_ns)]
 
 
 @dataclass(frozen=True, slots=True)

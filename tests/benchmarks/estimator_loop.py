@@ -16,7 +16,7 @@ from fleetmap.odometry.odometry import OdometryEstimate
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracker import MotionSince, Tracked, Tracker
 from fleetmap.rectification import RectifiedFrame, StereoCamera
-from fleetmap.samples import PositionPrior
+from fleetmap.samples import PositionPrior, wheel_between
 from fleetsim.estimator import EstimatorSession, Found
 from locclient.localizer import Estimate, Localizer
 from locclient.relocalizer import Seen
@@ -97,7 +97,7 @@ def run_odometry(
     for frame in range(len(session) if frames is None else min(frames, len(session))):
         stamp_ns = session.stamps_ns[frame]
         odometry.handle_imu(session.session.imu.between(last_ns, stamp_ns + 1))
-        odometry.handle_wheel([s for s in session.session.wheel if last_ns <= s.stamp_ns <= stamp_ns])
+        odometry.handle_wheel(wheel_between(session.session.wheel, last_ns, stamp_ns + 1))
         last_ns = stamp_ns + 1
         estimates.append(odometry.handle_stereo(blank(session, frame)))
     return estimates

@@ -10,7 +10,7 @@ from fleetmap.calibration import RigCalibration
 from fleetmap.geometry import Array, rotation_between_vectors, se3
 from fleetmap.odometry import OdometryEstimate, OdometryStatus, make_odometry
 from fleetmap.rectification import RectifiedFrame, Rectifier
-from fleetmap.samples import CameraFrame, ImuSamples, WheelSample
+from fleetmap.samples import CameraFrame, ImuSamples, WheelSample, wheel_between
 from mapserver.survey.keyframes import FrameSummary, Keyframe, KeyframePolicy, PictureShelf, make_keyframes, sharpness
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.work import ALONE, Worker
@@ -63,7 +63,7 @@ def run_odometry(
         frame = rectifier.rectify(raw)
         until_ns = raw.stamp_ns + int(rectifier.imu_minus_cam_s * 1e9) + 10_000_000
         odometry.handle_imu(imu.between(fed_ns, until_ns))
-        odometry.handle_wheel([sample for sample in wheel if fed_ns <= sample.stamp_ns < until_ns])
+        odometry.handle_wheel(wheel_between(wheel, fed_ns, until_ns))
         fed_ns = until_ns
         estimate = odometry.handle_stereo(frame)
         if estimate.new_odom_from_old_odom is not None:

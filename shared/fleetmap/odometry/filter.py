@@ -155,7 +155,7 @@ class InvariantFilter:
         jacobian[0:3, 0:3] = np.eye(3)
         jacobian[3:6, 6:9] = np.eye(3)
         jacobian[0:3, _OFFSET] = turn
-        jacobian[3:6, _OFFSET] = s.velocity_mps + np.cross(s.position_m, turn)
+        jacobian[3:6, _OFFSET] = s.velocity_mps + skew(s.position_m) @ turn
         self.covariance = _grown(self.covariance, jacobian)
         self.budget = _grown(self.budget, np.hstack([np.zeros((6, _ALLOWED)), jacobian]))
         self.clone_ids.append(clone_id)
@@ -260,9 +260,14 @@ class InvariantFilter:
         gain = np.asarray(np.linalg.solve(innovation, cross.T).T, np.float64)
         self._correct(gain @ residual)
         self.covariance = _symmetric(self.covariance - gain @ innovation @ gain.T)
-        left = np.eye(len(self.budget))
-        left[_ALLOWED:] -= gain @ whole
-        self._carry_budget(left, gain, real)
+        # as _carry_budget with left = 1 - gain @ whole, at the price of the few rows that `whole` has
+        known = whole @ self.budget
+        half = -0.5 * (known @ whole.T + real) @ gain.T
+        half += known[:, _ALLOWED:]
+        taken = np.zeros_like(self.budget)
+        taken[_ALLOWED:, _ALLOWED:] = gain @ half
+        taken[_ALLOWED:, :_ALLOWED] = gain @ known[:, :_ALLOWED]
+        self.budget = _symmetric(self.budget - taken - taken.T)
         return normalised
 
     def stand_still(self, gyro_mean_radps: Array, gyro_sigma_radps: float, gate: float) -> float:
@@ -286,7 +291,7 @@ class InvariantFilter:
         turn, base_body = base_from_body[:3, :3], se3_inverse(base_from_body)[:3, 3]
         rate = gyro_radps - s.gyro_bias_radps
         back = turn @ s.rotation.T
-        velocity = back @ s.velocity_mps + turn @ np.cross(rate, base_body)
+        velocity = back @ s.velocity_mps + turn @ (skew(rate) @ base_body)
         jacobian = np.zeros((4, _CLONES))
         # R^T v with the invariant error changes by R^T nu alone: turning the frame turns both
         jacobian[:3, 3:6] = back
@@ -411,11 +416,12 @@ def imu_intervals(imu: ImuSamples, start_ns: int, end_ns: int) -> tuple[Array, A
     """
     if end_ns <= start_ns or len(imu) == 0:
         return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
-    inside = imu.stamps_ns[(imu.stamps_ns > start_ns) & (imu.stamps_ns < end_ns)]
-    edges = np.concatenate([[start_ns], inside, [end_ns]]).astype(np.int64)
+    first, end = np.searchsorted(imu.stamps_ns, [start_ns + 1, end_ns]).tolist()
+    edges = np.concatenate([[start_ns], imu.stamps_ns[first:end], [end_ns]]).astype(np.int64)
     origin = edges[0]
     middles = 0.5 * ((edges[1:] - origin) + (edges[:-1] - origin))
-    at = (imu.stamps_ns - origin).astype(np.float64)
-    gyro = np.stack([np.interp(middles, at, imu.gyro_radps[:, k]) for k in range(3)], axis=1)
-    accel = np.stack([np.interp(middles, at, imu.accel_mps2[:, k]) for k in range(3)], axis=1)
+    around = slice(max(first - 1, 0), end + 1)
+    at = (imu.stamps_ns[around] - origin).astype(np.float64)
+    gyro = np.stack([np.interp(middles, at, imu.gyro_radps[around, k]) for k in range(3)], axis=1)
+    accel = np.stack([np.interp(middles, at, imu.accel_mps2[around, k]) for k in range(3)], axis=1)
     return np.diff(edges) * 1e-9, gyro, accel

@@ -5,6 +5,8 @@ error (r, nu, rho): R = Exp(r) R^, v = Exp(r) v^ + nu, p = Exp(r) p^ + rho (to f
 2017 for the error, Mourikis and Roumeliotis 2007 for the multi-state constraint.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -267,6 +269,18 @@ def _columns_of(seen: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 @kernel
+def share_that_passes(limit: float, mean_square: float) -> float:
+    """Of a normal error's variance, what is left among those whose square stays below the limit (truncated normal)."""
+    if mean_square * 40.0 < limit:
+        return 1.0
+    if limit < 1e-3 * mean_square:
+        return limit / (3.0 * mean_square)
+    edge = math.sqrt(limit / mean_square)
+    density = math.exp(-0.5 * edge * edge) / math.sqrt(2.0 * math.pi)
+    return 1.0 - 2.0 * edge * density / math.erf(edge / math.sqrt(2.0))
+
+
+@kernel
 def accumulate_tracks(
     odom_from_body_rotations: Array, body_positions: Array, body_from_cam: Array, starts: NDArray[np.int64],
     clones: NDArray[np.int64], pixels: Array, anchors: NDArray[np.int64], first_points: Array, camera: Array,
@@ -277,7 +291,7 @@ def accumulate_tracks(
 
     starts (T + 1,) delimits each track's rows of clones (n,) and pixels (n, 3). first_points (T, 3): where
     triangulation starts, in the camera of clone anchors (T,). noise (4,): variance that the whitened rows really have,
-    and sigmas of a track's own errors as in `add_error_sources`. clone_covariance (6 M, 6 M) in the error of this
+    and sigmas of a track's own errors as in `add_error_sources`, of which the gate lets pass what `share_that_passes`. clone_covariance (6 M, 6 M) in the error of this
     module, order rotation then position. moved (6 M,): how far the clones given here stand from the prior mean, when an
     iterated filter relinearises. Summed into: vector (6 M,), which is information (6 M, 2 + 6 M) times disparity offset,
     depth scale and the clones' errors, plus noise that really has the covariance scatter (6 M, 6 M). used (T,) becomes
@@ -323,10 +337,15 @@ def accumulate_tracks(
         if not cholesky_in_place(innovation):
             continue
         forward_substitute(innovation, whitened)
-        if (whitened * whitened).sum() > _chi_square_limit(dof, normal_quantile):
+        limit = _chi_square_limit(dof, normal_quantile)
+        if (whitened * whitened).sum() > limit:
             used[t] = -1
             continue
         used[t] = 1
+        for k in range(3):
+            column = own[:, k].copy()
+            forward_substitute(innovation, column)
+            own[:, k] *= math.sqrt(share_that_passes(limit, (column * column).sum()))
         gained, carried = matmul(by_clone.T, by_state), matmul(by_clone.T, own)
         for a in range(6 * n):
             to = index[a] - 2

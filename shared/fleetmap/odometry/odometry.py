@@ -180,6 +180,9 @@ class Odometry:
 
     def _new_filter(self, state: NavState, covariance: Array) -> InvariantFilter:
         budget = self._settings.filter.real_start_share**2 * covariance
+        if self._noise is not None:  # the mean of a steady gyro is far better than what it is weighed by
+            budget[9:12, :], budget[:, 9:12] = 0.0, 0.0
+            budget[range(9, 12), range(9, 12)] = self._settings.filter.real_gyro_bias_sigma_radps**2
         return InvariantFilter(state, covariance, self._settings.filter, self._camera, self._body_from_cam, budget)
 
     def _install(self, start: Start) -> None:
@@ -343,6 +346,7 @@ class Odometry:
             self._observations.add(earlier.frame_index, earlier.ids, earlier.pixels)
         self._observations.add(self._frame_index, tracked.ids, tracked.pixels)
         self._newest = (tracked.ids, tracked.pixels)
+        self._scene_depth_m = self._depth_of(tracked.pixels)
 
     def _consume(self, tracked: Tracked) -> NDArray[np.int8]:
         """Uses tracks that ended, that are due in their turn, or (after a gap) all.
@@ -371,14 +375,13 @@ class Odometry:
             earlier, candidate = self._filter.odom_from_clone(ids[-3]), self._filter.odom_from_clone(ids[-2])
             moved = se3_inverse(earlier) @ candidate
             angle = np.arccos(np.clip(0.5 * (np.trace(moved[:3, :3]) - 1), -1, 1))
-            parallax = float(np.linalg.norm(moved[:3, 3])) / self._scene_depth_m()
+            parallax = float(np.linalg.norm(moved[:3, 3])) / self._scene_depth_m
             still = angle < settings.keyframe_rotation_rad and parallax < settings.keyframe_parallax
             gone = ids[-2] if still else ids[0]
             self._filter.remove_clone(gone)
             self._clone_stamps.pop(gone, None)
 
-    def _scene_depth_m(self) -> float:
-        _, pixels = self._newest
+    def _depth_of(self, pixels: Array) -> float:
         disparities = pixels[:, 0] - pixels[:, 2]
         known = disparities[np.isfinite(disparities)]
         return self._camera.focal_px * self._camera.baseline_m / float(np.median(known)) if len(known) else 5.0
@@ -405,7 +408,7 @@ class Odometry:
             accel_bias_mps2=state.accel_bias_mps2.copy(),
             status=status,
             track_ids=tracked.ids,
-            scene_depth_m=self._scene_depth_m(),
+            scene_depth_m=self._scene_depth_m,
             inlier_share=share,
             after_gap=tracked.by_descriptors,
             inertial=self._inertial,

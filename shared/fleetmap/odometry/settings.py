@@ -60,6 +60,7 @@ class FilterSettings(Section, frozen=True):
     free_translation_sigma_m: float = 1.5
     time_offset_sigma_s: float = 0.002
     real_start_share: float = 0.2
+    real_gyro_bias_sigma_radps: float = 0.0003
     initial_velocity_sigma_mps: float = 1.0
     initial_tilt_sigma_rad: float = 0.01
     initial_gyro_bias_sigma_radps: float = 0.005

@@ -15,6 +15,8 @@ from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.pose_solver import Resection, ransac_resection, refine_resection, resection_with_rotation
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 
+# The way back begins at its end: steps that still move it by more than the check allows show soon.
+_BACK_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 8, 0.03)
 Ids = NDArray[np.int64]
 MotionSince = Callable[[int], Array | None]
 
@@ -170,7 +172,7 @@ class Tracker:
             criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
         back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-            frame.left, self._previous.left, new, old.copy(), winSize=window, maxLevel=1, criteria=criteria,
+            frame.left, self._previous.left, new, old.copy(), winSize=window, maxLevel=0, criteria=_BACK_CRITERIA,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
         new, back = new.reshape(-1, 2), back.reshape(-1, 2)

@@ -78,18 +78,30 @@ class Observations:
         alive (N,): ids that the newest frame saw, due (N,) which of them are to be used now. What is due but seen once
         stays; what ended so is forgotten.
         """
-        self._keep(np.isin(self._frames, held))
-        ended = ~np.isin(self._ids, alive)
-        _, at, counts = np.unique(self._ids, return_inverse=True, return_counts=True)
-        taken = (ended | np.isin(self._ids, alive[due])) & (counts[at] >= 2)
-        rows = np.flatnonzero(taken)
-        rows = rows[np.argsort(self._ids[rows], kind="stable")]
+        self._keep(_are_among(self._frames, held))
+        order = np.argsort(self._ids, kind="stable")
+        starts = np.flatnonzero(np.diff(self._ids[order], prepend=np.int64(-1)))
+        ids, counts = self._ids[order[starts]], np.diff(starts, append=len(order))
+        ended = ~_are_among(ids, alive)
+        taken = (ended | _are_among(ids, alive[due])) & (counts >= 2)
+        rows = order[np.repeat(taken, counts)]
         batch = _batch(self._ids[rows], self._frames[rows], self._pixels[rows], camera)
-        self._keep(~taken & ~ended)
+        staying = np.zeros(len(order), bool)
+        staying[order] = np.repeat(~taken & ~ended, counts)
+        self._keep(staying)
         return batch
 
     def _keep(self, keep: NDArray[np.bool_]) -> None:
         self._ids, self._frames, self._pixels = self._ids[keep], self._frames[keep], self._pixels[keep]
+
+
+def _are_among(values: Ids, among: Ids) -> NDArray[np.bool_]:
+    """As np.isin, at a third of its cost for so few."""
+    if not len(among):
+        return np.zeros(len(values), bool)
+    held = np.sort(among)
+    at = np.minimum(np.searchsorted(held, values), len(held) - 1)
+    return np.asarray(held[at] == values)
 
 
 def _batch(ids: Ids, frames: Ids, pixels: Array, camera: StereoCamera) -> TrackBatch:
