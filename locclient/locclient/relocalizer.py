@@ -1,6 +1,8 @@
 """One frame placed in the map: by projection where it nearly is, by words where it might be anywhere. Pure."""
 
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,24 +12,32 @@ from fleetmap.features.matching import match_by_projection, match_mutual
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.pose_solver import Resection, ransac_resection, refine_resection, resection_with_rotation
 from fleetmap.rectification import RectifiedFrame, StereoCamera
-from locclient.map_view import MapView
+from locclient.map_view import MapView, Rows
 from locclient.settings import LocalizerSettings
 
 _NEIGHBOURHOOD_M = 3.0
+_RANKED = 8  # so many times as many places are ranked as are tried
+_TRIALS_AT_A_PLACE = 2
+_FIRST_DOUBT = 3.0  # of the sigmas, while the place that matches were looked for around is only a guess
 _SAME_PLACE_M, _SAME_PLACE_COSINE = 1.2, 0.8  # less than half a bay: no other place looks so much the same so near
+
+T = TypeVar("T")
+Slices = Generator[None, None, T]  # work that may be interrupted wherever it yields
 
 
 @dataclass(frozen=True, slots=True)
 class Fix:
     """A verified place of one frame.
 
-    map_from_cam (4, 4); cov_rot_trans (6, 6) in map axes, rotation first; inliers and cells of the image that hold them.
+    map_from_cam (4, 4); cov_rot_trans (6, 6) in map axes, rotation first; inliers and cells of the image that hold them; share
+    of the inliers among what was matched at the end.
     """
 
     map_from_cam: Array
     cov_rot_trans: Array
     inliers: int
     cells: int
+    share: float = 1.0
 
 
 @dataclass(slots=True)
@@ -51,9 +61,9 @@ class Relocalizer:
         self._camera = camera
         self._settings = settings
 
-    def look(self, frame: RectifiedFrame) -> Seen:
-        """What one frame shows."""
-        features = orb.detect(frame.left, self._settings.orb)
+    def look(self, frame: RectifiedFrame) -> Slices[Seen]:
+        """What one frame shows, in slices: see `finished`."""
+        features = yield from orb.detect_in_slices(frame.left, self._settings.orb)
         pixels = np.column_stack([features.pixels, np.full(len(features), np.nan)])
         return Seen(features, pixels, frame, np.zeros(len(features), bool))
 
@@ -76,18 +86,30 @@ class Relocalizer:
         return self._by_projection(seen, map_from_cam, radius)
 
     def anywhere(
-        self, seen: Seen, allowed: NDArray[np.bool_] | None = None, map_from_cam_rotation: Array | None = None
-    ) -> list[Fix]:
-        """Fixes of all places that look like this one and verify, best first, duplicates removed.
+        self, seen: Seen, allowed: NDArray[np.bool_] | None = None, map_from_cam_rotation: Array | None = None,
+        found: Sequence[Fix] = (),
+    ) -> Slices[list[Fix]]:  # fmt: skip
+        """Fixes of all places that look like this one and verify, best first, duplicates removed; a slice for each place.
 
-        allowed (K,): places that may be considered. map_from_cam_rotation: the orientation, where it is known. A place
-        that a fix already stands at is not tried again: it is made of the same landmarks. One further on is, since
-        identical bays and aisles must be able to speak against each other.
+        allowed (K,): places that may be considered. map_from_cam_rotation: the orientation, where it is known. found: fixes of
+        this frame that are known already, returned with the others. A place
+        that a fix or a failed trial already stands at is not tried again: it is made of the same landmarks. One further on is,
+        since identical bays and aisles must be able to speak against each other.
         """
-        fixes: list[Fix] = []
-        for place in self.view.similar_places(seen.features.descriptors, allowed, self._settings.fix.top_places):
-            if any(_stands_at(fix, self.view.map_from_cam[place]) for fix in fixes):
+        settings = self._settings.fix
+        fixes = [fix for k, fix in enumerate(found) if all(not _same(fix, other) for other in found[:k])]
+        tried: list[Array] = []
+        for place in self.view.similar_places(seen.features.descriptors, allowed, _RANKED * settings.top_places):
+            map_from_place = self.view.map_from_cam[place]
+            if any(_stands_at(fix.map_from_cam, map_from_place) for fix in fixes):
                 continue
+            if sum(_stands_at(other, map_from_place) for other in tried) >= _TRIALS_AT_A_PLACE:
+                continue
+            if len(tried) == settings.top_places:
+                break
+            if tried:
+                yield
+            tried.append(map_from_place)
             fix = self._at_place(seen, int(place), map_from_cam_rotation)
             if fix is not None and all(not _same(fix, other) for other in fixes):
                 fixes.append(fix)
@@ -102,7 +124,7 @@ class Relocalizer:
         if len(pairs) < settings.min_inliers // 2:
             return None
         points, pixels = self.view.points_map[rows[pairs[:, 0]]], self._measured(seen, pairs[:, 1])
-        sigmas = self._sigmas(seen, pairs[:, 1], rows[pairs[:, 0]], points, None)
+        sigmas = self._sigmas(seen, pairs[:, 1], rows[pairs[:, 0]], None)
         wide_px = 2 * settings.ransac_px + settings.rotation_sigma_rad * self._camera.focal_px
         found: Resection | None = None
         if rotation is not None:
@@ -124,7 +146,7 @@ class Relocalizer:
         settings = self._settings.fix
         found: Resection | None = None
         inlier_features: NDArray[np.int64] = np.zeros(0, np.int64)
-        for radius in (radius_px, min(radius_px, settings.guided_radius_px) * 0.6):
+        for radius, doubt in ((radius_px, _FIRST_DOUBT), (min(radius_px, settings.guided_radius_px) * 0.6, 1.0)):
             rows, pixels, octaves = self.view.visible(
                 map_from_cam, self._camera, radius, np.radians(settings.max_view_angle_deg)
             )
@@ -140,7 +162,7 @@ class Relocalizer:
             if len(kept) < settings.min_inliers:
                 return None
             points = self.view.points_map[rows[kept]]
-            sigmas = self._sigmas(seen, hit[kept], rows[kept], points, map_from_cam)
+            sigmas = doubt * self._sigmas(seen, hit[kept], rows[kept], map_from_cam)
             measured = self._measured(seen, hit[kept], pixels[kept, 0] - pixels[kept, 2])
             found = refine_resection(self._camera, points, measured, sigmas, se3_inverse(map_from_cam))
             if found is None or found.inliers.sum() < settings.min_inliers:
@@ -167,24 +189,27 @@ class Relocalizer:
         carry[:3, :3] = carry[3:, 3:] = -rotation
         covariance = settings.covariance_scale * carry @ found.cov_rot_trans @ carry.T
         covariance += np.diag([settings.floor_rad**2] * 3 + [settings.floor_m**2] * 3)
-        return Fix(map_from_cam, covariance, int(found.inliers.sum()), cells)
+        return Fix(map_from_cam, covariance, int(found.inliers.sum()), cells, share)
 
-    def _sigmas(
-        self,
-        seen: Seen,
-        features: NDArray[np.int64],
-        rows: NDArray[np.int64],
-        points: Array,
-        map_from_cam: Array | None,
-    ) -> Array:
-        """(N, 2): of pixels by octave, widened by the landmark's own uncertainty; of disparities."""
-        base = self._settings.fix.feature_sigma_px * orb.SCALE_FACTOR ** np.minimum(
-            seen.features.octaves[features], 5
-        ).astype(np.float64)
-        if map_from_cam is not None:
-            distance = np.linalg.norm(points - map_from_cam[:3, 3], axis=1)
-            base = np.hypot(base, np.minimum(self._camera.focal_px * self.view.sigmas_m[rows] / distance, 10.0))
-        return np.column_stack([base, np.maximum(base, 1.0)])
+    def _sigmas(self, seen: Seen, features: NDArray[np.int64], rows: Rows, map_from_cam: Array | None) -> Array:
+        """(N, 2): of pixels and of disparities, by octave and by the landmarks' own uncertainty.
+
+        That lies along the direction from which a landmark was mapped: seen from there it hardly shows, from aside it does.
+        """
+        settings = self._settings.fix
+        scale = orb.SCALE_FACTOR ** np.minimum(seen.features.octaves[features], 5).astype(np.float64)
+        base = settings.feature_sigma_px * scale
+        if map_from_cam is None:
+            return np.column_stack([base, np.maximum(base, 1.0)])
+        rays = self.view.points_map[rows] - map_from_cam[:3, 3]
+        distances = np.linalg.norm(rays, axis=1)
+        along = np.abs((rays * self.view.view_directions_map[rows]).sum(axis=1)) / distances
+        off_px = self._camera.focal_px * self.view.sigmas_m[rows] / distances
+        across_px = off_px * np.sqrt(np.maximum(1.0 - along**2, 0.0))
+        depth_px = off_px * along * self._camera.baseline_m / distances
+        return np.column_stack(
+            [np.hypot(base, np.minimum(across_px, 10.0)), np.hypot(settings.disparity_sigma_px, depth_px)]
+        )
 
     def _radius_px(self, map_from_cam: Array, cov_rot_trans: Array) -> float:
         """Three sigmas of a landmark's predicted pixel, at the median distance of what should be visible."""
@@ -199,10 +224,19 @@ class Relocalizer:
         )
 
 
-def _stands_at(fix: Fix, map_from_place: Array) -> bool:
-    """Whether a place's neighbourhood is mostly that of a fix."""
-    apart_m = float(np.linalg.norm(fix.map_from_cam[:3, 3] - map_from_place[:3, 3]))
-    axis, place_axis = fix.map_from_cam[:3, 2], map_from_place[:3, 2]
+def finished(work: Slices[T]) -> T:
+    """The result of work in slices, all of them at once."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            return cast(T, done.value)
+
+
+def _stands_at(map_from_cam: Array, map_from_place: Array) -> bool:
+    """Whether a place's neighbourhood is mostly that of a camera."""
+    apart_m = float(np.linalg.norm(map_from_cam[:3, 3] - map_from_place[:3, 3]))
+    axis, place_axis = map_from_cam[:3, 2], map_from_place[:3, 2]
     return apart_m < _SAME_PLACE_M and bool(axis @ place_axis > _SAME_PLACE_COSINE)
 
 

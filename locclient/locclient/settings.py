@@ -4,6 +4,7 @@ from fleetmap.config import Section
 from fleetmap.features.orb import OrbSettings
 from fleetmap.features.stereo import StereoSettings
 from fleetmap.odometry import OdometrySettings
+from locclient.sight import SightSettings
 
 
 class FixSettings(Section, frozen=True):
@@ -18,7 +19,8 @@ class FixSettings(Section, frozen=True):
     guided_ratio: float = 0.95
     guided_radius_px: float = 12.0
     max_radius_px: float = 60.0
-    feature_sigma_px: float = 1.0
+    feature_sigma_px: float = 0.8
+    disparity_sigma_px: float = 0.2
     ransac_px: float = 5.0
     rotation_sigma_rad: float = 0.03
     covariance_scale: float = 4.0
@@ -31,8 +33,13 @@ class TrackSettings(Section, frozen=True):
     """When an estimate may be believed."""
 
     fix_interval_s: float = 0.2
+    settled_interval_s: float = 0.4
+    settled_fixes: int = 10
+    search_after_failed: int = 2
     confirming_fixes: int = 3
     confirming_distance_m: float = 1.0
+    strong_inliers: int = 60
+    strong_share: float = 0.55
     tight_prior_sigma_m: float = 0.6
     innovation_limit: float = 22.458
     hypothesis_distance_m: float = 0.5
@@ -42,6 +49,7 @@ class TrackSettings(Section, frozen=True):
     drift_share: float = 0.01
     drift_floor_m: float = 0.005
     degraded_after_s: float = 1.5
+    suspicious_after_s: float = 0.9
     degraded_radius_m: float = 0.3
     lost_radius_m: float = 3.0
     kidnap_fixes: int = 3
@@ -58,3 +66,4 @@ class LocalizerSettings(Section, frozen=True):
     orb: OrbSettings = OrbSettings(count=1000)
     fix: FixSettings = FixSettings()
     track: TrackSettings = TrackSettings()
+    sight: SightSettings = SightSettings()

@@ -18,6 +18,9 @@ from fleetmap.rectification import RectifiedFrame, StereoCamera
 # The way back begins at its end: steps that still move it by more than the check allows show soon.
 _BACK_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 8, 0.03)
 Ids = NDArray[np.int64]
+_FLOW_ITERATIONS = (
+    200  # finds a motion that a third of the points share; with fewer the flow has failed, and a live robot must go on
+)
 MotionSince = Callable[[int], Array | None]
 
 
@@ -198,7 +201,7 @@ class Tracker:
             return result
         again = ransac_resection(
             self._camera, points_cam[usable], measured, sigmas, threshold_px=self._settings.ransac_px,
-            min_inliers=self._settings.min_inliers, seed=count,
+            min_inliers=self._settings.min_inliers, seed=count, iterations=_FLOW_ITERATIONS,
         )  # fmt: skip
         if again is None or (result is not None and result.inliers.sum() >= again.inliers.sum()):
             again = result
