@@ -91,7 +91,7 @@ class MonocularOdometry(Odometry):
     ) -> None:  # fmt: skip
         super().__init__(calibration, camera, body_from_cam, imu_minus_cam_s, settings, stereo_settings)
         self._tracker = MonocularTracker(camera, settings.tracker, self._points_before)
-        self._observations = MonocularObservations(self._scene_depth_m)
+        self._observations = MonocularObservations(lambda: self._depth_m)
         self._vision_odometry = VisualOdometry(camera, settings.monocular)
         self._lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, 0.0])
         self._sightings: dict[int, list[tuple[int, Array]]] = {}
@@ -290,5 +290,5 @@ class MonocularOdometry(Odometry):
             self._depth_m = float(np.median(points[known, 2]))
         return points
 
-    def _scene_depth_m(self) -> float:
+    def _depth_of(self, pixels: Array) -> float:
         return self._depth_m
