@@ -14,6 +14,8 @@ from fleetmap.samples import CameraFrame, ImuSamples, WheelSample, wheel_between
 from mapserver.survey.keyframes import FrameSummary, Keyframe, KeyframePolicy, PictureShelf, make_keyframe, sharpness
 from mapserver.survey.settings import SurveySettings
 
+_LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of a frame, as its stamp may be too early
+
 
 @dataclass(frozen=True, slots=True)
 class FirstGuess:
@@ -57,7 +59,7 @@ def run_odometry(
     fed_ns = -(2**62)
     for number, raw in enumerate(frames):
         frame = rectifier.rectify(raw)
-        until_ns = raw.stamp_ns + int(rectifier.imu_minus_cam_s * 1e9) + 10_000_000
+        until_ns = raw.stamp_ns + int(rectifier.imu_minus_cam_s * 1e9) + _LEAD_NS
         odometry.handle_imu(imu.between(fed_ns, until_ns))
         odometry.handle_wheel(wheel_between(wheel, fed_ns, until_ns))
         fed_ns = until_ns
