@@ -46,9 +46,13 @@ class Site:
         self._robots = list(find_scenario(_SCENARIO).runs)
 
     def session(
-        self, seed: int, robot: str | None = None, rest_s: float | None = None, faults: tuple[Fault, ...] = ()
-    ) -> EstimatorSession:
-        """The run of a seed: another robot, another drive, other errors. Faults are those of IMU, wheels and frames."""
+        self, seed: int, robot: str | None = None, rest_s: float | None = None, faults: tuple[Fault, ...] = (), *,
+        camera_delay_s: float = 0.0, lost_share: float = 0.0,
+    ) -> EstimatorSession:  # fmt: skip
+        """The run of a seed: another robot, another drive, other errors. Faults are those of IMU, wheels and frames.
+
+        camera_delay_s: by so much frames are stamped too early. lost_share of the frames is missing, here and there.
+        """
         name, run = find_scenario(_SCENARIO).run(robot or self._robots[seed % len(self._robots)])
         rng = np.random.default_rng([seed, 77])
         kind, route = run.kind, run.routes[0]
@@ -58,13 +62,17 @@ class Site:
         motion = RouteMotion(driven, kind.limits, kind.body_height_m, kind.shake, rng)
         plan = FaultPlan(faults)
         times = [t for t in sample_times(motion.duration_s, run.rate_hz).tolist() if not plan.has("frames-dropped", t)]
+        if lost_share > 0:
+            times = [t for t in times if rng.random() >= lost_share]
         session: Session = replace(
             self._base, order=replace(self._base.order, seed=seed, robot=name), nominal=nominal_calibration(kind),
             true=true_calibration(kind, rng), motion=motion, frame_times_s=tuple(times),
             imu=plan.spoil_imu(measure_imu(motion, kind.imu, rng)),
             wheel=plan.spoil_wheels(measure_wheels(motion, kind.body_height_m, kind.wheels, rng)), priors=(),
         )  # fmt: skip
-        return EstimatorSession(session, field=self._field)
+        made = EstimatorSession(session, field=self._field)
+        made.stamps_ns = [stamp_ns - int(camera_delay_s * 1e9) for stamp_ns in made.stamps_ns]
+        return made
 
 
 def figures(session: EstimatorSession, estimates: list[OdometryEstimate], inertial: bool) -> Figures:

@@ -24,6 +24,7 @@ from locclient.settings import LocalizerSettings
 
 _TILE_M = 1024.0
 _NEVER_S = 1e9
+_LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of the frame that is handled, for stamps that are too early
 _EVERY_M, _EVERY_RAD = 0.4, 0.2
 
 
@@ -96,9 +97,10 @@ def run_odometry(
     estimates, last_ns = [], 0
     for frame in range(len(session) if frames is None else min(frames, len(session))):
         stamp_ns = session.stamps_ns[frame]
-        odometry.handle_imu(session.session.imu.between(last_ns, stamp_ns + 1))
-        odometry.handle_wheel(wheel_between(session.session.wheel, last_ns, stamp_ns + 1))
-        last_ns = stamp_ns + 1
+        until_ns = stamp_ns + _LEAD_NS
+        odometry.handle_imu(session.session.imu.between(last_ns, until_ns))
+        odometry.handle_wheel(wheel_between(session.session.wheel, last_ns, until_ns))
+        last_ns = until_ns
         estimates.append(odometry.handle_stereo(blank(session, frame)))
     return estimates
 

@@ -17,6 +17,8 @@ from mapserver.survey.work import ALONE, Worker
 
 _TOGETHER = 16  # keyframes whose pictures wait in memory until their features are found
 
+_LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of a frame, as its stamp may be too early
+
 
 @dataclass(frozen=True, slots=True)
 class FirstGuess:
@@ -61,7 +63,7 @@ def run_odometry(
     fed_ns = -(2**62)
     for number, raw in enumerate(frames):
         frame = rectifier.rectify(raw)
-        until_ns = raw.stamp_ns + int(rectifier.imu_minus_cam_s * 1e9) + 10_000_000
+        until_ns = raw.stamp_ns + int(rectifier.imu_minus_cam_s * 1e9) + _LEAD_NS
         odometry.handle_imu(imu.between(fed_ns, until_ns))
         odometry.handle_wheel(wheel_between(wheel, fed_ns, until_ns))
         fed_ns = until_ns

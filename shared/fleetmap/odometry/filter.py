@@ -131,9 +131,13 @@ class InvariantFilter:
         return phi, process
 
     def displace(
-        self, body_from_next: Array, rotation_sigma_rad: float, translation_sigma_m: float, duration_s: float = 0.0
-    ) -> None:
-        """Moves the state by a relative transform that is known only as well as the sigmas say."""
+        self, body_from_next: Array, rotation_sigma_rad: float, translation_sigma_m: float, duration_s: float = 0.0,
+        known: Array | None = None,
+    ) -> None:  # fmt: skip
+        """Moves the state by a relative transform that is known only as well as the sigmas say.
+
+        known (6, 6), where it is given, says it better: a covariance in the next body's axes, rotation first.
+        """
         s = self.state
         rotation = s.rotation.copy()
         s.position_m = s.position_m + rotation @ body_from_next[:3, 3]
@@ -143,7 +147,10 @@ class InvariantFilter:
         shape[6:9, 0:3] = skew(s.position_m) @ s.rotation
         shape[6:9, 3:6] = s.rotation
         sigmas = np.array([rotation_sigma_rad] * 3 + [translation_sigma_m] * 3)
-        process = (shape * sigmas**2) @ shape.T
+        free = np.diag(sigmas**2)
+        # both together: known where it is narrow, free where it is wider than that
+        spread = free if known is None else free - free @ np.linalg.solve(free + known, free)
+        process = np.asarray(shape @ spread @ shape.T)
         self._transition(np.eye(_NAV), process, process)
         self._forget_pair(duration_s)
 

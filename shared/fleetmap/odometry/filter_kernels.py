@@ -291,11 +291,12 @@ def accumulate_tracks(
 
     starts (T + 1,) delimits each track's rows of clones (n,) and pixels (n, 3). first_points (T, 3): where
     triangulation starts, in the camera of clone anchors (T,). noise (4,): variance that the whitened rows really have,
-    and sigmas of a track's own errors as in `add_error_sources`, of which the gate lets pass what `share_that_passes`. clone_covariance (6 M, 6 M) in the error of this
-    module, order rotation then position. moved (6 M,): how far the clones given here stand from the prior mean, when an
-    iterated filter relinearises. Summed into: vector (6 M,), which is information (6 M, 2 + 6 M) times disparity offset,
-    depth scale and the clones' errors, plus noise that really has the covariance scatter (6 M, 6 M). used (T,) becomes
-    1 for a track that was taken, 0 for one that could not be triangulated and -1 for one that failed its gate.
+    and sigmas of a track's own errors as in `add_error_sources`, of which what passes the gate counts (`share_that_passes`).
+    clone_covariance (6 M, 6 M) in the error of this module, order rotation then position. moved (6 M,): how far the
+    clones given here stand from the prior mean, when an iterated filter relinearises. Summed into: vector (6 M,), which
+    is information (6 M, 2 + 6 M) times disparity offset, depth scale and the clones' errors, plus noise that really has
+    the covariance scatter (6 M, 6 M). used (T,) becomes 1 for a track that was taken, 0 for one that could not be
+    triangulated and -1 for one that failed its gate.
     """
     count = len(body_positions)
     rotations, positions = np.empty((count, 3, 3)), np.empty((count, 3))

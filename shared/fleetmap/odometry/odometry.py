@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fleetmap.calibration import ImuNoise, RigCalibration
 from fleetmap.features.stereo import StereoSettings
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, skew
 from fleetmap.odometry.filter import InvariantFilter, NavState
 from fleetmap.odometry.imu_faults import joined, longest_gap_ns, without_spikes
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
@@ -46,6 +46,7 @@ class OdometryEstimate:
     odom_from_body (4, 4); cov_rot_trans (6, 6) in odom axes; velocity, biases (3,). track_ids (N,) of the points seen;
     after_gap where they had to be matched by descriptors; inertial once gravity is known. new_odom_from_old_odom is
     given when the frame `odom` was redefined (gravity found): earlier estimates must be multiplied by it from the left.
+    imu_minus_cam_s is the time offset as estimated so far, 0 without an IMU.
     scale_known is False for one camera whose scale nothing has shown: lengths are then in a unit of the odometry's own. revised:
     earlier frames that are placed anew, (frame index, odom_from_body (4, 4)).
     """
@@ -66,6 +67,7 @@ class OdometryEstimate:
     new_odom_from_old_odom: Array | None
     scale_known: bool = True
     revised: tuple[tuple[int, Array], ...] = ()
+    imu_minus_cam_s: float = 0.0
 
 
 class Odometry:
@@ -293,7 +295,24 @@ class Odometry:
             )
         body_from_next = self._body_from_cam @ se3_inverse(self._last_motion) @ self._cam_from_body
         duration_s = (self._state_ns - self._clone_stamps[self._frame_index - 1]) * 1e-9
-        self._filter.displace(body_from_next, s.free_rotation_sigma_rad, s.free_translation_sigma_m, duration_s)
+        self._filter.displace(
+            body_from_next, s.free_rotation_sigma_rad, s.free_translation_sigma_m, duration_s, self._loosely(tracked)
+        )
+
+    def _loosely(self, tracked: Tracked) -> Array | None:
+        """Covariance (6, 6), in the body's axes, that holds the state near the motion from all points of the last two frames.
+
+        An update takes the few tracks that are due or ended. Where they cluster or slip together the state must not
+        follow them further than all the others allow; so loose, it adds no information to speak of.
+        """
+        if tracked.cov_rot_trans is None:
+            return None
+        body_from_cam = np.zeros((6, 6))
+        rotation = self._body_from_cam[:3, :3]
+        body_from_cam[:3, :3] = body_from_cam[3:, 3:] = rotation
+        body_from_cam[3:, :3] = skew(self._body_from_cam[:3, 3]) @ rotation
+        wide = self._settings.filter.seen_motion_scale**2 * tracked.cov_rot_trans
+        return np.asarray(body_from_cam @ wide @ body_from_cam.T)
 
     def _seen_body(self, tracked: Tracked) -> tuple[int, Array] | None:
         """After a gap: the best matched clone and odom_from_body (4, 4) as vision measured it since then."""
@@ -413,6 +432,7 @@ class Odometry:
             after_gap=tracked.by_descriptors,
             inertial=self._inertial,
             new_odom_from_old_odom=change,
+            imu_minus_cam_s=self._offset_s + self._filter.imu_minus_cam_s if self._inertial else 0.0,
         )
 
 

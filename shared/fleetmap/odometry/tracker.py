@@ -42,8 +42,8 @@ class Tracked:
     """What one frame saw.
 
     ids (N,) and pixels (N, 3) u_left v u_right of the current frame. cam_from_previous: the motion measured since the
-    previous frame, None where too few points agree. After a gap (by_descriptors) `earlier` holds what was matched, best
-    first.
+    previous frame, None where too few points agree; cov_rot_trans (6, 6): of its left perturbation. After a gap
+    (by_descriptors) `earlier` holds what was matched, best first.
     """
 
     ids: Ids
@@ -52,6 +52,7 @@ class Tracked:
     cam_from_previous: Array | None
     inlier_share: float
     by_descriptors: bool
+    cov_rot_trans: Array | None = None
 
     @property
     def lost(self) -> bool:
@@ -102,6 +103,7 @@ class Tracker:
         forgotten; rotation_sigma_rad says how well its rotation is known, None where it is only a guess.
         """
         motion: Array | None = None
+        covariance: Array | None = None
         earlier: tuple[Earlier, ...] = ()
         share, far = 1.0, False
         self._frame_index += 1
@@ -113,11 +115,13 @@ class Tracker:
             else:
                 self._memory.clear()
                 guess = motion_since(self._frame_index - 1)
-                motion, share = self._follow(frame, np.eye(4) if guess is None else guess)
+                resection, share = self._follow(frame, np.eye(4) if guess is None else guess)
+                if resection is not None:
+                    motion, covariance = resection.cam_from_source, resection.cov_rot_trans
         self._renew_disparities(frame)
         self._add_corners(frame)
         self._previous = frame
-        return Tracked(self._points.ids.copy(), self._points.pixels.copy(), earlier, motion, share, far)
+        return Tracked(self._points.ids.copy(), self._points.pixels.copy(), earlier, motion, share, far, covariance)
 
     def _points_cam(self, pixels: Array) -> Array:
         if self._camera.baseline_m == 0:
@@ -137,7 +141,7 @@ class Tracker:
         predicted[lost] = pixels[lost, :2]
         return predicted
 
-    def _follow(self, frame: RectifiedFrame, cam_from_previous: Array) -> tuple[Array | None, float]:
+    def _follow(self, frame: RectifiedFrame, cam_from_previous: Array) -> tuple[Resection | None, float]:
         assert self._previous is not None
         if not len(self._points.ids):
             return None, 0.0
@@ -160,7 +164,7 @@ class Tracker:
             self._points.pixels[:, 2] = self._points.pixels[:, 0] - np.where(prior > 0, prior, np.nan)
         else:
             self._points.pixels[:, 2] = np.nan
-        return (resection.cam_from_source if resection is not None else None), share
+        return resection, share
 
     def _flow(self, frame: RectifiedFrame, predicted: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Pyramidal Lucas-Kanade with back-check: pixels (N, 2) and which ones hold."""

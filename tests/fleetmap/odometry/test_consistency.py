@@ -29,17 +29,17 @@ def speed_error_mps(
 
 @pytest.mark.parametrize("inertial", [True, False], ids=["stereo-inertial", "stereo"])
 def test_errors_are_as_large_as_they_are_said_to_be(site: consistency.Site, inertial: bool) -> None:
-    """Mean normalised error squared per dof over 4 runs of 14 s; the bench narrows it down over 100."""
-    runs = [consistency.run(site.session(seed), inertial, 210)[0] for seed in range(2000, 2004)]
+    """Mean normalised error squared per dof over 2 runs of 11 s; the bench narrows it down over 100."""
+    runs = [consistency.run(site.session(seed), inertial, 165)[0] for seed in range(2000, 2002)]
     assert 0.25 < np.mean([r.rotation_nees for r in runs]) < 2.5
     assert 0.25 < np.mean([r.position_nees for r in runs]) < 2.5
     assert np.mean([r.final_m / r.way_m for r in runs]) < 0.01
 
 
 def test_a_standing_robot_stays_and_does_not_become_too_sure(site: consistency.Site) -> None:
-    """20 s at rest: velocity is zero, the place holds, and the drive after it is as consistent as any."""
-    session = site.session(2010, "tote-1", rest_s=20.0)
-    estimates = estimator_loop.run_odometry(session, 290)
+    """12 s at rest: velocity is zero, the place holds, and the drive after it is as consistent as any."""
+    session = site.session(2010, "tote-1", rest_s=12.0)
+    estimates = estimator_loop.run_odometry(session, 175)
     first = next(k for k, e in enumerate(estimates) if e.inertial) + 15
     places = np.array([e.odom_from_body[:3, 3] for e in estimates[first:]])
     assert np.linalg.norm(places - places[0], axis=1).max() < 0.003
@@ -58,29 +58,48 @@ def se3_angle(a: OdometryEstimate, b: OdometryEstimate) -> float:
 
 def test_slipping_wheels_are_refused_and_others_help(site: consistency.Site) -> None:
     """Wheels that turn 1.6 times too fast for three seconds: the speed hardly differs from that without wheels."""
-    slipping = site.session(2020, "tote-1", faults=(Fault("wheel-slip", 6.0, 9.0),))
-    estimates = estimator_loop.run_odometry(slipping, 180)
-    assert speed_error_mps(slipping, estimates, 6.0, 9.0) < 0.1  # the wheels are off by 0.6 of about 1.5 m/s
+    slipping = site.session(2020, "tote-1", faults=(Fault("wheel-slip", 3.0, 6.0),))
+    estimates = estimator_loop.run_odometry(slipping, 92)
+    assert speed_error_mps(slipping, estimates, 3.0, 6.0) < 0.1  # the wheels are off by 0.6 of about 1.5 m/s
     with_wheels, without = [], []
     for seed in (2021, 2022):
         session = site.session(seed)
-        with_wheels.append(consistency.run(session, True, 180)[0].position_rms_m)
-        without.append(consistency.run(session, True, 180, WITHOUT_WHEELS)[0].position_rms_m)
+        with_wheels.append(consistency.run(session, True, 75)[0].position_rms_m)
+        without.append(consistency.run(session, True, 75, WITHOUT_WHEELS)[0].position_rms_m)
     assert np.mean(with_wheels) < 1.1 * np.mean(without)
 
 
 @pytest.mark.parametrize("fault", ["imu-spike", "imu-gap", "frames-dropped"])
 def test_a_short_fault_leaves_the_speed_alone(site: consistency.Site, fault: str) -> None:
-    session = site.session(2030, "tote-1", faults=(Fault(fault, 6.0, 6.4),))
-    estimates = estimator_loop.run_odometry(session, 150, settings=WITHOUT_WHEELS)
-    assert speed_error_mps(session, estimates, 6.0, 9.0) < 0.15
+    session = site.session(2030, "tote-1", faults=(Fault(fault, 3.0, 3.4),))
+    estimates = estimator_loop.run_odometry(session, 92, settings=WITHOUT_WHEELS)
+    assert speed_error_mps(session, estimates, 3.0, 6.0) < 0.15
     assert consistency.figures(session, estimates, inertial=True).position_rms_m < 0.1
+
+
+def test_stamps_20_ms_too_early_are_found_out_and_cost_nothing(site: consistency.Site) -> None:
+    """The same run with true and with shifted stamps: the offset is known within 2 ms, the errors are alike."""
+    undisturbed, estimates = consistency.run(site.session(2050, "tote-1"), True, 150)
+    assert abs(estimates[-1].imu_minus_cam_s) < 0.002
+    shifted, estimates = consistency.run(site.session(2050, "tote-1", camera_delay_s=0.02), True, 150)
+    assert abs(estimates[-1].imu_minus_cam_s - 0.02) < 0.002
+    assert shifted.position_rms_m < 1.2 * undisturbed.position_rms_m
+    assert max(shifted.rotation_nees, shifted.position_nees) < 4
+
+
+@pytest.mark.parametrize("inertial", [True, False], ids=["stereo-inertial", "stereo"])
+def test_a_fifth_of_the_frames_may_be_lost(site: consistency.Site, inertial: bool) -> None:
+    """Mean normalised error squared per dof over 2 runs of 10 s, as without losses; the way ends where it should."""
+    runs = [consistency.run(site.session(seed, lost_share=0.2), inertial, 120)[0] for seed in range(2060, 2062)]
+    assert 0.2 < np.mean([r.rotation_nees for r in runs]) < 2.5
+    assert 0.2 < np.mean([r.position_nees for r in runs]) < 2.5
+    assert np.mean([r.final_m / r.way_m for r in runs]) < 0.015
 
 
 def test_the_imu_of_another_run_is_dropped(site: consistency.Site) -> None:
     """The gyro turns where the pictures do not: the estimates go on without it, and say so."""
     session, other = site.session(2040, "tote-1"), site.session(2041, "tote-2")
     foreign = consistency.with_imu_of(session, other, from_s=3.0)
-    estimates = estimator_loop.run_odometry(foreign, 250, settings=WITHOUT_WHEELS)
+    estimates = estimator_loop.run_odometry(foreign, 130, settings=WITHOUT_WHEELS)
     assert any(e.inertial for e in estimates)
     assert not estimates[-1].inertial

@@ -205,3 +205,13 @@ def test_intervals_hold_the_middle_of_the_samples() -> None:
     np.testing.assert_allclose(accel, 2 * gyro)
     assert len(imu_intervals(ImuSamples.empty(), 0, 10)[0]) == 0
     assert len(imu_intervals(ImuSamples(stamps, ramp, ramp), 10, 10)[0]) == 0
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.5, 1.0, 3.0, 20.0, 100.0])
+def test_what_passes_a_gate_is_a_truncated_normal(sigma: float) -> None:
+    """Against the integral over what lies below the gate, by sums over a fine grid."""
+    edge = 2.0
+    x = np.linspace(-edge, edge, 200_001)
+    density = np.exp(-0.5 * (x / sigma) ** 2)
+    left = (x**2 * density).sum() / density.sum() / sigma**2
+    np.testing.assert_allclose(filter_kernels.share_that_passes(edge**2, sigma**2), left, rtol=1e-3)
