@@ -29,12 +29,13 @@ _THUMBNAILS = 2
 
 @dataclass(frozen=True)
 class LoadedMap:
-    """Some tiles of one version, ready for the localizer."""
+    """Some tiles of one version, ready for the localizer; is_offer: of a version to begin with or to try, not only other tiles."""
 
     wanted: WantedVersion
     manifest: Manifest
     vocabulary: Vocabulary
     tiles: dict[Cell, Tile]
+    is_offer: bool = True
 
     @property
     def version(self) -> int:
@@ -83,7 +84,10 @@ class Outcome:
 
 @dataclass
 class _Versions:
-    """good: the version whose fixes were confirmed; candidate: the one on trial; is_doubt: the good one is looked at again, because of what was said."""
+    """good: the version whose fixes were confirmed; candidate: the one on trial.
+
+    is_doubt: the good one is looked at again, because of what was said.
+    """
 
     good: LoadedMap | None = None
     candidate: LoadedMap | None = None
@@ -140,6 +144,8 @@ class Robot:
                 if self.running is loaded:
                     self._show(loaded)
                 return
+        if not loaded.is_offer:
+            return  # of a version that was given up while its tiles were read
         if versions.good is None:
             versions.good = loaded
             versions.changes.append(VersionChange(loaded.wanted, Change.ADOPTED))

@@ -6,8 +6,10 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+
+import numpy as np
 
 from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.geometry import Array
@@ -20,12 +22,13 @@ from locclient.live import Source
 from locclient.live.intake import Intake
 from locclient.map_room import MapRoom
 from locclient.outputs import Output
-from locclient.robot import Change, FailureContext, LoadedMap, Outcome, Robot, velocity_map_mps
+from locclient.robot import FailureContext, LoadedMap, Outcome, Robot, velocity_map_mps
 from locclient.robot_health import Figure, HealthFigures
 from locclient.server_talk import ServerTalk
 from locclient.service_manager import ServiceManager
 from locclient.settings import LocalizerSettings
 from locclient.spool import Spool, SpooledReport
+from locclient.tile_window import Cell
 
 _TAKE_S, _IDLE_S = 0.2, 0.1
 _HEALTH_EVERY_S, _POSE_EVERY_NS = 1.0, 500_000_000
@@ -77,8 +80,9 @@ class Runtime:
         self._figures = HealthFigures()
         self._last_frame_s: float | None = None
         self._health_s, self._pose_ns = 0.0, -(2**62)
-        self._wanted_first = parts.first
-        self._refused_tiles: dict[tuple[int, int], str] = {}
+        self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
+        self._fetched_again: set[str] = set()
+        self._refused_tiles: dict[str, dict[Cell, str]] = {}
 
     @property
     def figures(self) -> HealthFigures:
@@ -188,7 +192,7 @@ class Runtime:
         counts: dict[str, Figure] = dict(asdict(self._parts.intake.counts))
         spool = {f"spool_{name}": value for name, value in self._parts.spool.counts().items()}
         tiles = sum(len(loaded.tiles) for loaded in self._parts.robot.held)
-        return {**counts, **spool, "tiles_held": tiles, "tiles_refused": len(self._refused_tiles)}
+        return {**counts, **spool, "tiles_held": tiles, "tiles_refused": sum(map(len, self._refused_tiles.values()))}
 
     # --- the other threads --------------------------------------------------------------------------------------------
 
@@ -217,30 +221,47 @@ class Runtime:
             self._spool_failures()
 
     def _load_maps(self) -> None:
-        room, talk = self._parts.room, self._parts.talk
-        position, velocity = self._shared.place or (None, [0.0, 0.0, 0.0])
-        wanted = list(self._shared.held)
-        if self._wanted_first is not None:
-            wanted.append(self._wanted_first)
-            self._wanted_first = None
+        room, talk, shared = self._parts.room, self._parts.talk, self._shared
+        position, velocity = shared.place or (None, np.zeros(3))
         while talk is not None and talk.fetched:
-            wanted.append(talk.fetched.popleft())
-            room.forget_refusals(wanted[-1])
+            version = talk.fetched.popleft()
+            self._offers[version.manifest_sha256 or ""] = version
+            room.forget_refusals(version)
+        held = list(shared.held)
+        for version in held:
+            self._offers.pop(version.manifest_sha256 or "", None)
+        wanted = [*held, *self._offers.values()]
         for version in wanted:
             try:
-                loaded = room.load(version, position, velocity)  # type: ignore[arg-type]
+                loaded = room.load(version, position, velocity)
             except FleetmapError as error:
-                _log.warning("version %s cannot be loaded: %s", version.version, error)
+                self._note_unusable(version, str(error))
                 continue
             if loaded is not None:
-                self._shared.loaded.append(loaded)
-            refused = room.refused(version)
-            if refused != self._refused_tiles:
-                self._refused_tiles = refused
-                for cell, reason in refused.items():
-                    _log.warning("tile %s of version %s is refused: %s", cell, version.version, reason)
-                if refused and talk is not None:
-                    talk.refetch.append(version)
+                shared.loaded.append(replace(loaded, is_offer=version not in held))
+            self._note_refused_tiles(version)
+        room.keep_only(wanted)
+        known = {version.manifest_sha256 or "" for version in wanted}
+        self._refused_tiles = {sha256: cells for sha256, cells in self._refused_tiles.items() if sha256 in known}
+
+    def _note_unusable(self, version: WantedVersion, reason: str) -> None:
+        """Not even its manifest or one tile: without a server nothing is left to try, with one it is fetched again."""
+        _log.warning("version %s cannot be loaded: %s", version.version, reason)
+        self._offers.pop(version.manifest_sha256 or "", None)
+        if self._parts.talk is not None and version.manifest_sha256 not in self._fetched_again:
+            self._fetched_again.add(version.manifest_sha256 or "")
+            self._parts.talk.refetch.append(version)
+
+    def _note_refused_tiles(self, version: WantedVersion) -> None:
+        """Logs once what cannot be used, and asks for it again."""
+        refused, sha256 = self._parts.room.refused(version), version.manifest_sha256 or ""
+        if refused == self._refused_tiles.get(sha256, {}):
+            return
+        self._refused_tiles[sha256] = refused
+        for cell, reason in refused.items():
+            _log.warning("tile %s of version %s is refused: %s", cell, version.version, reason)
+        if refused and self._parts.talk is not None:
+            self._parts.talk.refetch.append(version)
 
     def _spool_failures(self) -> None:
         parts = self._parts
@@ -264,6 +285,3 @@ class Runtime:
         # One last word: what became of versions and failures since, if somebody listens.
         self._parts.talk.step()
         self._parts.talk.close()
-
-
-__all__ = ["Change", "Parts", "Runtime"]

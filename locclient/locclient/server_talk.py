@@ -21,7 +21,7 @@ class ServerTalk:
     """One `step` after another: asks for the wanted version and fetches it, delivers failures, acknowledges, reports health.
 
     The main thread leaves what is to be said in `health` and `changes` and finds fetched versions in `fetched`. A server that is
-    away costs nothing but patience; reports wait in the spool.
+    away costs nothing but patience; reports wait in the spool. refetch: a held version whose pieces on the disk are damaged.
     """
 
     def __init__(
@@ -54,7 +54,8 @@ class ServerTalk:
         try:
             self._publish_health()
             self._deliver()
-            if self._announced or self.refetch or now_s >= self._ask_at_s:
+            self._fetch_again()
+            if self._announced or now_s >= self._ask_at_s:
                 self._ask(now_s)
         except UnreachableError as error:
             _log.info("the map server is away: %s", error)
@@ -80,10 +81,7 @@ class ServerTalk:
         sha256 = wanted.manifest_sha256
         if sha256 is None:
             return
-        again = bool(self.refetch)
-        self.refetch.clear()
-        waits = now_s < self._not_before_s.get(sha256, 0.0)
-        if (sha256 in self._offered and not again) or waits:
+        if sha256 in self._offered or now_s < self._not_before_s.get(sha256, 0.0):
             return self._acknowledge_again()
         try:
             self._link.fetch(wanted)
@@ -99,6 +97,12 @@ class ServerTalk:
         self._offered.add(sha256)
         self.fetched.append(wanted)
         return None
+
+    def _fetch_again(self) -> None:
+        """Of a version that the robot holds, what its disk has lost meanwhile."""
+        if self.refetch:
+            self._link.fetch(self.refetch[0])
+            self.fetched.append(self.refetch.popleft())
 
     def _settle_changes(self) -> None:
         """Makes adopted versions the active ones on the disk, and remembers what to tell."""

@@ -1,0 +1,124 @@
+"""The daemon as a process: without a network, killed, started again, told to stop."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import robot_world
+from fleetmap.bus import MemoryBus, MemoryHub, ZenohBus
+from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
+from locclient.link import MapLink
+from locclient.spool import Spool
+from locclient.tile_cache import TileCache
+from mapserver.fleet import Fleet
+from mapserver.store import MapStore
+from mapserver.tile_service import TileService
+from recording_samples import Sample, write_euroc
+
+PATIENCE_S = 120.0
+
+
+def write_walk(folder: Path, frames: int, dark: range) -> Path:
+    """The robot's ride as a recording."""
+    moments = list(robot_world.moments(frames, dark=dark))
+    imu = [moment.imu for moment in moments]
+    sample = Sample(
+        np.array([moment.frame.stamp_ns for moment in moments]), [moment.frame.left for moment in moments],
+        [moment.frame.right for moment in moments], np.concatenate([part.stamps_ns for part in imu]),
+        np.concatenate([part.gyro_radps for part in imu]), np.concatenate([part.accel_mps2 for part in imu]),
+        [robot_world.truth(number) for number in range(frames)],
+    )  # fmt: skip
+    return write_euroc(folder, sample)
+
+
+def configuration(folder: Path, recording: Path, endpoint: str, *, speed: float) -> Path:
+    path = folder / "robot.toml"
+    path.write_text(
+        f'[run]\nserver = "{endpoint}"\nsite = "room"\nrobot = "r1"\ncache = "{folder}/cache"\n'
+        f'spool = "{folder}/spool.sqlite3"\nfailures = "{folder}/failures"\n'
+        f'[source]\nkind = "recording"\nrecording = "{recording}"\nspeed = {speed}\n'
+    )
+    return path
+
+
+@contextmanager
+def daemon(config: Path, notify: Path) -> Iterator[subprocess.Popen[str]]:
+    """A running `locclient run`; killed at the end if it still lives."""
+    environment = {**os.environ, "PYTHONPATH": ":".join(sys.path), "NOTIFY_SOCKET": str(notify)}
+    arguments = [sys.executable, "-m", "locclient.cli", "run", "--config", str(config), "--verbose"]
+    with subprocess.Popen(arguments, env=environment, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def wait_for(found: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not found():
+        assert time.monotonic() < deadline, "it took too long"
+        assert process.poll() is None, process.stderr.read() if process.stderr else ""
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell(tmp_path: Path) -> None:
+    """Away from its server, on what its disk holds, the robot goes dark: blind, dark. It is killed. A later life delivers."""
+    hub, table = MemoryHub(), []
+    with (
+        MapStore.open(tmp_path / "store", create=True) as store,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager,
+    ):
+        manager.bind(str(tmp_path / "notify"))
+        manager.setblocking(False)
+        robot_world.save(store)
+        with MemoryBus(hub) as bus, MemoryBus(hub) as robot_bus:
+            service = TileService(store, Fleet(store), bus, lambda *_: None)
+            link = MapLink(robot_bus, TileCache(tmp_path / "cache"), "room", "r1")
+            link.bring(link.wanted())
+            service.close()
+
+        with ZenohBus.listen("tcp/127.0.0.1:0") as found_port:
+            endpoint = found_port.endpoint  # free again in a moment, and nobody answers there
+        dark_walk = write_walk(tmp_path / "dark", 140, range(60, 140))
+        with daemon(configuration(tmp_path, dark_walk, endpoint, speed=2.0), tmp_path / "notify") as process:
+            spool = tmp_path / "spool.sqlite3"
+            wait_for(lambda: any((tmp_path / "failures").glob("*.json")), process)
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+        waiting = Spool(spool, max_bytes=10**8).waiting(10)
+        assert len(waiting) == 1
+        report = decode_message(waiting[0].payload, FailureReport)
+        assert (report.kind, report.cause, report.version) == ("blind", "dark", 1)
+        assert any(note.inliers for note in report.fixes), "it had localised itself without any server"
+        assert manager.recv(100) == b"READY=1"
+        assert manager.recv(100).startswith(b"WATCHDOG=1\nSTATUS=")
+
+        def take(_: str, payload: bytes) -> bytes:
+            table.append(decode_message(payload, FailureReport).id)
+            return encode_message(FailureAck(id=table[-1]))
+
+        fleet = Fleet(store)
+        with ZenohBus.listen(endpoint) as bus:
+            service = TileService(store, fleet, bus, lambda *_: None)
+            bus.queryable(robot_key("*", "*", "failures"), take)
+            light_walk = write_walk(tmp_path / "light", 70, range(0))
+            config = configuration(tmp_path, light_walk, endpoint, speed=0.5)
+            with daemon(config, tmp_path / "notify") as process:
+                told = lambda: bool(table) and fleet.robots("room") and fleet.robots("room")[0].last_health is not None  # noqa: E731
+                wait_for(lambda: bool(told()), process)
+                process.send_signal(signal.SIGTERM)
+                assert process.wait(30) == 0
+            service.close()
+        assert fleet.robots("room")[0].version == 1
+    assert table == [report.id]
+    assert Spool(spool, max_bytes=10**8).counts()["delivered"] == 1
