@@ -24,7 +24,7 @@ from mapserver.store import MapStore
 from mapserver.tile_service import TileService
 from recording_samples import Sample, write_euroc
 
-PATIENCE_S = 120.0
+PATIENCE_S = 240.0  # the first start of all compiles every kernel
 
 
 def write_walk(folder: Path, frames: int, dark: range) -> Path:

@@ -13,10 +13,15 @@ import numpy as np  # noqa: E402
 
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_tile, encode_tile  # noqa: E402
 from map_samples import draft_details, random_survey, random_tile  # noqa: E402
+from mapserver.quality.figures import Compared, Evidence, Looks, Motion  # noqa: E402
 from mapserver.store import MapStore  # noqa: E402
 from mapserver.store.archive import ARCHIVE_FORMAT, encode_archive  # noqa: E402
 from mapserver.store.migrations import MIGRATIONS  # noqa: E402
 from mapserver.store.transfer import EXPORT_FORMAT  # noqa: E402
+
+
+_LOOKS = Looks(40, 0.975, 0.0, 0.001, 0.004, 290.0, 1.77)
+EVIDENCE = Evidence(held_out=Compared(_LOOKS, _LOOKS, 1.0), motion=Motion(100, 0, 0.01))
 
 
 def write_store(folder: Path) -> None:
@@ -27,8 +32,9 @@ def write_store(folder: Path) -> None:
             tiles = [random_tile(rng, landmarks=8, places=1, cell=(x, 0)) for x in range(2)]
             details = draft_details(path_m=12.5)
             store.save_draft(
-                "lab", tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive %d" % seed
-            )
+                "lab", tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive %d" % seed,
+                evidence=EVIDENCE if seed == 3 else None,
+            )  # fmt: skip
             if seed < 3:
                 store.publish("lab")
         store.record_robot_report("lab", "r1", {"status": "TRACKING"}, 1)

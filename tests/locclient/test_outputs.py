@@ -47,11 +47,11 @@ def test_ros_topics_hold_the_same() -> None:
     tracked = estimate(5.0, x_m=2.0, sigma_m=0.1)
     told = published(OutputSection(format="ros2", domain=3), tracked, estimate(6.0, Status.LOST, known=False))
     expected = tracked.map_from_body @ se3_inverse(BASE_FROM_BODY)
-    poses = told[ros_key(3, "/localization/pose", "geometry_msgs/PoseWithCovarianceStamped")]
-    assert len(poses) == 1
-    pose = decode_prior(poses[0])
-    np.testing.assert_allclose(pose.map_from_base, expected, atol=1e-12)
-    np.testing.assert_allclose(np.diag(pose.cov_rot_trans), [1e-4] * 3 + [0.01] * 3)
+    stamped = told[ros_key(3, "/localization/pose", "geometry_msgs/PoseWithCovarianceStamped")]
+    assert len(stamped) == 1
+    prior = decode_prior(stamped[0])
+    np.testing.assert_allclose(prior.map_from_base, expected, atol=1e-12)
+    np.testing.assert_allclose(np.diag(prior.cov_rot_trans), [1e-4] * 3 + [0.01] * 3)
     first, second = (decode_frame_links(payload) for payload in told[ros_key(3, "/tf", "tf2_msgs/TFMessage")])
     assert [(link.parent, link.child) for link in first] == [("map", "odom"), ("odom", "base_link")]
     np.testing.assert_allclose(first[0].parent_from_child @ first[1].parent_from_child, expected, atol=1e-12)
