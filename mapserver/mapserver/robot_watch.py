@@ -8,7 +8,7 @@ from mapserver.measures import Tally
 MAX_GAP_S = 5.0  # a robot that is silent for longer was not observed meanwhile
 DRIVING_MPS = 0.05
 BLIND_S, GOOD_S, RADIUS_LIMIT_M = 2.0, 5.0, 0.30  # as docs/reports.md defines failures
-WRONG_DOCK_M = 0.30
+WRONG_M = 0.30
 CHI2_6_0999 = 22.458  # 99.9 % of a squared Mahalanobis distance of 6 degrees of freedom
 _MAX_COUNT = 1 << 40
 _MAX_FIGURE = 1e15
@@ -26,6 +26,7 @@ class RobotWatch:
         self._fix_counted = False
         self._blind_since_ns: int | None = None
         self._good_since_ns: int | None = None
+        self._jump_ns: int | None = None
         self._in_failure = False
         self._place: tuple[int, float, float] | None = None
         self._pose_mps: float | None = None
@@ -52,7 +53,7 @@ class RobotWatch:
         speed_mps = figures.get("speed_mps", self._pose_mps)
         tally.driving_ms = dt_ms if speed_mps is not None and abs(speed_mps) >= DRIVING_MPS else 0
         self._count_status(tally, health, figures, dt_ms)
-        self._count_fixes(tally, figures)
+        self._count_fixes(tally, health.stamp_ns, figures)
         self._count_work(tally, figures)
         self._stamp_ns, self._wall_ns, self._figures = health.stamp_ns, health.wall_ns, figures
         return tally
@@ -74,7 +75,7 @@ class RobotWatch:
     def _begin_run(self) -> None:
         self._stamp_ns, self._figures = None, {}
         self._has_fix = self._fix_counted = self._in_failure = False
-        self._blind_since_ns = self._good_since_ns = None
+        self._blind_since_ns = self._good_since_ns = self._jump_ns = None
 
     def _elapsed_ms(self, stamp_ns: int) -> int:
         if self._stamp_ns is None:
@@ -115,7 +116,7 @@ class RobotWatch:
             self._in_failure = False
         return int(is_new)
 
-    def _count_fixes(self, tally: Tally, figures: dict[str, float]) -> None:
+    def _count_fixes(self, tally: Tally, stamp_ns: int, figures: dict[str, float]) -> None:
         if "first_fix_s" in figures and not self._fix_counted:
             self._fix_counted = True
             tally.first_fixes, tally.first_fix_ms = 1, round(min(abs(figures["first_fix_s"]), 1e6) * 1e3)
@@ -124,9 +125,13 @@ class RobotWatch:
             tally.innovations, tally.innovation_sum = 1, innovation
             tally.innovation_m_sum = figures.get("fix_innovation_m", 0.0)
             tally.exceeded = int(innovation > CHI2_6_0999)
+        if self._has_fix and figures.get("fix_innovation_m", 0.0) > WRONG_M:
+            # The estimate was wrong before, or is now. Jumps without 5 s between them are one.
+            tally.jumps = int(self._jump_ns is None or stamp_ns - self._jump_ns >= GOOD_S * 1e9)
+            self._jump_ns = stamp_ns
         dock_m = figures.get("dock_error_m")
         if dock_m is not None:
-            tally.docks, tally.docks_wrong = 1, int(dock_m > WRONG_DOCK_M)
+            tally.docks, tally.docks_wrong = 1, int(dock_m > WRONG_M)
 
     def _count_work(self, tally: Tally, figures: dict[str, float]) -> None:
         if "frame_ms_mean" in figures:

@@ -110,6 +110,16 @@ def test_docks_and_innovations() -> None:
     assert (found.docks, found.docks_wrong) == (2, 1)
 
 
+def test_fixes_far_from_where_the_robot_took_itself_to_be() -> None:
+    far = dict.fromkeys((3, 4, 7, 13), 0.5)
+    found = total([health(n, fix_innovation=3.0, fix_innovation_m=far.get(n, 0.02)) for n in range(20)])
+    assert found.jumps == 2  # seconds 3 to 7 are one
+    start = [health(n, "INITIALISING", fix_innovation_m=5.0) for n in range(3)]
+    assert total(start).jumps == 0  # before the first fix nothing was known
+    assert Tally(jumps=2, suspected=3).silent_estimated == 3
+    assert Tally(jumps=4, suspected=3, docks_wrong=1).silent_estimated == 5
+
+
 def test_skew_is_that_of_the_fastest_message_and_follows() -> None:
     skew = ClockSkew()
     assert skew.ahead_s is None
