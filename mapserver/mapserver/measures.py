@@ -21,7 +21,8 @@ class Tally:
     observed, driving: time that reports cover, and of it with the wheels turning; after_fix: since the run's first fix, localised: of
     it TRACKING; usable: with a position that may be relied upon. failures: reported ones; suspected: those that are estimates of
     silent ones; blind_seen: stretches of blindness that the server saw in the statuses itself. exceeded: innovations beyond
-    their 99.9 % bound; jumps: fixes more than 0.30 m from where the robot took itself to be. docks_wrong: arrivals where the estimate was more than 0.30 m off.
+    their 99.9 % bound; jumps: fixes more than 0.30 m from where the robot took itself to be; docks_wrong: arrivals where the estimate
+    was so far off.
     """
 
     reports: int = 0
