@@ -65,6 +65,16 @@ def test_silence_is_not_observed() -> None:
     assert (found.observed_ms, found.reports) == (2000, 4)
 
 
+def test_a_status_without_frames_is_of_the_past() -> None:
+    """A camera that is torn off: the last status was TRACKING, and is repeated."""
+    reports = [health(min(n, 10), wall_ns=n * NS, speed_mps=1.0) for n in range(31)]
+    found = total(reports)
+    assert (found.observed_ms, found.after_fix_ms) == (30_000, 30_000)
+    assert found.localised_ms == found.usable_ms == 12_000  # two seconds of silence are not yet one
+    assert found.blind_seen == 1
+    assert total([health(n, wall_ns=n * NS) for n in range(31)]).blind_seen == 0
+
+
 def test_driving_by_speed_else_by_poses_else_not_at_all() -> None:
     assert total([health(n, speed_mps=1.0) for n in range(5)]).driving_ms == 4000
     assert total([health(n, speed_mps=0.0) for n in range(5)]).driving_ms == 0
