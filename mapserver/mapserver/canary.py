@@ -116,6 +116,6 @@ def _told(found: Rate) -> str:
     if found.per_robot_day is None:
         return f"{found.events} failures before anything was driven"
     return (
-        f"{found.events} in {found.robot_days:.2f} robot-days ({found.per_robot_day:.3g} per robot-day, "
+        f"{found.events} in {found.robot_days:.3g} robot-days ({found.per_robot_day:.3g} per robot-day, "
         f"{found.low:.3g} to {found.high:.3g})"
     )

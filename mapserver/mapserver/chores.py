@@ -55,5 +55,8 @@ async def run_chores(chores: list[Chore]) -> None:
             except FleetmapError as error:
                 # A store that is busy for a moment must not stop the server; robots also ask by themselves.
                 _log.warning("%s failed: %s", chore.name, error)
+            except Exception:
+                # A fault of ours in one chore must not end the others.
+                _log.exception("%s failed", chore.name)
             chore.due_s = time.monotonic() + chore.every_s
         await asyncio.sleep(_LOOK_EVERY_S)

@@ -261,7 +261,8 @@ def _set_options(section: Section) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, value in msgspec.structs.asdict(section).items():
         if isinstance(value, Section):
-            found[name] = _set_options(value)
+            if options := _set_options(value):
+                found[name] = options
         elif value is not None:
             found[name] = value
     return found

@@ -21,7 +21,8 @@ class Tally:
     observed, driving: time that reports cover, and of it with the wheels turning; after_fix: since the run's first fix, localised: of
     it TRACKING; usable: with a position that may be relied upon. failures: reported ones; suspected: those that are estimates of
     silent ones; blind_seen: stretches of blindness that the server saw in the statuses itself. exceeded: innovations beyond
-    their 99.9 % bound. docks_wrong: arrivals where the estimate was more than 0.30 m off.
+    their 99.9 % bound; jumps: fixes more than 0.30 m from where the robot took itself to be; docks_wrong: arrivals where the estimate
+    was so far off.
     """
 
     reports: int = 0
@@ -36,6 +37,7 @@ class Tally:
     innovation_sum: float = 0.0
     innovation_m_sum: float = 0.0
     exceeded: int = 0
+    jumps: int = 0
     docks: int = 0
     docks_wrong: int = 0
     cpu_reports: int = 0
@@ -65,8 +67,11 @@ class Tally:
 
     @property
     def silent_estimated(self) -> int:
-        """Silent failures as far as they can be guessed: what robots suspect, and docks that were somewhere else."""
-        return self.suspected + self.docks_wrong
+        """Silent failures as far as they can be guessed: what robots suspect or their fixes show, and docks that were elsewhere.
+
+        Robots suspect what their fixes show, so that one of the two is counted, whichever is more.
+        """
+        return max(self.suspected, self.jumps) + self.docks_wrong
 
     @property
     def unreported_blindness(self) -> int:

@@ -31,7 +31,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from benchmarks.bench_service import _SOURCES, _cpu_s, _rss_mb, serving
 from benchmarks.fleet_clients import SITE, TILES
 from map_samples import draft_details, random_tile
-from mapserver.measures import Tally
+from mapserver.measures import TALLY_COLUMNS, Tally
 from mapserver.store import FailureFilter, FleetBatch, MapStore
 
 _PAGES = (
@@ -180,7 +180,13 @@ def measure_month(folder: Path, robots: int) -> dict[str, float]:
             ]
             keys += [("version", str(n)) for n in range(3)] + [("cause", f"c{n}") for n in range(6)] + [("site", "")]
             for axis, key in keys:
-                batch.add(SITE, axis, key, hour, Tally(*(int(value) for value in rng.integers(0, 3_600_000, 24))))
+                batch.add(
+                    SITE,
+                    axis,
+                    key,
+                    hour,
+                    Tally(*(int(value) for value in rng.integers(0, 3_600_000, len(TALLY_COLUMNS)))),
+                )
             store.fleet.add(batch)
         timed: dict[str, Callable[[], object]] = {
             "robots_day_ms": lambda: store.fleet.tallies(SITE, "robot", since_hour=696),

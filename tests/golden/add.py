@@ -12,13 +12,14 @@ sys.path[:0] = [str(GOLDEN.parent), *(str(GOLDEN.parents[1] / part) for part in 
 import numpy as np  # noqa: E402
 
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_tile, encode_tile  # noqa: E402
+from fleetmap.messages import FailureReport, Thumbnail  # noqa: E402
 from map_samples import draft_details, random_survey, random_tile  # noqa: E402
+from mapserver.fleet import Fleet  # noqa: E402
 from mapserver.quality.figures import Compared, Evidence, Looks, Motion  # noqa: E402
 from mapserver.store import MapStore  # noqa: E402
 from mapserver.store.archive import ARCHIVE_FORMAT, encode_archive  # noqa: E402
 from mapserver.store.migrations import MIGRATIONS  # noqa: E402
 from mapserver.store.transfer import EXPORT_FORMAT  # noqa: E402
-
 
 _LOOKS = Looks(40, 0.975, 0.0, 0.001, 0.004, 290.0, 1.77)
 EVIDENCE = Evidence(held_out=Compared(_LOOKS, _LOOKS, 1.0), motion=Motion(100, 0, 0.01))
@@ -40,6 +41,11 @@ def write_store(folder: Path) -> None:
         store.record_robot_report("lab", "r1", {"status": "TRACKING"}, 1)
         store.rollback("lab")
         store.update_job(store.begin_job("lab", "nightly"), "done", "version 2 is published", {"drafts": 1})
+        report = FailureReport(
+            site="lab", robot="r1", id="f1", stamp_ns=5, wall_ns=6, duration_s=2.5, kind="blind", status="LOST", cause="dark",
+            version=1, tile=(0, 0), thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"jpeg"),),
+        )  # fmt: skip
+        Fleet(store, clock_ns=lambda: 1_767_323_045_000_000_000).take_failure("lab", "r1", report)
 
 
 def write_tile(path: Path) -> None:

@@ -16,6 +16,7 @@ from fleetmap.recordings.tum import write_tum
 from fleetmap.samples import SensorSet, Trajectory
 from map_samples import draft_details, save_sample_draft
 from mapserver import cli
+from mapserver.commands.fleet import fleet_app
 from mapserver.config import MapserverConfig, command_defaults, read_config
 from mapserver.store import MapStore
 
@@ -78,10 +79,14 @@ def test_interruption_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
 
 
 def test_every_option_has_its_key_in_the_file() -> None:
-    """And every section and key belongs to a command or to the survey."""
+    """And every section and key belongs to a command, to a command of a group, or to settings of their own."""
     commands = {command.__name__: command for command in cli.COMMANDS}
     sections = {field.name: field.default for field in msgspec.structs.fields(MapserverConfig)}
-    assert set(sections) == {*commands, "survey", "gate"}
+    assert set(sections) == {*commands, "fleet", "survey", "gate", "ingest", "canary", "resurvey"}
+    grouped = {command.callback.__name__: command.callback for command in fleet_app.registered_commands}
+    assert set(sections["fleet"].__struct_fields__) == set(grouped)
+    commands |= {f"fleet.{name}": command for name, command in grouped.items()}
+    sections |= {f"fleet.{name}": getattr(sections["fleet"], name) for name in grouped}
     for name, command in commands.items():
         options = set()
         for parameter in inspect.signature(command).parameters.values():

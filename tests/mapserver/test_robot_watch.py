@@ -65,6 +65,16 @@ def test_silence_is_not_observed() -> None:
     assert (found.observed_ms, found.reports) == (2000, 4)
 
 
+def test_a_status_without_frames_is_of_the_past() -> None:
+    """A camera that is torn off: the last status was TRACKING, and is repeated."""
+    reports = [health(min(n, 10), wall_ns=n * NS, speed_mps=1.0) for n in range(31)]
+    found = total(reports)
+    assert (found.observed_ms, found.after_fix_ms) == (30_000, 30_000)
+    assert found.localised_ms == found.usable_ms == 12_000  # two seconds of silence are not yet one
+    assert found.blind_seen == 1
+    assert total([health(n, wall_ns=n * NS) for n in range(31)]).blind_seen == 0
+
+
 def test_driving_by_speed_else_by_poses_else_not_at_all() -> None:
     assert total([health(n, speed_mps=1.0) for n in range(5)]).driving_ms == 4000
     assert total([health(n, speed_mps=0.0) for n in range(5)]).driving_ms == 0
@@ -108,6 +118,16 @@ def test_docks_and_innovations() -> None:
     )
     assert (found.innovations, found.exceeded, found.innovation_m_sum) == (1, 1, 0.2)
     assert (found.docks, found.docks_wrong) == (2, 1)
+
+
+def test_fixes_far_from_where_the_robot_took_itself_to_be() -> None:
+    far = dict.fromkeys((3, 4, 7, 13), 0.5)
+    found = total([health(n, fix_innovation=3.0, fix_innovation_m=far.get(n, 0.02)) for n in range(20)])
+    assert found.jumps == 2  # seconds 3 to 7 are one
+    start = [health(n, "INITIALISING", fix_innovation_m=5.0) for n in range(3)]
+    assert total(start).jumps == 0  # before the first fix nothing was known
+    assert Tally(jumps=2, suspected=3).silent_estimated == 3
+    assert Tally(jumps=4, suspected=3, docks_wrong=1).silent_estimated == 5
 
 
 def test_skew_is_that_of_the_fastest_message_and_follows() -> None:

@@ -1,11 +1,14 @@
 """The OpenAPI document: FastAPI's own, with problem documents instead of its validation errors, and examples."""
 
+from dataclasses import asdict
 from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from mapserver.api.views import Problem
+from mapserver.measures import Tally, measures
+from mapserver.store import FailureRow
 
 _PARAMETER_EXAMPLES: dict[str, Any] = {
     "site": "hall", "version": 3, "before": 2, "after": 3, "job": 17, "sha256": "5e" * 32, "limit": 100,
@@ -33,7 +36,30 @@ _JOB = {
     "id": 17, "site": "hall", "kind": "nightly", "state": "done", "started": "2026-01-02T01:00:00Z",
     "finished": "2026-01-02T01:40:00Z", "message": "version 3 is published", "report": {},
 }  # fmt: skip
+_FAILURE = asdict(
+    FailureRow(
+        number=12, site="hall", robot="tug-7", failure_id="3f9a", received_ns=1767323049000000000,
+        happened_ns=1767323045000000000, duration_s=3.5, kind="blind", cause="dark", status="LOST", version=3, tile="4,-1",
+        x_map_m=70.2, y_map_m=-3.1,
+    )
+)  # fmt: skip
+_MEASURES = asdict(
+    measures(
+        Tally(
+            reports=57000, observed_ms=57_000_000, driving_ms=40_000_000, after_fix_ms=56_000_000, localised_ms=55_000_000,
+            usable_ms=55_500_000, first_fixes=3, first_fix_ms=9000, failures=1, blind_failures=1, blind_seen=1,
+        )
+    )
+)  # fmt: skip
 _ANSWER_EXAMPLES: dict[str, Any] = {
+    "/v1/failures": {"failures": [_FAILURE], "next": None},
+    "/v1/failures/{number}": {"failure": _FAILURE, "report": {"sharpness": 0.4}, "pictures": []},
+    "/v1/fleet/measures": {
+        "by": "robot",
+        "measures": [{"site": "hall", "key": "tug-7", "measures": _MEASURES}],
+        "next": None,
+    },
+    "/v1/sites/{site}/hours": {"hours": [{"hour_ns": 1767322800000000000, "measures": _MEASURES}], "next": None},
     "/v1/sites": {"sites": [_SITE], "next": None},
     "/v1/sites/{site}/versions": {"versions": [_VERSION], "next": None},
     "/v1/sites/{site}/current": _VERSION,

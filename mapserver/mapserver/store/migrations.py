@@ -124,6 +124,7 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
             innovation_sum REAL NOT NULL,
             innovation_m_sum REAL NOT NULL,
             exceeded INTEGER NOT NULL,
+            jumps INTEGER NOT NULL,
             docks INTEGER NOT NULL,
             docks_wrong INTEGER NOT NULL,
             cpu_reports INTEGER NOT NULL,

@@ -11,7 +11,7 @@ import pytest
 
 from fleetmap.errors import NewerFormatError
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_manifest, decode_tile, encode_manifest, pack
-from mapserver.store import Actor, MapStore
+from mapserver.store import Actor, FailureFilter, MapStore
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
 from mapserver.store.migrations import MIGRATIONS
 from mapserver.store.transfer import EXPORT_FORMAT
@@ -93,6 +93,10 @@ def test_databases_of_every_format_open_whole(tmp_path: Path, number: int) -> No
         evidence = store.evidence("lab", 3)
         assert (evidence is not None) is (number >= 3)
         assert evidence is None or evidence.held_out.draft.localised_share == 0.975
+        if number >= 4:
+            (failure,) = store.fleet.failures(FailureFilter())
+            assert (failure.failure_id, store.fleet.picture(failure.number, 0)) == ("f1", b"jpeg")
+            assert store.fleet.tallies("lab", "cause", key="dark")["lab", "dark"].failures == 1
 
 
 def test_newer_formats_are_refused_by_number(tmp_path: Path) -> None:
