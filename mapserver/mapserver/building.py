@@ -22,6 +22,8 @@ from fleetmap.rectification import StereoCamera
 from fleetmap.samples import SensorSet, Trajectory
 from mapserver.build_report import Accuracy, BuildReport, accuracy, full_report, make_report, sessions_report
 from mapserver.landmark_budget import choose_landmarks
+from mapserver.loop_places import loop_places
+from mapserver.noted_job import noted_job
 from mapserver.picture_files import PictureFile
 from mapserver.progress import ProgressView, StageTimes
 from mapserver.store import DraftDetails, MapStore
@@ -88,12 +90,13 @@ def run_build(order: BuildOrder, settings: SurveySettings) -> str:
     admitted = admit_recordings(
         order.recordings, order.frames, order.calibration, order.use, console, needs_truth=order.frame_from_ground_truth
     )
-    with MapStore.open(order.store, create=True) as maps:
+    with MapStore.open(order.store, create=True) as maps, noted_job(maps, order.site, "build") as job:
         parent = _parent(order, maps)
         base = None if parent is None else parent.map
         chosen = choose_vocabulary(maps, order.site, order.vocabulary)
         built = _survey(order, admitted, zones, base, chosen, settings, console, times, started_s)
-        return _keep(order, built, parent, settings, maps)
+        job.message, job.report = _keep(order, built, parent, settings, maps)
+    return job.message
 
 
 @dataclass(frozen=True)
@@ -188,7 +191,10 @@ def _truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
     return chained(known, joined.trajectories) if len(known) == len(truths) else None
 
 
-def _keep(order: BuildOrder, built: _Built, parent: _Parent | None, settings: SurveySettings, maps: MapStore) -> str:
+def _keep(
+    order: BuildOrder, built: _Built, parent: _Parent | None, settings: SurveySettings, maps: MapStore
+) -> tuple[str, dict[str, Any]]:
+    """Stores the draft and writes the files; a sentence about it, and what the store notes of the job."""
     survey_map = built.joined.map
     for_robots = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M, _wanted_ids(maps, parent, survey_map))
     tiles = tiles_from_survey(survey_map, chosen=for_robots)
@@ -219,7 +225,9 @@ def _keep(order: BuildOrder, built: _Built, parent: _Parent | None, settings: Su
     report = msgspec.structs.replace(report, map_bytes=info.map_bytes)
     built.times.begin("writing")
     _write_files(order, built, parent, report, version)
-    return _sentence(order.site, version, parent, report)
+    places = loop_places([s.entry.name for s in built.taken], [s.survey for s in built.taken], built.joined)
+    noted = msgspec.to_builtins(report) | {"version": version, "loop_places": places}
+    return _sentence(order.site, version, parent, report), noted
 
 
 def _wanted_ids(maps: MapStore, parent: _Parent | None, survey_map: SurveyMap) -> NDArray[np.uint32] | None:

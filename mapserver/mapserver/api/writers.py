@@ -21,8 +21,12 @@ class Writers:
 
     def check(self, request: Request) -> None:
         """Raises HTTPException 401 for a missing or wrong token, 403 where nobody may write."""
+        self.check_shown(request, request.headers.get("authorization", ""))
+
+    def check_shown(self, request: Request, authorization: str) -> None:
+        """As `check`, with an authorization that came otherwise than in the request's header."""
         if self.token is not None:
-            shown = request.headers.get("authorization", "").encode("latin-1", "replace")
+            shown = authorization.encode("latin-1", "replace")
             if not hmac.compare_digest(shown, f"Bearer {self.token}".encode()):
                 raise HTTPException(401, "this needs the server's token", {"WWW-Authenticate": "Bearer"})
         elif not self.is_loopback:

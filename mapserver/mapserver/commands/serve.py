@@ -65,6 +65,7 @@ def _run(
     from mapserver.api.app import create_app
     from mapserver.api.metrics import Metrics
     from mapserver.chores import run_chores, server_chores
+    from mapserver.dashboard.install import install_dashboard
     from mapserver.fleet import Fleet
     from mapserver.tile_service import TileService
 
@@ -92,6 +93,7 @@ def _run(
         maps, fleet, metrics, bus, lifespan, writers=writers, gate=settings.gate, canary=settings.canary,
         resurvey=settings.resurvey,
     )  # fmt: skip
+    install_dashboard(app, maps, fleet, writers, settings.gate, settings.canary, settings.resurvey)
     config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=_STOP_WITHIN_S)
     # uvicorn stops on these signals by itself and afterwards raises them again for the handlers that were there before:
     # the default ones would end the process with a status that says it was killed.

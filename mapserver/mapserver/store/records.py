@@ -15,6 +15,7 @@ from mapserver.store.canaries import canaries
 from mapserver.store.fleet_records import FleetRecords
 from mapserver.store.fleet_rows import CanaryRow
 from mapserver.store.ledger import Ledger
+from mapserver.store.lifecycle import ROLLBACK_TARGET
 from mapserver.store.rows import NOBODY, Actor, Event, JobInfo, RobotInfo, SiteInfo, VerdictRow, VersionInfo
 
 JOB_STATES = ("running", "done", "failed")
@@ -61,6 +62,12 @@ class StoreRecords:
         """The site's current version, None before the first publication; raises UsageError for an unknown site."""
         self._check_site(site)
         return self._current_row(site)
+
+    def rollback_target(self, site: str) -> int | None:
+        """The version that rolling back would make current, None where none was so before."""
+        self._check_site(site)
+        rows = self._ledger.query(ROLLBACK_TARGET.replace(":site", "?1"), (site,))
+        return int(rows[0]["version"]) if rows else None
 
     def manifest(self, site: str, version: int) -> Manifest:
         """The manifest of a version; errors as of `version` and `blob`."""
@@ -127,6 +134,11 @@ class StoreRecords:
     def canaries(self, site: str | None = None, *, running: bool = False) -> list[CanaryRow]:
         """Versions that some robots (of a site) tried first, the last one first; those that run alone with `running`."""
         return canaries(self._ledger, site, running=running)
+
+    def last_events(self, site: str, limit: int) -> list[Event]:
+        """The last of a site's history, newest first."""
+        rows = self._ledger.query("SELECT * FROM events WHERE site = ? ORDER BY id DESC LIMIT ?", (site, limit))
+        return [Event(**row) for row in rows]
 
     def robots(self, site: str | None = None) -> list[RobotInfo]:
         """What every robot (of a site) said last."""

@@ -1,0 +1,141 @@
+"""What the pages read and do, of maps and surveys: the one way from them to the store."""
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any
+
+from fleetmap.errors import UsageError
+from fleetmap.mapformat import Manifest, decode_tile
+from mapserver.dashboard.plan import Plan, make_plan
+from mapserver.gate import GateSettings
+from mapserver.store import Actor, Difference, Event, JobInfo, MapStore, SiteInfo, VerdictRow, VersionInfo
+
+_KEPT_PLANS = 8
+_EVENTS_SHOWN = 50
+_JOBS_SHOWN = 100
+
+
+@dataclass(frozen=True, slots=True)
+class VersionQuality:
+    """What is known about a version: its manifest with the build's report, what the gate said, oldest first."""
+
+    info: VersionInfo
+    manifest: Manifest
+    verdicts: list[VerdictRow]
+
+
+@dataclass(frozen=True, slots=True)
+class SiteHistory:
+    """Versions and events of a site, newest first. before: the version that rolling back would make current, if any."""
+
+    site: SiteInfo
+    versions: list[VersionInfo]
+    events: list[Event]
+    before: int | None
+
+    @property
+    def fingerprint(self) -> tuple[object, ...]:
+        """Changes whenever the page that shows this would."""
+        newest = self.events[0].id if self.events else 0
+        return newest, tuple((info.version, info.state) for info in self.versions)
+
+
+class MapData:
+    """Reads and changes maps in an open store. Methods may be called from any thread; errors are the store's."""
+
+    def __init__(self, store: MapStore, gate: GateSettings) -> None:
+        self._store = store
+        self._gate = gate
+        self._plans: OrderedDict[str, Plan] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def sites(self) -> list[str]:
+        """Names of all sites."""
+        return [info.site for info in self._store.sites()]
+
+    def chosen_site(self, site: str | None) -> str:
+        """`site`, or the first one where none is named; raises UsageError where it is not there."""
+        known = self.sites()
+        if not known:
+            raise UsageError("the store has no site yet; `mapserver build` makes one of a recording")
+        if site is not None and site not in known:
+            raise UsageError(f"the store has no site {site[:64]}; it has: {', '.join(known)}")
+        return site or known[0]
+
+    def history(self, site: str) -> SiteHistory:
+        """Versions and the last events of a site."""
+        info = next(info for info in self._store.sites() if info.site == site)
+        versions = self._store.versions(site)[::-1]
+        events = self._store.last_events(site, _EVENTS_SHOWN)
+        return SiteHistory(info, versions, events, self._store.rollback_target(site))
+
+    def current_version(self, site: str) -> int | None:
+        """The number of the current version, None before the first."""
+        current = self._store.current(site)
+        return None if current is None else current.version
+
+    def quality(self, site: str, version: int) -> VersionQuality:
+        """A version with all that was said about it."""
+        return VersionQuality(
+            self._store.version(site, version), self._store.manifest(site, version), self._store.verdicts(site, version)
+        )
+
+    def plan(self, site: str, version: int) -> Plan:
+        """The plan of a version; the last ones are kept, since versions do not change."""
+        sha256 = self._store.version(site, version).manifest_sha256
+        with self._lock:  # one at a time: a second browser waits for the first one's picture instead of making it too
+            plan = self._plans.get(sha256)
+            if plan is None:
+                manifest = self._store.manifest(site, version)
+                plan = make_plan(manifest, lambda entry: decode_tile(self._store.blob(entry.sha256)))
+                self._plans[sha256] = plan
+            self._plans.move_to_end(sha256)
+            while len(self._plans) > _KEPT_PLANS:
+                self._plans.popitem(last=False)
+        return plan
+
+    def difference(self, site: str, before: int, after: int) -> Difference:
+        """What changed between two versions."""
+        return self._store.difference(site, before, after)
+
+    def changed_tiles(self, site: str, before: int, after: int) -> dict[tuple[int, int], str]:
+        """Cells that are not the same in both: added, removed or changed."""
+        old, new = (
+            {(tile.x, tile.y): tile.sha256 for tile in self._store.manifest(site, version).tiles}
+            for version in (before, after)
+        )
+        changed = {cell: "changed" for cell in old.keys() & new.keys() if old[cell] != new[cell]}
+        return (
+            changed
+            | dict.fromkeys(new.keys() - old.keys(), "added")
+            | dict.fromkeys(old.keys() - new.keys(), "removed")
+        )
+
+    def jobs(self, site: str) -> list[JobInfo]:
+        """The last jobs of a site, newest first."""
+        return self._store.jobs(site, limit=_JOBS_SHOWN)
+
+    def job(self, number: int) -> JobInfo:
+        """One job."""
+        return self._store.job(number)
+
+    def publish(self, site: str, version: int, actor: Actor) -> str:
+        """Takes a draft through the gate and makes it current."""
+        self._store.publish(site, version, actor=actor, gate=self._gate)
+        return f"Version {version} is published and current."
+
+    def promote(self, site: str, version: int, actor: Actor) -> str:
+        """Makes an earlier version current."""
+        self._store.promote(site, version, actor=actor)
+        return f"Version {version} is current."
+
+    def roll_back(self, site: str, actor: Actor) -> str:
+        """Makes the version current that was so before."""
+        return f"Version {self._store.rollback(site, actor=actor)} is current."
+
+
+def report_figure(report: dict[str, Any], name: str) -> float | None:
+    """A number of a build's report, None where it has none."""
+    value = report.get(name)
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None

@@ -1,0 +1,274 @@
+"""The map page: versions, coverage, what is known of a version, what changed between two, promote and roll back."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from fastapi import Request
+from markupsafe import Markup
+from nicegui import ui
+
+from mapserver.dashboard import drawing
+from mapserver.dashboard.confirm import change_button
+from mapserver.dashboard.data import MapData, SiteHistory, VersionQuality
+from mapserver.dashboard.frame import RESPONSE_TIMEOUT_S, Rooms, Where, html, load, number, show
+from mapserver.dashboard.markup import badge, choices, facts, joined, link, moment, share, size, table
+from mapserver.dashboard.plan import Plan
+from mapserver.store import Difference, VersionInfo
+
+_LOOK_AGAIN_S = 5.0
+_STATE_TONES = {"current": "good", "draft": "warn", "published": "quiet", "retired": "quiet"}
+# Figures of a build in the words of the people who look at them.
+_FIGURES = {
+    "path_m": ("Driven", "{:.1f} m"),
+    "duration_s": ("Recorded", "{:.0f} s"),
+    "keyframes": ("Keyframes", "{:.0f}"),
+    "landmarks": ("Landmarks surveyed", "{:.0f}"),
+    "ate_rmse_m": ("Error against ground truth", "{:.3f} m"),
+    "seconds": ("Time to build", "{:.0f} s"),
+}
+
+
+def install(rooms: Rooms) -> None:
+    """Adds the page."""
+
+    @ui.page("/map", title="Map – fleetmap", response_timeout=RESPONSE_TIMEOUT_S)
+    async def map_page(
+        request: Request,
+        site: str | None = None,
+        version: str | None = None,
+        before: str | None = None,
+        after: str | None = None,
+    ) -> None:
+        async def build(where: Where) -> None:
+            history = await load(rooms.maps.history, where.site)
+            html(Markup("<h1>Map of {}</h1>").format(where.site))
+            _changes(rooms, where, history)
+            html(_versions(where, history.versions, number(version, "version") or _usual(history)))
+            shown = number(version, "version") or _usual(history)
+            if shown is not None:
+                await _one_version(rooms.maps, where, shown)
+            await _difference(rooms.maps, where, history, number(before, "version"), number(after, "version"))
+            html(_events(history))
+            _follow(rooms, where, history)
+
+        await show(rooms, request, "map", site, build)
+
+
+def _usual(history: SiteHistory) -> int | None:
+    """The version to show where none is named: the current one, else the newest."""
+    if history.site.current_version is not None:
+        return history.site.current_version
+    return history.versions[0].version if history.versions else None
+
+
+def _changes(rooms: Rooms, where: Where, history: SiteHistory) -> None:
+    """What a person may do to the versions."""
+    current = history.site.current_version
+    html(
+        Markup("<p>{}</p>").format(
+            "No version is published yet." if current is None else f"Robots are to use version {current}."
+        )
+    )
+    with ui.row().classes("actions"):
+        if history.before is not None:
+            change_button(
+                rooms,
+                f"Roll back to version {history.before}",
+                f"All robots of {where.site} go from version {current} back to version {history.before}. Version {current} "
+                "is retired; it can be made current again later.",
+                lambda actor: rooms.maps.roll_back(where.site, actor),
+            )
+        for info in history.versions:
+            if info.state == "draft":
+                change_button(
+                    rooms,
+                    f"Publish draft {info.version}",
+                    f"Draft {info.version} goes through the gate. If the gate accepts it, all robots of {where.site} get it.",
+                    lambda actor, chosen=info.version: rooms.maps.publish(where.site, chosen, actor),  # type: ignore[misc]
+                )
+            elif info.state in {"published", "retired"} and info.version != history.before:
+                change_button(
+                    rooms,
+                    f"Promote version {info.version}",
+                    f"All robots of {where.site} go from version {current} to version {info.version}.",
+                    lambda actor, chosen=info.version: rooms.maps.promote(where.site, chosen, actor),  # type: ignore[misc]
+                )
+
+
+def _versions(where: Where, versions: list[VersionInfo], shown: int | None) -> Markup:
+    rows = [
+        (
+            link(where.to("map", version=info.version), f"Version {info.version}"),
+            joined([badge(_STATE_TONES[info.state], info.state), " (shown below)" if info.version == shown else ""]),
+            info.parent,
+            info.created.replace("T", " ").replace("Z", " UTC"),
+            moment(info.published_ns),
+            info.tiles,
+            info.landmarks,
+            size(info.map_bytes),
+        )
+        for info in versions
+    ]
+    head = ("Version", "State", "Built on", "Built", "Published", "Tiles", "Landmarks", "Size")
+    return Markup("<h2>Versions</h2>{}").format(
+        table(head, rows, empty="No version yet; `mapserver build` makes one of a recording.", name="Versions")
+    )
+
+
+async def _one_version(maps: MapData, where: Where, version: int) -> None:
+    quality = await load(maps.quality, where.site, version)
+    plan = await load(maps.plan, where.site, version)
+    picture = drawing.svg(
+        plan,
+        f"Tiles, landmarks and places of version {version}",
+        [drawing.coverage(plan), drawing.ground(plan, picture_address(where, version)), drawing.scale_bar(plan)],
+    )
+    left = Markup(
+        '<div><h2>Coverage of version {}</h2><div class="planbox">{}</div><p class="quiet">Grey: landmarks. Blue dots: places where '
+        "robots can find themselves. Squares: tiles, the fuller the stronger.</p></div>"
+    ).format(version, picture)
+    right = Markup("<div><h2>Quality of version {}</h2>{}{}</div>").format(
+        version, _quality_facts(quality, plan), _verdicts(quality)
+    )
+    html(Markup('<div class="pair">{}{}</div>').format(left, right))
+
+
+def picture_address(where: Where, version: int) -> str:
+    """Where a browser gets the picture of a version's plan."""
+    return f"{where.root}/plans/{where.site}/{version}.png"
+
+
+def _quality_facts(quality: VersionQuality, plan: Plan) -> Markup:
+    report, info = quality.manifest.report, quality.info
+    pairs: list[tuple[str, object]] = [
+        (words, pattern.format(report[name]))
+        for name, (words, pattern) in _FIGURES.items()
+        if isinstance(report.get(name), int | float)
+    ]
+    area_m2 = len(plan.tiles) * plan.tile_size_m**2
+    pairs += [
+        ("Landmarks for robots", info.landmarks),
+        ("Places for robots", plan.places),
+        ("Area with tiles", f"{area_m2:.0f} m²"),
+        ("Download for a robot", size(info.map_bytes + info.vocabulary_bytes)),
+    ]
+    loops = report.get("loops")
+    if isinstance(loops, dict):
+        pairs.append(("Loops", f"{loops.get('accepted', 0)} accepted of {loops.get('candidates', 0)} looked at"))
+    pairs.append(
+        ("Recordings", ", ".join(f"{entry.name} ({entry.frames} frames)" for entry in quality.manifest.recordings))
+    )
+    pairs += [(f"Doctor: {name}", "; ".join(words) or "nothing wrong") for name, words in _findings(report)]
+    return facts(pairs)
+
+
+def _findings(report: dict[str, Any]) -> Iterable[tuple[str, list[str]]]:
+    found = report.get("findings")
+    return found.items() if isinstance(found, dict) else ()
+
+
+def _verdicts(quality: VersionQuality) -> Markup:
+    """What the gate said, the last word first."""
+    if not quality.verdicts:
+        return Markup('<p class="quiet">The gate has not judged this version yet; publishing asks it.</p>')
+    parts = []
+    for verdict in reversed(quality.verdicts):
+        tone, words = ("good", "accepted") if verdict.accepted else ("bad", "refused")
+        if verdict.forced:
+            tone, words = "warn", "published by force"
+        reasons = joined(Markup("<li>{}</li>").format(reason) for reason in verdict.reasons)
+        missing = verdict.report.get("not_judged")
+        parts.append(
+            Markup("<p>Gate, {}: {}</p><ul>{}</ul>{}").format(
+                moment(verdict.stamp_ns),
+                badge(tone, words),
+                reasons,
+                Markup('<p class="quiet">Could not be judged: {}.</p>').format(", ".join(missing).replace("_", " "))
+                if missing
+                else "",
+            )
+        )
+    return joined(parts)
+
+
+async def _difference(maps: MapData, where: Where, history: SiteHistory, before: int | None, after: int | None) -> None:
+    """A choice of two versions, and what changed between them."""
+    numbers = [str(info.version) for info in history.versions]
+    if len(numbers) < 2:
+        return
+    if after is None:
+        after = _usual(history) or int(numbers[0])
+    if before is None:
+        earlier = [int(text) for text in numbers if int(text) < after]
+        before = earlier[0] if earlier else int(numbers[0])
+    asked = Markup(
+        '<h2 id="changes">What changed between two versions</h2><form class="ask" method="get" action="{}#changes">'
+        '<input type="hidden" name="site" value="{}">{}{}<button type="submit">Compare</button></form>'
+    ).format(
+        f"{where.root}/map",
+        where.site,
+        choices("before", "From version", numbers, str(before), any_word=None),
+        choices("after", "To version", numbers, str(after), any_word=None),
+    )
+    html(asked)
+    found = await load(maps.difference, where.site, before, after)
+    kinds = await load(maps.changed_tiles, where.site, before, after)
+    plan = await load(maps.plan, where.site, after)
+    picture = drawing.svg(
+        plan,
+        f"Tiles that changed from version {before} to {after}",
+        [drawing.ground(plan, picture_address(where, after)), drawing.cells(plan, kinds), drawing.scale_bar(plan)],
+    )
+    html(
+        Markup(
+            '<div class="pair"><div><div class="planbox">{}</div><p class="quiet">Tiles <span class="good">added</span> '
+            '(whole line), <span class="warn">changed</span> (dashes), <span class="bad">removed</span> (dots).</p></div><div>{}</div></div>'
+        ).format(picture, _difference_facts(found))
+    )
+
+
+def _difference_facts(found: Difference) -> Markup:
+    moved = "none"
+    if found.landmarks_moved and found.moved_median_m is not None and found.moved_max_m is not None:
+        moved = (
+            f"{found.landmarks_moved}, by {found.moved_median_m:.3f} m in the middle, {found.moved_max_m:.3f} m at most"
+        )
+    tiles = f"{found.tiles_added} added, {found.tiles_changed} changed, {found.tiles_removed} removed, {found.tiles_kept} the same"
+    pairs: list[tuple[str, object]] = [
+        ("Tiles", tiles),
+        ("Landmarks", f"{found.landmarks_added} new, {found.landmarks_removed} gone, {found.landmarks_kept} the same"),
+        ("Landmarks that moved", moved),
+        ("A robot downloads", f"{size(found.fetch_bytes)} of {size(found.full_bytes)}"),
+        ("Vocabulary", "another one" if found.vocabulary_changed else "the same"),
+    ]
+    for name, (words, pattern) in _FIGURES.items():
+        both = found.quality.get(name)
+        if both is not None:
+            texts = [pattern.format(v) if isinstance(v, int | float) else "–" for v in (both.before, both.after)]
+            pairs.append((words, f"{texts[0]} before, {texts[1]} after"))
+    if found.landmarks_kept + found.landmarks_moved + found.landmarks_removed:
+        before = found.landmarks_kept + found.landmarks_moved + found.landmarks_removed
+        pairs.append(
+            ("Of the landmarks before", f"{share((before - found.landmarks_removed) / before)} are still there")
+        )
+    return facts(pairs)
+
+
+def _events(history: SiteHistory) -> Markup:
+    rows = [
+        (moment(event.stamp_ns), event.kind.replace("_", " "), event.detail, event.actor or "the program", event.reason)
+        for event in history.events
+    ]
+    return Markup("<h2>History</h2>{}").format(
+        table(("When", "What", "In detail", "Who", "Why"), rows, empty="Nothing happened yet.", name="History")
+    )
+
+
+def _follow(rooms: Rooms, where: Where, history: SiteHistory) -> None:
+    """Loads the page anew when somebody or the server itself changed versions, unless a dialog is open."""
+
+    async def look() -> None:
+        if (await load(rooms.maps.history, where.site)).fingerprint != history.fingerprint:
+            ui.run_javascript("if (!document.querySelector('.q-dialog')) location.reload()")
+
+    ui.timer(_LOOK_AGAIN_S, look, immediate=False)

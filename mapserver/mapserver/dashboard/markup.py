@@ -1,0 +1,103 @@
+"""Pieces of HTML. Everything that comes from elsewhere goes through `escape`: robots choose their words themselves. Pure."""
+
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from urllib.parse import urlencode
+
+from markupsafe import Markup, escape
+
+NOTHING = Markup('<span class="quiet">–</span>')
+
+
+def joined(parts: Iterable[object], between: str = "") -> Markup:
+    """All parts one after the other, each escaped unless it is markup."""
+    return Markup(between).join(escape(part) for part in parts)
+
+
+def cell(value: object) -> Markup:
+    """A value as it stands in a table: a dash for None."""
+    return NOTHING if value is None or value == "" else escape(value)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]], *, empty: str, name: str) -> Markup:
+    """A table with a head; the sentence `empty` where there are no rows. name: what screen readers call it."""
+    body = [joined([Markup("<td>{}</td>").format(cell(value)) for value in row]) for row in rows]
+    if not body:
+        return Markup('<p class="quiet">{}</p>').format(empty)
+    titles = joined(Markup('<th scope="col">{}</th>').format(title) for title in head)
+    lines = joined(Markup("<tr>{}</tr>").format(line) for line in body)
+    return Markup(
+        '<div class="scroll" tabindex="0" role="region" aria-label="{0}"><table aria-label="{0}"><thead><tr>{1}</tr></thead>'
+        "<tbody>{2}</tbody></table></div>"
+    ).format(name, titles, lines)
+
+
+def facts(pairs: Iterable[tuple[str, object]]) -> Markup:
+    """Names and values under each other."""
+    return Markup('<dl class="facts">{}</dl>').format(
+        joined(Markup("<dt>{}</dt><dd>{}</dd>").format(name, cell(value)) for name, value in pairs)
+    )
+
+
+def badge(tone: str, words: object) -> Markup:
+    """A short state. tone: good, warn, bad or quiet; the words alone say it too."""
+    return Markup('<span class="badge {}">{}</span>').format(tone, words)
+
+
+def link(address: str, words: object) -> Markup:
+    """A link."""
+    return Markup('<a href="{}">{}</a>').format(address, words)
+
+
+def address(path: str, **query: object) -> str:
+    """`path` with the questions that are not None."""
+    asked = {name: value for name, value in query.items() if value is not None and value != ""}
+    return f"{path}?{urlencode(asked)}" if asked else path
+
+
+def choices(
+    name: str, label: str, values: Sequence[str], chosen: str | None, *, any_word: str | None = "any"
+) -> Markup:
+    """A labelled list to choose from; any_word names the choice of none of them."""
+    options = [(value, value) for value in values]
+    if any_word is not None:
+        options.insert(0, ("", any_word))
+    if chosen and chosen not in values:
+        options.append((chosen, chosen))
+    marked = joined(
+        Markup('<option value="{}"{}>{}</option>').format(
+            value, Markup(" selected") if value == (chosen or "") else "", words
+        )
+        for value, words in options
+    )
+    return Markup('<label>{} <select name="{}">{}</select></label>').format(label, name, marked)
+
+
+def moment(stamp_ns: int | None) -> str | None:
+    """A stamp of the server's clock as people read it, in UTC."""
+    return None if stamp_ns is None else f"{datetime.fromtimestamp(stamp_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC"
+
+
+def size(number: int | None) -> str | None:
+    """Bytes as people read them."""
+    if number is None:
+        return None
+    value = float(number)
+    for unit in ("B", "kB", "MB"):
+        if value < 1000:
+            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
+        value /= 1000
+    return f"{value:.2f} GB"
+
+
+def share(value: float | None) -> str | None:
+    """A share in percent."""
+    return None if value is None else f"{100 * value:.1f} %"
+
+
+def age(seconds_s: float) -> str:
+    """How long ago."""
+    for limit_s, unit_s, unit in ((120, 1, "s"), (7200, 60, "min"), (172_800, 3600, "h")):
+        if seconds_s < limit_s:
+            return f"{seconds_s / unit_s:.0f} {unit}"
+    return f"{seconds_s / 86400:.0f} days"

@@ -1,0 +1,87 @@
+"""The plan of a version: its landmarks and places from above as one picture, and its tiles. Pure."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array
+from fleetmap.mapformat import Manifest, Tile, TileEntry
+
+_LONG_SIDE_PX = 1600
+_FINEST_M = 0.04  # metres per pixel: below, single landmarks are dots far apart
+_BEYOND_M = 12.0  # what is shown around where robots were; landmarks of far walls would shrink everything else
+_LANDMARK_BGR, _PLACE_BGR = (150, 138, 128), (235, 120, 50)  # middle tones, to be seen on white and on black
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """low, high: corners in `map`, metres. png: transparent where nothing is. places: keyframes that robots may recognise."""
+
+    low_m: tuple[float, float]
+    high_m: tuple[float, float]
+    tile_size_m: float
+    tiles: tuple[TileEntry, ...]
+    places: int
+    png: bytes
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height."""
+        return self.high_m[0] - self.low_m[0], self.high_m[1] - self.low_m[1]
+
+
+def make_plan(manifest: Manifest, read_tile: Callable[[TileEntry], Tile]) -> Plan:
+    """The plan of a version; an empty one shows 10 m around the origin."""
+    tiles = [read_tile(entry) for entry in manifest.tiles]
+    landmarks = np.concatenate([np.zeros((0, 2)), *(tile.points_map[:, :2] for tile in tiles)])
+    places = np.concatenate([np.zeros((0, 2)), *(tile.map_from_cam[:, :2, 3] for tile in tiles)])
+    low, high = _corners(manifest, places)
+    return Plan(
+        (float(low[0]), float(low[1])),
+        (float(high[0]), float(high[1])),
+        manifest.tile_size_m,
+        manifest.tiles,
+        len(places),
+        _picture(landmarks, places, low, high),
+    )
+
+
+def _corners(manifest: Manifest, places: Array) -> tuple[Array, Array]:
+    if not manifest.tiles:
+        return np.array([-5.0, -5.0]), np.array([5.0, 5.0])
+    cells = np.array([(entry.x, entry.y) for entry in manifest.tiles], float)
+    low, high = cells.min(axis=0) * manifest.tile_size_m, (cells.max(axis=0) + 1) * manifest.tile_size_m
+    if len(places):
+        near_low = np.maximum(low, places.min(axis=0) - _BEYOND_M)
+        near_high = np.minimum(high, places.max(axis=0) + _BEYOND_M)
+        if (near_high - near_low > 1.0).all():
+            return near_low, near_high
+    return low, high
+
+
+def _picture(landmarks: Array, places: Array, low: Array, high: Array) -> bytes:
+    """A PNG: darker where more landmarks are above each other, with a dot for each place."""
+    scale_m = max(_FINEST_M, float((high - low).max()) / _LONG_SIDE_PX)
+    width, height = np.maximum(np.ceil((high - low) / scale_m).astype(int), 1)
+    picture = np.zeros((height, width, 4), np.uint8)
+    counts = np.zeros((height, width), np.float32)
+    np.add.at(counts, _pixels(landmarks, low, high, scale_m, height), 1)
+    counts = cv2.GaussianBlur(counts, (3, 3), 0) * 4
+    picture[..., :3] = _LANDMARK_BGR
+    picture[..., 3] = np.where(counts > 0, np.clip(60 + 90 * np.log1p(counts), 0, 230), 0).astype(np.uint8)
+    radius = max(1, round(0.12 / scale_m))
+    for y, x in zip(*_pixels(places, low, high, scale_m, height), strict=True):
+        cv2.circle(picture, (int(x), int(y)), radius, (*_PLACE_BGR, 255), -1)
+    done, data = cv2.imencode(".png", picture)
+    assert done
+    return data.tobytes()
+
+
+def _pixels(points: Array, low: Array, high: Array, scale_m: float, height: int) -> tuple[NDArray[np.int64], ...]:
+    """Rows and columns of the points that are in the picture; y points up."""
+    inside = ((points >= low) & (points < high)).all(axis=1)
+    columns, rows = ((points[inside] - low) / scale_m).astype(np.int64).T
+    return np.maximum(height - 1 - rows, 0), columns
