@@ -35,7 +35,7 @@ _SHAPES = {
     "triangle": '<path d="M0-1.2L1.15.9H-1.15Z"/>',
     "cross": '<path class="stroke" d="M-1-1L1 1M-1 1L1-1"/>',
 }
-_MARK_SHARE = 0.0075  # of the plan's longer side: radius of a mark
+_MARK_SHARE = 0.006  # of the plan's longer side: radius of a mark
 
 
 def svg(plan: Plan, name: str, layers: Iterable[Markup], *, css: str = "plan") -> Markup:

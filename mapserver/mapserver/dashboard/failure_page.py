@@ -113,7 +113,7 @@ async def _map(rooms: Rooms, where: Where, version: int, shown: list[FailureRow]
         plan, f"Map of {where.site}, version {version}",
         [drawing.ground(plan, picture_address(where, version)), drawing.scale_bar(plan)],
     )  # fmt: skip
-    with ui.element("div").classes("planbox low"):
+    with ui.element("div"), ui.element("div").classes("planbox"):
         html(ground)
         layer = html(drawing.svg(plan, "Failures on the map", [_marks(where, plan, shown)]), classes="over")
     return plan, layer

@@ -78,10 +78,9 @@ def _figures(live: LiveSite, health: SiteHealth) -> Markup:
                 ("Robots heard now", "", f"{heard} of {len(live.robots)}", "reported within 10 s"),
                 ("Localised now", "good", live.count("good"), f"{live.count('warn')} unsure or starting"),
                 ("Lost now", "bad" if lost else "", lost, "cannot say where they are"),
-                ("Failures per robot-day, last 24 h", "", rate_words(health.day.failures), health.trend),
-                (
-                    "Silent failures, an estimate", "", rate_words(silent),
-                    f"{silent.events} suspected by robots or docks in 24 h",
+                _rate_figure("Failures per robot-day, last 24 h", health.day.failures, health.trend),
+                _rate_figure(
+                    "Silent failures per robot-day, an estimate", silent, f"{silent.events} suspected in 24 h"
                 ),
                 ("Time with a usable position", "", share(health.day.availability) or "–", "of the last 24 h"),
             )
@@ -89,11 +88,24 @@ def _figures(live: LiveSite, health: SiteHealth) -> Markup:
     )  # fmt: skip
 
 
+def figure(value: float | None) -> str:
+    """A rate with two digits, without exponent."""
+    if value is None:
+        return "–"
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def _rate_figure(name: str, found: Rate, more: str) -> tuple[str, str, str, str]:
+    """A rate large, its interval and a remark below."""
+    interval = f"true rate {figure(found.low)} to {figure(found.high)} (95 %); " if found.low is not None else ""
+    return name, "", figure(found.per_robot_day), interval + more
+
+
 def rate_words(found: Rate) -> str:
     """A rate with the interval that holds the true one with 95 %."""
     if found.per_robot_day is None:
         return "–"
-    return f"{found.per_robot_day:.2g} ({found.low:.2g} to {found.high:.2g})"
+    return f"{figure(found.per_robot_day)} ({figure(found.low)} to {figure(found.high)})"
 
 
 def _trials(trials: tuple[Trial, ...]) -> Markup:
@@ -129,7 +141,7 @@ async def _plan(rooms: Rooms, where: Where, live: LiveSite) -> tuple[Plan, ui.ht
         plan, f"Map of {where.site}, version {version}",
         [drawing.ground(plan, picture_address(where, version)), drawing.scale_bar(plan)],
     )  # fmt: skip
-    with ui.element("div").classes("planbox"):
+    with ui.element("div"), ui.element("div").classes("planbox"):
         html(ground)
         layer = html(_robots(plan, where, live), classes="over")
     return plan, layer
@@ -186,7 +198,8 @@ def _table(where: Where, live: LiveSite, health: SiteHealth) -> ui.table:
     columns = [
         {"name": name, "label": label, "field": name, "sortable": True, "align": "left"} for name, label in _COLUMNS
     ]
-    look_for = ui.input("Find a robot, state or version").props("outlined dense clearable").style("width:320px")
+    with ui.element("div"):
+        look_for = ui.input("Find a robot, state or version").props("outlined dense clearable").style("width:320px")
     shown = ui.table(columns=columns, rows=_rows(where, live, health), row_key="robot", pagination=25)
     shown.props('flat :rows-per-page-options="[25, 100, 0]"')
     look_for.bind_value_to(shown, "filter")

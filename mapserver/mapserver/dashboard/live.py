@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from mapserver.fleet import Fleet, RobotStatus
 
 SILENT_S = 10.0  # robots report every second
+_GONE_S = 3.0
 _KEPT_S = 0.9
 
 # What a status means to people, and its tone. Robots may send others, which are shown as they are.
@@ -83,7 +84,8 @@ def live_robot(status: RobotStatus) -> LiveRobot:
     pose, health = status.last_pose or {}, status.last_health or {}
     said = health.get("status") or pose.get("status")
     words, tone = STATUSES.get(str(said), (str(said).lower(), "warn")) if said else ("not started", "quiet")
-    if status.seconds_since > SILENT_S or status.is_present is False:
+    # A robot that takes its token back says goodbye; one that never shows a token is believed by its messages.
+    if status.seconds_since > (SILENT_S if status.is_present is not False else _GONE_S):
         words, tone = SILENT
     place = pose.get("position_map_m")
     is_somewhere = place is not None and None not in place

@@ -13,7 +13,7 @@ from fleetmap.mapformat import Manifest, Tile, TileEntry
 _LONG_SIDE_PX = 1600
 _FINEST_M = 0.04  # metres per pixel: below, single landmarks are dots far apart
 _BEYOND_M = 12.0  # what is shown around where robots were; landmarks of far walls would shrink everything else
-_LANDMARK_BGR, _PLACE_BGR = (150, 138, 128), (235, 120, 50)  # middle tones, to be seen on white and on black
+_LANDMARK_BGR, _PLACE_BGR = (140, 128, 118), (235, 120, 50)  # middle tones, to be seen on white and on black
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,9 +69,9 @@ def _picture(landmarks: Array, places: Array, low: Array, high: Array) -> bytes:
     picture = np.zeros((height, width, 4), np.uint8)
     counts = np.zeros((height, width), np.float32)
     np.add.at(counts, _pixels(landmarks, low, high, scale_m, height), 1)
-    counts = cv2.GaussianBlur(counts, (3, 3), 0) * 4
+    counts = cv2.dilate(counts, np.ones((3, 3), np.uint8))  # pages show it smaller than it is
     picture[..., :3] = _LANDMARK_BGR
-    picture[..., 3] = np.where(counts > 0, np.clip(60 + 90 * np.log1p(counts), 0, 230), 0).astype(np.uint8)
+    picture[..., 3] = np.where(counts > 0, np.clip(110 + 70 * np.log1p(counts), 0, 255), 0).astype(np.uint8)
     radius = max(1, round(0.12 / scale_m))
     for y, x in zip(*_pixels(places, low, high, scale_m, height), strict=True):
         cv2.circle(picture, (int(x), int(y)), radius, (*_PLACE_BGR, 255), -1)

@@ -1,0 +1,333 @@
+"""The dashboard in a real browser: every page, live changes, versions promoted and rolled back, nothing loaded from elsewhere."""
+
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from dashboard_scene import (
+    SITE,
+    Seen,
+    Served,
+    chromium,
+    failure,
+    fill_store,
+    place_of,
+    serving,
+    speak,
+    speak_all,
+    watch,
+)
+from fleetmap.bus import ZenohBus
+from fleetmap.messages import FailureAck, decode_message, encode_message, robot_key
+from mapserver.store import MapStore
+
+ROBOTS = 300
+TOKEN = "a-token-of-the-test"
+PAGES = {
+    "": "Robots of hall",
+    "map": "Map of hall",
+    "failures": "Failures of hall",
+    "failures/1": "Failure 1 of tug-7",
+    "surveys": "Surveys of hall",
+}
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    path = chromium()
+    with sync_playwright() as playwright:
+        # The second name is how a page from elsewhere would reach loopback.
+        rules = "--host-resolver-rules=MAP elsewhere.example 127.0.0.1"
+        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", rules])
+        yield started
+        started.close()
+
+
+@pytest.fixture(scope="module")
+def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("store")
+    fill_store(folder)
+    with serving(folder) as server:
+        with ZenohBus.connect(server.zenoh) as bus:
+            speak_all(bus, ROBOTS, 1_000_000_000)
+        yield server
+    assert [line for line in server.log if "ERROR" in line or "Traceback" in line] == []
+
+
+@pytest.fixture
+def page(browser: Browser) -> Iterator[Page]:
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    yield context.new_page()
+    context.close()
+
+
+def opened(page: Page, served: Served, path: str, **query: object) -> Seen:
+    """Opens a page and waits until it is live."""
+    seen = watch(page)
+    asked = "&".join(f"{name}={value}" for name, value in query.items())
+    page.goto(f"{served.http}/dashboard/{path}?{asked}")
+    expect(page.locator("h1")).to_be_visible()
+    page.wait_for_function("window.socket && window.socket.connected")
+    return seen
+
+
+def test_every_page_is_whole_in_both_looks_and_loads_nothing_from_elsewhere(page: Page, served: Served) -> None:
+    for path, title in PAGES.items():
+        seen = opened(page, served, path)
+        expect(page.locator("h1")).to_have_text(title)
+        for look, width in ((look, width) for look in ("light", "dark") for width in (1280, 820)):
+            page.emulate_media(color_scheme=look)
+            page.set_viewport_size({"width": width, "height": 1000})
+            page.wait_for_function(f"document.body.classList.contains('body--{look}')")
+            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{path} is wider than {width}"
+            contrast, words = page.evaluate(WEAKEST_CONTRAST)
+            assert contrast >= 4.5, f"{path}, {look}: {words}"
+        page.wait_for_load_state("networkidle")
+        assert seen.faults == []
+        assert len(seen.requests) > 3
+        assert seen.elsewhere([served.http, served.http.replace("http:", "ws:")]) == []
+
+
+# Contrast (WCAG 2) of all words with the nearest ground that is painted behind them: the weakest, and its words.
+WEAKEST_CONTRAST = """() => {
+  const numbers = text => (text.match(/[\\d.]+/g) || []).map(Number);
+  const light = rgb => rgb.map(v => v / 255).map(v => v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, v, n) => sum + v * [0.2126, 0.7152, 0.0722][n], 0);
+  const ground = node => {
+    for (let at = node; at; at = at.parentElement) {
+      const found = numbers(getComputedStyle(at).backgroundColor);
+      if (found.length === 3 || found[3] === 1) return found.slice(0, 3);
+    }
+    return [255, 255, 255];
+  };
+  let weakest = [21, ''];
+  for (const node of document.querySelectorAll('body *')) {
+    const words = [...node.childNodes].some(child => child.nodeType === 3 && child.textContent.trim());
+    if (!words || !node.checkVisibility() || node.closest('svg, style, script, .nicegui-error-popup')) continue;
+    const behind = ground(node), ink = numbers(getComputedStyle(node).color), share = ink[3] ?? 1;
+    const seen = ink.slice(0, 3).map((v, n) => share * v + (1 - share) * behind[n]);
+    const [a, b] = [light(seen), light(behind)].sort((one, other) => one - other);
+    const contrast = (b + 0.05) / (a + 0.05);
+    if (contrast < weakest[0]) weakest = [contrast, node.tagName + ' ' + node.className + ' ' + node.textContent.slice(0, 80)];
+  }
+  return weakest;
+}"""
+
+
+def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> None:
+    with ZenohBus.connect(served.zenoh) as bus:
+        speak_all(bus, ROBOTS, 2_000_000_000)
+        seen = opened(page, served, "")
+        expect(page.locator(".figures")).to_contain_text(f"{ROBOTS} of {ROBOTS}")
+        mark = page.locator(".mark", has=page.locator("title", has_text=re.compile(r"^tug-4:")))
+        assert _place(mark.get_attribute("transform")) == pytest.approx(place_of(4), abs=1e-3)
+        before = page.evaluate("performance.timeOrigin")
+        speak(bus, "tug-4", 3_000_000_000, (40.0, 14.0), "LOST")
+        expect(mark).to_have_attribute("transform", re.compile(r"translate\(40\.000 -14\.000\)"), timeout=5000)
+        expect(mark).to_have_class("mark bad")
+        page.get_by_label("Find a robot").fill("tug-4")
+        row = page.locator("tbody tr", has=page.get_by_role("link", name="tug-4", exact=True))
+        expect(row).to_contain_text("lost")
+        assert page.evaluate("performance.timeOrigin") == before, "the page changed by itself, it was not loaded again"
+        assert seen.faults == []
+
+
+def _place(transform: str | None) -> tuple[float, float]:
+    x, y = re.findall(r"-?[\d.]+", transform or "")[:2]
+    return float(x), -float(y)
+
+
+def test_pages_with_300_robots_load_within_a_second(browser: Browser, served: Served) -> None:
+    """With nothing in the browser's cache; what other programs take of the machine meanwhile is not counted."""
+    for path in PAGES:
+        took_s = [_load_s(browser, f"{served.http}/dashboard/{path}") / _waiting() for _ in range(2)]
+        assert min(took_s) < 1.0, path
+
+
+def _load_s(browser: Browser, address: str) -> float:
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    page = context.new_page()
+    started_s = time.perf_counter()
+    page.goto(address, wait_until="commit")
+    page.wait_for_selector("h1")
+    took_s = time.perf_counter() - started_s
+    context.close()
+    return took_s
+
+
+def _waiting() -> float:
+    """How many times longer a busy program takes than it computes: 1 on a machine with nothing else to do."""
+    began_s, began_cpu_s = time.perf_counter(), time.process_time()
+    while time.process_time() - began_cpu_s < 0.05:
+        sum(range(1000))
+    return max(1.0, (time.perf_counter() - began_s) / (time.process_time() - began_cpu_s))
+
+
+def test_a_failure_is_found_opened_and_shown_with_its_context(page: Page, served: Served) -> None:
+    seen = opened(page, served, "failures")
+    page.get_by_label("Cause").select_option("dark")
+    page.get_by_role("button", name="Show").click()
+    expect(page).to_have_url(re.compile("cause=dark"))
+    expect(page.locator("tbody tr")).to_have_count(1)
+    page.get_by_role("link", name="Failure 1", exact=True).click()
+    expect(page.locator("h1")).to_have_text("Failure 1 of tug-7")
+    for words in ("dark", "tug-7", "1,0", "0.4 m", "too few matches"):
+        expect(page.locator(".nicegui-content")).to_contain_text(words)
+    pictures = page.locator(".pictures img")
+    expect(pictures).to_have_count(2)
+    expect(pictures.nth(1)).to_have_attribute("alt", re.compile("^Matches"))
+    pictures.nth(1).scroll_into_view_if_needed()
+    page.wait_for_function(
+        "[...document.querySelectorAll('.pictures img')].every(i => i.complete && i.naturalWidth === 160)"
+    )
+    assert seen.faults == []
+
+
+def test_what_robots_say_is_shown_as_words_and_never_runs(page: Page, served: Served) -> None:
+    seen = opened(page, served, "failures")
+    expect(page.locator("tbody")).to_contain_text("<b>bold</b>")
+    assert page.locator("tbody b").count() == 0
+    expect(page.locator("tbody")).to_contain_text("suspected")
+    assert seen.faults == []
+
+
+def test_a_new_failure_appears_by_itself(page: Page, served: Served) -> None:
+    seen = opened(page, served, "failures", robot="tug-12")
+    expect(page.locator(".nicegui-content")).to_contain_text("No failure")
+    with ZenohBus.connect(served.zenoh) as bus:
+        answer = bus.get(
+            robot_key(SITE, "tug-12", "failures"), encode_message(failure("tug-12", "live", cause="glare"))
+        )
+        assert not decode_message(answer, FailureAck).refused
+    expect(page.locator("tbody")).to_contain_text("glare", timeout=8000)
+    expect(page.locator(".mark.bad")).to_have_count(1)
+    assert seen.faults == []
+
+
+def test_a_job_shows_the_doctor_and_its_loops(page: Page, served: Served) -> None:
+    seen = opened(page, served, "surveys")
+    content = page.locator(".nicegui-content")
+    for words in (
+        "cameras are swapped",
+        "camera 1 is blurred",
+        "saw nothing that the map has",
+        "its neighbours disagree",
+    ):
+        expect(content).to_contain_text(words)
+    assert [page.locator(f".line.{tone}").count() for tone in ("good", "bad", "quiet")] == [1, 1, 1]
+    with MapStore.open(served.folder) as store:
+        store.begin_job(SITE, "nightly")
+    expect(page.locator("tbody").first).to_contain_text("nightly", timeout=8000)
+    assert seen.faults == []
+
+
+def test_versions_are_compared(page: Page, served: Served) -> None:
+    seen = opened(page, served, "map", before=1, after=3)
+    assert page.locator(".cell.added").count() == 2
+    assert page.locator(".cell.changed").count() == 6
+    content = page.locator(".nicegui-content")
+    for words in ("2 added, 6 changed, 0 removed", "211.0 m before, 213.0 m after", "accepted"):
+        expect(content).to_contain_text(words)
+    assert seen.faults == []
+
+
+def test_wrong_addresses_are_answered_in_words(page: Page, served: Served) -> None:
+    for path, words in (
+        ("map?site=nowhere", "no site nowhere"),
+        ("map?version=99", "no version 99"),
+        ("map?version=x", "not a number"),
+        ("failures/77", "no failure 77"),
+        ("surveys?job=99", "no job 99"),
+    ):
+        page.goto(f"{served.http}/dashboard/{path}")
+        expect(page.locator(".notice.bad")).to_contain_text(words)
+    assert page.request.get(f"{served.http}/dashboard/plans/hall/99.png").status == 404
+    assert page.request.get(f"{served.http}/dashboard/pictures/1/9.jpg").status == 404
+
+
+def test_the_look_that_was_chosen_stays(page: Page, served: Served) -> None:
+    opened(page, served, "")
+    page.get_by_role("button", name="Light or dark").click()
+    chosen = "document.body.classList.contains('body--dark')"
+    assert page.evaluate(chosen)
+    opened(page, served, "surveys")
+    assert page.evaluate(chosen)
+
+
+def change(page: Page, words: str, *, name: str = "ada", token: str | None = None) -> None:
+    """Asks for a change and confirms it."""
+    page.get_by_role("button", name=words, exact=True).click()
+    dialog = page.locator(".q-dialog")
+    dialog.get_by_label("Your name").fill(name)
+    dialog.get_by_label("Why").fill("robots lose themselves in aisle 3")
+    if token is not None:
+        dialog.get_by_label("token").fill(token)
+    dialog.get_by_role("button", name=f"Yes: {words}").click()
+
+
+def current(served: Served) -> int:
+    with MapStore.open(served.folder) as store:
+        return store.current(SITE).version
+
+
+def test_publish_promote_and_roll_back_ask_first(page: Page, tmp_path: Path) -> None:
+    fill_store(tmp_path)
+    (tmp_path / "token").write_text(TOKEN)
+    with serving(tmp_path, "--token-file", str(tmp_path / "token")) as served:
+        seen = opened(page, served, "map")
+        page.get_by_role("button", name="Roll back to version 1").click()
+        page.get_by_role("button", name="No, change nothing").click()
+        expect(page.locator(".q-dialog")).to_have_count(0)
+        assert current(served) == 2
+
+        change(page, "Roll back to version 1", name=" ", token=TOKEN)
+        expect(page.locator(".q-dialog .notice")).to_contain_text("your name")
+        page.keyboard.press("Escape")
+        opened(page, served, "map")
+        change(page, "Roll back to version 1", token="wrong")
+        expect(page.locator(".q-dialog .notice")).to_contain_text("token")
+        assert current(served) == 2
+
+        opened(page, served, "map")
+        change(page, "Roll back to version 1", token=TOKEN)
+        expect(page.locator(".nicegui-content")).to_contain_text("Robots are to use version 1.")
+        assert current(served) == 1
+        history = page.get_by_role("region", name="History")
+        expect(history).to_contain_text("robots lose themselves in aisle 3")
+        change(page, "Promote version 2", token=TOKEN)
+        expect(page.locator(".nicegui-content")).to_contain_text("Robots are to use version 2.")
+        change(page, "Publish draft 3", token=TOKEN)
+        expect(page.locator(".nicegui-content")).to_contain_text("Robots are to use version 3.")
+        assert current(served) == 3
+        assert seen.faults == []
+
+        # Somebody else acts: the page follows.
+        with MapStore.open(served.folder) as store:
+            store.rollback(SITE)
+        expect(page.locator(".nicegui-content")).to_contain_text("Robots are to use version 2.", timeout=10_000)
+
+
+def test_without_a_token_only_the_machine_itself_changes_something(page: Page, served: Served) -> None:
+    port = urlsplit(served.http).port
+    page.goto(f"http://elsewhere.example:{port}/dashboard/map")
+    expect(page.locator("h1")).to_be_visible()
+    page.wait_for_function("window.socket && window.socket.connected")
+    change(page, "Roll back to version 1")
+    expect(page.locator(".q-dialog .notice")).to_contain_text("loopback")
+    assert current(served) == 2
+
+
+def test_a_version_taken_back_by_the_server_is_told_with_its_reason(page: Page, served: Served) -> None:
+    with MapStore.open(served.folder) as store:
+        canary = store.start_canary(SITE, 1, 0.05)
+        seen = opened(page, served, "")
+        expect(page.locator(".notice")).to_contain_text("Version 1 is tried by 5.0 % of the robots")
+        store.end_canary(canary, promote=False, outcome="it fails more often than the margin allows")
+    expect(page.locator(".notice")).to_contain_text("taken back", timeout=10_000)
+    expect(page.locator(".notice")).to_contain_text("it fails more often than the margin allows")
+    assert seen.faults == []
