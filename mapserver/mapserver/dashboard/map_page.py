@@ -222,7 +222,8 @@ async def _difference(maps: MapData, where: Where, history: SiteHistory, before:
     html(
         Markup(
             '<div class="pair"><div><div class="planbox">{}</div><p class="quiet">Tiles <span class="good">added</span> '
-            '(whole line), <span class="warn">changed</span> (dashes), <span class="bad">removed</span> (dots).</p></div><div>{}</div></div>'
+            '(whole line), <span class="warn">changed</span> (dashes), '
+            '<span class="bad">removed</span> (dots).</p></div><div>{}</div></div>'
         ).format(picture, _difference_facts(found))
     )
 

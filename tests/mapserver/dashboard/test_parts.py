@@ -1,0 +1,223 @@
+"""What the pages are made of, without a browser."""
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from markupsafe import Markup
+
+from dashboard_scene import LENGTH_M, SITE, build_report, fill_store, hall_tiles
+from fleetmap.errors import UsageError
+from fleetmap.mapformat import Manifest
+from mapserver.canary import CanarySettings
+from mapserver.dashboard import drawing
+from mapserver.dashboard.data import MapData
+from mapserver.dashboard.health_data import HealthData, trend_words
+from mapserver.dashboard.live import LiveRobots, live_robot
+from mapserver.dashboard.markup import address, age, choices, facts, link, size, table
+from mapserver.dashboard.plan import make_plan
+from mapserver.fleet import Fleet, RobotStatus
+from mapserver.gate import GateSettings
+from mapserver.measures import Tally
+from mapserver.noted_job import noted_job
+from mapserver.resurvey import ResurveySettings
+from mapserver.store import Actor, MapStore
+
+EVIL = "<script>alert(1)</script>\"'&"
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        table([EVIL], [[EVIL]], empty=EVIL, name=EVIL),
+        table([EVIL], [], empty=EVIL, name=EVIL),
+        facts([(EVIL, EVIL)]),
+        link(address("x", site=EVIL), EVIL),
+        choices(EVIL, EVIL, [EVIL], EVIL),
+        drawing.bars([drawing.Bar(EVIL, 1.0, 0.5, 2.0, EVIL)], EVIL),
+    ],
+)
+def test_words_from_elsewhere_never_become_markup(made: Markup) -> None:
+    assert "<script" not in made
+    assert "&lt;script&gt;" in made
+    assert "\"'" not in made
+
+
+def test_words_for_people() -> None:
+    assert [size(n) for n in (None, 999, 1000, 2_500_000, 3_000_000_000)] == [
+        None,
+        "999 B",
+        "1.0 kB",
+        "2.5 MB",
+        "3.00 GB",
+    ]
+    assert [age(s) for s in (3, 119, 180, 7300, 200_000)] == ["3 s", "119 s", "3 min", "2 h", "2 days"]
+
+
+@pytest.fixture
+def store(tmp_path: Path):
+    fill_store(tmp_path)
+    with MapStore.open(tmp_path) as opened:
+        yield opened
+
+
+def test_a_plan_shows_landmarks_where_they_are(store: MapStore) -> None:
+    data = MapData(store, GateSettings())
+    plan = data.plan(SITE, 2)
+    picture = cv2.imdecode(np.frombuffer(plan.png, np.uint8), cv2.IMREAD_UNCHANGED)
+    scale_m = plan.size_m[0] / picture.shape[1]
+    assert plan.size_m[1] / picture.shape[0] == pytest.approx(scale_m, rel=0.01)
+
+    def alpha(x_m: float, y_m: float) -> int:
+        row, column = int((plan.high_m[1] - y_m) / scale_m), int((x_m - plan.low_m[0]) / scale_m)
+        return int(picture[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3, 3].max())
+
+    points = np.concatenate([tile.points_map for tile in hall_tiles(1, shifted_m=0.2)])
+    assert all(alpha(x, y) > 100 for x, y, _ in points[::50])
+    assert alpha(LENGTH_M / 2, 4.0) == 0, "between rack and aisle nothing was seen"
+    assert data.plan(SITE, 2) is plan, "made once"
+
+
+def test_a_plan_without_tiles_and_one_without_places(store: MapStore) -> None:
+    manifest = store.manifest(SITE, 2)
+    empty = make_plan(_with_tiles(manifest, ()), lambda _: pytest.fail("there is none"))
+    assert empty.size_m == (10.0, 10.0)
+    (tile,) = (tile for tile in hall_tiles(1) if (tile.tile_x, tile.tile_y) == (0, 0))
+    from dataclasses import replace
+
+    bare = replace(tile, place_ids=tile.place_ids[:0], map_from_cam=tile.map_from_cam[:0], place_landmark_ids=())
+    entry = next(entry for entry in manifest.tiles if (entry.x, entry.y) == (0, 0))
+    alone = make_plan(_with_tiles(manifest, (entry,)), lambda _: bare)
+    assert (alone.low_m, alone.high_m, alone.places) == ((0.0, 0.0), (16.0, 16.0), 0)
+
+
+def _with_tiles(manifest: Manifest, tiles: tuple[object, ...]) -> Manifest:
+    import msgspec
+
+    return msgspec.structs.replace(manifest, tiles=tiles)
+
+
+def test_marks_stand_with_y_upwards(store: MapStore) -> None:
+    plan = MapData(store, GateSettings()).plan(SITE, 2)
+    drawn = drawing.marks(plan, [drawing.Mark(3.0, 5.0, "bad", "cross", "here")])
+    assert "translate(3.000 -5.000)" in drawn
+
+
+def test_changes_of_tiles_and_sites(store: MapStore) -> None:
+    data = MapData(store, GateSettings())
+    kinds = data.changed_tiles(SITE, 1, 3)
+    assert sorted(kinds.values()) == ["added"] * 2 + ["changed"] * 6
+    assert set(data.changed_tiles(SITE, 3, 1).values()) == {"removed", "changed"}
+    assert data.history(SITE).before == 1
+    before = data.history(SITE).fingerprint
+    data.roll_back(SITE, Actor("ada"))
+    assert data.history(SITE).fingerprint != before
+    assert data.history(SITE).before is None
+    with pytest.raises(UsageError, match="no site nowhere"):
+        data.chosen_site("nowhere")
+
+
+def status(**changed: object) -> RobotStatus:
+    usual = {
+        "site": SITE, "robot": "r", "version": 2, "wanted_version": 2, "is_canary": False, "is_present": None,
+        "clock_ahead_s": None, "seconds_since": 0.5, "last_ack": None, "last_health": {"status": "TRACKING"},
+        "last_pose": {"position_map_m": [1.0, 2.0, 0.0], "status": "TRACKING"},
+    }  # fmt: skip
+    return RobotStatus(**(usual | changed))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changed", "words", "tone"),
+    [
+        ({}, "localised", "good"),
+        ({"last_health": {"status": "LOST"}}, "lost", "bad"),
+        ({"last_health": {"status": "AMBIGUOUS"}}, "several places fit", "bad"),
+        ({"last_health": {"status": "NEW_WORD"}}, "new_word", "warn"),
+        ({"last_health": None, "last_pose": None}, "not started", "quiet"),
+        ({"seconds_since": 11.0}, "silent", "quiet"),
+        ({"seconds_since": 4.0, "is_present": False}, "silent", "quiet"),
+        ({"seconds_since": 4.0, "is_present": True}, "localised", "good"),
+        ({"seconds_since": 1.0, "is_present": False}, "localised", "good"),
+    ],
+)
+def test_a_robots_state_in_words(changed: dict[str, object], words: str, tone: str) -> None:
+    robot = live_robot(status(**changed))
+    assert (robot.words, robot.tone) == (words, tone)
+
+
+def test_a_place_that_is_no_number_is_no_place() -> None:
+    assert live_robot(status(last_pose={"position_map_m": [None, 2.0, 0.0]})).place_m is None
+
+
+def test_many_pages_look_once(store: MapStore) -> None:
+    class Counting(Fleet):
+        looked = 0
+
+        def robots(self, site: str | None = None) -> list[RobotStatus]:
+            self.looked += 1
+            return [status(robot="a"), status(robot="b", last_health={"status": "LOST"})]
+
+    fleet, now = Counting(store), [0.0]
+    live = LiveRobots(fleet, lambda: now[0])
+    assert [robot.name for robot in live.look(SITE).robots] == ["b", "a"]
+    live.look(SITE)
+    assert fleet.looked == 1
+    now[0] = 1.0
+    live.look(SITE)
+    assert fleet.looked == 2
+
+
+def tally(failures: int, robot_days: float) -> Tally:
+    return Tally(failures=failures, driving_ms=round(robot_days * 16 * 3.6e6))
+
+
+@pytest.mark.parametrize(
+    ("day", "week", "words"),
+    [
+        (tally(0, 0), tally(3, 7), "nothing to compare with yet"),
+        (tally(0, 1), tally(0, 7), "none in the week before either"),
+        (tally(2, 1), tally(7, 7), "no clear change from the week before"),
+        (tally(20, 10), tally(20, 70), "more than in the week before"),
+        (tally(1, 10), tally(100, 70), "fewer than in the week before"),
+    ],
+)
+def test_the_trend_says_only_what_the_counts_can_tell(day: Tally, week: Tally, words: str) -> None:
+    assert trend_words(day, week) == words
+
+
+def test_chance_alone_seldom_makes_a_trend() -> None:
+    rng = np.random.default_rng(0)
+    told = [
+        trend_words(tally(int(rng.poisson(6)), 10), tally(int(rng.poisson(42)), 70))
+        != "no clear change from the week before"
+        for _ in range(1000)
+    ]
+    assert np.mean(told) <= 0.05 + 3 * math.sqrt(0.05 * 0.95 / 1000)
+
+
+def test_health_of_a_site(store: MapStore) -> None:
+    import time
+
+    health = HealthData(store, CanarySettings(), ResurveySettings(), time.time_ns)
+    found = health.site(SITE)
+    assert (found.day.failures.events, found.day.silent_estimated.events) == (1, 1)
+    assert len(found.days) == 14
+    assert found.days[-1].events == 1
+    known = health.choices(SITE)
+    assert (known.robots, known.versions, known.tiles) == (["tug-7", "tug-9"], ["2"], ["1,0"])
+    assert "dark" in known.causes
+    assert health.site(SITE) is found
+
+
+def test_a_job_is_noted_from_begin_to_end(store: MapStore) -> None:
+    with noted_job(store, SITE, "build") as job:
+        assert store.jobs(SITE)[0].state == "running"
+        job.message, job.report = "draft 4", build_report()
+    done = store.jobs(SITE)[0]
+    assert (done.state, done.message, done.report["version"]) == ("done", "draft 4", 3)
+    with pytest.raises(UsageError), noted_job(store, SITE, "build"):
+        raise UsageError("cameras are swapped")
+    failed = store.jobs(SITE)[0]
+    assert (failed.state, failed.message) == ("failed", "cameras are swapped")
