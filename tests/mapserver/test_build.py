@@ -98,6 +98,23 @@ def test_the_report_has_the_stable_keys_with_their_meanings(done: Path) -> None:
     assert len(decode_archive(archive).map_from_body) == report["keyframes"]
 
 
+def test_the_store_notes_the_build_as_a_job_with_its_loops_on_the_map(done: Path) -> None:
+    report = json.loads((done / "r.json").read_text())
+    with MapStore.open(done / "store") as store:
+        (job,) = store.jobs("lab")
+    assert (job.kind, job.state, job.report["version"]) == ("build", "done", 1)
+    assert job.message.startswith("site lab: draft 1")
+    assert job.report["findings"] == report["findings"]
+    shown = job.report["loop_places"]
+    for verdict in ("accepted", "rejected", "ambiguous", "gated_out"):
+        told = [record for record in report["loop_records"] if record["verdict"] == verdict]
+        assert sum(place["verdict"] == verdict for place in shown) == min(len(told), 300)
+    path_m = read_tum(done / "t.tum")[:, 1:3]
+    for place in shown:
+        for end in (place["from_map_m"], place["to_map_m"]):
+            assert np.linalg.norm(path_m - end, axis=1).min() < 1e-3
+
+
 def test_the_manifest_tells_what_the_map_depends_on(done: Path) -> None:
     with MapStore.open(done / "store") as maps:
         manifest = maps.manifest("lab", 1)

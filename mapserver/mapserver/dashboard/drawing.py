@@ -124,11 +124,17 @@ class Bar(NamedTuple):
     words: str
 
 
+def _round_up(value: float) -> float:
+    """The next of 1, 2, 5, 10, 20, ..."""
+    steps = (digit * 10.0**power for power in range(-1, 9) for digit in (1, 2, 5))
+    return next((step for step in steps if step >= value), value)
+
+
 def bars(found: list[Bar], name: str) -> Markup:
-    """Rates side by side with the intervals that hold the true ones; the scale ends at the highest, at least 1."""
-    width, height, foot, left = 640.0, 150.0, 20.0, 34.0
-    top = max([1.0, *(bar.value for bar in found if bar.value is not None)])
-    top = max(top, min(3 * top, max([top, *(bar.high for bar in found if bar.high is not None)])))
+    """Rates side by side with the intervals that hold the true ones; those that are very wide go beyond the scale."""
+    width, height, foot, left = 640.0, 150.0, 20.0, 44.0
+    highest = max([0.5, *(bar.value for bar in found if bar.value is not None)])
+    top = _round_up(min(3 * highest, max([highest, *(bar.high for bar in found if bar.high is not None)])))
     step = (width - left) / max(len(found), 1)
 
     def y(value: float) -> float:

@@ -78,10 +78,8 @@ def _figures(live: LiveSite, health: SiteHealth) -> Markup:
                 ("Robots heard now", "", f"{heard} of {len(live.robots)}", "reported within 10 s"),
                 ("Localised now", "good", live.count("good"), f"{live.count('warn')} unsure or starting"),
                 ("Lost now", "bad" if lost else "", lost, "cannot say where they are"),
-                _rate_figure("Failures per robot-day, last 24 h", health.day.failures, health.trend),
-                _rate_figure(
-                    "Silent failures per robot-day, an estimate", silent, f"{silent.events} suspected in 24 h"
-                ),
+                _rate_figure("Failures per robot-day, last 24 h", health.day.failures, f"; {health.trend}"),
+                _rate_figure("Silent failures per robot-day, an estimate", silent, ""),
                 ("Time with a usable position", "", share(health.day.availability) or "–", "of the last 24 h"),
             )
         )
@@ -97,8 +95,15 @@ def figure(value: float | None) -> str:
 
 def _rate_figure(name: str, found: Rate, more: str) -> tuple[str, str, str, str]:
     """A rate large, its interval and a remark below."""
-    interval = f"true rate {figure(found.low)} to {figure(found.high)} (95 %); " if found.low is not None else ""
-    return name, "", figure(found.per_robot_day), interval + more
+    if found.low is None:
+        return name, "", "–", "nothing was driven"
+    counted = f"{found.events} in {figure(found.robot_days)} robot-days"
+    return (
+        name,
+        "",
+        figure(found.per_robot_day),
+        f"{counted}: {figure(found.low)} to {figure(found.high)} with 95 %{more}",
+    )
 
 
 def rate_words(found: Rate) -> str:
@@ -180,16 +185,16 @@ def _rates(health: SiteHealth) -> Markup:
     found = [
         Bar(
             "24 h" if n == len(health.days) - 1 else f"-{len(health.days) - 1 - n} d", day.per_robot_day, day.low, day.high,
-            f"{day.events} failures in {day.robot_days:.1f} robot-days: {rate_words(day)} per robot-day",
+            f"{day.events} in {figure(day.robot_days)} robot-days: {rate_words(day)} per robot-day",
         )
         for n, day in enumerate(health.days)
     ]  # fmt: skip
     return Markup(
         "<h2>Failures per robot-day</h2>{}<p class=\"quiet\">A bar for each 24 hours; a robot-day is 16 hours of driving. The thin line "
-        "holds the true rate with 95 %. Last 24 hours: {} failures in {:.1f} robot-days, {}.</p>"
+        "holds the true rate with 95 %. Last 24 hours: {} in {} robot-days, {}.</p>"
     ).format(
         drawing.bars(found, "Failures per robot-day of the last days"), health.day.failures.events,
-        health.day.failures.robot_days, health.trend,
+        figure(health.day.failures.robot_days), health.trend,
     )  # fmt: skip
 
 
