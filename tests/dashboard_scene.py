@@ -183,8 +183,8 @@ def place_of(number: int) -> tuple[float, float]:
 def speak(bus: ZenohBus, robot: str, stamp_ns: int, place_m: tuple[float, float], status: str = "TRACKING") -> None:
     """One robot's pose and health."""
     map_from_base = se3(np.eye(3), np.array([*place_m, 0.0]))
-    pose = PoseMessage.of(stamp_ns, map_from_base, np.eye(6) * 1e-4, status, 2)
-    bus.publish(robot_key(SITE, robot, "pose"), encode_message(pose))
+    estimate = PoseMessage.of(stamp_ns, map_from_base, np.eye(6) * 1e-4, status, 2)
+    bus.publish(robot_key(SITE, robot, "pose"), encode_message(estimate))
     health = RobotHealth(
         site=SITE, robot=robot, stamp_ns=stamp_ns, version=2, status=status, metrics={"speed_mps": 0.8}
     )

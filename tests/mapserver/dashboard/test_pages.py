@@ -137,8 +137,8 @@ def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> 
         assert seen.faults == []
 
 
-def _place(transform: str | None) -> tuple[float, float]:
-    x, y = re.findall(r"-?[\d.]+", transform or "")[:2]
+def _place(moved: str | None) -> tuple[float, float]:
+    x, y = re.findall(r"-?[\d.]+", moved or "")[:2]
     return float(x), -float(y)
 
 
