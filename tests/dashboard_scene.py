@@ -180,21 +180,30 @@ def place_of(number: int) -> tuple[float, float]:
     return 4.0 + (number * 7.3) % (LENGTH_M - 8), 6.0 + AISLE_M * (number % 3)
 
 
-def speak(bus: ZenohBus, robot: str, stamp_ns: int, place_m: tuple[float, float], status: str = "TRACKING") -> None:
+def speak(
+    bus: ZenohBus,
+    robot: str,
+    stamp_ns: int,
+    place_m: tuple[float, float],
+    status: str = "TRACKING",
+    *,
+    with_health: bool = True,
+) -> None:
     """One robot's pose and health."""
     map_from_base = se3(np.eye(3), np.array([*place_m, 0.0]))
-    pose = PoseMessage.of(stamp_ns, map_from_base, np.eye(6) * 1e-4, status, 2)
-    bus.publish(robot_key(SITE, robot, "pose"), encode_message(pose))
+    estimate = PoseMessage.of(stamp_ns, map_from_base, np.eye(6) * 1e-4, status, 2)
+    bus.publish(robot_key(SITE, robot, "pose"), encode_message(estimate))
     health = RobotHealth(
         site=SITE, robot=robot, stamp_ns=stamp_ns, version=2, status=status, metrics={"speed_mps": 0.8}
     )
     bus.publish(robot_key(SITE, robot, "health"), encode_message(health))
 
 
-def speak_all(bus: ZenohBus, count: int, stamp_ns: int) -> None:
+def speak_all(bus: ZenohBus, count: int, stamp_ns: int, *, with_health: bool = True) -> None:
     """`count` robots, most of them well."""
     for number in range(count):
-        speak(bus, f"tug-{number}", stamp_ns, place_of(number), _STATUSES[number % len(_STATUSES)])
+        status = _STATUSES[number % len(_STATUSES)]
+        speak(bus, f"tug-{number}", stamp_ns, place_of(number), status, with_health=with_health)
 
 
 @dataclass
@@ -204,6 +213,7 @@ class Served:
     http: str
     zenoh: str
     folder: Path
+    process: int
     log: list[str] = field(default_factory=list)
 
 
@@ -220,7 +230,7 @@ def serving(folder: Path, *options: str, http: str = "127.0.0.1:0") -> Iterator[
         try:
             addresses = dict(process.stdout.readline().strip().split(": ", 1) for _ in range(2))
             assert process.stdout.readline() == "ready\n"
-            served = Served(addresses["http"], addresses["zenoh"], folder)
+            served = Served(addresses["http"], addresses["zenoh"], folder, process.pid)
             yield served
             process.terminate()
             assert process.wait(timeout=20) == 0

@@ -3,13 +3,12 @@
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Any
 
-from fleetmap.errors import UsageError
+from fleetmap.errors import StateError, UsageError
 from fleetmap.mapformat import Manifest, decode_tile
 from mapserver.dashboard.plan import Plan, make_plan
 from mapserver.gate import GateSettings
-from mapserver.store import Actor, Difference, Event, JobInfo, MapStore, SiteInfo, VerdictRow, VersionInfo
+from mapserver.store import Actor, CanaryRow, Difference, Event, JobInfo, MapStore, SiteInfo, VerdictRow, VersionInfo
 
 _KEPT_PLANS = 8
 _EVENTS_SHOWN = 50
@@ -27,26 +26,32 @@ class VersionQuality:
 
 @dataclass(frozen=True, slots=True)
 class SiteHistory:
-    """Versions and events of a site, newest first. before: the version that rolling back would make current, if any."""
+    """Versions and events of a site, newest first.
+
+    before: the version that rolling back would make current, if any; trial: the version that some robots try now, if any.
+    """
 
     site: SiteInfo
     versions: list[VersionInfo]
     events: list[Event]
     before: int | None
+    trial: CanaryRow | None
 
     @property
     def fingerprint(self) -> tuple[object, ...]:
         """Changes whenever the page that shows this would."""
         newest = self.events[0].id if self.events else 0
-        return newest, tuple((info.version, info.state) for info in self.versions)
+        trial = None if self.trial is None else self.trial.id
+        return newest, trial, tuple((info.version, info.state) for info in self.versions)
 
 
 class MapData:
     """Reads and changes maps in an open store. Methods may be called from any thread; errors are the store's."""
 
-    def __init__(self, store: MapStore, gate: GateSettings) -> None:
+    def __init__(self, store: MapStore, gate: GateSettings, trial_share: float) -> None:
         self._store = store
         self._gate = gate
+        self.trial_share = trial_share
         self._plans: OrderedDict[str, Plan] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -68,7 +73,8 @@ class MapData:
         info = next(info for info in self._store.sites() if info.site == site)
         versions = self._store.versions(site)[::-1]
         events = self._store.last_events(site, _EVENTS_SHOWN)
-        return SiteHistory(info, versions, events, self._store.rollback_target(site))
+        trials = self._store.canaries(site, running=True)
+        return SiteHistory(info, versions, events, self._store.rollback_target(site), trials[0] if trials else None)
 
     def current_version(self, site: str) -> int | None:
         """The number of the current version, None before the first."""
@@ -130,12 +136,19 @@ class MapData:
         self._store.promote(site, version, actor=actor)
         return f"Version {version} is current."
 
-    def roll_back(self, site: str, actor: Actor) -> str:
-        """Makes the version current that was so before."""
+    def start_trial(self, site: str, version: int, actor: Actor) -> str:
+        """Gives a version to some robots first."""
+        self._store.start_canary(site, version, self.trial_share, actor=actor, gate=self._gate)
+        return f"Version {version} is tried by {self.trial_share:.0%} of the robots."
+
+    def stop_trial(self, site: str, trial: CanaryRow, actor: Actor) -> str:
+        """Takes the version back that some robots try; raises StateError where it is not tried any more."""
+        outcome = f"taken back by hand: {actor.reason or 'no reason given'}"
+        self._store.end_canary(trial, promote=False, outcome=outcome, actor=actor)
+        return f"Version {trial.version} of {site} is taken back."
+
+    def roll_back(self, site: str, version: int, actor: Actor) -> str:
+        """Makes the version current that was so before; raises StateError where that is not `version` any more."""
+        if self._store.rollback_target(site) != version or self._store.canaries(site, running=True):
+            raise StateError(f"rolling back does not lead to version {version} any more; load the page again")
         return f"Version {self._store.rollback(site, actor=actor)} is current."
-
-
-def report_figure(report: dict[str, Any], name: str) -> float | None:
-    """A number of a build's report, None where it has none."""
-    value = report.get(name)
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None

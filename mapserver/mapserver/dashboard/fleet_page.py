@@ -206,7 +206,7 @@ def _table(where: Where, live: LiveSite, health: SiteHealth) -> ui.table:
     with ui.element("div"):
         look_for = ui.input("Find a robot, state or version").props("outlined dense clearable").style("width:320px")
     shown = ui.table(columns=columns, rows=_rows(where, live, health), row_key="robot", pagination=25)
-    shown.props('flat :rows-per-page-options="[25, 100, 0]"')
+    shown.props('flat color=ink :rows-per-page-options="[25, 100, 0]"')
     look_for.bind_value_to(shown, "filter")
     shown.add_slot(
         "body-cell-state",

@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from scipy.stats import binomtest
+from scipy.special import bdtr
 
 from mapserver.canary import CanarySettings
 from mapserver.canary_watch import find
@@ -133,7 +133,7 @@ def trend_words(day: Tally, week: Tally) -> str:
     """How a day's failures compare with the week's before, as far as the counts can tell.
 
     Given all failures of both, those of the day are binomial with the day's share of the driving if nothing changed (the
-    conditional test of two Poisson rates, Przyborowski and Wilenski 1940).
+    conditional test of two Poisson rates, Przyborowski and Wilenski 1940; twice the smaller tail).
     """
     if day.robot_days <= 0 or week.robot_days <= 0:
         return "nothing to compare with yet"
@@ -141,6 +141,8 @@ def trend_words(day: Tally, week: Tally) -> str:
     if total == 0:
         return "none in the week before either"
     share = day.robot_days / (day.robot_days + week.robot_days)
-    if binomtest(day.failures, total, share).pvalue >= _SURE:
-        return "no clear change from the week before"
-    return "more than in the week before" if day.failures > share * total else "fewer than in the week before"
+    if 2 * (1 - float(bdtr(day.failures - 1, total, share)) if day.failures else 1.0) < _SURE:
+        return "more than in the week before"
+    if 2 * float(bdtr(day.failures, total, share)) < _SURE:
+        return "fewer than in the week before"
+    return "no clear change from the week before"

@@ -29,7 +29,7 @@ def install_dashboard(
 ) -> None:  # fmt: skip
     """Adds the pages to `app`. Once in a process: NiceGUI keeps its pages in the module."""
     rooms = Rooms(
-        MapData(store, gate),
+        MapData(store, gate, canary.share),
         HealthData(store, canary, resurvey, time.time_ns),
         LiveRobots(fleet, time.monotonic),
         writers,

@@ -81,13 +81,13 @@ class LiveRobots:
 
 def live_robot(status: RobotStatus) -> LiveRobot:
     """What a page shows of a robot."""
-    pose, health = status.last_pose or {}, status.last_health or {}
-    said = health.get("status") or pose.get("status")
+    estimate, health = status.last_pose or {}, status.last_health or {}
+    said = health.get("status") or estimate.get("status")
     words, tone = STATUSES.get(str(said), (str(said).lower(), "warn")) if said else ("not started", "quiet")
     # A robot that takes its token back says goodbye; one that never shows a token is believed by its messages.
     if status.seconds_since > (SILENT_S if status.is_present is not False else _GONE_S):
         words, tone = SILENT
-    place = pose.get("position_map_m")
+    place = estimate.get("position_map_m")
     is_somewhere = place is not None and None not in place
     return LiveRobot(
         name=status.robot,

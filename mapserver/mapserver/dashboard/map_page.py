@@ -13,7 +13,7 @@ from mapserver.dashboard.data import MapData, SiteHistory, VersionQuality
 from mapserver.dashboard.frame import RESPONSE_TIMEOUT_S, Rooms, Where, html, load, number, show
 from mapserver.dashboard.markup import badge, choices, facts, joined, link, moment, share, size, table
 from mapserver.dashboard.plan import Plan
-from mapserver.store import Difference, VersionInfo
+from mapserver.store import CanaryRow, Difference, VersionInfo
 
 _LOOK_AGAIN_S = 5.0
 _STATE_TONES = {"current": "good", "draft": "warn", "published": "quiet", "retired": "quiet"}
@@ -61,38 +61,73 @@ def _usual(history: SiteHistory) -> int | None:
     return history.versions[0].version if history.versions else None
 
 
+def _trial_words(history: SiteHistory) -> str:
+    trial = history.trial
+    return "" if trial is None else f" Version {trial.version} is tried by {share(trial.share)} of them."
+
+
 def _changes(rooms: Rooms, where: Where, history: SiteHistory) -> None:
     """What a person may do to the versions."""
     current = history.site.current_version
     html(
         Markup("<p>{}</p>").format(
-            "No version is published yet." if current is None else f"Robots are to use version {current}."
+            "No version is published yet."
+            if current is None
+            else f"Robots are to use version {current}." + _trial_words(history)
         )
     )
     with ui.row().classes("actions"):
-        if history.before is not None:
+        if history.trial is not None:
+            _stop_button(rooms, where, history.trial)
+        elif (before := history.before) is not None:
             change_button(
                 rooms,
                 f"Roll back to version {history.before}",
                 f"All robots of {where.site} go from version {current} back to version {history.before}. Version {current} "
                 "is retired; it can be made current again later.",
-                lambda actor: rooms.maps.roll_back(where.site, actor),
+                lambda actor: rooms.maps.roll_back(where.site, before, actor),
             )
         for info in history.versions:
-            if info.state == "draft":
-                change_button(
-                    rooms,
-                    f"Publish draft {info.version}",
-                    f"Draft {info.version} goes through the gate. If the gate accepts it, all robots of {where.site} get it.",
-                    lambda actor, chosen=info.version: rooms.maps.publish(where.site, chosen, actor),  # type: ignore[misc]
-                )
-            elif info.state in {"published", "retired"} and info.version != history.before:
-                change_button(
-                    rooms,
-                    f"Promote version {info.version}",
-                    f"All robots of {where.site} go from version {current} to version {info.version}.",
-                    lambda actor, chosen=info.version: rooms.maps.promote(where.site, chosen, actor),  # type: ignore[misc]
-                )
+            if info.state != "current":
+                _version_buttons(rooms, where, history, info)
+
+
+def _stop_button(rooms: Rooms, where: Where, trial: CanaryRow) -> None:
+    change_button(
+        rooms,
+        f"Stop trying version {trial.version}",
+        f"The robots that try version {trial.version} go back to version {trial.base_version}. Version {trial.version} is retired; "
+        "it can be made current again later.",
+        lambda actor: rooms.maps.stop_trial(where.site, trial, actor),
+    )
+
+
+def _version_buttons(rooms: Rooms, where: Where, history: SiteHistory, info: VersionInfo) -> None:
+    """Buttons that give a version to all robots, or to some of them first."""
+    version, current, share_words = info.version, history.site.current_version, f"{rooms.maps.trial_share:.0%}"
+    through_gate = f"Draft {version} goes through the gate. If the gate accepts it, " if info.state == "draft" else ""
+    if info.state == "draft":
+        change_button(
+            rooms,
+            f"Publish draft {version}",
+            f"{through_gate}all robots of {where.site} get it.",
+            lambda actor: rooms.maps.publish(where.site, version, actor),
+        )
+    elif version != history.before or history.trial is not None:
+        change_button(
+            rooms,
+            f"Promote version {version}",
+            f"All robots of {where.site} go from version {current} to version {version}.",
+            lambda actor: rooms.maps.promote(where.site, version, actor),
+        )
+    if current is not None and history.trial is None and version > current:
+        change_button(
+            rooms,
+            f"Try version {version} on {share_words} of the robots",
+            f"{through_gate}{share_words} of the robots get version {version}. Where they fail more often than the others, it is taken "
+            "back without anybody doing anything; where they do not, all get it.",
+            lambda actor: rooms.maps.start_trial(where.site, version, actor),
+        )
 
 
 def _versions(where: Where, versions: list[VersionInfo], shown: int | None) -> Markup:

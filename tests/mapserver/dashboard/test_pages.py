@@ -137,8 +137,8 @@ def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> 
         assert seen.faults == []
 
 
-def _place(transform: str | None) -> tuple[float, float]:
-    x, y = re.findall(r"-?[\d.]+", transform or "")[:2]
+def _place(moved: str | None) -> tuple[float, float]:
+    x, y = re.findall(r"-?[\d.]+", moved or "")[:2]
     return float(x), -float(y)
 
 
@@ -325,7 +325,11 @@ def test_without_a_token_only_the_machine_itself_changes_something(page: Page, s
 def test_a_version_taken_back_by_the_server_is_told_with_its_reason(page: Page, served: Served) -> None:
     with MapStore.open(served.folder) as store:
         canary = store.start_canary(SITE, 1, 0.05)
-        seen = opened(page, served, "")
+        seen = opened(page, served, "map")
+        expect(page.locator(".nicegui-content")).to_contain_text("Version 1 is tried by 5.0 % of them")
+        expect(page.get_by_role("button", name="Stop trying version 1")).to_be_visible()
+        expect(page.get_by_role("button", name="Roll back")).to_have_count(0)
+        opened(page, served, "")
         expect(page.locator(".notice")).to_contain_text("Version 1 is tried by 5.0 % of the robots")
         store.end_canary(canary, promote=False, outcome="it fails more often than the margin allows")
     expect(page.locator(".notice")).to_contain_text("taken back", timeout=10_000)

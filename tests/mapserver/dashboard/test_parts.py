@@ -9,7 +9,7 @@ import pytest
 from markupsafe import Markup
 
 from dashboard_scene import LENGTH_M, SITE, build_report, fill_store, hall_tiles
-from fleetmap.errors import UsageError
+from fleetmap.errors import StateError, UsageError
 from fleetmap.mapformat import Manifest
 from mapserver.canary import CanarySettings
 from mapserver.dashboard import drawing
@@ -64,7 +64,7 @@ def store(tmp_path: Path):
 
 
 def test_a_plan_shows_landmarks_where_they_are(store: MapStore) -> None:
-    data = MapData(store, GateSettings())
+    data = MapData(store, GateSettings(), 0.05)
     plan = data.plan(SITE, 2)
     picture = cv2.imdecode(np.frombuffer(plan.png, np.uint8), cv2.IMREAD_UNCHANGED)
     scale_m = plan.size_m[0] / picture.shape[1]
@@ -100,23 +100,40 @@ def _with_tiles(manifest: Manifest, tiles: tuple[object, ...]) -> Manifest:
 
 
 def test_marks_stand_with_y_upwards(store: MapStore) -> None:
-    plan = MapData(store, GateSettings()).plan(SITE, 2)
+    plan = MapData(store, GateSettings(), 0.05).plan(SITE, 2)
     drawn = drawing.marks(plan, [drawing.Mark(3.0, 5.0, "bad", "cross", "here")])
     assert "translate(3.000 -5.000)" in drawn
 
 
 def test_changes_of_tiles_and_sites(store: MapStore) -> None:
-    data = MapData(store, GateSettings())
+    data = MapData(store, GateSettings(), 0.05)
     kinds = data.changed_tiles(SITE, 1, 3)
     assert sorted(kinds.values()) == ["added"] * 2 + ["changed"] * 6
     assert set(data.changed_tiles(SITE, 3, 1).values()) == {"removed", "changed"}
     assert data.history(SITE).before == 1
     before = data.history(SITE).fingerprint
-    data.roll_back(SITE, Actor("ada"))
+    with pytest.raises(StateError, match="load the page again"):
+        data.roll_back(SITE, 2, Actor("ada"))
+    data.roll_back(SITE, 1, Actor("ada"))
     assert data.history(SITE).fingerprint != before
     assert data.history(SITE).before is None
     with pytest.raises(UsageError, match="no site nowhere"):
         data.chosen_site("nowhere")
+
+
+def test_a_trial_is_started_and_stopped(store: MapStore) -> None:
+    data = MapData(store, GateSettings(), 0.05)
+    before = data.history(SITE).fingerprint
+    data.start_trial(SITE, 3, Actor("ada"))
+    trial = data.history(SITE).trial
+    assert trial is not None
+    assert (trial.version, trial.base_version, data.current_version(SITE)) == (3, 2, 2)
+    assert data.history(SITE).fingerprint != before
+    data.stop_trial(SITE, trial, Actor("ada", "it was for a look"))
+    assert data.history(SITE).trial is None
+    assert store.canaries(SITE)[0].outcome == "taken back by hand: it was for a look"
+    with pytest.raises(StateError):
+        data.stop_trial(SITE, trial, Actor("ada"))
 
 
 def status(**changed: object) -> RobotStatus:
