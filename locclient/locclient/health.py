@@ -156,10 +156,15 @@ def _is_blind(frame: FrameRecord, is_localised: bool) -> bool:
     return frame.status in (Status.LOST, Status.AMBIGUOUS)
 
 
-def _is_overconfident(frame: FrameRecord, is_localised: bool) -> bool:
+def is_outside_its_bound(frame: FrameRecord) -> bool:
+    """Whether the truth lies outside the 99.9 % bound of the position that the frame claims."""
     if frame.error_map_m is None or frame.cov_rot_trans is None:
         return False
     return float(frame.error_map_m @ np.linalg.solve(frame.cov_rot_trans[3:, 3:], frame.error_map_m)) > CHI2_3_0999
+
+
+def _is_overconfident(frame: FrameRecord, is_localised: bool) -> bool:
+    return is_outside_its_bound(frame)
 
 
 def _episodes(

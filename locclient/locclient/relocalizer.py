@@ -10,10 +10,11 @@ from fleetmap.features.matching import match_by_projection, match_mutual
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.pose_solver import Resection, ransac_resection, refine_resection, resection_with_rotation
 from fleetmap.rectification import RectifiedFrame, StereoCamera
-from locclient.map_view import MapView
+from locclient.map_view import MapView, Rows
 from locclient.settings import LocalizerSettings
 
 _NEIGHBOURHOOD_M = 3.0
+_FIRST_DOUBT = 3.0  # of the sigmas, while the place that matches were looked for around is only a guess
 _SAME_PLACE_M, _SAME_PLACE_COSINE = 1.2, 0.8  # less than half a bay: no other place looks so much the same so near
 
 
@@ -102,7 +103,7 @@ class Relocalizer:
         if len(pairs) < settings.min_inliers // 2:
             return None
         points, pixels = self.view.points_map[rows[pairs[:, 0]]], self._measured(seen, pairs[:, 1])
-        sigmas = self._sigmas(seen, pairs[:, 1], rows[pairs[:, 0]], points, None)
+        sigmas = self._sigmas(seen, pairs[:, 1], rows[pairs[:, 0]], None)
         wide_px = 2 * settings.ransac_px + settings.rotation_sigma_rad * self._camera.focal_px
         found: Resection | None = None
         if rotation is not None:
@@ -124,7 +125,7 @@ class Relocalizer:
         settings = self._settings.fix
         found: Resection | None = None
         inlier_features: NDArray[np.int64] = np.zeros(0, np.int64)
-        for radius in (radius_px, min(radius_px, settings.guided_radius_px) * 0.6):
+        for radius, doubt in ((radius_px, _FIRST_DOUBT), (min(radius_px, settings.guided_radius_px) * 0.6, 1.0)):
             rows, pixels, octaves = self.view.visible(
                 map_from_cam, self._camera, radius, np.radians(settings.max_view_angle_deg)
             )
@@ -140,7 +141,7 @@ class Relocalizer:
             if len(kept) < settings.min_inliers:
                 return None
             points = self.view.points_map[rows[kept]]
-            sigmas = self._sigmas(seen, hit[kept], rows[kept], points, map_from_cam)
+            sigmas = doubt * self._sigmas(seen, hit[kept], rows[kept], map_from_cam)
             measured = self._measured(seen, hit[kept], pixels[kept, 0] - pixels[kept, 2])
             found = refine_resection(self._camera, points, measured, sigmas, se3_inverse(map_from_cam))
             if found is None or found.inliers.sum() < settings.min_inliers:
@@ -169,22 +170,25 @@ class Relocalizer:
         covariance += np.diag([settings.floor_rad**2] * 3 + [settings.floor_m**2] * 3)
         return Fix(map_from_cam, covariance, int(found.inliers.sum()), cells)
 
-    def _sigmas(
-        self,
-        seen: Seen,
-        features: NDArray[np.int64],
-        rows: NDArray[np.int64],
-        points: Array,
-        map_from_cam: Array | None,
-    ) -> Array:
-        """(N, 2): of pixels by octave, widened by the landmark's own uncertainty; of disparities."""
-        base = self._settings.fix.feature_sigma_px * orb.SCALE_FACTOR ** np.minimum(
-            seen.features.octaves[features], 5
-        ).astype(np.float64)
-        if map_from_cam is not None:
-            distance = np.linalg.norm(points - map_from_cam[:3, 3], axis=1)
-            base = np.hypot(base, np.minimum(self._camera.focal_px * self.view.sigmas_m[rows] / distance, 10.0))
-        return np.column_stack([base, np.maximum(base, 1.0)])
+    def _sigmas(self, seen: Seen, features: NDArray[np.int64], rows: Rows, map_from_cam: Array | None) -> Array:
+        """(N, 2): of pixels and of disparities, by octave and by the landmarks' own uncertainty.
+
+        That lies along the direction from which a landmark was mapped: seen from there it hardly shows, from aside it does.
+        """
+        settings = self._settings.fix
+        scale = orb.SCALE_FACTOR ** np.minimum(seen.features.octaves[features], 5).astype(np.float64)
+        base = settings.feature_sigma_px * scale
+        if map_from_cam is None:
+            return np.column_stack([base, np.maximum(base, 1.0)])
+        rays = self.view.points_map[rows] - map_from_cam[:3, 3]
+        distances = np.linalg.norm(rays, axis=1)
+        along = np.abs((rays * self.view.view_directions_map[rows]).sum(axis=1)) / distances
+        off_px = self._camera.focal_px * self.view.sigmas_m[rows] / distances
+        across_px = off_px * np.sqrt(np.maximum(1.0 - along**2, 0.0))
+        depth_px = off_px * along * self._camera.baseline_m / distances
+        return np.column_stack(
+            [np.hypot(base, np.minimum(across_px, 10.0)), np.hypot(settings.disparity_sigma_px, depth_px)]
+        )
 
     def _radius_px(self, map_from_cam: Array, cov_rot_trans: Array) -> float:
         """Three sigmas of a landmark's predicted pixel, at the median distance of what should be visible."""

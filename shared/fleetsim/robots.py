@@ -87,6 +87,7 @@ class RobotKind:
 ROBOTS = {
     "surveyor": RobotKind(Limits(1.5, 0.8, 1.0, 0.8), Shake()),
     "tote": RobotKind(Limits(2.0, 1.2, 1.6, 0.7), Shake(), camera_height_m=0.38, camera_forward_m=0.3, pitch_rad=-0.03),
+    "runner": RobotKind(Limits(2.0, 1.2, 1.6, 0.7), Shake()),
     "pallet-mover": RobotKind(
         Limits(1.6, 0.7, 0.9, 1.0), Shake(0.002, 0.0009), camera_height_m=0.6, pitch_rad=0.0, clearance_m=0.4
     ),

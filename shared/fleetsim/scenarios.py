@@ -80,6 +80,8 @@ def _small_loop() -> Scenario:
         "survey": Run("surveyor", (_loop(layout, 0, 1),), is_sharp=True),
         "tote-1": Run("tote", (first,)),
         "tote-2": Run("tote", (second,)),
+        "runner-1": Run("runner", (first,)),
+        "opposite-1": Run("runner", (Route(first.way_points_map[::-1]),)),
     }
     return Scenario("a loop through two aisles; what `make demo` records", layout, runs)
 

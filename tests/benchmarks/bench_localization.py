@@ -1,0 +1,195 @@
+"""A robot in the map of another day: every figure that the project promises for it, beside its target.
+
+`PYTHONPATH=tests python tests/benchmarks/bench_localization.py [--only NAME...] [--work FOLDER] [--out FILE.json]`; recordings of
+`fleetsim record small-loop` and the map made of its survey stay in the work folder (FLEETMAP_BENCH_WORK, else the temporary
+folder) and serve again. CPU times are the process's; run it on an idle machine, with one run after the other.
+"""
+
+import benchmarks.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
+import argparse
+import json
+import operator
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version as version_of
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fleetmap.odometry import Odometry
+from fleetmap.recordings import FrameSelection, open_recording
+from fleetmap.rectification import Rectifier
+from locclient import health
+from locclient.connection import connected
+from locclient.replay import ReplayResult, replay
+from locclient.settings import LocalizerSettings
+from locclient.sources import ReplaySource
+
+SITE = "hall"
+Compare = Callable[[float, float], bool]
+AT_MOST, AT_LEAST = operator.le, operator.ge
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A recording against the survey's map, and what is promised of it: figure -> (limit, how)."""
+
+    record: tuple[str, ...]
+    promises: dict[str, tuple[float, Compare]]
+
+
+_CHEAP: dict[str, tuple[float, Compare]] = {"cpu_mean_ms": (10, AT_MOST), "cpu_p99_ms": (20, AT_MOST), "rss_mb": (320, AT_MOST)}
+_HONEST: dict[str, tuple[float, Compare]] = {"silent_failures": (0, AT_MOST), "truth_outside_share": (0.01, AT_MOST)}
+_NEXT_DAY: dict[str, tuple[float, Compare]] = {
+    "localised_share": (0.99, AT_LEAST), "median_mm": (15, AT_MOST), "p99_mm": (35, AT_MOST), "heading_p99_deg": (0.3, AT_MOST),
+}  # fmt: skip
+CASES: dict[str, Case] = {
+    "next day": Case(("--robot", "runner-1", "--day", "1"), _NEXT_DAY | _HONEST | _CHEAP),
+    "night, stock three days on": Case(
+        ("--robot", "runner-1", "--day", "3", "--light", "night"),
+        {"localised_share": (0.97, AT_LEAST), "median_mm": (17, AT_MOST)} | _HONEST | _CHEAP,
+    ),
+    "camera 0.5 m lower": Case(("--robot", "tote-1", "--day", "1"), _HONEST | _CHEAP),
+    "opposite direction": Case(("--robot", "opposite-1", "--day", "1"), _HONEST | _CHEAP),
+}
+
+
+def tool(name: str) -> list[str]:
+    """The command of this checkout."""
+    return [sys.executable, "-c", f"from {name}.cli import main; main()"]
+
+
+def recorded(work: Path, options: tuple[str, ...], scenario: str = "small-loop") -> Path:
+    """The recording of `fleetsim record SCENARIO OPTIONS`, made where it is not there yet."""
+    name = "-".join((scenario, *(option.lstrip("-") for option in options))) + ".mcap"
+    if not (work / name).exists():
+        subprocess.run([*tool("fleetsim"), "record", scenario, *options, "--out", str(work / name)], check=True)
+    return work / name
+
+
+def surveyed(work: Path) -> Path:
+    """The store with the survey's map, in the frame of the truth."""
+    store = work / "store"
+    if not (store / "built").exists():
+        to_store = ["--site", SITE, "--store", str(store)]
+        survey = recorded(work, ())
+        report = ["--report", str(work / "survey.json")]
+        subprocess.run([*tool("mapserver"), "build", str(survey), *to_store, "--frame-from-ground-truth", *report], check=True)
+        subprocess.run([*tool("mapserver"), "publish", *to_store], check=True)
+        (store / "built").touch()
+    return store
+
+
+def played(path: Path, store: Path, settings: LocalizerSettings, frames: str = ":", *, reverse: bool = False) -> ReplayResult:
+    """The recording replayed in the store's map, as `locclient replay` does."""
+    options = {"site": SITE, "store": store, "server": None, "robot": "bench"}
+    with open_recording(path) as recording, connected(options) as link:
+        source = ReplaySource.of(recording, FrameSelection.parse(frames), reverse=reverse)
+        return replay(source, link, settings, None, realtime=False, progress=lambda _: None)
+
+
+def odometry_ms(path: Path, settings: LocalizerSettings, frames: str = ":") -> list[float]:
+    """CPU milliseconds of each frame by odometry alone, rectification included."""
+    out = []
+    with open_recording(path) as recording:
+        source = ReplaySource.of(recording, FrameSelection.parse(frames), reverse=False)
+        rectifier = Rectifier(source.calibration)
+        odometry = Odometry(
+            source.calibration, rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s, settings.odometry,
+            settings.stereo,
+        )  # fmt: skip
+        for number, imu in enumerate(source.imu_before_each()):
+            raw = source.frame(number)
+            begun_s = time.process_time()
+            odometry.handle_imu(imu)
+            odometry.handle_wheel(source.wheel_before(number))
+            odometry.handle_stereo(rectifier.rectify(raw))
+            out.append(1e3 * (time.process_time() - begun_s))
+    return out[health.WARM_UP_FRAMES :]
+
+
+def figures(result: ReplayResult) -> dict[str, Any]:
+    """What a run was worth, flat."""
+    frames = result.frames
+    errors, angles, cpu = health.error_m(frames), health.error_deg(frames), health.frame_ms(frames)
+    outside = [health.is_outside_its_bound(frame) for frame in frames if frame.error_map_m is not None]
+    first = health.first_fix(frames)
+    return {
+        "frames": len(frames),
+        "first_fix_frame": first,
+        "localised_share": health.localised_share(frames),
+        "median_mm": None if errors is None else 1e3 * errors["median"],
+        "p99_mm": None if errors is None else 1e3 * errors["p99"],
+        "max_mm": None if errors is None else 1e3 * errors["max"],
+        "heading_p99_deg": None if angles is None else angles["p99"],
+        "silent_failures": health.silent_failures(frames),
+        "position_failures": health.position_failures(frames),
+        "truth_outside_share": float(np.mean(outside)) if outside else None,
+        "cpu_mean_ms": None if cpu is None else cpu["mean"],
+        "cpu_p99_ms": None if cpu is None else cpu["p99"],
+        "rss_mb": resident_mb()["resident"],
+        "rss_anonymous_mb": resident_mb()["anonymous"],
+        "stage_ms": health.stage_ms(frames),
+        "status_share": health.status_share(frames),
+    }
+
+
+def resident_mb() -> dict[str, float]:
+    """10^6 bytes of this process in memory, and of those what is not mapped from disk. Linux."""
+    wanted = {"VmRSS": "resident", "RssAnon": "anonymous"}
+    rows = (line.split() for line in Path("/proc/self/status").read_text().splitlines())
+    return {wanted[row[0][:-1]]: float(row[1]) * 1.024e-3 for row in rows if row and row[0][:-1] in wanted}
+
+
+def show(name: str, found: dict[str, Any], case: Case) -> None:
+    """One case's table: figure, value, target."""
+    print(f"\n{name} (fleetsim record small-loop {' '.join(case.record)})")
+    for key, value in found.items():
+        if isinstance(value, dict):
+            shown = "  ".join(f"{k} {v:.3g}" for k, v in value.items())
+        else:
+            shown = "-" if value is None else f"{value:.4g}"
+        target = ""
+        if key in case.promises:
+            limit, compare = case.promises[key]
+            good = value is not None and compare(value, limit)
+            target = f"{'<=' if compare is AT_MOST else '>='} {limit:g} {'' if good else 'MISSED'}"
+        print(f"  {key:22} {shown:>12}  {target}")
+
+
+def main() -> None:
+    """Prints the tables; writes them as JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", action="append", default=[], choices=list(CASES))
+    parser.add_argument("--work", type=Path, default=Path(os.environ.get("FLEETMAP_BENCH_WORK", tempfile.gettempdir())) / "localization")
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    store, settings, found = surveyed(arguments.work), LocalizerSettings(), {}
+    for name in arguments.only or CASES:
+        recording = recorded(arguments.work, CASES[name].record)
+        played(recording, store, settings, ":60")  # compiles, warms up
+        found[name] = figures(played(recording, store, settings))
+        alone = odometry_ms(recording, settings)
+        found[name] |= {"odometry_alone_mean_ms": float(np.mean(alone)), "odometry_alone_p99_ms": float(np.percentile(alone, 99))}
+        show(name, found[name], CASES[name])
+    if arguments.out is not None:
+        machine = {
+            "command": " ".join(sys.argv), "machine": platform.processor() or platform.machine(), "cores": os.cpu_count(),
+            "python": platform.python_version(), "numpy": np.__version__, "numba": version_of("numba"),
+            "opencv": version_of("opencv-python-headless"),
+        }  # fmt: skip
+        arguments.out.write_text(json.dumps(machine | {"cases": found}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
