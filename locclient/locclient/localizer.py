@@ -1,7 +1,7 @@
 """The localizer: samples and tiles in, one honest estimate for each frame out. Never touches a file, a socket or a clock."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -9,16 +9,19 @@ from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
 from fleetmap.calibration import RigCalibration
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
+from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
-from fleetmap.odometry import Odometry, OdometryEstimate
+from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import ImuSamples, PositionPrior, WheelSample
+from locclient.anchors import Anchor, applied, difference, moved
 from locclient.map_view import MapView
-from locclient.relocalizer import Fix, Relocalizer, Seen
+from locclient.relocalizer import Fix, Relocalizer, Seen, Slices
 from locclient.settings import LocalizerSettings
+from locclient.sight import Cause, SightJudge
 
 _RADIUS_95 = 2.796  # of a three-dimensional normal distribution, in sigmas
+_SPREAD_SHARE = 0.45  # of the time between two looks: frames that come less often are not made to share one
 
 
 class Status(StrEnum):
@@ -43,8 +46,10 @@ class Hypothesis:
 class Estimate:
     """Where the body is.
 
-    map_from_body (4, 4) and cov_rot_trans (6, 6) (map axes, rotation first) are None until there is anything to say. fix: this
-    frame's own, None without one; refused: why a fix was not used. hypotheses: what speaks for which place while AMBIGUOUS.
+    map_from_body (4, 4) and cov_rot_trans (6, 6) (map axes, rotation first) are None until there is anything to say. cause: what
+    stands in the way, NONE while TRACKING. fix: the one that was finished with this frame, None without one, taken from the
+    frame of fix_stamp_ns, which may be a few frames old: looking at the map is spread over frames. refused: why a fix was not
+    used. hypotheses: what speaks for which place while AMBIGUOUS.
     stage_s: seconds by the clock that was passed in, for odometry and for looking at the map.
     """
 
@@ -59,25 +64,17 @@ class Estimate:
     hypotheses: tuple[Hypothesis, ...]
     odometry: OdometryEstimate
     stage_s: dict[str, float]
+    cause: Cause = Cause.NONE
+    fix_stamp_ns: int | None = None
 
 
-@dataclass
-class _Anchor:
-    """Where the body was in `map` at one frame of the odometry, and everything that speaks for it.
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    """What a look at the map came to."""
 
-    map_from_body and cov_rot_trans: at that frame. now_map_from_body, now_cov: the same carried to the present.
-    """
-
-    frame_index: int
-    stamp_ns: int
-    map_from_body: Array
-    cov_rot_trans: Array
-    now_map_from_body: Array
-    now_cov: Array
-    support: int = 1
-    misses: int = 0
-    travelled_m: float = 0.0
-    strangers: list["_Anchor"] = field(default_factory=list)
+    fix: Fix | None = None
+    refused: str = ""
+    innovation: float | None = None
 
 
 class Localizer:
@@ -99,12 +96,21 @@ class Localizer:
         )
         self._relocalizer: Relocalizer | None = None
         self._map_version: int | None = None
+        self._tiles: dict[tuple[int, int], Tile] = {}
+        self._vocabulary: Vocabulary | None = None
+        self._survey_focal_px = 0.0
         self._prior: PositionPrior | None = None
         self._way_since_prior_m = 0.0
-        self._anchor: _Anchor | None = None  # the confirmed place
-        self._candidates: list[_Anchor] = []  # unconfirmed ones
+        self._anchor: Anchor | None = None  # the confirmed place
+        self._candidates: list[Anchor] = []  # unconfirmed ones
         self._last_odom: Array | None = None
-        self._last_look_ns: int | None = None
+        self._last_ns: int | None = None
+        self._begun_ns: int | None = None  # of the last look
+        self._work: Slices[_Outcome] | None = None  # the look that goes on
+        self._moment: Anchor | None = None  # the frame of that look, as the identity
+        self._failed_looks = 0
+        self._judge = SightJudge(settings.sight)
+        self._cause = Cause.NONE
         self._ever_tracked = False
 
     def handle_imu(self, samples: ImuSamples) -> None:
@@ -122,21 +128,46 @@ class Localizer:
     def handle_version(
         self, version: int, tiles: Iterable[Tile], vocabulary: Vocabulary, survey_focal_px: float
     ) -> None:
-        """The tiles around, of one version; takes the place of what was held."""
-        self._relocalizer = Relocalizer(MapView(tiles, vocabulary, survey_focal_px), self._camera, self._settings)
+        """The tiles around, of one version; takes the place of what was held. A look that goes on is given up."""
+        self._tiles = {(tile.tile_x, tile.tile_y): tile for tile in tiles}
+        self._vocabulary, self._survey_focal_px = vocabulary, survey_focal_px
         self._map_version = version
+        self._hold()
+
+    def handle_tile(self, tile: Tile) -> None:
+        """One more tile of the version that is held, or another edition of one."""
+        assert self._vocabulary is not None, "tiles belong to a version: handle_version comes first"
+        self._tiles[(tile.tile_x, tile.tile_y)] = tile
+        self._hold()
+
+    def forget_tiles(self, cells: Iterable[tuple[int, int]]) -> None:
+        """Lets go of tiles, (tile_x, tile_y), that are far away."""
+        for cell in cells:
+            self._tiles.pop(cell, None)
+        if self._vocabulary is not None:
+            self._hold()
+
+    def _hold(self) -> None:
+        assert self._vocabulary is not None
+        view = MapView(self._tiles.values(), self._vocabulary, self._survey_focal_px)
+        self._relocalizer = Relocalizer(view, self._camera, self._settings)
+        self._work = self._moment = None
 
     def handle_stereo(self, frame: RectifiedFrame) -> Estimate:
         """The estimate at `frame`, newer than any before."""
         begun = self._clock()
+        self._cause = self._judge.judge(frame)
+        if self._cause is Cause.FROZEN:
+            frame = self._judge.without_frozen(frame)
         odometry = self._odometry.handle_stereo(frame)
+        if self._cause is Cause.NONE:
+            self._cause = self._judge.judge_depth(odometry.scene_depth_m)
         tracked = self._clock()
         self._follow(odometry)
-        fix, refused, innovation = None, "", None
-        if self._relocalizer is not None and self._is_due(frame.stamp_ns, odometry):
-            fix, refused, innovation = self._look(frame, odometry)
+        outcome, looked_ns = self._see_map(frame, odometry)
+        self._last_ns = frame.stamp_ns
         self._stage_s = {"odometry": tracked - begun, "map": self._clock() - tracked}
-        return self._estimate(odometry, fix, refused, innovation)
+        return self._estimate(odometry, outcome, looked_ns)
 
     # --- odometry in, drift out ------------------------------------------------------------------------------------------
 
@@ -146,72 +177,88 @@ class Localizer:
         last = None if self._last_odom is None else self._last_odom if change is None else change @ self._last_odom
         step = np.eye(4) if last is None else se3_inverse(last) @ odometry.odom_from_body
         self._way_since_prior_m += float(np.linalg.norm(step[:3, 3]))
-        anchors = [*([self._anchor, *self._anchor.strangers] if self._anchor else []), *self._candidates]
-        for anchor in anchors:
-            anchor.travelled_m += float(np.linalg.norm(step[:3, 3]))
-            self._carry(anchor, odometry, step)
+        for anchor in [*self._anchors(), *([self._moment] if self._moment else [])]:
+            anchor.carry(self._odometry, odometry, step, self._settings.track)
         self._last_odom = odometry.odom_from_body
 
-    def _carry(self, anchor: _Anchor, odometry: OdometryEstimate, step: Array) -> None:
-        """From the anchor's frame while the odometry holds it (exact), else on from the last frame; re-anchors before it is forgotten."""
-        settings = self._settings.track
-        motion = self._odometry.motion_since(anchor.frame_index)
-        if motion is None:  # the odometry began anew since: one step on its estimates alone
-            loose = np.diag([0.02**2] * 3 + [(0.05 + 0.1 * float(np.linalg.norm(step[:3, 3]))) ** 2] * 3)
-            anchor.now_map_from_body, anchor.now_cov = _compose(anchor.now_map_from_body, anchor.now_cov, step, loose)
-        else:
-            distance = float(np.linalg.norm(motion[0][:3, 3]))
-            floor = np.diag([0.0] * 3 + [(settings.drift_floor_m + settings.drift_share * distance) ** 2] * 3)
-            anchor.now_map_from_body, anchor.now_cov = _compose(
-                anchor.map_from_body, anchor.cov_rot_trans, motion[0], motion[1] + floor
-            )
-        if motion is None or anchor.frame_index == self._odometry.oldest_frame_index:
-            anchor.frame_index = odometry.frame_index
-            anchor.map_from_body, anchor.cov_rot_trans = anchor.now_map_from_body, anchor.now_cov
+    def _anchors(self) -> list[Anchor]:
+        return [*([self._anchor, *self._anchor.strangers] if self._anchor else []), *self._candidates]
 
     def _is_due(self, stamp_ns: int, odometry: OdometryEstimate) -> bool:
-        last = self._last_look_ns
-        return (
-            last is None
-            or odometry.after_gap
-            or (stamp_ns - last) * 1e-9 >= 0.999 * self._settings.track.fix_interval_s
-        )
+        settings, last = self._settings.track, self._begun_ns
+        settled = self._anchor is not None and self._anchor.support >= settings.settled_fixes and not self._failed_looks
+        interval_s = max(settings.fix_interval_s, settings.settled_interval_s) if settled else settings.fix_interval_s
+        return last is None or odometry.after_gap or (stamp_ns - last) * 1e-9 >= 0.999 * interval_s
 
     # --- looking at the map ----------------------------------------------------------------------------------------------
 
-    def _look(self, frame: RectifiedFrame, odometry: OdometryEstimate) -> tuple[Fix | None, str, float | None]:
-        assert self._relocalizer is not None
-        self._last_look_ns = frame.stamp_ns
-        seen = self._relocalizer.look(frame)
-        if self._anchor is not None:
-            map_from_body, covariance = self._anchor.now_map_from_body, self._anchor.now_cov
-            map_from_cam = map_from_body @ self._body_from_cam
-            fix = self._relocalizer.near(seen, map_from_cam, self._at_camera(map_from_body, covariance))
-            if fix is None:
-                fixes = self._relocalizer.anywhere(seen, None, map_from_cam[:3, :3])
-                fix = fixes[0] if fixes and fixes[0].inliers >= self._settings.fix.min_inliers else None
-            if fix is None:
-                return None, "nothing in the map agrees with this frame", None
-            return self._correct(fix, map_from_body, covariance, odometry)
-        fixes = self._search(seen)
-        return self._weigh(fixes, odometry)
+    def _see_map(self, frame: RectifiedFrame, odometry: OdometryEstimate) -> tuple[_Outcome, int | None]:
+        """What a look that is finished with this frame came to, and the stamp of the frame that it was for.
 
-    def _search(self, seen: Seen) -> list[Fix]:
+        The first look, and those of recordings with hardly more frames than looks, are finished with the frame that they are for.
+        """
+        if self._relocalizer is None:
+            return _Outcome(), None
+        if self._work is None:
+            if not self._is_due(frame.stamp_ns, odometry):
+                return _Outcome(), None
+            at_once = self._is_sparse(frame.stamp_ns) or odometry.after_gap
+            self._begun_ns = frame.stamp_ns
+            self._moment = Anchor.at(odometry, np.eye(4), np.zeros((6, 6)))
+            for anchor in self._anchors():
+                anchor.mark()
+            self._work = self._look(frame, self._relocalizer)
+        else:
+            at_once = False
+        assert self._moment is not None
+        try:
+            next(self._work)
+            while at_once:
+                next(self._work)
+        except StopIteration as done:
+            looked_ns, self._work, self._moment = self._moment.stamp_ns, None, None
+            outcome: _Outcome = done.value
+            self._failed_looks = 0 if outcome.fix is not None else self._failed_looks + 1
+            return outcome, looked_ns
+        return _Outcome(), None
+
+    def _is_sparse(self, stamp_ns: int) -> bool:
+        """Whether there are too few frames to spread a look over."""
+        if self._begun_ns is None or self._last_ns is None:
+            return True
+        return (stamp_ns - self._last_ns) * 1e-9 > _SPREAD_SHARE * self._settings.track.fix_interval_s
+
+    def _look(self, frame: RectifiedFrame, relocalizer: Relocalizer) -> Slices[_Outcome]:
+        seen = yield from relocalizer.look(frame)
+        if self._anchor is None:
+            fixes = yield from self._search(seen, relocalizer)
+            return self._weigh(fixes)
+        map_from_body, covariance = self._anchor.then_map_from_body, self._anchor.then_cov
+        map_from_cam = map_from_body @ self._body_from_cam
+        fix = relocalizer.near(seen, map_from_cam, self._at_camera(map_from_body, covariance))
+        if fix is None and self._failed_looks + 1 >= self._settings.track.search_after_failed:
+            yield
+            fixes = yield from relocalizer.anywhere(seen, None, map_from_cam[:3, :3])
+            fix = fixes[0] if fixes and fixes[0].inliers >= self._settings.fix.min_inliers else None
+        if fix is None:
+            return _Outcome(None, "nothing in the map agrees with this frame")
+        return self._correct(fix, map_from_body, covariance)
+
+    def _search(self, seen: Seen, relocalizer: Relocalizer) -> Slices[list[Fix]]:
         """Fixes anywhere, around the candidates first; inside the prior where there is one."""
-        assert self._relocalizer is not None
-        relocalizer = self._relocalizer
         fixes: list[Fix] = []
         for candidate in self._candidates:
-            map_from_body, covariance = candidate.now_map_from_body, candidate.now_cov
+            map_from_body, covariance = candidate.then_map_from_body, candidate.then_cov
             fix = relocalizer.near(
                 seen, map_from_body @ self._body_from_cam, self._at_camera(map_from_body, covariance)
             )
             if fix is not None:
                 fixes.append(fix)
+            yield
         known = None
         if len(self._candidates) == 1:
-            known = (self._candidates[0].now_map_from_body @ self._body_from_cam)[:3, :3]
-        fixes += relocalizer.anywhere(seen, self._places_in_prior(), known)
+            known = (self._candidates[0].then_map_from_body @ self._body_from_cam)[:3, :3]
+        fixes += yield from relocalizer.anywhere(seen, self._places_in_prior(), known)
         return [f for f in fixes if f.inliers >= self._settings.fix.min_inliers and self._in_prior(f)]
 
     def _prior_cov_m2(self) -> Array:
@@ -236,39 +283,35 @@ class Localizer:
 
     # --- tracking --------------------------------------------------------------------------------------------------------
 
-    def _correct(
-        self, fix: Fix, map_from_body: Array, covariance: Array, odometry: OdometryEstimate
-    ) -> tuple[Fix | None, str, float | None]:
-        """Kalman update of the confirmed place; a fix outside its gate is refused, unless such fixes agree among themselves."""
+    def _correct(self, fix: Fix, map_from_body: Array, covariance: Array) -> _Outcome:
+        """Kalman update of the confirmed place at the frame of the look; a fix outside its gate is refused, unless such fixes
+        agree among themselves."""
         assert self._anchor is not None
+        assert self._moment is not None
         measured, measured_cov = self._at_body(fix)
-        error = _difference(measured, map_from_body)
+        error = difference(measured, map_from_body)
         spread = covariance + measured_cov
         innovation = float(error @ np.linalg.solve(spread, error))
         if innovation > self._settings.track.innovation_limit:
-            self._consider_kidnapping(fix, odometry)
-            return (
-                None,
-                f"the fix is {np.linalg.norm(error[3:]):.2f} m off, more than its covariance admits",
-                innovation,
-            )
+            self._consider_kidnapping(fix)
+            off_m = float(np.linalg.norm(error[3:]))
+            return _Outcome(None, f"the fix is {off_m:.2f} m off, more than its covariance admits", innovation)
         gain = np.linalg.solve(spread, covariance).T
-        corrected = _apply(gain @ error, map_from_body)
         rest = np.eye(6) - gain
         updated = rest @ covariance @ rest.T + gain @ measured_cov @ gain.T
-        anchor = self._new_anchor(corrected, updated, odometry)
+        anchor = Anchor.behind(self._moment, applied(gain @ error, map_from_body), updated)
         anchor.support = self._anchor.support + 1
         self._anchor = anchor
-        return fix, "", innovation
+        return _Outcome(fix, "", innovation)
 
-    def _consider_kidnapping(self, fix: Fix, odometry: OdometryEstimate) -> None:
+    def _consider_kidnapping(self, fix: Fix) -> None:
         """Refused fixes that agree with each other, frame after frame, end the belief in the old place; they must be confirmed anew."""
         assert self._anchor is not None
         settings = self._settings.track
         self._candidates = self._anchor.strangers
         for candidate in self._candidates:
             candidate.misses += 1
-        self._weigh_one(fix, odometry)
+        self._weigh_one(fix)
         self._anchor.strangers = [c for c in self._candidates if c.misses < settings.max_misses]
         self._candidates = []
         if max(c.support for c in self._anchor.strangers) >= settings.kidnap_fixes:
@@ -276,15 +319,15 @@ class Localizer:
 
     # --- confirmation ----------------------------------------------------------------------------------------------------
 
-    def _weigh(self, fixes: list[Fix], odometry: OdometryEstimate) -> tuple[Fix | None, str, float | None]:
+    def _weigh(self, fixes: list[Fix]) -> _Outcome:
         """Every fix speaks for a candidate or begins one; confirmed is the one that is left with enough behind it."""
         for candidate in self._candidates:
             candidate.misses += 1
         for fix in fixes:
-            self._weigh_one(fix, odometry)
+            self._weigh_one(fix)
         self._candidates = [c for c in self._candidates if c.misses < self._settings.track.max_misses]
         if not fixes:
-            return None, "nothing in the map agrees with this frame", None
+            return _Outcome(None, "nothing in the map agrees with this frame")
         best = max(self._candidates, key=lambda c: c.support)
         rivals = [
             c
@@ -295,16 +338,23 @@ class Localizer:
             self._anchor, self._candidates, self._prior = best, [], None
             self._ever_tracked = True
         if rivals:
-            return None, f"{len(rivals) + 1} places agree with what was seen", None
-        own = [f for f in fixes if np.linalg.norm(self._at_body(f)[0][:3, 3] - best.now_map_from_body[:3, 3]) < 0.3]
-        return (own[0], "", None) if own else (None, "the fix does not agree with those before", None)
+            return _Outcome(None, f"{len(rivals) + 1} places agree with what was seen")
+        assert self._moment is not None
+        seen_from = self._moment
+        own = []
+        for fix in fixes:
+            now = Anchor.behind(seen_from, *self._at_body(fix)).now_map_from_body
+            if np.linalg.norm(now[:3, 3] - best.now_map_from_body[:3, 3]) < 0.3:
+                own.append(fix)
+        return _Outcome(own[0]) if own else _Outcome(None, "the fix does not agree with those before")
 
-    def _weigh_one(self, fix: Fix, odometry: OdometryEstimate) -> None:
+    def _weigh_one(self, fix: Fix) -> None:
+        assert self._moment is not None
         settings = self._settings.track
         measured, measured_cov = self._at_body(fix)
+        fresh = Anchor.behind(self._moment, measured, measured_cov)
         for candidate in self._candidates:
-            predicted, covariance = candidate.now_map_from_body, candidate.now_cov
-            error = _difference(measured, predicted)
+            error, covariance = difference(fresh.now_map_from_body, candidate.now_map_from_body), candidate.now_cov
             close = np.linalg.norm(error[3:]) < settings.hypothesis_distance_m + 3 * np.sqrt(
                 np.trace(covariance[3:, 3:])
             )
@@ -313,13 +363,11 @@ class Localizer:
             ):
                 if candidate.misses:  # at most one vote a frame
                     candidate.support, candidate.misses = candidate.support + 1, 0
-                candidate.frame_index, candidate.stamp_ns = odometry.frame_index, odometry.stamp_ns
-                candidate.map_from_body, candidate.cov_rot_trans = measured, measured_cov
-                candidate.now_map_from_body, candidate.now_cov = measured, measured_cov
+                candidate.moved_to(fresh)
                 return
-        self._candidates.append(self._new_anchor(measured, measured_cov, odometry))
+        self._candidates.append(fresh)
 
-    def _is_confirmed(self, candidate: _Anchor) -> bool:
+    def _is_confirmed(self, candidate: Anchor) -> bool:
         settings = self._settings.track
         tight = (
             self._prior is not None
@@ -330,39 +378,41 @@ class Localizer:
         )
         return bool(tight or enough)
 
-    def _new_anchor(self, map_from_body: Array, covariance: Array, odometry: OdometryEstimate) -> _Anchor:
-        return _Anchor(odometry.frame_index, odometry.stamp_ns, map_from_body, covariance, map_from_body, covariance)
-
     # --- output ----------------------------------------------------------------------------------------------------------
 
-    def _estimate(
-        self, odometry: OdometryEstimate, fix: Fix | None, refused: str, innovation: float | None
-    ) -> Estimate:
-        settings = self._settings.track
-        if self._anchor is not None:
-            map_from_body, covariance = self._anchor.now_map_from_body, self._anchor.now_cov
-            radius = _RADIUS_95 * float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
-            age_s = (odometry.stamp_ns - self._anchor.stamp_ns) * 1e-9
-            if radius > settings.lost_radius_m:
-                status = Status.LOST
-            elif radius > settings.degraded_radius_m or age_s > settings.degraded_after_s:
-                status = Status.DEGRADED
-            else:
-                status = Status.TRACKING
-            return Estimate(
-                odometry.stamp_ns, status, map_from_body, self._published(covariance), self._map_version, fix, refused, innovation, (),
-                odometry, self._stage_s,
-            )  # fmt: skip
-        ranked = sorted(self._candidates, key=lambda c: -c.support)
-        hypotheses = tuple(Hypothesis(c.now_map_from_body, c.support) for c in ranked)
-        rivals = [c for c in ranked[1:] if c.support >= settings.rival_share * ranked[0].support]
-        status = Status.AMBIGUOUS if rivals else Status.LOST if self._ever_tracked else Status.INITIALISING
-        best = ranked[0] if ranked and not rivals else None
-        return Estimate(
-            odometry.stamp_ns, status, None if best is None else best.now_map_from_body,
-            None if best is None else self._published(best.now_cov), self._map_version, fix, refused,
-            innovation, hypotheses, odometry, self._stage_s,
+    def _estimate(self, odometry: OdometryEstimate, outcome: _Outcome, looked_ns: int | None) -> Estimate:
+        said = Estimate(
+            odometry.stamp_ns, Status.INITIALISING, None, None, self._map_version, outcome.fix, outcome.refused,
+            outcome.innovation, (), odometry, self._stage_s, self._cause, looked_ns,
         )  # fmt: skip
+        if self._anchor is not None:
+            status, cause = self._worth(self._anchor, odometry)
+            now, covariance = self._anchor.now_map_from_body, self._published(self._anchor.now_cov)
+            return replace(said, status=status, cause=cause, map_from_body=now, cov_rot_trans=covariance)
+        ranked = sorted(self._candidates, key=lambda c: -c.support)
+        rivals = [c for c in ranked[1:] if c.support >= self._settings.track.rival_share * ranked[0].support]
+        status = Status.AMBIGUOUS if rivals else Status.LOST if self._ever_tracked else Status.INITIALISING
+        said = replace(
+            said, status=status, hypotheses=tuple(Hypothesis(c.now_map_from_body, c.support) for c in ranked)
+        )
+        if ranked and not rivals:
+            now, covariance = ranked[0].now_map_from_body, self._published(ranked[0].now_cov)
+            said = replace(said, map_from_body=now, cov_rot_trans=covariance)
+        return said
+
+    def _worth(self, anchor: Anchor, odometry: OdometryEstimate) -> tuple[Status, Cause]:
+        """Status of a confirmed place, and what is in the way of a better one."""
+        settings = self._settings.track
+        radius = _RADIUS_95 * float(np.sqrt(np.linalg.eigvalsh(anchor.now_cov[3:, 3:])[-1]))
+        age_s = (odometry.stamp_ns - anchor.stamp_ns) * 1e-9
+        is_lost = odometry.status is OdometryStatus.DEGRADED
+        cause = self._cause or (Cause.ODOMETRY if is_lost else Cause.UNMATCHED if self._failed_looks else Cause.NONE)
+        if radius > settings.lost_radius_m:
+            return Status.LOST, cause
+        late_s = settings.degraded_after_s if self._cause is Cause.NONE else settings.suspicious_after_s
+        if radius > settings.degraded_radius_m or age_s > late_s or self._cause is Cause.FROZEN:
+            return Status.DEGRADED, cause
+        return Status.TRACKING, Cause.NONE
 
     def _published(self, covariance: Array) -> Array:
         """With the map's own uncertainty, which is common to all fixes: no number of them averages it away."""
@@ -372,33 +422,7 @@ class Localizer:
     def _at_body(self, fix: Fix) -> tuple[Array, Array]:
         """A fix as map_from_body with its covariance (map axes, about the body)."""
         map_from_body = fix.map_from_cam @ self._cam_from_body
-        return map_from_body, _moved(fix.cov_rot_trans, map_from_body[:3, 3] - fix.map_from_cam[:3, 3])
+        return map_from_body, moved(fix.cov_rot_trans, map_from_body[:3, 3] - fix.map_from_cam[:3, 3])
 
     def _at_camera(self, map_from_body: Array, covariance: Array) -> Array:
-        return _moved(covariance, (map_from_body @ self._body_from_cam)[:3, 3] - map_from_body[:3, 3])
-
-
-def _moved(cov_rot_trans: Array, lever_m: Array) -> Array:
-    """The covariance of a point at `lever_m` from the one it was given for, on the same rigid thing; map axes."""
-    carry = np.eye(6)
-    carry[3:, :3] = -np.array(
-        [[0, -lever_m[2], lever_m[1]], [lever_m[2], 0, -lever_m[0]], [-lever_m[1], lever_m[0], 0]]
-    )
-    return np.asarray(carry @ cov_rot_trans @ carry.T)
-
-
-def _compose(map_from_body: Array, covariance: Array, body_from_next: Array, cov_step: Array) -> tuple[Array, Array]:
-    """map_from_next and its covariance (map axes): a place moved on by a step whose covariance is left, in the body's axes."""
-    rotation = map_from_body[:3, :3]
-    lever = rotation @ body_from_next[:3, 3]
-    turn = np.kron(np.eye(2), rotation)
-    return map_from_body @ body_from_next, _moved(covariance + turn @ cov_step @ turn.T, lever)
-
-
-def _difference(measured: Array, predicted: Array) -> Array:
-    """(6,) rotation and position of measured against predicted, map axes."""
-    return np.concatenate([so3_log(measured[:3, :3] @ predicted[:3, :3].T), measured[:3, 3] - predicted[:3, 3]])
-
-
-def _apply(error: Array, map_from_body: Array) -> Array:
-    return se3(so3_exp(error[:3]) @ map_from_body[:3, :3], map_from_body[:3, 3] + error[3:])
+        return moved(covariance, (map_from_body @ self._body_from_cam)[:3, 3] - map_from_body[:3, 3])

@@ -1,6 +1,8 @@
 """One frame placed in the map: by projection where it nearly is, by words where it might be anywhere. Pure."""
 
+from collections.abc import Generator
 from dataclasses import dataclass
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,21 +16,28 @@ from locclient.map_view import MapView, Rows
 from locclient.settings import LocalizerSettings
 
 _NEIGHBOURHOOD_M = 3.0
+_RANKED = 8  # so many times as many places are ranked as are tried
+_TRIALS_AT_A_PLACE = 2
 _FIRST_DOUBT = 3.0  # of the sigmas, while the place that matches were looked for around is only a guess
 _SAME_PLACE_M, _SAME_PLACE_COSINE = 1.2, 0.8  # less than half a bay: no other place looks so much the same so near
+
+T = TypeVar("T")
+Slices = Generator[None, None, T]  # work that may be interrupted wherever it yields
 
 
 @dataclass(frozen=True, slots=True)
 class Fix:
     """A verified place of one frame.
 
-    map_from_cam (4, 4); cov_rot_trans (6, 6) in map axes, rotation first; inliers and cells of the image that hold them.
+    map_from_cam (4, 4); cov_rot_trans (6, 6) in map axes, rotation first; inliers and cells of the image that hold them; share
+    of the inliers among what was matched at the end.
     """
 
     map_from_cam: Array
     cov_rot_trans: Array
     inliers: int
     cells: int
+    share: float = 1.0
 
 
 @dataclass(slots=True)
@@ -52,9 +61,9 @@ class Relocalizer:
         self._camera = camera
         self._settings = settings
 
-    def look(self, frame: RectifiedFrame) -> Seen:
-        """What one frame shows."""
-        features = orb.detect(frame.left, self._settings.orb)
+    def look(self, frame: RectifiedFrame) -> Slices[Seen]:
+        """What one frame shows, in slices: see `finished`."""
+        features = yield from orb.detect_in_slices(frame.left, self._settings.orb)
         pixels = np.column_stack([features.pixels, np.full(len(features), np.nan)])
         return Seen(features, pixels, frame, np.zeros(len(features), bool))
 
@@ -78,17 +87,27 @@ class Relocalizer:
 
     def anywhere(
         self, seen: Seen, allowed: NDArray[np.bool_] | None = None, map_from_cam_rotation: Array | None = None
-    ) -> list[Fix]:
-        """Fixes of all places that look like this one and verify, best first, duplicates removed.
+    ) -> Slices[list[Fix]]:
+        """Fixes of all places that look like this one and verify, best first, duplicates removed; a slice for each place.
 
         allowed (K,): places that may be considered. map_from_cam_rotation: the orientation, where it is known. A place
-        that a fix already stands at is not tried again: it is made of the same landmarks. One further on is, since
-        identical bays and aisles must be able to speak against each other.
+        that a fix or a failed trial already stands at is not tried again: it is made of the same landmarks. One further on is,
+        since identical bays and aisles must be able to speak against each other.
         """
+        settings = self._settings.fix
         fixes: list[Fix] = []
-        for place in self.view.similar_places(seen.features.descriptors, allowed, self._settings.fix.top_places):
-            if any(_stands_at(fix, self.view.map_from_cam[place]) for fix in fixes):
+        tried: list[Array] = []
+        for place in self.view.similar_places(seen.features.descriptors, allowed, _RANKED * settings.top_places):
+            map_from_place = self.view.map_from_cam[place]
+            if any(_stands_at(fix.map_from_cam, map_from_place) for fix in fixes):
                 continue
+            if sum(_stands_at(other, map_from_place) for other in tried) >= _TRIALS_AT_A_PLACE:
+                continue
+            if len(tried) == settings.top_places:
+                break
+            if tried:
+                yield
+            tried.append(map_from_place)
             fix = self._at_place(seen, int(place), map_from_cam_rotation)
             if fix is not None and all(not _same(fix, other) for other in fixes):
                 fixes.append(fix)
@@ -168,7 +187,7 @@ class Relocalizer:
         carry[:3, :3] = carry[3:, 3:] = -rotation
         covariance = settings.covariance_scale * carry @ found.cov_rot_trans @ carry.T
         covariance += np.diag([settings.floor_rad**2] * 3 + [settings.floor_m**2] * 3)
-        return Fix(map_from_cam, covariance, int(found.inliers.sum()), cells)
+        return Fix(map_from_cam, covariance, int(found.inliers.sum()), cells, share)
 
     def _sigmas(self, seen: Seen, features: NDArray[np.int64], rows: Rows, map_from_cam: Array | None) -> Array:
         """(N, 2): of pixels and of disparities, by octave and by the landmarks' own uncertainty.
@@ -203,10 +222,19 @@ class Relocalizer:
         )
 
 
-def _stands_at(fix: Fix, map_from_place: Array) -> bool:
-    """Whether a place's neighbourhood is mostly that of a fix."""
-    apart_m = float(np.linalg.norm(fix.map_from_cam[:3, 3] - map_from_place[:3, 3]))
-    axis, place_axis = fix.map_from_cam[:3, 2], map_from_place[:3, 2]
+def finished(work: Slices[T]) -> T:
+    """The result of work in slices, all of them at once."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            return cast(T, done.value)
+
+
+def _stands_at(map_from_cam: Array, map_from_place: Array) -> bool:
+    """Whether a place's neighbourhood is mostly that of a camera."""
+    apart_m = float(np.linalg.norm(map_from_cam[:3, 3] - map_from_place[:3, 3]))
+    axis, place_axis = map_from_cam[:3, 2], map_from_place[:3, 2]
     return apart_m < _SAME_PLACE_M and bool(axis @ place_axis > _SAME_PLACE_COSINE)
 
 

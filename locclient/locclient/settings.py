@@ -4,6 +4,7 @@ from fleetmap.config import Section
 from fleetmap.features.orb import OrbSettings
 from fleetmap.features.stereo import StereoSettings
 from fleetmap.odometry import OdometrySettings
+from locclient.sight import SightSettings
 
 
 class FixSettings(Section, frozen=True):
@@ -32,6 +33,9 @@ class TrackSettings(Section, frozen=True):
     """When an estimate may be believed."""
 
     fix_interval_s: float = 0.2
+    settled_interval_s: float = 0.4
+    settled_fixes: int = 10
+    search_after_failed: int = 2
     confirming_fixes: int = 3
     confirming_distance_m: float = 1.0
     tight_prior_sigma_m: float = 0.6
@@ -43,6 +47,7 @@ class TrackSettings(Section, frozen=True):
     drift_share: float = 0.01
     drift_floor_m: float = 0.005
     degraded_after_s: float = 1.5
+    suspicious_after_s: float = 0.9
     degraded_radius_m: float = 0.3
     lost_radius_m: float = 3.0
     kidnap_fixes: int = 3
@@ -59,3 +64,4 @@ class LocalizerSettings(Section, frozen=True):
     orb: OrbSettings = OrbSettings(count=1000)
     fix: FixSettings = FixSettings()
     track: TrackSettings = TrackSettings()
+    sight: SightSettings = SightSettings()

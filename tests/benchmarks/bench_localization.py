@@ -47,7 +47,11 @@ class Case:
     promises: dict[str, tuple[float, Compare]]
 
 
-_CHEAP: dict[str, tuple[float, Compare]] = {"cpu_mean_ms": (10, AT_MOST), "cpu_p99_ms": (20, AT_MOST), "rss_mb": (320, AT_MOST)}
+_CHEAP: dict[str, tuple[float, Compare]] = {
+    "cpu_mean_ms": (10, AT_MOST),
+    "cpu_p99_ms": (20, AT_MOST),
+    "rss_mb": (320, AT_MOST),
+}
 _HONEST: dict[str, tuple[float, Compare]] = {"silent_failures": (0, AT_MOST), "truth_outside_share": (0.01, AT_MOST)}
 _NEXT_DAY: dict[str, tuple[float, Compare]] = {
     "localised_share": (0.99, AT_LEAST), "median_mm": (15, AT_MOST), "p99_mm": (35, AT_MOST), "heading_p99_deg": (0.3, AT_MOST),
@@ -83,13 +87,17 @@ def surveyed(work: Path) -> Path:
         to_store = ["--site", SITE, "--store", str(store)]
         survey = recorded(work, ())
         report = ["--report", str(work / "survey.json")]
-        subprocess.run([*tool("mapserver"), "build", str(survey), *to_store, "--frame-from-ground-truth", *report], check=True)
+        subprocess.run(
+            [*tool("mapserver"), "build", str(survey), *to_store, "--frame-from-ground-truth", *report], check=True
+        )
         subprocess.run([*tool("mapserver"), "publish", *to_store], check=True)
         (store / "built").touch()
     return store
 
 
-def played(path: Path, store: Path, settings: LocalizerSettings, frames: str = ":", *, reverse: bool = False) -> ReplayResult:
+def played(
+    path: Path, store: Path, settings: LocalizerSettings, frames: str = ":", *, reverse: bool = False
+) -> ReplayResult:
     """The recording replayed in the store's map, as `locclient replay` does."""
     options = {"site": SITE, "store": store, "server": None, "robot": "bench"}
     with open_recording(path) as recording, connected(options) as link:
@@ -170,7 +178,9 @@ def main() -> None:
     """Prints the tables; writes them as JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", action="append", default=[], choices=list(CASES))
-    parser.add_argument("--work", type=Path, default=Path(os.environ.get("FLEETMAP_BENCH_WORK", tempfile.gettempdir())) / "localization")
+    parser.add_argument(
+        "--work", type=Path, default=Path(os.environ.get("FLEETMAP_BENCH_WORK", tempfile.gettempdir())) / "localization"
+    )
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
@@ -180,7 +190,10 @@ def main() -> None:
         played(recording, store, settings, ":60")  # compiles, warms up
         found[name] = figures(played(recording, store, settings))
         alone = odometry_ms(recording, settings)
-        found[name] |= {"odometry_alone_mean_ms": float(np.mean(alone)), "odometry_alone_p99_ms": float(np.percentile(alone, 99))}
+        found[name] |= {
+            "odometry_alone_mean_ms": float(np.mean(alone)),
+            "odometry_alone_p99_ms": float(np.percentile(alone, 99)),
+        }
         show(name, found[name], CASES[name])
     if arguments.out is not None:
         machine = {

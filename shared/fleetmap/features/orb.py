@@ -1,6 +1,8 @@
 """Grid ORB: oriented FAST corners spread over the image and its scales, with OpenCV's rotated binary descriptors."""
 
+from collections.abc import Generator
 from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
@@ -15,6 +17,7 @@ from fleetmap.samples import Image
 SCALE_FACTOR = 1.2
 _PATCH_RADIUS = 15
 _BORDER_PX = 19
+_SLICE_LEVEL = 2  # the two finest levels are as much work as all the others
 
 
 class OrbSettings(Section, frozen=True):
@@ -58,8 +61,22 @@ def detect(image: Image, settings: OrbSettings) -> Features:
 
     Source: Rublee et al. 2011 (ORB), Mur-Artal 2015 (levels).
     """
-    found = [_detect_level(image, level, quota, settings) for level, quota in enumerate(_quotas(settings))]
-    keypoints = [keypoint for level in found for keypoint in level]
+    work = detect_in_slices(image, settings)
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            return cast(Features, done.value)
+
+
+def detect_in_slices(image: Image, settings: OrbSettings) -> Generator[None, None, Features]:
+    """As `detect`, in three pieces of about equal work, for who must not stop for long."""
+    keypoints: list[cv2.KeyPoint] = []
+    for level, quota in enumerate(_quotas(settings)):
+        if level == _SLICE_LEVEL:
+            yield
+        keypoints += _detect_level(image, level, quota, settings)
+    yield
     return describe(image, keypoints, settings.levels)
 
 

@@ -1,0 +1,83 @@
+"""What is wrong with the pictures of a frame, told from them alone. Pure."""
+
+from collections import deque
+from enum import StrEnum
+
+import cv2
+import numpy as np
+
+from fleetmap.config import Section
+from fleetmap.rectification import RectifiedFrame
+from fleetmap.samples import Image
+
+_EVERY_PX = 4  # rows and columns that are looked at
+
+
+class Cause(StrEnum):
+    """Why an estimate is worth less than TRACKING, in a word; NONE while nothing is wrong."""
+
+    NONE = ""
+    DARK = "dark"
+    GLARE = "glare"
+    FROZEN = "frozen"
+    BLURRED = "blurred"
+    OCCLUDED = "occluded"
+    ODOMETRY = "odometry lost"
+    UNMATCHED = "nothing in the map agrees"
+
+
+class SightSettings(Section, frozen=True):
+    """When a picture counts as bad."""
+
+    dark_contrast: float = 4.0
+    glare_share: float = 0.6
+    blurred_share: float = 0.1
+    typical_frames: int = 150
+    occluded_depth_share: float = 0.4
+
+
+class SightJudge:
+    """Judges frames in their order."""
+
+    def __init__(self, settings: SightSettings) -> None:
+        self._settings = settings
+        self._last: list[Image | None] = [None, None]
+        self._frozen = [False, False]
+        self._sharpness: deque[float] = deque(maxlen=settings.typical_frames)
+        self._depths_m: deque[float] = deque(maxlen=settings.typical_frames)
+
+    def judge(self, frame: RectifiedFrame) -> Cause:
+        """What is wrong with the pictures of `frame`: too dark, too bright, the last one again (of either camera), or blurred."""
+        pictures = [picture for picture in (frame.left, frame.right) if picture is not None]
+        thinned = [np.ascontiguousarray(picture[::_EVERY_PX, ::_EVERY_PX]) for picture in pictures]
+        self._frozen = [self._is_frozen(side, small) for side, small in enumerate(thinned)]
+        if float(thinned[0].std()) < self._settings.dark_contrast:
+            return Cause.DARK if float(thinned[0].mean()) < 128.0 else Cause.GLARE
+        if float((thinned[0] >= 250).mean()) > self._settings.glare_share:
+            return Cause.GLARE
+        if any(self._frozen):
+            return Cause.FROZEN
+        sharpness = float(cv2.Laplacian(frame.left[:: _EVERY_PX // 2], cv2.CV_16S)[:, ::_EVERY_PX].var())
+        typical = float(np.median(self._sharpness)) if self._sharpness else sharpness
+        self._sharpness.append(sharpness)
+        return Cause.BLURRED if sharpness < self._settings.blurred_share * typical else Cause.NONE
+
+    def without_frozen(self, frame: RectifiedFrame) -> RectifiedFrame:
+        """`frame`, just judged, without what a stuck camera repeats: no right picture, or nothing to see at all."""
+        left = np.zeros_like(frame.left) if self._frozen[0] else frame.left
+        return RectifiedFrame(frame.stamp_ns, left, None, None)
+
+    def judge_depth(self, scene_depth_m: float) -> Cause:
+        """Whether something stands before the cameras: what is seen is much nearer than it used to be."""
+        typical_m = float(np.median(self._depths_m)) if self._depths_m else scene_depth_m
+        if scene_depth_m < self._settings.occluded_depth_share * typical_m:
+            return Cause.OCCLUDED
+        self._depths_m.append(scene_depth_m)
+        return Cause.NONE
+
+    def _is_frozen(self, side: int, small: Image) -> bool:
+        """Sensor noise never repeats itself: equal to the last bit is a stuck camera."""
+        last, self._last[side] = self._last[side], small
+        return (
+            last is not None and last.shape == small.shape and float(small.std()) > 1.0 and np.array_equal(last, small)
+        )
