@@ -5,8 +5,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fleetmap.geometry import Array, se3, so3_exp, so3_log
-from fleetmap.odometry import Odometry, OdometryEstimate
+from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from locclient.settings import TrackSettings
+
+# Sigmas of one step: radians, metres, share of the way.
+_STANDING, _BEGUN_ANEW = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
 
 
 @dataclass
@@ -62,9 +65,12 @@ class Anchor:
         step_m = float(np.linalg.norm(step[:3, 3]))
         self.travelled_m += step_m
         motion = tracker.motion_since(self.frame_index)
-        if motion is None:  # the odometry began anew since: one step on its estimates alone
-            loose = np.diag([0.02**2] * 3 + [(0.05 + 0.1 * step_m) ** 2] * 3)
-            self.now_map_from_body, self.now_cov = composed(self.now_map_from_body, self.now_cov, step, loose)
+        if motion is None:
+            # Forgotten because the robot stood, or because the odometry began anew: one step on its estimates alone.
+            is_sure = odometry.new_odom_from_old_odom is None and odometry.status is not OdometryStatus.DEGRADED
+            turn_rad, way_m, share = _STANDING if is_sure else _BEGUN_ANEW
+            doubt = np.diag([turn_rad**2] * 3 + [(way_m + share * step_m) ** 2] * 3)
+            self.now_map_from_body, self.now_cov = composed(self.now_map_from_body, self.now_cov, step, doubt)
         else:
             distance = float(np.linalg.norm(motion[0][:3, 3]))
             floor = np.diag([0.0] * 3 + [(settings.drift_floor_m + settings.drift_share * distance) ** 2] * 3)

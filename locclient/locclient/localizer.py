@@ -159,6 +159,7 @@ class Localizer:
         self._cause = self._judge.judge(frame)
         if self._cause is Cause.FROZEN:
             frame = self._judge.without_frozen(frame)
+        judged = self._clock()
         odometry = self._odometry.handle_stereo(frame)
         if self._cause is Cause.NONE:
             self._cause = self._judge.judge_depth(odometry.scene_depth_m)
@@ -166,7 +167,7 @@ class Localizer:
         self._follow(odometry)
         outcome, looked_ns = self._see_map(frame, odometry)
         self._last_ns = frame.stamp_ns
-        self._stage_s = {"odometry": tracked - begun, "map": self._clock() - tracked}
+        self._stage_s = {"sight": judged - begun, "odometry": tracked - judged, "map": self._clock() - tracked}
         return self._estimate(odometry, outcome, looked_ns)
 
     # --- odometry in, drift out ------------------------------------------------------------------------------------------

@@ -3,14 +3,13 @@
 from collections import deque
 from enum import StrEnum
 
-import cv2
 import numpy as np
 
 from fleetmap.config import Section
 from fleetmap.rectification import RectifiedFrame
 from fleetmap.samples import Image
 
-_EVERY_PX = 4  # rows and columns that are looked at
+_EVERY_PX = 8  # rows and columns that are looked at
 
 
 class Cause(StrEnum):
@@ -57,7 +56,8 @@ class SightJudge:
             return Cause.GLARE
         if any(self._frozen):
             return Cause.FROZEN
-        sharpness = float(cv2.Laplacian(frame.left[:: _EVERY_PX // 2], cv2.CV_16S)[:, ::_EVERY_PX].var())
+        rows = frame.left[::_EVERY_PX].astype(np.int16)
+        sharpness = float(np.diff(rows, axis=1).var())
         typical = float(np.median(self._sharpness)) if self._sharpness else sharpness
         self._sharpness.append(sharpness)
         return Cause.BLURRED if sharpness < self._settings.blurred_share * typical else Cause.NONE

@@ -86,8 +86,9 @@ def ransac_resection(
     threshold_px: float,
     min_inliers: int,
     seed: int,
+    iterations: int = 800,
 ) -> Resection | None:
-    """As `refine_resection` without a start: three-point RANSAC first.
+    """As `refine_resection` without a start: three-point RANSAC first, of so many iterations at most.
 
     None below min_inliers. Source: Ke and Roumeliotis 2017 (AP3P).
     """
@@ -97,7 +98,7 @@ def ransac_resection(
     found, rotvec, translation, inliers = cv2.solvePnPRansac(
         np.ascontiguousarray(points_source, np.float64), np.ascontiguousarray(pixels[:, :2], np.float64),
         camera.matrix, np.zeros(4),
-        iterationsCount=800, reprojectionError=threshold_px, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
+        iterationsCount=iterations, reprojectionError=threshold_px, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
     )  # fmt: skip
     if not found or inliers is None or len(inliers) < min_inliers:
         return None

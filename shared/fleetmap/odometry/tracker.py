@@ -16,6 +16,7 @@ from fleetmap.pose_solver import Resection, ransac_resection, refine_resection, 
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 
 Ids = NDArray[np.int64]
+_FLOW_ITERATIONS = 200  # finds a motion that a third of the points share; with fewer the flow has failed, and a live robot must go on
 MotionSince = Callable[[int], Array | None]
 
 
@@ -196,7 +197,7 @@ class Tracker:
             return result
         again = ransac_resection(
             self._camera, points_cam[usable], measured, sigmas, threshold_px=self._settings.ransac_px,
-            min_inliers=self._settings.min_inliers, seed=count,
+            min_inliers=self._settings.min_inliers, seed=count, iterations=_FLOW_ITERATIONS,
         )  # fmt: skip
         if again is None or (result is not None and result.inliers.sum() >= again.inliers.sum()):
             again = result
