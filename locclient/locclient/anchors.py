@@ -10,6 +10,7 @@ from locclient.settings import TrackSettings
 
 # Sigmas of one step: radians, metres, share of the way.
 _STANDING, _BEGUN_ANEW = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
+_BY_SIGHT = (0.005, 0.02, 0.1)  # of a motion that no IMU vouches for: a few wrong points can turn it
 
 
 @dataclass
@@ -74,6 +75,9 @@ class Anchor:
         else:
             distance = float(np.linalg.norm(motion[0][:3, 3]))
             floor = np.diag([0.0] * 3 + [(settings.drift_floor_m + settings.drift_share * distance) ** 2] * 3)
+            if not odometry.inertial:
+                turn_rad, way_m, share = _BY_SIGHT
+                floor = np.diag([turn_rad**2] * 3 + [(way_m + share * distance) ** 2] * 3)
             self.now_map_from_body, self.now_cov = composed(
                 self.map_from_body, self.cov_rot_trans, motion[0], motion[1] + floor
             )

@@ -188,6 +188,7 @@ class Localizer:
     def _is_due(self, stamp_ns: int, odometry: OdometryEstimate) -> bool:
         settings, last = self._settings.track, self._begun_ns
         settled = self._anchor is not None and self._anchor.support >= settings.settled_fixes and not self._failed_looks
+        settled = settled and odometry.inertial
         interval_s = max(settings.fix_interval_s, settings.settled_interval_s) if settled else settings.fix_interval_s
         return last is None or odometry.after_gap or (stamp_ns - last) * 1e-9 >= 0.999 * interval_s
 
@@ -237,7 +238,8 @@ class Localizer:
         map_from_body, covariance = self._anchor.then_map_from_body, self._anchor.then_cov
         map_from_cam = map_from_body @ self._body_from_cam
         fix = relocalizer.near(seen, map_from_cam, self._at_camera(map_from_body, covariance))
-        if fix is None and self._failed_looks + 1 >= self._settings.track.search_after_failed:
+        is_sparse = self._is_sparse(frame.stamp_ns)
+        if fix is None and (is_sparse or self._failed_looks + 1 >= self._settings.track.search_after_failed):
             yield
             fixes = yield from relocalizer.anywhere(seen, None, map_from_cam[:3, :3])
             fix = fixes[0] if fixes and fixes[0].inliers >= self._settings.fix.min_inliers else None
@@ -259,7 +261,7 @@ class Localizer:
         known = None
         if len(self._candidates) == 1:
             known = (self._candidates[0].then_map_from_body @ self._body_from_cam)[:3, :3]
-        fixes += yield from relocalizer.anywhere(seen, self._places_in_prior(), known)
+        fixes = yield from relocalizer.anywhere(seen, self._places_in_prior(), known, fixes)
         return [f for f in fixes if f.inliers >= self._settings.fix.min_inliers and self._in_prior(f)]
 
     def _prior_cov_m2(self) -> Array:
@@ -335,7 +337,7 @@ class Localizer:
             for c in self._candidates
             if c is not best and c.support >= self._settings.track.rival_share * best.support
         ]
-        if not rivals and self._is_confirmed(best):
+        if not rivals and self._is_confirmed(best, fixes):
             self._anchor, self._candidates, self._prior = best, [], None
             self._ever_tracked = True
         if rivals:
@@ -368,8 +370,15 @@ class Localizer:
                 return
         self._candidates.append(fresh)
 
-    def _is_confirmed(self, candidate: Anchor) -> bool:
+    def _is_confirmed(self, candidate: Anchor, fixes: list[Fix]) -> bool:
+        """By a tight prior, by fixes and way enough, or by one fix so strong, and alone of all places that were tried, that no
+        other place of this map can be meant."""
         settings = self._settings.track
+        strong = (
+            len(self._candidates) == len(fixes) == 1
+            and fixes[0].inliers >= settings.strong_inliers
+            and fixes[0].share >= settings.strong_share
+        )
         tight = (
             self._prior is not None
             and np.sqrt(np.linalg.eigvalsh(self._prior_cov_m2())[-1]) <= settings.tight_prior_sigma_m
@@ -377,7 +386,7 @@ class Localizer:
         enough = (
             candidate.support >= settings.confirming_fixes and candidate.travelled_m >= settings.confirming_distance_m
         )
-        return bool(tight or enough)
+        return bool(tight or enough or strong)
 
     # --- output ----------------------------------------------------------------------------------------------------------
 

@@ -1,6 +1,6 @@
 """One frame placed in the map: by projection where it nearly is, by words where it might be anywhere. Pure."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar, cast
 
@@ -86,16 +86,18 @@ class Relocalizer:
         return self._by_projection(seen, map_from_cam, radius)
 
     def anywhere(
-        self, seen: Seen, allowed: NDArray[np.bool_] | None = None, map_from_cam_rotation: Array | None = None
-    ) -> Slices[list[Fix]]:
+        self, seen: Seen, allowed: NDArray[np.bool_] | None = None, map_from_cam_rotation: Array | None = None,
+        found: Sequence[Fix] = (),
+    ) -> Slices[list[Fix]]:  # fmt: skip
         """Fixes of all places that look like this one and verify, best first, duplicates removed; a slice for each place.
 
-        allowed (K,): places that may be considered. map_from_cam_rotation: the orientation, where it is known. A place
+        allowed (K,): places that may be considered. map_from_cam_rotation: the orientation, where it is known. found: fixes of
+        this frame that are known already, returned with the others. A place
         that a fix or a failed trial already stands at is not tried again: it is made of the same landmarks. One further on is,
         since identical bays and aisles must be able to speak against each other.
         """
         settings = self._settings.fix
-        fixes: list[Fix] = []
+        fixes = [fix for k, fix in enumerate(found) if all(not _same(fix, other) for other in found[:k])]
         tried: list[Array] = []
         for place in self.view.similar_places(seen.features.descriptors, allowed, _RANKED * settings.top_places):
             map_from_place = self.view.map_from_cam[place]

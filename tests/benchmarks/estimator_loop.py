@@ -19,7 +19,7 @@ from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import PositionPrior
 from fleetsim.estimator import EstimatorSession, Found
 from locclient.localizer import Estimate, Localizer
-from locclient.relocalizer import Seen
+from locclient.relocalizer import Seen, Slices
 from locclient.settings import LocalizerSettings
 
 _TILE_M = 1024.0
@@ -201,7 +201,12 @@ def run_localizer(
     localizer.handle_version(1, tiles, vocabulary, session.camera.focal_px)
     index_of = {stamp: index for index, stamp in enumerate(session.stamps_ns)}
     assert localizer._relocalizer is not None
-    localizer._relocalizer.look = lambda frame: seen(session, index_of[frame.stamp_ns])  # type: ignore[method-assign]
+
+    def look(frame: RectifiedFrame) -> Slices[Seen]:
+        yield
+        return seen(session, index_of[frame.stamp_ns])
+
+    localizer._relocalizer.look = look  # type: ignore[method-assign]
     if prior is not None:
         localizer.handle_prior(prior)
     estimates, last_ns = [], 0

@@ -4,7 +4,7 @@ The robot drives along x. Odometry is exact; what a frame's fixes say is where t
 that the script gives for that frame.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fleetmap.bow import Vocabulary
 from fleetmap.calibration import CameraCalibration, RigCalibration
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
@@ -21,6 +22,7 @@ from locclient import localizer as module
 from locclient.localizer import Estimate, Localizer, Status
 from locclient.relocalizer import Fix
 from locclient.settings import LocalizerSettings, TrackSettings
+from locclient.sight import Cause
 
 BODY_FROM_CAM = se3(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.05, 0.3]))
 MAP_FROM_ODOM = se3(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([12.0, -5.0, 1.0]))
@@ -77,16 +79,21 @@ class ScriptedRelocalizer:
     def view(self) -> Any:
         return type("View", (), {"map_from_cam": np.tile(np.eye(4), (4, 1, 1))})
 
-    def look(self, frame: RectifiedFrame) -> RectifiedFrame:
-        return frame
+    def look(self, frame: RectifiedFrame) -> Generator[None, None, list[Fix]]:
+        seen = self.fixes
+        yield
+        return seen
 
-    def near(self, seen: object, map_from_cam: Array, cov_rot_trans: Array) -> Fix | None:
+    def near(self, seen: list[Fix], map_from_cam: Array, cov_rot_trans: Array) -> Fix | None:
         reach_m = 0.3 + 3 * np.sqrt(np.trace(cov_rot_trans[3:, 3:]))
-        close = [f for f in self.fixes if np.linalg.norm(f.map_from_cam[:3, 3] - map_from_cam[:3, 3]) < reach_m]
+        close = [f for f in seen if np.linalg.norm(f.map_from_cam[:3, 3] - map_from_cam[:3, 3]) < reach_m]
         return close[0] if close else None
 
-    def anywhere(self, seen: object, allowed: object = None, rotation: object = None) -> list[Fix]:
-        return list(self.fixes)
+    def anywhere(
+        self, seen: list[Fix], allowed: object = None, rotation: object = None, found: object = ()
+    ) -> Generator[None, None, list[Fix]]:
+        yield
+        return list(seen)
 
 
 class Robot:
@@ -105,10 +112,13 @@ class Robot:
         self.odometry = ScriptedOdometry()
         self.localizer._odometry = self.odometry  # type: ignore[assignment]
         self.frames = 0
+        self.inliers = 40
+        self.is_dark = False
+        self.rng = np.random.default_rng(0)
         self.map_from_body = MAP_FROM_ODOM.copy()
 
     def load(self, version: int = 1) -> "Robot":
-        self.localizer.handle_version(version, [], None, 400.0)  # type: ignore[arg-type]
+        self.localizer.handle_version(version, [], Vocabulary.__new__(Vocabulary), 400.0)
         return self
 
     def go(self, step_m: float, offsets: Iterable[Array] = TRUE, turn_rad: float = 0.02) -> Estimate:
@@ -118,8 +128,8 @@ class Robot:
         self.odometry.next_motion = motion
         self.relocalizer.fixes = [self._fix(offset) for offset in offsets]
         self.frames += 1
-        blank = np.zeros((480, 640), np.uint8)
-        return self.localizer.handle_stereo(RectifiedFrame(self.frames * FRAME_NS, blank, None, None))
+        picture = np.zeros((480, 640), np.uint8) if self.is_dark else self.rng.integers(0, 255, (480, 640), np.uint8)
+        return self.localizer.handle_stereo(RectifiedFrame(self.frames * FRAME_NS, picture, None, None))
 
     def ride(self, steps: int, step_m: float, offsets: Sequence[Array] = TRUE) -> list[Estimate]:
         return [self.go(step_m, offsets) for _ in range(steps)]
@@ -127,7 +137,7 @@ class Robot:
     def _fix(self, offset: Array) -> Fix:
         moved = self.map_from_body.copy()
         moved[:3, 3] += offset
-        return Fix(moved @ BODY_FROM_CAM, np.diag([0.002**2] * 3 + [0.01**2] * 3), 60, 20)
+        return Fix(moved @ BODY_FROM_CAM, np.diag([0.002**2] * 3 + [0.01**2] * 3), self.inliers, 20)
 
     def error_m(self, estimate: Estimate) -> float:
         assert estimate.map_from_body is not None
@@ -167,7 +177,7 @@ def test_tracking_takes_three_fixes_however_far_the_way(robot: Robot) -> None:
 def test_tracking_takes_a_metre_however_many_the_fixes(robot: Robot) -> None:
     said = robot.ride(12, 0.13)  # the first frame stands; 8 steps are 1.04 m
     assert [e.status for e in said] == [Status.INITIALISING] * 8 + [Status.TRACKING] * 4
-    assert all(e.fix is not None for e in said)
+    assert all(e.fix is not None for e in said[:10])
     assert all(robot.error_m(e) < 1e-6 for e in said[-1:])
 
 
@@ -309,7 +319,48 @@ def test_no_number_of_fixes_claims_more_than_the_map_knows(tracking: Robot) -> N
     assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[:3, :3])[0]) >= settings.map_sigma_rad
 
 
-def test_the_map_is_looked_at_as_often_as_set_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_map_is_looked_at_as_often_as_set_over_frames_that_lie_closer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first look is done at once, the others go on in the frame after, while the robot moves on; nothing is lost by that."""
+    robot = Robot(monkeypatch, fix_interval_s=0.6, settled_interval_s=0.6).load()
+    robot.inliers = 100
+    said = [robot.go(0.5, [off(0.0)]) for _ in range(11)]
+    numbers = {(e.stamp_ns // FRAME_NS, e.fix_stamp_ns // FRAME_NS) for e in said if e.fix_stamp_ns is not None}
+    assert numbers == {(1, 1), (5, 4), (8, 7), (11, 10)}
+
+
+def test_a_look_that_took_two_frames_corrects_the_present(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fixes are those of the frame that was looked at; the robot has turned and moved since."""
     robot = Robot(monkeypatch, fix_interval_s=0.6).load()
-    said = robot.ride(10, 0.5)
-    assert [e.fix is not None for e in said] == [k % 3 == 0 for k in range(10)]
+    said = [robot.go(0.4, turn_rad=0.2) for _ in range(30)]
+    assert said[-1].status is Status.TRACKING
+    assert all(robot.error_m(e) < 1e-6 for e in said[-1:])
+
+
+def test_one_strong_fix_alone_is_believed(robot: Robot) -> None:
+    robot.inliers = 100
+    estimate = robot.go(0.0)
+    assert estimate.status is Status.TRACKING
+    assert robot.error_m(estimate) < 1e-6
+
+
+def test_a_strong_fix_with_a_rival_is_not_believed(robot: Robot) -> None:
+    robot.inliers = 100
+    said = robot.ride(8, 0.0, [off(0.0), off(0.0, 5.0)])
+    assert {e.status for e in said} == {Status.AMBIGUOUS}
+
+
+def test_darkness_is_named_within_a_second(tracking: Robot) -> None:
+    tracking.is_dark = True
+    said = [tracking.go(0.2, NO_FIX) for _ in range(5)]
+    assert said[-1].status is Status.DEGRADED
+    assert said[-1].cause is Cause.DARK
+    assert said[0].cause is Cause.NONE
+    tracking.is_dark = False
+    after = tracking.ride(3, 0.2)[-1]
+    assert (after.status, after.cause) == (Status.TRACKING, Cause.NONE)
+
+
+def test_what_was_never_seen_says_so(tracking: Robot) -> None:
+    said = [tracking.go(0.2, NO_FIX) for _ in range(9)]
+    assert said[-1].status is Status.DEGRADED
+    assert said[-1].cause is Cause.UNMATCHED

@@ -16,7 +16,9 @@ from fleetmap.pose_solver import Resection, ransac_resection, refine_resection, 
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 
 Ids = NDArray[np.int64]
-_FLOW_ITERATIONS = 200  # finds a motion that a third of the points share; with fewer the flow has failed, and a live robot must go on
+_FLOW_ITERATIONS = (
+    200  # finds a motion that a third of the points share; with fewer the flow has failed, and a live robot must go on
+)
 MotionSince = Callable[[int], Array | None]
 
 
