@@ -18,7 +18,8 @@ class Anchor:
     """Where the body was in `map` at one frame of the odometry, and everything that speaks for it.
 
     map_from_body and cov_rot_trans: at that frame. now_map_from_body, now_cov: the same carried to the present. then_map_from_body,
-    then_cov: at the frame that the map is being looked at for, which may be some frames ago. stamp_ns: of its last fix.
+    then_cov: at the frame that the map is being looked at for, which may be some frames ago. stamp_ns: of its last fix. support: fixes
+    that agreed; evidence: their inliers, older ones fading.
     """
 
     frame_index: int
@@ -30,6 +31,7 @@ class Anchor:
     then_map_from_body: Array = field(default_factory=lambda: np.eye(4))
     then_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
     support: int = 1
+    evidence: float = 0.0
     misses: int = 0
     travelled_m: float = 0.0
     strangers: list["Anchor"] = field(default_factory=list)

@@ -23,6 +23,9 @@ from locclient.sight import Cause, SightJudge
 _RADIUS_95 = 2.796  # of a three-dimensional normal distribution, in sigmas
 _SPREAD_SHARE = 0.45  # of the time between two looks: frames that come less often are not made to share one
 
+_CANDIDATES_AT_ONCE = 3  # in one slice of a search
+_PLACE_REACH_M = 3.0  # from a place that shows the same as the robot sees
+
 
 class Status(StrEnum):
     """What an estimate is worth."""
@@ -250,14 +253,15 @@ class Localizer:
     def _search(self, seen: Seen, relocalizer: Relocalizer) -> Slices[list[Fix]]:
         """Fixes anywhere, around the candidates first; inside the prior where there is one."""
         fixes: list[Fix] = []
-        for candidate in self._candidates:
+        for number, candidate in enumerate(self._candidates):
             map_from_body, covariance = candidate.then_map_from_body, candidate.then_cov
             fix = relocalizer.near(
                 seen, map_from_body @ self._body_from_cam, self._at_camera(map_from_body, covariance)
             )
             if fix is not None:
                 fixes.append(fix)
-            yield
+            if number % _CANDIDATES_AT_ONCE == _CANDIDATES_AT_ONCE - 1:
+                yield
         known = None
         if len(self._candidates) == 1:
             known = (self._candidates[0].then_map_from_body @ self._body_from_cam)[:3, :3]
@@ -274,7 +278,7 @@ class Localizer:
             return None
         off = self._relocalizer.view.map_from_cam[:, :2, 3] - self._prior.map_from_base[:2, 3]
         sigma = float(np.sqrt(np.linalg.eigvalsh(self._prior_cov_m2())[-1]))
-        return np.asarray(np.linalg.norm(off, axis=1) < 3.7 * sigma + 10.0)
+        return np.asarray(np.linalg.norm(off, axis=1) < 3.7 * sigma + _PLACE_REACH_M)
 
     def _in_prior(self, fix: Fix) -> bool:
         """Whether a fix lies within the 0.999 bound of the prior's position."""
@@ -326,17 +330,14 @@ class Localizer:
         """Every fix speaks for a candidate or begins one; confirmed is the one that is left with enough behind it."""
         for candidate in self._candidates:
             candidate.misses += 1
+            candidate.evidence *= self._settings.track.evidence_kept_share
         for fix in fixes:
             self._weigh_one(fix)
         self._candidates = [c for c in self._candidates if c.misses < self._settings.track.max_misses]
         if not fixes:
             return _Outcome(None, "nothing in the map agrees with this frame")
-        best = max(self._candidates, key=lambda c: c.support)
-        rivals = [
-            c
-            for c in self._candidates
-            if c is not best and c.support >= self._settings.track.rival_share * best.support
-        ]
+        best = self._ranked()[0]
+        rivals = self._rivals()
         if not rivals and self._is_confirmed(best, fixes):
             self._anchor, self._candidates, self._prior = best, [], None
             self._ever_tracked = True
@@ -366,9 +367,20 @@ class Localizer:
             ):
                 if candidate.misses:  # at most one vote a frame
                     candidate.support, candidate.misses = candidate.support + 1, 0
+                    candidate.evidence += fix.inliers
                 candidate.moved_to(fresh)
                 return
+        fresh.evidence = float(fix.inliers)
         self._candidates.append(fresh)
+
+    def _ranked(self) -> list[Anchor]:
+        """Candidates, the one that most speaks for first."""
+        return sorted(self._candidates, key=lambda c: -c.evidence)
+
+    def _rivals(self) -> list[Anchor]:
+        """Candidates besides the best that nearly as much speaks for."""
+        ranked = self._ranked()
+        return [c for c in ranked[1:] if c.evidence >= self._settings.track.rival_share * ranked[0].evidence]
 
     def _is_confirmed(self, candidate: Anchor, fixes: list[Fix]) -> bool:
         """By a tight prior, by fixes and way enough, or by one fix so strong, and alone of all places that were tried, that no
@@ -378,6 +390,8 @@ class Localizer:
             len(self._candidates) == len(fixes) == 1
             and fixes[0].inliers >= settings.strong_inliers
             and fixes[0].share >= settings.strong_share
+            and self._relocalizer is not None
+            and self._relocalizer.view.twin_score(fixes[0].map_from_cam) < settings.twin_score
         )
         tight = (
             self._prior is not None
@@ -397,10 +411,13 @@ class Localizer:
         )  # fmt: skip
         if self._anchor is not None:
             status, cause = self._worth(self._anchor, odometry)
+            if status is not Status.TRACKING and self._anchor.strangers:  # there, or where fixes say since: who knows
+                places = (self._anchor, *self._anchor.strangers)
+                doubts = tuple(Hypothesis(c.now_map_from_body, c.support) for c in places)
+                return replace(said, status=Status.AMBIGUOUS, cause=cause, hypotheses=doubts)
             now, covariance = self._anchor.now_map_from_body, self._published(self._anchor.now_cov)
             return replace(said, status=status, cause=cause, map_from_body=now, cov_rot_trans=covariance)
-        ranked = sorted(self._candidates, key=lambda c: -c.support)
-        rivals = [c for c in ranked[1:] if c.support >= self._settings.track.rival_share * ranked[0].support]
+        ranked, rivals = self._ranked(), self._rivals()
         status = Status.AMBIGUOUS if rivals else Status.LOST if self._ever_tracked else Status.INITIALISING
         said = replace(
             said, status=status, hypotheses=tuple(Hypothesis(c.now_map_from_body, c.support) for c in ranked)
@@ -419,8 +436,7 @@ class Localizer:
         cause = self._cause or (Cause.ODOMETRY if is_lost else Cause.UNMATCHED if self._failed_looks else Cause.NONE)
         if radius > settings.lost_radius_m:
             return Status.LOST, cause
-        late_s = settings.degraded_after_s if self._cause is Cause.NONE else settings.suspicious_after_s
-        if radius > settings.degraded_radius_m or age_s > late_s or self._cause is Cause.FROZEN:
+        if radius > settings.degraded_radius_m or age_s > settings.degraded_after_s or self._cause is Cause.FROZEN:
             return Status.DEGRADED, cause
         return Status.TRACKING, Cause.NONE
 

@@ -14,6 +14,7 @@ from locclient import map_view_kernels
 
 Rows = NDArray[np.int64]
 _NEAREST_M = 0.2
+_ELSEWHERE_M, _LOOKS_AWAY = 3.0, 0.3
 _REACH_SHARE = 1.3  # of the distance up to which a landmark was found: detection does not end sharply
 
 
@@ -38,7 +39,7 @@ class MapView:
         self.map_from_cam = _joined([t.map_from_cam for t in held], (0, 4, 4), np.float64)
         self.place_rows = [self._rows(ids) for t in held for ids in t.place_landmark_ids]
         self._index = PlaceIndex(vocabulary.word_count)
-        words = vocabulary.words(self.descriptors) if len(self.descriptors) else np.zeros(0, np.int32)
+        self._words = words = vocabulary.words(self.descriptors) if len(self.descriptors) else np.zeros(0, np.int32)
         for place, rows in enumerate(self.place_rows):
             self._index.add(place, vocabulary.bow_vector(words[rows]))
 
@@ -58,6 +59,17 @@ class MapView:
         vector = self.vocabulary.bow_vector(self.vocabulary.words(descriptors))
         places, _ = self._index.query(vector, allowed, top)
         return places
+
+    def twin_score(self, map_from_cam: Array) -> float:
+        """How much the place nearest to a camera looks like any elsewhere in this map, 0 to 1: 0.4 and more in aisles alike."""
+        apart_m = np.linalg.norm(self.map_from_cam[:, :3, 3] - map_from_cam[:3, 3], axis=1)
+        nearest = int(np.argmin(apart_m - self.map_from_cam[:, :3, 2] @ map_from_cam[:3, 2]))
+        vector = self.vocabulary.bow_vector(self._words[self.place_rows[nearest]])
+        there = self.map_from_cam[nearest]
+        apart_m = np.linalg.norm(self.map_from_cam[:, :3, 3] - there[:3, 3], axis=1)
+        looks_away = self.map_from_cam[:, :3, 2] @ there[:3, 2] < _LOOKS_AWAY
+        _, scores = self._index.query(vector, (apart_m > _ELSEWHERE_M) | ((apart_m > 1.0) & looks_away), 1)
+        return float(scores[0]) if len(scores) else 0.0
 
     def visible(
         self, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float

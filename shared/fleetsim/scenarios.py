@@ -132,6 +132,7 @@ def _identical() -> Scenario:
     runs = {
         "survey": Run("surveyor", (_snake(layout, range(6)),), is_sharp=True, zone_period_s=20.0),
         "tote-1": Run("tote", (_loop(layout, 1, 2),), zone_period_s=20.0),
+        "runner-1": Run("runner", (_loop(layout, 2, 1),), zone_period_s=20.0),
     }
     return Scenario("six aisles that look the same until stock is moved: aliasing", layout, runs)
 

@@ -74,10 +74,13 @@ class ScriptedRelocalizer:
     """Offers the fixes of the present frame: near the prediction the one that lies there, anywhere all of them."""
 
     fixes: list[Fix] = field(default_factory=list)
+    twin_score: float = 0.1
 
     @property
     def view(self) -> Any:
-        return type("View", (), {"map_from_cam": np.tile(np.eye(4), (4, 1, 1))})
+        return type(
+            "View", (), {"map_from_cam": np.tile(np.eye(4), (4, 1, 1)), "twin_score": lambda _: self.twin_score}
+        )
 
     def look(self, frame: RectifiedFrame) -> Generator[None, None, list[Fix]]:
         seen = self.fixes
@@ -341,6 +344,11 @@ def test_one_strong_fix_alone_is_believed(robot: Robot) -> None:
     estimate = robot.go(0.0)
     assert estimate.status is Status.TRACKING
     assert robot.error_m(estimate) < 1e-6
+
+
+def test_a_strong_fix_where_the_map_has_a_twin_must_be_confirmed(robot: Robot) -> None:
+    robot.inliers, robot.relocalizer.twin_score = 100, 0.45
+    assert [e.status for e in robot.ride(3, 0.6)] == [Status.INITIALISING] * 2 + [Status.TRACKING]
 
 
 def test_a_strong_fix_with_a_rival_is_not_believed(robot: Robot) -> None:
