@@ -365,7 +365,7 @@ class Odometry:
             self._observations.add(earlier.frame_index, earlier.ids, earlier.pixels)
         self._observations.add(self._frame_index, tracked.ids, tracked.pixels)
         self._newest = (tracked.ids, tracked.pixels)
-        self._scene_depth_m = self._depth_of(tracked.pixels)
+        self._newest_depth_m = self._depth_of(tracked.pixels)
 
     def _consume(self, tracked: Tracked) -> NDArray[np.int8]:
         """Uses tracks that ended, that are due in their turn, or (after a gap) all.
@@ -394,11 +394,14 @@ class Odometry:
             earlier, candidate = self._filter.odom_from_clone(ids[-3]), self._filter.odom_from_clone(ids[-2])
             moved = se3_inverse(earlier) @ candidate
             angle = np.arccos(np.clip(0.5 * (np.trace(moved[:3, :3]) - 1), -1, 1))
-            parallax = float(np.linalg.norm(moved[:3, 3])) / self._scene_depth_m
+            parallax = float(np.linalg.norm(moved[:3, 3])) / self._scene_depth_m()
             still = angle < settings.keyframe_rotation_rad and parallax < settings.keyframe_parallax
             gone = ids[-2] if still else ids[0]
             self._filter.remove_clone(gone)
             self._clone_stamps.pop(gone, None)
+
+    def _scene_depth_m(self) -> float:
+        return self._newest_depth_m
 
     def _depth_of(self, pixels: Array) -> float:
         disparities = pixels[:, 0] - pixels[:, 2]
@@ -427,7 +430,7 @@ class Odometry:
             accel_bias_mps2=state.accel_bias_mps2.copy(),
             status=status,
             track_ids=tracked.ids,
-            scene_depth_m=self._scene_depth_m,
+            scene_depth_m=self._scene_depth_m(),
             inlier_share=share,
             after_gap=tracked.by_descriptors,
             inertial=self._inertial,
