@@ -91,7 +91,7 @@ class MonocularOdometry(Odometry):
     ) -> None:  # fmt: skip
         super().__init__(calibration, camera, body_from_cam, imu_minus_cam_s, settings, stereo_settings)
         self._tracker = MonocularTracker(camera, settings.tracker, self._points_before)
-        self._observations = MonocularObservations(lambda: self._scene_depth_m)
+        self._observations = MonocularObservations(self._scene_depth_m)
         self._vision_odometry = VisualOdometry(camera, settings.monocular)
         self._lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, 0.0])
         self._sightings: dict[int, list[tuple[int, Array]]] = {}
@@ -99,7 +99,7 @@ class MonocularOdometry(Odometry):
         self._newest_pixels: tuple[NDArray[np.int64], Array] = (np.zeros(0, np.int64), np.zeros((0, 2)))
         self._still_since_ns: int | None = None
         self._tried_ns = 0
-        self._scene_depth_m = settings.monocular.first_depth
+        self._depth_m = settings.monocular.first_depth
 
     def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
         """The estimate at `frame`, of one image in spite of the name; newer than any before."""
@@ -120,7 +120,7 @@ class MonocularOdometry(Odometry):
         start = None if self._noise is None else self._metric_start(stamp_ns, sight)
         if start is not None:
             revised = self._go_metric(stamp_ns, *start)
-        self._scene_depth_m = sight.depth * (1.0 if start is None or start[1] is None else start[1])
+        self._depth_m = sight.depth * (1.0 if start is None or start[1] is None else start[1])
         estimate = self._sight_estimate(frame.stamp_ns, tracked, sight, revised)
         self._frame_index += 1
         return estimate
@@ -280,15 +280,15 @@ class MonocularOdometry(Odometry):
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
             if (rotations[views[0]] @ rays[0]) @ (rotations[views[-1]] @ rays[1]) > least:
                 continue
-            point = positions[views[-1]] + self._scene_depth_m * rotations[views[-1]] @ rays[1]
+            point = positions[views[-1]] + self._depth_m * rotations[views[-1]] @ rays[1]
             if filter_kernels.triangulate(rotations, positions, views, pixels, self._lens, weights, point):
                 out[n] = point
         points = transform_points(se3_inverse(odom_from_cam[-1]), out)
         with np.errstate(invalid="ignore"):
             known = (points[:, 2] > 0) & (points[:, 2] < _FAR_M)
         if known.sum() >= self._settings.monocular.min_points:
-            self._scene_depth_m = float(np.median(points[known, 2]))
+            self._depth_m = float(np.median(points[known, 2]))
         return points
 
-    def _depth_of(self, pixels: Array) -> float:
-        return self._scene_depth_m
+    def _scene_depth_m(self) -> float:
+        return self._depth_m
