@@ -89,8 +89,8 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
 
         with ZenohBus.listen("tcp/127.0.0.1:0") as found_port:
             endpoint = found_port.endpoint  # free again in a moment, and nobody answers there
-        dark_walk = write_walk(tmp_path / "dark", 140, range(60, 140))
-        with daemon(configuration(tmp_path, dark_walk, endpoint, speed=2.0), tmp_path / "notify") as process:
+        dark_walk = write_walk(tmp_path / "dark", 280, range(130, 280))
+        with daemon(configuration(tmp_path, dark_walk, endpoint, speed=0.0), tmp_path / "notify") as process:
             spool = tmp_path / "spool.sqlite3"
             wait_for(lambda: any((tmp_path / "failures").glob("*.json")), process)
             process.send_signal(signal.SIGKILL)
