@@ -62,12 +62,13 @@ class MapView:
 
     def twin_score(self, map_from_cam: Array) -> float:
         """How much the place nearest to a camera looks like any elsewhere in this map, 0 to 1: 0.4 and more in aisles alike."""
-        apart_m = np.linalg.norm(self.map_from_cam[:, :3, 3] - map_from_cam[:3, 3], axis=1)
-        nearest = int(np.argmin(apart_m - self.map_from_cam[:, :3, 2] @ map_from_cam[:3, 2]))
+        axes_map, places_map = self.map_from_cam[:, :3, 2], self.map_from_cam[:, :3, 3]
+        axis_map = map_from_cam[:3, 2]
+        apart_m = np.linalg.norm(places_map - map_from_cam[:3, 3], axis=1)
+        nearest = int(np.argmin(apart_m - axes_map @ axis_map))
         vector = self.vocabulary.bow_vector(self._words[self.place_rows[nearest]])
-        there = self.map_from_cam[nearest]
-        apart_m = np.linalg.norm(self.map_from_cam[:, :3, 3] - there[:3, 3], axis=1)
-        looks_away = self.map_from_cam[:, :3, 2] @ there[:3, 2] < _LOOKS_AWAY
+        apart_m = np.linalg.norm(places_map - places_map[nearest], axis=1)
+        looks_away = axes_map @ axes_map[nearest] < _LOOKS_AWAY
         _, scores = self._index.query(vector, (apart_m > _ELSEWHERE_M) | ((apart_m > 1.0) & looks_away), 1)
         return float(scores[0]) if len(scores) else 0.0
 
