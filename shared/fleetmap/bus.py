@@ -322,7 +322,7 @@ class ZenohBus(Bus):
     def alive(self, key_expr: str, *, timeout_s: float = 2.0) -> list[str]:
         """See Bus."""
         # A router answers from its own table before `get` returns: what the channel does not hold would stop it for ever.
-        channel = zenoh.handlers.FifoChannel(_MAX_ALIVE)
+        channel: Any = zenoh.handlers.FifoChannel(_MAX_ALIVE)
         replies = self._guarded(lambda: self._session.liveliness().get(key_expr, channel, timeout=timeout_s))
         return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 
