@@ -27,6 +27,7 @@ MAX_MESSAGE_BYTES = 1 << 20  # whatever is larger travels in parts: one large me
 
 _log = logging.getLogger(__name__)
 _RETRY_S = 0.05
+_MAX_ALIVE = 1 << 17
 
 
 class Handle:
@@ -320,7 +321,9 @@ class ZenohBus(Bus):
 
     def alive(self, key_expr: str, *, timeout_s: float = 2.0) -> list[str]:
         """See Bus."""
-        replies = self._guarded(lambda: self._session.liveliness().get(key_expr, timeout=timeout_s))
+        # A router answers from its own table before `get` returns: what the channel does not hold would stop it for ever.
+        channel: Any = zenoh.handlers.FifoChannel(_MAX_ALIVE)
+        replies = self._guarded(lambda: self._session.liveliness().get(key_expr, channel, timeout=timeout_s))
         return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 
     def connected(self) -> bool:

@@ -197,3 +197,14 @@ def test_key_expressions() -> None:
         ("a/*", "a", False),
     ):
         assert key_matches(key_expr, key) is expected, (key_expr, key)
+
+
+def test_presence_of_more_than_a_channel_usually_holds() -> None:
+    with ZenohBus.listen("tcp/127.0.0.1:0") as server, ZenohBus.connect(server.endpoint) as robots:
+        keys = [f"fleetmap/lab/robots/r{n}/alive" for n in range(700)]
+        for key in keys:
+            robots.declare_alive(key)
+        deadline = time.monotonic() + 20
+        while len(found := server.alive("fleetmap/*/robots/*/alive")) < len(keys) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert found == sorted(keys)
