@@ -4,7 +4,9 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -140,8 +142,6 @@ def failure(
     robot: str, failure_id: str, *, cause: str = "dark", kind: str = "blind", wall_ns: int | None = None
 ) -> FailureReport:
     """A failure with everything that a robot can tell."""
-    import time
-
     at = np.array([20.0, 6.0, 0.0])
     return FailureReport(
         site=SITE,
@@ -199,11 +199,45 @@ def speak(
     bus.publish(robot_key(SITE, robot, "health"), encode_message(health))
 
 
-def speak_all(bus: ZenohBus, count: int, stamp_ns: int, *, with_health: bool = True) -> None:
-    """`count` robots, most of them well."""
+def speak_all(
+    bus: ZenohBus,
+    count: int,
+    stamp_ns: int,
+    *,
+    with_health: bool = True,
+    moved: Mapping[str, tuple[float, float]] | None = None,
+) -> None:
+    """`count` robots, most of them well; those that moved are lost where they went."""
     for number in range(count):
-        status = _STATUSES[number % len(_STATUSES)]
-        speak(bus, f"tug-{number}", stamp_ns, place_of(number), status, with_health=with_health)
+        robot, status = f"tug-{number}", _STATUSES[number % len(_STATUSES)]
+        place_m = (moved or {}).get(robot)
+        if place_m is None:
+            speak(bus, robot, stamp_ns, place_of(number), status, with_health=with_health)
+        else:
+            speak(bus, robot, stamp_ns, place_m, "LOST", with_health=with_health)
+
+
+@contextmanager
+def talking(endpoint: str, count: int) -> Iterator[dict[str, tuple[float, float]]]:
+    """Robots that speak every second, as real ones do; what is put into the dictionary moves them there."""
+    moved: dict[str, tuple[float, float]] = {}
+    ended = threading.Event()
+    with ZenohBus.connect(endpoint) as bus:
+
+        def talk() -> None:
+            stamp_ns = time.time_ns()
+            while not ended.is_set():
+                speak_all(bus, count, stamp_ns, moved=dict(moved))
+                stamp_ns += 1_000_000_000
+                ended.wait(1.0)
+
+        thread = threading.Thread(target=talk)
+        thread.start()
+        try:
+            yield moved
+        finally:
+            ended.set()
+            thread.join()
 
 
 @dataclass

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import httpx
 import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
@@ -18,8 +19,7 @@ from dashboard_scene import (
     fill_store,
     place_of,
     serving,
-    speak,
-    speak_all,
+    talking,
     watch,
 )
 from fleetmap.bus import ZenohBus
@@ -53,8 +53,11 @@ def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     folder = tmp_path_factory.mktemp("store")
     fill_store(folder)
     with serving(folder) as server:
-        with ZenohBus.connect(server.zenoh) as bus:
-            speak_all(bus, ROBOTS, 1_000_000_000)
+        with talking(server.zenoh, ROBOTS):
+            deadline_s = time.monotonic() + 30
+            while len(httpx.get(f"{server.http}/v1/robots?limit=1000").json()["robots"]) < ROBOTS:
+                assert time.monotonic() < deadline_s
+                time.sleep(0.2)
         yield server
     assert [line for line in server.log if "ERROR" in line or "Traceback" in line] == []
 
@@ -120,19 +123,18 @@ WEAKEST_CONTRAST = """() => {
 
 
 def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> None:
-    with ZenohBus.connect(served.zenoh) as bus:
-        speak_all(bus, ROBOTS, 2_000_000_000)
+    with talking(served.zenoh, ROBOTS) as moved:
         seen = opened(page, served, "")
-        expect(page.locator(".figures")).to_contain_text(f"{ROBOTS} of {ROBOTS}")
+        expect(page.locator(".figures")).to_contain_text(f"{ROBOTS} of {ROBOTS}", timeout=15_000)
         mark = page.locator(".mark", has=page.locator("title", has_text=re.compile(r"^tug-4:")))
         assert _place(mark.get_attribute("transform")) == pytest.approx(place_of(4), abs=1e-3)
         before = page.evaluate("performance.timeOrigin")
-        speak(bus, "tug-4", 3_000_000_000, (40.0, 14.0), "LOST")
-        expect(mark).to_have_attribute("transform", re.compile(r"translate\(40\.000 -14\.000\)"), timeout=5000)
-        expect(mark).to_have_class("mark bad")
+        moved["tug-4"] = (40.0, 14.0)
+        expect(mark).to_have_attribute("transform", re.compile(r"translate\(40\.000 -14\.000\)"), timeout=15_000)
+        expect(mark).to_have_class("mark bad", timeout=15_000)
         page.get_by_label("Find a robot").fill("tug-4")
         row = page.locator("tbody tr", has=page.get_by_role("link", name="tug-4", exact=True))
-        expect(row).to_contain_text("lost")
+        expect(row).to_contain_text("lost", timeout=15_000)
         assert page.evaluate("performance.timeOrigin") == before, "the page changed by itself, it was not loaded again"
         assert seen.faults == []
 
