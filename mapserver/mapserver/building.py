@@ -133,7 +133,8 @@ def build_draft(
         built = _survey(order, admitted, zones, base, chosen, settings, console, times, started_s, unusable)
         draft = _keep(order, built, parent, settings, maps)
         places = loop_places([s.entry.name for s in built.taken], [s.survey for s in built.taken], built.joined)
-        job.message, job.report = draft.sentence, draft.report | {"version": draft.version, "loop_places": places}
+        draft = replace(draft, report=draft.report | {"loop_places": places})
+        job.message, job.report = draft.sentence, draft.report | {"version": draft.version}
         return draft
 
 

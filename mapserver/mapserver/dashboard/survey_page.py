@@ -80,10 +80,15 @@ def _time(text: str | None) -> str | None:
 
 async def _one_job(rooms: Rooms, where: Where, job: JobInfo) -> None:
     html(Markup("<h2>Job {}: {}</h2><p>{}</p>").format(job.id, job.kind, job.message or _state(job)))
-    report = job.report.get("build") if isinstance(job.report.get("build"), dict) else job.report
-    assert isinstance(report, dict)
+    report = _build_of(job.report)
     html(Markup('<div class="pair">{}{}</div>').format(_doctor(report), _recordings(report)))
     await _loops(rooms, where, report)
+
+
+def _build_of(report: dict[str, Any]) -> dict[str, Any]:
+    """The build that a job's report tells of: a night's last one, else the report itself."""
+    builds = list(_dicts(report.get("builds")))
+    return builds[-1] if builds else report
 
 
 def _doctor(report: dict[str, Any]) -> Markup:

@@ -223,8 +223,8 @@ def test_a_job_shows_the_doctor_and_its_loops(page: Page, served: Served) -> Non
         expect(content).to_contain_text(words)
     assert [page.locator(f".line.{tone}").count() for tone in ("good", "bad", "quiet")] == [1, 1, 1]
     with MapStore.open(served.folder) as store:
-        store.begin_job(SITE, "nightly")
-    expect(page.locator("tbody").first).to_contain_text("nightly", timeout=8000)
+        store.begin_job(SITE, "convert")
+    expect(page.locator("tbody").first).to_contain_text("convert", timeout=8000)
     assert seen.faults == []
 
 
