@@ -105,7 +105,10 @@ def survey_from(
             guess = _with_depths(guess, state, depths)
             keyframes = guess.keyframes
             finder = PairFinder(keyframes, state.camera, rectifier.body_from_cam, settings, worker)
-        pairs = _match_all(state, finder, settings, progress)
+        if (
+            round_number == 0 or depths is not None
+        ):  # a second search finds hardly a match more; its coordinates are finer
+            pairs = _match_all(state, finder, settings, progress)
         state.landmarks = build_landmarks(
             keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings, worker
         )
