@@ -21,7 +21,8 @@ def test_pose_graph(name: str) -> None:
     (figures,) = bench_solvers.pose_graphs([name]).values()
     print(json.dumps({name: figures}))
     assert figures["above_best"] <= 1e-3
-    assert figures["wrong_kept"] == 0
+    # Where the noise turns whole spheres, one loop in hundreds that was drawn at random lies within it.
+    assert figures["wrong_kept"] <= 0.005 * figures["loops_wrong"]
     assert figures["off_clean_share_of_extent"] <= 0.02
 
 
