@@ -33,7 +33,9 @@ from mapserver.survey.zones import Zones
 
 NAME = "identical-aisles-118m"
 MAX_ATE_M = 0.025
-TRUE_EDGE_M = 0.5  # an accepted loop that is farther from the truth is wrong: bays repeat at 2.7 m, aisles at more
+# A loop that is off by more than half of the smallest step by which the site repeats takes one place for another. Below that it
+# sees the right thing, from as far as six metres along an aisle with sigmas of a quarter of a metre.
+TRUE_EDGE_M = 0.5 * Layout.bay_m
 UNGATED = LoopSettings(max_innovation=np.inf, view_range_depths=1e9, rotation_sigma_limit_rad=0.0)
 
 
