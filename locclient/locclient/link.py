@@ -284,7 +284,8 @@ class CachedMap:
 
     def vocabulary(self, manifest: Manifest) -> bytes:
         """The version's vocabulary; LinkError where it is not here."""
-        return self._blob(manifest.vocabulary.sha256)
+        sha256 = manifest.vocabulary.sha256
+        return shipped_vocabulary(sha256) or self._blob(sha256)
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
         """Tiles of the version, as `MapLink.tiles`."""
@@ -336,7 +337,9 @@ def _wanted_of(site: str, active: ActiveVersion) -> WantedVersion:
 
 def _addresses(manifest: Manifest, wanted: WantedVersion) -> list[str]:
     """Of all that a version consists of, its manifest first."""
-    return [wanted.manifest_sha256 or "", manifest.vocabulary.sha256, *(tile.sha256 for tile in manifest.tiles)]
+    vocabulary = manifest.vocabulary.sha256
+    words = [] if shipped_vocabulary(vocabulary) else [vocabulary]  # what ships with the program is always here
+    return [wanted.manifest_sha256 or "", *words, *(tile.sha256 for tile in manifest.tiles)]
 
 
 def _address(wanted: WantedVersion) -> tuple[int, str]:
