@@ -24,7 +24,8 @@ def loop_places(names: Sequence[str], surveys: Sequence[Survey], joined: Joined)
     refused: list[dict[str, Any]] = []
     for name, survey, map_from_body in zip(names, surveys, parts, strict=True):
         frames = [keyframe.frame_index for keyframe in survey.first_guess.keyframes]
-        for record in survey.loops.records:
+        # Records keep the numbers that keyframes had before parts of the survey were left out: then no places are known.
+        for record in survey.loops.records if all(part.kept for part in survey.parts) else ():
             place = _place(name, record, map_from_body[:, :2, 3], frames)
             (accepted if record.verdict is Verdict.ACCEPTED else refused).append(place)
     refused.sort(key=lambda place: (-place["score"], place["recording"], place["from_map_m"], place["to_map_m"]))
