@@ -94,14 +94,16 @@ def world(tmp_path: Path) -> Iterator[World]:
     with MapStore.open(tmp_path / "store", create=True) as store, MemoryBus(hub) as bus, MemoryBus(hub) as robot_bus:
         robot_world.save(store)
         fleet = Fleet(store)
-        service = TileService(store, fleet, bus, lambda *_: None)
         made = World(hub, store, fleet, robot_bus, tmp_path)
 
         def take(_: str, payload: bytes) -> bytes:
             made.table.append(decode_message(payload, FailureReport).id)
             return encode_message(FailureAck(id=made.table[-1]))
 
-        bus.queryable(robot_key("*", "*", "failures"), take)
+        bus.queryable(
+            robot_key("*", "*", "failures"), take
+        )  # before the service's own table: what arrives is looked at here
+        service = TileService(store, fleet, bus, lambda *_: None)
         yield made
         service.close()
 

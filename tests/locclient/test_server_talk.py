@@ -80,7 +80,7 @@ def world(tmp_path: Path) -> Iterator[World]:
         made_late: list[
             World
         ] = []  # asked before the service's own table is: these tests look at what arrives, and when
-        bus.queryable(robot_key("*", "*", "failures"), lambda key, payload: made_late[0].take_failure(key, payload))
+        bus.queryable(robot_key("*", "*", "failures"), lambda *asked: made_late[0].take_failure(*asked))
         service = TileService(store, fleet, bus, lambda *_: None)
         link = MapLink(robot_bus, TileCache(tmp_path / "cache"), "lab", "r1")
         spool = Spool(tmp_path / "spool", max_bytes=10**6)
