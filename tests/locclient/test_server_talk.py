@@ -77,10 +77,12 @@ def world(tmp_path: Path) -> Iterator[World]:
         save_sample_draft(store)
         store.publish("lab")
         fleet = Fleet(store)
-        made_late: list[
-            World
-        ] = []  # asked before the service's own table is: these tests look at what arrives, and when
-        bus.queryable(robot_key("*", "*", "failures"), lambda *asked: made_late[0].take_failure(*asked))
+        made_late: list[World] = []
+
+        def take(key: str, payload: bytes) -> bytes:  # before the service's own table: what arrives is looked at here
+            return made_late[0].take_failure(key, payload)
+
+        bus.queryable(robot_key("*", "*", "failures"), take)
         service = TileService(store, fleet, bus, lambda *_: None)
         link = MapLink(robot_bus, TileCache(tmp_path / "cache"), "lab", "r1")
         spool = Spool(tmp_path / "spool", max_bytes=10**6)
