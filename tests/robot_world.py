@@ -14,7 +14,7 @@ from fleetmap.geometry import Array
 from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.messages import WantedVersion
 from fleetmap.rectification import Rectifier
-from fleetmap.samples import CameraFrame, ImuSamples
+from fleetmap.samples import CameraFrame, Image, ImuSamples
 from locclient.live.intake import Moment
 from locclient.robot import LoadedMap, Robot
 from locclient.settings import LocalizerSettings
@@ -59,10 +59,17 @@ def moments(frames: int, *, dark: range = range(0)) -> Iterator[Moment]:
             parts.append((stamps[chosen] + shift_ns, gyro[chosen], accel[chosen]))
         imu = ImuSamples(*(np.concatenate(part) for part in zip(*parts, strict=True)))
         fed_ns = until_ns
-        left, right = sample.left[index], sample.right[index]
+        rng = np.random.default_rng(number)  # a sensor's noise: a camera that repeats itself to the bit counts as stuck
+        left, right = (_noisy(picture, rng) for picture in (sample.left[index], sample.right[index]))
         if number in dark:
             left, right = np.zeros_like(left), np.zeros_like(right)
         yield Moment(CameraFrame(stamp_ns, left, right), imu, [], [])
+
+
+def _noisy(picture: Image, rng: np.random.Generator) -> Image:
+    """With a grey value more or less in every other pixel."""
+    noise = rng.integers(-1, 2, picture.shape, dtype=np.int16)
+    return np.clip(picture + noise, 0, 255).astype(np.uint8)
 
 
 def truth(number: int) -> Array:

@@ -143,9 +143,6 @@ def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world:
     assert world.fleet.robots("room")[0].last_ack["version"] == 1
 
 
-@pytest.mark.xfail(
-    reason="since one strong fix is believed, some frames around the switch are not TRACKING: a defect, not yet mended"
-)
 def test_a_new_version_is_taken_while_driving(world: World) -> None:
     robot, listener = robot_world.new_robot(), Listener()
     source = ScriptedSource(list(robot_world.moments(200)), ready=lambda: robot.running is not None)
@@ -164,7 +161,7 @@ def test_a_new_version_is_taken_while_driving(world: World) -> None:
     runtime = Runtime(parts, ServiceManager(""))
     runtime.run()
     assert listener.estimates[-1].map_version == 2
-    assert all(estimate.status == "TRACKING" for estimate in listener.estimates[60:])
+    assert [e.cause for e in listener.estimates[60:] if e.status != "TRACKING"] == []
     assert parts.link is not None
     active = parts.link.active()
     assert active is not None
