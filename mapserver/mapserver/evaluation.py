@@ -3,12 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, align_points, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.samples import Stamps, Trajectory
 
 MAX_GAP_NS = 200_000_000
+MAX_CLOCK_SHIFT_S = 0.05
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 SHORT_LENGTHS_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # for runs too short for KITTI's
 
@@ -31,6 +33,14 @@ class AteResult:
     frame_from_estimate: Array
     stamps_ns: Stamps
     errors_m: Array
+
+
+@dataclass(frozen=True, slots=True)
+class ClockShift:
+    """How much later, by its own stamps, the truth has to be read to fit the estimate best, and the rigid ATE that is left then."""
+
+    shift_s: float
+    rmse_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +108,35 @@ def absolute_trajectory_error(
         stamps_ns=mine.stamps_ns,
         errors_m=errors,
     )
+
+
+def best_clock_shift(
+    estimate: Trajectory, truth: Trajectory, max_shift_s: float = MAX_CLOCK_SHIFT_S, max_gap_ns: int = MAX_GAP_NS
+) -> ClockShift | None:
+    """The shift of the truth's stamps, within +- `max_shift_s`, at which the rigid ATE is smallest.
+
+    A diagnosis beside the ATE, never in its place: a truth that was recorded by another clock costs speed times shift. Positions
+    of the truth are interpolated linearly. None where fewer than three stamps have a truth at every shift.
+    """
+    mine, _ = paired(estimate, truth, max_gap_ns)
+    origin_ns = int(truth.stamps_ns[0]) if len(truth) else 0
+    at_s, own_s = (truth.stamps_ns - origin_ns) * 1e-9, (mine.stamps_ns - origin_ns) * 1e-9
+    inside = (own_s >= at_s[0] + max_shift_s) & (own_s <= at_s[-1] - max_shift_s) if len(mine) else np.zeros(0, bool)
+    if inside.sum() < 3:
+        return None
+    own_s, positions = own_s[inside], mine.positions_m[inside]
+
+    def rmse_m(shift_s: float) -> float:
+        true = np.column_stack([np.interp(own_s + shift_s, at_s, axis) for axis in truth.positions_m.T])
+        frame_from_estimate, _ = align_points(true, positions, with_scale=False)
+        return _rms(np.linalg.norm(transform_points(frame_from_estimate, positions) - true, axis=1))
+
+    # The error has one minimum for a smooth motion, but noise makes others: the best of a grid says around which to look.
+    grid = np.linspace(-max_shift_s, max_shift_s, 21)
+    middle, step = float(grid[np.argmin([rmse_m(shift) for shift in grid])]), float(grid[1] - grid[0])
+    bounds = max(middle - step, -max_shift_s), min(middle + step, max_shift_s)
+    found = minimize_scalar(rmse_m, bounds=bounds, method="bounded", options={"xatol": 1e-5})
+    return ClockShift(float(found.x), float(found.fun))
 
 
 def unaligned_errors(

@@ -5,7 +5,13 @@ import numpy as np
 from fleetmap.recordings.covariances import StampedCovariances
 from fleetmap.samples import Trajectory
 from mapserver.consistency import at_first_stamp, consistency
-from mapserver.evaluation import absolute_trajectory_error, drift, relative_trajectory_error, unaligned_errors
+from mapserver.evaluation import (
+    absolute_trajectory_error,
+    best_clock_shift,
+    drift,
+    relative_trajectory_error,
+    unaligned_errors,
+)  # fmt: skip
 
 Summary = dict[str, float | int | None]
 
@@ -20,13 +26,15 @@ def summary(
 ) -> Summary:
     """Errors by name; raises SurveyError where too few stamps of the estimate have a truth.
 
-    ate_*: after a rigid alignment; ate_sim3_rmse_m and scale: after one with scale; unaligned_*: as they are, or with
+    ate_*: after a rigid alignment; ate_sim3_rmse_m and scale: after one with scale; clock_shift_s: how much later the truth would
+    have to be read to fit best, and ate_at_clock_shift_m what the ATE would be then; unaligned_*: as they are, or with
     `from_first` after placing the first stamp on the truth; rpe_*: of the motion between stamps that follow each other;
     drift_*: KITTI's, over drift_shortest_m to drift_longest_m, None for paths below a metre; nees_*: of the unaligned errors by
     their covariances, None without. frames: how many should have had an estimate, the base of evaluated_share.
     """
     rigid = absolute_trajectory_error(estimate, truth, frames=frames)
     similarity = absolute_trajectory_error(estimate, truth, with_scale=True)
+    shift = best_clock_shift(estimate, truth)
     relative = relative_trajectory_error(estimate, truth)
     placed = at_first_stamp(estimate, truth) if from_first else estimate
     _, errors_m, errors_rad = unaligned_errors(placed, truth)
@@ -40,6 +48,8 @@ def summary(
         "ate_max_m": rigid.max_m,
         "ate_sim3_rmse_m": similarity.rmse_m,
         "scale": similarity.scale,
+        "clock_shift_s": None if shift is None else shift.shift_s,
+        "ate_at_clock_shift_m": None if shift is None else shift.rmse_m,
         "unaligned_median_m": float(np.median(errors_m)),
         "unaligned_max_m": float(errors_m.max()),
         "unaligned_median_rad": float(np.median(errors_rad)),

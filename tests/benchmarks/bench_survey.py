@@ -16,6 +16,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from fleetmap.recordings import open_recording
+from fleetmap.recordings.tum import read_tum
+from mapserver.evaluation import best_clock_shift
 from realdata import DATA
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -71,7 +74,10 @@ def survey(case: Case, recording: Path, folder: Path) -> dict[str, Any]:
         "--trajectory", folder / f"{case.name}.tum",
     )  # fmt: skip
     found: dict[str, Any] = json.loads(report.read_text("utf-8"))
-    return found
+    with open_recording(recording) as opened:
+        truth = opened.ground_truth
+    shift = None if truth is None else best_clock_shift(read_tum(folder / f"{case.name}.tum"), truth)
+    return found | {"clock_shift": None if shift is None else asdict(shift)}
 
 
 def bench(names: list[str], recordings: Path | None = None) -> list[dict[str, Any]]:
@@ -85,7 +91,8 @@ def bench(names: list[str], recordings: Path | None = None) -> list[dict[str, An
                 continue
             report = survey(case, recording, folder)
             rows.append(
-                asdict(case) | {key: report[key] for key in (*KEYS, "loops", "frames", "duration_s", "seconds")}
+                asdict(case)
+                | {key: report[key] for key in (*KEYS, "clock_shift", "loops", "frames", "duration_s", "seconds")}
             )
     return rows
 
@@ -101,6 +108,10 @@ def show(rows: list[dict[str, Any]]) -> None:
             f"{row['name']:24} {1e3 * row['ate_rmse_m']:8.2f} {1e3 * row['limit_m']:7.1f} {1e3 * row['ate_sim3_rmse_m']:8.2f} {scale:>8} "
             f"{row['evaluated_share']:6.2f} {row['realtime_factor']:7.2f} {row['peak_rss_mb']:6.0f}  {row['field']}"
         )
+    for row in rows:
+        if row["clock_shift"] is not None:
+            shift_ms, left_mm = (1e3 * row["clock_shift"][key] for key in ("shift_s", "rmse_m"))
+            print(f"{row['name']}: with the truth's clock shifted by {shift_ms:+.1f} ms {left_mm:.2f} mm would be left")
     machine = {
         "machine": platform.processor() or platform.machine(), "cores": os.cpu_count(), "python": platform.python_version(),
         "versions": {name: metadata.version(name) for name in LIBRARIES}, "command": " ".join(sys.argv),

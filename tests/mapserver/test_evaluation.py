@@ -10,6 +10,7 @@ from fleetmap.geometry import Array, interpolate_se3, se3_exp, se3_inverse
 from fleetmap.samples import Trajectory
 from mapserver.evaluation import (
     absolute_trajectory_error,
+    best_clock_shift,
     drift,
     kitti_drift,
     paired,
@@ -57,6 +58,20 @@ def test_ate_agrees_with_evo(with_scale: bool) -> None:
     np.testing.assert_allclose(result.errors_m, ape.error, atol=1e-9)
     assert result.scale == (pytest.approx(1.07, rel=1e-2) if with_scale else 1.0)
     assert (result.matched, result.evaluated_share) == (400, 1.0)
+
+
+def test_a_truth_on_another_clock_is_noticed() -> None:
+    """The shift is found again, and what the ATE would be without it; a truth on the same clock gives none."""
+    truth, estimate = _truth(), _estimate(_truth())
+    late = Trajectory(truth.stamps_ns + 17_000_000, truth.frame_from_body)
+    shifted, same = best_clock_shift(estimate, late), best_clock_shift(estimate, truth)
+    assert shifted is not None
+    assert same is not None
+    assert shifted.shift_s - same.shift_s == pytest.approx(0.017, abs=5e-4)
+    assert same.shift_s == pytest.approx(0.0, abs=3e-3)  # noise of 2 cm at 2 m/s
+    assert shifted.rmse_m == pytest.approx(same.rmse_m, rel=0.03)
+    assert shifted.rmse_m < 0.98 * absolute_trajectory_error(estimate, late).rmse_m
+    assert best_clock_shift(_estimate(_truth(2)), _truth(2)) is None
 
 
 @pytest.mark.parametrize("step", [1, 10])
