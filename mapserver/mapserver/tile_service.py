@@ -1,6 +1,7 @@
 """The server's side of the bus: answers for versions, manifests, bytes and patches, hears the robots, announces versions."""
 
 import logging
+import threading
 from collections.abc import Callable
 
 from fleetmap.bus import Bus, Handle
@@ -48,6 +49,7 @@ class TileService:
         self._announced: dict[tuple[str, str], str | None] = {}
         self._recent = RecentBytes(_RECENT_BYTES)
         self._patches = RecentBytes(_RECENT_PATCHES_BYTES)
+        self._patching = threading.Lock()
         self._kinds = RecentKinds(store.served_kind)
         self._handles: list[Handle] = [
             bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
@@ -137,10 +139,14 @@ class TileService:
         return patch
 
     def _made_patch(self, base: str, result: str) -> bytes:
-        """The patch; nothing where it is not worth it, which is kept as well."""
+        """The patch; nothing where it is not worth it, which is kept as well.
+
+        One at a time: several threads that work on patches would take turns with an operator's request, and it waits for each.
+        """
         whole = self._read(result)
         try:
-            patch = make_patch(self._read(base), whole)
+            with self._patching:
+                patch = make_patch(self._read(base), whole)
         except MapFormatError as error:
             _log.info("no patch from %s to %s: %s", base, result, error)
             return b""
