@@ -17,6 +17,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from fleetmap.bus import MemoryBus, MemoryHub
 from fleetsim.commands import record_order
 from fleetsim.recorder import Order
 from fleetsim.scenarios import SCENARIOS, Scenario, find_scenario
+from fleetsim.stock import Slot, last_restock_day
 from locclient.link import MapLink
 from locclient.tile_cache import TileCache
 from mapserver.config import MapserverConfig
@@ -73,6 +75,16 @@ def scenario_of_nights(name: str, rate: float) -> str:
     return own
 
 
+def stock_moved(own: str, before: int, after: int) -> float:
+    """Share of the slots whose goods are others on day `after` than on day `before`."""
+    layout = find_scenario(own).layout
+    slots = [Slot(*place) for place in product(range(layout.rows), range(layout.bays), range(layout.levels))]
+    moved = sum(
+        last_restock_day(layout, SEED, after, slot) != last_restock_day(layout, SEED, before, slot) for slot in slots
+    )
+    return moved / len(slots)
+
+
 def fetched(folder: Path, cache: Path) -> dict[str, int]:
     """Bytes that a robot with this cache fetches until it has the current version: all, of the manifest, of tiles."""
     told: list[tuple[str, str, int]] = []
@@ -116,7 +128,8 @@ def measure(work: Path, scenario: str, frames: str, rate: float) -> list[dict[st
             assert said is not None
             session = said["builds"][-1]["sessions"][0]
             row = {
-                "night": night.name, "version": said["version"], "full_bytes": full["bytes"], "fetched_bytes": delta["bytes"],
+                "night": night.name, "stock_moved": stock_moved(own, NIGHTS[max(len(rows) - 1, 0)].day, night.day),
+                "version": said["version"], "full_bytes": full["bytes"], "fetched_bytes": delta["bytes"],
                 "share": delta["bytes"] / full["bytes"], "manifest_bytes": delta["manifest"], "tile_bytes": delta["tiles"],
                 "full_manifest_bytes": full["manifest"], "seconds": seconds,
             }  # fmt: skip
@@ -128,12 +141,12 @@ def measure(work: Path, scenario: str, frames: str, rate: float) -> list[dict[st
 def show(rows: Sequence[dict[str, Any]]) -> None:
     """The table."""
     print(
-        f"{'night':18} {'full':>8} {'fetched':>8} {'share':>7} {'manifest':>8} {'tiles':>8} {'kept':>6} moved faded added"
+        f"{'night':18} {'stock':>6} {'full':>8} {'fetched':>8} {'share':>7} {'manifest':>8} {'tiles':>8} {'kept':>6} moved faded added"
     )
     for row in rows:
         counts = [row.get(f"landmarks_{what}", "-") for what in ("kept", "moved", "faded", "added")]
         print(
-            f"{row['night']:18} {row['full_bytes']:8} {row['fetched_bytes']:8} {100 * row['share']:6.2f}% "
+            f"{row['night']:18} {100 * row['stock_moved']:5.1f}% {row['full_bytes']:8} {row['fetched_bytes']:8} {100 * row['share']:6.2f}% "
             f"{row['manifest_bytes']:8} {row['tile_bytes']:8} {counts[0]:>6} {counts[1]:>5} {counts[2]:>5} {counts[3]:>5}",
             flush=True,
         )
