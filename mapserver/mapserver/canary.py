@@ -85,7 +85,7 @@ def judge_canary(canary: Tally, others: Tally, age_days: float, settings: Canary
             f"after {age_days:.1f} days it is still not shown to be within the margin ({within:.1%})",
         )
     else:
-        action, why = "wait", f"within the margin with {within:.1%}, evidence of harm {evidence:.2g} to 1"
+        action, why = "wait", _why_wait(ours, theirs, within, evidence)
     margin = f"{settings.margin_ratio:g} times the others' rate + {settings.margin_per_robot_day:g} per robot-day"
     reason = f"{why}; canary {_told(ours)}, others {_told(theirs)}, margin {margin}"
     return CanaryFinding(action, reason, ours, theirs, evidence, within)
@@ -110,6 +110,14 @@ def within_margin(canary: Rate, others: Rate, margin_ratio: float, margin_per_ro
     other_rates = gammaincinv(others.events + 0.5, _QUANTILES) / others.robot_days
     limits = margin_ratio * other_rates + margin_per_robot_day
     return float(np.mean(gammainc(canary.events + 0.5, canary.robot_days * limits)))
+
+
+def _why_wait(canary: Rate, others: Rate, within: float, evidence: float) -> str:
+    if canary.robot_days <= 0 or others.robot_days <= 0:
+        return (
+            f"nothing can be said before robots drive with {'it' if canary.robot_days <= 0 else 'the version before'}"
+        )
+    return f"too early to tell: within the margin with {within:.1%}, evidence of harm {evidence:.2g} to 1"
 
 
 def _told(found: Rate) -> str:

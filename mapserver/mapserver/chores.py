@@ -10,11 +10,13 @@ from fleetmap.errors import FleetmapError
 from mapserver.canary_watch import review
 from mapserver.config import MapserverConfig
 from mapserver.fleet import Fleet
+from mapserver.job_locks import end_interrupted
 from mapserver.store import MapStore
 from mapserver.tile_service import TileService
 
 _ANNOUNCE_EVERY_S = 1.0
 _LOOK_EVERY_S = 0.2
+_JOBS_EVERY_S = 20.0
 _log = logging.getLogger(__name__)
 
 
@@ -36,6 +38,7 @@ def server_chores(store: MapStore, fleet: Fleet, service: TileService, settings:
         Chore("keeping reports", ingest.flush_every_s, fleet.flush),
         Chore("looking for robots", ingest.presence_every_s, service.look_for_robots),
         Chore("removing old reports", ingest.prune_every_s, fleet.prune),
+        Chore("looking for jobs that were killed", _JOBS_EVERY_S, lambda: end_interrupted(store, time.time_ns())),
         Chore(
             "looking at canaries",
             settings.canary.check_every_s,

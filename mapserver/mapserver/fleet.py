@@ -16,10 +16,12 @@ from fleetmap.messages import (
     RobotAck,
     RobotHealth,
     WantedVersion,
+    decode_message,
     report_dict,
 )
 from mapserver.clock_skew import ClockSkew
 from mapserver.ingest import Ingest, IngestSettings
+from mapserver.refused_reports import RefusedReports, refused
 from mapserver.site_plan import SitePlan, read_plan
 from mapserver.store import MapStore
 
@@ -75,6 +77,7 @@ class Fleet:
         self._clock_ns = clock_ns
         self._lock = threading.Lock()
         self._ingest = Ingest(store, settings)
+        self._refused = RefusedReports(store.folder / "refused")
         self._robots: dict[tuple[str, str], _Robot] = {}
         for info in store.robots():
             skew = ClockSkew(info.last_report.get("clock_ahead_s"))
@@ -147,6 +150,19 @@ class Fleet:
             return FailureAck(id=report.id, refused=str(error)[:2000])
         self._ingest.take_failure(report, now_ns, ahead_s)
         return FailureAck(id=report.id)
+
+    def take_failure_bytes(self, site: str, robot: str, payload: bytes) -> FailureAck:
+        """As `take_failure`, of an encoded report. One that is refused for good is set aside in the store's folder.
+
+        Raises LinkError for bytes that do not even say which report they are, StoreError where it may be kept later.
+        """
+        try:
+            ack = self.take_failure(site, robot, decode_message(payload, FailureReport))
+        except LinkError as error:
+            ack = refused(payload, str(error))
+        if ack.refused:
+            self._refused.keep(site, robot, payload, ack.refused, self._clock_ns())
+        return ack
 
     def take_presence(self, present: Iterable[tuple[str, str]]) -> None:
         """Notes which robots (site, name) show their liveliness token now; those that were never heard stay unknown."""

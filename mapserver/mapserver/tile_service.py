@@ -1,13 +1,13 @@
 """The server's side of the bus: answers for versions, manifests, bytes and patches, hears the robots, announces versions."""
 
 import logging
+import threading
 from collections.abc import Callable
 
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError
 from fleetmap.mapformat import check_name, make_patch
 from fleetmap.messages import (
-    FailureReport,
     PoseMessage,
     RobotAck,
     RobotHealth,
@@ -22,6 +22,7 @@ from fleetmap.messages import (
 )
 from mapserver.fleet import Fleet
 from mapserver.recent_bytes import RecentBytes
+from mapserver.recent_kinds import RecentKinds
 from mapserver.store import MapStore
 
 Count = Callable[[str, str, int], None]
@@ -48,6 +49,8 @@ class TileService:
         self._announced: dict[tuple[str, str], str | None] = {}
         self._recent = RecentBytes(_RECENT_BYTES)
         self._patches = RecentBytes(_RECENT_PATCHES_BYTES)
+        self._patching = threading.Lock()
+        self._kinds = RecentKinds(store.served_kind)
         self._handles: list[Handle] = [
             bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
             bus.queryable(robot_key("*", "*", "failures"), self._counted("failure", self._failure)),
@@ -103,7 +106,10 @@ class TileService:
 
     def _failure(self, key: str, payload: bytes) -> bytes:
         site, robot, _what = split_key(key)
-        return encode_message(self._fleet.take_failure(site, robot, decode_message(payload, FailureReport)))
+        ack = self._fleet.take_failure_bytes(site, robot, payload)
+        if ack.refused:
+            self._count("failure refused for good", "refused", 0)
+        return encode_message(ack)
 
     def _manifest(self, key: str) -> bytes:
         site, _what, number = split_key(key)
@@ -116,7 +122,7 @@ class TileService:
 
     def _blob(self, key: str) -> bytes:
         site, _what, sha256 = split_key(key)
-        if self._store.served_kind(sha256, site) is None:
+        if self._kinds.get(sha256, site) is None:
             raise LinkError(f"site {site} has no published bytes {sha256}; fetch its current manifest again")
         return self._read(sha256)
 
@@ -124,7 +130,7 @@ class TileService:
         """What makes one published thing of a site out of another; refused where it would not be much smaller."""
         site, _what, addresses = split_key(key)
         base, _, result = addresses.partition("-")
-        kinds = {self._store.served_kind(sha256, site) for sha256 in (base, result)}
+        kinds = {self._kinds.get(sha256, site) for sha256 in (base, result)}
         if len(kinds) != 1 or not kinds <= _PATCHED_KINDS:
             raise LinkError(f"site {site} has no published pair {addresses[:160]} of one kind; fetch the whole")
         patch = self._patches.get(addresses, lambda: self._made_patch(base, result))
@@ -133,10 +139,14 @@ class TileService:
         return patch
 
     def _made_patch(self, base: str, result: str) -> bytes:
-        """The patch; nothing where it is not worth it, which is kept as well."""
+        """The patch; nothing where it is not worth it, which is kept as well.
+
+        One at a time: several threads that work on patches would take turns with an operator's request, and it waits for each.
+        """
         whole = self._read(result)
         try:
-            patch = make_patch(self._read(base), whole)
+            with self._patching:
+                patch = make_patch(self._read(base), whole)
         except MapFormatError as error:
             _log.info("no patch from %s to %s: %s", base, result, error)
             return b""

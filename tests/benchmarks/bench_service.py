@@ -244,6 +244,7 @@ def measure_fleet(folder: Path, clients: int, processes: int) -> dict[str, dict[
                 with measured(process.pid, http) as load:
                     found = fleet.fetch(anew=name == "whole again")
                 rows[name] = found | load.figures()
+                rows[name]["http_p99_over_idle"] = rows[name]["http_p99_ms"] / rows["idle"]["http_p99_ms"]
                 show(name, rows[name])
         finally:
             fleet.close()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import bench_map_budget, bench_map_fuzz, bench_service
+from benchmarks import bench_map_budget, bench_map_fuzz, bench_nights, bench_service
 from realdata import real_data
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
@@ -22,6 +22,7 @@ def test_three_hundred_robots_fetch_a_site_and_a_delta() -> None:
     assert delta["bytes_per_robot"] <= 0.15 * whole["bytes_per_robot"]
     assert nothing["bytes_per_robot"] <= 0.01 * whole["bytes_per_robot"]
     assert whole["http_p99_ms"] < 50
+    assert delta["http_p99_ms"] < 50
     # Once the server's caches are full, another 15 GB cost hardly more memory: what is freed is not all given back.
     assert rows["whole again"]["rss_max_mb"] < 1.25 * rows["whole again"]["rss_begin_mb"]
     assert rows["whole again"]["rss_max_mb"] < 500
@@ -48,3 +49,12 @@ def test_the_default_budget_costs_little(tmp_path: Path) -> None:
     assert float(default["bytes_per_m"]) <= 3000  # type: ignore[arg-type]
     assert int(default["largest_tile_bytes"]) <= 256_000  # type: ignore[call-overload]
     assert float(default["localised_share"]) >= float(full["localised_share"]) - 0.02  # type: ignore[arg-type]
+
+
+def test_a_night_costs_what_changed_in_it(tmp_path: Path) -> None:
+    _, quiet, *moved = bench_nights.measure(tmp_path, "small-loop", "::2", 0.05)
+    assert quiet["share"] <= 0.01
+    assert len(moved) == 2
+    for night in moved:
+        assert night["share"] <= 0.15
+        assert night["landmarks_added"] > quiet["landmarks_added"]

@@ -1,5 +1,9 @@
 """What was used last is kept, and no more than the limit."""
 
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 
 from mapserver.recent_bytes import RecentBytes
@@ -32,3 +36,26 @@ def test_what_is_larger_than_the_limit_and_what_fails_is_not_kept() -> None:
     for number in range(100):
         held.get(str(number), lambda: b"")
     assert held.total_bytes <= 1000
+
+
+def test_what_many_ask_for_at_once_is_made_once() -> None:
+    """Also where making it fails at first: the next one tries."""
+    held, begun, made = RecentBytes(1000), threading.Event(), []
+
+    def make() -> bytes:
+        made.append(threading.get_ident())
+        begun.wait(5)
+        if len(made) == 1:
+            raise LookupError
+        return b"patch"
+
+    with ThreadPoolExecutor(8) as pool:
+        asked = [pool.submit(held.get, "a", make) for _ in range(8)]
+        while not made:
+            time.sleep(0.001)
+        begun.set()
+        failed = sum(answer.exception() is not None for answer in asked)
+        answers = [answer.result() for answer in asked if answer.exception() is None]
+    assert failed == 1
+    assert answers == [b"patch"] * 7
+    assert len(made) == 2

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -277,6 +278,26 @@ def test_a_failure_is_acknowledged_when_it_is_on_the_disk(world: World) -> None:
     with pytest.raises(LinkError, match="FailureReport"):
         world.robot_bus.get(key, b"nonsense")
     assert world.counts[-1] == ("failure", "refused", 0)
+
+
+def test_a_report_that_cannot_be_read_is_refused_for_good_and_set_aside(world: World) -> None:
+    """It says its id, so that the robot can let go of it; of another fleetmap it may be."""
+    key = robot_key("lab", "r1", "failures")
+    payload = msgspec.msgpack.encode({"id": "f-7", "site": "lab", "robot": "r1", "kind": 3})
+    ack = decode_message(world.robot_bus.get(key, payload), FailureAck)
+    assert ack.id == "f-7"
+    assert "no FailureReport" in ack.refused
+    assert world.counts[-2:] == [
+        ("failure refused for good", "refused", 0),
+        ("failure", "ok", len(encode_message(ack))),
+    ]
+    (kept,) = (world.folder / "refused").glob("*.msgpack")
+    assert kept.read_bytes() == payload
+    assert ack.refused in kept.with_suffix(".reason.txt").read_text()
+    for number in range(120):
+        world.fleet.take_failure_bytes("lab", "r1", msgspec.msgpack.encode({"id": f"g-{number}"}))
+    assert len(list((world.folder / "refused").iterdir())) <= 200
+    assert world.store.verify().faults == []
 
 
 def test_bad_messages_are_counted_and_change_nothing(world: World, caplog: pytest.LogCaptureFixture) -> None:

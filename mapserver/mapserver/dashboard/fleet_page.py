@@ -15,6 +15,7 @@ from mapserver.dashboard.map_page import picture_address
 from mapserver.dashboard.markup import age, badge, joined, link, moment, share, table
 from mapserver.dashboard.plan import Plan
 from mapserver.measures import Rate
+from mapserver.rate_words import driven_words, figure, is_telling, rate_words
 
 _MOVE_EVERY_S, _LIST_EVERY_S = 1.0, 2.0
 _SHAPES = {"good": "circle", "warn": "triangle", "bad": "square", "quiet": "circle"}
@@ -86,31 +87,19 @@ def _figures(live: LiveSite, health: SiteHealth) -> Markup:
     )  # fmt: skip
 
 
-def figure(value: float | None) -> str:
-    """A rate with two digits, without exponent."""
-    if value is None:
-        return "–"
-    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
-
-
 def _rate_figure(name: str, found: Rate, more: str) -> tuple[str, str, str, str]:
     """A rate large, its interval and a remark below."""
     if found.low is None:
         return name, "", "–", "nothing was driven"
-    counted = f"{found.events} in {figure(found.robot_days)} robot-days"
+    counted = f"{found.events} in {driven_words(found.robot_days)}"
+    if not is_telling(found):
+        return name, "", "–", f"{counted}: too little for a rate"
     return (
         name,
         "",
         figure(found.per_robot_day),
         f"{counted}: {figure(found.low)} to {figure(found.high)} with 95 %{more}",
     )
-
-
-def rate_words(found: Rate) -> str:
-    """A rate with the interval that holds the true one with 95 %."""
-    if found.per_robot_day is None:
-        return "–"
-    return f"{figure(found.per_robot_day)} ({figure(found.low)} to {figure(found.high)})"
 
 
 def _trials(trials: tuple[Trial, ...]) -> Markup:
@@ -184,17 +173,18 @@ def _rates(health: SiteHealth) -> Markup:
     """Failures per robot-day of the last days."""
     found = [
         Bar(
-            "24 h" if n == len(health.days) - 1 else f"-{len(health.days) - 1 - n} d", day.per_robot_day, day.low, day.high,
-            f"{day.events} in {figure(day.robot_days)} robot-days: {rate_words(day)} per robot-day",
+            "24 h" if n == len(health.days) - 1 else f"-{len(health.days) - 1 - n} d",
+            *((day.per_robot_day, day.low, day.high) if is_telling(day) else (None, None, None)),
+            f"{day.events} in {driven_words(day.robot_days)}: {rate_words(day)} per robot-day",
         )
         for n, day in enumerate(health.days)
     ]  # fmt: skip
     return Markup(
         "<h2>Failures per robot-day</h2>{}<p class=\"quiet\">A bar for each 24 hours; a robot-day is 16 hours of driving. The thin line "
-        "holds the true rate with 95 %. Last 24 hours: {} in {} robot-days, {}.</p>"
+        "holds the true rate with 95 %; days with little driving have no bar. Last 24 hours: {} in {}, {}.</p>"
     ).format(
         drawing.bars(found, "Failures per robot-day of the last days"), health.day.failures.events,
-        figure(health.day.failures.robot_days), health.trend,
+        driven_words(health.day.failures.robot_days), health.trend,
     )  # fmt: skip
 
 
@@ -206,7 +196,7 @@ def _table(where: Where, live: LiveSite, health: SiteHealth) -> ui.table:
     with ui.element("div"):
         look_for = ui.input("Find a robot, state or version").props("outlined dense clearable").style("width:320px")
     shown = ui.table(columns=columns, rows=_rows(where, live, health), row_key="robot", pagination=25)
-    shown.props('flat color=ink :rows-per-page-options="[25, 100, 0]"')
+    shown.props('flat wrap-cells color=ink :rows-per-page-options="[25, 100, 0]"')
     look_for.bind_value_to(shown, "filter")
     shown.add_slot(
         "body-cell-state",

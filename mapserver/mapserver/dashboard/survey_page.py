@@ -157,8 +157,8 @@ async def _loops(rooms: Rooms, where: Where, report: dict[str, Any]) -> None:
     accepted = sum(place.get("verdict") == "accepted" for place in found)
     html(
         Markup(
-            '<h2>Loops on the map of version {}</h2><div class="planbox">{}</div><p>Green lines with dots: {} loops accepted. Dashed red '
-            "and thin lines: {} refused ones, those that looked most alike.</p>{}"
+            '<h2>Loops on the map of version {}</h2><div class="planbox">{}</div><p>Green lines with dots: accepted loops ({}). Dashed red '
+            "and thin lines: refused ones, those that looked most alike ({}).</p>{}"
         ).format(version, picture, accepted, len(found) - accepted, _refusals(found))
     )
 

@@ -6,6 +6,7 @@ from html import escape
 
 from mapserver.fleet_reports.summary import FleetSummary
 from mapserver.measures import HOUR_NS, Measures, Rate
+from mapserver.rate_words import driven_words, is_telling, rate_words
 
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1a1a1a; --paper: #fff; --faint: #666; --line: #ccc; --bad: #b3261e; }
@@ -14,7 +15,7 @@ _STYLE = """
 body { font: 16px/1.45 system-ui, sans-serif; color: var(--ink); background: var(--paper); margin: 1.5rem auto;
   max-width: 62rem; padding: 0 1rem; }
 h1 { font-size: 1.5rem; margin: 0 0 .25rem; } h2 { font-size: 1.1rem; margin: 2rem 0 .5rem; }
-p, td, th { overflow-wrap: anywhere; } .faint { color: var(--faint); } .bad { color: var(--bad); font-weight: 600; }
+p, td { overflow-wrap: anywhere; } .faint { color: var(--faint); } .bad { color: var(--bad); font-weight: 600; }
 table { border-collapse: collapse; width: 100%; } th, td { text-align: left; padding: .3rem .8rem .3rem 0;
   border-bottom: 1px solid var(--line); vertical-align: top; } td.n, th.n { text-align: right; }
 .figures { display: flex; flex-wrap: wrap; gap: 1rem 2.5rem; margin: 1rem 0; }
@@ -56,7 +57,7 @@ def _figures(summary: FleetSummary) -> str:
         (
             "failures per robot-day",
             _rate(total.failures),
-            f"{total.failures.events} in all; before: {_rate(before.failures)}",
+            f"{total.failures.events} in all, in {driven_words(total.failures.robot_days)}; before: {_rate(before.failures)}",
         ),
         ("silent ones, an estimate", _rate(total.silent_estimated), f"{total.silent_estimated.events} suspected"),
         ("usable position", _percent(total.availability), f"of {total.observed_h:.1f} h observed"),
@@ -106,9 +107,10 @@ def _trend(summary: FleetSummary) -> str:
         for hour, count in counts.items()
         if count
     )
+    span = f"from {_when(since * HOUR_NS)} to {_when(summary.until_ns)} UTC, at most {most} in an hour"
     return (
         f'<h2>Failures by the hour</h2><svg viewBox="0 0 600 82" width="100%" role="img" aria-label="failures by the hour">'
-        f'<line x1="0" y1="80.5" x2="600" y2="80.5"/>{bars}</svg><p class="faint">at most {most} in an hour</p>'
+        f'<line x1="0" y1="80.5" x2="600" y2="80.5"/>{bars}</svg><p class="faint">{span}</p>'
     )
 
 
@@ -160,9 +162,9 @@ def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _rate(found: Rate) -> str:
-    if found.per_robot_day is None:
+    if found.robot_days <= 0:
         return "not known"
-    return f"{found.per_robot_day:.2g} ({found.low:.2g} to {found.high:.2g})"
+    return rate_words(found) if is_telling(found) else "too little driven"
 
 
 def _percent(value: float | None) -> str:

@@ -5,6 +5,7 @@ built twice and nothing is lost, wherever a night was killed: before the draft i
 it to the gate, and recordings that a version holds are only put away.
 """
 
+import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ from rich.console import Console
 from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, SurveyError
 from mapserver.building import BuildOrder, build_draft
 from mapserver.gate import GateSettings
+from mapserver.job_locks import INTERRUPTED, end_interrupted, held
 from mapserver.nightly import inbox as boxes
 from mapserver.nightly.lock import only_one
 from mapserver.nightly.recorded import Recorded, identify
@@ -74,8 +76,10 @@ def run_night(order: NightOrder, survey: SurveySettings, gate: GateSettings, con
     with MapStore.open(order.store, create=True) as maps, only_one(order.store, order.site):
         night = Night(maps.begin_job(order.site, JOB))
         _take_over(maps, order.site, night)
+        end_interrupted(maps, time.time_ns())
         try:
-            sentence = _Conductor(order, survey, gate, console, maps, night).run()
+            with held(order.store, night.job):
+                sentence = _Conductor(order, survey, gate, console, maps, night).run()
         except FleetmapError as error:
             with suppress(StoreError):  # a full disk: then the next night finds this one's job running, and ends it
                 night.version = _current(maps, order.site)
@@ -105,14 +109,15 @@ def _current(maps: MapStore, site: str) -> int | None:
 def _take_over(maps: MapStore, site: str, night: Night) -> None:
     """Ends the jobs of nights that were killed: the lock says that none of them runs."""
     for job in maps.jobs(site):
-        if job.kind != JOB or job.state != "running" or job.id == night.job:
+        if job.kind != JOB or job.id == night.job or not (job.state == "running" or INTERRUPTED in job.report):
             continue
         night.resumes += [job.id, *job.report.get("resumes", [])]
     maps.update_job(night.job, "running", "", night.report())
     for number in night.resumes:
         job = maps.job(number)
-        if job.state == "running":
-            maps.update_job(number, "failed", f"was interrupted; job {night.job} goes on with it", job.report)
+        if job.state == "running" or INTERRUPTED in job.report:
+            report = {key: value for key, value in job.report.items() if key != INTERRUPTED}
+            maps.update_job(number, "failed", f"was interrupted; job {night.job} goes on with it", report)
 
 
 class _Conductor:

@@ -33,6 +33,11 @@ class StoreRecords:
         self._ledger = Ledger(root / "store.sqlite3", clock_ns)
         self.fleet = FleetRecords(self._ledger)
 
+    @property
+    def folder(self) -> Path:
+        """Where the store is."""
+        return self._root
+
     def sites(self) -> list[SiteInfo]:
         """All sites by name."""
         rows = self._ledger.query(
@@ -159,6 +164,11 @@ class StoreRecords:
                ORDER BY id DESC LIMIT ?3""",
             (site, before, limit),
         )
+        return [JobInfo(**{**row, "report": json.loads(row["report"])}) for row in rows]
+
+    def running_jobs(self) -> list[JobInfo]:
+        """Jobs that stand as running, oldest first."""
+        rows = self._ledger.query("SELECT * FROM jobs WHERE state = 'running' ORDER BY id")
         return [JobInfo(**{**row, "report": json.loads(row["report"])}) for row in rows]
 
     def job(self, number: int) -> JobInfo:

@@ -43,6 +43,27 @@ def changed(tile: Tile, rng: np.random.Generator, share: float, places: bool = T
     return replace(tile, landmark_ids=ids, place_landmark_ids=tuple(lists), **columns)
 
 
+def test_one_landmark_less_costs_hardly_more_than_the_addresses() -> None:
+    """A site has many tiles, and in most nights little changes in each."""
+    tile = random_tile(np.random.default_rng(4), landmarks=900, places=20)
+    kept = np.arange(len(tile)) != 450
+    names = (
+        "landmark_ids",
+        "points_map",
+        "descriptors",
+        "view_directions_map",
+        "view_half_angle_rad",
+        "max_distance_m",
+        "sigma_m",
+    )
+    lists = tuple(ids[ids != tile.landmark_ids[450]] for ids in tile.place_landmark_ids)
+    less = replace(tile, place_landmark_ids=lists, **{name: getattr(tile, name)[kept] for name in names})
+    base, result = encode_tile(tile), encode_tile(less)
+    patch = make_patch(base, result)
+    assert apply_patch(base, patch) == result
+    assert len(patch) < 64 + 70
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(3, 60), st.integers(0, 4), st.floats(0, 0.3))
 def test_a_patched_tile_is_the_newer_one(seed: int, landmarks: int, places: int, share: float) -> None:

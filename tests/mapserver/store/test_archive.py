@@ -68,3 +68,9 @@ def test_damaged_archives_are_refused() -> None:
     for payload in (b"", b"\xff\xff\xff\xff{}", b"\x02\0\0\0{}"):
         with pytest.raises(MapFormatError):
             decode_archive(pack(b"FMAR", 1, payload))
+
+
+def test_an_archive_takes_memory_in_proportion_to_its_bytes() -> None:
+    """Zeros shrink a thousandfold: what claims to is refused before it is unpacked."""
+    with pytest.raises(MapFormatError, match="declares 200000000 bytes"):
+        decode_archive(pack(b"FMAR", 2, bytes(200_000_000), level=1))

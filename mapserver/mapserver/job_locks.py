@@ -1,0 +1,72 @@
+"""Who runs a job holds a lock that its death lets go: a job that stands as running without one was killed."""
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+
+from fleetmap.errors import StoreError
+from mapserver.store import JobInfo, MapStore
+
+INTERRUPTED = "interrupted"
+"""Key of the report of a job that was ended here."""
+
+_YOUNG_S = 60.0  # a job is noted before it holds its lock
+
+
+@contextmanager
+def held(store: Path, job: int) -> Iterator[None]:
+    """Shows that a job runs, for the block. Raises StoreError where the disk refuses."""
+    path = _path(store, job)
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise StoreError(f"{path} cannot be made ({error.strerror}); check the store's rights and space") from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        with suppress(OSError):
+            path.unlink()
+        os.close(descriptor)
+
+
+def end_interrupted(maps: MapStore, now_ns: int) -> list[int]:
+    """Notes as failed what stands as running though nobody runs it; returns the numbers of those jobs."""
+    ended, store = [], maps.folder
+    for job in maps.running_jobs():
+        if _is_young(job, now_ns) or _is_held(store, job.id):
+            continue
+        message = "was interrupted: its process is gone; run it again, a night goes on by itself the next time"
+        maps.update_job(job.id, "failed", message, job.report | {INTERRUPTED: True})
+        with suppress(OSError):
+            _path(store, job.id).unlink()
+        ended.append(job.id)
+    return ended
+
+
+def _is_young(job: JobInfo, now_ns: int) -> bool:
+    return 0 <= now_ns / 1e9 - datetime.fromisoformat(job.started).astimezone(UTC).timestamp() < _YOUNG_S
+
+
+def _is_held(store: Path, job: int) -> bool:
+    """Whether a living process holds the job's lock; also where that cannot be told."""
+    try:
+        descriptor = os.open(_path(store, job), os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def _path(store: Path, job: int) -> Path:
+    return store / f"job-{job}.lock"

@@ -1,0 +1,56 @@
+"""Failure reports that cannot be kept as such: set aside as they came, so that somebody can find out why."""
+
+import logging
+from pathlib import Path
+
+import msgspec
+
+from fleetmap.errors import LinkError, UsageError
+from fleetmap.mapformat import check_name
+from fleetmap.mapformat.manifest import Name
+from fleetmap.messages import FailureAck
+
+_MAX_KEPT = 100
+_log = logging.getLogger(__name__)
+
+
+class _IdOnly(msgspec.Struct, frozen=True):
+    id: Name
+
+
+def refused(payload: bytes, reason: str) -> FailureAck:
+    """The answer after which a robot does not send an unreadable report again; raises LinkError where not even its id can be read."""
+    try:
+        known = msgspec.msgpack.decode(payload, type=_IdOnly)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise LinkError(reason) from error
+    return FailureAck(id=known.id, refused=reason[:2000])
+
+
+class RefusedReports:
+    """A folder of the last of them, the bytes of each beside its reason. A disk that refuses costs only these."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def keep(self, site: str, robot: str, payload: bytes, reason: str, now_ns: int) -> None:
+        """Sets one aside."""
+        _log.warning("a failure of robot %r of site %r is refused for good: %s", robot[:80], site[:80], reason)
+        try:
+            self._folder.mkdir(exist_ok=True)
+            path = self._folder / f"{now_ns:020d}-{_sender(site, robot)}.msgpack"
+            path.write_bytes(payload)
+            path.with_suffix(".reason.txt").write_text(f"{reason}\n", "utf-8")
+            for old in sorted(self._folder.glob("*.msgpack"))[:-_MAX_KEPT]:
+                old.unlink()
+                old.with_suffix(".reason.txt").unlink(missing_ok=True)
+        except OSError as error:
+            _log.warning("it could not be set aside in %s: %s", self._folder, error)
+
+
+def _sender(site: str, robot: str) -> str:
+    """Part of a file's name."""
+    try:
+        return f"{check_name(site, 'site')}-{check_name(robot, 'robot')}"
+    except UsageError:
+        return "unknown"
