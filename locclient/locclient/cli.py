@@ -1,13 +1,12 @@
 """The command `locclient`. Heavy imports happen inside the commands, after their arguments are checked."""
 
 import os
-import sys
 from importlib import import_module
 from pkgutil import iter_modules
 
 import typer
 
-from fleetmap.errors import FleetmapError
+from fleetmap.command_line import run
 from locclient import commands
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
@@ -28,15 +27,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def main() -> None:
-    """Runs the command line; a FleetmapError becomes its message on stderr and its exit status, Ctrl-C becomes 130."""
-    try:
-        app()
-    except FleetmapError as error:
-        typer.echo(f"error: {error}", err=True)
-        sys.exit(error.exit_status)
-    except KeyboardInterrupt:
-        typer.echo("interrupted", err=True)
-        sys.exit(130)
+    """Runs the command line."""
+    run(app)
 
 
 if __name__ == "__main__":

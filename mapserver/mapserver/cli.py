@@ -1,11 +1,10 @@
 """The command `mapserver`. Heavy imports happen inside the commands, after their arguments are checked."""
 
 import os
-import sys
 
 import typer
 
-from fleetmap.errors import FleetmapError
+from fleetmap.command_line import run
 from mapserver.commands.build import build
 from mapserver.commands.config_option import ConfigFile
 from mapserver.commands.convert import convert
@@ -52,15 +51,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def main() -> None:
-    """Runs the command line; a FleetmapError becomes its message on stderr and its exit status, Ctrl-C becomes 130."""
-    try:
-        app()
-    except FleetmapError as error:
-        typer.echo(f"error: {error}", err=True)
-        sys.exit(error.exit_status)
-    except KeyboardInterrupt:
-        typer.echo("interrupted", err=True)
-        sys.exit(130)
+    """Runs the command line."""
+    run(app)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
 """The command `fleetsim`: lists scenarios, records them, shows what they look like."""
 
 import math
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from fleetmap.errors import FleetmapError, UsageError
+from fleetmap.command_line import run
+from fleetmap.errors import UsageError
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, help="The warehouse simulator: recordings with exact truth."
@@ -109,9 +109,5 @@ def _size_px(text: str | None) -> tuple[int, int] | None:
 
 
 def main() -> None:
-    """Runs the command line; a FleetmapError becomes its message and its exit status."""
-    try:
-        app()
-    except FleetmapError as error:
-        typer.echo(f"fleetsim: {error}", err=True)
-        sys.exit(error.exit_status)
+    """Runs the command line."""
+    run(app)
