@@ -2,11 +2,14 @@
 
 import logging
 import threading
+import time
+from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError
-from fleetmap.mapformat import check_name, make_patch
+from fleetmap.mapformat import check_name, decode_manifest, make_patch
 from fleetmap.messages import (
     PoseMessage,
     RobotAck,
@@ -33,6 +36,7 @@ _RECENT_BYTES = 64_000_000
 _RECENT_PATCHES_BYTES = 32_000_000
 _PATCH_SHARE = 0.7  # of the whole, above which a patch is not worth its work
 _PATCHED_KINDS = {"tile", "manifest"}
+_PREPARE_S = 10.0  # longer would keep other chores waiting
 
 
 class TileService:
@@ -63,11 +67,17 @@ class TileService:
     def announce_changes(self) -> list[str]:
         """Tells every known robot whose wanted version changed since the last call; returns the sites where somebody was told.
 
-        The first call tells all of them, because they may have missed what happened while no server ran.
+        The first call tells all of them, because they may have missed what happened while no server ran. The patches that they will
+        ask for, all at once, are made before they are told, as far as `_PREPARE_S` goes.
         """
         changed = []
         for info in self._store.sites():
-            for robot, wanted in self._fleet.wanted_versions(info.site).items():
+            robots = self._fleet.wanted_versions(info.site)
+            moves = Counter((self._announced.get((info.site, robot)), w.manifest_sha256) for robot, w in robots.items())
+            for (base, result), _ in moves.most_common():
+                if base is not None and result is not None and base != result:
+                    self._prepare(info.site, base, result)
+            for robot, wanted in robots.items():
                 key, address = (info.site, robot), wanted.manifest_sha256
                 if key not in self._announced or self._announced[key] != address:
                     self._bus.publish(robot_key(info.site, robot, "wanted"), encode_message(wanted))
@@ -137,6 +147,21 @@ class TileService:
         if not patch:
             raise LinkError(f"a patch from {base} is not much smaller than {result}; fetch the whole")
         return patch
+
+    def _prepare(self, site: str, base: str, result: str) -> None:
+        """Makes the patches from one version to another, by their manifests' addresses; what fails is made, or refused, when asked."""
+        until_s = time.monotonic() + _PREPARE_S
+        try:
+            old, new = (decode_manifest(self._read(sha256)) for sha256 in (base, result))
+            known = {(tile.x, tile.y): tile.sha256 for tile in old.tiles}
+        except FleetmapError as error:
+            _log.info("patches from %s to %s are made when they are asked for: %s", base, result, error)
+            return
+        pairs = [(base, result), *((known.get((tile.x, tile.y)), tile.sha256) for tile in new.tiles)]
+        for before, after in pairs:
+            if before is not None and before != after and time.monotonic() < until_s:
+                with suppress(FleetmapError):  # not worth it, or not to be had: whoever asks is told
+                    self._patch(patch_key(site, before, after))
 
     def _made_patch(self, base: str, result: str) -> bytes:
         """The patch; nothing where it is not worth it, which is kept as well.

@@ -30,6 +30,7 @@ import numpy as np
 from benchmarks.service_clients import SITE
 from fleetmap.bus import ZenohBus
 from fleetmap.mapformat import Tile
+from fleetmap.messages import robot_key
 from locclient.link import MapLink
 from locclient.tile_cache import TileCache
 from map_samples import draft_details, random_tile
@@ -235,12 +236,13 @@ def measure_fleet(folder: Path, clients: int, processes: int) -> dict[str, dict[
         fleet = Fleet(endpoint, clients, processes)
         try:
             for name in ("whole", "delta", "nothing moved", "whole again"):
-                if name == "delta":
-                    publish(folder, next_night(folder))
-                elif name == "nothing moved":
-                    with MapStore.open(folder) as store:
-                        republish(store)
-                time.sleep(2.0)  # announcements
+                if name in {"delta", "nothing moved"}:
+                    with announced(endpoint):
+                        if name == "delta":
+                            publish(folder, next_night(folder))
+                        else:
+                            with MapStore.open(folder) as store:
+                                republish(store)
                 with measured(process.pid, http) as load:
                     found = fleet.fetch(anew=name == "whole again")
                 rows[name] = found | load.figures()
@@ -249,6 +251,19 @@ def measure_fleet(folder: Path, clients: int, processes: int) -> dict[str, dict[
         finally:
             fleet.close()
     return rows
+
+
+@contextmanager
+def announced(endpoint: str) -> Iterator[None]:
+    """Waits until a robot is told of what the block publishes, as robots do before they fetch."""
+    heard = threading.Event()
+    with ZenohBus.connect(endpoint) as bus:
+        bus.subscribe(robot_key(SITE, "robot-0", "wanted"), lambda *_: heard.set())
+        while not bus.connected():
+            time.sleep(0.05)
+        yield
+        assert heard.wait(120), "nobody was told of the new version"
+        time.sleep(2.0)  # the other robots are told too
 
 
 def republish(store: MapStore) -> None:

@@ -30,9 +30,14 @@ from fleetmap.messages import (
 from locclient.link import MapLink, StoreFolderLink
 from locclient.tile_cache import StoreFolder, TileCache
 from map_samples import draft_details, random_tile, save_sample_draft
+from mapserver import tile_service
 from mapserver.fleet import Fleet
 from mapserver.store import FailureFilter, MapStore
 from mapserver.tile_service import TileService
+
+TILE_COLUMNS = (
+    "landmark_ids", "points_map", "descriptors", "view_directions_map", "view_half_angle_rad", "max_distance_m", "sigma_m",
+)  # fmt: skip
 
 
 @dataclass
@@ -278,6 +283,27 @@ def test_a_failure_is_acknowledged_when_it_is_on_the_disk(world: World) -> None:
     with pytest.raises(LinkError, match="FailureReport"):
         world.robot_bus.get(key, b"nonsense")
     assert world.counts[-1] == ("failure", "refused", 0)
+
+
+def test_patches_are_ready_when_robots_are_told(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+    make = tile_service.make_patch
+    monkeypatch.setattr(tile_service, "make_patch", lambda *pair: (made.append(len(pair[1])), make(*pair))[1])
+    rng = np.random.default_rng(3)
+    tiles = [random_tile(rng, landmarks=400, cell=(x, 0)) for x in range(3)]
+    world.publish(tiles)
+    world.hall.bring(world.hall.wanted())
+    world.service.announce_changes()
+    assert made == []
+    kept = np.arange(len(tiles[1])) > 0
+    fewer = {name: getattr(tiles[1], name)[kept] for name in TILE_COLUMNS}
+    lists = tuple(ids[ids != tiles[1].landmark_ids[0]] for ids in tiles[1].place_landmark_ids)
+    wanted = world.publish([tiles[0], replace(tiles[1], place_landmark_ids=lists, **fewer), tiles[2]])
+    assert world.service.announce_changes() == ["hall"]
+    assert len(made) == 2  # of the manifest and of the tile that changed
+    world.hall.bring(wanted)
+    assert len(made) == 2
+    assert [what for what, result, _ in world.counts if (what, result) == ("patch", "ok")] == ["patch", "patch"]
 
 
 def test_a_report_that_cannot_be_read_is_refused_for_good_and_set_aside(world: World) -> None:
