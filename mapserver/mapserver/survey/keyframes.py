@@ -69,14 +69,19 @@ class Keyframe:
     from_views: bool = False
 
     @property
+    def pictures(self) -> Pictures:
+        """What lies on the shelf."""
+        return self.shelf.get(self.shelf_number)
+
+    @property
     def frame(self) -> RectifiedFrame:
         """The rectified frame."""
-        return self.shelf.get(self.shelf_number).frame
+        return self.pictures.frame
 
     @property
     def pyramid(self) -> patch_align.Pyramid:
         """The left picture and its halvings."""
-        return self.shelf.get(self.shelf_number).pyramid
+        return self.pictures.pyramid
 
 
 def make_keyframe(
