@@ -11,7 +11,7 @@ from fleetmap.bow import Vocabulary
 from fleetmap.calibration import RigCalibration
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.rectification import Rectifier
+from fleetmap.rectification import RectifiedFrame, Rectifier
 from fleetmap.samples import CameraFrame, ImuSamples, WheelSample
 from mapserver.survey.adjust import Motion, SurveyState, adjust, adjust_windows
 from mapserver.survey.bundle import RelativeTerm
@@ -56,7 +56,7 @@ class Survey:
 
 
 def survey(
-    frames: Iterable[CameraFrame], frame_count: int, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
+    frames: Iterable[CameraFrame | RectifiedFrame], frame_count: int, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
     vocabulary: Vocabulary, settings: SurveySettings, zones: Zones, progress: Progress,
     shelf: PictureShelf | None = None, wheel: Sequence[WheelSample] = (), worker: Worker = ALONE,
 ) -> Survey:  # fmt: skip
