@@ -97,7 +97,7 @@ def survey_from(
     if state.motion.inertial:
         adjust(state, settings, rounds=2)
     guess = _with_depths(guess, state, depths)
-    loops = _close_loops(guess, state, pairs, vocabulary, settings, zones, progress)
+    loops = _close_loops(guess, state, pairs, vocabulary, settings, zones, progress, worker)
     turn = NO_TURN
     for round_number in range(2):
         progress("global adjustment", round_number, 2)
@@ -208,7 +208,7 @@ def _match_all(state: SurveyState, finder: PairFinder, settings: SurveySettings,
 
 def _close_loops(
     guess: FirstGuess, state: SurveyState, pairs: list[PairMatch], vocabulary: Vocabulary, settings: SurveySettings, zones: Zones,
-    progress: Progress,
+    progress: Progress, worker: Worker,
 ) -> Loops:  # fmt: skip
     """Finds loops, and moves the keyframes to where the pose graph with them says."""
     keyframes = guess.keyframes
@@ -217,7 +217,7 @@ def _close_loops(
     kind, known = (LoopCloser, chain) if guess.scale_known else (ScaledLoopCloser, gate_covariances(chain, walk))
     closer = kind(
         keyframes, vectors, vocabulary.word_count, state.camera, state.body_from_cam, state.map_from_body,
-        GraphMarginals(state.map_from_body, known), {(p.i, p.j) for p in pairs}, settings, zones,
+        GraphMarginals(state.map_from_body, known), {(p.i, p.j) for p in pairs}, settings, zones, worker,
     )  # fmt: skip
     for i in range(len(keyframes)):
         closer.close(i)
