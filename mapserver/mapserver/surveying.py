@@ -80,7 +80,13 @@ def admit_recordings(
 
 
 def _admission(
-    path: Path, frames: str, calibration: Path | None, use: SensorSet | None, console: Console, needs_truth: bool, worker: Worker
+    path: Path,
+    frames: str,
+    calibration: Path | None,
+    use: SensorSet | None,
+    console: Console,
+    needs_truth: bool,
+    worker: Worker,
 ) -> Admission:
     with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
         recording = reduced(opened, use)

@@ -107,7 +107,9 @@ def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count:
     return seen
 
 
-_Moment = tuple[Image, RectifiedFrame | None, RectifiedFrame | None]  # left as recorded, the pair, the pair a little later
+_Moment = tuple[
+    Image, RectifiedFrame | None, RectifiedFrame | None
+]  # left as recorded, the pair, the pair a little later
 
 
 def _moments(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int) -> Iterator[_Moment]:

@@ -1,6 +1,7 @@
 """Solving the reduced system: dense where small, else by conjugate gradients, else by sparse factorisation."""
 
 from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 import scipy.linalg
@@ -137,10 +138,8 @@ def solve_sparse(system: ReducedSystem) -> Array | None:
     return step.reshape(system.rhs.shape) if np.isfinite(step).all() else None
 
 
-def _factor(matrix: scipy.sparse.csc_array, order: str) -> scipy.sparse.linalg.SuperLU:
-    return scipy.sparse.linalg.splu(
-        matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    )
+def _factor(matrix: scipy.sparse.csc_array, order: Literal["NATURAL", "MMD_AT_PLUS_A"]) -> Any:
+    return scipy.sparse.linalg.splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 @dataclass(frozen=True)

@@ -288,7 +288,9 @@ class LoopCloser:
         return np.asarray(_WELL_KNOWN_COV * 2.0 ** (self._marginals.learned / _LEARNED_PER_DOUBLING))
 
 
-_Look = tuple[int, int, Array, float | None]  # reference, the other, its camera from the reference's, sigma of the rotation
+_Look = tuple[
+    int, int, Array, float | None
+]  # reference, the other, its camera from the reference's, sigma of the rotation
 
 
 def _verify(compared: ComparedFeatures, look: _Look) -> PairMatch | None:

@@ -90,7 +90,15 @@ def _project_match(
     count = len(a.features)
     predicted, radius, span = np.empty((count, 2)), np.empty(count), np.zeros((count, 2), np.int64)
     predict_features(
-        b_from_a, a.points_cam, a.disparities[:, 0], a.features.octaves, _lens(camera), radius_px, predicted, radius, span
+        b_from_a,
+        a.points_cam,
+        a.disparities[:, 0],
+        a.features.octaves,
+        _lens(camera),
+        radius_px,
+        predicted,
+        radius,
+        span,
     )
     found, _ = match_by_projection(
         predicted, radius, a.features.descriptors, span, b.features.pixels, b.features.octaves, b.features.descriptors,

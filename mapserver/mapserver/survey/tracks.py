@@ -125,7 +125,7 @@ def observed_again(
 
 def _is_first(table: NDArray[np.int64]) -> NDArray[np.bool_]:
     """(M,) which observations are the first of their landmark."""
-    return np.r_[True, table[1:, 1] != table[:-1, 1]]
+    return np.asarray(np.diff(table[:, 1], prepend=-1) != 0)
 
 
 def _tracks_from_reference(keyframes: list[Keyframe], groups: _Groups) -> tuple[NDArray[np.int64], Array]:
@@ -235,9 +235,12 @@ def _align(
 ) -> Array:  # fmt: skip
     """Refined pixels (N, 3) of `ours`, NaN where the patches do not agree."""
     refined, a, b, align = np.empty((len(ours), 3)), reference.features, own.features, settings.align
+    whole, half, quarter = reference.pyramid
+    own_whole, own_half, own_quarter = pictures.pyramid
     align_observations(
-        *reference.pyramid, a.pixels, a.octaves, a.angles_deg, theirs,
-        transform_points(se3_inverse(map_from_reference), points_map), *pictures.pyramid, b.pixels, b.octaves, b.angles_deg, ours,
-        cam_from_map @ map_from_reference, align.half_window_px, align.max_shift_px, align.min_correlation, refined,
+        whole, half, quarter, a.pixels, a.octaves, a.angles_deg, theirs,
+        transform_points(se3_inverse(map_from_reference), points_map), own_whole, own_half, own_quarter, b.pixels, b.octaves,
+        b.angles_deg, ours, cam_from_map @ map_from_reference, align.half_window_px, align.max_shift_px, align.min_correlation,
+        refined,
     )  # fmt: skip
     return refined

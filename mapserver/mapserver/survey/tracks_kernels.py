@@ -90,7 +90,12 @@ def _warp_of_motion(x: float, y: float, z: float, own_from_reference: Array, war
     if not 0.02 < abs(determinant) < 50.0:
         return False
     a, b, c, d = warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1]
-    warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1] = d / determinant, -b / determinant, -c / determinant, a / determinant
+    warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1] = (
+        d / determinant,
+        -b / determinant,
+        -c / determinant,
+        a / determinant,
+    )
     return True
 
 
@@ -109,7 +114,12 @@ def align_observations(
     out (N, 3): x, y, sigma_px in level-0 pixels, NaN where the patches do not agree.
     """
     side = 2 * half_window + 1
-    template, window, warp, found = np.empty((side + 2, side + 2)), np.empty((side, side)), np.empty((2, 2)), np.empty(4)
+    template, window, warp, found = (
+        np.empty((side + 2, side + 2)),
+        np.empty((side, side)),
+        np.empty((2, 2)),
+        np.empty(4),
+    )
     for n in range(len(theirs)):
         i, j = theirs[n], ours[n]
         x, y, z = points_reference[n, 0], points_reference[n, 1], points_reference[n, 2]
