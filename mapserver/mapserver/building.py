@@ -119,10 +119,11 @@ def build_draft(
     zones = Zones() if order.zones is None else read_zones(order.zones)
     times = StageTimes(time.perf_counter)
     times.begin("examination")
-    admitted = admit_recordings(
-        order.recordings, order.frames, order.calibration, order.use, console,
-        needs_truth=order.frame_from_ground_truth, unusable=unusable,
-    )  # fmt: skip
+    with open_worker(order.threads, None) as worker:
+        admitted = admit_recordings(
+            order.recordings, order.frames, order.calibration, order.use, console,
+            needs_truth=order.frame_from_ground_truth, unusable=unusable, worker=worker,
+        )  # fmt: skip
     with (
         MapStore.open(order.store, create=True) as maps,
         noted_job(maps, order.site, "build") if noted else nullcontext(Job()) as job,

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording
 from mapserver.doctor import Finding, Verdict, examine
+from mapserver.survey.work import ALONE, Worker
 
 # Wrong units, axes, cameras or partners: a survey would not fail on them but be wrong. Gaps, blur and damage are its daily bread.
 DECISIVE = (
@@ -34,9 +35,11 @@ class CheckedRecording:
         return words
 
 
-def checked(recording: Recording, on_frame: Callable[[], None] = lambda: None) -> CheckedRecording:
+def checked(
+    recording: Recording, on_frame: Callable[[], None] = lambda: None, worker: Worker = ALONE
+) -> CheckedRecording:
     """The recording with what was found in it. RecordingError where a check that decides failed."""
-    examination = examine(recording, on_frame, sampled=SAMPLED_FRAMES, turn_frames=TURN_FRAMES)
+    examination = examine(recording, on_frame, sampled=SAMPLED_FRAMES, turn_frames=TURN_FRAMES, worker=worker)
     for finding in examination.findings:
         if finding.verdict is Verdict.FAIL and finding.name in DECISIVE:
             raise RecordingError(

@@ -60,7 +60,7 @@ class Admission:
 
 def admit_recordings(
     paths: Sequence[Path], frames: str, calibration: Path | None, use: SensorSet | None, console: Console, *,
-    needs_truth: bool, unusable: dict[Path, str] | None = None,
+    needs_truth: bool, unusable: dict[Path, str] | None = None, worker: Worker = ALONE,
 ) -> dict[Path, Admission]:  # fmt: skip
     """Examines all of them, and refuses before the work what could not end well.
 
@@ -69,7 +69,7 @@ def admit_recordings(
     admitted: dict[Path, Admission] = {}
     for path in paths:
         try:
-            admitted[path] = _admission(path, frames, calibration, use, console, needs_truth)
+            admitted[path] = _admission(path, frames, calibration, use, console, needs_truth, worker)
         except RecordingError as error:
             if unusable is None:
                 raise
@@ -80,14 +80,20 @@ def admit_recordings(
 
 
 def _admission(
-    path: Path, frames: str, calibration: Path | None, use: SensorSet | None, console: Console, needs_truth: bool
+    path: Path,
+    frames: str,
+    calibration: Path | None,
+    use: SensorSet | None,
+    console: Console,
+    needs_truth: bool,
+    worker: Worker,
 ) -> Admission:
     with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
         recording = reduced(opened, use)
         for loss in recording.losses:
             console.print(f"loss: {loss.what}: {loss.detail}", markup=False)
         _check(recording, FrameSelection.parse(frames).apply(recording), needs_truth)
-        examined = checked(recording)
+        examined = checked(recording, worker=worker)
         for remark in examined.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
         return Admission(tuple(examined.remarks()), examined.correction_s)
@@ -109,8 +115,8 @@ def survey_recording(
         indices = FrameSelection.parse(frames).apply(recording)
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         done = survey(
-            read_ahead(recording.read_frame(int(index)) for index in indices), len(indices), recording.imu, recording.calibration,
-            rectifier, vocabulary, settings, zones, progress, shelf, recording.wheel, worker,
+            read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices), len(indices), recording.imu,
+            recording.calibration, rectifier, vocabulary, settings, zones, progress, shelf, recording.wheel, worker,
         )  # fmt: skip
         done, placed = _placed(done, recording.priors, recording.calibration.base_from_body)
         entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices))

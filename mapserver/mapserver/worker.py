@@ -13,6 +13,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
+import cv2
+
 from fleetmap.errors import UsageError
 from mapserver.survey.work import ALONE, Batch, Result, Shared, Worker
 
@@ -101,8 +103,19 @@ def open_worker(threads: int | None, scheduler: str | None) -> Iterator[Worker]:
     elif count == 1:
         yield ALONE
     else:
-        with ThreadPoolExecutor(count, thread_name_prefix="survey") as pool:
+        with ThreadPoolExecutor(count, thread_name_prefix="survey") as pool, _opencv_alone():
             yield Threads(pool, count)
+
+
+@contextmanager
+def _opencv_alone() -> Iterator[None]:
+    """OpenCV without threads of its own: where ours have work for every core, its would only wait for each other."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 @contextmanager

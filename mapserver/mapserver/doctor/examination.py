@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import so3_log
+from fleetmap.geometry import Array, so3_log
 from fleetmap.recordings import Recording
-from fleetmap.rectification import RectifiedFrame, Rectifier
-from fleetmap.samples import CameraFrame, SensorSet
+from fleetmap.rectification import RectifiedFrame, Rectifier, StereoCamera
+from fleetmap.samples import CameraFrame, Image, SensorSet
 from mapserver.doctor import inertial, timing
 from mapserver.doctor.camera_rotation import rotation_between
 from mapserver.doctor.disparity_zero import DisparityZero, disparity_zero, stereo_against_motion
@@ -17,6 +17,7 @@ from mapserver.doctor.findings import Finding, Verdict
 from mapserver.doctor.gyro_images import CameraTurns, gyro_check
 from mapserver.doctor.sharpness import laplacian_variance, sharpness
 from mapserver.doctor.stereo import StereoMatches, epipolar_error, match_pair, swapped_cameras
+from mapserver.survey.work import ALONE, Worker
 
 SAMPLED_FRAMES = 40
 TURN_FRAMES = 200
@@ -58,6 +59,7 @@ def examine(
     *,
     sampled: int = SAMPLED_FRAMES,
     turn_frames: int = TURN_FRAMES,
+    worker: Worker = ALONE,
 ) -> Examination:
     """Everything the checks say about a recording.
 
@@ -76,11 +78,11 @@ def examine(
         inertial.gravity_magnitude(imu),
     ]
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
-    seen = _sampled(recording, frames, rectifier, sampled)
+    seen = _sampled(recording, frames, rectifier, sampled, worker)
     if recording.sensor_set in (SensorSet.STEREO, SensorSet.STEREO_INERTIAL):
         findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
         findings += [stereo_against_motion(seen.zeros, rectifier.camera)]
-    turns = _camera_turns(recording, frames, rectifier, turn_frames)
+    turns = _camera_turns(recording, frames, rectifier, turn_frames, worker)
     checked, measured_offset_s = gyro_check(turns, imu, shift_s)
     findings += [*checked, sharpness(seen.variances), _readable(frames)]
     return Examination(findings + timing.other_losses(recording.losses), measured_offset_s)
@@ -95,38 +97,66 @@ class _Seen:
     variances: list[float]
 
 
-def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int) -> _Seen:
+def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, worker: Worker) -> _Seen:
     seen = _Seen([], [], [])
+    moments = _moments(recording, frames, rectifier, count)
+    for variance, pair, zero in worker.map(_look, rectifier.camera, moments):
+        seen.variances.append(variance)
+        seen.pairs.extend([] if pair is None else [pair])
+        seen.zeros.extend([] if zero is None else [zero])
+    return seen
+
+
+_Moment = tuple[
+    Image, RectifiedFrame | None, RectifiedFrame | None
+]  # left as recorded, the pair, the pair a little later
+
+
+def _moments(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int) -> Iterator[_Moment]:
+    """Frames spread over the recording; without a pair where there is no right picture."""
     stamps_ns = recording.frame_stamps_ns
     for index in np.unique(np.linspace(0, len(recording) - 1, min(count, len(recording))).round().astype(int)):
         frame = frames.read(int(index))
         if frame is None:
             continue
-        seen.variances.append(laplacian_variance(frame.left))
         if frame.right is None:
+            yield frame.left, None, None
             continue
-        rectified = rectifier.rectify(frame)
-        seen.pairs.append(match_pair(rectified))
         later = int(np.searchsorted(stamps_ns, stamps_ns[index] + _MOTION_NS))
-        if later < len(recording) and stamps_ns[later] - stamps_ns[index] <= _LONGEST_MOTION_NS:
-            after = frames.read(later)
-            zero = None if after is None else disparity_zero(rectified, rectifier.rectify(after), rectifier.camera)
-            seen.zeros.extend([] if zero is None else [zero])
-    return seen
+        near = later < len(recording) and stamps_ns[later] - stamps_ns[index] <= _LONGEST_MOTION_NS
+        after = frames.read(later) if near else None
+        yield frame.left, rectifier.rectify(frame), None if after is None else rectifier.rectify(after)
 
 
-def _camera_turns(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int) -> CameraTurns:
+def _look(camera: StereoCamera, moment: _Moment) -> tuple[float, StereoMatches | None, DisparityZero | None]:
+    left, pair, after = moment
+    zero = None if pair is None or after is None else disparity_zero(pair, after, camera)
+    return laplacian_variance(left), None if pair is None else match_pair(pair), zero
+
+
+def _camera_turns(
+    recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, worker: Worker
+) -> CameraTurns:
     starts, ends, rates = [], [], []
-    rotation = rectifier.body_from_cam[:3, :3]
-    for before, after in _consecutive(recording, frames, rectifier, count):
-        before_from_after = rotation_between(before, after, rectifier.camera)
-        if before_from_after is None:
-            continue
-        dt_s = (after.stamp_ns - before.stamp_ns) * 1e-9
-        starts.append(before.stamp_ns)
-        ends.append(after.stamp_ns)
-        rates.append(so3_log(rotation @ before_from_after @ rotation.T) / dt_s)
+    pairs = _consecutive(recording, frames, rectifier, count)
+    for start_ns, end_ns, rate in worker.map(_turn, (rectifier.camera, rectifier.body_from_cam[:3, :3]), pairs):
+        if rate is not None:
+            starts.append(start_ns)
+            ends.append(end_ns)
+            rates.append(rate)
     return CameraTurns(np.array(starts, np.int64), np.array(ends, np.int64), np.array(rates).reshape(-1, 3))
+
+
+def _turn(
+    shared: tuple[StereoCamera, Array], pair: tuple[RectifiedFrame, RectifiedFrame]
+) -> tuple[int, int, Array | None]:
+    """Stamps of two frames and the body's angular rate (3,) between them."""
+    (camera, rotation), (before, after) = shared, pair
+    before_from_after = rotation_between(before, after, camera)
+    if before_from_after is None:
+        return before.stamp_ns, after.stamp_ns, None
+    dt_s = (after.stamp_ns - before.stamp_ns) * 1e-9
+    return before.stamp_ns, after.stamp_ns, so3_log(rotation @ before_from_after @ rotation.T) / dt_s
 
 
 def _consecutive(

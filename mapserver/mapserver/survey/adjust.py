@@ -59,10 +59,11 @@ def adjust(
     """
     for round_number in range(rounds):
         problem = bundle_problem(state, settings, free)
-        last = final and round_number + 1 == rounds
-        result = optimize(problem, settings.final_bundle if last else settings.bundle)
+        last = round_number + 1 == rounds
+        how = settings.rough_bundle if not last else settings.final_bundle if final else settings.bundle
+        result = optimize(problem, how)
         _take(state, result)
-        if round_number + 1 < rounds:
+        if not last:
             keep = result.squared_sigmas < settings.noise.cut_sigmas**2
             if free is not None:
                 keep |= ~np.isin(state.landmarks.obs_keyframe, np.flatnonzero(free))
@@ -110,7 +111,7 @@ def _local(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_]
             marks.obs_sigma_px[rows],
         ),
     )  # fmt: skip
-    result = optimize(bundle_problem(part, settings, free[keyframes]), settings.bundle)
+    result = optimize(bundle_problem(part, settings, free[keyframes]), settings.rough_bundle)
     state.map_from_body[keyframes] = result.map_from_body
     marks.points_map[touched] = result.points_map
     if (

@@ -101,6 +101,9 @@ class BundleSettings(Section, frozen=True):
     lambda_start: float = 1e-4
     relative_cost_tolerance: float = 1e-4
     dense_unknowns: int = 1500  # reduced systems up to this size are solved by dense Cholesky
+    sparse_couplings: float = (
+        40.0  # for each keyframe; up to so many sparse factorisation is quicker than conjugate gradients
+    )
     pcg_tolerance: float = 1e-4
     pcg_max_iterations: int = 300  # then the step is solved again by sparse factorisation
 

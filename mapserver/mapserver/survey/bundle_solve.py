@@ -1,6 +1,7 @@
 """Solving the reduced system: dense where small, else by conjugate gradients, else by sparse factorisation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 import scipy.linalg
@@ -15,11 +16,15 @@ from mapserver.survey.bundle_structure import Structure
 
 @dataclass(frozen=True)
 class Chains:
-    """The inertial edges' order: edge_slots (E, 2), -1 for held keyframes; sequence and link (P,) as in the kernels."""
+    """The inertial edges' order: edge_slots (E, 2), -1 for held keyframes; sequence and link (P,) as in the kernels.
+
+    layouts: that of the sparse matrix, once it was asked for.
+    """
 
     edge_slots: AnyArray
     sequence: AnyArray
     link: AnyArray
+    layouts: list["SparseLayout"] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -56,11 +61,13 @@ def build_chains(edge_slots: AnyArray, count: int) -> Chains:
 def solve_reduced(system: ReducedSystem, settings: BundleSettings, last: str) -> tuple[Array | None, str]:
     """The step (P, D), None where S is not positive definite, and which solver gave it.
 
-    `last` solved the problem's last system: where conjugate gradients have stalled once, they are not tried again.
+    `last` solved the problem's last system: where conjugate gradients have stalled once, they are not tried again. Along a
+    drive they need hundreds of iterations, but there few keyframes see the same, and factors stay sparse.
     """
     if system.rhs.size <= settings.dense_unknowns:
         return solve_dense(system), "dense"
-    step = None if last == "sparse" else solve_pcg(system, settings)
+    along_a_drive = len(system.blocks) <= settings.sparse_couplings * len(system.rhs)
+    step = None if last == "sparse" or along_a_drive else solve_pcg(system, settings)
     return (step, "pcg") if step is not None else (solve_sparse(system), "sparse")
 
 
@@ -117,40 +124,86 @@ def solve_pcg(system: ReducedSystem, settings: BundleSettings) -> Array | None:
 
 def solve_sparse(system: ReducedSystem) -> Array | None:
     """The step by sparse LU without pivoting, fill reduced by minimum degree."""
-    matrix = _sparse_matrix(system)
+    layouts = system.chains.layouts
+    order = layouts[0].order if layouts else np.arange(system.rhs.size)
+    layout = layouts[0] if layouts else SparseLayout.of(system, order)
     try:
-        factor = scipy.sparse.linalg.splu(
-            matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
+        factor = _factor(layout.matrix(system), "NATURAL" if layouts else "MMD_AT_PLUS_A")
     except RuntimeError:  # exactly singular
         return None
-    step = factor.solve(system.rhs.ravel()).reshape(system.rhs.shape)
-    return step if np.isfinite(step).all() else None
+    if not layouts:  # minimum degree is not asked again for systems of the same structure
+        layouts.append(SparseLayout.of(system, np.argsort(factor.perm_c)))
+    step = np.empty(system.rhs.size)
+    step[order] = factor.solve(system.rhs.ravel()[order])
+    return step.reshape(system.rhs.shape) if np.isfinite(step).all() else None
 
 
-def _sparse_matrix(system: ReducedSystem) -> scipy.sparse.csc_array:
-    s, size = system.structure, system.rhs.shape[1]
-    held = ~s.free.ravel()
-    block_rows = np.repeat(np.arange(len(s.row_ptr) - 1), np.diff(s.row_ptr))
-    row, col, value = _entries(block_rows, s.cols, system.blocks, size)
-    off = row // size != col // size
-    parts = [(row, col, value), (col[off], row[off], value[off])]
-    for x in range(2):
-        for y in range(2):
-            p, q = system.chains.edge_slots[:, x], system.chains.edge_slots[:, y]
-            both = (p >= 0) & (q >= 0)
-            inner = system.edge_blocks[both, 15 * x : 15 * x + 15, 15 * y : 15 * y + 15]
-            parts.append(_entries(p[both], q[both], inner, size))
-    rows, cols, values = (np.concatenate([part[k] for part in parts]) for k in range(3))
-    keep = ~(held[rows] | held[cols])
+def _factor(matrix: scipy.sparse.csc_array, order: Literal["NATURAL", "MMD_AT_PLUS_A"]) -> Any:
+    return scipy.sparse.linalg.splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+@dataclass(frozen=True)
+class SparseLayout:
+    """Where a problem's numbers lie in the sparse matrix of each of its systems, unknowns in an order that fills in little.
+
+    order (U,): the unknowns by their place in the matrix. entries: of all numbers of a system those that count, in the matrix's
+    order; starts: the first of each group that is summed; indices, indptr as in a CSC matrix.
+    """
+
+    order: AnyArray
+    entries: AnyArray
+    starts: AnyArray
+    indices: AnyArray
+    indptr: AnyArray
+
+    @classmethod
+    def of(cls, system: ReducedSystem, order: AnyArray) -> "SparseLayout":
+        """The layout of all systems with the structure of this one."""
+        count, held = system.rhs.size, ~system.structure.free.ravel()
+        place = np.empty(count, np.int64)
+        place[order] = np.arange(count)
+        rows, cols = _unknowns(system)
+        entries = np.flatnonzero((rows >= 0) & (cols >= 0))
+        # numbers of held unknowns are dropped, but for the last ones, which are the diagonal's
+        entries = entries[~(held[rows[entries]] | held[cols[entries]]) | (entries >= len(rows) - count)]
+        codes = place[cols[entries]] * count + place[rows[entries]]
+        sequence = np.argsort(codes, kind="stable")
+        codes = codes[sequence]
+        starts = np.flatnonzero(np.diff(codes, prepend=-1))
+        indptr = np.searchsorted(codes[starts] // count, np.arange(count + 1))
+        return cls(order, entries[sequence], starts, (codes[starts] % count).astype(np.int32), indptr.astype(np.int32))
+
+    def matrix(self, system: ReducedSystem) -> scipy.sparse.csc_array:
+        """S with rows and columns in `order`; unknowns that are held have a one on the diagonal."""
+        damp = np.where(system.structure.free, system.damp, 1.0)
+        values = np.concatenate(
+            [system.blocks.ravel(), system.blocks[_below(system)].ravel(), system.edge_blocks.ravel(), damp.ravel()]
+        )
+        data = np.add.reduceat(values[self.entries], self.starts)
+        return scipy.sparse.csc_array((data, self.indices, self.indptr), shape=(len(self.order),) * 2)
+
+
+def _block_rows(system: ReducedSystem) -> AnyArray:
+    s = system.structure
+    return np.repeat(np.arange(len(s.row_ptr) - 1), np.diff(s.row_ptr))
+
+
+def _below(system: ReducedSystem) -> AnyArray:
+    """(B,) which image blocks lie beside the diagonal, and so count a second time above it."""
+    return np.asarray(_block_rows(system) != system.structure.cols)
+
+
+def _unknowns(system: ReducedSystem) -> tuple[AnyArray, AnyArray]:
+    """Row and column of every number of a system: image blocks, those mirrored, edge blocks, diagonal; -1 for held keyframes."""
+    size, s = system.rhs.shape[1], system.structure
+    shape = (len(s.cols), 6, 6)
+    row = np.broadcast_to(size * _block_rows(system)[:, None, None] + np.arange(6)[:, None], shape)
+    col = np.broadcast_to(size * s.cols.astype(np.int64)[:, None, None] + np.arange(6), shape)
+    below = _below(system)
+    slots = np.repeat(system.chains.edge_slots.reshape(-1, 2), 15, axis=1)
+    ends = np.where(slots >= 0, size * slots + np.tile(np.arange(15), 2), -1)
+    along = np.repeat(ends[:, :, None], 30, axis=2)
     diagonal = np.arange(system.rhs.size)
-    rows, cols = np.concatenate([rows[keep], diagonal]), np.concatenate([cols[keep], diagonal])
-    values = np.concatenate([values[keep], np.where(held, 1.0, system.damp.ravel())])
-    return scipy.sparse.coo_array((values, (rows, cols)), shape=(system.rhs.size, system.rhs.size)).tocsc()
-
-
-def _entries(block_rows: AnyArray, block_cols: AnyArray, blocks: Array, size: int) -> tuple[AnyArray, AnyArray, Array]:
-    inner = np.arange(blocks.shape[1])
-    row = np.broadcast_to(size * block_rows[:, None, None] + inner[None, :, None], blocks.shape)
-    col = np.broadcast_to(size * block_cols[:, None, None] + inner[None, None, :], blocks.shape)
-    return row.ravel(), col.ravel(), blocks.ravel()
+    rows = [row.ravel(), col[below].ravel(), along.ravel(), diagonal]
+    cols = [col.ravel(), row[below].ravel(), along.transpose(0, 2, 1).ravel(), diagonal]
+    return np.concatenate(rows), np.concatenate(cols)

@@ -1,16 +1,18 @@
 """What a finished survey does not hand on: duplicates, landmarks that are badly known, keyframes that others make superfluous."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from fleetmap.features.matching import packed
 from fleetmap.geometry import Array
 from mapserver.survey.adjust import SurveyState
 from mapserver.survey.keyframes import Keyframe
 from mapserver.survey.settings import CullSettings
-from mapserver.survey.tracks import Landmarks
+from mapserver.survey.summary_kernels import mark_duplicates, mark_redundant
+from mapserver.survey.tracks import Landmarks, of_features
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +32,7 @@ def cull(
     sigmas_m (N,) of the landmarks.
     """
     marks = state.landmarks
-    octaves = np.array(
-        [keyframes[k].features.octaves[f] for k, f in zip(marks.obs_keyframe, marks.obs_feature, strict=True)], np.int64
-    )
+    octaves = of_features(marks, [k.features.octaves for k in keyframes]).astype(np.int64)
     double = _duplicates(marks, keyframes, sigmas_m, settings)
     weak = ~double & (parallax_rad(state) < np.radians(settings.min_parallax_deg))
     lasting = ~(double | weak)
@@ -67,23 +67,11 @@ def _duplicates(
     if not len(near):
         return double
     starts = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map) + 1))
-    counts = np.diff(starts)
-    order = np.lexsort((near[:, 1], near[:, 0]))
-    for a, b in near[order]:
-        if double[a] or double[b]:
-            continue
-        apart_m = float(np.linalg.norm(marks.points_map[a] - marks.points_map[b]))
-        if apart_m > 3.0 * float(np.hypot(sigmas_m[a], sigmas_m[b])):
-            continue
-        of_a, of_b = slice(starts[a], starts[a + 1]), slice(starts[b], starts[b + 1])
-        if np.intersect1d(marks.obs_keyframe[of_a], marks.obs_keyframe[of_b]).size:
-            continue
-        first, second = (
-            keyframes[marks.obs_keyframe[s.start]].features.descriptors[marks.obs_feature[s.start]]
-            for s in (of_a, of_b)
-        )
-        if int(np.bitwise_count(first ^ second).sum()) <= settings.duplicate_distance:
-            double[b if counts[a] >= counts[b] else a] = True
+    first = replace(marks, obs_keyframe=marks.obs_keyframe[starts[:-1]], obs_feature=marks.obs_feature[starts[:-1]])
+    mark_duplicates(
+        near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.int64), marks.points_map, sigmas_m, starts, marks.obs_keyframe,
+        packed(of_features(first, [k.features.descriptors for k in keyframes])), settings.duplicate_distance, double,
+    )  # fmt: skip
     return double
 
 
@@ -96,18 +84,13 @@ def redundant(
     Source: Mur-Artal and Tardos 2015 (ORB-SLAM).
     """
     gone = np.zeros(count, bool)
-    usable = lasting[marks.obs_landmark]
-    by_keyframe = [np.flatnonzero((marks.obs_keyframe == k) & usable) for k in range(count)]
+    usable = np.flatnonzero(lasting[marks.obs_landmark])
+    own = marks.obs_keyframe[usable]
+    seen = np.bincount(own, minlength=count)
     starts = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map) + 1))
-    for k in sorted(range(1, count - 1), key=lambda k: (len(by_keyframe[k]), k)):
-        own = by_keyframe[k]
-        if not len(own):
-            gone[k] = True
-            continue
-        repeated = 0
-        for row in own:
-            others = slice(starts[marks.obs_landmark[row]], starts[marks.obs_landmark[row] + 1])
-            finer = (octaves[others] <= octaves[row] + 1) & ~gone[marks.obs_keyframe[others]]
-            repeated += int(finer.sum()) - 1 >= settings.redundant_observers
-        gone[k] = repeated >= settings.redundant_share * len(own)
+    order = np.array(sorted(range(1, count - 1), key=lambda k: (seen[k], k)), np.int64)
+    mark_redundant(
+        order, usable[np.argsort(own, kind="stable")], np.concatenate([[0], np.cumsum(seen)]), marks.obs_landmark,
+        marks.obs_keyframe, octaves, starts, settings.redundant_observers, settings.redundant_share, gone,
+    )  # fmt: skip
     return gone

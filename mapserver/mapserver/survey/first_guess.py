@@ -1,6 +1,6 @@
 """Stage 1: odometry over all frames, and the choice of keyframes on the way."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,8 +14,6 @@ from fleetmap.samples import CameraFrame, ImuSamples, WheelSample, wheel_between
 from mapserver.survey.keyframes import FrameSummary, Keyframe, KeyframePolicy, PictureShelf, make_keyframes, sharpness
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.work import ALONE, Worker
-
-_TOGETHER = 16  # keyframes whose pictures wait in memory until their features are found
 
 _LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of a frame, as its stamp may be too early
 
@@ -39,13 +37,14 @@ class FirstGuess:
 
 
 def run_odometry(
-    frames: Iterable[CameraFrame], imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings,
-    progress: Callable[[int], None], shelf: PictureShelf | None = None,
+    frames: Iterable[CameraFrame | RectifiedFrame], imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
+    settings: SurveySettings, progress: Callable[[int], None], shelf: PictureShelf | None = None,
     wheel: Sequence[WheelSample] = (), worker: Worker = ALONE,
 ) -> FirstGuess:  # fmt: skip
     """Feeds frames (in order), the IMU and the wheels up to each into the odometry.
 
-    progress is called with each frame's number.
+    frames: as they were recorded, or rectified by who reads them ahead. progress is called with each frame's number. While the
+    odometry goes on, the worker finds the features of the keyframes that it has chosen.
     """
     odometry = make_odometry(
         calibration,
@@ -58,33 +57,22 @@ def run_odometry(
     policy = KeyframePolicy(settings.keyframes)
     estimates: list[OdometryEstimate] = []
     odom_from_body: list[Array] = []
-    keyframes: list[Keyframe] = []
-    chosen: list[tuple[int, RectifiedFrame]] = []
-    fed_ns = -(2**62)
-    for number, raw in enumerate(frames):
-        frame = rectifier.rectify(raw)
-        until_ns = raw.stamp_ns + int(rectifier.imu_minus_cam_s * 1e9) + _LEAD_NS
-        odometry.handle_imu(imu.between(fed_ns, until_ns))
-        odometry.handle_wheel(wheel_between(wheel, fed_ns, until_ns))
-        fed_ns = until_ns
-        estimate = odometry.handle_stereo(frame)
-        if estimate.new_odom_from_old_odom is not None:
-            odom_from_body = [estimate.new_odom_from_old_odom @ earlier for earlier in odom_from_body]
-        estimates.append(estimate)
-        odom_from_body.append(estimate.odom_from_body)
-        for earlier_number, placed in estimate.revised:
-            odom_from_body[earlier_number] = placed
-            estimates[earlier_number] = replace(
-                estimates[earlier_number], odom_from_body=placed, status=OdometryStatus.TRACKING,
-                scale_known=estimate.scale_known,
-            )  # fmt: skip
-        if policy.wants(_summary(frame, estimate)):
-            chosen.append((number, frame))
-        if len(chosen) == _TOGETHER:
-            keyframes += make_keyframes(chosen, rectifier.camera, settings, shelf, worker)
-            chosen = []
-        progress(number)
-    keyframes += make_keyframes(chosen, rectifier.camera, settings, shelf, worker)
+
+    def chosen() -> Iterator[tuple[int, RectifiedFrame]]:
+        fed_ns = -(2**62)
+        for number, raw in enumerate(frames):
+            frame = raw if isinstance(raw, RectifiedFrame) else rectifier.rectify(raw)
+            until_ns = raw.stamp_ns + int(rectifier.imu_minus_cam_s * 1e9) + _LEAD_NS
+            odometry.handle_imu(imu.between(fed_ns, until_ns))
+            odometry.handle_wheel(wheel_between(wheel, fed_ns, until_ns))
+            fed_ns = until_ns
+            estimate = odometry.handle_stereo(frame)
+            _take(estimate, estimates, odom_from_body)
+            progress(number)
+            if policy.wants(_summary(frame, estimate)):
+                yield number, frame
+
+    keyframes = list(make_keyframes(chosen(), rectifier.camera, settings, shelf, worker))
     inertial = bool(estimates) and calibration.imu is not None and estimates[-1].inertial
     guess = FirstGuess(
         estimates,
@@ -96,6 +84,20 @@ def run_odometry(
         bool(estimates) and estimates[-1].scale_known,
     )
     return guess if rectifier.camera.baseline_m > 0 else connected_part(guess, rectifier.body_from_cam)
+
+
+def _take(estimate: OdometryEstimate, estimates: list[OdometryEstimate], odom_from_body: list[Array]) -> None:
+    """Adds one frame's estimate, and moves the ones before as it says."""
+    if estimate.new_odom_from_old_odom is not None:
+        odom_from_body[:] = [estimate.new_odom_from_old_odom @ earlier for earlier in odom_from_body]
+    estimates.append(estimate)
+    odom_from_body.append(estimate.odom_from_body)
+    for earlier_number, placed in estimate.revised:
+        odom_from_body[earlier_number] = placed
+        estimates[earlier_number] = replace(
+            estimates[earlier_number], odom_from_body=placed, status=OdometryStatus.TRACKING,
+            scale_known=estimate.scale_known,
+        )  # fmt: skip
 
 
 def _summary(frame: RectifiedFrame, estimate: OdometryEstimate) -> FrameSummary:

@@ -1,8 +1,9 @@
 """Which frames become keyframes, and what is kept of each."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Protocol
 
 import cv2
@@ -13,9 +14,9 @@ from fleetmap.features import orb, patch_align, stereo
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from mapserver.survey.settings import KeyframeSettings, SurveySettings
-from mapserver.survey.work import ALONE, Worker, in_batches
+from mapserver.survey.work import ALONE, Worker
 
-_BATCH = 4  # frames for one call: a twentieth of a second each
+_BATCH = 2  # frames for one call: a twentieth of a second each
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,37 +70,48 @@ class Keyframe:
     from_views: bool = False
 
     @property
+    def pictures(self) -> Pictures:
+        """What lies on the shelf."""
+        return self.shelf.get(self.shelf_number)
+
+    @property
     def frame(self) -> RectifiedFrame:
         """The rectified frame."""
-        return self.shelf.get(self.shelf_number).frame
+        return self.pictures.frame
 
     @property
     def pyramid(self) -> patch_align.Pyramid:
         """The left picture and its halvings."""
-        return self.shelf.get(self.shelf_number).pyramid
+        return self.pictures.pyramid
 
 
 def make_keyframe(
     frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings, shelf: PictureShelf | None = None
 ) -> Keyframe:  # fmt: skip
     """Detects, describes and stereo-matches one frame; its pictures go to `shelf`, into memory without one."""
-    return make_keyframes([(frame_index, frame)], camera, settings, shelf, ALONE)[0]
+    return next(make_keyframes([(frame_index, frame)], camera, settings, shelf, ALONE))
 
 
 def make_keyframes(
-    frames: Sequence[tuple[int, RectifiedFrame]], camera: StereoCamera, settings: SurveySettings, shelf: PictureShelf | None,
+    frames: Iterable[tuple[int, RectifiedFrame]], camera: StereoCamera, settings: SurveySettings, shelf: PictureShelf | None,
     worker: Worker,
-) -> list[Keyframe]:  # fmt: skip
-    """The same of several frames, each with its number."""
+) -> Iterator[Keyframe]:  # fmt: skip
+    """The same of several frames, each with its number; a worker is at some of them while the next ones are still awaited."""
     kept = MemoryShelf() if shelf is None else shelf
-    batches = in_batches([frame for _, frame in frames], _BATCH)
-    extracted = [x for batch in worker.map(_extract, (camera, settings), batches) for x in batch]
-    made = []
-    for (number, frame), (features, disparities) in zip(frames, extracted, strict=True):
-        points = camera.point_from_pixel(features.pixels, disparities[:, 0])
-        place = kept.put(Pictures(frame, patch_align.half_pyramid(frame.left)))
-        made.append(Keyframe(number, frame.stamp_ns, features, disparities, points, kept, place))
-    return made
+    waiting: deque[tuple[int, RectifiedFrame]] = deque()
+
+    def batches() -> Iterator[list[RectifiedFrame]]:
+        source = iter(frames)
+        while batch := list(islice(source, _BATCH)):
+            waiting.extend(batch)
+            yield [frame for _, frame in batch]
+
+    for found in worker.map(_extract, (camera, settings), batches()):
+        for features, disparities in found:
+            number, frame = waiting.popleft()
+            points = camera.point_from_pixel(features.pixels, disparities[:, 0])
+            place = kept.put(Pictures(frame, patch_align.half_pyramid(frame.left)))
+            yield Keyframe(number, frame.stamp_ns, features, disparities, points, kept, place)
 
 
 def _extract(

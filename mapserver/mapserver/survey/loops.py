@@ -10,11 +10,12 @@ from fleetmap.bow import BowVector, PlaceIndex
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.rectification import StereoCamera
 from mapserver.survey.graph_marginals import GraphMarginals
-from mapserver.survey.keyframes import Keyframe
-from mapserver.survey.matching import median_depth_m
+from mapserver.survey.keyframes import Keyframe, without_pictures
+from mapserver.survey.matching import ComparedFeatures, median_depth_m
 from mapserver.survey.pairs import PairMatch, match_pair
 from mapserver.survey.pose_graph import PoseEdge, adjoint
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.work import ALONE, Worker
 from mapserver.survey.zones import Zones
 
 _CORRELATION = (
@@ -91,6 +92,7 @@ class LoopCloser:
     def __init__(
         self, keyframes: list[Keyframe], vectors: list[BowVector], word_count: int, camera: StereoCamera, body_from_cam: Array,
         map_from_body: Array, marginals: GraphMarginals, matched: set[tuple[int, int]], settings: SurveySettings, zones: Zones,
+        worker: Worker = ALONE,
     ) -> None:  # fmt: skip
         self._keyframes, self._vectors, self._camera = keyframes, vectors, camera
         self._body_from_cam, self._map_from_body = body_from_cam, map_from_body  # moved by every accepted loop
@@ -100,6 +102,8 @@ class LoopCloser:
         for i, j in sorted(matched):
             self._neighbours.setdefault(i, []).append(j)
             self._neighbours.setdefault(j, []).append(i)
+        self._worker = worker
+        self._compared = ComparedFeatures([without_pictures(k) for k in keyframes], camera, settings)
         self._depths_m = np.array([median_depth_m(keyframe) for keyframe in keyframes])
         self._index = PlaceIndex(word_count)
         self.loops = Loops()
@@ -108,14 +112,16 @@ class LoopCloser:
         """Looks for revisits of keyframe i among those before it, then adds it to the index. To be called in order."""
         ids, scores = self._alike(i)
         believed: list[tuple[PoseEdge, LoopRecord]] = []
-        for n in self._gate(i, ids, scores):
+        inside = self._gate(i, ids, scores)
+        matches = self._worker.map(_verify, self._compared, [self._look(i, int(ids[n])) for n in inside])
+        for n, match in zip(inside, matches, strict=True):
             j, score = int(ids[n]), float(scores[n])
             same = [edge.j for edge, _ in believed if not self._are_apart(j, np.array([edge.j]))[0]]
             if len(same) >= self._settings.loops.per_place:
                 reason = f"its place is closed with keyframe {same[0]} already"
                 self.loops.records.append(LoopRecord(i, j, score, Verdict.REJECTED, reason))
                 continue
-            outcome = self._examine(i, j, score, ids[scores >= _TWIN_SCORE * score])
+            outcome = self._examine(i, j, score, match, ids[scores >= _TWIN_SCORE * score])
             if isinstance(outcome, LoopRecord):
                 self.loops.records.append(outcome)
             else:
@@ -170,14 +176,13 @@ class LoopCloser:
         return inside[: loops.top]
 
     def _examine(
-        self, i: int, j: int, score: float, twins: NDArray[np.int64]
+        self, i: int, j: int, score: float, match: PairMatch | None, twins: NDArray[np.int64]
     ) -> tuple[PoseEdge, LoopRecord] | LoopRecord:
         """The edge of a candidate that passed every test alone, or why it did not."""
 
         def refuse(verdict: Verdict, reason: str, inliers: int = 0) -> LoopRecord:
             return LoopRecord(i, j, score, verdict, reason, inliers)
 
-        match = self._verify(i, j)
         if match is None:
             return refuse(Verdict.REJECTED, "too few features agree on one motion")
         count = len(match.features)
@@ -216,14 +221,14 @@ class LoopCloser:
         lengths_m = np.linalg.norm(steps[possible], axis=1)
         return float(lengths_m.min()) if len(lengths_m) else None
 
-    def _verify(self, i: int, j: int) -> PairMatch | None:
-        """Match of j (as reference) with i; the graph's rotation is used where it is known well enough."""
+    def _look(self, i: int, j: int) -> "_Look":
+        """How to match j (as reference) with i; the graph's rotation is used where it is known well enough."""
         predicted = (
             self._cam_from_body @ se3_inverse(self._map_from_body[i]) @ self._map_from_body[j] @ self._body_from_cam
         )
         sigma = float(np.sqrt(np.trace(self._marginals.relative_cov(i, j)[:3, :3])))
         known = max(sigma, 0.02) if sigma < self._settings.loops.rotation_sigma_limit_rad else None
-        return match_pair(j, i, self._keyframes, self._camera, predicted, known, self._settings.pairs)
+        return j, i, predicted, known
 
     def _edge(self, match: PairMatch) -> PoseEdge:
         """Body i from body j; the match has camera i (its j) from camera j (its i)."""
@@ -281,6 +286,16 @@ class LoopCloser:
 
     def _well_known(self) -> Array:
         return np.asarray(_WELL_KNOWN_COV * 2.0 ** (self._marginals.learned / _LEARNED_PER_DOUBLING))
+
+
+_Look = tuple[
+    int, int, Array, float | None
+]  # reference, the other, its camera from the reference's, sigma of the rotation
+
+
+def _verify(compared: ComparedFeatures, look: _Look) -> PairMatch | None:
+    j, i, predicted, known = look
+    return match_pair(j, i, compared.keyframes, compared.camera, predicted, known, compared.settings.pairs)
 
 
 def _cells(keyframe: Keyframe, features: NDArray[np.int64], camera: StereoCamera) -> int:

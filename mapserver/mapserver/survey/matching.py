@@ -27,7 +27,7 @@ class PairFinder:
     ) -> None:  # fmt: skip
         self._keyframes, self._camera, self._body_from_cam, self._settings = keyframes, camera, body_from_cam, settings
         self._worker = worker
-        self._shared = _Features([without_pictures(k) for k in keyframes], camera, settings)
+        self._shared = ComparedFeatures([without_pictures(k) for k in keyframes], camera, settings)
         self._depths = np.array([median_depth_m(k) for k in keyframes])
 
     def candidates(self, map_from_body: Array, *, previous: int, only_near: int | None = None) -> list[tuple[int, int]]:
@@ -79,7 +79,7 @@ class PairFinder:
 
 
 @dataclass(frozen=True, slots=True)
-class _Features:
+class ComparedFeatures:
     """What matching looks at of a survey: its keyframes without their pictures."""
 
     keyframes: list[Keyframe]
@@ -88,7 +88,7 @@ class _Features:
 
 
 def _match_batch(
-    features: _Features, batch: tuple[list[tuple[int, int, Array]], float | None, bool]
+    features: ComparedFeatures, batch: tuple[list[tuple[int, int, Array]], float | None, bool]
 ) -> list[PairMatch | None]:
     looks, rotation_sigma_rad, is_known = batch
     return [

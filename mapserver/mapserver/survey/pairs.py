@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.features.matching import match_by_projection, match_mutual
-from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.geometry import Array, se3_inverse
 from fleetmap.pose_solver import Resection, ransac_resection, refine_resection, resection_with_rotation
 from fleetmap.rectification import StereoCamera
 from mapserver.survey.keyframes import Keyframe
+from mapserver.survey.pairs_kernels import predict_features, share_in_view
 from mapserver.survey.settings import PairSettings
 
 Indices = NDArray[np.int64]
@@ -86,26 +87,29 @@ def _project_match(
     a: Keyframe, b: Keyframe, camera: StereoCamera, b_from_a: Array, settings: PairSettings, radius_px: float
 ) -> Indices:
     """(P, 2) matches of a's features with depth into b by projection."""
-    known = np.flatnonzero(np.isfinite(a.disparities[:, 0]))
-    points_b = transform_points(b_from_a, a.points_cam[known])
-    predicted = camera.pixel_from_point(points_b)[:, :2]
-    inside = (
-        (predicted[:, 0] > 0)
-        & (predicted[:, 1] > 0)
-        & (predicted[:, 0] < camera.width_px)
-        & (predicted[:, 1] < camera.height_px)
+    count = len(a.features)
+    predicted, radius, span = np.empty((count, 2)), np.empty(count), np.zeros((count, 2), np.int64)
+    predict_features(
+        b_from_a,
+        a.points_cam,
+        a.disparities[:, 0],
+        a.features.octaves,
+        _lens(camera),
+        radius_px,
+        predicted,
+        radius,
+        span,
     )
-    predicted[~inside] = np.nan
-    ratio = np.clip(a.points_cam[known, 2] / np.maximum(points_b[:, 2], 0.05), 0.1, 10.0)
-    octave = a.features.octaves[known] + np.log(ratio) / np.log(1.2)
-    span = np.column_stack([np.floor(octave) - 2, np.ceil(octave) + 2]).astype(np.int64)
-    radius = radius_px * 1.2 ** np.clip(octave, 0, 4)
     found, _ = match_by_projection(
-        predicted, radius, a.features.descriptors[known], span, b.features.pixels, b.features.octaves, b.features.descriptors,
+        predicted, radius, a.features.descriptors, span, b.features.pixels, b.features.octaves, b.features.descriptors,
         settings.guided_distance, 0.95,
     )  # fmt: skip
     hit = np.flatnonzero(found >= 0)
-    return np.column_stack([known[hit], found[hit]])
+    return np.column_stack([hit, found[hit]])
+
+
+def _lens(camera: StereoCamera) -> Array:
+    return np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px], np.float64)
 
 
 def _from_projection(
@@ -148,13 +152,4 @@ def _complete(
 
 def view_overlap(a: Keyframe, camera: StereoCamera, b_from_a: Array) -> float:
     """Share of a's points with depth that b would see, at a similar distance."""
-    points = a.points_cam[np.isfinite(a.disparities[:, 0])]
-    if not len(points):
-        return 0.0
-    seen = transform_points(b_from_a, points)
-    pixels = camera.pixel_from_point(seen)
-    inside = (
-        (pixels[:, 0] > 0) & (pixels[:, 1] > 0) & (pixels[:, 0] < camera.width_px) & (pixels[:, 1] < camera.height_px)
-    )
-    ratio = seen[:, 2] / points[:, 2]
-    return float((inside & (ratio > 0.4) & (ratio < 2.5)).mean())
+    return share_in_view(b_from_a, a.points_cam, a.disparities[:, 0], _lens(camera))

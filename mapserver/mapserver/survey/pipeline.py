@@ -11,7 +11,7 @@ from fleetmap.bow import Vocabulary
 from fleetmap.calibration import RigCalibration
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.rectification import Rectifier
+from fleetmap.rectification import RectifiedFrame, Rectifier
 from fleetmap.samples import CameraFrame, ImuSamples, WheelSample
 from mapserver.survey.adjust import Motion, SurveyState, adjust, adjust_windows
 from mapserver.survey.bundle import RelativeTerm
@@ -29,7 +29,7 @@ from mapserver.survey.result import SurveyMap
 from mapserver.survey.scaled_loops import ScaledLoopCloser, gate_covariances, rigid, solve_scaled
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.summary import summarise
-from mapserver.survey.tracks import build_landmarks
+from mapserver.survey.tracks import build_landmarks, observed_again
 from mapserver.survey.view_depths import ViewDepths, survey_camera
 from mapserver.survey.work import ALONE, Worker
 from mapserver.survey.zones import Zones
@@ -56,7 +56,7 @@ class Survey:
 
 
 def survey(
-    frames: Iterable[CameraFrame], frame_count: int, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
+    frames: Iterable[CameraFrame | RectifiedFrame], frame_count: int, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
     vocabulary: Vocabulary, settings: SurveySettings, zones: Zones, progress: Progress,
     shelf: PictureShelf | None = None, wheel: Sequence[WheelSample] = (), worker: Worker = ALONE,
 ) -> Survey:  # fmt: skip
@@ -97,7 +97,7 @@ def survey_from(
     if state.motion.inertial:
         adjust(state, settings, rounds=2)
     guess = _with_depths(guess, state, depths)
-    loops = _close_loops(guess, state, pairs, vocabulary, settings, zones, progress)
+    loops = _close_loops(guess, state, pairs, vocabulary, settings, zones, progress, worker)
     turn = NO_TURN
     for round_number in range(2):
         progress("global adjustment", round_number, 2)
@@ -105,15 +105,17 @@ def survey_from(
             guess = _with_depths(guess, state, depths)
             keyframes = guess.keyframes
             finder = PairFinder(keyframes, state.camera, rectifier.body_from_cam, settings, worker)
-        if (
-            round_number == 0 or depths is not None
-        ):  # a second search finds hardly a match more; its coordinates are finer
+        if round_number == 0 or depths is not None:
             pairs = _match_all(state, finder, settings, progress)
-        state.landmarks = build_landmarks(
-            keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings, worker
-        )
+            state.landmarks = build_landmarks(
+                keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings, worker
+            )
+        else:  # a second search finds hardly a match more; its coordinates are finer
+            state.landmarks = observed_again(
+                state.landmarks, keyframes, state.map_from_body, state.body_from_cam, state.camera, settings, worker
+            )
         state.landmarks = without_turn(state.landmarks, state.camera, turn.correction_px)
-        adjust(state, settings, final=True)
+        adjust(state, settings, rounds=3 if round_number == 0 or depths is not None else 2, final=True)
         if round_number == 0:
             turn = estimate_turn(state, settings)
     progress("global adjustment", 2, 2)
@@ -191,7 +193,7 @@ def _match_neighbours(
     covariances = guess.covariances[[k.frame_index for k in guess.keyframes]]
     return finder.match(
         candidates, state.map_from_body, drift_allowance_m(covariances, state.map_from_body[:, :3, 3]),
-        rotation_sigma_rad=0.02 if guess.inertial else None, is_known=False,
+        rotation_sigma_rad=0.02 if guess.inertial else None, is_known=True,
         progress=lambda n: progress("matching", n + 1, len(candidates)),
     )  # fmt: skip
 
@@ -206,7 +208,7 @@ def _match_all(state: SurveyState, finder: PairFinder, settings: SurveySettings,
 
 def _close_loops(
     guess: FirstGuess, state: SurveyState, pairs: list[PairMatch], vocabulary: Vocabulary, settings: SurveySettings, zones: Zones,
-    progress: Progress,
+    progress: Progress, worker: Worker,
 ) -> Loops:  # fmt: skip
     """Finds loops, and moves the keyframes to where the pose graph with them says."""
     keyframes = guess.keyframes
@@ -215,7 +217,7 @@ def _close_loops(
     kind, known = (LoopCloser, chain) if guess.scale_known else (ScaledLoopCloser, gate_covariances(chain, walk))
     closer = kind(
         keyframes, vectors, vocabulary.word_count, state.camera, state.body_from_cam, state.map_from_body,
-        GraphMarginals(state.map_from_body, known), {(p.i, p.j) for p in pairs}, settings, zones,
+        GraphMarginals(state.map_from_body, known), {(p.i, p.j) for p in pairs}, settings, zones, worker,
     )  # fmt: skip
     for i in range(len(keyframes)):
         closer.close(i)

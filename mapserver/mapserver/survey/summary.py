@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.features.matching import packed
+from fleetmap.features.patch_align import halvings
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.rectification import StereoCamera
 from fleetmap.samples import Trajectory
@@ -15,7 +16,8 @@ from mapserver.survey.first_guess import FirstGuess
 from mapserver.survey.keyframes import Keyframe
 from mapserver.survey.result import SurveyMap
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.tracks import Landmarks
+from mapserver.survey.summary_kernels import medoids
+from mapserver.survey.tracks import Landmarks, of_features
 from mapserver.survey.trajectory import frame_trajectory
 
 _PATCH_HALF_PX = 10  # a 9 px window seen from nearer or turned still finds all of itself
@@ -28,9 +30,7 @@ def summarise(state: SurveyState, guess: FirstGuess, settings: SurveySettings) -
     marks, kept, culled = cull(state, guess.keyframes, every_sigma, settings.cull)
     keyframes = [k for k, keep in zip(guess.keyframes, kept, strict=True) if keep]
     marks = replace(marks, obs_keyframe=(np.cumsum(kept) - 1)[marks.obs_keyframe].astype(np.int32))
-    octaves = np.array(
-        [keyframes[k].features.octaves[f] for k, f in zip(marks.obs_keyframe, marks.obs_feature, strict=True)], np.int8
-    )
+    octaves = of_features(marks, [k.features.octaves for k in keyframes])
     frame_stamps = np.array([e.stamp_ns for e in guess.estimates], np.int64)
     numbers = [k.frame_index for k in guess.keyframes]
     map_from_body = frame_trajectory(frame_stamps, guess.odom_from_body, numbers, state.map_from_body)
@@ -61,17 +61,10 @@ def summarise(state: SurveyState, guess: FirstGuess, settings: SurveySettings) -
 
 def medoid_descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
     """(N, 32): of each landmark's descriptors the one nearest to all others (their medoid)."""
-    rows = np.array(
-        [keyframes[k].features.descriptors[f] for k, f in zip(marks.obs_keyframe, marks.obs_feature, strict=True)]
-    )
-    out = np.zeros((len(marks.points_map), 32), np.uint8)
-    starts = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map) + 1))
-    words = packed(rows) if len(rows) else np.zeros((0, 4), np.uint64)
-    for n in range(len(out)):
-        own = words[starts[n] : starts[n + 1]]
-        total = np.bitwise_count(own[:, None] ^ own[None]).sum(axis=(1, 2))
-        out[n] = rows[starts[n] + int(np.argmin(total))]
-    return out
+    rows = of_features(marks, [k.features.descriptors for k in keyframes])
+    chosen = np.zeros(len(marks.points_map), np.int64)
+    medoids(packed(rows), np.searchsorted(marks.obs_landmark, np.arange(len(chosen) + 1)), chosen)
+    return rows[chosen]
 
 
 def point_sigmas_m(state: SurveyState) -> Array:
@@ -112,14 +105,16 @@ def cut_patches(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8
     out = np.zeros((len(marks.points_map), size, size), np.uint8)
     first = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map)))
     steps = np.arange(-_PATCH_HALF_PX, _PATCH_HALF_PX + 1)
-    for n, row in enumerate(first):
-        keyframe = keyframes[marks.obs_keyframe[row]]
-        level = min(int(np.rint(keyframe.features.octaves[marks.obs_feature[row]] * np.log2(1.2))), 2)
-        image = keyframe.pyramid[level]
-        x, y = np.rint(marks.obs_pixels[row, :2] / 2.0**level).astype(int)
-        rows = np.clip(y + steps, 0, image.shape[0] - 1)
-        columns = np.clip(x + steps, 0, image.shape[1] - 1)
-        out[n] = image[rows[:, None], columns]
+    owners, features = marks.obs_keyframe[first], marks.obs_feature[first]
+    for k in np.unique(owners).tolist():
+        own = np.flatnonzero(owners == k)
+        levels, pyramid = halvings(keyframes[k].features.octaves[features[own]]), keyframes[k].pyramid
+        for level, image in enumerate(pyramid):
+            index = own[levels == level]
+            x, y = np.rint(marks.obs_pixels[first[index], :2] / 2.0**level).astype(int).T
+            rows = np.clip(y[:, None] + steps, 0, image.shape[0] - 1)
+            columns = np.clip(x[:, None] + steps, 0, image.shape[1] - 1)
+            out[index] = image[rows[:, :, None], columns[:, None, :]]
     return out
 
 

@@ -1,17 +1,20 @@
 """Landmarks from verified pairs: features joined across keyframes, one per keyframe, with sub-pixel coordinates."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import patch_align, stereo
+from fleetmap.features import stereo
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.rectification import StereoCamera
-from mapserver.survey.keyframes import Keyframe, with_pictures
+from mapserver.survey.keyframes import Keyframe, Pictures, with_pictures
 from mapserver.survey.pairs import PairMatch
 from mapserver.survey.settings import NoiseSettings, SurveySettings
+from mapserver.survey.tracks_kernels import align_observations
 from mapserver.survey.tracks_kernels import join as join_kernel
 from mapserver.survey.work import ALONE, Worker, in_batches
 
@@ -44,11 +47,38 @@ class Landmarks:
         )  # fmt: skip
 
 
+def of_features(marks: Landmarks, columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """What each observation's feature has: columns are one array for each keyframe, a row for each feature."""
+    out = np.empty((len(marks.obs_keyframe), *columns[0].shape[1:]), columns[0].dtype)
+    order = np.argsort(marks.obs_keyframe, kind="stable")
+    ends = np.cumsum(np.bincount(marks.obs_keyframe, minlength=len(columns)))
+    for column, rows in zip(columns, np.split(order, ends[:-1]), strict=True):
+        out[rows] = column[marks.obs_feature[rows]]
+    return out
+
+
 def join_tracks(keyframes: list[Keyframe], pairs: list[PairMatch]) -> list[list[tuple[int, int]]]:
     """Groups of (keyframe, feature) that pairs connect, no keyframe twice in a group; strongest pairs are joined first."""
+    groups = _joined(pairs)
+    members = list(zip(groups.keyframes.tolist(), groups.features.tolist(), strict=True))
+    edges = np.append(groups.starts, len(members)).tolist()
+    return [members[start:end] for start, end in pairwise(edges)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Groups:
+    """Members (M,) of G groups, one group after the other, by rising keyframe; starts (G,) of each."""
+
+    keyframes: NDArray[np.int64]
+    features: NDArray[np.int64]
+    starts: NDArray[np.int64]
+
+
+def _joined(pairs: list[PairMatch]) -> _Groups:
     ordered = sorted(pairs, key=lambda p: (-len(p.features), p.i, p.j))
     if not ordered:
-        return []
+        nothing = np.zeros(0, np.int64)
+        return _Groups(nothing, nothing, nothing)
     sides = [np.concatenate([p.features[:, side] for p in ordered]).astype(np.int64) for side in range(2)]
     counts = [len(p.features) for p in ordered]
     owners = [np.repeat(np.array([p.i for p in ordered]), counts), np.repeat(np.array([p.j for p in ordered]), counts)]
@@ -57,10 +87,10 @@ def join_tracks(keyframes: list[Keyframe], pairs: list[PairMatch]) -> list[list[
     nodes, links = np.unique(np.concatenate(codes), return_inverse=True)
     roots = join_kernel(links[: len(codes[0])], links[len(codes[0]) :], nodes // stride)
     order = np.lexsort((nodes, roots))
-    _, starts, sizes = np.unique(roots[order], return_index=True, return_counts=True)
-    found = nodes[order]
-    members = list(zip((found // stride).tolist(), (found % stride).tolist(), strict=True))
-    return [members[start : start + size] for start, size in zip(starts, sizes, strict=True) if size > 1]
+    _, inverse, sizes = np.unique(roots[order], return_inverse=True, return_counts=True)
+    shared = sizes[inverse] > 1
+    found, lasting = nodes[order][shared], sizes[sizes > 1]
+    return _Groups(found // stride, found % stride, np.cumsum(lasting) - lasting)
 
 
 def build_landmarks(
@@ -68,48 +98,71 @@ def build_landmarks(
     settings: SurveySettings, worker: Worker = ALONE,
 ) -> Landmarks:  # fmt: skip
     """Tracks of the pairs with a stereo point to start from, each observation's coordinate refined against the reference patch."""
-    rows: list[tuple[int, int, int]] = []
-    points: list[Array] = []
     map_from_cam = map_from_body @ body_from_cam
-    for group in join_tracks(keyframes, pairs):
-        reference = _reference(keyframes, group)
-        if reference is None:
-            continue
-        keyframe, feature = reference
-        points.append(transform_points(map_from_cam[keyframe], keyframes[keyframe].points_cam[feature][None])[0])
-        ordered = [reference, *(node for node in group if node != reference)]
-        rows.extend((k, len(points) - 1, f) for k, f in ordered)
-    if not rows:
+    table, points_cam = _tracks_from_reference(keyframes, _joined(pairs))
+    if not len(table):
         nothing = np.zeros(0, np.int32)
         return Landmarks(np.zeros((0, 3)), nothing, nothing, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)))
-    table = np.array(rows, np.int64)
-    pixels, sigmas = _observe(keyframes, table, map_from_cam, camera, settings, worker)
+    there = map_from_cam[table[_is_first(table), 0]]
+    points_map = np.einsum("nij,nj->ni", there[:, :3, :3], points_cam) + there[:, :3, 3]
+    pixels, sigmas = _observe(keyframes, table, points_map, map_from_cam, camera, settings, worker)
     return Landmarks(
-        np.array(points), table[:, 0].astype(np.int32), table[:, 1].astype(np.int32), table[:, 2], pixels, sigmas
+        points_map, table[:, 0].astype(np.int32), table[:, 1].astype(np.int32), table[:, 2], pixels, sigmas
     )
 
 
-def _reference(keyframes: list[Keyframe], group: list[tuple[int, int]]) -> tuple[int, int] | None:
-    """The observation that defines the landmark's patch: with depth, finest octave, nearest."""
-    usable = [(k, f) for k, f in group if np.isfinite(keyframes[k].disparities[f, 0])]
-    if not usable:
-        return None
-    return min(
-        usable,
-        key=lambda node: (keyframes[node[0]].features.octaves[node[1]], -keyframes[node[0]].disparities[node[1], 0]),
+def observed_again(
+    marks: Landmarks, keyframes: list[Keyframe], map_from_body: Array, body_from_cam: Array, camera: StereoCamera,
+    settings: SurveySettings, worker: Worker = ALONE,
+) -> Landmarks:  # fmt: skip
+    """The same landmarks with their coordinates refined anew: from better places patches are warped better."""
+    table = np.column_stack([marks.obs_keyframe, marks.obs_landmark, marks.obs_feature]).astype(np.int64)
+    pixels, sigmas = _observe(
+        keyframes, table, marks.points_map, map_from_body @ body_from_cam, camera, settings, worker
     )
+    return replace(marks, obs_pixels=pixels, obs_sigma_px=sigmas)
+
+
+def _is_first(table: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(M,) which observations are the first of their landmark."""
+    return np.asarray(np.diff(table[:, 1], prepend=-1) != 0)
+
+
+def _tracks_from_reference(keyframes: list[Keyframe], groups: _Groups) -> tuple[NDArray[np.int64], Array]:
+    """(M, 3) keyframe, landmark, feature of the groups that know a depth, each one's reference first; its points_cam (N, 3).
+
+    The reference defines the landmark's patch: with depth, finest octave, nearest.
+    """
+    if not len(groups.keyframes):
+        return np.zeros((0, 3), np.int64), np.zeros((0, 3))
+    first_of = np.cumsum([0, *(len(k.features) for k in keyframes)])
+    at = first_of[groups.keyframes] + groups.features
+    octaves = np.concatenate([k.features.octaves for k in keyframes])[at]
+    disparities = np.concatenate([k.disparities[:, 0] for k in keyframes])[at]
+    members = np.arange(len(at))
+    group = np.repeat(np.arange(len(groups.starts)), np.diff(groups.starts, append=len(at)))
+    best = np.lexsort((members, -disparities, octaves, ~np.isfinite(disparities), group))[groups.starts]
+    known = np.isfinite(disparities[best])
+    is_reference = np.zeros(len(at), bool)
+    is_reference[best] = True
+    order = np.lexsort((members, ~is_reference, group))
+    order = order[known[group[order]]]
+    landmark = (np.cumsum(known) - 1)[group]
+    table = np.column_stack([groups.keyframes, landmark, groups.features])[order]
+    return table, np.concatenate([k.points_cam for k in keyframes])[at[best[known]]]
 
 
 def _observe(
     keyframes: list[Keyframe],
     table: NDArray[np.int64],
+    points_map: Array,
     map_from_cam: Array,
     camera: StereoCamera,
     settings: SurveySettings,
     worker: Worker,
 ) -> tuple[Array, Array]:
     """Pixels (M, 3) and sigmas (M, 2) of observations (keyframe, landmark, feature), references first in each landmark."""
-    is_reference = np.r_[True, table[1:, 1] != table[:-1, 1]]
+    is_reference = _is_first(table)
     reference_row = np.maximum.accumulate(np.where(is_reference, np.arange(len(table)), 0))
     groups = in_batches(np.unique(table[:, 0]).tolist(), _BATCH)
     rows_of = [np.flatnonzero(np.isin(table[:, 0], group)) for group in groups]
@@ -120,7 +173,7 @@ def _observe(
             sources = np.unique(references[:, 0]).tolist()
             known = {k: with_pictures(keyframes[k], whole=k in group) for k in sorted({*group, *sources})}
             places = {k: map_from_cam[k] for k in known}
-            yield _Looks(table[rows], references, is_reference[rows], known, places)
+            yield _Looks(table[rows], references, is_reference[rows], points_map[table[rows, 1]], known, places)
 
     pixels, sigmas = np.empty((len(table), 3)), np.empty((len(table), 2))
     found = worker.map(_observe_batch, (camera, settings), batches())
@@ -131,11 +184,13 @@ def _observe(
 
 @dataclass(frozen=True, slots=True)
 class _Looks:
-    """Observations (M, 3) of some keyframes, their references (M, 3), which are references themselves, and all that these need."""
+    """Observations (M, 3) of some keyframes, their references (M, 3), which are references themselves, where their landmarks
+    are, and all that these need."""
 
     table: NDArray[np.int64]
     references: NDArray[np.int64]
     is_reference: NDArray[np.bool_]
+    points_map: Array
     keyframes: dict[int, Keyframe]
     map_from_cam: dict[int, Array]
 
@@ -147,21 +202,24 @@ def _observe_batch(shared: tuple[StereoCamera, SurveySettings], looks: _Looks) -
     pixels, sigmas = np.empty((len(looks.table), 3)), np.empty((len(looks.table), 2))
     for k in np.unique(looks.table[:, 0]).tolist():
         rows = np.flatnonzero(looks.table[:, 0] == k)
-        own, frame = keyframes[k], keyframes[k].frame
+        own, pictures = keyframes[k], keyframes[k].pictures
         features, references, is_reference = looks.table[rows, 2], looks.references[rows], looks.is_reference[rows]
+        points_map = looks.points_map[rows]
         left, sigma = own.features.pixels[features].copy(), _descriptor_sigma(own, features, noise)
         sigma[is_reference] = noise.aligned_sigma_px
-        for source in np.unique(references[:, 0]).tolist():
-            inner = np.flatnonzero((references[:, 0] == source) & ~is_reference)
-            if not len(inner):
-                continue
-            own_from_source = se3_inverse(looks.map_from_cam[k]) @ looks.map_from_cam[source]
-            theirs = references[inner, 2]
-            refined = _align(keyframes[source], theirs, own, features[inner], own_from_source, camera, settings)
+        cam_from_map = se3_inverse(looks.map_from_cam[k])
+        others = np.flatnonzero(~is_reference)
+        others = others[np.argsort(references[others, 0], kind="stable")]
+        sources, starts = np.unique(references[others, 0], return_index=True)
+        for source, inner in zip(sources.tolist(), np.split(others, starts[1:]), strict=True):
+            refined = _align(
+                keyframes[source], references[inner, 2], own, pictures, features[inner], looks.map_from_cam[source],
+                cam_from_map, points_map[inner], settings,
+            )  # fmt: skip
             sure = np.isfinite(refined[:, 0])
             left[inner[sure]] = refined[sure, :2]
             sigma[inner[sure]] = np.hypot(noise.aligned_sigma_px, refined[sure, 2])
-        found = stereo.disparities(frame, camera, left, settings.stereo, own.disparities[features, 0])
+        found = stereo.disparities(pictures.frame, camera, left, settings.stereo, own.disparities[features, 0])
         pixels[rows] = np.column_stack([left, left[:, 0] - found[:, 0]])
         sigmas[rows] = np.column_stack([sigma, np.hypot(noise.disparity_sigma_px, np.nan_to_num(found[:, 1], nan=1.0))])
     return pixels, sigmas
@@ -172,17 +230,17 @@ def _descriptor_sigma(keyframe: Keyframe, features: NDArray[np.int64], noise: No
 
 
 def _align(
-    reference: Keyframe, theirs: NDArray[np.int64], own: Keyframe, ours: NDArray[np.int64], own_from_reference: Array,
-    camera: StereoCamera, settings: SurveySettings,
+    reference: Keyframe, theirs: NDArray[np.int64], own: Keyframe, pictures: Pictures, ours: NDArray[np.int64],
+    map_from_reference: Array, cam_from_map: Array, points_map: Array, settings: SurveySettings,
 ) -> Array:  # fmt: skip
-    """Refined pixels (N, 3) of `ours`; the warp comes from the motion, which is finer than the octaves and angles of features."""
-    a, b = reference.features.take(theirs), own.features.take(ours)
-    warp = patch_align.similarity_from_motion(camera, reference.points_cam[theirs], own_from_reference)
-    rough = patch_align.similarity_from_features(
-        a.octaves, a.angles_deg.astype(np.float64), b.octaves, b.angles_deg.astype(np.float64)
-    )
-    unknown = ~np.isfinite(warp).all(axis=(1, 2))
-    warp[unknown] = rough[unknown]
-    return patch_align.refine_matches(
-        reference.pyramid, own.pyramid, a.pixels, a.octaves, b.pixels, b.octaves, warp, settings.align
-    )
+    """Refined pixels (N, 3) of `ours`, NaN where the patches do not agree."""
+    refined, a, b, align = np.empty((len(ours), 3)), reference.features, own.features, settings.align
+    whole, half, quarter = reference.pyramid
+    own_whole, own_half, own_quarter = pictures.pyramid
+    align_observations(
+        whole, half, quarter, a.pixels, a.octaves, a.angles_deg, theirs,
+        transform_points(se3_inverse(map_from_reference), points_map), own_whole, own_half, own_quarter, b.pixels, b.octaves,
+        b.angles_deg, ours, cam_from_map @ map_from_reference, align.half_window_px, align.max_shift_px, align.min_correlation,
+        refined,
+    )  # fmt: skip
+    return refined
