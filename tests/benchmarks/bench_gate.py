@@ -1,6 +1,6 @@
 """The loop gate at site scale: 44 aisles that look the same, features without pictures, the survey's own loop closing.
 
-`PYTHONPATH=tests python tests/benchmarks/bench_gate.py [--bays N] [--every M] [--out FILE.json]`. Blocks of four aisles are
+`PYTHONPATH=tests python tests/benchmarks/bench_gate.py [--bays N] [--every M] [--drift-scale S] [--out FILE.json]`. Blocks of four aisles are
 driven up and down, two of the four twice; in the end the robot returns to the first aisle, kilometres after it was there.
 Odometry is the truth with errors drawn from the covariances that the gate is told.
 """
@@ -125,12 +125,12 @@ def keyframe(session: EstimatorSession, number: int, frame: int) -> Keyframe:
     )  # fmt: skip
 
 
-def drifted(truth: Array, rng: np.random.Generator) -> tuple[Array, list[PoseEdge]]:
+def drifted(truth: Array, rng: np.random.Generator, scale: float = 1.0) -> tuple[Array, list[PoseEdge]]:
     """Where odometry believes the keyframes to be, and its edges."""
     believed, edges = [truth[0]], []
     for k, (a, b) in enumerate(pairwise(truth)):
         i_from_j = se3_inverse(a) @ b
-        sigma = WALK * np.sqrt(max(float(np.linalg.norm(i_from_j[:3, 3])), 0.05))
+        sigma = scale * WALK * np.sqrt(max(float(np.linalg.norm(i_from_j[:3, 3])), 0.05))
         measured = se3_exp(rng.normal(size=6) * sigma) @ i_from_j
         edges.append(PoseEdge(k, k + 1, measured, np.diag(sigma**2), is_loop=False))
         believed.append(believed[-1] @ measured)
@@ -168,8 +168,8 @@ def holds_one_aisle(marginals: GraphMarginals, truth: Array, i: int, j: int, lay
     return True
 
 
-def bench(bays: int, every_m: float, per_place: int = 2, seed: int = 0) -> Gated:
-    """Drives the tour once."""
+def bench(bays: int, every_m: float, per_place: int = 2, seed: int = 0, drift_scale: float = 1.0) -> Gated:
+    """Drives the tour once; with `drift_scale` above 1 the odometry is so much worse, and says so."""
     layout, settings = identical_site(bays), SurveySettings(loops=LoopSettings(per_place=per_place))
     simulated = prepare_tour(layout)
     session = EstimatorSession(simulated)
@@ -184,7 +184,7 @@ def bench(bays: int, every_m: float, per_place: int = 2, seed: int = 0) -> Gated
             print(f"{n + 1} of {len(frames)} keyframes made", flush=True)
     vocabulary = site_vocabulary(keyframes)
     vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in keyframes]
-    believed, edges = drifted(truth, np.random.default_rng(seed))
+    believed, edges = drifted(truth, np.random.default_rng(seed), drift_scale)
     marginals = GraphMarginals(believed, edges)
     matched = {(k, k + step) for step in (1, 2) for k in range(len(keyframes) - step)}
     closer = LoopCloser(
@@ -242,9 +242,10 @@ def main() -> None:
     parser.add_argument("--bays", type=int, default=BAYS)
     parser.add_argument("--every", type=float, default=EVERY_M)
     parser.add_argument("--per-place", type=int, default=2)
+    parser.add_argument("--drift-scale", type=float, default=1.0)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    found = bench(options.bays, options.every, options.per_place)
+    found = bench(options.bays, options.every, options.per_place, drift_scale=options.drift_scale)
     show(found)
     if options.out is not None:
         head = {"machine": platform.machine(), "python": platform.python_version(), "closed_share": found.closed_share}
