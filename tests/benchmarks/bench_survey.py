@@ -45,7 +45,7 @@ CASES = (
 KEYS = ("ate_rmse_m", "ate_sim3_rmse_m", "scale_error", "evaluated_share", "realtime_factor", "peak_rss_mb")
 
 
-def _run(module: str, *arguments: str | Path) -> None:
+def run(module: str, *arguments: str | Path) -> None:
     command = [sys.executable, "-c", f"from {module} import main; main()", *map(str, arguments)]
     done = subprocess.run(
         command, env=os.environ | {"PYTHONPATH": SOURCES}, capture_output=True, text=True, check=False
@@ -62,14 +62,14 @@ def recording_of(case: Case, folder: Path) -> Path | None:
         return None
     path = folder / f"{case.name}.mcap"
     if not path.exists():
-        _run("fleetsim.cli", "record", case.name, "--seed", "1", "--out", path)
+        run("fleetsim.cli", "record", case.name, "--seed", "1", "--out", path)
     return path
 
 
 def survey(case: Case, recording: Path, folder: Path) -> dict[str, Any]:
     """The build's report."""
     report = folder / f"{case.name}.json"
-    _run(
+    run(
         "mapserver.cli", "build", recording, "--site", case.name, "--store", folder / "store", "--report", report,
         "--trajectory", folder / f"{case.name}.tum",
     )  # fmt: skip

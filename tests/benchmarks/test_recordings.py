@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import bench_survey
+from benchmarks import bench_build, bench_survey
 from realdata import real_data
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -66,3 +66,12 @@ def test_held_out_frames_are_localised(tmp_path: Path) -> None:
     assert report["error_m"]["median"] <= 0.05
     assert report["error_m"]["p95"] <= 0.15
     assert report["silent_failures"] == 0
+
+
+@pytest.mark.timeout(3600)
+def test_build_speed_and_memory() -> None:
+    """Three times faster than recorded at 20 Hz, and ten minutes in less than 2 GB."""
+    rows = bench_build.measure(None, 10.0, len(os.sched_getaffinity(0)))
+    bench_build.show(rows, len(os.sched_getaffinity(0)))
+    assert rows["10 minutes"]["peak_rss_mb"] <= bench_build.MEMORY_LIMIT_MB
+    assert rows["five aisles"]["times_20_hz"] >= bench_build.SPEED_LIMIT
