@@ -36,7 +36,7 @@ _RECENT_BYTES = 64_000_000
 _RECENT_PATCHES_BYTES = 32_000_000
 _PATCH_SHARE = 0.7  # of the whole, above which a patch is not worth its work
 _PATCHED_KINDS = {"tile", "manifest"}
-_PREPARE_S = 10.0  # longer would keep other chores waiting
+_PREPARE_S = 10.0  # in all: longer would keep robots and other chores waiting
 
 
 class TileService:
@@ -70,13 +70,13 @@ class TileService:
         The first call tells all of them, because they may have missed what happened while no server ran. The patches that they will
         ask for, all at once, are made before they are told, as far as `_PREPARE_S` goes.
         """
-        changed = []
+        changed, until_s = [], time.monotonic() + _PREPARE_S
         for info in self._store.sites():
             robots = self._fleet.wanted_versions(info.site)
             moves = Counter((self._announced.get((info.site, robot)), w.manifest_sha256) for robot, w in robots.items())
             for (base, result), _ in moves.most_common():
                 if base is not None and result is not None and base != result:
-                    self._prepare(info.site, base, result)
+                    self._prepare(info.site, base, result, until_s)
             for robot, wanted in robots.items():
                 key, address = (info.site, robot), wanted.manifest_sha256
                 if key not in self._announced or self._announced[key] != address:
@@ -148,9 +148,8 @@ class TileService:
             raise LinkError(f"a patch from {base} is not much smaller than {result}; fetch the whole")
         return patch
 
-    def _prepare(self, site: str, base: str, result: str) -> None:
+    def _prepare(self, site: str, base: str, result: str, until_s: float) -> None:
         """Makes the patches from one version to another, by their manifests' addresses; what fails is made, or refused, when asked."""
-        until_s = time.monotonic() + _PREPARE_S
         try:
             old, new = (decode_manifest(self._read(sha256)) for sha256 in (base, result))
             known = {(tile.x, tile.y): tile.sha256 for tile in old.tiles}
