@@ -1,7 +1,7 @@
 """The loop gate at site scale: 44 aisles that look the same, features without pictures, the survey's own loop closing.
 
-`PYTHONPATH=tests python tests/benchmarks/bench_gate.py [--bays N] [--every M] [--drift-scale S] [--out FILE.json]`. Blocks of four aisles are
-driven up and down, two of the four twice; in the end the robot returns to the first aisle, kilometres after it was there.
+`PYTHONPATH=tests python tests/benchmarks/bench_gate.py [--bays N] [--every M] [--drift-scale S] [--out FILE.json]`. Blocks of four
+aisles are driven up and down, two of the four twice; in the end the robot returns to the first aisle, kilometres after it was there.
 Odometry is the truth with errors drawn from the covariances that the gate is told.
 """
 
@@ -169,8 +169,11 @@ def holds_one_aisle(marginals: GraphMarginals, truth: Array, i: int, j: int, lay
 
 
 def bench(bays: int, every_m: float, per_place: int = 2, seed: int = 0, drift_scale: float = 1.0) -> Gated:
-    """Drives the tour once; with `drift_scale` above 1 the odometry is so much worse, and says so."""
-    layout, settings = identical_site(bays), SurveySettings(loops=LoopSettings(per_place=per_place))
+    """Drives the tour once; with `drift_scale` above 1 the odometry is so much worse, and says so, and the survey is told how far
+    apart the aisles are."""
+    layout = identical_site(bays)
+    repeats_every_m = layout.pitch_m if drift_scale > 1 else 0.0
+    settings = SurveySettings(loops=LoopSettings(per_place=per_place, repeats_every_m=repeats_every_m))
     simulated = prepare_tour(layout)
     session = EstimatorSession(simulated)
     frames = chosen_frames(session.map_from_body, every_m)

@@ -24,6 +24,7 @@ _CORRELATION = (
 
 
 _CHUNK = 64  # candidates that are gated at once
+_SIDES = 16  # to which the site may repeat
 _TWIN_SCORE = 0.7  # of a candidate's score, from which on another place looks the same
 _WORTH_LEARNING = 1.0  # variance against the measurement's: below, a loop changes what the gate knows by less than half
 # Known so well, no place can be taken for another: the gate need not learn more. Doubled with every so many loops that it has
@@ -207,16 +208,18 @@ class LoopCloser:
         return edge, LoopRecord(i, j, score, Verdict.ACCEPTED, "verified", count)
 
     def _unseen_twin(self, edge: PoseEdge, twins: NDArray[np.int64]) -> float | None:
-        """How far off the robot could be too if the site repeats as it is seen to, None where it cannot be.
+        """How far off the robot could be too if the site repeats as it is seen to, or said to; None where it cannot be.
 
         Twins look like the old keyframe; those that lie elsewhere count. The way to each of them is a step by which the site repeats,
         perhaps also to a place where no keyframe is yet: a first visit must not be taken for a return.
         """
-        if not len(twins):
+        ways = np.zeros((0, 3))
+        if len(twins):
+            twins = twins[self._are_apart(edge.j, twins)]
+            ways = self._map_from_body[twins, :3, 3] - self._map_from_body[edge.j, :3, 3]
+        steps = np.concatenate([ways, -ways, _around(self._settings.loops.repeats_every_m)])
+        if not len(steps):
             return None
-        twins = twins[self._are_apart(edge.j, twins)]
-        ways = self._map_from_body[twins, :3, 3] - self._map_from_body[edge.j, :3, 3]
-        steps = np.concatenate([ways, -ways])
         possible = self._marginals.innovations_squared_beside(edge, steps) <= self._settings.loops.max_innovation
         lengths_m = np.linalg.norm(steps[possible], axis=1)
         return float(lengths_m.min()) if len(lengths_m) else None
@@ -296,6 +299,14 @@ _Look = tuple[
 def _verify(compared: ComparedFeatures, look: _Look) -> PairMatch | None:
     j, i, predicted, known = look
     return match_pair(j, i, compared.keyframes, compared.camera, predicted, known, compared.settings.pairs)
+
+
+def _around(distance_m: float) -> Array:
+    """(16, 3) level steps of one length to all sides, none for no length."""
+    if distance_m <= 0:
+        return np.zeros((0, 3))
+    angles = np.arange(_SIDES) * (2 * np.pi / _SIDES)
+    return distance_m * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(_SIDES)])
 
 
 def _cells(keyframe: Keyframe, features: NDArray[np.int64], camera: StereoCamera) -> int:

@@ -47,6 +47,9 @@ class LoopSettings(Section, frozen=True):
     min_gap_keyframes: int = 8
     max_innovation: float = 22.458  # 0.999 of chi-square with 6 degrees of freedom
     view_range_depths: float = 1.0
+    repeats_every_m: float = (
+        0.0  # how far apart aisles that look alike are, where the site's people know it; 0 where they do not
+    )
     min_inliers: int = 15
     alone_inliers: int = 30
     min_cells: int = 6

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from box_room import out_and_back, stereo_pair
 from fleetmap.bow import Vocabulary, train_vocabulary
@@ -41,7 +42,9 @@ def seen() -> tuple[list[Keyframe], Array, Rectifier, Vocabulary]:
     return keyframes, places, rectifier, train_vocabulary(descriptors, 8, 3, np.random.default_rng(2), images)
 
 
-def closed(believed_shift_m: Array, sigma_m: float, *, zones: Zones | None = None) -> tuple[Loops, Array]:
+def closed(
+    believed_shift_m: Array, sigma_m: float, *, zones: Zones | None = None, settings: SurveySettings = SETTINGS
+) -> tuple[Loops, Array]:
     """Loops of the chain and its places; the second look at the wall is believed to be so far from the first.
 
     sigma_m: of the whole way from keyframe 0 to the last one.
@@ -59,11 +62,15 @@ def closed(believed_shift_m: Array, sigma_m: float, *, zones: Zones | None = Non
     vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in whole]
     closer = LoopCloser(
         whole, vectors, vocabulary.word_count, rectifier.camera, rectifier.body_from_cam, map_from_body,
-        GraphMarginals(map_from_body, chain), {(k, k + 1) for k in range(steps)}, SETTINGS, zones or Zones(),
+        GraphMarginals(map_from_body, chain), {(k, k + 1) for k in range(steps)}, settings, zones or Zones(),
     )  # fmt: skip
     for k in range(len(whole)):
         closer.close(k)
     return closer.loops, map_from_body
+
+
+def replace_loops(settings: SurveySettings, **changes: float) -> SurveySettings:
+    return structs.replace(settings, loops=structs.replace(settings.loops, **changes))
 
 
 def wall_records(loops: Loops) -> list[LoopRecord]:
@@ -108,6 +115,16 @@ def test_the_gate_opens_as_far_as_the_robot_may_have_drifted() -> None:
     """The same 1.5 m, when the way between is known to 0.8 m only."""
     loops, _ = closed(np.array([0, 1.5, 0]), 0.8)
     assert {(10 + k, k) for k in WALL} <= {(e.i, e.j) for e in loops.edges}
+
+
+@pytest.mark.parametrize(("sigma_m", "verdict"), [(0.8, Verdict.AMBIGUOUS), (0.1, Verdict.ACCEPTED)])
+def test_where_people_say_that_the_site_repeats_a_first_alias_is_not_believed(sigma_m: float, verdict: Verdict) -> None:
+    """Nothing in the survey looks like the wall but the wall itself; the next aisle, 1.5 m aside, may not have been seen yet."""
+    settings = replace_loops(SETTINGS, repeats_every_m=1.5)
+    shift = np.array([0, 1.5 if sigma_m > 0.5 else 0.1, 0])
+    loops, _ = closed(shift, sigma_m, settings=settings)
+    assert {r.verdict for r in wall_records(loops) if r.i - r.j == 10} == {verdict}
+    assert bool(loops.edges) is (verdict is Verdict.ACCEPTED)
 
 
 def test_zones_exclude_what_position_alone_would_admit() -> None:
