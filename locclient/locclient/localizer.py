@@ -330,7 +330,7 @@ class Localizer:
         """Every fix speaks for a candidate or begins one; confirmed is the one that is left with enough behind it."""
         for candidate in self._candidates:
             candidate.misses += 1
-            candidate.evidence *= self._settings.track.evidence_kept_share
+            candidate.fade(self._settings.track.evidence_kept_share)
         for fix in fixes:
             self._weigh_one(fix)
         self._candidates = [c for c in self._candidates if c.misses < self._settings.track.max_misses]
@@ -367,10 +367,11 @@ class Localizer:
             ):
                 if candidate.misses:  # at most one vote a frame
                     candidate.support, candidate.misses = candidate.support + 1, 0
-                    candidate.evidence += fix.inliers
+                    candidate.speak(fix.inliers, fix.expected)
                 candidate.moved_to(fresh)
                 return
-        fresh.evidence = float(fix.inliers)
+        fresh.fade(0.0)
+        fresh.speak(fix.inliers, fix.expected)
         self._candidates.append(fresh)
 
     def _ranked(self) -> list[Anchor]:
@@ -378,9 +379,21 @@ class Localizer:
         return sorted(self._candidates, key=lambda c: -c.evidence)
 
     def _rivals(self) -> list[Anchor]:
-        """Candidates besides the best that nearly as much speaks for."""
-        ranked = self._ranked()
-        return [c for c in ranked[1:] if c.evidence >= self._settings.track.rival_share * ranked[0].evidence]
+        """Candidates besides the best for which nearly as much speaks, look by look since they were thought of: as many inliers,
+        or as many of the landmarks that should be seen there. A place where the map is thin is no less likely than its twin."""
+        ranked, settings = self._ranked(), self._settings.track
+        if not ranked:
+            return []
+        best = ranked[0]
+        return [
+            c
+            for c in ranked[1:]
+            if c.inliers >= settings.rival_share * best.inliers
+            or (
+                c.hits >= settings.rival_hit_share * best.hits
+                and c.inliers >= settings.rival_least_share * best.inliers
+            )
+        ]
 
     def _is_confirmed(self, candidate: Anchor, fixes: list[Fix]) -> bool:
         """By a tight prior, by fixes and way enough, or by one fix so strong, and alone of all places that were tried, that no
@@ -390,8 +403,7 @@ class Localizer:
             len(self._candidates) == len(fixes) == 1
             and fixes[0].inliers >= settings.strong_inliers
             and fixes[0].share >= settings.strong_share
-            and self._relocalizer is not None
-            and self._relocalizer.view.twin_score(fixes[0].map_from_cam) < settings.twin_score
+            and fixes[0].twin_share < settings.strong_twin_share
         )
         tight = (
             self._prior is not None

@@ -14,7 +14,6 @@ from locclient import map_view_kernels
 
 Rows = NDArray[np.int64]
 _NEAREST_M = 0.2
-_ELSEWHERE_M, _LOOKS_AWAY = 3.0, 0.3
 _REACH_SHARE = 1.3  # of the distance up to which a landmark was found: detection does not end sharply
 
 
@@ -37,40 +36,21 @@ class MapView:
         self.max_distances_m = _joined([t.max_distance_m for t in held], (0,), np.float32)
         self.sigmas_m = _joined([t.sigma_m for t in held], (0,), np.float32)
         self.map_from_cam = _joined([t.map_from_cam for t in held], (0, 4, 4), np.float64)
-        self.place_rows = [self._rows(ids) for t in held for ids in t.place_landmark_ids]
+        order = np.argsort(self.landmark_ids, kind="stable")
+        self.place_rows = [_rows_of(ids, self.landmark_ids, order) for t in held for ids in t.place_landmark_ids]
         self._index = PlaceIndex(vocabulary.word_count)
-        self._words = words = vocabulary.words(self.descriptors) if len(self.descriptors) else np.zeros(0, np.int32)
+        words = vocabulary.words(self.descriptors) if len(self.descriptors) else np.zeros(0, np.int32)
         for place, rows in enumerate(self.place_rows):
             self._index.add(place, vocabulary.bow_vector(words[rows]))
 
     def __len__(self) -> int:
         return len(self.points_map)
 
-    def _rows(self, ids: NDArray[np.uint32]) -> Rows:
-        """Rows of landmark ids; those in tiles that are not held are left out."""
-        order = np.argsort(self.landmark_ids, kind="stable")
-        at = np.searchsorted(self.landmark_ids[order], ids)
-        at = np.minimum(at, max(len(order) - 1, 0))
-        rows = order[at] if len(order) else np.zeros(0, np.int64)
-        return np.asarray(rows[self.landmark_ids[rows] == ids] if len(order) else rows, np.int64)
-
     def similar_places(self, descriptors: NDArray[np.uint8], allowed: NDArray[np.bool_] | None, top: int) -> Rows:
         """Places that share the most words with the descriptors, best first."""
         vector = self.vocabulary.bow_vector(self.vocabulary.words(descriptors))
         places, _ = self._index.query(vector, allowed, top)
         return places
-
-    def twin_score(self, map_from_cam: Array) -> float:
-        """How much the place nearest to a camera looks like any elsewhere in this map, 0 to 1: 0.4 and more in aisles alike."""
-        axes_map, places_map = self.map_from_cam[:, :3, 2], self.map_from_cam[:, :3, 3]
-        axis_map = map_from_cam[:3, 2]
-        apart_m = np.linalg.norm(places_map - map_from_cam[:3, 3], axis=1)
-        nearest = int(np.argmin(apart_m - axes_map @ axis_map))
-        vector = self.vocabulary.bow_vector(self._words[self.place_rows[nearest]])
-        apart_m = np.linalg.norm(places_map - places_map[nearest], axis=1)
-        looks_away = axes_map @ axes_map[nearest] < _LOOKS_AWAY
-        _, scores = self._index.query(vector, (apart_m > _ELSEWHERE_M) | ((apart_m > 1.0) & looks_away), 1)
-        return float(scores[0]) if len(scores) else 0.0
 
     def visible(
         self, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float
@@ -103,6 +83,15 @@ class MapView:
         for p in np.flatnonzero(near):
             held[self.place_rows[p]] = True
         return np.flatnonzero(held)
+
+
+def _rows_of(ids: NDArray[np.uint32], landmark_ids: NDArray[np.uint32], order: Rows) -> Rows:
+    """Rows of landmark ids, `order` sorts all of them; those in tiles that are not held are left out."""
+    if not len(order):
+        return np.zeros(0, np.int64)
+    at = np.searchsorted(landmark_ids, ids, sorter=order)
+    rows = order[np.minimum(at, len(order) - 1)]
+    return np.asarray(rows[landmark_ids[rows] == ids], np.int64)
 
 
 def _joined(parts: list[NDArray[np.generic]], shape: tuple[int, ...], dtype: type) -> NDArray:  # type: ignore[type-arg]
