@@ -240,15 +240,16 @@ class Localizer:
             return self._weigh(fixes)
         map_from_body, covariance = self._anchor.then_map_from_body, self._anchor.then_cov
         map_from_cam = map_from_body @ self._body_from_cam
-        fix = relocalizer.near(seen, map_from_cam, self._at_camera(map_from_body, covariance))
+        near = relocalizer.near(seen, map_from_cam, self._at_camera(map_from_body, covariance))
+        fixes = [] if near is None else [near]
         is_sparse = self._is_sparse(frame.stamp_ns)
-        if fix is None and (is_sparse or self._failed_looks + 1 >= self._settings.track.search_after_failed):
+        if near is None and (is_sparse or self._failed_looks + 1 >= self._settings.track.search_after_failed):
             yield
             fixes = yield from relocalizer.anywhere(seen, None, map_from_cam[:3, :3])
-            fix = fixes[0] if fixes and fixes[0].inliers >= self._settings.fix.min_inliers else None
-        if fix is None:
+            fixes = [fix for fix in fixes if fix.inliers >= self._settings.fix.min_inliers]
+        if not fixes:
             return _Outcome(None, "nothing in the map agrees with this frame")
-        return self._correct(fix, map_from_body, covariance)
+        return self._correct(fixes, map_from_body, covariance)
 
     def _search(self, seen: Seen, relocalizer: Relocalizer) -> Slices[list[Fix]]:
         """Fixes anywhere, around the candidates first; inside the prior where there is one."""
@@ -290,20 +291,22 @@ class Localizer:
 
     # --- tracking --------------------------------------------------------------------------------------------------------
 
-    def _correct(self, fix: Fix, map_from_body: Array, covariance: Array) -> _Outcome:
-        """Kalman update of the confirmed place at the frame of the look; a fix outside its gate is refused, unless such fixes
-        agree among themselves."""
+    def _correct(self, fixes: list[Fix], map_from_body: Array, covariance: Array) -> _Outcome:
+        """Kalman update of the confirmed place at the frame of the look; fixes outside its gate are refused, unless such fixes
+        agree among themselves. So are several inside it: long without the map, the place may have grown to hold its own twin."""
         assert self._anchor is not None
         assert self._moment is not None
-        measured, measured_cov = self._at_body(fix)
-        error = difference(measured, map_from_body)
-        spread = covariance + measured_cov
-        innovation = float(error @ np.linalg.solve(spread, error))
-        if innovation > self._settings.track.innovation_limit:
-            self._consider_kidnapping(fix)
+        judged = [(fix, *self._innovation(fix, map_from_body, covariance)) for fix in fixes]
+        inside = [entry for entry in judged if entry[2] <= self._settings.track.innovation_limit]
+        fix, error, innovation = min(judged, key=lambda entry: entry[2])
+        if len(inside) != 1:
+            self._consider_kidnapping(fixes)
+            if inside:
+                return _Outcome(None, f"{len(inside)} places agree with what was seen", innovation)
             off_m = float(np.linalg.norm(error[3:]))
             return _Outcome(None, f"the fix is {off_m:.2f} m off, more than its covariance admits", innovation)
-        gain = np.linalg.solve(spread, covariance).T
+        _, measured_cov = self._at_body(fix)
+        gain = np.linalg.solve(covariance + measured_cov, covariance).T
         rest = np.eye(6) - gain
         updated = rest @ covariance @ rest.T + gain @ measured_cov @ gain.T
         anchor = Anchor.behind(self._moment, applied(gain @ error, map_from_body), updated)
@@ -311,14 +314,22 @@ class Localizer:
         self._anchor = anchor
         return _Outcome(fix, "", innovation)
 
-    def _consider_kidnapping(self, fix: Fix) -> None:
+    def _innovation(self, fix: Fix, map_from_body: Array, covariance: Array) -> tuple[Array, float]:
+        """(6,) how far a fix is from what was predicted, and that squared by its covariance."""
+        measured, measured_cov = self._at_body(fix)
+        error = difference(measured, map_from_body)
+        return error, float(error @ np.linalg.solve(covariance + measured_cov, error))
+
+    def _consider_kidnapping(self, fixes: list[Fix]) -> None:
         """Refused fixes that agree with each other, frame after frame, end the belief in the old place; they must be confirmed anew."""
         assert self._anchor is not None
         settings = self._settings.track
         self._candidates = self._anchor.strangers
         for candidate in self._candidates:
             candidate.misses += 1
-        self._weigh_one(fix)
+            candidate.fade(settings.evidence_kept_share)
+        for fix in fixes:
+            self._weigh_one(fix)
         self._anchor.strangers = [c for c in self._candidates if c.misses < settings.max_misses]
         self._candidates = []
         if max(c.support for c in self._anchor.strangers) >= settings.kidnap_fixes:

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import PlaceIndex, Vocabulary
+from fleetmap.bow import Vocabulary
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile
@@ -14,6 +14,7 @@ from locclient import map_view_kernels
 
 Rows = NDArray[np.int64]
 _NEAREST_M = 0.2
+_UNSEEN_WEIGHT = 5.0  # of words that no place has: a place of few words is not much like anything
 _REACH_SHARE = 1.3  # of the distance up to which a landmark was found: detection does not end sharply
 
 
@@ -38,19 +39,36 @@ class MapView:
         self.map_from_cam = _joined([t.map_from_cam for t in held], (0, 4, 4), np.float64)
         order = np.argsort(self.landmark_ids, kind="stable")
         self.place_rows = [_rows_of(ids, self.landmark_ids, order) for t in held for ids in t.place_landmark_ids]
-        self._index = PlaceIndex(vocabulary.word_count)
         words = vocabulary.words(self.descriptors) if len(self.descriptors) else np.zeros(0, np.int32)
-        for place, rows in enumerate(self.place_rows):
-            self._index.add(place, vocabulary.bow_vector(words[rows]))
+        held_words = [np.unique(words[rows]) for rows in self.place_rows]
+        counts = [len(unique) for unique in held_words]
+        flat, places = _joined(held_words, (0,), np.int64), np.repeat(np.arange(len(counts)), counts)
+        order = np.argsort(flat, kind="stable")
+        self._place_of_posting = places[order]
+        self._word_starts = np.searchsorted(flat[order], np.arange(vocabulary.word_count + 1))
+        weights = vocabulary.idf[flat].astype(np.float64)
+        self._place_weights = np.bincount(places, weights, minlength=len(counts)) + _UNSEEN_WEIGHT
 
     def __len__(self) -> int:
         return len(self.points_map)
 
     def similar_places(self, descriptors: NDArray[np.uint8], allowed: NDArray[np.bool_] | None, top: int) -> Rows:
-        """Places that share the most words with the descriptors, best first."""
-        vector = self.vocabulary.bow_vector(self.vocabulary.words(descriptors))
-        places, _ = self._index.query(vector, allowed, top)
-        return places
+        """Places of whose words the descriptors hold the largest share, best first.
+
+        Not the likeness of the two: a map within a budget holds a tenth of what a robot sees, and what it lacks says nothing.
+        """
+        if not len(self.place_rows) or not len(descriptors):
+            return np.zeros(0, np.int64)
+        words = np.unique(self.vocabulary.words(descriptors))
+        starts, ends = self._word_starts[words], self._word_starts[words + 1]
+        postings = np.concatenate([np.arange(a, b) for a, b in zip(starts.tolist(), ends.tolist(), strict=True)])
+        weights = np.repeat(self.vocabulary.idf[words].astype(np.float64), ends - starts)
+        shares = np.bincount(self._place_of_posting[postings], weights, minlength=len(self.place_rows))
+        shares /= self._place_weights
+        if allowed is not None:
+            shares = np.where(allowed, shares, 0.0)
+        best = np.argsort(-shares, kind="stable")[:top]
+        return np.asarray(best[shares[best] > 0.0], np.int64)
 
     def visible(
         self, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float

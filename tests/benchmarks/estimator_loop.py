@@ -193,7 +193,7 @@ def tile_of(
     images = np.zeros(len(kept), np.int64)
     for place, ids in enumerate(lists):
         images[ids] = place
-    return [tile], train_vocabulary(descriptors, 10, 3, rng, images)
+    return [tile], train_vocabulary(descriptors, 10, 4, rng, images)
 
 
 class SessionRelocalizer(Relocalizer):
