@@ -20,7 +20,7 @@ class Anchor:
     map_from_body and cov_rot_trans: at that frame. now_map_from_body, now_cov: the same carried to the present. then_map_from_body,
     then_cov: at the frame that the map is being looked at for, which may be some frames ago. stamp_ns: of its last fix. support: fixes
     that agreed; evidence: their inliers, older ones fading; inliers, hits: their mean over all looks since the first, and that of
-    their share of the landmarks that should have been seen, none where there was no fix.
+    their share of what should have been seen, nothing where there was no fix.
     """
 
     frame_index: int
@@ -68,10 +68,10 @@ class Anchor:
         self.evidence, self.hit_evidence = kept_share * self.evidence, kept_share * self.hit_evidence
         self.looks = kept_share * self.looks + 1.0
 
-    def speak(self, inliers: int, expected: int) -> None:
+    def speak(self, inliers: int, hit_share: float) -> None:
         """A fix of this look was there."""
         self.evidence += inliers
-        self.hit_evidence += inliers / max(expected, inliers)
+        self.hit_evidence += hit_share
 
     def mark(self) -> None:
         """Remembers the present for the look that begins now."""

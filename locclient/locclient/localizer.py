@@ -246,7 +246,7 @@ class Localizer:
         if near is None and (is_sparse or self._failed_looks + 1 >= self._settings.track.search_after_failed):
             yield
             fixes = yield from relocalizer.anywhere(seen, None, map_from_cam[:3, :3])
-            fixes = [fix for fix in fixes if fix.inliers >= self._settings.fix.min_inliers]
+            fixes = [fix for fix in fixes if self._counts(fix)]
         if not fixes:
             return _Outcome(None, "nothing in the map agrees with this frame")
         return self._correct(fixes, map_from_body, covariance)
@@ -267,7 +267,13 @@ class Localizer:
         if len(self._candidates) == 1:
             known = (self._candidates[0].then_map_from_body @ self._body_from_cam)[:3, :3]
         fixes = yield from relocalizer.anywhere(seen, self._places_in_prior(), known, fixes)
-        return [f for f in fixes if f.inliers >= self._settings.fix.min_inliers and self._in_prior(f)]
+        return [f for f in fixes if self._counts(f) and self._in_prior(f)]
+
+    def _counts(self, fix: Fix) -> bool:
+        """Whether a fix may name a place: not where most of what stands there should have been seen and was not. Racks repeat:
+        some landmarks of any agree with some of any other."""
+        settings = self._settings.fix
+        return fix.inliers >= settings.min_inliers and fix.hit_share >= settings.min_hit_share
 
     def _prior_cov_m2(self) -> Array:
         """(2, 2) of the prior's horizontal position now: the way since may have led anywhere."""
@@ -378,11 +384,11 @@ class Localizer:
             ):
                 if candidate.misses:  # at most one vote a frame
                     candidate.support, candidate.misses = candidate.support + 1, 0
-                    candidate.speak(fix.inliers, fix.expected)
+                    candidate.speak(fix.inliers, fix.hit_share)
                 candidate.moved_to(fresh)
                 return
         fresh.fade(0.0)
-        fresh.speak(fix.inliers, fix.expected)
+        fresh.speak(fix.inliers, fix.hit_share)
         self._candidates.append(fresh)
 
     def _ranked(self) -> list[Anchor]:

@@ -15,6 +15,7 @@ from locclient import map_view_kernels
 Rows = NDArray[np.int64]
 _NEAREST_M = 0.2
 _UNSEEN_WEIGHT = 5.0  # of words that no place has: a place of few words is not much like anything
+_WITNESS_M, _WITNESS_COSINE = 1.0, 0.8
 _REACH_SHARE = 1.3  # of the distance up to which a landmark was found: detection does not end sharply
 
 
@@ -87,6 +88,21 @@ class MapView:
         rows, pixels = rows[:count].copy(), pixels[:count].copy()
         octaves = np.log(np.maximum(reaches_m[rows] / distances_m[:count], 0.5)) / np.log(SCALE_FACTOR)
         return rows, pixels, octaves
+
+    def witnessed(self, map_from_cam: Array, camera: StereoCamera) -> Rows:
+        """Rows of the landmarks in the picture of a camera there that the survey saw from next to it, looking the same way: what
+        racks hide is not among them. All that may be visible where the survey did not pass."""
+        rows, _, _ = self.visible(map_from_cam, camera, 0.0, np.pi)
+        apart_m = np.linalg.norm(self.map_from_cam[:, :3, 3] - map_from_cam[:3, 3], axis=1)
+        places = np.flatnonzero(
+            (apart_m < _WITNESS_M) & (self.map_from_cam[:, :3, 2] @ map_from_cam[:3, 2] > _WITNESS_COSINE)
+        )
+        if not len(places):
+            return rows
+        held = np.zeros(len(self), bool)
+        for place in places:
+            held[self.place_rows[place]] = True
+        return rows[held[rows]]
 
     def _reaches_m(self, focal_px: float) -> NDArray[np.float32]:
         """(N,) up to which distance a camera of this focal length finds each landmark."""

@@ -31,7 +31,8 @@ class Fix:
     """A verified place of one frame.
 
     map_from_cam (4, 4); cov_rot_trans (6, 6) in map axes, rotation first; inliers and cells of the image that hold them; share
-    of the inliers among what was matched at the end. expected: landmarks that a camera there should see. twin_share: how much of
+    of the inliers among what was matched at the end. hit_share: of the landmarks that the survey saw from next to there, how many
+    are among the inliers; 1 where nobody looked. twin_share: how much of
     what speaks for this place speaks for another one too, 1 where nobody looked. matches (P, 2): features and landmarks, rows of
     the view, of the inliers.
     """
@@ -41,7 +42,7 @@ class Fix:
     inliers: int
     cells: int
     share: float = 1.0
-    expected: int = 0
+    hit_share: float = 1.0
     twin_share: float = 1.0
     matches: NDArray[np.int64] | None = field(default=None, repr=False, compare=False)
 
@@ -216,9 +217,9 @@ class Relocalizer:
             map_from_cam = se3_inverse(found.cam_from_source)
             matches = np.column_stack([hit[kept], rows[kept]])[found.inliers]
         assert found is not None
-        return self._verified(seen, found, matches, len(rows))
+        return self._verified(seen, found, matches)
 
-    def _verified(self, seen: Seen, found: Resection, matches: NDArray[np.int64], expected: int) -> Fix | None:
+    def _verified(self, seen: Seen, found: Resection, matches: NDArray[np.int64]) -> Fix | None:
         settings, features = self._settings.fix, matches[:, 0]
         pixels = seen.pixels[features]
         column = np.clip(pixels[:, 0] / self._camera.width_px * 8, 0, 7).astype(int)
@@ -235,7 +236,9 @@ class Relocalizer:
         carry[:3, :3] = carry[3:, 3:] = -rotation
         covariance = settings.covariance_scale * carry @ found.cov_rot_trans @ carry.T
         covariance += np.diag([settings.floor_rad**2] * 3 + [settings.floor_m**2] * 3)
-        return Fix(map_from_cam, covariance, int(found.inliers.sum()), cells, share, expected, matches=matches)
+        witnessed = self.view.witnessed(map_from_cam, self._camera)
+        hit_share = float(np.isin(matches[:, 1], witnessed).sum() / max(len(witnessed), 1))
+        return Fix(map_from_cam, covariance, int(found.inliers.sum()), cells, share, hit_share, matches=matches)
 
     def _sigmas(self, seen: Seen, features: NDArray[np.int64], rows: Rows, map_from_cam: Array | None) -> Array:
         """(N, 2): of pixels and of disparities, by octave and by the landmarks' own uncertainty.

@@ -12,8 +12,9 @@ class FixSettings(Section, frozen=True):
 
     min_inliers: int = 15
     min_cells: int = 6
+    min_hit_share: float = 0.13
     top_places: int = 8
-    top_places_found: int = 3
+    top_places_found: int = 1
     twin_votes_share: float = 0.2
     most_twins: int = 64
     max_distance: int = 75

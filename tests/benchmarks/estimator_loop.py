@@ -28,6 +28,7 @@ _TILE_M = 1024.0
 _NEVER_S = 1e9
 _LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of the frame that is handled, for stamps that are too early
 _EVERY_M, _EVERY_RAD = 0.4, 0.2
+_NOISE = np.random.default_rng(0).integers(0, 255, (7, 48, 64), np.uint8)
 
 
 class EstimatorTracker(Tracker):
@@ -85,12 +86,9 @@ def seen(session: EstimatorSession, frame: int) -> Seen:
 
 def blank(session: EstimatorSession, frame: int) -> RectifiedFrame:
     """A frame that carries its stamp alone: noise for the judge of pictures, nothing at all where nothing is to be seen."""
-    stamp_ns, shape = session.stamps_ns[frame], (96, 128)
-    if not len(session.sighting(frame).ids):
-        return RectifiedFrame(stamp_ns, np.zeros(shape, np.uint8), None, None)
-    return RectifiedFrame(
-        stamp_ns, np.random.default_rng(stamp_ns).integers(0, 255, shape, np.uint8, endpoint=False), None, None
-    )
+    is_dark = not len(session.sighting(frame).ids)
+    left = np.zeros_like(_NOISE[0]) if is_dark else _NOISE[frame % len(_NOISE)]
+    return RectifiedFrame(session.stamps_ns[frame], left, None, None)
 
 
 def run_odometry(
