@@ -43,7 +43,7 @@ class MapView:
         words = vocabulary.words(self.descriptors) if len(self.descriptors) else np.zeros(0, np.int32)
         held_words = [np.unique(words[rows]) for rows in self.place_rows]
         counts = [len(unique) for unique in held_words]
-        flat, places = _joined(held_words, (0,), np.int64), np.repeat(np.arange(len(counts)), counts)
+        flat, places = np.concatenate([np.zeros(0, np.int32), *held_words]), np.repeat(np.arange(len(counts)), counts)
         order = np.argsort(flat, kind="stable")
         self._place_of_posting = places[order]
         self._word_starts = np.searchsorted(flat[order], np.arange(vocabulary.word_count + 1))
@@ -64,8 +64,8 @@ class MapView:
         starts, ends = self._word_starts[words], self._word_starts[words + 1]
         postings = np.concatenate([np.arange(a, b) for a, b in zip(starts.tolist(), ends.tolist(), strict=True)])
         weights = np.repeat(self.vocabulary.idf[words].astype(np.float64), ends - starts)
-        shares = np.bincount(self._place_of_posting[postings], weights, minlength=len(self.place_rows))
-        shares /= self._place_weights
+        found = np.bincount(self._place_of_posting[postings], weights, minlength=len(self.place_rows))
+        shares = found / self._place_weights
         if allowed is not None:
             shares = np.where(allowed, shares, 0.0)
         best = np.argsort(-shares, kind="stable")[:top]
