@@ -246,10 +246,10 @@ class Localizer:
         if near is None and (is_sparse or self._failed_looks + 1 >= self._settings.track.search_after_failed):
             yield
             fixes = yield from relocalizer.anywhere(seen, None, map_from_cam[:3, :3])
-            fixes = [fix for fix in fixes if self._counts(fix)]
+            fixes = [fix for fix in fixes if fix.inliers >= self._settings.fix.min_inliers]
         if not fixes:
             return _Outcome(None, "nothing in the map agrees with this frame")
-        return self._correct(fixes, map_from_body, covariance)
+        return self._correct(fixes, map_from_body, covariance, is_near=near is not None)
 
     def _search(self, seen: Seen, relocalizer: Relocalizer) -> Slices[list[Fix]]:
         """Fixes anywhere, around the candidates first; inside the prior where there is one."""
@@ -297,13 +297,15 @@ class Localizer:
 
     # --- tracking --------------------------------------------------------------------------------------------------------
 
-    def _correct(self, fixes: list[Fix], map_from_body: Array, covariance: Array) -> _Outcome:
+    def _correct(self, fixes: list[Fix], map_from_body: Array, covariance: Array, *, is_near: bool) -> _Outcome:
         """Kalman update of the confirmed place at the frame of the look; fixes outside its gate are refused, unless such fixes
         agree among themselves. So are several inside it: long without the map, the place may have grown to hold its own twin."""
         assert self._anchor is not None
         assert self._moment is not None
         judged = [(fix, *self._innovation(fix, map_from_body, covariance)) for fix in fixes]
-        inside = [entry for entry in judged if entry[2] <= self._settings.track.innovation_limit]
+        # What was looked for where the robot should be is judged by the prediction alone; what was found anywhere must count besides.
+        limit = self._settings.track.innovation_limit
+        inside = [entry for entry in judged if entry[2] <= limit and (is_near or self._counts(entry[0]))]
         fix, error, innovation = min(judged, key=lambda entry: entry[2])
         if len(inside) != 1:
             self._consider_kidnapping(fixes)
