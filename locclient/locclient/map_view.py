@@ -94,9 +94,8 @@ class MapView:
         racks hide is not among them. All that may be visible where the survey did not pass."""
         rows, _, _ = self.visible(map_from_cam, camera, 0.0, np.pi)
         apart_m = np.linalg.norm(self.map_from_cam[:, :3, 3] - map_from_cam[:3, 3], axis=1)
-        places = np.flatnonzero(
-            (apart_m < _WITNESS_M) & (self.map_from_cam[:, :3, 2] @ map_from_cam[:3, 2] > _WITNESS_COSINE)
-        )
+        axes_map = self.map_from_cam[:, :3, 2]
+        places = np.flatnonzero((apart_m < _WITNESS_M) & (axes_map @ map_from_cam[:3, 2] > _WITNESS_COSINE))
         if not len(places):
             return rows
         held = np.zeros(len(self), bool)
