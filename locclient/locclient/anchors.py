@@ -19,7 +19,8 @@ class Anchor:
 
     map_from_body and cov_rot_trans: at that frame. now_map_from_body, now_cov: the same carried to the present. then_map_from_body,
     then_cov: at the frame that the map is being looked at for, which may be some frames ago. stamp_ns: of its last fix. support: fixes
-    that agreed; evidence: their inliers, older ones fading.
+    that agreed; evidence: their inliers, older ones fading; inliers, hits: their mean over all looks since the first, and that of
+    their share of what should have been seen, nothing where there was no fix.
     """
 
     frame_index: int
@@ -32,6 +33,8 @@ class Anchor:
     then_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
     support: int = 1
     evidence: float = 0.0
+    hit_evidence: float = 0.0
+    looks: float = 0.0
     misses: int = 0
     travelled_m: float = 0.0
     strangers: list["Anchor"] = field(default_factory=list)
@@ -49,6 +52,26 @@ class Anchor:
             *chained(map_from_body, cov_rot_trans, moment.map_from_body, moment.cov_rot_trans),
             *chained(map_from_body, cov_rot_trans, moment.now_map_from_body, moment.now_cov),
         )  # fmt: skip
+
+    @property
+    def inliers(self) -> float:
+        """Mean over the looks, later ones counting more."""
+        return self.evidence / max(self.looks, 1.0)
+
+    @property
+    def hits(self) -> float:
+        """Mean over the looks, later ones counting more."""
+        return self.hit_evidence / max(self.looks, 1.0)
+
+    def fade(self, kept_share: float) -> None:
+        """One more look, in which it has not spoken yet."""
+        self.evidence, self.hit_evidence = kept_share * self.evidence, kept_share * self.hit_evidence
+        self.looks = kept_share * self.looks + 1.0
+
+    def speak(self, inliers: int, hit_share: float) -> None:
+        """A fix of this look was there."""
+        self.evidence += inliers
+        self.hit_evidence += hit_share
 
     def mark(self) -> None:
         """Remembers the present for the look that begins now."""

@@ -240,15 +240,16 @@ class Localizer:
             return self._weigh(fixes)
         map_from_body, covariance = self._anchor.then_map_from_body, self._anchor.then_cov
         map_from_cam = map_from_body @ self._body_from_cam
-        fix = relocalizer.near(seen, map_from_cam, self._at_camera(map_from_body, covariance))
+        near = relocalizer.near(seen, map_from_cam, self._at_camera(map_from_body, covariance))
+        fixes = [] if near is None else [near]
         is_sparse = self._is_sparse(frame.stamp_ns)
-        if fix is None and (is_sparse or self._failed_looks + 1 >= self._settings.track.search_after_failed):
+        if near is None and (is_sparse or self._failed_looks + 1 >= self._settings.track.search_after_failed):
             yield
             fixes = yield from relocalizer.anywhere(seen, None, map_from_cam[:3, :3])
-            fix = fixes[0] if fixes and fixes[0].inliers >= self._settings.fix.min_inliers else None
-        if fix is None:
+            fixes = [fix for fix in fixes if fix.inliers >= self._settings.fix.min_inliers]
+        if not fixes:
             return _Outcome(None, "nothing in the map agrees with this frame")
-        return self._correct(fix, map_from_body, covariance)
+        return self._correct(fixes, map_from_body, covariance, is_near=near is not None)
 
     def _search(self, seen: Seen, relocalizer: Relocalizer) -> Slices[list[Fix]]:
         """Fixes anywhere, around the candidates first; inside the prior where there is one."""
@@ -266,7 +267,13 @@ class Localizer:
         if len(self._candidates) == 1:
             known = (self._candidates[0].then_map_from_body @ self._body_from_cam)[:3, :3]
         fixes = yield from relocalizer.anywhere(seen, self._places_in_prior(), known, fixes)
-        return [f for f in fixes if f.inliers >= self._settings.fix.min_inliers and self._in_prior(f)]
+        return [f for f in fixes if self._counts(f) and self._in_prior(f)]
+
+    def _counts(self, fix: Fix) -> bool:
+        """Whether a fix may name a place: not where most of what stands there should have been seen and was not. Racks repeat:
+        some landmarks of any agree with some of any other."""
+        settings = self._settings.fix
+        return fix.inliers >= settings.min_inliers and fix.hit_share >= settings.min_hit_share
 
     def _prior_cov_m2(self) -> Array:
         """(2, 2) of the prior's horizontal position now: the way since may have led anywhere."""
@@ -290,20 +297,24 @@ class Localizer:
 
     # --- tracking --------------------------------------------------------------------------------------------------------
 
-    def _correct(self, fix: Fix, map_from_body: Array, covariance: Array) -> _Outcome:
-        """Kalman update of the confirmed place at the frame of the look; a fix outside its gate is refused, unless such fixes
-        agree among themselves."""
+    def _correct(self, fixes: list[Fix], map_from_body: Array, covariance: Array, *, is_near: bool) -> _Outcome:
+        """Kalman update of the confirmed place at the frame of the look; fixes outside its gate are refused, unless such fixes
+        agree among themselves. So are several inside it: long without the map, the place may have grown to hold its own twin."""
         assert self._anchor is not None
         assert self._moment is not None
-        measured, measured_cov = self._at_body(fix)
-        error = difference(measured, map_from_body)
-        spread = covariance + measured_cov
-        innovation = float(error @ np.linalg.solve(spread, error))
-        if innovation > self._settings.track.innovation_limit:
-            self._consider_kidnapping(fix)
+        judged = [(fix, *self._innovation(fix, map_from_body, covariance)) for fix in fixes]
+        # What was looked for where the robot should be is judged by the prediction alone; what was found anywhere must count besides.
+        limit = self._settings.track.innovation_limit
+        inside = [entry for entry in judged if entry[2] <= limit and (is_near or self._counts(entry[0]))]
+        fix, error, innovation = min(judged, key=lambda entry: entry[2])
+        if len(inside) != 1:
+            self._consider_kidnapping(fixes)
+            if inside:
+                return _Outcome(None, f"{len(inside)} places agree with what was seen", innovation)
             off_m = float(np.linalg.norm(error[3:]))
             return _Outcome(None, f"the fix is {off_m:.2f} m off, more than its covariance admits", innovation)
-        gain = np.linalg.solve(spread, covariance).T
+        _, measured_cov = self._at_body(fix)
+        gain = np.linalg.solve(covariance + measured_cov, covariance).T
         rest = np.eye(6) - gain
         updated = rest @ covariance @ rest.T + gain @ measured_cov @ gain.T
         anchor = Anchor.behind(self._moment, applied(gain @ error, map_from_body), updated)
@@ -311,14 +322,22 @@ class Localizer:
         self._anchor = anchor
         return _Outcome(fix, "", innovation)
 
-    def _consider_kidnapping(self, fix: Fix) -> None:
+    def _innovation(self, fix: Fix, map_from_body: Array, covariance: Array) -> tuple[Array, float]:
+        """(6,) how far a fix is from what was predicted, and that squared by its covariance."""
+        measured, measured_cov = self._at_body(fix)
+        error = difference(measured, map_from_body)
+        return error, float(error @ np.linalg.solve(covariance + measured_cov, error))
+
+    def _consider_kidnapping(self, fixes: list[Fix]) -> None:
         """Refused fixes that agree with each other, frame after frame, end the belief in the old place; they must be confirmed anew."""
         assert self._anchor is not None
         settings = self._settings.track
         self._candidates = self._anchor.strangers
         for candidate in self._candidates:
             candidate.misses += 1
-        self._weigh_one(fix)
+            candidate.fade(settings.evidence_kept_share)
+        for fix in fixes:
+            self._weigh_one(fix)
         self._anchor.strangers = [c for c in self._candidates if c.misses < settings.max_misses]
         self._candidates = []
         if max(c.support for c in self._anchor.strangers) >= settings.kidnap_fixes:
@@ -330,7 +349,7 @@ class Localizer:
         """Every fix speaks for a candidate or begins one; confirmed is the one that is left with enough behind it."""
         for candidate in self._candidates:
             candidate.misses += 1
-            candidate.evidence *= self._settings.track.evidence_kept_share
+            candidate.fade(self._settings.track.evidence_kept_share)
         for fix in fixes:
             self._weigh_one(fix)
         self._candidates = [c for c in self._candidates if c.misses < self._settings.track.max_misses]
@@ -367,10 +386,11 @@ class Localizer:
             ):
                 if candidate.misses:  # at most one vote a frame
                     candidate.support, candidate.misses = candidate.support + 1, 0
-                    candidate.evidence += fix.inliers
+                    candidate.speak(fix.inliers, fix.hit_share)
                 candidate.moved_to(fresh)
                 return
-        fresh.evidence = float(fix.inliers)
+        fresh.fade(0.0)
+        fresh.speak(fix.inliers, fix.hit_share)
         self._candidates.append(fresh)
 
     def _ranked(self) -> list[Anchor]:
@@ -378,9 +398,21 @@ class Localizer:
         return sorted(self._candidates, key=lambda c: -c.evidence)
 
     def _rivals(self) -> list[Anchor]:
-        """Candidates besides the best that nearly as much speaks for."""
-        ranked = self._ranked()
-        return [c for c in ranked[1:] if c.evidence >= self._settings.track.rival_share * ranked[0].evidence]
+        """Candidates besides the best for which nearly as much speaks, look by look since they were thought of: as many inliers,
+        or as many of the landmarks that should be seen there. A place where the map is thin is no less likely than its twin."""
+        ranked, settings = self._ranked(), self._settings.track
+        if not ranked:
+            return []
+        best = ranked[0]
+        return [
+            c
+            for c in ranked[1:]
+            if c.inliers >= settings.rival_share * best.inliers
+            or (
+                c.hits >= settings.rival_hit_share * best.hits
+                and c.inliers >= settings.rival_least_share * best.inliers
+            )
+        ]
 
     def _is_confirmed(self, candidate: Anchor, fixes: list[Fix]) -> bool:
         """By a tight prior, by fixes and way enough, or by one fix so strong, and alone of all places that were tried, that no
@@ -390,8 +422,7 @@ class Localizer:
             len(self._candidates) == len(fixes) == 1
             and fixes[0].inliers >= settings.strong_inliers
             and fixes[0].share >= settings.strong_share
-            and self._relocalizer is not None
-            and self._relocalizer.view.twin_score(fixes[0].map_from_cam) < settings.twin_score
+            and fixes[0].twin_share < settings.strong_twin_share
         )
         tight = (
             self._prior is not None

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import PlaceIndex, Vocabulary
+from fleetmap.bow import Vocabulary
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile
@@ -14,7 +14,8 @@ from locclient import map_view_kernels
 
 Rows = NDArray[np.int64]
 _NEAREST_M = 0.2
-_ELSEWHERE_M, _LOOKS_AWAY = 3.0, 0.3
+_UNSEEN_WEIGHT = 5.0  # of words that no place has: a place of few words is not much like anything
+_WITNESS_M, _WITNESS_COSINE = 1.0, 0.8
 _REACH_SHARE = 1.3  # of the distance up to which a landmark was found: detection does not end sharply
 
 
@@ -37,40 +38,38 @@ class MapView:
         self.max_distances_m = _joined([t.max_distance_m for t in held], (0,), np.float32)
         self.sigmas_m = _joined([t.sigma_m for t in held], (0,), np.float32)
         self.map_from_cam = _joined([t.map_from_cam for t in held], (0, 4, 4), np.float64)
-        self.place_rows = [self._rows(ids) for t in held for ids in t.place_landmark_ids]
-        self._index = PlaceIndex(vocabulary.word_count)
-        self._words = words = vocabulary.words(self.descriptors) if len(self.descriptors) else np.zeros(0, np.int32)
-        for place, rows in enumerate(self.place_rows):
-            self._index.add(place, vocabulary.bow_vector(words[rows]))
+        order = np.argsort(self.landmark_ids, kind="stable")
+        self.place_rows = [_rows_of(ids, self.landmark_ids, order) for t in held for ids in t.place_landmark_ids]
+        words = vocabulary.words(self.descriptors) if len(self.descriptors) else np.zeros(0, np.int32)
+        held_words = [np.unique(words[rows]) for rows in self.place_rows]
+        counts = [len(unique) for unique in held_words]
+        flat, places = np.concatenate([np.zeros(0, np.int32), *held_words]), np.repeat(np.arange(len(counts)), counts)
+        order = np.argsort(flat, kind="stable")
+        self._place_of_posting = places[order]
+        self._word_starts = np.searchsorted(flat[order], np.arange(vocabulary.word_count + 1))
+        weights = vocabulary.idf[flat].astype(np.float64)
+        self._place_weights = np.bincount(places, weights, minlength=len(counts)) + _UNSEEN_WEIGHT
 
     def __len__(self) -> int:
         return len(self.points_map)
 
-    def _rows(self, ids: NDArray[np.uint32]) -> Rows:
-        """Rows of landmark ids; those in tiles that are not held are left out."""
-        order = np.argsort(self.landmark_ids, kind="stable")
-        at = np.searchsorted(self.landmark_ids[order], ids)
-        at = np.minimum(at, max(len(order) - 1, 0))
-        rows = order[at] if len(order) else np.zeros(0, np.int64)
-        return np.asarray(rows[self.landmark_ids[rows] == ids] if len(order) else rows, np.int64)
-
     def similar_places(self, descriptors: NDArray[np.uint8], allowed: NDArray[np.bool_] | None, top: int) -> Rows:
-        """Places that share the most words with the descriptors, best first."""
-        vector = self.vocabulary.bow_vector(self.vocabulary.words(descriptors))
-        places, _ = self._index.query(vector, allowed, top)
-        return places
+        """Places of whose words the descriptors hold the largest share, best first.
 
-    def twin_score(self, map_from_cam: Array) -> float:
-        """How much the place nearest to a camera looks like any elsewhere in this map, 0 to 1: 0.4 and more in aisles alike."""
-        axes_map, places_map = self.map_from_cam[:, :3, 2], self.map_from_cam[:, :3, 3]
-        axis_map = map_from_cam[:3, 2]
-        apart_m = np.linalg.norm(places_map - map_from_cam[:3, 3], axis=1)
-        nearest = int(np.argmin(apart_m - axes_map @ axis_map))
-        vector = self.vocabulary.bow_vector(self._words[self.place_rows[nearest]])
-        apart_m = np.linalg.norm(places_map - places_map[nearest], axis=1)
-        looks_away = axes_map @ axes_map[nearest] < _LOOKS_AWAY
-        _, scores = self._index.query(vector, (apart_m > _ELSEWHERE_M) | ((apart_m > 1.0) & looks_away), 1)
-        return float(scores[0]) if len(scores) else 0.0
+        Not the likeness of the two: a map within a budget holds a tenth of what a robot sees, and what it lacks says nothing.
+        """
+        if not len(self.place_rows) or not len(descriptors):
+            return np.zeros(0, np.int64)
+        words = np.unique(self.vocabulary.words(descriptors))
+        starts, ends = self._word_starts[words], self._word_starts[words + 1]
+        postings = np.concatenate([np.arange(a, b) for a, b in zip(starts.tolist(), ends.tolist(), strict=True)])
+        weights = np.repeat(self.vocabulary.idf[words].astype(np.float64), ends - starts)
+        found = np.bincount(self._place_of_posting[postings], weights, minlength=len(self.place_rows))
+        shares = found / self._place_weights
+        if allowed is not None:
+            shares = np.where(allowed, shares, 0.0)
+        best = np.argsort(-shares, kind="stable")[:top]
+        return np.asarray(best[shares[best] > 0.0], np.int64)
 
     def visible(
         self, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float
@@ -90,6 +89,20 @@ class MapView:
         octaves = np.log(np.maximum(reaches_m[rows] / distances_m[:count], 0.5)) / np.log(SCALE_FACTOR)
         return rows, pixels, octaves
 
+    def witnessed(self, map_from_cam: Array, camera: StereoCamera) -> Rows:
+        """Rows of the landmarks in the picture of a camera there that the survey saw from next to it, looking the same way: what
+        racks hide is not among them. All that may be visible where the survey did not pass."""
+        rows, _, _ = self.visible(map_from_cam, camera, 0.0, np.pi)
+        apart_m = np.linalg.norm(self.map_from_cam[:, :3, 3] - map_from_cam[:3, 3], axis=1)
+        axes_map = self.map_from_cam[:, :3, 2]
+        places = np.flatnonzero((apart_m < _WITNESS_M) & (axes_map @ map_from_cam[:3, 2] > _WITNESS_COSINE))
+        if not len(places):
+            return rows
+        held = np.zeros(len(self), bool)
+        for place in places:
+            held[self.place_rows[place]] = True
+        return rows[held[rows]]
+
     def _reaches_m(self, focal_px: float) -> NDArray[np.float32]:
         """(N,) up to which distance a camera of this focal length finds each landmark."""
         return np.asarray(self.max_distances_m * np.float32(focal_px / self._survey_focal_px), np.float32)
@@ -103,6 +116,15 @@ class MapView:
         for p in np.flatnonzero(near):
             held[self.place_rows[p]] = True
         return np.flatnonzero(held)
+
+
+def _rows_of(ids: NDArray[np.uint32], landmark_ids: NDArray[np.uint32], order: Rows) -> Rows:
+    """Rows of landmark ids, `order` sorts all of them; those in tiles that are not held are left out."""
+    if not len(order):
+        return np.zeros(0, np.int64)
+    at = np.searchsorted(landmark_ids, ids, sorter=order)
+    rows = order[np.minimum(at, len(order) - 1)]
+    return np.asarray(rows[landmark_ids[rows] == ids], np.int64)
 
 
 def _joined(parts: list[NDArray[np.generic]], shape: tuple[int, ...], dtype: type) -> NDArray:  # type: ignore[type-arg]

@@ -53,7 +53,7 @@ class MessagePackOutput:
         covariance = estimate.cov_rot_trans if placed.map_from_odom is not None else None
         body_from_base = se3_inverse(base_from_body)
         message = EstimateMessage(
-            stamp_ns=estimate.stamp_ns, status=estimate.status.value, map_version=estimate.map_version,
+            stamp_ns=estimate.stamp_ns, status=estimate.status.value, cause=estimate.cause.value, map_version=estimate.map_version,
             odom_from_base=Placement.of(placed.odom_from_base),
             map_from_odom=None if placed.map_from_odom is None else Placement.of(placed.map_from_odom),
             cov_rot_trans=None if covariance is None else tuple(float(v) for v in covariance.ravel()),

@@ -1,7 +1,7 @@
 """One frame placed in the map: by projection where it nearly is, by words where it might be anywhere. Pure."""
 
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TypeVar, cast
 
 import numpy as np
@@ -14,6 +14,7 @@ from fleetmap.pose_solver import Resection, ransac_resection, refine_resection, 
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from locclient.map_view import MapView, Rows
 from locclient.settings import LocalizerSettings
+from locclient.twins import Twin, find_twins
 
 _NEIGHBOURHOOD_M = 3.0
 _RANKED = 8  # so many times as many places are ranked as are tried
@@ -30,7 +31,10 @@ class Fix:
     """A verified place of one frame.
 
     map_from_cam (4, 4); cov_rot_trans (6, 6) in map axes, rotation first; inliers and cells of the image that hold them; share
-    of the inliers among what was matched at the end.
+    of the inliers among what was matched at the end. hit_share: of the landmarks that the survey saw from next to there, how many
+    are among the inliers; 1 where nobody looked. twin_share: how much of
+    what speaks for this place speaks for another one too, 1 where nobody looked. matches (P, 2): features and landmarks, rows of
+    the view, of the inliers.
     """
 
     map_from_cam: Array
@@ -38,6 +42,9 @@ class Fix:
     inliers: int
     cells: int
     share: float = 1.0
+    hit_share: float = 1.0
+    twin_share: float = 1.0
+    matches: NDArray[np.int64] | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(slots=True)
@@ -94,18 +101,20 @@ class Relocalizer:
         allowed (K,): places that may be considered. map_from_cam_rotation: the orientation, where it is known. found: fixes of
         this frame that are known already, returned with the others. A place
         that a fix or a failed trial already stands at is not tried again: it is made of the same landmarks. One further on is,
-        since identical bays and aisles must be able to speak against each other.
+        since identical bays and aisles must be able to speak against each other; what looks the same as the best fix anywhere in
+        the map is tried in any case.
         """
         settings = self._settings.fix
         fixes = [fix for k, fix in enumerate(found) if all(not _same(fix, other) for other in found[:k])]
         tried: list[Array] = []
+        most = settings.top_places_found if fixes else settings.top_places
         for place in self.view.similar_places(seen.features.descriptors, allowed, _RANKED * settings.top_places):
             map_from_place = self.view.map_from_cam[place]
             if any(_stands_at(fix.map_from_cam, map_from_place) for fix in fixes):
                 continue
             if sum(_stands_at(other, map_from_place) for other in tried) >= _TRIALS_AT_A_PLACE:
                 continue
-            if len(tried) == settings.top_places:
+            if len(tried) >= most:
                 break
             if tried:
                 yield
@@ -113,7 +122,45 @@ class Relocalizer:
             fix = self._at_place(seen, int(place), map_from_cam_rotation)
             if fix is not None and all(not _same(fix, other) for other in fixes):
                 fixes.append(fix)
+        fixes.sort(key=lambda f: -f.inliers)
+        if fixes:
+            yield
+            fixes = yield from self._with_twins(seen, fixes)
         return sorted(fixes, key=lambda f: -f.inliers)
+
+    def _with_twins(self, seen: Seen, fixes: list[Fix]) -> Slices[list[Fix]]:
+        """The fixes, and those at the twins of the best one."""
+        settings, best = self._settings.fix, fixes[0]
+        if best.matches is None:
+            return fixes
+        features, rows = best.matches.T
+        twins = yield from find_twins(
+            seen.features.descriptors[features], self.view.points_map[rows], self.view.descriptors, self.view.points_map,
+            best.map_from_cam, settings.twin_votes_share, settings.most_twins,
+        )  # fmt: skip
+        fixes = [replace(best, twin_share=max((twin.share for twin in twins), default=0.0)), *fixes[1:]]
+        for twin in twins:
+            if any(_stands_at(fix.map_from_cam, twin.map_from_cam) for fix in fixes):
+                continue
+            yield
+            fix = self._at_twin(seen, twin, features)
+            if fix is not None and all(not _same(fix, other) for other in fixes):
+                fixes.append(fix)
+        return fixes
+
+    def _at_twin(self, seen: Seen, twin: Twin, features: NDArray[np.int64]) -> Fix | None:
+        settings = self._settings.fix
+        index = features[twin.features]
+        found = resection_with_rotation(
+            self._camera, self.view.points_map[twin.landmarks], self._measured(seen, index),
+            self._sigmas(seen, index, twin.landmarks, None), twin.map_from_cam[:3, :3].T,
+            threshold_px=2 * settings.ransac_px + settings.rotation_sigma_rad * self._camera.focal_px,
+            min_inliers=settings.min_inliers // 3, rotation_sigma_rad=settings.rotation_sigma_rad,
+        )  # fmt: skip
+        map_from_cam = twin.map_from_cam if found is None else se3_inverse(found.cam_from_source)
+        return self._by_projection(
+            seen, map_from_cam, settings.max_radius_px if found is None else settings.guided_radius_px
+        )
 
     def _at_place(self, seen: Seen, place: int, rotation: Array | None) -> Fix | None:
         settings = self._settings.fix
@@ -145,7 +192,7 @@ class Relocalizer:
         """Guided matching of all visible landmarks around a place, twice: wide, then narrow around the first answer."""
         settings = self._settings.fix
         found: Resection | None = None
-        inlier_features: NDArray[np.int64] = np.zeros(0, np.int64)
+        matches: NDArray[np.int64] = np.zeros((0, 2), np.int64)
         for radius, doubt in ((radius_px, _FIRST_DOUBT), (min(radius_px, settings.guided_radius_px) * 0.6, 1.0)):
             rows, pixels, octaves = self.view.visible(
                 map_from_cam, self._camera, radius, np.radians(settings.max_view_angle_deg)
@@ -168,12 +215,12 @@ class Relocalizer:
             if found is None or found.inliers.sum() < settings.min_inliers:
                 return None
             map_from_cam = se3_inverse(found.cam_from_source)
-            inlier_features = hit[kept][found.inliers]
+            matches = np.column_stack([hit[kept], rows[kept]])[found.inliers]
         assert found is not None
-        return self._verified(seen, found, inlier_features)
+        return self._verified(seen, found, matches)
 
-    def _verified(self, seen: Seen, found: Resection, features: NDArray[np.int64]) -> Fix | None:
-        settings = self._settings.fix
+    def _verified(self, seen: Seen, found: Resection, matches: NDArray[np.int64]) -> Fix | None:
+        settings, features = self._settings.fix, matches[:, 0]
         pixels = seen.pixels[features]
         column = np.clip(pixels[:, 0] / self._camera.width_px * 8, 0, 7).astype(int)
         row = np.clip(pixels[:, 1] / self._camera.height_px * 6, 0, 5).astype(int)
@@ -189,7 +236,9 @@ class Relocalizer:
         carry[:3, :3] = carry[3:, 3:] = -rotation
         covariance = settings.covariance_scale * carry @ found.cov_rot_trans @ carry.T
         covariance += np.diag([settings.floor_rad**2] * 3 + [settings.floor_m**2] * 3)
-        return Fix(map_from_cam, covariance, int(found.inliers.sum()), cells, share)
+        witnessed = self.view.witnessed(map_from_cam, self._camera)
+        hit_share = float(np.isin(matches[:, 1], witnessed).sum() / max(len(witnessed), 1))
+        return Fix(map_from_cam, covariance, int(found.inliers.sum()), cells, share, hit_share, matches=matches)
 
     def _sigmas(self, seen: Seen, features: NDArray[np.int64], rows: Rows, map_from_cam: Array | None) -> Array:
         """(N, 2): of pixels and of disparities, by octave and by the landmarks' own uncertainty.

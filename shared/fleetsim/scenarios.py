@@ -70,6 +70,17 @@ def _snake(layout: Layout, aisles: range) -> Route:
     return Route((*points, points[0], (left + 8.0, points[0][1])))
 
 
+def _both_ways(layout: Layout) -> Route:
+    """Every aisle twice, once in each direction. For six aisles."""
+    left, right = _END_M, layout.length_m - _END_M
+    y = [layout.aisle_y_m(aisle) for aisle in range(6)]
+    points = [(left, y[0])]
+    for out, back in ((0, 1), (2, 3), (4, 5), (1, 0), (3, 2), (5, 4)):
+        points += [(left, y[out])] if points[-1] != (left, y[out]) else []
+        points += [(right, y[out]), (right, y[back]), (left, y[back])]
+    return Route(tuple(points))
+
+
 def _small_loop() -> Scenario:
     layout = Layout(aisles=2, bays=4)
     y0, y1 = layout.aisle_y_m(0), layout.aisle_y_m(1)
@@ -131,10 +142,17 @@ def _identical() -> Scenario:
     layout = Layout(aisles=6, bays=8, has_landmarks=False, are_aisles_identical=True)
     runs = {
         "survey": Run("surveyor", (_snake(layout, range(6)),), is_sharp=True, zone_period_s=20.0),
+        "survey-both-ways": Run("surveyor", (_both_ways(layout),), is_sharp=True, zone_period_s=20.0),
         "tote-1": Run("tote", (_loop(layout, 1, 2),), zone_period_s=20.0),
         "runner-1": Run("runner", (_loop(layout, 2, 1),), zone_period_s=20.0),
     }
     return Scenario("six aisles that look the same until stock is moved: aliasing", layout, runs)
+
+
+def _marked_ends() -> Scenario:
+    alike = _identical()
+    marked = Layout(aisles=6, bays=8, are_aisles_identical=True)
+    return replace(alike, description="the same with different signs, posters and pallets at their ends", layout=marked)
 
 
 def _faulty() -> Scenario:
@@ -186,6 +204,7 @@ SCENARIOS = {
     "five-aisles": _five_aisles,
     "busy": _busy,
     "identical-aisles": _identical,
+    "marked-ends": _marked_ends,
     "site": _site,
 }
 

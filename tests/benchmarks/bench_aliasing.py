@@ -1,8 +1,8 @@
-"""Whether identical aisles look alike to the features, and what the localizer makes of starts in them.
+"""Whether identical aisles look alike to the features.
 
-`PYTHONPATH=tests python tests/benchmarks/bench_aliasing.py [--starts N] [--out FILE.json]` prints the tables: matches between
-corresponding places across aisles and across days, then N estimator-level starts (20; 200 take an hour) without and with a prior.
-tests/fleetsim/test_aliasing.py asserts a smaller first table.
+`PYTHONPATH=tests python tests/benchmarks/bench_aliasing.py [--out FILE.json]` prints the table: matches between corresponding
+places across aisles and across days. tests/fleetsim/test_aliasing.py asserts a smaller one; what the localizer makes of starts in
+such aisles is what bench_aliased_starts.py measures.
 """
 
 import benchmarks.one_core  # noqa: F401 -- first of all, before numpy
@@ -15,17 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import aliased_starts, estimator_loop
 from fleetmap.features import orb
 from fleetmap.features.matching import match_mutual
 from fleetmap.features.orb import Features
 from fleetmap.geometry import Array
-from fleetsim.estimator import EstimatorSession
 from fleetsim.layout import Layout
 from fleetsim.light import Exposure
 from fleetsim.optics import make_optics
 from fleetsim.painter import Look, Painter
-from fleetsim.recorder import Order, prepare
 from fleetsim.robots import ROBOTS, nominal_calibration
 from fleetsim.scenarios import find_scenario
 from fleetsim.world import World
@@ -107,25 +104,6 @@ def bench_aliasing() -> dict[str, dict[str, Likeness]]:
     return found
 
 
-def bench_starts(count: int) -> dict[str, dict[str, float]]:
-    """Summaries of starts spread over a drive through two of six identical aisles, on the day of their survey."""
-    sessions = []
-    for order in (Order("identical-aisles"), Order("identical-aisles", robot="runner-1")):
-        session = prepare(order)
-        session.renderer.close()
-        sessions.append(EstimatorSession(session))
-    survey, robot = sessions
-    tiles, vocabulary = estimator_loop.survey_map(survey, np.random.default_rng(0), every_m=0.8)
-    numbers = np.linspace(30, len(robot) - 60, count).astype(int).tolist()
-    found = {}
-    for name, sigma_m in (("no prior", None), ("prior of 0.5 m", 0.5), ("prior of 2 m", 2.0)):
-        rng = np.random.default_rng(1)
-        outcomes = aliased_starts.starts(robot, tiles, vocabulary, numbers, 4.0, sigma_m, rng)
-        found[name] = aliased_starts.summary(outcomes, 3.0)
-        print(f"{name:16s}", "  ".join(f"{key} {value:.3g}" for key, value in found[name].items()))
-    return found
-
-
 def replace_layout(layout: Layout, *, has_landmarks: bool, are_aisles_identical: bool) -> Layout:
     """The layout with its aisles made alike or not."""
     fields = {name: getattr(layout, name) for name in layout.__struct_fields__}
@@ -135,14 +113,12 @@ def replace_layout(layout: Layout, *, has_landmarks: bool, are_aisles_identical:
 def main() -> None:
     """Prints the table; writes it as JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--starts", type=int, default=20)
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     out, found = arguments.out, bench_aliasing()
-    started = bench_starts(arguments.starts)
     if out is not None:
         text = {title: {name: asdict(value) for name, value in rows.items()} for title, rows in found.items()}
-        out.write_text(json.dumps(text | {"starts": started}, indent=2) + "\n")
+        out.write_text(json.dumps(text, indent=2) + "\n")
 
 
 if __name__ == "__main__":

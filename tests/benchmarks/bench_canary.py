@@ -86,7 +86,7 @@ def record() -> dict[int, list[tuple[str, dict[str, float]]]]:
     (tile,), vocabulary = estimator_loop.survey_map(survey, np.random.default_rng(0))
     found = {}
     for version, used in ((1, tile), (2, shifted(tile))):
-        estimates = estimator_loop.run_localizer(robot, [used], vocabulary)
+        estimates = estimator_loop.run_localizer(robot, estimator_loop.map_view(robot, [used], vocabulary))
         errors = estimator_loop.position_errors_m(estimates, robot.map_from_body)
         print(f"version {version}: errors median {np.median(errors):.3f} m, largest {errors.max():.3f} m", flush=True)
         found[version] = health_series(robot, estimates)

@@ -81,13 +81,14 @@ def measure_everything(session: EstimatorSession) -> None:
 def speeds(robot: EstimatorSession, survey: EstimatorSession) -> Figures:
     """Times real time on one core: generating, with odometry, with localization in a map."""
     tiles, vocabulary = estimator_loop.survey_map(survey, np.random.default_rng(0))
+    view = estimator_loop.map_view(robot, tiles, vocabulary)
     duration_s = robot.session.frame_times_s[-1]
     runs: dict[str, Callable[[], object]] = {
         "generate": lambda: measure_everything(robot),
         "odometry": lambda: estimator_loop.run_odometry(robot),
-        "odometry and localization": lambda: estimator_loop.run_localizer(robot, tiles, vocabulary),
+        "odometry and localization": lambda: estimator_loop.run_localizer(robot, view),
     }
-    estimator_loop.run_localizer(robot, tiles, vocabulary, frames=60)  # compiles
+    estimator_loop.run_localizer(robot, view, frames=60)  # compiles
     measure_everything(robot)
     return {name: duration_s / cpu_s(run) for name, run in runs.items()}
 
@@ -123,7 +124,7 @@ def compare_localization() -> tuple[Figures, Figures]:
         session.renderer.close()
     rendered = rendered_map.run_localizer(robot, frames, tiles, vocabulary)
     tiles, vocabulary = estimator_loop.survey_map(EstimatorSession(survey), np.random.default_rng(0))
-    estimates = estimator_loop.run_localizer(simulated, tiles, vocabulary)
+    estimates = estimator_loop.run_localizer(simulated, estimator_loop.map_view(simulated, tiles, vocabulary))
     truth = simulated.map_from_body
     return localization_figures(rendered, truth), localization_figures(estimates, truth)
 

@@ -1,6 +1,7 @@
 """Odometry and localization fed by `fleetsim.estimator` instead of pictures. What closes the loop lives here, because neither side
 may know the other."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,13 +20,15 @@ from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import PositionPrior, wheel_between
 from fleetsim.estimator import EstimatorSession, Found
 from locclient.localizer import Estimate, Localizer
-from locclient.relocalizer import Seen, Slices
+from locclient.map_view import MapView
+from locclient.relocalizer import Relocalizer, Seen, Slices
 from locclient.settings import LocalizerSettings
 
 _TILE_M = 1024.0
 _NEVER_S = 1e9
 _LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of the frame that is handled, for stamps that are too early
 _EVERY_M, _EVERY_RAD = 0.4, 0.2
+_NOISE = np.random.default_rng(0).integers(0, 255, (7, 48, 64), np.uint8)
 
 
 class EstimatorTracker(Tracker):
@@ -82,8 +85,10 @@ def seen(session: EstimatorSession, frame: int) -> Seen:
 
 
 def blank(session: EstimatorSession, frame: int) -> RectifiedFrame:
-    """A frame that carries its stamp alone."""
-    return RectifiedFrame(session.stamps_ns[frame], np.zeros((1, 1), np.uint8), None, None)
+    """A frame that carries its stamp alone: noise for the judge of pictures, nothing at all where nothing is to be seen."""
+    is_dark = not len(session.sighting(frame).ids)
+    left = np.zeros_like(_NOISE[0]) if is_dark else _NOISE[frame % len(_NOISE)]
+    return RectifiedFrame(session.stamps_ns[frame], left, None, None)
 
 
 def run_odometry(
@@ -186,38 +191,50 @@ def tile_of(
     images = np.zeros(len(kept), np.int64)
     for place, ids in enumerate(lists):
         images[ids] = place
-    return [tile], train_vocabulary(descriptors, 10, 3, rng, images)
+    return [tile], train_vocabulary(descriptors, 10, 4, rng, images)
+
+
+class SessionRelocalizer(Relocalizer):
+    """A relocalizer with its eyes replaced: what a frame shows comes from a session. One view serves many of them."""
+
+    def __init__(self, view: MapView, session: EstimatorSession, settings: LocalizerSettings) -> None:
+        super().__init__(view, session.camera, settings)
+        self._session = session
+        self._index_of = {stamp: index for index, stamp in enumerate(session.stamps_ns)}
+
+    def look(self, frame: RectifiedFrame) -> Slices[Seen]:
+        """As the relocalizer's."""
+        yield
+        return seen(self._session, self._index_of[frame.stamp_ns])
 
 
 def run_localizer(
-    session: EstimatorSession,
-    tiles: list[Tile],
-    vocabulary: Vocabulary,
-    prior: PositionPrior | None = None,
-    frames: int | None = None,
-) -> list[Estimate]:
-    """The localizer's estimates over a session in a map."""
+    session: EstimatorSession, view: MapView, prior: PositionPrior | None = None, frames: int | None = None, *,
+    has_wheels: bool = False, until: Callable[[Estimate], bool] = lambda _: False,
+) -> list[Estimate]:  # fmt: skip
+    """The localizer's estimates over a session in a map; the last one is that for which `until` holds."""
     nominal, settings = session.session.nominal, LocalizerSettings()
     localizer = Localizer(nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s, settings)
     localizer._odometry._tracker = EstimatorTracker(session, session.camera, settings.odometry.tracker)
-    localizer.handle_version(1, tiles, vocabulary, session.camera.focal_px)
-    index_of = {stamp: index for index, stamp in enumerate(session.stamps_ns)}
-    assert localizer._relocalizer is not None
-
-    def look(frame: RectifiedFrame) -> Slices[Seen]:
-        yield
-        return seen(session, index_of[frame.stamp_ns])
-
-    localizer._relocalizer.look = look  # type: ignore[method-assign]
+    localizer._relocalizer, localizer._map_version = SessionRelocalizer(view, session, settings), 1
     if prior is not None:
         localizer.handle_prior(prior)
     estimates, last_ns = [], 0
     for frame in range(len(session) if frames is None else min(frames, len(session))):
         stamp_ns = session.stamps_ns[frame]
         localizer.handle_imu(session.session.imu.between(last_ns, stamp_ns + 1))
+        if has_wheels:
+            localizer.handle_wheel(wheel_between(session.session.wheel, last_ns, stamp_ns + 1))
         last_ns = stamp_ns + 1
         estimates.append(localizer.handle_stereo(blank(session, frame)))
+        if until(estimates[-1]):
+            break
     return estimates
+
+
+def map_view(session: EstimatorSession, tiles: list[Tile], vocabulary: Vocabulary) -> MapView:
+    """What a robot with the session's camera holds of a map that was surveyed with the same."""
+    return MapView(tiles, vocabulary, session.camera.focal_px)
 
 
 def relative_errors_m(estimates: list[OdometryEstimate], map_from_body: Array, step: int = 15) -> Array:

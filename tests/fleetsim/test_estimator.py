@@ -150,7 +150,7 @@ def test_odometry_and_localizer_live_on_it() -> None:
     assert np.median(motion_errors) < 0.02
     tiles, vocabulary = estimator_loop.survey_map(survey, np.random.default_rng(0), every_m=0.2)
     prior = robot.session.priors[0]
-    estimates = estimator_loop.run_localizer(robot, tiles, vocabulary, prior)
+    estimates = estimator_loop.run_localizer(robot, estimator_loop.map_view(robot, tiles, vocabulary), prior)
     tracking = [e.status.value == "TRACKING" for e in estimates]
     assert np.mean(tracking[20:]) > 0.8
     assert np.median(estimator_loop.position_errors_m(estimates[20:], robot.map_from_body[20:])) < 0.03

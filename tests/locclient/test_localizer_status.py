@@ -74,13 +74,11 @@ class ScriptedRelocalizer:
     """Offers the fixes of the present frame: near the prediction the one that lies there, anywhere all of them."""
 
     fixes: list[Fix] = field(default_factory=list)
-    twin_score: float = 0.1
+    twin_share: float = 0.1
 
     @property
     def view(self) -> Any:
-        return type(
-            "View", (), {"map_from_cam": np.tile(np.eye(4), (4, 1, 1)), "twin_score": lambda _: self.twin_score}
-        )
+        return type("View", (), {"map_from_cam": np.tile(np.eye(4), (4, 1, 1))})
 
     def look(self, frame: RectifiedFrame) -> Generator[None, None, list[Fix]]:
         seen = self.fixes
@@ -140,7 +138,13 @@ class Robot:
     def _fix(self, offset: Array) -> Fix:
         moved = self.map_from_body.copy()
         moved[:3, 3] += offset
-        return Fix(moved @ BODY_FROM_CAM, np.diag([0.002**2] * 3 + [0.01**2] * 3), self.inliers, 20)
+        return Fix(
+            moved @ BODY_FROM_CAM,
+            np.diag([0.002**2] * 3 + [0.01**2] * 3),
+            self.inliers,
+            20,
+            twin_share=self.relocalizer.twin_share,
+        )
 
     def error_m(self, estimate: Estimate) -> float:
         assert estimate.map_from_body is not None
@@ -347,7 +351,7 @@ def test_one_strong_fix_alone_is_believed(robot: Robot) -> None:
 
 
 def test_a_strong_fix_where_the_map_has_a_twin_must_be_confirmed(robot: Robot) -> None:
-    robot.inliers, robot.relocalizer.twin_score = 100, 0.45
+    robot.inliers, robot.relocalizer.twin_share = 100, 0.45
     assert [e.status for e in robot.ride(3, 0.6)] == [Status.INITIALISING] * 2 + [Status.TRACKING]
 
 

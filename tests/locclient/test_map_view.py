@@ -1,5 +1,7 @@
 """What a robot should see of its map, against plain numpy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,3 +49,18 @@ def test_visible_landmarks_are_those_of_the_definition(view: MapView, margin_px:
         assert np.isfinite(octaves).all()
         total += len(rows)
     assert total > 0
+
+
+def test_a_place_is_found_by_the_share_of_it_that_is_seen() -> None:
+    """A robot sees ten times what the map holds; what the map lacks must not count against a place."""
+    rng = np.random.default_rng(5)
+    tile = random_tile(rng, landmarks=9000, places=12)
+    tile = replace(tile, place_landmark_ids=tuple(np.sort(tile.landmark_ids[k : k + 4800 : 80]) for k in range(12)))
+    view = MapView([tile], train_vocabulary(tile.descriptors, 10, 4, rng), SURVEY_FOCAL_PX)
+    clutter = rng.integers(0, 256, (600, 32), np.uint8)
+    for place, rows in enumerate(view.place_rows):
+        found = view.similar_places(np.concatenate([clutter, view.descriptors[rows]]), None, 3)
+        assert found[0] == place
+        others = np.arange(len(view.place_rows)) != place
+        assert place not in view.similar_places(np.concatenate([clutter, view.descriptors[rows]]), others, 3)
+    assert len(view.similar_places(np.zeros((0, 32), np.uint8), None, 3)) == 0

@@ -1,5 +1,7 @@
 """What a running robot tells its own programs, and the frame odom in which nothing jumps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from fleetmap.recordings.ros_messages import decode_frame_links, decode_prior, d
 from locclient.localizer import Status
 from locclient.odom_frame import OdomFrame
 from locclient.outputs import OutputSection, open_output
+from locclient.sight import Cause
 
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([0.2, 0.0, 0.5]))
 
@@ -30,7 +33,7 @@ def published(section: OutputSection, *estimates: object) -> dict[str, list[byte
 
 def test_messagepack_holds_both_transforms() -> None:
     tracked = estimate(5.0, x_m=2.0, sigma_m=0.1)
-    lost = estimate(6.0, Status.AMBIGUOUS, known=False, hypotheses=2)
+    lost = replace(estimate(6.0, Status.AMBIGUOUS, known=False, hypotheses=2), cause=Cause.DARK)
     told = published(OutputSection(), tracked, lost)
     assert list(told) == ["fleetmap/hall/robots/r1/estimate"]
     first, second = (decode_message(payload, EstimateMessage) for payload in told["fleetmap/hall/robots/r1/estimate"])
@@ -40,6 +43,7 @@ def test_messagepack_holds_both_transforms() -> None:
     np.testing.assert_allclose(map_from_base, tracked.map_from_body @ se3_inverse(BASE_FROM_BODY), atol=1e-12)
     assert first.cov_rot_trans is not None
     assert first.cov_rot_trans[35] == pytest.approx(0.01)
+    assert (first.cause, second.cause) == ("", "dark")
     assert (second.map_from_odom, second.cov_rot_trans, len(second.hypotheses)) == (None, None, 2)
 
 

@@ -1,0 +1,130 @@
+"""What the localizer says where aisles are truly identical: starts at the estimator's level, beside what is promised of them.
+
+`PYTHONPATH=tests python tests/benchmarks/bench_aliased_starts.py [--starts N] [--seeds N...] [--only NAME...] [--out FILE.json]`.
+Six aisles 5 m apart that were surveyed both ways, so that each has five twins; N starts (200) of each kind, shared among the sites
+of the seeds. With signs at the aisles' ends the starts are followed out of the racks. Two rows say what a map can not protect from:
+where the robot's own aisle is not in it and one twin is, or three.
+"""
+
+import benchmarks.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
+import argparse
+import json
+import operator
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from importlib.metadata import version as version_of
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.aliased_starts import (
+    Site,
+    Start,
+    among_racks,
+    resolving_start_at,
+    start_at,
+    summary,
+    surveyed_site,
+    with_aisles,
+)
+
+WITHIN_S, WITHIN_M = 3.0, 5.0
+_FOLLOWED_S = 3.2
+Compare = Callable[[float, float], bool]
+_NEVER_WRONG: dict[str, tuple[float, Compare]] = {"wrong_starts": (0, operator.le)}
+_OUT, _OUT_M, _SPEED_MPS, _RATE_HZ = "out of the aisle", 8.0, 2.0, 15.0
+_MAPPED = {"own aisle and all twins but one unmapped": (5,), "own aisle and two of five twins unmapped": (3, 4, 5)}
+PROMISES: dict[str, dict[str, tuple[float, Compare]]] = {
+    "no prior": _NEVER_WRONG | {"right_among_hypotheses_share": (1.0, operator.ge)},
+    "prior of 0.5 m": _NEVER_WRONG | {"right_in_time_share": (0.99, operator.ge)},
+    "prior of 2 m": _NEVER_WRONG,
+    _OUT: _NEVER_WRONG | {"resolved_share": (1.0, operator.ge)},
+    **dict(zip(_MAPPED, ({}, _NEVER_WRONG), strict=True)),
+}
+_PRIORS_M = {"no prior": None, "prior of 0.5 m": 0.5, "prior of 2 m": 2.0}
+
+
+def starts_of(name: str, site: Site, count: int, seed: int) -> list[Start]:
+    """So many starts of one kind, spread over the drive."""
+    rng, robot = np.random.default_rng([seed, 1]), site.robot
+    if name in _PRIORS_M:
+        return [start_at(site, n, _FOLLOWED_S, _PRIORS_M[name], rng) for n in _spread(30, len(robot) - 60, count)]
+    frames = among_racks(robot)
+    if name == _OUT:
+        late = frames[-int(_OUT_M / _SPEED_MPS * _RATE_HZ) :]
+        return [resolving_start_at(site, n, WITHIN_M) for n in _spread(late[0], late[-1], count)]
+    part = with_aisles(site, _MAPPED[name])
+    return [start_at(part, n, _FOLLOWED_S, None, rng) for n in _spread(frames[0], frames[-1] - 46, count)]
+
+
+def _site_of(name: str) -> str:
+    return "marked-ends" if name == _OUT else "identical-aisles"
+
+
+def _spread(first: int, last: int, count: int) -> list[int]:
+    return [int(number) for number in np.linspace(first, last, count)]
+
+
+def judged(name: str, found: list[Start]) -> dict[str, float]:
+    """The figures of one kind of start."""
+    figures = summary(found, WITHIN_S)
+    if name == _OUT:
+        late_m = [s.late_m for s in found if s.late_m is not None]
+        figures["resolved_share"] = len([m for m in late_m if m <= WITHIN_M]) / len(found)
+        figures["resolved_median_m"] = float(np.median(late_m)) if late_m else np.nan
+        figures["resolved_last_m"] = float(np.max(late_m)) if late_m else np.nan
+    return figures
+
+
+def show(name: str, figures: dict[str, float]) -> None:
+    """One kind's figures, what is promised of them, and what was missed."""
+    print(f"\n{name}")
+    for key, value in figures.items():
+        target = ""
+        if key in PROMISES[name]:
+            limit, compare = PROMISES[name][key]
+            target = f"{'<=' if compare is operator.le else '>='} {limit:g} {'' if compare(value, limit) else 'MISSED'}"
+        print(f"  {key:30} {value:8.3g}  {target}", flush=True)
+
+
+def main() -> None:
+    """Prints the tables; writes them as JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--starts", type=int, default=200)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[11, 12])
+    parser.add_argument("--only", action="append", default=[], choices=list(PROMISES))
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    found: dict[str, list[Start]] = {name: [] for name in arguments.only or PROMISES}
+    for seed in arguments.seeds:
+        begun_s = time.process_time()
+        sites = {name: surveyed_site(name, seed) for name in {_site_of(name) for name in found}}
+        print(f"seed {seed}: sites in {time.process_time() - begun_s:.0f} s", flush=True)
+        for name, starts in found.items():
+            begun_s = time.process_time()
+            share = starts_of(name, sites[_site_of(name)], max(1, arguments.starts // len(arguments.seeds)), seed)
+            starts.extend(share)
+            print(f"seed {seed}, {name}: {len(share)} starts in {time.process_time() - begun_s:.0f} s", flush=True)
+            for start in share:
+                if start.wrong_frames:
+                    print("  wrong:", start, flush=True)
+    figures = {name: judged(name, starts) for name, starts in found.items()}
+    for name, row in figures.items():
+        show(name, row)
+    if arguments.out is not None:
+        machine = {
+            "command": " ".join(sys.argv), "machine": platform.processor() or platform.machine(), "cores": os.cpu_count(),
+            "python": platform.python_version(), "numpy": np.__version__, "numba": version_of("numba"),
+        }  # fmt: skip
+        outcomes = {name: [asdict(start) for start in starts] for name, starts in found.items()}
+        arguments.out.write_text(json.dumps(machine | {"figures": figures, "starts": outcomes}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

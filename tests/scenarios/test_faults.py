@@ -1,0 +1,82 @@
+"""Faults of a robot's sensors: said within a second, survived without a silent failure, and over soon after they end.
+
+Without pictures: what a stuck camera or a person in the way looks like is shown by tests/benchmarks/bench_faults.py.
+"""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from benchmarks import estimator_loop
+from fleetsim.estimator import EstimatorSession
+from fleetsim.faults import Fault, FaultPlan
+from fleetsim.landmarks import LandmarkField
+from fleetsim.recorder import Order, Session, prepare
+from locclient.localizer import Estimate, Status
+from locclient.map_view import MapView
+from locclient.sight import Cause
+
+BEGIN_S = 2.5  # on the way, three seconds before the end
+WRONG_M = 0.3
+
+
+@lru_cache(maxsize=1)
+def _site() -> tuple[Session, LandmarkField, MapView]:
+    """A robot's drive along three metres, and the map of another's."""
+    survey = prepare(Order("clip"))
+    survey.renderer.close()
+    field = LandmarkField(survey.world)
+    surveyed = EstimatorSession(survey, field=field)
+    tiles, vocabulary = estimator_loop.survey_map(surveyed, np.random.default_rng(0), every_m=0.2)
+    robot = prepare(Order("clip", robot="tote-1"))
+    robot.renderer.close()
+    return robot, field, estimator_loop.map_view(surveyed, tiles, vocabulary)
+
+
+def driven(name: str, duration_s: float) -> tuple[EstimatorSession, list[Estimate]]:
+    """The robot's drive with one fault."""
+    sound, field, view = _site()
+    plan = FaultPlan((Fault(name, BEGIN_S, BEGIN_S + duration_s),))
+    times_s = tuple(t for t in sound.frame_times_s if not plan.has("frames-dropped", t))
+    spoiled = replace(sound, imu=plan.spoil_imu(sound.imu), wheel=plan.spoil_wheels(sound.wheel), frame_times_s=times_s)
+    spoiled.renderer.faults = plan
+    session = EstimatorSession(spoiled, field=field)
+    return session, estimator_loop.run_localizer(session, view, has_wheels=True)
+
+
+def said(session: EstimatorSession, estimates: list[Estimate]) -> dict[float, Estimate]:
+    """Estimates by seconds since the fault's begin; none of them TRACKING at the wrong place."""
+    for estimate, truth in zip(estimates, session.map_from_body, strict=True):
+        if estimate.status is Status.TRACKING:
+            assert estimate.map_from_body is not None
+            assert np.linalg.norm(estimate.map_from_body[:3, 3] - truth[:3, 3]) < WRONG_M
+    begin = session.session.frame_times_s[0]
+    first_ns = session.stamps_ns[0]
+    return {(e.stamp_ns - first_ns) * 1e-9 + begin - BEGIN_S: e for e in estimates}
+
+
+def test_darkness_is_said_with_its_cause_and_ends_with_it() -> None:
+    """DEGRADED with the cause `dark` within a second, TRACKING within half a second of the light's return."""
+    by_time = said(*driven("camera-dark", 1.2))
+    dark = [e for t, e in by_time.items() if 1.0 <= t < 1.2]
+    assert dark
+    assert all(e.status in (Status.DEGRADED, Status.LOST) and e.cause is Cause.DARK for e in dark)
+    assert all(e.status is Status.TRACKING for t, e in by_time.items() if t > 1.7)
+
+
+@pytest.mark.parametrize(("fault", "duration_s"), [("imu-spike", 0.1), ("wheel-slip", 1.5)])
+def test_nonsense_of_one_sensor_is_rejected(fault: str, duration_s: float) -> None:
+    """TRACKING throughout."""
+    by_time = said(*driven(fault, duration_s))
+    assert {e.status for t, e in by_time.items() if t > 0.0} == {Status.TRACKING}
+
+
+@pytest.mark.parametrize(("fault", "duration_s"), [("imu-gap", 0.4), ("frames-dropped", 1.0)])
+def test_a_gap_is_bridged_by_the_other_sensor(fault: str, duration_s: float) -> None:
+    """TRACKING or DEGRADED within it, TRACKING within a second of its end."""
+    by_time = said(*driven(fault, duration_s))
+    assert {e.status for t, e in by_time.items() if t > 0.0} <= {Status.TRACKING, Status.DEGRADED}
+    assert all(e.status is Status.TRACKING for t, e in by_time.items() if t > duration_s + 1.0)
+    assert any(t > duration_s + 1.0 for t in by_time)
