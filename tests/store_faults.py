@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -272,6 +273,14 @@ def traced(scenario: Scenario, folder: Path, mode: str, every: int) -> Iterator[
             yield number, [f"{name}: {fault}" for fault in faults]
 
 
+def _tries(scenario: Scenario, folder: Path, mode: str, every: int) -> Iterator[tuple[int, list[str]]]:
+    if mode == "power cut":
+        return power_cuts(scenario, folder, every)
+    if mode in TRACED:
+        return traced(scenario, folder, mode, every)
+    return strikes(scenario, folder, mode, every)
+
+
 def hash_of(*words: str) -> int:
     """A number that is the same on every run."""
     return sum(ord(sign) * (i + 1) for i, sign in enumerate("/".join(words)))
@@ -280,37 +289,39 @@ def hash_of(*words: str) -> int:
 def run(
     modes: list[str], every: int, names: list[str] | None = None, within_s: float = float("inf")
 ) -> dict[str, object]:
-    """What was tried: counts by scenario and mode, and what was wrong; `is_complete` unless time was short."""
+    """What was tried: counts by scenario and mode, and what was wrong; `is_complete` unless time was short.
+
+    Scenarios and modes take turns, so that none is left out where time is short.
+    """
     memory = Path("/dev/shm")
     started_s = time.monotonic()
     tries: dict[str, dict[str, int]] = {}
     wrong: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as made:
         work = Path(made)
-        for scenario in scenarios(work):
-            if names is not None and scenario.name not in names:
+        chosen = [scenario for scenario in scenarios(work) if names is None or scenario.name in names]
+        waiting = deque(
+            (scenario, mode, _tries(scenario, work / f"store-{n}-{m}", mode, every))
+            for n, scenario in enumerate(chosen)
+            for m, mode in enumerate(modes)
+        )
+        for scenario, mode, _ in waiting:
+            tries.setdefault(scenario.name, {})[mode] = 0
+        while waiting and time.monotonic() - started_s <= within_s:
+            scenario, mode, found = waiting.popleft()
+            tried = next(found, None)
+            if tried is None:
                 continue
-            counts = tries.setdefault(scenario.name, {})
-            for mode in modes:
-                folder = work / "store"
-                if mode == "power cut":
-                    found = power_cuts(scenario, folder, every)
-                elif mode in TRACED:
-                    found = traced(scenario, folder, mode, every)
-                else:
-                    found = strikes(scenario, folder, mode, every)
-                counts[mode] = 0
-                for number, faults in found:
-                    if time.monotonic() - started_s > within_s:
-                        break
-                    counts[mode] += 1
-                    if faults:
-                        wrong.append({"scenario": scenario.name, "mode": mode, "call": number, "faults": faults})
+            number, faults = tried
+            tries[scenario.name][mode] += 1
+            if faults:
+                wrong.append({"scenario": scenario.name, "mode": mode, "call": number, "faults": faults})
+            waiting.append((scenario, mode, found))
     seconds = time.monotonic() - started_s
     total = sum(sum(counts.values()) for counts in tries.values())
     return {
         "points": total,
-        "is_complete": seconds <= within_s,
+        "is_complete": not waiting,
         "seconds": round(seconds, 1),
         "tries": tries,
         "wrong": wrong,

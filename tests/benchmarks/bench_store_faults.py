@@ -55,7 +55,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--every", type=int, default=1, help="only every N-th call")
     parser.add_argument("--inputs", type=int, default=100_000, help="damaged inputs of all formats together")
-    parser.add_argument("--within-s", type=float, default=1500.0, help="stop injecting after so many seconds")
+    parser.add_argument("--within-s", type=float, default=900.0, help="stop injecting after so many seconds")
     parser.add_argument("--out", type=Path, default=None)
     arguments = parser.parse_args()
     fuzzed = fuzz_all(arguments.inputs)
