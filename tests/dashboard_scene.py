@@ -59,6 +59,7 @@ def hall_tiles(seed: int, *, shifted_m: float = 0.0, length_m: float = LENGTH_M)
 
 def _tile(rng, cell, ids, points, place_ids, places) -> Tile:  # type: ignore[no-untyped-def]
     map_from_cam = np.tile(np.eye(4), (len(places), 1, 1))
+    map_from_cam[:, :3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # along the aisle, E
     map_from_cam[:, :2, 3] = places
     towards = np.tile([0.0, 1.0, 0.0], (len(points), 1))
     return Tile(

@@ -10,6 +10,7 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.samples import Trajectory
 from mapserver.evaluation import AteResult, absolute_trajectory_error, paired
+from mapserver.quality.figures import TileDirections
 from mapserver.survey.pipeline import Survey
 from mapserver.survey.result import SurveyMap
 from mapserver.survey.sessions.joining import Joined
@@ -33,6 +34,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     the estimate is too large (0.01 is 1 %), None without ground truth. peak_rss_mb: most memory the process held, in 10^6 bytes.
     findings: by recording, what the doctor found wanting in it, and what was corrected.
     culled: what the surveys did not hand on. sessions: what became of every recording, and of the map's landmarks by it.
+    directions: which way the places of each tile look, and which way none does.
     """
 
     recordings: list[str]
@@ -54,6 +56,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     findings: dict[str, list[str]]
     culled: dict[str, int]
     sessions: list[dict[str, Any]]
+    directions: list[TileDirections]
 
 
 class Accuracy(msgspec.Struct, frozen=True):
@@ -129,6 +132,7 @@ def make_report(
         culled={key: sum(count[key] for count in culled) for key in culled[0]},
         findings={},
         sessions=[],
+        directions=[],
     )
 
 

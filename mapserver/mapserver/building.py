@@ -28,6 +28,7 @@ from mapserver.loop_places import loop_places
 from mapserver.noted_job import Job, noted_job
 from mapserver.picture_files import PictureFile
 from mapserver.progress import ProgressView, StageTimes
+from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence
 from mapserver.store import NOBODY, Actor, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
@@ -44,7 +45,7 @@ from mapserver.vocabulary_choice import ChosenVocabulary, choose_vocabulary, jud
 from mapserver.worker import open_worker
 from mapserver.zones_file import read_zones
 
-_NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled")
+_NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled", "directions")
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fleetmap")
 
 
@@ -246,6 +247,7 @@ def _keep(order: BuildOrder, built: _Built, parent: Before | None, settings: Sur
         report,
         findings={s.entry.name: s.remarks() for s in built.surveyed},
         sessions=sessions_report([s.entry.name for s in built.surveyed], built.joined),
+        directions=evidence.directions or [],
     )
     details = DraftDetails(
         created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
@@ -374,6 +376,8 @@ def _sentence(site: str, version: int, parent: Before | None, report: BuildRepor
     built_on = "" if parent is None else f" on version {parent.manifest.version}"
     left = [s["recording"] for s in report.sessions if not s["joined"]]
     left_out = f"; left out, they could not be joined: {', '.join(left)}" if left else ""
+    one_way = one_way_words(report.directions)
+    warned = f"; {one_way}" if one_way else ""
     if report.scale == "unknown":
         return (
             f"site {site}: draft {version} of {report.keyframes} keyframes and {report.landmarks} landmarks, {sizes}; its scale is "
@@ -381,5 +385,5 @@ def _sentence(site: str, version: int, parent: Before | None, report: BuildRepor
         )
     return (
         f"site {site}: draft {version}{built_on} of {report.keyframes} keyframes and {report.landmarks} landmarks over "
-        f"{report.path_m:.1f} m, {sizes}{left_out}; make it current with `mapserver publish --site {site}`"
+        f"{report.path_m:.1f} m, {sizes}{left_out}{warned}; make it current with `mapserver publish --site {site}`"
     )

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +15,7 @@ from fleetmap.mapformat import Manifest, RecordingEntry, Tile, decode_tile, enco
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
 from fleetmap.rectification import Rectifier, StereoCamera
 from fleetmap.samples import SensorSet, Trajectory
+from mapserver.quality.directions import tile_directions
 from mapserver.quality.evidence import Offered, examine, trajectory_breaks
 from mapserver.quality.figures import Evidence, Motion
 from mapserver.quality.frames import Look, Probe, held_out_frames, look_at, probes_of_map, spread
@@ -127,10 +129,11 @@ def examine_draft(
     ]
     last = [] if before is None else probes_of_map(before.survey, PROBES)
     stored = [decode_tile(encode_tile(tile)) for tile in tiles]
-    return examine(
+    evidence = examine(
         TileMap(stored), None if before is None else TileMap(before.tiles), Offered(probes, replayed, last),
         _motion(trajectories, surveys), vocabulary, settings,
     )  # fmt: skip
+    return msgspec.structs.replace(evidence, directions=tile_directions(stored))
 
 
 def _motion(trajectories: Sequence[Trajectory], surveys: Sequence[Survey]) -> Motion | None:

@@ -108,7 +108,14 @@ def test_session_keys_are_documented() -> None:
 
 
 def test_evidence_keys_are_documented() -> None:
-    kinds = (figures.Evidence, figures.Compared, figures.Looks, figures.Aliasing, figures.Motion)
+    kinds = (
+        figures.Evidence,
+        figures.Compared,
+        figures.Looks,
+        figures.Aliasing,
+        figures.Motion,
+        figures.TileDirections,
+    )
     keys = {field.name for kind in kinds for field in msgspec.structs.fields(kind)}
     assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Evidence"))} == keys
 

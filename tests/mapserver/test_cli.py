@@ -14,10 +14,11 @@ from fleetmap.errors import UsageError
 from fleetmap.geometry import se3_exp
 from fleetmap.recordings.tum import write_tum
 from fleetmap.samples import SensorSet, Trajectory
-from map_samples import draft_details, save_sample_draft
+from map_samples import draft_details, random_tile, save_sample_draft
 from mapserver import cli
 from mapserver.commands.fleet import fleet_app
 from mapserver.config import MapserverConfig, command_defaults, read_config
+from mapserver.quality.figures import Evidence, TileDirections
 from mapserver.store import MapStore
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -64,6 +65,19 @@ def test_exit_statuses(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: 
     assert "Traceback" not in told.err
     assert status(monkeypatch, "publish", "--site", "empty", *to_store) == 4
     assert status(monkeypatch, "publish", "--site", "lab", *to_store) == 0
+
+
+def test_publishing_says_which_way_nobody_drove(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    with MapStore.open(tmp_path / "store", create=True) as maps:
+        tiles = [random_tile(np.random.default_rng(0), cell=(3, -1))]
+        seen = Evidence(directions=[TileDirections((3, -1), {"E": 12}, {"W": 12})])
+        maps.save_draft(
+            "lab", tiles=tiles, vocabulary=b"words", details=draft_details(), archive=b"archive", evidence=seen
+        )
+    assert status(monkeypatch, "publish", "--site", "lab", "--store", tmp_path / "store") == 0
+    assert "tile 3,-1: 12 places face E and none near them W" in capsys.readouterr().out
 
 
 def test_interruption_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

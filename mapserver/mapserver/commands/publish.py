@@ -25,6 +25,7 @@ def publish(
 ) -> None:
     """Take a draft through the gate and make it the current version; ends with status 4 where the gate refuses it."""
     from mapserver.config import read_config
+    from mapserver.quality.directions import one_way_words
     from mapserver.store import MapStore
 
     gate = read_config(config_path(context)).gate
@@ -32,9 +33,13 @@ def publish(
         published = maps.publish(site, version, actor=acting(actor, reason), force=force, gate=gate)
         info = maps.version(site, published)
         verdict = maps.verdicts(site, published)[-1]
+        evidence = maps.evidence(site, published)
+    directions = () if evidence is None else evidence.directions or ()
     sizes = f"{info.tiles} tiles, {info.landmarks} landmarks, {info.map_bytes} bytes"
     typer.echo(f"site {site}: version {published} is current ({sizes})")
     for refused in verdict.reasons:
         typer.echo(f"published by force although {refused}")
     if verdict.report.get("not_judged"):
         typer.echo(f"not judged, for want of evidence: {', '.join(verdict.report['not_judged'])}")
+    if one_way := one_way_words(directions):
+        typer.echo(one_way)

@@ -13,6 +13,7 @@ from mapserver.dashboard.data import MapData, SiteHistory, VersionQuality
 from mapserver.dashboard.frame import RESPONSE_TIMEOUT_S, Rooms, Where, html, load, number, show
 from mapserver.dashboard.markup import badge, choices, facts, joined, link, moment, share, size, table
 from mapserver.dashboard.plan import Plan
+from mapserver.quality.directions import missing_words
 from mapserver.store import CanaryRow, Difference, VersionInfo
 
 _LOOK_AGAIN_S = 5.0
@@ -166,6 +167,19 @@ async def _one_version(maps: MapData, where: Where, version: int) -> None:
         version, _quality_facts(quality, plan), _verdicts(quality)
     )
     html(Markup('<div class="pair">{}{}</div>').format(left, right))
+    html(one_way(plan))
+
+
+def one_way(plan: Plan) -> Markup:
+    """The tiles where robots that come from the other side will not find themselves."""
+    rows = [
+        (f"{found.tile[0]},{found.tile[1]}", ", ".join(found.seen), ", ".join(found.missing), missing_words(found))
+        for found in plan.directions
+        if found.missing
+    ]
+    head = ("Tile", "Seen facing", "Missing", "In detail")
+    empty = "Every place was seen from both sides."
+    return Markup("<h2>Seen one way only</h2>{}").format(table(head, rows, empty=empty, name="Seen one way only"))
 
 
 def picture_address(where: Where, version: int) -> str:

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Manifest, Tile, TileEntry
+from mapserver.quality.directions import tile_directions
+from mapserver.quality.figures import TileDirections
 
 _LONG_SIDE_PX = 1600
 _FINEST_M = 0.04  # metres per pixel: below, single landmarks are dots far apart
@@ -18,7 +20,10 @@ _LANDMARK_BGR, _PLACE_BGR = (140, 128, 118), (235, 120, 50)  # middle tones, to 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """low, high: corners in `map`, metres. png: transparent where nothing is. places: keyframes that robots may recognise."""
+    """low, high: corners in `map`, metres. png: transparent where nothing is. places: keyframes that robots may recognise.
+
+    directions: which way the places of each tile look.
+    """
 
     low_m: tuple[float, float]
     high_m: tuple[float, float]
@@ -26,6 +31,7 @@ class Plan:
     tiles: tuple[TileEntry, ...]
     places: int
     png: bytes
+    directions: tuple[TileDirections, ...]
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -46,6 +52,7 @@ def make_plan(manifest: Manifest, read_tile: Callable[[TileEntry], Tile]) -> Pla
         manifest.tiles,
         len(places),
         _picture(landmarks, places, low, high),
+        tuple(tile_directions(tiles)),
     )
 
 

@@ -38,6 +38,18 @@ class Motion(msgspec.Struct, frozen=True):
     worst_m: float
 
 
+class TileDirections(msgspec.Struct, frozen=True):
+    """Which way the places of a tile look, by heading (E along x of `map`, N along y); tile: its x and y.
+
+    seen: places by their heading. missing: headings of which nothing was seen at places that were passed the other way, with how
+    many those are; empty where both ways were driven.
+    """
+
+    tile: tuple[int, int]
+    seen: dict[str, int]
+    missing: dict[str, int]
+
+
 class Evidence(msgspec.Struct, frozen=True):
     """All of it; None where there was nothing to judge by."""
 
@@ -47,3 +59,4 @@ class Evidence(msgspec.Struct, frozen=True):
     aliasing: Aliasing | None = None
     aliasing_before: Aliasing | None = None
     motion: Motion | None = None
+    directions: list[TileDirections] | None = None

@@ -1,9 +1,11 @@
 """What the pages are made of, without a browser."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from markupsafe import Markup
@@ -16,6 +18,7 @@ from mapserver.dashboard import drawing
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.health_data import HealthData, trend_words
 from mapserver.dashboard.live import LiveRobots, live_robot
+from mapserver.dashboard.map_page import one_way
 from mapserver.dashboard.markup import address, age, choices, facts, link, size, table
 from mapserver.dashboard.plan import make_plan
 from mapserver.fleet import Fleet, RobotStatus
@@ -80,13 +83,22 @@ def test_a_plan_shows_landmarks_where_they_are(store: MapStore) -> None:
     assert data.plan(SITE, 2) is plan, "made once"
 
 
+def test_the_map_page_names_the_way_that_nobody_drove(store: MapStore) -> None:
+    plan = MapData(store, GateSettings(), 0.05).plan(SITE, 2)
+    made = one_way(plan)
+    assert {tuple(found.missing) for found in plan.directions} == {("W",)}
+    for found in plan.directions:
+        assert f"<td>{found.tile[0]},{found.tile[1]}</td><td>E</td><td>W</td>" in made
+    both = replace(plan, directions=tuple(msgspec.structs.replace(found, missing={}) for found in plan.directions))
+    assert "<td>" not in one_way(both)
+    assert "seen from both sides" in one_way(both)
+
+
 def test_a_plan_without_tiles_and_one_without_places(store: MapStore) -> None:
     manifest = store.manifest(SITE, 2)
     empty = make_plan(_with_tiles(manifest, ()), lambda _: pytest.fail("there is none"))
     assert empty.size_m == (10.0, 10.0)
     (tile,) = (tile for tile in hall_tiles(1) if (tile.tile_x, tile.tile_y) == (0, 0))
-    from dataclasses import replace
-
     bare = replace(tile, place_ids=tile.place_ids[:0], map_from_cam=tile.map_from_cam[:0], place_landmark_ids=())
     entry = next(entry for entry in manifest.tiles if (entry.x, entry.y) == (0, 0))
     alone = make_plan(_with_tiles(manifest, (entry,)), lambda _: bare)
@@ -94,8 +106,6 @@ def test_a_plan_without_tiles_and_one_without_places(store: MapStore) -> None:
 
 
 def _with_tiles(manifest: Manifest, tiles: tuple[object, ...]) -> Manifest:
-    import msgspec
-
     return msgspec.structs.replace(manifest, tiles=tiles)
 
 

@@ -1,0 +1,84 @@
+"""Which way the places of a map look, and which way nothing looks: a robot that comes the other way finds nothing there. Pure."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from fleetmap.geometry import Array
+from fleetmap.mapformat import Tile
+from mapserver.quality.figures import TileDirections
+
+HEADINGS = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")  # E along x of `map`, N along y
+_NEAR_M = 2.0  # the other lane of an aisle, not the next aisle
+_OTHER_WAY = -0.5  # cosine between the headings of two places, below which one looks the other way of the other
+_UPRIGHT = 0.3  # horizontal part of an axis below which a camera looks at the ceiling or the floor
+_LEAST_M = 3.0  # places that look one way only and lie closer together than this are a turn, not an aisle
+_NAMED = 2
+
+
+def tile_directions(tiles: Sequence[Tile]) -> list[TileDirections]:
+    """What each tile with places was seen of, in the order of the tiles; places that look up or down are left out.
+
+    One way only is judged for every place by those around it, over the borders of tiles: in a tile with two aisles, each driven
+    in another direction, nothing looks the other way in either of them.
+    """
+    counts = [len(tile.map_from_cam) for tile in tiles]
+    map_from_cam = np.concatenate([np.zeros((0, 4, 4)), *(tile.map_from_cam for tile in tiles)])
+    axes_map = map_from_cam[:, :2, 2]
+    lengths = np.linalg.norm(axes_map, axis=1)
+    level = lengths > _UPRIGHT
+    headings = axes_map / np.maximum(lengths, 1e-9)[:, None]
+    sectors = np.round(np.arctan2(headings[:, 1], headings[:, 0]) / (np.pi / 4)).astype(int) % len(HEADINGS)
+    positions_map = map_from_cam[:, :3, 3]
+    one_way = level & ~_met(positions_map, headings, level)
+    owners = np.repeat(np.arange(len(tiles)), counts)
+    found = []
+    for number, tile in enumerate(tiles):
+        mine = owners == number
+        seen = Counter(sectors[mine & level].tolist())
+        if not seen:
+            continue
+        missing = {}
+        for sector in sorted(seen):
+            alone = mine & one_way & (sectors == sector)
+            if _extent_m(positions_map[alone]) >= _LEAST_M:
+                missing[HEADINGS[(sector + 4) % len(HEADINGS)]] = int(alone.sum())
+        by_heading = {HEADINGS[sector]: seen[sector] for sector in sorted(seen)}
+        found.append(TileDirections((tile.tile_x, tile.tile_y), by_heading, missing))
+    return found
+
+
+def one_way_words(found: Sequence[TileDirections]) -> str:
+    """How many tiles were driven one way only and what is missing in the first of them; empty where nothing is."""
+    one_way = [tile for tile in found if tile.missing]
+    if not one_way:
+        return ""
+    named = "; ".join(f"tile {tile.tile[0]},{tile.tile[1]}: {missing_words(tile)}" for tile in one_way[:_NAMED])
+    more = f"; and {len(one_way) - _NAMED} more" if len(one_way) > _NAMED else ""
+    return f"{len(one_way)} of {len(found)} tiles hold places that were seen one way only ({named}{more})"
+
+
+def missing_words(tile: TileDirections) -> str:
+    """What nothing looks at, in words."""
+    return ", ".join(
+        f"{count} places face {HEADINGS[(HEADINGS.index(heading) + 4) % len(HEADINGS)]} and none near them {heading}"
+        for heading, count in tile.missing.items()
+    )
+
+
+def _met(positions_map: Array, headings: Array, level: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(K,) which places have another near them that looks the other way."""
+    met = np.zeros(len(positions_map), bool)
+    if len(positions_map):
+        first, second = cKDTree(positions_map).query_pairs(_NEAR_M, output_type="ndarray").reshape(-1, 2).T
+        opposed = level[first] & level[second] & ((headings[first] * headings[second]).sum(axis=1) < _OTHER_WAY)
+        met[first[opposed]] = met[second[opposed]] = True
+    return met
+
+
+def _extent_m(positions_map: Array) -> float:
+    """Diagonal of what holds the places."""
+    return float(np.linalg.norm(np.ptp(positions_map[:, :2], axis=0))) if len(positions_map) else 0.0
