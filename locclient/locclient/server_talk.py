@@ -6,10 +6,10 @@ from collections import deque
 from collections.abc import Callable
 
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError
-from fleetmap.messages import RobotHealth, WantedVersion
+from fleetmap.messages import FailureReport, RobotHealth, WantedVersion, decode_message
 from locclient.link import MapLink
 from locclient.robot import Change, VersionChange
-from locclient.spool import Spool
+from locclient.spool import Spool, SpooledReport
 
 _ASK_EVERY_S = 60.0
 _QUIET_S, _MAX_QUIET_S = 1.0, 30.0
@@ -153,8 +153,14 @@ class ServerTalk:
             self._link.publish_health(self.health.popleft())
 
     def _deliver(self) -> None:
-        """Failures, oldest first. One that the server refuses for now does not hold up those behind it."""
+        """Failures, oldest first. One that the server refuses for now does not hold up those behind it.
+
+        One that the disk has damaged is let go: nobody will ever be able to read it, and it would be told for ever.
+        """
         for report in self._spool.waiting(_DELIVER_AT_ONCE):
+            if not _is_whole(report):
+                self._spool.refused(report.id)
+                continue
             try:
                 ack = self._link.tell_failure(report.payload)
             except UnreachableError:
@@ -170,3 +176,15 @@ class ServerTalk:
                 self._spool.refused(report.id)
             else:
                 self._spool.done(report.id)
+
+
+def _is_whole(report: SpooledReport) -> bool:
+    """Whether what lies in the spool is still the report that was put there; says so where it is not."""
+    try:
+        told = decode_message(report.payload, FailureReport).id
+    except LinkError as error:
+        _log.warning("the report of failure %s is damaged and dropped: %s", report.id, error)
+        return False
+    if told != report.id:
+        _log.warning("the report of failure %s is damaged and dropped: it tells of %s", report.id, told)
+    return told == report.id

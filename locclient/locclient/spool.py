@@ -71,12 +71,12 @@ class Spool:
             )
 
     def refused(self, report_id: str) -> None:
-        """Lets go of a report that the server will never take."""
+        """Lets go of a report that the server will never take, or could never read."""
         with self._transaction() as database:
             self._count(database, "refused", database.execute("DELETE FROM report WHERE id = ?", (report_id,)).rowcount)
 
     def counts(self) -> dict[str, int]:
-        """`waiting` now; `delivered`, `dropped` for want of room and `refused` since the file was made."""
+        """`waiting` now; `delivered`, `dropped` for want of room and `refused` (damaged ones among them) since the file was made."""
         with self._transaction() as database:
             known = dict(database.execute("SELECT name, value FROM count").fetchall())
             waiting = database.execute("SELECT COUNT(*) FROM report").fetchone()[0]

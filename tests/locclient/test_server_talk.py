@@ -248,6 +248,21 @@ def test_a_report_that_the_server_refuses_does_not_hold_up_the_others(world: Wor
     assert world.spool.counts()["delivered"] == 1
 
 
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"\x00" * 40, report("damaged").payload[:-3], report("of another failure").payload],
+    ids=["empty", "zeros", "truncated", "another"],
+)
+def test_a_report_that_the_disk_has_damaged_is_dropped_and_counted(world: World, payload: bytes) -> None:
+    """It is told neither once nor for ever, and those before and behind it arrive."""
+    world.spool.put(report("before"))
+    world.spool.put(SpooledReport("damaged", payload))
+    world.spool.put(report("behind"))
+    world.step()
+    assert world.table == ["before", "behind"]
+    assert world.spool.counts() == {"waiting": 0, "delivered": 2, "dropped": 0, "refused": 1}
+
+
 def test_health_is_the_last_one_only(world: World) -> None:
     for stamp_ns in (1, 2, 3):
         world.talk.health.append(
