@@ -148,6 +148,7 @@ class Placement(msgspec.Struct, frozen=True, kw_only=True):
 class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
     """What the robot's own programs navigate by, frame by frame.
 
+    cause: what stands in the way of TRACKING, in a word; docs/service.md lists them, empty for nothing.
     odom_from_base is continuous; map_from_odom moves with every fix and is None while there is no single place to name.
     cov_rot_trans: of map_from_base in map axes, rotation first, row by row, None with it. hypotheses: places while AMBIGUOUS.
     """

@@ -13,8 +13,12 @@ import pytest
 import typer
 
 from contracts_documents import REPOSITORY, code_words, rows, section, text
+from estimates import estimate
 from fleetmap import messages
+from locclient import failures
 from locclient.health import METRICS
+from locclient.localizer import Status
+from locclient.sight import Cause
 from mapserver.build_report import BuildReport
 from mapserver.measures import Measures
 from mapserver.nightly.night import Night
@@ -95,6 +99,29 @@ def test_bus_keys_are_documented() -> None:
     keys = set(re.findall(r"^(fleetmap/\S+)", inspect.getdoc(messages) or "", re.MULTILINE))
     assert len(keys) >= 7
     assert {code_words(row[0])[0] for row in rows(section(SERVICE, "Bus"))} == keys
+
+
+def test_causes_are_documented() -> None:
+    causes = {cause.value for cause in Cause if cause is not Cause.NONE}
+    assert {code_words(row[0])[0] for row in rows(section(SERVICE, "Causes"))} == causes
+
+
+def test_causes_of_failures_are_documented() -> None:
+    sharp = failures.Picture(0.5, 1.0, is_frozen=False)
+    pictures = [failures.Picture(0.0, 1.0, False), failures.Picture(0.5, 1.0, True), failures.Picture(0.5, 0.0, False)]
+    causes = {failures.cause_of(estimate(1.0), picture) for picture in pictures}
+    for lost in (
+        estimate(1.0, Status.LOST), estimate(1.0, Status.LOST, version=None), estimate(1.0, Status.LOST, innovation=99.0),
+        estimate(1.0, Status.AMBIGUOUS),
+    ):  # fmt: skip
+        causes.add(failures.cause_of(lost, sharp))
+    monitor = failures.FailureMonitor()
+    monitor.handle(estimate(1.0, fix=True), sharp)
+    silence = monitor.handle_silence(10.0)
+    assert silence is not None
+    causes.add(silence.cause)
+    assert len(causes) == 8
+    assert causes <= set(code_words(section(SERVICE, "Causes")))
 
 
 def test_build_report_keys_are_documented() -> None:
