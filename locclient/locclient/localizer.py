@@ -52,7 +52,8 @@ class Estimate:
     map_from_body (4, 4) and cov_rot_trans (6, 6) (map axes, rotation first) are None until there is anything to say. cause: what
     stands in the way, NONE while TRACKING. fix: the one that was finished with this frame, None without one, taken from the
     frame of fix_stamp_ns, which may be a few frames old: looking at the map is spread over frames. refused: why a fix was not
-    used. hypotheses: what speaks for which place while AMBIGUOUS.
+    used. innovation: how far what the map says is from what was predicted, squared by its covariance; innovation_m: in metres, of what
+    was found where the robot should be, or was believed. hypotheses: what speaks for which place while AMBIGUOUS.
     stage_s: seconds by the clock that was passed in, for odometry and for looking at the map.
     """
 
@@ -69,6 +70,7 @@ class Estimate:
     stage_s: dict[str, float]
     cause: Cause = Cause.NONE
     fix_stamp_ns: int | None = None
+    innovation_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,7 @@ class _Outcome:
     fix: Fix | None = None
     refused: str = ""
     innovation: float | None = None
+    innovation_m: float | None = None
 
 
 class Localizer:
@@ -307,12 +310,13 @@ class Localizer:
         limit = self._settings.track.innovation_limit
         inside = [entry for entry in judged if entry[2] <= limit and (is_near or self._counts(entry[0]))]
         fix, error, innovation = min(judged, key=lambda entry: entry[2])
+        off_m = float(np.linalg.norm(error[3:]))
         if len(inside) != 1:
             self._consider_kidnapping(fixes)
             if inside:
                 return _Outcome(None, f"{len(inside)} places agree with what was seen", innovation)
-            off_m = float(np.linalg.norm(error[3:]))
-            return _Outcome(None, f"the fix is {off_m:.2f} m off, more than its covariance admits", innovation)
+            said = f"the fix is {off_m:.2f} m off, more than its covariance admits"
+            return _Outcome(None, said, innovation, off_m if is_near else None)
         _, measured_cov = self._at_body(fix)
         gain = np.linalg.solve(covariance + measured_cov, covariance).T
         rest = np.eye(6) - gain
@@ -320,7 +324,7 @@ class Localizer:
         anchor = Anchor.behind(self._moment, applied(gain @ error, map_from_body), updated)
         anchor.support = self._anchor.support + 1
         self._anchor = anchor
-        return _Outcome(fix, "", innovation)
+        return _Outcome(fix, "", innovation, off_m)
 
     def _innovation(self, fix: Fix, map_from_body: Array, covariance: Array) -> tuple[Array, float]:
         """(6,) how far a fix is from what was predicted, and that squared by its covariance."""
@@ -439,6 +443,7 @@ class Localizer:
         said = Estimate(
             odometry.stamp_ns, Status.INITIALISING, None, None, self._map_version, outcome.fix, outcome.refused,
             outcome.innovation, (), odometry, self._stage_s, self._cause, looked_ns,
+            outcome.innovation_m,
         )  # fmt: skip
         if self._anchor is not None:
             status, cause = self._worth(self._anchor, odometry)

@@ -33,7 +33,8 @@ class Fix:
     map_from_cam (4, 4); cov_rot_trans (6, 6) in map axes, rotation first; inliers and cells of the image that hold them; share
     of the inliers among what was matched at the end. hit_share: of the landmarks that the survey saw from next to there, how many
     are among the inliers; 1 where nobody looked. twin_share: how much of
-    what speaks for this place speaks for another one too, 1 where nobody looked. matches (P, 2): features and landmarks, rows of
+    what speaks for this place speaks for another one too, 1 where nobody looked. expected: how many landmarks the hit_share is of, and
+    seen those that were found, 0 where nobody looked. matches (P, 2): features and landmarks, rows of
     the view, of the inliers.
     """
 
@@ -44,6 +45,8 @@ class Fix:
     share: float = 1.0
     hit_share: float = 1.0
     twin_share: float = 1.0
+    expected: int = 0
+    seen: int = 0
     matches: NDArray[np.int64] | None = field(default=None, repr=False, compare=False)
 
 
@@ -237,8 +240,11 @@ class Relocalizer:
         covariance = settings.covariance_scale * carry @ found.cov_rot_trans @ carry.T
         covariance += np.diag([settings.floor_rad**2] * 3 + [settings.floor_m**2] * 3)
         witnessed = self.view.witnessed(map_from_cam, self._camera)
-        hit_share = float(np.isin(matches[:, 1], witnessed).sum() / max(len(witnessed), 1))
-        return Fix(map_from_cam, covariance, int(found.inliers.sum()), cells, share, hit_share, matches=matches)
+        hits = int(np.isin(matches[:, 1], witnessed).sum())
+        return Fix(
+            map_from_cam, covariance, int(found.inliers.sum()), cells, share, hits / max(len(witnessed), 1),
+            expected=len(witnessed), seen=hits, matches=matches,
+        )  # fmt: skip
 
     def _sigmas(self, seen: Seen, features: NDArray[np.int64], rows: Rows, map_from_cam: Array | None) -> Array:
         """(N, 2): of pixels and of disparities, by octave and by the landmarks' own uncertainty.

@@ -15,9 +15,11 @@ from fleetmap.mapformat import Manifest
 from fleetmap.messages import PoseMessage, RobotHealth
 from fleetmap.rectification import Rectifier
 from fleetmap.samples import PositionPrior, SensorSet, Trajectory
+from locclient.docks import DockWatch
 from locclient.health import METRICS, FrameRecord, localised
 from locclient.link import FetchedTiles, MapLink, MapSource
 from locclient.localizer import Estimate, Localizer
+from locclient.robot_health import FixFigures
 from locclient.settings import LocalizerSettings
 from locclient.sources import ReplaySource
 
@@ -99,7 +101,7 @@ def replay(
     if prior is not None:
         localizer.handle_prior(prior)
     result = ReplayResult([], [], [], manifest, tiles, [ready.note] if ready.note else [])
-    reporter = _Reporter(link, result)
+    reporter, docks = _Reporter(link, result), DockWatch(source.calibration.base_from_body)
     begun_s, first_ns = time.monotonic(), None
     for number, imu in enumerate(source.imu_before_each()):
         decode_s = time.process_time()
@@ -111,7 +113,8 @@ def replay(
         wall_s, cpu_s = time.monotonic(), time.process_time()
         localizer.handle_imu(imu)
         localizer.handle_wheel(source.wheel_before(number))
-        for coarse in source.priors_before(number):
+        priors = source.priors_before(number)
+        for coarse in priors:
             localizer.handle_prior(coarse)
         frame = rectifier.rectify(raw)
         rectified_s = time.process_time()
@@ -119,10 +122,11 @@ def replay(
         cpu = time.process_time() - cpu_s
         stages = {"decode": decode_s, "rectify": rectified_s - cpu_s, **estimate.stage_s}
         truth = source.truth_map_from_body(number) if manifest.configuration.get(TRUTH_FLAG) else None
+        dock_error_m = docks.handle(priors, estimate)
         result.frames.append(_record(estimate, truth, cpu, time.monotonic() - wall_s, stages))
         result.estimates.append(estimate)
         result.truths.append(truth)
-        reporter.after_frame(estimate, source.calibration.base_from_body)
+        reporter.after_frame(estimate, source.calibration.base_from_body, dock_error_m)
         progress(number)
     reporter.finish()
     return result
@@ -153,13 +157,15 @@ class _Reporter:
 
     def __init__(self, link: RobotLink, result: ReplayResult) -> None:
         self._link, self._result = link, result
+        self._fixes = FixFigures()
         self._health_ns = self._pose_ns = -(2**62)
         self._broken = False
         refused = "; ".join(f"tile {x},{y}: {reason}" for (x, y), reason in result.tiles.refused.items())
         self._send(lambda to: to.ack(result.manifest.version, stamp_ns=time.time_ns(), refused=refused))
 
-    def after_frame(self, estimate: Estimate, base_from_body: Array) -> None:
+    def after_frame(self, estimate: Estimate, base_from_body: Array, dock_error_m: float | None) -> None:
         """Publishes what is due."""
+        self._fixes.handle(estimate, dock_error_m)
         if (
             estimate.map_from_body is not None
             and estimate.cov_rot_trans is not None
@@ -188,6 +194,7 @@ class _Reporter:
             spread = METRICS[group](self._result.frames)
             if isinstance(spread, dict):
                 figures.update({f"{group}_{name}": value for name, value in spread.items()})
+        figures.update(self._fixes.take())
         health = RobotHealth(
             site=self._link.site, robot=self._link.robot, stamp_ns=estimate.stamp_ns, version=estimate.map_version,
             status=estimate.status.value, flags=("tiles_refused",) if self._result.tiles.refused else (), metrics=figures,

@@ -15,6 +15,7 @@ from fleetmap.messages import WantedVersion
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.rectification import RectifiedFrame, Rectifier
 from fleetmap.samples import Image
+from locclient.docks import DockWatch
 from locclient.failures import Failure, FailureMonitor, Picture, PictureJudge
 from locclient.live.intake import Moment
 from locclient.localizer import Estimate, Localizer
@@ -73,13 +74,14 @@ class FailureContext:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one frame brought. cpu_s: from encoded images to estimate."""
+    """What one frame brought. cpu_s: from encoded images to estimate. dock_error_m: as `DockWatch` says, None without an arrival."""
 
     estimate: Estimate
     placed: Placed
     picture: Picture
     cpu_s: float
     failure: FailureContext | None
+    dock_error_m: float | None = None
 
 
 @dataclass
@@ -114,6 +116,7 @@ class Robot:
         self._versions = _Versions()
         self._odom = OdomFrame(calibration.base_from_body)
         self._judge, self.monitor = PictureJudge(), FailureMonitor()
+        self._docks = DockWatch(calibration.base_from_body)
         self._pictures: deque[tuple[int, Image]] = deque(maxlen=_THUMBNAILS)
         self._last: tuple[RectifiedFrame, Estimate] | None = None
 
@@ -172,7 +175,8 @@ class Robot:
         context = None if failure is None else self._context(failure)
         if not self._pictures or estimate.stamp_ns - self._pictures[-1][0] >= _THUMBNAIL_EVERY_NS:
             self._pictures.append((estimate.stamp_ns, frame.left))
-        return Outcome(estimate, self._odom.handle(estimate), picture, cpu_s, context)
+        dock_error_m = self._docks.handle(moment.priors, estimate)
+        return Outcome(estimate, self._odom.handle(estimate), picture, cpu_s, context, dock_error_m)
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """The failure that a source which sends no frames is."""

@@ -7,11 +7,51 @@ import numpy as np
 
 from fleetmap.messages import RobotHealth
 from locclient.failures import is_blind, radius_95_m
-from locclient.localizer import Status
+from locclient.localizer import Estimate, Status
 from locclient.robot import Outcome
 
 _RECENT = 300
 Figure = float | int | str | bool | None
+
+
+class FixFigures:
+    """What looks at the map, docks and odometry tell of a run, of those in HEALTH_FIGURES; the largest since the report before.
+
+    Metres count where the robot had claimed to know its place: who says that he is lost, and is found elsewhere, was not wrong.
+    """
+
+    def __init__(self) -> None:
+        self._expected = self._seen = 0
+        self._largest: dict[str, float] = {}
+        self._last: Estimate | None = None
+
+    def handle(self, estimate: Estimate, dock_error_m: float | None) -> None:
+        """Counts a frame."""
+        was_tracking = self._last is not None and self._last.status is Status.TRACKING
+        self._last = estimate
+        self._note("fix_innovation", estimate.innovation)
+        self._note("fix_innovation_m", estimate.innovation_m if was_tracking else None)
+        self._note("dock_error_m", dock_error_m)
+        if estimate.fix is not None:
+            self._expected += estimate.fix.expected
+            self._seen += estimate.fix.seen
+
+    def take(self) -> dict[str, Figure]:
+        """The figures of a report; what was largest begins anew."""
+        figures: dict[str, Figure] = {
+            name: self._largest.get(name) for name in ("fix_innovation", "fix_innovation_m", "dock_error_m")
+        }
+        self._largest = {}
+        figures |= {"landmarks_expected": self._expected, "landmarks_seen": self._seen}
+        if self._last is not None:
+            figures["speed_mps"] = float(np.linalg.norm(self._last.odometry.velocity_odom_mps))
+            radius = radius_95_m(self._last.cov_rot_trans)
+            figures["radius_95_m"] = radius if np.isfinite(radius) else None
+        return figures
+
+    def _note(self, name: str, value: float | None) -> None:
+        if value is not None:
+            self._largest[name] = max(self._largest.get(name, 0.0), float(value))
 
 
 class HealthFigures:
@@ -23,7 +63,7 @@ class HealthFigures:
         self._first_ns: int | None = None
         self._first_fix_s: float | None = None
         self._first_frame_ms: float | None = None
-        self._innovation: float | None = None
+        self._fixes = FixFigures()
         self._last: Outcome | None = None
 
     @property
@@ -43,8 +83,7 @@ class HealthFigures:
         if self._first_fix_s is not None:
             self._frames += 1
             self._localised += estimate.status is Status.TRACKING
-        if estimate.innovation is not None:
-            self._innovation = max(self._innovation or 0.0, float(estimate.innovation))
+        self._fixes.handle(estimate, outcome.dock_error_m)
 
     def count_failure(self) -> None:
         """A failure was told."""
@@ -67,14 +106,10 @@ class HealthFigures:
             "first_frame_ms": self._first_frame_ms,
             "frame_ms_mean": float(np.mean(self._frame_ms)) if self._frame_ms else None,
             "frame_ms_p99": float(np.percentile(self._frame_ms, 99)) if self._frame_ms else None,
-            "fix_innovation": self._innovation,
             "failures": self._failures,
+            **self._fixes.take(),
         }
-        self._innovation = None
         if last is not None:
-            figures["speed_mps"] = float(np.linalg.norm(last.estimate.odometry.velocity_odom_mps))
-            radius = radius_95_m(last.estimate.cov_rot_trans)
-            figures["radius_95_m"] = radius if np.isfinite(radius) else None
             figures["exposure"], figures["sharpness"] = last.picture.exposure, last.picture.sharpness
         return RobotHealth(
             site=site, robot=robot, stamp_ns=0 if last is None else last.estimate.stamp_ns, wall_ns=wall_ns,

@@ -71,9 +71,10 @@ HEALTH_FIGURES = (
 )  # fmt: skip
 """Metrics of RobotHealth that the server counts with; a robot leaves out what it does not know. Since the report before:
 fix_innovation, the largest squared Mahalanobis distance (6 degrees of freedom) between a fix and its prediction,
-fix_innovation_m, the largest such distance in metres, and dock_error_m, the distance between estimate and dock at an arrival.
-Since the run's begin: frames, frames_dropped, landmarks_expected and landmarks_seen (looked for in pictures, and found there),
-first_fix_s, the time to the first fix. The others are of now."""
+fix_innovation_m, the largest such distance in metres, and dock_error_m, the distance between estimate and dock at an arrival;
+both in metres only where the robot had claimed to know its place. Since the run's begin: frames, frames_dropped,
+landmarks_expected and landmarks_seen (looked for in pictures, and found there), first_fix_s, the time to the first fix. The
+others are of now."""
 
 
 class RobotHealth(msgspec.Struct, frozen=True, kw_only=True):

@@ -376,3 +376,19 @@ def test_what_was_never_seen_says_so(tracking: Robot) -> None:
     said = [tracking.go(0.2, NO_FIX) for _ in range(9)]
     assert said[-1].status is Status.DEGRADED
     assert said[-1].cause is Cause.UNMATCHED
+
+
+def test_metres_of_an_innovation_are_told_of_what_lies_near_or_was_believed(tracking: Robot) -> None:
+    """Believed: where it was found. Refused beside the prediction: how far. Refused elsewhere: it may be a twin, which says nothing."""
+    tracking.go(0.4, [off(0.03)])
+    near = tracking.go(0.4, [off(0.04)])
+    assert near.fix is not None
+    assert near.innovation_m == pytest.approx(0.04, abs=0.02)
+    beside = tracking.go(0.4, [off(0.25)])
+    assert beside.fix is None
+    assert beside.innovation_m == pytest.approx(0.25, abs=0.05)
+    assert tracking.go(0.4, []).innovation_m is None
+    for _ in range(TrackSettings().search_after_failed):
+        elsewhere = tracking.go(0.4, [off(9.0)])
+    assert elsewhere.innovation is not None
+    assert elsewhere.innovation_m is None
