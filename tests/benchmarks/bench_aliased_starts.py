@@ -10,15 +10,10 @@ import benchmarks.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
 import argparse
-import json
 import operator
-import os
-import platform
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict
-from importlib.metadata import version as version_of
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +28,7 @@ from benchmarks.aliased_starts import (
     surveyed_site,
     with_aisles,
 )
+from benchmarks.recorded_runs import write_results
 
 WITHIN_S, WITHIN_M = 3.0, 5.0
 _FOLLOWED_S = 3.2
@@ -117,13 +113,8 @@ def main() -> None:
     figures = {name: judged(name, starts) for name, starts in found.items()}
     for name, row in figures.items():
         show(name, row)
-    if arguments.out is not None:
-        machine = {
-            "command": " ".join(sys.argv), "machine": platform.processor() or platform.machine(), "cores": os.cpu_count(),
-            "python": platform.python_version(), "numpy": np.__version__, "numba": version_of("numba"),
-        }  # fmt: skip
-        outcomes = {name: [asdict(start) for start in starts] for name, starts in found.items()}
-        arguments.out.write_text(json.dumps(machine | {"figures": figures, "starts": outcomes}, indent=2) + "\n")
+    outcomes = {name: [asdict(start) for start in starts] for name, starts in found.items()}
+    write_results(arguments.out, {"figures": figures, "starts": outcomes})
 
 
 if __name__ == "__main__":

@@ -1,25 +1,18 @@
 """What the localizer says while something is broken, and how soon all is well again: one line for each fault of the simulator.
 
-`PYTHONPATH=tests python tests/benchmarks/bench_faults.py [--only NAME...] [--work FOLDER] [--out FILE.json]`; recordings and map are kept
-in the work folder of bench_localization.py. A row is right when the status within a second of the fault's beginning is one of those
-that are promised, nothing fails silently, and the robot tracks again soon after the fault's end.
+`PYTHONPATH=tests python tests/benchmarks/bench_faults.py [--only NAME...] [--work FOLDER] [--out FILE.json]`; recordings and map are
+kept in the work folder, where bench_localization.py finds the same. A row is right when the status within a second of the fault's
+beginning is one of those that are promised, nothing fails silently, and the robot tracks again soon after the fault's end.
 """
 
 import benchmarks.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
-import argparse
-import json
-import os
-import platform
-import sys
-import tempfile
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 
-from benchmarks.bench_localization import played, recorded, surveyed
+from benchmarks.recorded_runs import parsed, played, recorded, surveyed, write_results
 from fleetsim.scenarios import find_scenario
 from locclient import health
 from locclient.localizer import Status
@@ -115,27 +108,14 @@ def show(found: Outcome) -> None:
 
 def main() -> None:
     """Prints the table; writes JSON where asked."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", action="append", default=[], choices=list(EXPECTED))
-    parser.add_argument(
-        "--work", type=Path, default=Path(os.environ.get("FLEETMAP_BENCH_WORK", tempfile.gettempdir())) / "localization"
-    )
-    parser.add_argument("--out", type=Path)
-    arguments = parser.parse_args()
-    arguments.work.mkdir(parents=True, exist_ok=True)
+    arguments = parsed(__doc__, EXPECTED)
     store, found = surveyed(arguments.work), []
     print(f"{'fault':10} {'right':5} {'said s':>9} {'back s':>9} {'back m':>9} {'outside':>9} {'silent':>7}")
     for name in arguments.only or EXPECTED:
         recording = recorded(arguments.work, ("--robot", name, "--day", "1"), "faults")
         found.append(outcome(name, played(recording, store, LocalizerSettings())))
         show(found[-1])
-    if arguments.out is not None:
-        machine = {
-            "command": " ".join(sys.argv),
-            "machine": platform.processor() or platform.machine(),
-            "python": platform.python_version(),
-        }
-        arguments.out.write_text(json.dumps(machine | {"faults": [asdict(o) for o in found]}, indent=2) + "\n")
+    write_results(arguments.out, {"faults": [asdict(o) for o in found]})
 
 
 if __name__ == "__main__":

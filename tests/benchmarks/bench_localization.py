@@ -8,33 +8,24 @@ folder) and serve again. CPU times are the process's; run it on an idle machine,
 import benchmarks.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
-import argparse
-import json
 import operator
-import os
-import platform
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.recorded_runs import parsed, played, recorded, surveyed, write_results
 from fleetmap.odometry import Odometry
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.rectification import Rectifier
 from locclient import health
-from locclient.connection import connected
-from locclient.replay import ReplayResult, replay
+from locclient.replay import ReplayResult
 from locclient.settings import LocalizerSettings
 from locclient.sources import ReplaySource
 
-SITE = "hall"
 Compare = Callable[[float, float], bool]
 AT_MOST, AT_LEAST = operator.le, operator.ge
 
@@ -65,44 +56,6 @@ CASES: dict[str, Case] = {
     "camera 0.5 m lower": Case(("--robot", "tote-1", "--day", "1"), _HONEST | _CHEAP),
     "opposite direction": Case(("--robot", "opposite-1", "--day", "1"), _HONEST | _CHEAP),
 }
-
-
-def tool(name: str) -> list[str]:
-    """The command of this checkout."""
-    return [sys.executable, "-c", f"from {name}.cli import main; main()"]
-
-
-def recorded(work: Path, options: tuple[str, ...], scenario: str = "small-loop") -> Path:
-    """The recording of `fleetsim record SCENARIO OPTIONS`, made where it is not there yet."""
-    name = "-".join((scenario, *(option.lstrip("-") for option in options))) + ".mcap"
-    if not (work / name).exists():
-        subprocess.run([*tool("fleetsim"), "record", scenario, *options, "--out", str(work / name)], check=True)
-    return work / name
-
-
-def surveyed(work: Path) -> Path:
-    """The store with the survey's map, in the frame of the truth."""
-    store = work / "store"
-    if not (store / "built").exists():
-        to_store = ["--site", SITE, "--store", str(store)]
-        survey = recorded(work, ())
-        report = ["--report", str(work / "survey.json")]
-        subprocess.run(
-            [*tool("mapserver"), "build", str(survey), *to_store, "--frame-from-ground-truth", *report], check=True
-        )
-        subprocess.run([*tool("mapserver"), "publish", *to_store], check=True)
-        (store / "built").touch()
-    return store
-
-
-def played(
-    path: Path, store: Path, settings: LocalizerSettings, frames: str = ":", *, reverse: bool = False
-) -> ReplayResult:
-    """The recording replayed in the store's map, as `locclient replay` does."""
-    options = {"site": SITE, "store": store, "server": None, "robot": "bench"}
-    with open_recording(path) as recording, connected(options) as link:
-        source = ReplaySource.of(recording, FrameSelection.parse(frames), reverse=reverse)
-        return replay(source, link, settings, None, realtime=False, progress=lambda _: None)
 
 
 def odometry_ms(path: Path, settings: LocalizerSettings, frames: str = ":") -> list[float]:
@@ -176,14 +129,7 @@ def show(name: str, found: dict[str, Any], case: Case) -> None:
 
 def main() -> None:
     """Prints the tables; writes them as JSON where asked."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", action="append", default=[], choices=list(CASES))
-    parser.add_argument(
-        "--work", type=Path, default=Path(os.environ.get("FLEETMAP_BENCH_WORK", tempfile.gettempdir())) / "localization"
-    )
-    parser.add_argument("--out", type=Path)
-    arguments = parser.parse_args()
-    arguments.work.mkdir(parents=True, exist_ok=True)
+    arguments = parsed(__doc__, CASES)
     store, settings, found = surveyed(arguments.work), LocalizerSettings(), {}
     for name in arguments.only or CASES:
         recording = recorded(arguments.work, CASES[name].record)
@@ -195,13 +141,7 @@ def main() -> None:
             "odometry_alone_p99_ms": float(np.percentile(alone, 99)),
         }
         show(name, found[name], CASES[name])
-    if arguments.out is not None:
-        machine = {
-            "command": " ".join(sys.argv), "machine": platform.processor() or platform.machine(), "cores": os.cpu_count(),
-            "python": platform.python_version(), "numpy": np.__version__, "numba": version_of("numba"),
-            "opencv": version_of("opencv-python-headless"),
-        }  # fmt: skip
-        arguments.out.write_text(json.dumps(machine | {"cases": found}, indent=2) + "\n")
+    write_results(arguments.out, {"cases": found})
 
 
 if __name__ == "__main__":
