@@ -273,10 +273,12 @@ class Localizer:
         return [f for f in fixes if self._counts(f) and self._in_prior(f)]
 
     def _counts(self, fix: Fix) -> bool:
-        """Whether a fix may name a place: not where most of what stands there should have been seen and was not. Racks repeat:
-        some landmarks of any agree with some of any other."""
-        settings = self._settings.fix
-        return fix.inliers >= settings.min_inliers and fix.hit_share >= settings.min_hit_share
+        """Whether a fix may name a place: not by few landmarks where most of what stands there should have been seen and was not.
+        Racks repeat: some landmarks of any agree with some of any other."""
+        settings, strong = self._settings.fix, self._settings.track.strong_inliers
+        return fix.inliers >= strong or (
+            fix.inliers >= settings.min_inliers and fix.hit_share >= settings.min_hit_share
+        )
 
     def _prior_cov_m2(self) -> Array:
         """(2, 2) of the prior's horizontal position now: the way since may have led anywhere."""
