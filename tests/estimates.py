@@ -4,7 +4,7 @@ import numpy as np
 
 from fleetmap.geometry import Array, se3
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
-from locclient.localizer import Estimate, Hypothesis, Status
+from locclient.estimate import Estimate, Hypothesis, Status
 from locclient.relocalizer import Fix
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.samples import PositionPrior
-from locclient.localizer import Estimate, Status
+from locclient.estimate import Estimate, Status
 
 _EXACT_M = 0.1  # sigma up to which a coarse place is a dock's: three of them are what counts as a failure
 _LEFT_M = 1.0  # way after which the next word of a dock is another arrival

@@ -9,14 +9,15 @@ import numpy as np
 from fleetmap.geometry import Array
 from fleetmap.messages import FixNote
 from fleetmap.samples import Image
+from locclient.estimate import Estimate, Status
 from locclient.health import BLIND_S, GOOD_S, RADIUS_LIMIT_M, SILENT_S
-from locclient.localizer import Estimate, Status
 
 _RADIUS_95 = 2.796
 _FIX_NOTES = 20
 _DARK, _BLURRED_SHARE = 0.06, 0.25
 _TYPICAL_FRAMES = 200
 _MAX_REFUSED_CHARS = 500
+MOVED_LIMIT_M = 0.30
 CONTRADICTING_LOOKS = 3  # one refused fix is chance, several in a row are a doubt
 
 
@@ -76,8 +77,8 @@ class FailureMonitor:
     """Tells every failure once, when it is old enough to be one; the next may begin after GOOD_S of good tracking.
 
     `blind`: after the first fix, no place that may be relied upon for BLIND_S. `suspected`: the robot believes to track, but the
-    last looks at the map contradict it for SILENT_S. The first can be seen by the robot; the second estimates what only a truth
-    could show.
+    last looks at the map contradict it for SILENT_S, or it is found elsewhere than it had said, beyond what its
+    covariance admitted. The first can be seen by the robot; the second estimates what only a truth could show.
     """
 
     def __init__(self) -> None:
@@ -112,6 +113,8 @@ class FailureMonitor:
             return self._told("blind", self._causes.most_common(1)[0][0], self._blind_ns, now_ns, picture)
         if self._doubted_ns is not None and (now_ns - self._doubted_ns) * 1e-9 > SILENT_S:
             return self._told("suspected", "fix_refused", self._doubted_ns, now_ns, picture)
+        if estimate.moved_m is not None and estimate.moved_m > MOVED_LIMIT_M:
+            return self._told("suspected", "moved", now_ns, now_ns, picture)
         return None
 
     def handle_silence(self, for_s: float) -> Failure | None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,8 @@ from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.anchors import Anchor, applied, difference, moved
+from locclient.candidates import begin_look, is_proven, is_unmistakable, ranked, rivals, still_held, vote
+from locclient.estimate import Estimate, Hypothesis, Status
 from locclient.map_view import MapView
 from locclient.relocalizer import Fix, Relocalizer, Seen, Slices
 from locclient.settings import LocalizerSettings
@@ -27,52 +28,6 @@ _CANDIDATES_AT_ONCE = 3  # in one slice of a search
 _PLACE_REACH_M = 3.0  # from a place that shows the same as the robot sees
 
 
-class Status(StrEnum):
-    """What an estimate is worth."""
-
-    INITIALISING = "INITIALISING"
-    TRACKING = "TRACKING"
-    DEGRADED = "DEGRADED"
-    AMBIGUOUS = "AMBIGUOUS"
-    LOST = "LOST"
-
-
-@dataclass(frozen=True, slots=True)
-class Hypothesis:
-    """A place where the robot may be: map_from_body (4, 4) and how many fixes spoke for it."""
-
-    map_from_body: Array
-    support: int
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """Where the body is.
-
-    map_from_body (4, 4) and cov_rot_trans (6, 6) (map axes, rotation first) are None until there is anything to say. cause: what
-    stands in the way, NONE while TRACKING. fix: the one that was finished with this frame, None without one, taken from the
-    frame of fix_stamp_ns, which may be a few frames old: looking at the map is spread over frames. refused: why a fix was not
-    used. innovation: how far what the map says is from what was predicted, squared by its covariance; innovation_m: in metres, of what
-    was found where the robot should be, or was believed. hypotheses: what speaks for which place while AMBIGUOUS.
-    stage_s: seconds by the clock that was passed in, for odometry and for looking at the map.
-    """
-
-    stamp_ns: int
-    status: Status
-    map_from_body: Array | None
-    cov_rot_trans: Array | None
-    map_version: int | None
-    fix: Fix | None
-    refused: str
-    innovation: float | None
-    hypotheses: tuple[Hypothesis, ...]
-    odometry: OdometryEstimate
-    stage_s: dict[str, float]
-    cause: Cause = Cause.NONE
-    fix_stamp_ns: int | None = None
-    innovation_m: float | None = None
-
-
 @dataclass(frozen=True, slots=True)
 class _Outcome:
     """What a look at the map came to."""
@@ -81,6 +36,7 @@ class _Outcome:
     refused: str = ""
     innovation: float | None = None
     innovation_m: float | None = None
+    moved_m: float | None = None
 
 
 class Localizer:
@@ -109,6 +65,7 @@ class Localizer:
         self._way_since_prior_m = 0.0
         self._anchor: Anchor | None = None  # the confirmed place
         self._candidates: list[Anchor] = []  # unconfirmed ones
+        self._given_up: Anchor | None = None  # what was said to be the place until fixes named another
         self._last_odom: Array | None = None
         self._last_ns: int | None = None
         self._begun_ns: int | None = None  # of the last look
@@ -189,7 +146,8 @@ class Localizer:
         self._last_odom = odometry.odom_from_body
 
     def _anchors(self) -> list[Anchor]:
-        return [*([self._anchor, *self._anchor.strangers] if self._anchor else []), *self._candidates]
+        known = [self._anchor, *self._anchor.strangers] if self._anchor else []
+        return [*known, *self._candidates, *([self._given_up] if self._given_up else [])]
 
     def _is_due(self, stamp_ns: int, odometry: OdometryEstimate) -> bool:
         settings, last = self._settings.track, self._begun_ns
@@ -337,37 +295,31 @@ class Localizer:
     def _consider_kidnapping(self, fixes: list[Fix]) -> None:
         """Refused fixes that agree with each other, frame after frame, end the belief in the old place; they must be confirmed anew."""
         assert self._anchor is not None
-        settings = self._settings.track
-        self._candidates = self._anchor.strangers
-        for candidate in self._candidates:
-            candidate.misses += 1
-            candidate.fade(settings.evidence_kept_share)
-        for fix in fixes:
-            self._weigh_one(fix)
-        self._anchor.strangers = [c for c in self._candidates if c.misses < settings.max_misses]
-        self._candidates = []
+        settings, strangers = self._settings.track, self._anchor.strangers
+        begin_look(strangers, settings)
+        self._hear(fixes, strangers)
+        self._anchor.strangers = still_held(strangers, settings)
         if max(c.support for c in self._anchor.strangers) >= settings.kidnap_fixes:
-            self._candidates, self._anchor = self._anchor.strangers, None
+            self._given_up, self._candidates, self._anchor = self._anchor, self._anchor.strangers, None
 
     # --- confirmation ----------------------------------------------------------------------------------------------------
 
     def _weigh(self, fixes: list[Fix]) -> _Outcome:
         """Every fix speaks for a candidate or begins one; confirmed is the one that is left with enough behind it."""
-        for candidate in self._candidates:
-            candidate.misses += 1
-            candidate.fade(self._settings.track.evidence_kept_share)
-        for fix in fixes:
-            self._weigh_one(fix)
-        self._candidates = [c for c in self._candidates if c.misses < self._settings.track.max_misses]
+        settings = self._settings.track
+        begin_look(self._candidates, settings)
+        self._hear(fixes, self._candidates)
+        self._candidates = still_held(self._candidates, settings)
         if not fixes:
             return _Outcome(None, "nothing in the map agrees with this frame")
-        best = self._ranked()[0]
-        rivals = self._rivals()
-        if not rivals and self._is_confirmed(best, fixes):
-            self._anchor, self._candidates, self._prior = best, [], None
+        best, others = ranked(self._candidates)[0], rivals(self._candidates, settings)
+        if others:
+            return _Outcome(None, f"{len(others) + 1} places agree with what was seen")
+        moved_m = None
+        if self._is_confirmed(best, fixes):
+            moved_m = self._moved_m(best)
+            self._anchor, self._candidates, self._prior, self._given_up = best, [], None, None
             self._ever_tracked = True
-        if rivals:
-            return _Outcome(None, f"{len(rivals) + 1} places agree with what was seen")
         assert self._moment is not None
         seen_from = self._moment
         own = []
@@ -375,69 +327,35 @@ class Localizer:
             now = Anchor.behind(seen_from, *self._at_body(fix)).now_map_from_body
             if np.linalg.norm(now[:3, 3] - best.now_map_from_body[:3, 3]) < 0.3:
                 own.append(fix)
-        return _Outcome(own[0]) if own else _Outcome(None, "the fix does not agree with those before")
+        if not own:
+            return _Outcome(None, "the fix does not agree with those before", moved_m=moved_m)
+        return _Outcome(own[0], moved_m=moved_m)
 
-    def _weigh_one(self, fix: Fix) -> None:
+    def _hear(self, fixes: Sequence[Fix], candidates: list[Anchor]) -> None:
+        """Every fix has its vote, at the present."""
         assert self._moment is not None
-        settings = self._settings.track
-        measured, measured_cov = self._at_body(fix)
-        fresh = Anchor.behind(self._moment, measured, measured_cov)
-        for candidate in self._candidates:
-            error, covariance = difference(fresh.now_map_from_body, candidate.now_map_from_body), candidate.now_cov
-            close = np.linalg.norm(error[3:]) < settings.hypothesis_distance_m + 3 * np.sqrt(
-                np.trace(covariance[3:, 3:])
-            )
-            if close and np.linalg.norm(error[:3]) < np.radians(settings.hypothesis_angle_deg) + 3 * np.sqrt(
-                np.trace(covariance[:3, :3])
-            ):
-                if candidate.misses:  # at most one vote a frame
-                    candidate.support, candidate.misses = candidate.support + 1, 0
-                    candidate.speak(fix.inliers, fix.hit_share)
-                candidate.moved_to(fresh)
-                return
-        fresh.fade(0.0)
-        fresh.speak(fix.inliers, fix.hit_share)
-        self._candidates.append(fresh)
-
-    def _ranked(self) -> list[Anchor]:
-        """Candidates, the one that most speaks for first."""
-        return sorted(self._candidates, key=lambda c: -c.evidence)
-
-    def _rivals(self) -> list[Anchor]:
-        """Candidates besides the best for which nearly as much speaks, look by look since they were thought of: as many inliers,
-        or as many of the landmarks that should be seen there. A place where the map is thin is no less likely than its twin."""
-        ranked, settings = self._ranked(), self._settings.track
-        if not ranked:
-            return []
-        best = ranked[0]
-        return [
-            c
-            for c in ranked[1:]
-            if c.inliers >= settings.rival_share * best.inliers
-            or (
-                c.hits >= settings.rival_hit_share * best.hits
-                and c.inliers >= settings.rival_least_share * best.inliers
-            )
-        ]
+        for fix in fixes:
+            vote(candidates, Anchor.behind(self._moment, *self._at_body(fix)), fix, self._settings.track)
 
     def _is_confirmed(self, candidate: Anchor, fixes: list[Fix]) -> bool:
         """By a tight prior, by fixes and way enough, or by one fix so strong, and alone of all places that were tried, that no
         other place of this map can be meant."""
         settings = self._settings.track
-        strong = (
-            len(self._candidates) == len(fixes) == 1
-            and fixes[0].inliers >= settings.strong_inliers
-            and fixes[0].share >= settings.strong_share
-            and fixes[0].twin_share < settings.strong_twin_share
-        )
+        strong = len(self._candidates) == len(fixes) == 1 and is_unmistakable(fixes[0], settings)
         tight = (
             self._prior is not None
             and np.sqrt(np.linalg.eigvalsh(self._prior_cov_m2())[-1]) <= settings.tight_prior_sigma_m
         )
-        enough = (
-            candidate.support >= settings.confirming_fixes and candidate.travelled_m >= settings.confirming_distance_m
-        )
-        return bool(tight or enough or strong)
+        return bool(tight or strong or is_proven(candidate, settings))
+
+    def _moved_m(self, place: Anchor) -> float | None:
+        """How far a place is from the one that was given up for it; None where its covariance had admitted as much."""
+        if self._given_up is None:
+            return None
+        error = difference(place.now_map_from_body, self._given_up.now_map_from_body)
+        covariance = place.now_cov + self._given_up.now_cov
+        beyond = error @ np.linalg.solve(covariance, error) > self._settings.track.innovation_limit
+        return float(np.linalg.norm(error[3:])) if beyond else None
 
     # --- output ----------------------------------------------------------------------------------------------------------
 
@@ -445,7 +363,7 @@ class Localizer:
         said = Estimate(
             odometry.stamp_ns, Status.INITIALISING, None, None, self._map_version, outcome.fix, outcome.refused,
             outcome.innovation, (), odometry, self._stage_s, self._cause, looked_ns,
-            outcome.innovation_m,
+            outcome.innovation_m, outcome.moved_m,
         )  # fmt: skip
         if self._anchor is not None:
             status, cause = self._worth(self._anchor, odometry)
@@ -455,13 +373,13 @@ class Localizer:
                 return replace(said, status=Status.AMBIGUOUS, cause=cause, hypotheses=doubts)
             now, covariance = self._anchor.now_map_from_body, self._published(self._anchor.now_cov)
             return replace(said, status=status, cause=cause, map_from_body=now, cov_rot_trans=covariance)
-        ranked, rivals = self._ranked(), self._rivals()
-        status = Status.AMBIGUOUS if rivals else Status.LOST if self._ever_tracked else Status.INITIALISING
+        places, others = ranked(self._candidates), rivals(self._candidates, self._settings.track)
+        status = Status.AMBIGUOUS if others else Status.LOST if self._ever_tracked else Status.INITIALISING
         said = replace(
-            said, status=status, hypotheses=tuple(Hypothesis(c.now_map_from_body, c.support) for c in ranked)
+            said, status=status, hypotheses=tuple(Hypothesis(c.now_map_from_body, c.support) for c in places)
         )
-        if ranked and not rivals:
-            now, covariance = ranked[0].now_map_from_body, self._published(ranked[0].now_cov)
+        if places and not others:
+            now, covariance = places[0].now_map_from_body, self._published(places[0].now_cov)
             said = replace(said, map_from_body=now, cov_rot_trans=covariance)
         return said
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
-from locclient.localizer import Estimate
+from locclient.estimate import Estimate
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from fleetmap.messages import EstimateMessage, Placement, encode_message, robot_
 from fleetmap.recordings.ros_keys import attachment, ros_key
 from fleetmap.recordings.ros_messages import FrameLink, encode_frame_links, encode_prior, encode_text
 from fleetmap.samples import PositionPrior
-from locclient.localizer import Estimate
+from locclient.estimate import Estimate
 from locclient.odom_frame import Placed
 
 _MAX_HYPOTHESES = 16

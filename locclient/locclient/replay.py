@@ -16,9 +16,10 @@ from fleetmap.messages import PoseMessage, RobotHealth
 from fleetmap.rectification import Rectifier
 from fleetmap.samples import PositionPrior, SensorSet, Trajectory
 from locclient.docks import DockWatch
+from locclient.estimate import Estimate
 from locclient.health import METRICS, FrameRecord, localised
 from locclient.link import FetchedTiles, MapLink, MapSource
-from locclient.localizer import Estimate, Localizer
+from locclient.localizer import Localizer
 from locclient.robot_health import FixFigures
 from locclient.settings import LocalizerSettings
 from locclient.sources import ReplaySource

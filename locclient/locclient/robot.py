@@ -16,9 +16,10 @@ from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.rectification import RectifiedFrame, Rectifier
 from fleetmap.samples import Image
 from locclient.docks import DockWatch
+from locclient.estimate import Estimate
 from locclient.failures import Failure, FailureMonitor, Picture, PictureJudge
 from locclient.live.intake import Moment
-from locclient.localizer import Estimate, Localizer
+from locclient.localizer import Localizer
 from locclient.odom_frame import OdomFrame, Placed
 from locclient.settings import LocalizerSettings
 from locclient.tile_window import Cell

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from fleetmap.messages import RobotHealth
+from locclient.estimate import Estimate, Status
 from locclient.failures import is_blind, radius_95_m
-from locclient.localizer import Estimate, Status
 from locclient.robot import Outcome
 
 _RECENT = 300
@@ -18,6 +18,7 @@ class FixFigures:
     """What looks at the map, docks and odometry tell of a run, of those in HEALTH_FIGURES; the largest since the report before.
 
     Metres count where the robot had claimed to know its place: who says that he is lost, and is found elsewhere, was not wrong.
+    So does a place that was said with a covariance in which the robot was not, as those fixes showed that named another.
     """
 
     def __init__(self) -> None:
@@ -31,6 +32,7 @@ class FixFigures:
         self._last = estimate
         self._note("fix_innovation", estimate.innovation)
         self._note("fix_innovation_m", estimate.innovation_m if was_tracking else None)
+        self._note("fix_innovation_m", estimate.moved_m)
         self._note("dock_error_m", dock_error_m)
         if estimate.fix is not None:
             self._expected += estimate.fix.expected

@@ -6,7 +6,7 @@ import numpy as np
 
 from fleetmap.config import Section
 from fleetmap.geometry import Array, se3_inverse
-from locclient.localizer import Estimate, Status
+from locclient.estimate import Estimate, Status
 
 _DRIFT_SHARE = 0.02  # of the way, several times what the odometry errs by
 

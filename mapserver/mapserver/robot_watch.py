@@ -138,8 +138,9 @@ class RobotWatch:
             tally.innovation_m_sum = figures.get("fix_innovation_m", 0.0)
             tally.exceeded = int(innovation > CHI2_6_0999)
         if self._has_fix and figures.get("fix_innovation_m", 0.0) > WRONG_M:
-            # The estimate was wrong before, or is now. Jumps without 5 s between them are one.
-            tally.jumps = int(self._jump_ns is None or stamp_ns - self._jump_ns >= GOOD_S * 1e9)
+            # The estimate was wrong before, or is now. Jumps without 5 s between them are one; one within a failure belongs to it.
+            is_new = self._jump_ns is None or stamp_ns - self._jump_ns >= GOOD_S * 1e9
+            tally.jumps = int(is_new and not self._in_failure)
             self._jump_ns = stamp_ns
         dock_m = figures.get("dock_error_m")
         if dock_m is not None:

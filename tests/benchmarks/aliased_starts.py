@@ -13,7 +13,7 @@ from fleetmap.samples import PositionPrior
 from fleetsim.estimator import EstimatorSession, Found, Ids, Sighting
 from fleetsim.landmarks import LandmarkField
 from fleetsim.recorder import Order, prepare
-from locclient.localizer import Estimate, Status
+from locclient.estimate import Estimate, Status
 from locclient.map_view import MapView
 from mapserver.survey.settings import BudgetSettings
 

@@ -24,12 +24,12 @@ import numpy as np
 
 from benchmarks import estimator_loop
 from fleetmap.bus import MemoryBus, MemoryHub
-from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.messages import RobotHealth, WantedVersion, decode_message, robot_key
 from fleetsim.estimator import EstimatorSession
 from fleetsim.recorder import Order, prepare
-from locclient.localizer import Estimate
+from locclient.estimate import Estimate
+from locclient.robot_health import FixFigures
 from map_samples import draft_details
 from mapserver.canary import CanarySettings, number_of
 from mapserver.canary_watch import review
@@ -39,7 +39,6 @@ from mapserver.tile_service import TileService
 
 SITE, SHIFT_M, AISLE_Y_M = "hall", np.array([0.5, 0.0, 0.0]), 3.8
 _NS = 1_000_000_000
-_SPEED_MPS = 1.5
 _MAX_S = 3 * 3600
 
 
@@ -54,26 +53,16 @@ def shifted(tile: Tile) -> Tile:
 def health_series(session: EstimatorSession, estimates: list[Estimate]) -> list[tuple[str, dict[str, float]]]:
     """What a robot would have said, second by second: status and figures. It knows no truth."""
     said: list[tuple[str, dict[str, float]]] = []
-    map_from_odom: Array | None = None
-    figures: dict[str, float] = {}
-    has_fix, second = False, 0
+    figures = FixFigures()
+    has_fix = False
     for number, estimate in enumerate(estimates):
-        odom_from_body = estimate.odometry.odom_from_body
-        if estimate.fix is not None and map_from_odom is not None:
-            map_from_body = estimate.fix.map_from_cam @ se3_inverse(session.body_from_cam)
-            far_m = float(np.linalg.norm((map_from_body - map_from_odom @ odom_from_body)[:3, 3]))
-            figures["fix_innovation_m"] = max(figures.get("fix_innovation_m", 0.0), far_m)
-        if estimate.innovation is not None and np.isfinite(estimate.innovation):
-            figures["fix_innovation"] = max(figures.get("fix_innovation", 0.0), float(estimate.innovation))
-        if estimate.map_from_body is not None:
-            has_fix = has_fix or estimate.fix is not None
-            map_from_odom = estimate.map_from_body @ se3_inverse(odom_from_body)
-        if session.session.frame_times_s[number] >= second + 1:
-            told = (
-                {"speed_mps": _SPEED_MPS, "frames": float(number)} | figures | ({"first_fix_s": 1.0} if has_fix else {})
+        figures.handle(estimate, None)
+        has_fix = has_fix or estimate.fix is not None
+        if session.session.frame_times_s[number] >= len(said) + 1:
+            told = {name: float(value) for name, value in figures.take().items() if value is not None}
+            said.append(
+                (estimate.status.value, told | {"frames": float(number)} | ({"first_fix_s": 1.0} if has_fix else {}))
             )
-            said.append((estimate.status.value, told))
-            figures, second = {}, second + 1
     return said
 
 

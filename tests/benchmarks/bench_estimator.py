@@ -21,7 +21,7 @@ from fleetmap.odometry.odometry import OdometryEstimate
 from fleetmap.rectification import RectifiedFrame, Rectifier
 from fleetsim.estimator import EstimatorSession
 from fleetsim.recorder import Order, Session, prepare
-from locclient.localizer import Estimate
+from locclient.estimate import Estimate
 
 Figures = dict[str, float]
 

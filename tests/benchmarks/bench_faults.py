@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.recorded_runs import parsed, played, recorded, surveyed, write_results
 from fleetsim.scenarios import find_scenario
 from locclient import health
-from locclient.localizer import Status
+from locclient.estimate import Status
 from locclient.replay import ReplayResult
 from locclient.settings import LocalizerSettings
 

@@ -19,7 +19,8 @@ from fleetmap.odometry.tracker import MotionSince, Tracked, Tracker
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import PositionPrior, wheel_between
 from fleetsim.estimator import EstimatorSession, Found
-from locclient.localizer import Estimate, Localizer
+from locclient.estimate import Estimate
+from locclient.localizer import Localizer
 from locclient.map_view import MapView
 from locclient.relocalizer import Relocalizer, Seen, Slices
 from locclient.settings import LocalizerSettings

@@ -14,7 +14,8 @@ from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile
 from fleetmap.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetsim.recorder import Session
-from locclient.localizer import Estimate, Localizer
+from locclient.estimate import Estimate
+from locclient.localizer import Localizer
 from locclient.settings import LocalizerSettings
 
 _RADIUS_PX, _BITS, _RATIO = 3.0, 70, 0.9

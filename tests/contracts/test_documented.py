@@ -16,8 +16,8 @@ from contracts_documents import REPOSITORY, code_words, rows, section, text
 from estimates import estimate
 from fleetmap import messages
 from locclient import failures
+from locclient.estimate import Status
 from locclient.health import METRICS
-from locclient.localizer import Status
 from locclient.sight import Cause
 from mapserver.build_report import BuildReport
 from mapserver.measures import Measures

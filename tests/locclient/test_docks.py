@@ -9,7 +9,7 @@ from estimates import estimate
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.samples import PositionPrior
 from locclient.docks import DockWatch
-from locclient.localizer import Estimate, Status
+from locclient.estimate import Estimate, Status
 
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([0.3, 0.0, 1.0]))
 

@@ -1,11 +1,13 @@
 """A failure is told once, when it is old enough, with its cause; what is not one is not told."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from estimates import estimate
+from locclient.estimate import Status
 from locclient.failures import Failure, FailureMonitor, Picture, PictureJudge
-from locclient.localizer import Status
 
 GOOD, DARK = Picture(0.4, 1.0, False), Picture(0.01, 0.0, False)
 
@@ -67,6 +69,22 @@ def test_fixes_that_contradict_are_a_suspicion() -> None:
     told = play(monitor, 3, 6, refused="the fix is 2.00 m off", innovation=400.0)
     assert [(failure.kind, failure.cause) for failure in told] == [("suspected", "fix_refused")]
     assert told[0].fixes[-1].innovation == 400.0
+
+
+def test_a_place_that_turns_out_to_be_another_is_told_once() -> None:
+    """Half a metre is a failure, a decimetre is not, and what belongs to a failure that was told is not told again."""
+    monitor = FailureMonitor()
+    play(monitor, 0, 3, fix=True)
+    near, far = (replace(estimate(t, fix=True), moved_m=m) for t, m in ((3.0, 0.1), (3.2, 0.5)))
+    assert monitor.handle(near, GOOD) is None
+    told = monitor.handle(far, GOOD)
+    assert told is not None
+    assert (told.kind, told.cause) == ("suspected", "moved")
+    assert monitor.handle(replace(estimate(3.4, fix=True), moved_m=0.6), GOOD) is None
+    assert not play(monitor, 3.6, 9, fix=True)
+    assert not monitor.is_running
+    assert play(monitor, 9, 12, status=Status.LOST)[0].kind == "blind"
+    assert monitor.handle(replace(estimate(12.1, fix=True), moved_m=7.0), GOOD) is None
 
 
 def test_silence_is_a_failure_of_its_own() -> None:

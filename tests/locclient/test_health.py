@@ -7,8 +7,8 @@ import pytest
 
 from fleetmap.geometry import Array
 from locclient import health
+from locclient.estimate import Status
 from locclient.health import METRICS, FrameRecord
-from locclient.localizer import Status
 
 T, D, A, L, I = Status.TRACKING, Status.DEGRADED, Status.AMBIGUOUS, Status.LOST, Status.INITIALISING  # noqa: E741
 

@@ -19,7 +19,8 @@ from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import PositionPrior
 from locclient import localizer as module
-from locclient.localizer import Estimate, Localizer, Status
+from locclient.estimate import Estimate, Status
+from locclient.localizer import Localizer
 from locclient.relocalizer import Fix
 from locclient.settings import LocalizerSettings, TrackSettings
 from locclient.sight import Cause
@@ -266,6 +267,18 @@ def test_a_kidnapped_robot_leaves_tracking_and_finds_its_new_place(tracking: Rob
     after = tracking.ride(6, 0.25)
     assert after[-1].status is Status.TRACKING
     assert tracking.error_m(after[-1]) < 1e-6
+    moved = [estimate.moved_m for estimate in after if estimate.moved_m is not None]
+    assert moved == pytest.approx([float(np.linalg.norm(off(-8.0)))], abs=0.1), "told once, when it was sure"
+
+
+def test_who_knew_that_he_might_be_anywhere_has_not_moved(tracking: Robot) -> None:
+    """Odometry that begins anew far off in its own view: what was said before the gap is given up, but had admitted as much."""
+    tracking.odometry.drift_share = 0.5
+    tracking.ride(30, 0.5, NO_FIX)
+    tracking.map_from_body[:3, 3] += off(-1.0)
+    after = tracking.ride(12, 0.25)
+    assert after[-1].status is Status.TRACKING
+    assert all(estimate.moved_m is None for estimate in after)
 
 
 def test_wrong_fixes_that_disagree_kidnap_nobody(tracking: Robot) -> None:

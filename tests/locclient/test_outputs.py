@@ -12,7 +12,7 @@ from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.messages import EstimateMessage, decode_message
 from fleetmap.recordings.ros_keys import ros_key
 from fleetmap.recordings.ros_messages import decode_frame_links, decode_prior, decode_text
-from locclient.localizer import Status
+from locclient.estimate import Status
 from locclient.odom_frame import OdomFrame
 from locclient.outputs import OutputSection, open_output
 from locclient.sight import Cause

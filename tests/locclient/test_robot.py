@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import robot_world
-from locclient.localizer import Status
+from locclient.estimate import Status
 from locclient.robot import Change, Robot
 from mapserver.store import MapStore
 

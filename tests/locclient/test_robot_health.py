@@ -13,8 +13,8 @@ from estimates import estimate
 from fleetmap.geometry import se3_inverse
 from fleetmap.messages import HEALTH_FIGURES, RobotHealth
 from fleetmap.samples import PositionPrior
+from locclient.estimate import Estimate, Status
 from locclient.link import FetchedTiles
-from locclient.localizer import Estimate, Status
 from locclient.replay import ReplayResult, RobotLink, _record, _Reporter
 from locclient.robot_health import FixFigures, HealthFigures
 from mapserver.robot_watch import RobotWatch
@@ -54,6 +54,13 @@ def test_who_says_that_he_is_lost_is_not_silently_wrong(before: Status) -> None:
     figures.handle(look(0.2, 3.0, 0.8, 10, 5), None)
     taken = figures.take()
     assert (taken["fix_innovation"], taken["fix_innovation_m"]) == (3.0, None)
+
+
+def test_a_robot_that_is_found_elsewhere_than_it_said_tells_how_far() -> None:
+    figures = FixFigures()
+    figures.handle(estimate(0.0, Status.LOST), None)
+    figures.handle(replace(look(0.2, 3.0, 0.8, 10, 5), moved_m=0.6), None)
+    assert figures.take()["fix_innovation_m"] == 0.6
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ import robot_world
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import RecordingError
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
+from locclient.estimate import Estimate
 from locclient.link import CachedMap, MapLink, StoreFolderLink
 from locclient.live.intake import Intake, Moment
-from locclient.localizer import Estimate
 from locclient.map_room import MapRoom
 from locclient.odom_frame import Placed
 from locclient.robot import Robot

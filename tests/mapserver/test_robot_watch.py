@@ -126,6 +126,8 @@ def test_fixes_far_from_where_the_robot_took_itself_to_be() -> None:
     assert found.jumps == 2  # seconds 3 to 7 are one
     start = [health(n, "INITIALISING", fix_innovation_m=5.0) for n in range(3)]
     assert total(start).jumps == 0  # before the first fix nothing was known
+    lost = [health(n, "TRACKING" if n < 3 or n > 6 else "LOST", fix_innovation_m=5.0 * (n == 7)) for n in range(20)]
+    assert (total(lost).blind_seen, total(lost).jumps) == (1, 0)  # a carried robot: one failure, not two
     assert Tally(jumps=2, suspected=3).silent_estimated == 3
     assert Tally(jumps=4, suspected=3, docks_wrong=1).silent_estimated == 5
 

@@ -14,7 +14,7 @@ from fleetsim.estimator import EstimatorSession
 from fleetsim.faults import Fault, FaultPlan
 from fleetsim.landmarks import LandmarkField
 from fleetsim.recorder import Order, Session, prepare
-from locclient.localizer import Estimate, Status
+from locclient.estimate import Estimate, Status
 from locclient.map_view import MapView
 from locclient.sight import Cause
 
