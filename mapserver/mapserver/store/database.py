@@ -33,6 +33,17 @@ def open_database(path: Path) -> Database:
     return database
 
 
+def open_reader(path: Path) -> Database:
+    """A second connection to a database that `open_database` has open, which cannot write; usable from any thread under one lock."""
+    connection = sqlite3.connect(path, timeout=_BUSY_TIMEOUT_MS / 1000, isolation_level=None, check_same_thread=False)
+    try:
+        connection.execute("PRAGMA query_only = ON")
+    except BaseException:
+        connection.close()
+        raise
+    return Database(connection, execute_plugins=False)
+
+
 @contextmanager
 def transaction(database: Database, *, durable: bool = True) -> Iterator[sqlite3.Connection]:
     """One write transaction: all of the block or nothing; a durable one is on the disk when it ends."""
