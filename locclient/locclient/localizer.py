@@ -373,13 +373,13 @@ class Localizer:
                 return replace(said, status=Status.AMBIGUOUS, cause=cause, hypotheses=doubts)
             now, covariance = self._anchor.now_map_from_body, self._published(self._anchor.now_cov)
             return replace(said, status=status, cause=cause, map_from_body=now, cov_rot_trans=covariance)
-        places, others = ranked(self._candidates), rivals(self._candidates, self._settings.track)
+        likely, others = ranked(self._candidates), rivals(self._candidates, self._settings.track)
         status = Status.AMBIGUOUS if others else Status.LOST if self._ever_tracked else Status.INITIALISING
         said = replace(
-            said, status=status, hypotheses=tuple(Hypothesis(c.now_map_from_body, c.support) for c in places)
+            said, status=status, hypotheses=tuple(Hypothesis(c.now_map_from_body, c.support) for c in likely)
         )
-        if places and not others:
-            now, covariance = places[0].now_map_from_body, self._published(places[0].now_cov)
+        if likely and not others:
+            now, covariance = likely[0].now_map_from_body, self._published(likely[0].now_cov)
             said = replace(said, map_from_body=now, cov_rot_trans=covariance)
         return said
 
