@@ -63,6 +63,7 @@ class Localizer:
         self._survey_focal_px = 0.0
         self._prior: PositionPrior | None = None
         self._way_since_prior_m = 0.0
+        self._told: Anchor | None = None  # the place of a prior that is known in all directions
         self._anchor: Anchor | None = None  # the confirmed place
         self._candidates: list[Anchor] = []  # unconfirmed ones
         self._given_up: Anchor | None = None  # what was said to be the place until fixes named another
@@ -85,8 +86,9 @@ class Localizer:
         self._odometry.handle_wheel(samples)
 
     def handle_prior(self, prior: PositionPrior) -> None:
-        """A coarse place at this moment; used for the search until a fix has been confirmed, widened by the way since."""
-        self._prior, self._way_since_prior_m = prior, 0.0
+        """A coarse place at this moment; used for the search until a fix has been confirmed, widened by the way since. One whose
+        covariance is finite is a place of its own as long as the map knows none: DEGRADED, by odometry from there."""
+        self._prior, self._way_since_prior_m, self._told = prior, 0.0, None
 
     def handle_version(
         self, version: int, tiles: Iterable[Tile], vocabulary: Vocabulary, survey_focal_px: float
@@ -144,10 +146,14 @@ class Localizer:
         for anchor in [*self._anchors(), *([self._moment] if self._moment else [])]:
             anchor.carry(self._odometry, odometry, step, self._settings.track)
         self._last_odom = odometry.odom_from_body
+        if self._prior is not None and self._told is None and np.isfinite(self._prior.cov_rot_trans).all():
+            map_from_body = self._prior.map_from_base @ self._base_from_body
+            lever_m = map_from_body[:3, 3] - self._prior.map_from_base[:3, 3]
+            self._told = Anchor.at(odometry, map_from_body, moved(self._prior.cov_rot_trans, lever_m))
 
     def _anchors(self) -> list[Anchor]:
         known = [self._anchor, *self._anchor.strangers] if self._anchor else []
-        return [*known, *self._candidates, *([self._given_up] if self._given_up else [])]
+        return [*known, *self._candidates, *(a for a in (self._given_up, self._told) if a)]
 
     def _is_due(self, stamp_ns: int, odometry: OdometryEstimate) -> bool:
         settings, last = self._settings.track, self._begun_ns
@@ -301,6 +307,7 @@ class Localizer:
         self._anchor.strangers = still_held(strangers, settings)
         if max(c.support for c in self._anchor.strangers) >= settings.kidnap_fixes:
             self._given_up, self._candidates, self._anchor = self._anchor, self._anchor.strangers, None
+            self._prior = self._told = None  # whatever named that place before is as wrong
 
     # --- confirmation ----------------------------------------------------------------------------------------------------
 
@@ -318,7 +325,8 @@ class Localizer:
         moved_m = None
         if self._is_confirmed(best, fixes):
             moved_m = self._moved_m(best)
-            self._anchor, self._candidates, self._prior, self._given_up = best, [], None, None
+            self._anchor, self._candidates, self._given_up = best, [], None
+            self._prior = self._told = None
             self._ever_tracked = True
         assert self._moment is not None
         seen_from = self._moment
@@ -380,8 +388,18 @@ class Localizer:
         )
         if likely and not others:
             now, covariance = likely[0].now_map_from_body, self._published(likely[0].now_cov)
-            said = replace(said, map_from_body=now, cov_rot_trans=covariance)
-        return said
+            return replace(said, map_from_body=now, cov_rot_trans=covariance)
+        if likely or self._told is None or self._relocalizer is None:
+            return said
+        return self._as_told(said, self._told)
+
+    def _as_told(self, said: Estimate, told: Anchor) -> Estimate:
+        """Nothing in the map agrees: the prior and the way since, as far as that goes."""
+        now, covariance = told.now_map_from_body, self._published(told.now_cov)
+        radius_m = _RADIUS_95 * float(np.sqrt(np.linalg.eigvalsh(told.now_cov[3:, 3:])[-1]))
+        status = said.status if radius_m > self._settings.track.lost_radius_m else Status.DEGRADED
+        cause = self._cause or Cause.UNMATCHED
+        return replace(said, status=status, map_from_body=now, cov_rot_trans=covariance, cause=cause)
 
     def _worth(self, anchor: Anchor, odometry: OdometryEstimate) -> tuple[Status, Cause]:
         """Status of a confirmed place, and what is in the way of a better one."""

@@ -5,7 +5,7 @@ that the script gives for that frame.
 """
 
 from collections.abc import Generator, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -229,6 +229,36 @@ def test_a_prior_is_no_longer_tight_after_some_way(robot: Robot) -> None:
     robot.ride(6, 0.4, NO_FIX)
     said = [e.status for e in robot.ride(4, 0.6)]
     assert said == [Status.INITIALISING] * 2 + [Status.TRACKING] * 2
+
+
+def whole_prior(robot: Robot, sigma_m: float, offset: Array) -> PositionPrior:
+    """As a dock tells it: with a heading and a height."""
+    known = prior(robot, sigma_m, offset)
+    return replace(known, cov_rot_trans=np.diag([0.02**2] * 3 + [sigma_m**2] * 3))
+
+
+def test_where_the_map_shows_nothing_a_dock_is_a_place_with_a_covariance(robot: Robot) -> None:
+    """An aisle that was surveyed the other way only: never tracking, never silent about what is known."""
+    robot.odometry.drift_share = 0.1
+    robot.localizer.handle_prior(whole_prior(robot, 0.1, off(0.1)))
+    for _ in range(6):
+        estimate = robot.go(0.5, NO_FIX)
+        assert (estimate.status, estimate.cause) == (Status.DEGRADED, Cause.UNMATCHED)
+        assert estimate.cov_rot_trans is not None
+        assert 0.05 < robot.error_m(estimate) < 3 * np.sqrt(np.trace(estimate.cov_rot_trans[3:, 3:]))
+    far = robot.ride(54, 0.5, NO_FIX)[-1]
+    assert far.status is Status.INITIALISING, "so far from the dock it is no place any more"
+    assert robot.ride(3, 1.0)[-1].status is Status.TRACKING
+    assert robot.error_m(robot.go(0.1)) < 0.01
+
+
+def test_a_kidnapped_robot_does_not_trust_the_dock_that_it_was_carried_from(tracking: Robot) -> None:
+    tracking.localizer.handle_prior(whole_prior(tracking, 0.1, off(0.0)))
+    tracking.map_from_body[:3, 3] += off(-8.0)
+    after = tracking.ride(9, 0.25)
+    assert Status.DEGRADED not in {estimate.status for estimate in after}
+    assert after[-1].status is Status.TRACKING
+    assert tracking.error_m(after[-1]) < 1e-6
 
 
 def test_two_places_that_fit_are_ambiguous_until_motion_decides(robot: Robot) -> None:
