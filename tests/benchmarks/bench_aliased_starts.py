@@ -10,9 +10,7 @@ import benchmarks.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
 import argparse
-import operator
 import time
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -28,19 +26,18 @@ from benchmarks.aliased_starts import (
     surveyed_site,
     with_aisles,
 )
-from benchmarks.recorded_runs import write_results
+from benchmarks.recorded_runs import AT_LEAST, AT_MOST, Promises, show_against, write_results
 
 WITHIN_S, WITHIN_M = 3.0, 5.0
 _FOLLOWED_S = 3.2
-Compare = Callable[[float, float], bool]
-_NEVER_WRONG: dict[str, tuple[float, Compare]] = {"wrong_starts": (0, operator.le)}
+_NEVER_WRONG: Promises = {"wrong_starts": (0, AT_MOST)}
 _OUT, _OUT_M, _SPEED_MPS, _RATE_HZ = "out of the aisle", 8.0, 2.0, 15.0
 _MAPPED = {"own aisle and all twins but one unmapped": (5,), "own aisle and two of five twins unmapped": (3, 4, 5)}
-PROMISES: dict[str, dict[str, tuple[float, Compare]]] = {
-    "no prior": _NEVER_WRONG | {"right_among_hypotheses_share": (1.0, operator.ge)},
-    "prior of 0.5 m": _NEVER_WRONG | {"right_in_time_share": (0.99, operator.ge)},
+PROMISES: dict[str, Promises] = {
+    "no prior": _NEVER_WRONG | {"right_among_hypotheses_share": (1.0, AT_LEAST)},
+    "prior of 0.5 m": _NEVER_WRONG | {"right_in_time_share": (0.99, AT_LEAST)},
     "prior of 2 m": _NEVER_WRONG,
-    _OUT: _NEVER_WRONG | {"resolved_share": (1.0, operator.ge)},
+    _OUT: _NEVER_WRONG | {"resolved_share": (1.0, AT_LEAST)},
     **dict(zip(_MAPPED, ({}, _NEVER_WRONG), strict=True)),
 }
 _PRIORS_M = {"no prior": None, "prior of 0.5 m": 0.5, "prior of 2 m": 2.0}
@@ -78,17 +75,6 @@ def judged(name: str, found: list[Start]) -> dict[str, float]:
     return figures
 
 
-def show(name: str, figures: dict[str, float]) -> None:
-    """One kind's figures, what is promised of them, and what was missed."""
-    print(f"\n{name}")
-    for key, value in figures.items():
-        target = ""
-        if key in PROMISES[name]:
-            limit, compare = PROMISES[name][key]
-            target = f"{'<=' if compare is operator.le else '>='} {limit:g} {'' if compare(value, limit) else 'MISSED'}"
-        print(f"  {key:30} {value:8.3g}  {target}", flush=True)
-
-
 def main() -> None:
     """Prints the tables; writes them as JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -112,7 +98,7 @@ def main() -> None:
                     print("  wrong:", start, flush=True)
     figures = {name: judged(name, starts) for name, starts in found.items()}
     for name, row in figures.items():
-        show(name, row)
+        show_against(name, row, PROMISES[name])
     outcomes = {name: [asdict(start) for start in starts] for name, starts in found.items()}
     write_results(arguments.out, {"figures": figures, "starts": outcomes})
 

@@ -8,16 +8,25 @@ folder) and serve again. CPU times are the process's; run it on an idle machine,
 import benchmarks.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
-import operator
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.recorded_runs import parsed, played, recorded, surveyed, write_results
+from benchmarks.recorded_runs import (
+    AT_LEAST,
+    AT_MOST,
+    Promises,
+    parsed,
+    played,
+    recorded,
+    resident_mb,
+    show_against,
+    surveyed,
+    write_results,
+)
 from fleetmap.odometry import Odometry
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.rectification import Rectifier
@@ -26,25 +35,22 @@ from locclient.replay import ReplayResult
 from locclient.settings import LocalizerSettings
 from locclient.sources import ReplaySource
 
-Compare = Callable[[float, float], bool]
-AT_MOST, AT_LEAST = operator.le, operator.ge
-
 
 @dataclass(frozen=True, slots=True)
 class Case:
     """A recording against the survey's map, and what is promised of it: figure -> (limit, how)."""
 
     record: tuple[str, ...]
-    promises: dict[str, tuple[float, Compare]]
+    promises: Promises
 
 
-_CHEAP: dict[str, tuple[float, Compare]] = {
+_CHEAP: Promises = {
     "cpu_mean_ms": (10, AT_MOST),
     "cpu_p99_ms": (20, AT_MOST),
     "rss_mb": (320, AT_MOST),
 }
-_HONEST: dict[str, tuple[float, Compare]] = {"silent_failures": (0, AT_MOST), "truth_outside_share": (0.01, AT_MOST)}
-_NEXT_DAY: dict[str, tuple[float, Compare]] = {
+_HONEST: Promises = {"silent_failures": (0, AT_MOST), "truth_outside_share": (0.01, AT_MOST)}
+_NEXT_DAY: Promises = {
     "localised_share": (0.99, AT_LEAST), "median_mm": (15, AT_MOST), "p99_mm": (35, AT_MOST), "heading_p99_deg": (0.3, AT_MOST),
 }  # fmt: skip
 CASES: dict[str, Case] = {
@@ -104,29 +110,6 @@ def figures(result: ReplayResult) -> dict[str, Any]:
     }
 
 
-def resident_mb() -> dict[str, float]:
-    """10^6 bytes of this process in memory, and of those what is not mapped from disk. Linux."""
-    wanted = {"VmRSS": "resident", "RssAnon": "anonymous"}
-    rows = (line.split() for line in Path("/proc/self/status").read_text().splitlines())
-    return {wanted[row[0][:-1]]: float(row[1]) * 1.024e-3 for row in rows if row and row[0][:-1] in wanted}
-
-
-def show(name: str, found: dict[str, Any], case: Case) -> None:
-    """One case's table: figure, value, target."""
-    print(f"\n{name} (fleetsim record small-loop {' '.join(case.record)})")
-    for key, value in found.items():
-        if isinstance(value, dict):
-            shown = "  ".join(f"{k} {v:.3g}" for k, v in value.items())
-        else:
-            shown = "-" if value is None else f"{value:.4g}"
-        target = ""
-        if key in case.promises:
-            limit, compare = case.promises[key]
-            good = value is not None and compare(value, limit)
-            target = f"{'<=' if compare is AT_MOST else '>='} {limit:g} {'' if good else 'MISSED'}"
-        print(f"  {key:22} {shown:>12}  {target}")
-
-
 def main() -> None:
     """Prints the tables; writes them as JSON where asked."""
     arguments = parsed(__doc__, CASES)
@@ -140,7 +123,8 @@ def main() -> None:
             "odometry_alone_mean_ms": float(np.mean(alone)),
             "odometry_alone_p99_ms": float(np.percentile(alone, 99)),
         }
-        show(name, found[name], CASES[name])
+        title = f"{name} (fleetsim record small-loop {' '.join(CASES[name].record)})"
+        show_against(title, found[name], CASES[name].promises)
     write_results(arguments.out, {"cases": found})
 
 
