@@ -69,7 +69,10 @@ def measure(robots: int, seconds: float, pages: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         fill_store(Path(folder))
         with serving(Path(folder)) as served:
-            talking = subprocess.Popen([sys.executable, "-c", _TALK, served.zenoh, str(robots)])
+            talking = subprocess.Popen(
+                [sys.executable, "-c", _TALK, served.zenoh, str(robots)],
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+            )
             browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
             try:
                 time.sleep(3)
@@ -91,6 +94,7 @@ def measure(robots: int, seconds: float, pages: int) -> dict[str, Any]:
                     context.new_page().goto(f"{served.http}/dashboard/")
                 time.sleep(3)
                 with_pages = _cost(served.process, seconds)
+                assert talking.poll() is None, "the robots fell silent: what was measured is a server at rest"
             finally:
                 browser.close()
                 talking.kill()
