@@ -14,6 +14,7 @@ from mapserver.dashboard import failure_page, fleet_page, map_page, survey_page
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.frame import Rooms
 from mapserver.dashboard.health_data import HealthData
+from mapserver.dashboard.kept_files import KeptFiles
 from mapserver.dashboard.live import LiveRobots
 from mapserver.fleet import Fleet
 from mapserver.gate import GateSettings
@@ -53,6 +54,7 @@ def install_dashboard(
         reconnect_timeout=10.0,
         binding_refresh_interval=None,
         show_welcome_message=False,
+        gzip_middleware_factory=KeptFiles,
     )
 
 
