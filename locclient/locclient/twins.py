@@ -20,6 +20,7 @@ _MOST_FEATURES, _MOST_PAIRS = 96, 400_000
 _MAX_BITS, _HEIGHT_M = 50, 0.3
 _CELL_M = 0.5
 _OWN_M = 1.2  # around the place itself
+_OWN_THING_M = 0.5  # around what was recognized: it, and what of it was mapped twice
 _AT_ONCE = 3_000_000  # comparisons in a slice: some ten milliseconds
 _LEAST_VOTES = 6
 
@@ -67,16 +68,22 @@ def _peaks(
     place = map_from_cam[:2, 3]
     low, high = map_points_map[:, :2].min(axis=0) - 12.0, map_points_map[:, :2].max(axis=0) + 12.0
     shape = tuple(int(n) for n in np.ceil((high - low) / _CELL_M))
+    # What stands at the place itself speaks for it alone. Near a camera it lies in the same cell from whichever side it is seen.
+    other = np.linalg.norm(map_points_map[pairs[:, 1]] - points_map[pairs[:, 0]], axis=1) > _OWN_THING_M
+    others = np.ascontiguousarray(pairs[other])
     counts = np.zeros((4, *shape), np.int32)
     turns = [np.array([[c, -s], [s, c]]) for c, s in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))]
     offsets = [(points_map[:, :2] - place) @ turn.T for turn in turns]
     for quarter, offset in enumerate(offsets):
-        twins_kernels.vote(pairs, offset, map_points_map, low, _CELL_M, np.full(shape, -1, np.int32), counts[quarter])
+        twins_kernels.vote(others, offset, map_points_map, low, _CELL_M, np.full(shape, -1, np.int32), counts[quarter])
+    there = np.zeros(shape, np.int32)
+    twins_kernels.vote(pairs, offsets[0], map_points_map, low, _CELL_M, np.full(shape, -1, np.int32), there)
     quarters, columns, rows = np.nonzero(counts >= _LEAST_VOTES)
     centres = low + _CELL_M * (np.column_stack([columns, rows]) + 1.0)
     votes = counts[quarters, columns, rows]
     is_own = (quarters == 0) & (np.linalg.norm(centres - place, axis=1) < _OWN_M)
-    own = max(int(votes[is_own].max(initial=0)), 1)
+    column, row = np.clip(((place - low) / _CELL_M).astype(int), 1, np.array(shape) - 1)
+    own = max(int(there[column - 1 : column + 1, row - 1 : row + 1].max()), 1)
     order = np.flatnonzero(~is_own & (votes >= least_share * own))
     order = order[np.argsort(-votes[order], kind="stable")]
     found: list[Twin] = []
@@ -87,7 +94,7 @@ def _peaks(
             continue
         taken.append((quarter, centre))
         found.append(
-            _twin(pairs, offsets[quarter], turns[quarter], centre, votes[k] / own, used, map_points_map, map_from_cam)
+            _twin(others, offsets[quarter], turns[quarter], centre, votes[k] / own, used, map_points_map, map_from_cam)
         )
         if len(found) == most:
             break

@@ -54,7 +54,7 @@ class EstimatorTracker(Tracker):
         begun = np.array([self._begun_px[number] for number in ids.tolist()]).reshape(-1, 2)
         return self._session.follow(self._frame_index, ids.astype(np.uint64), begun)
 
-    def _flow(self, frame: RectifiedFrame, predicted: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def _flow(self, frame: RectifiedFrame, predicted: Array, sure: bool) -> tuple[Array, NDArray[np.bool_]]:
         pixels, kept = self._measure(self._points.ids)
         return np.where(kept[:, None], pixels[:, :2], predicted), kept
 

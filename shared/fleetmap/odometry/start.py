@@ -12,6 +12,7 @@ from fleetmap.odometry.settings import FilterSettings, StartSettings
 from fleetmap.samples import ImuSamples, Trajectory
 
 _MAX_LOOK_BACK_S = 20.0
+_PARTS = 10  # of a window whose means must agree; it has twice as many samples at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +39,7 @@ def start_steady(
     end_ns = until_ns
     while end_ns - window_ns >= first_ns:
         window = imu.between(end_ns - window_ns, end_ns)
-        if len(window) >= 20 and is_steady(window, settings):
+        if len(window) >= 2 * _PARTS and is_steady(window, settings):
             return _steady_state(window, end_ns, filter_settings)
         end_ns -= window_ns // 4
     return None
@@ -49,9 +50,10 @@ def is_steady(window: ImuSamples, settings: StartSettings) -> bool:
 
     Standing still and rolling at constant speed look alike here; gravity can be read in both, so the speed stays open.
     """
-    parts = np.array_split(np.arange(len(window)), 10)
-    gyro = np.array([window.gyro_radps[p].mean(axis=0) for p in parts])
-    accel = np.array([window.accel_mps2[p].mean(axis=0) for p in parts])
+    firsts = np.linspace(0, len(window), _PARTS, endpoint=False).astype(np.int64)
+    counts = np.diff(firsts, append=len(window))[:, None]
+    gyro = np.add.reduceat(window.gyro_radps, firsts, axis=0) / counts
+    accel = np.add.reduceat(window.accel_mps2, firsts, axis=0) / counts
     return bool(
         gyro.std(axis=0).max() < settings.steady_gyro_sigma_radps
         and accel.std(axis=0).max() < settings.steady_accel_sigma_mps2

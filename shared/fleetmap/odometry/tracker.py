@@ -16,6 +16,7 @@ from fleetmap.pose_solver import Resection, ransac_resection, refine_resection, 
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 
 # The way back begins at its end: steps that still move it by more than the check allows show soon.
+_LEVELS_WHEN_SURE, _HELD_WHEN_SURE = 1, 0.6
 _BACK_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 8, 0.03)
 Ids = NDArray[np.int64]
 _FLOW_ITERATIONS = (
@@ -115,7 +116,8 @@ class Tracker:
             else:
                 self._memory.clear()
                 guess = motion_since(self._frame_index - 1)
-                resection, share = self._follow(frame, np.eye(4) if guess is None else guess)
+                sure = guess is not None and rotation_sigma_rad is not None
+                resection, share = self._follow(frame, np.eye(4) if guess is None else guess, sure)
                 if resection is not None:
                     motion, covariance = resection.cam_from_source, resection.cov_rot_trans
         self._renew_disparities(frame)
@@ -141,12 +143,13 @@ class Tracker:
         predicted[lost] = pixels[lost, :2]
         return predicted
 
-    def _follow(self, frame: RectifiedFrame, cam_from_previous: Array) -> tuple[Resection | None, float]:
+    def _follow(self, frame: RectifiedFrame, cam_from_previous: Array, sure: bool) -> tuple[Resection | None, float]:
+        """sure: the motion is a prediction, not a guess."""
         assert self._previous is not None
         if not len(self._points.ids):
             return None, 0.0
         points_cam = self._points_cam(self._points.pixels)
-        flowed, kept = self._flow(frame, self._predict(points_cam, self._points.pixels, cam_from_previous))
+        flowed, kept = self._flow(frame, self._predict(points_cam, self._points.pixels, cam_from_previous), sure)
         resection = self._motion(points_cam, flowed, kept, cam_from_previous)
         before = int(kept.sum())
         if resection is not None:
@@ -166,16 +169,31 @@ class Tracker:
             self._points.pixels[:, 2] = np.nan
         return resection, share
 
-    def _flow(self, frame: RectifiedFrame, predicted: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Pyramidal Lucas-Kanade with back-check: pixels (N, 2) and which ones hold."""
+    def _flow(self, frame: RectifiedFrame, predicted: Array, sure: bool) -> tuple[Array, NDArray[np.bool_]]:
+        """Pyramidal Lucas-Kanade with back-check: pixels (N, 2) and which ones hold.
+
+        From a prediction one level above the picture is enough. Coarser ones cost as much again, and where near and far things
+        meet they lead away from a good start. Where too little holds that way, the prediction was none: again from all levels.
+        """
+        levels = self._settings.pyramid_levels
+        new, kept = self._flow_from(
+            frame, self._points.pixels, predicted, min(levels, _LEVELS_WHEN_SURE) if sure else levels
+        )
+        if sure and kept.mean() < _HELD_WHEN_SURE:
+            return self._flow_from(frame, self._points.pixels, predicted, levels)
+        return new, kept
+
+    def _flow_from(
+        self, frame: RectifiedFrame, pixels: Array, predicted: Array, levels: int
+    ) -> tuple[Array, NDArray[np.bool_]]:
         assert self._previous is not None
         s = self._settings
-        old = self._points.pixels[:, :2].astype(np.float32).reshape(-1, 1, 2)
+        old = pixels[:, :2].astype(np.float32).reshape(-1, 1, 2)
         start = predicted.astype(np.float32).reshape(-1, 1, 2)
         window = (s.window_px, s.window_px)
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
         new, found, _ = cv2.calcOpticalFlowPyrLK(
-            self._previous.left, frame.left, old, start.copy(), winSize=window, maxLevel=s.pyramid_levels,
+            self._previous.left, frame.left, old, start.copy(), winSize=window, maxLevel=levels,
             criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
         back, found_back, _ = cv2.calcOpticalFlowPyrLK(
