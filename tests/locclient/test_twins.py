@@ -72,6 +72,17 @@ def test_a_hall_in_which_nothing_repeats_has_no_twins() -> None:
     assert hall.twins() == []
 
 
+def test_what_lies_beside_a_camera_is_no_twin_of_itself() -> None:
+    """Looking at the floor below: from whichever side it would be seen, the same things lie in the same square metre."""
+    rng = np.random.default_rng(4)
+    points = rng.uniform((-0.4, -0.4, 0), (0.4, 0.4, 0.2), (90, 3))
+    looks = rng.integers(0, 256, (90, 32), np.uint8)
+    far = rng.uniform((-15, -15, 0), (15, 15, 0.2), (400, 3))
+    held = np.concatenate([spoiled(rng, looks, 0.05), rng.integers(0, 256, (400, 32), np.uint8)])
+    down = se3(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 1.0]))
+    assert finished(find_twins(looks, points, held, np.concatenate([points, far]), down, 0.2, 64)) == []
+
+
 def test_alike_is_what_its_definition_says() -> None:
     rng = np.random.default_rng(3)
     looks = rng.integers(0, 256, (40, 32), np.uint8)

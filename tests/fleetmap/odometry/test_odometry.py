@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleetmap.calibration import ImuNoise
-from fleetmap.geometry import Array, se3_inverse, se3_log
+from fleetmap.geometry import Array, se3_inverse, se3_log, so3_exp
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings, OdometryStatus
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracker import Tracker
@@ -175,3 +175,25 @@ def test_tracks_are_where_the_points_went() -> None:
     assert tracked.cam_from_previous is not None
     step = se3_inverse(BODY_FROM_CAM) @ se3_inverse(truth_between(4 * FRAME_NS, 5 * FRAME_NS)) @ BODY_FROM_CAM
     assert np.linalg.norm(se3_log(tracked.cam_from_previous @ se3_inverse(step))[3:]) < 0.01
+
+
+def test_a_prediction_costs_less_than_a_guess_and_may_be_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Predicted well, points are followed from one level; predicted badly, from all of them, and held all the same."""
+    step = se3_inverse(se3_inverse(BODY_FROM_CAM) @ truth_between(FRAME_NS, 2 * FRAME_NS) @ BODY_FROM_CAM)
+    # 14 px to the side: more than what one level above the picture can make good
+    turned = np.eye(4)
+    turned[:3, :3] = so3_exp(np.array([0.0, 14.0 / CAMERA.focal_px, 0.0]))
+    held, levels = {}, {}
+    for name, predicted, sigma_rad in (("well", step, 0.01), ("badly", turned @ step, 0.01), ("guessed", step, None)):
+        tracker, used = Tracker(CAMERA, TrackerSettings()), []
+        real = tracker._flow_from
+        monkeypatch.setattr(
+            tracker, "_flow_from", lambda *a, real=real, used=used: (used.append(a[3]), real(*a))[1], raising=True
+        )
+        tracker.track(stereo_frame(FRAME_NS), lambda _: None, sigma_rad)
+        tracked = tracker.track(stereo_frame(2 * FRAME_NS), lambda _, predicted=predicted: predicted, sigma_rad)
+        held[name], levels[name] = len(tracked.ids), used
+        assert tracked.cam_from_previous is not None
+        assert np.linalg.norm(se3_log(tracked.cam_from_previous @ se3_inverse(step))) < 0.02
+    assert levels == {"well": [1], "badly": [1, 3], "guessed": [3]}
+    assert min(held.values()) > 0.9 * max(held.values())
