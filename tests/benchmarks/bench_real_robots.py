@@ -27,6 +27,7 @@ from benchmarks.recorded_runs import (
     tool,
     write_results,
 )
+from benchmarks.yardstick import at_reference, mean_of, slowness
 from fleetmap.recordings import open_recording
 from locclient import health
 from locclient.settings import LocalizerSettings
@@ -64,20 +65,22 @@ def start_anywhere(path: Path, store: Path) -> dict[str, Any]:
     """The robot is switched on at one odd frame after another, spread over the recording, knowing nothing: the first frame's fix."""
     with open_recording(path) as recording:
         odd = np.arange(1, len(recording.frame_stamps_ns), 2)
-    fixed, cpu_ms, errors_mm = 0, [], []
+    fixed, cpu_ms, errors_mm, slow = 0, [], [], []
     played(path, store, LocalizerSettings(), ":40")  # loads the kernels
     for number in odd[np.linspace(0, len(odd) - 1, _STARTS).astype(int)].tolist():
         (frame,) = played(path, store, LocalizerSettings(), f"{number}:{number + 1}").frames
         fixed += frame.has_fix
-        cpu_ms.append(1e3 * frame.cpu_s)
+        slow.append(slowness())
+        cpu_ms.append(at_reference(1e3 * frame.cpu_s, slow[-1:]) or np.inf)
         if frame.has_fix and frame.error_m is not None:
             errors_mm.append(1e3 * frame.error_m)
     return {
         "starts": _STARTS,
         "fixed_on_first_frame": fixed,
-        "fixed_in_60_ms": sum(ms <= 60 for ms in cpu_ms),
-        "cpu_median_ms": float(np.median(cpu_ms)),
-        "cpu_max_ms": max(cpu_ms),
+        "slowness": mean_of(slow),
+        "ready_in_60_ms_at_reference": sum(ms <= 60 for ms in cpu_ms),
+        "cpu_median_ms_at_reference": float(np.median(cpu_ms)),
+        "cpu_max_ms_at_reference": max(cpu_ms),
         "error_max_mm": max(errors_mm, default=None),
     }
 
@@ -96,7 +99,7 @@ CASES: dict[str, Case] = {
     "euroc_mh01_start, first fix from nothing": Case(
         "euroc_mh01_start",
         start_anywhere,
-        {"fixed_on_first_frame": (19, AT_LEAST), "fixed_in_60_ms": (19, AT_LEAST)},
+        {"fixed_on_first_frame": (19, AT_LEAST), "ready_in_60_ms_at_reference": (19, AT_LEAST)},
     ),
 }
 

@@ -16,16 +16,17 @@ def min_eigenvalue_scores(image: NDArray[np.uint8], pixels: NDArray[np.float32],
         x, y = int(pixels[n, 0]), int(pixels[n, 1])
         if x < half + 1 or y < half + 1 or x >= width - half - 1 or y >= height - half - 1:
             continue
-        xx, xy, yy = 0.0, 0.0, 0.0
-        for v in range(y - half, y + half + 1):
-            for u in range(x - half, x + half + 1):
-                gx = float(image[v, u + 1]) - float(image[v, u - 1])
-                gy = float(image[v + 1, u]) - float(image[v - 1, u])
+        xx, xy, yy = np.int64(0), np.int64(0), np.int64(0)
+        window = image[y - half - 1 : y + half + 2, x - half - 1 : x + half + 2]
+        for v in range(1, 2 * half + 2):
+            for u in range(1, 2 * half + 2):
+                gx = np.int32(window[v, u + 1]) - np.int32(window[v, u - 1])
+                gy = np.int32(window[v + 1, u]) - np.int32(window[v - 1, u])
                 xx += gx * gx
                 xy += gx * gy
                 yy += gy * gy
         mean = 0.5 * (xx + yy)
-        scores[n] = mean - np.sqrt(max(mean * mean - (xx * yy - xy * xy), 0.0))
+        scores[n] = mean - np.sqrt(max(mean * mean - (float(xx) * float(yy) - float(xy) * float(xy)), 0.0))
     return scores
 
 
@@ -86,15 +87,30 @@ def centroid_angles_deg(image: NDArray[np.uint8], pixels: NDArray[np.float32], r
     """
     angles = np.zeros(len(pixels), np.float32)
     height, width = image.shape
+    reach = np.empty(radius + 1, np.int64)
+    for dv in range(radius + 1):
+        reach[dv] = int(np.sqrt(radius * radius - dv * dv))
     for n in range(len(pixels)):
         x, y = int(pixels[n, 0] + 0.5), int(pixels[n, 1] + 0.5)
-        m10, m01 = 0.0, 0.0
-        for dv in range(-radius, radius + 1):
-            v = min(max(y + dv, 0), height - 1)
-            reach = int(np.sqrt(radius * radius - dv * dv))
-            for du in range(-reach, reach + 1):
-                u = min(max(x + du, 0), width - 1)
-                m10 += du * float(image[v, u])
-                m01 += dv * float(image[v, u])
-        angles[n] = np.degrees(np.arctan2(m01, m10)) % 360.0
+        m10, m01 = np.int64(0), np.int64(0)
+        if x >= radius and y >= radius and x < width - radius and y < height - radius:
+            disc = image[y - radius : y + radius + 1, x - radius : x + radius + 1]
+            for v in range(2 * radius + 1):
+                r = reach[abs(v - radius)]
+                row = disc[v, radius - r : radius + r + 1]
+                along, total = np.int64(0), np.int64(0)
+                for u in range(2 * r + 1):
+                    value = np.int64(row[u])
+                    along += u * value
+                    total += value
+                m10 += along - r * total
+                m01 += (v - radius) * total
+        else:
+            for dv in range(-radius, radius + 1):
+                v, r = min(max(y + dv, 0), height - 1), reach[abs(dv)]
+                for du in range(-r, r + 1):
+                    value = np.int64(image[v, min(max(x + du, 0), width - 1)])
+                    m10 += du * value
+                    m01 += dv * value
+        angles[n] = np.degrees(np.arctan2(float(m01), float(m10))) % 360.0
     return angles
