@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fleetmap.calibration import ImuNoise, RigCalibration
 from fleetmap.features.stereo import StereoSettings
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, skew
+from fleetmap.geometry import Array, interpolate_se3, rotation_angle_rad, se3_inverse, skew
 from fleetmap.odometry.filter import InvariantFilter, NavState
 from fleetmap.odometry.imu_faults import joined, longest_gap_ns, without_spikes
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
@@ -28,6 +28,8 @@ _GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of f
 _ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
 _IMU_GAP_NS = 50_000_000  # longer without samples than this, and the IMU says nothing of the motion
 _DISAGREEMENT_RAD = 0.02  # between the turn that pictures show from one frame to the next and the gyro's
+_MOST_OFFSET_SIGMAS = 3.0  # between the clocks, beyond which it is not the clocks
+_STRAYED_M, _MOST_STRAYED = 0.5, 3  # from what the pictures show of one step, and for so many frames in a row
 _MOST_DISAGREEMENTS = 8  # frames that disagree beyond those that agree, before the IMU is no longer believed
 
 
@@ -103,6 +105,9 @@ class Odometry:
         self._vision: list[tuple[int, Array]] = []
         self._last_motion = np.eye(4)
         self._clone_stamps: dict[int, int] = {}
+        self._last_odom_from_body = np.eye(4)
+        self._strayed = 0
+        self._not_before_ns = -(2**62)  # the IMU of before led to a start that was wrong
 
     def handle_imu(self, samples: ImuSamples) -> None:
         """Takes samples newer than any before; ignored by a rig without IMU noise figures."""
@@ -138,8 +143,13 @@ class Odometry:
         self._remember(tracked)
         used = self._consume(tracked)
         self._prune()
-        change = None if self._inertial or self._noise is None else self._try_start(stamp_ns, tracked)
+        change = None
+        if self._inertial and not self._is_sound(tracked):
+            change = self._begin_again(stamp_ns, tracked)
+        elif not self._inertial and self._noise is not None:
+            change = self._try_start(stamp_ns, tracked)
         estimate = self._estimate(frame.stamp_ns, tracked, used, change)
+        self._last_odom_from_body = estimate.odom_from_body
         self._frame_index += 1
         return estimate
 
@@ -202,7 +212,8 @@ class Odometry:
         assert self._noise is not None
         seen = self._filter.state.odom_from_body
         s = self._settings.start
-        start = start_steady(self._imu, stamp_ns, s, self._settings.filter)
+        since = self._imu.between(self._not_before_ns, stamp_ns + 1)
+        start = start_steady(since, stamp_ns, s, self._settings.filter)
         if start is None:
             if tracked.lost:
                 self._vision.clear()
@@ -225,6 +236,40 @@ class Odometry:
         self._seed_tracks()
         return np.asarray(self._filter.state.odom_from_body @ se3_inverse(seen))
 
+    def _is_sound(self, tracked: Tracked) -> bool:
+        """Whether the inertial filter may go on.
+
+        A start that took an even acceleration for rest is tilted by degrees. The filter then explains what it sees by clocks
+        that are further apart than they can be; or it strays from the pictures, frame after frame.
+        """
+        assert self._filter is not None
+        if abs(self._filter.imu_minus_cam_s) > _MOST_OFFSET_SIGMAS * self._settings.filter.time_offset_sigma_s:
+            return False
+        now = self._predicted_since(self._frame_index - 1)
+        if now is None or tracked.cam_from_previous is None:
+            return True
+        off_m = float(np.linalg.norm((now @ se3_inverse(tracked.cam_from_previous))[:3, 3]))
+        self._strayed = 0 if off_m < _STRAYED_M else self._strayed + 1
+        return self._strayed < _MOST_STRAYED
+
+    def _begin_again(self, stamp_ns: int, tracked: Tracked) -> Array:
+        """By sight alone from where the last frame was, until gravity is known anew; returns new_odom_from_old_odom (4, 4).
+
+        That is the identity: what was called `odom` goes on, but nothing of before is known as well as it was said to be.
+        """
+        self._last_motion = np.eye(4) if tracked.cam_from_previous is None else tracked.cam_from_previous
+        seen = self._last_odom_from_body @ self._body_from_cam @ se3_inverse(self._last_motion) @ self._cam_from_body
+        state = NavState(rotation=seen[:3, :3], position_m=seen[:3, 3])
+        self._filter = self._new_filter(state, np.diag([1e-10] * 15))
+        self._filter.add_clone(self._frame_index, np.zeros(3))
+        self._inertial, self._state_ns, self._not_before_ns, self._strayed = False, stamp_ns, stamp_ns, 0
+        self._clone_stamps = {self._frame_index: stamp_ns}
+        self._vision.clear()
+        self._looks.clear()
+        self._observations.clear()
+        self._seed_tracks()
+        return np.eye(4)
+
     def _seed_tracks(self) -> None:
         """After a restart the tracks go on from the newest frame alone."""
         self._observations.add(self._frame_index, *self._newest)
@@ -245,14 +290,14 @@ class Odometry:
         return rate
 
     def _guess_motion(self, target_ns: int) -> None:
-        """Without samples: as from the frame before last to the last, as uncertain as without an IMU."""
+        """Without samples: as fast as between the last two frames that are held, as uncertain as without an IMU."""
         assert self._filter is not None
-        settings = self._settings.filter
-        earlier, last = (self._filter.odom_from_clone(clone) for clone in self._filter.clone_ids[-2:])
+        settings, held = self._settings.filter, self._filter.clone_ids[-2:]
+        earlier, last = (self._filter.odom_from_clone(clone) for clone in held)
         duration_s = max(target_ns - self._state_ns, 0) * 1e-9
-        self._filter.displace(
-            se3_inverse(earlier) @ last, settings.free_rotation_sigma_rad, settings.free_translation_sigma_m, duration_s
-        )
+        between_s = (self._clone_stamps[held[1]] - self._clone_stamps[held[0]]) * 1e-9
+        motion = interpolate_se3(np.eye(4), se3_inverse(earlier) @ last, duration_s / max(between_s, 1e-3))
+        self._filter.displace(motion, settings.free_rotation_sigma_rad, settings.free_translation_sigma_m, duration_s)
         self._filter.doubt_velocity(settings.initial_velocity_sigma_mps)
         self._state_ns = max(target_ns, self._state_ns)
 

@@ -1,6 +1,7 @@
 """The odometry on pictures of a painted room, with exact truth."""
 
 from collections.abc import Iterable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -197,3 +198,38 @@ def test_a_prediction_costs_less_than_a_guess_and_may_be_wrong(monkeypatch: pyte
         assert np.linalg.norm(se3_log(tracked.cam_from_previous @ se3_inverse(step))) < 0.02
     assert levels == {"well": [1], "badly": [1, 3], "guessed": [3]}
     assert min(held.values()) > 0.9 * max(held.values())
+
+
+@pytest.mark.parametrize("broken", ["clocks", "velocity"])
+def test_a_filter_that_leaves_the_pictures_begins_again(broken: str) -> None:
+    """By sight alone for a while, then by the IMU; `odom` goes on, and says that it is less sure."""
+    odometry = Odometry(rig(IMU), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    samples = noisy_imu(
+        np.random.default_rng(1), 6.5, IMU, np.array([0.01, -0.02, 0.015]), np.array([0.03, -0.02, 0.04])
+    )
+    said, fed_ns = [], 0
+    for k in range(1, 100):
+        frame = stereo_frame(k * FRAME_NS)
+        odometry.handle_imu(samples.between(fed_ns, frame.stamp_ns + 1))
+        fed_ns = frame.stamp_ns + 1
+        if k == 40:
+            assert odometry._filter is not None
+            if broken == "clocks":
+                odometry._filter.imu_minus_cam_s = 0.09
+            else:  # and sure of it
+                odometry._filter.state.velocity_mps += np.array([0.0, 0.0, 14.0])
+                odometry._filter.covariance *= 1e-9
+        said.append(odometry.handle_stereo(frame))
+    assert said[38].inertial
+    began = [n for n, estimate in enumerate(said) if estimate.new_odom_from_old_odom is not None and n > 38]
+    assert 39 <= began[0] <= 42
+    assert not said[began[0]].inertial
+    np.testing.assert_array_equal(said[began[0]].new_odom_from_old_odom, np.eye(4))
+    assert said[-1].inertial, "gravity was found again"
+    again = next(n for n in range(began[0], len(said)) if said[n].inertial)
+    error = relative_error(said[again], said[-1])
+    assert np.linalg.norm(error[3:]) < 0.05
+    steps_m = [
+        np.linalg.norm((b.odom_from_body - a.odom_from_body)[:3, 3]) for a, b in pairwise(said[began[0] : again])
+    ]
+    assert max(steps_m) < 0.3
