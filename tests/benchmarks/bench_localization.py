@@ -25,6 +25,7 @@ from benchmarks.recorded_runs import (
     resident_mb,
     show_against,
     surveyed,
+    warmed_up,
     write_results,
 )
 from benchmarks.yardstick import at_reference, mean_of, slowness
@@ -117,7 +118,8 @@ def main() -> None:
     store, settings, found = surveyed(arguments.work), LocalizerSettings(), {}
     for name in arguments.only or CASES:
         recording = recorded(arguments.work, CASES[name].record)
-        played(recording, store, settings, ":60")  # compiles, warms up
+        warmed_up(recording, store)
+        played(recording, store, settings, ":60")
         slow = [slowness()]
         found[name] = figures(played(recording, store, settings))
         slow.append(slowness())
