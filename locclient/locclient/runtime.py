@@ -22,7 +22,7 @@ from locclient.live import Source
 from locclient.live.intake import Intake
 from locclient.map_room import MapRoom
 from locclient.outputs import Output
-from locclient.robot import FailureContext, LoadedMap, Outcome, Robot, velocity_map_mps
+from locclient.robot import FailureContext, LoadedMap, Outcome, Robot, position_map_m, velocity_map_mps
 from locclient.robot_health import Figure, HealthFigures
 from locclient.server_talk import ServerTalk
 from locclient.service_manager import ServiceManager
@@ -148,8 +148,7 @@ class Runtime:
         if parts.output is not None:
             self._tell(lambda: parts.output.publish(estimate, outcome.placed, parts.robot.base_from_body))  # type: ignore[union-attr]
         self._figures.handle(outcome)
-        position = None if estimate.map_from_body is None else estimate.map_from_body[:3, 3]
-        self._shared.place = (position, velocity_map_mps(estimate))
+        self._shared.place = (position_map_m(estimate), velocity_map_mps(estimate))
         self._note_failure(outcome.failure, 0.0)
         if parts.link is None or estimate.cov_rot_trans is None or outcome.placed.map_from_odom is None:
             return

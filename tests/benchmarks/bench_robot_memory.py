@@ -33,12 +33,12 @@ from benchmarks.recorded_runs import (
     surveyed,
     write_results,
 )
-from fleetmap.recordings import FrameSelection, open_recording
+from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.rectification import Rectifier
 from locclient.link import StoreFolderLink
 from locclient.live.intake import Moment
 from locclient.map_room import MapRoom
-from locclient.robot import Robot, velocity_map_mps
+from locclient.robot import Robot, position_map_m, velocity_map_mps
 from locclient.robot_health import HealthFigures
 from locclient.settings import LocalizerSettings
 from locclient.sources import ReplaySource
@@ -96,19 +96,23 @@ def large_site(work: Path, megabytes: float) -> Path:
     return folder
 
 
+def long_enough(recording: Recording, minutes: float) -> Recording:
+    """The recording driven as often as it takes; from where it stands at the end the robot is carried back to where it began."""
+    last = len(recording.frame_stamps_ns) - 1
+    lap_s = float(recording.frame_stamps_ns[last] - recording.frame_stamps_ns[0]) * 1e-9
+    return repeated(recording, int(np.ceil(60.0 * minutes / lap_s)) + 1, (0, last))
+
+
 def drive(store: Path, recording: Path, minutes: float) -> dict[str, Any]:
     """The robot's life, and its memory minute by minute."""
     cv2.setNumThreads(1)
     link = StoreFolderLink(StoreFolder(store), SITE)
     wanted = link.ready().wanted
-    site_mb = sum(entry.size for entry in link.manifest(wanted).tiles) / 1e6
+    site_mb = sum(entry.bytes for entry in link.manifest(wanted).tiles) / 1e6
     figures, room = HealthFigures(), MapRoom(link, WindowSettings())
     memory, tiles_held, begun_s = [], [], time.process_time()
     with open_recording(recording) as opened:
-        lap_s = (int(opened.frame_stamps_ns[-1]) - int(opened.frame_stamps_ns[0])) * 1e-9
-        source = ReplaySource.of(
-            repeated(opened, int(np.ceil(90.0 * minutes / lap_s)) + 1), FrameSelection.parse(":"), reverse=False
-        )
+        source = ReplaySource.of(long_enough(opened, minutes), FrameSelection.parse(":"), reverse=False)
         rectifier = Rectifier(source.calibration)
         robot = Robot(source.calibration, rectifier, LocalizerSettings(), TrialSettings(), time.process_time)
         place, velocity, first_ns = None, np.zeros(3), None
@@ -126,7 +130,7 @@ def drive(store: Path, recording: Path, minutes: float) -> dict[str, Any]:
             assert outcome is not None
             figures.handle(outcome)
             estimate = outcome.estimate
-            place = None if estimate.map_from_body is None else estimate.map_from_body[:3, 3]
+            place = position_map_m(estimate)
             velocity = velocity_map_mps(estimate)
             first_ns = estimate.stamp_ns if first_ns is None else first_ns
             if estimate.stamp_ns - first_ns >= 60e9 * len(memory):
@@ -137,7 +141,7 @@ def drive(store: Path, recording: Path, minutes: float) -> dict[str, Any]:
     settled = memory[_SETTLED_MIN:]
     report = figures.report(SITE, "bench", 0, {}, silent=False).metrics
     return {
-        "frames": number + 1, "laps_s": lap_s, "site_mb": site_mb, "tiles": len(link.manifest(wanted).tiles),
+        "frames": number + 1, "site_mb": site_mb, "tiles": len(link.manifest(wanted).tiles),
         "tiles_held_most": max(tiles_held), "tiles_held_last": tiles_held[-1],
         "resident_mb": max(row["resident"] for row in memory), "anonymous_mb": max(row["anonymous"] for row in memory),
         "growth_mb": settled[-1]["resident"] - settled[0]["resident"], "by_minute": memory,

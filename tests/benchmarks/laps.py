@@ -33,11 +33,14 @@ class _Laps:
         self.recording.close()
 
 
-def repeated(recording: Recording, laps: int) -> Recording:
-    """The recording up to where it is best left for an earlier place, and from there on again, `laps` times in all."""
+def repeated(recording: Recording, laps: int, seam: tuple[int, int] | None = None) -> Recording:
+    """The recording up to where it is best left for an earlier place, and from there on again, `laps` times in all.
+
+    seam: the frame to go back to, and the one at which; by default the two that are most alike.
+    """
     stamps_ns, truth = recording.frame_stamps_ns, recording.ground_truth
     assert truth is not None
-    first, last = _seam(truth, stamps_ns)
+    first, last = seam or _seam(truth, stamps_ns)
     start_ns, lap_ns = int(stamps_ns[first]), int(stamps_ns[last] - stamps_ns[first])
     lap = np.arange(first, last)
     index = np.concatenate([np.arange(first), *([lap] * laps)])
