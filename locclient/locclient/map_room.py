@@ -4,12 +4,11 @@ from dataclasses import dataclass, field
 
 from fleetmap.bow import Vocabulary, decode_vocabulary
 from fleetmap.errors import FleetmapError
-from fleetmap.geometry import Array
 from fleetmap.mapformat import Manifest, Tile
 from fleetmap.messages import WantedVersion
 from locclient.link import MapSource
 from locclient.robot import LoadedMap
-from locclient.tile_window import Cell, WindowSettings, window
+from locclient.tile_window import Cell, Place, WindowSettings, window
 
 
 @dataclass
@@ -25,16 +24,16 @@ class MapRoom:
     """Reads from one MapSource. A tile that cannot be read is left out, and its reason kept; the others stay usable."""
 
     def __init__(self, source: MapSource, settings: WindowSettings) -> None:
-        self._source, self._settings = source, settings
+        self._source, self.settings = source, settings
         self._versions: dict[str, _Version] = {}
 
-    def load(self, wanted: WantedVersion, position_map_m: Array | None, velocity_map_mps: Array) -> LoadedMap | None:
-        """The version's tiles around a place (3,), all without one; None where they are those that were loaded last.
+    def load(self, wanted: WantedVersion, place: Place) -> LoadedMap | None:
+        """The version's tiles around a place, all for anywhere; None where they are those that were loaded last.
 
         Raises FleetmapError where its manifest or vocabulary cannot be had, or none of its tiles.
         """
         version = self._version(wanted)
-        cells = window(version.manifest, version.cells, position_map_m, velocity_map_mps, self._settings)
+        cells = window(version.manifest, version.cells, place, self.settings)
         if cells == version.cells:
             return None
         missing = cells - version.tiles.keys() - version.refused.keys()

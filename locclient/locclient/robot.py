@@ -5,8 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
-import numpy as np
-
 from fleetmap.bow import Vocabulary
 from fleetmap.calibration import RigCalibration
 from fleetmap.geometry import Array
@@ -16,7 +14,7 @@ from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.rectification import RectifiedFrame, Rectifier
 from fleetmap.samples import Image
 from locclient.docks import DockWatch
-from locclient.estimate import Estimate, Status
+from locclient.estimate import Estimate
 from locclient.failures import Failure, FailureMonitor, Picture, PictureJudge
 from locclient.live.intake import Moment
 from locclient.localizer import Localizer
@@ -233,20 +231,3 @@ class Robot:
             reason = f"{said}, and version {versions.good.version} gives no fixes either; it is tried again later"
             versions.changes.append(VersionChange(versions.candidate.wanted, Change.POSTPONED, reason))
         self._versions = replace(versions, candidate=None, trial=None, is_doubt=False)
-
-
-def position_map_m(estimate: Estimate) -> Array | None:
-    """(3,) around which tiles are held; None where the robot may be anywhere, so that all of them are: one that is lost would drive
-    out of the tiles that it holds, and never find another place."""
-    if estimate.map_from_body is None or estimate.status is Status.LOST:
-        return None
-    return np.asarray(estimate.map_from_body[:3, 3])
-
-
-def velocity_map_mps(estimate: Estimate) -> Array:
-    """(3,) where the robot drives, for tiles ahead; zero without a place."""
-    if estimate.map_from_body is None:
-        return np.zeros(3)
-    odom = estimate.odometry
-    turn = estimate.map_from_body[:3, :3] @ odom.odom_from_body[:3, :3].T
-    return np.asarray(turn @ odom.velocity_odom_mps)

@@ -9,10 +9,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-
 from fleetmap.errors import FleetmapError, RecordingError
-from fleetmap.geometry import Array
 from fleetmap.messages import PoseMessage, WantedVersion, encode_message
 from fleetmap.rectification import StereoCamera
 from locclient.failure_files import write_failure
@@ -22,13 +19,13 @@ from locclient.live import Source
 from locclient.live.intake import Intake
 from locclient.map_room import MapRoom
 from locclient.outputs import Output
-from locclient.robot import FailureContext, LoadedMap, Outcome, Robot, position_map_m, velocity_map_mps
+from locclient.robot import FailureContext, LoadedMap, Outcome, Robot
 from locclient.robot_health import Figure, HealthFigures
 from locclient.server_talk import ServerTalk
 from locclient.service_manager import ServiceManager
 from locclient.settings import LocalizerSettings
 from locclient.spool import Spool, SpooledReport
-from locclient.tile_window import Cell
+from locclient.tile_window import Cell, Place, Whereabouts
 
 _TAKE_S, _IDLE_S = 0.2, 0.1
 _HEALTH_EVERY_S, _POSE_EVERY_NS = 1.0, 500_000_000
@@ -62,7 +59,7 @@ class Parts:
 class _Shared:
     """What threads leave for each other; deques and plain values, which need no lock."""
 
-    place: tuple[Array | None, Array] | None = None
+    place: Place = field(default_factory=Place)
     held: list[WantedVersion] = field(default_factory=list)
     loaded: deque[LoadedMap] = field(default_factory=deque)
     failures: deque[tuple[FailureContext, int]] = field(default_factory=lambda: deque(maxlen=_MAX_PENDING))
@@ -78,6 +75,7 @@ class Runtime:
         self._sensors_stop = threading.Event()
         self._shared = _Shared()
         self._figures = HealthFigures()
+        self._whereabouts = Whereabouts(parts.room.settings)
         self._last_frame_s: float | None = None
         self._health_s, self._pose_ns = 0.0, -(2**62)
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
@@ -148,7 +146,7 @@ class Runtime:
         if parts.output is not None:
             self._tell(lambda: parts.output.publish(estimate, outcome.placed, parts.robot.base_from_body))  # type: ignore[union-attr]
         self._figures.handle(outcome)
-        self._shared.place = (position_map_m(estimate), velocity_map_mps(estimate))
+        self._shared.place = self._whereabouts.handle(estimate)
         self._note_failure(outcome.failure, 0.0)
         if parts.link is None or estimate.cov_rot_trans is None or outcome.placed.map_from_odom is None:
             return
@@ -221,7 +219,7 @@ class Runtime:
 
     def _load_maps(self) -> None:
         room, talk, shared = self._parts.room, self._parts.talk, self._shared
-        position, velocity = shared.place or (None, np.zeros(3))
+        place = shared.place
         while talk is not None and talk.fetched:
             version = talk.fetched.popleft()
             self._offers[version.manifest_sha256 or ""] = version
@@ -232,7 +230,7 @@ class Runtime:
         wanted = [*held, *self._offers.values()]
         for version in wanted:
             try:
-                loaded = room.load(version, position, velocity)
+                loaded = room.load(version, place)
             except FleetmapError as error:
                 self._note_unusable(version, str(error))
                 continue

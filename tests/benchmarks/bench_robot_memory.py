@@ -38,12 +38,12 @@ from fleetmap.rectification import Rectifier
 from locclient.link import StoreFolderLink
 from locclient.live.intake import Moment
 from locclient.map_room import MapRoom
-from locclient.robot import Robot, position_map_m, velocity_map_mps
+from locclient.robot import Robot
 from locclient.robot_health import HealthFigures
 from locclient.settings import LocalizerSettings
 from locclient.sources import ReplaySource
 from locclient.tile_cache import StoreFolder
-from locclient.tile_window import WindowSettings
+from locclient.tile_window import Place, Whereabouts, WindowSettings
 from locclient.version_trial import TrialSettings
 
 PROMISES: Promises = {"resident_mb": (320, AT_MOST), "anonymous_mb": (200, AT_MOST), "growth_mb": (5, AT_MOST)}
@@ -109,19 +109,19 @@ def drive(store: Path, recording: Path, minutes: float) -> dict[str, Any]:
     link = StoreFolderLink(StoreFolder(store), SITE)
     wanted = link.ready().wanted
     site_mb = sum(entry.bytes for entry in link.manifest(wanted).tiles) / 1e6
-    figures, room = HealthFigures(), MapRoom(link, WindowSettings())
+    figures, room, whereabouts = HealthFigures(), MapRoom(link, WindowSettings()), Whereabouts(WindowSettings())
     memory, tiles_held, begun_s = [], [], time.process_time()
     with open_recording(recording) as opened:
         source = ReplaySource.of(long_enough(opened, minutes), FrameSelection.parse(":"), reverse=False)
         rectifier = Rectifier(source.calibration)
         robot = Robot(source.calibration, rectifier, LocalizerSettings(), TrialSettings(), time.process_time)
-        place, velocity, first_ns = None, np.zeros(3), None
+        place, first_ns = Place(), None
         for number, imu in enumerate(source.imu_before_each()):
             priors = source.priors_before(number)
             if number == 0 and priors:  # a robot that starts on its dock
-                place = priors[0].map_from_base[:3, 3]
+                place = Place(priors[0].map_from_base[:3, 3])
             if number % _MAP_EVERY == 0:
-                loaded = room.load(wanted, place, velocity)
+                loaded = room.load(wanted, place)
                 if loaded is not None:
                     robot.use(loaded)
                 tiles_held.append(sum(len(held.tiles) for held in robot.held))
@@ -130,8 +130,7 @@ def drive(store: Path, recording: Path, minutes: float) -> dict[str, Any]:
             assert outcome is not None
             figures.handle(outcome)
             estimate = outcome.estimate
-            place = position_map_m(estimate)
-            velocity = velocity_map_mps(estimate)
+            place = whereabouts.handle(estimate)
             first_ns = estimate.stamp_ns if first_ns is None else first_ns
             if estimate.stamp_ns - first_ns >= 60e9 * len(memory):
                 memory.append(resident_mb())

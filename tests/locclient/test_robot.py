@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import robot_world
-from estimates import estimate
 from locclient.estimate import Status
-from locclient.robot import Change, Robot, position_map_m
+from locclient.robot import Change, Robot
 from mapserver.store import MapStore
 
 
@@ -87,10 +86,3 @@ def test_darkness_is_no_verdict_about_a_version(store: MapStore) -> None:
     drive(robot, range(70, 120), moments)
     assert [change.change for change in robot.take_changes()] == [Change.POSTPONED]
     assert [held.version for held in robot.held] == [1]
-
-
-def test_who_may_be_anywhere_holds_all_tiles() -> None:
-    np.testing.assert_array_equal(position_map_m(estimate(0.0, x_m=3.0)), [3.0, 0.0, 0.0])
-    np.testing.assert_array_equal(position_map_m(estimate(0.0, Status.DEGRADED, x_m=3.0)), [3.0, 0.0, 0.0])
-    assert position_map_m(estimate(0.0, Status.LOST, x_m=300.0)) is None
-    assert position_map_m(estimate(0.0, Status.AMBIGUOUS, known=False)) is None

@@ -24,7 +24,7 @@ from locclient.server_talk import ServerTalk
 from locclient.service_manager import ServiceManager
 from locclient.spool import Spool
 from locclient.tile_cache import StoreFolder, TileCache
-from locclient.tile_window import WindowSettings
+from locclient.tile_window import Place, WindowSettings
 from mapserver.fleet import Fleet
 from mapserver.store import MapStore
 from mapserver.tile_service import TileService
@@ -112,7 +112,7 @@ def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world:
     """Without a network from frame 30 to 120, dark from 60 to 100: the estimates are to the bit those of a robot alone."""
     moments = list(robot_world.moments(130, dark=range(60, 100)))
     folder = StoreFolderLink(StoreFolder(world.folder / "store"), "room")
-    whole = MapRoom(folder, WindowSettings()).load(folder.wanted(), None, np.zeros(3))
+    whole = MapRoom(folder, WindowSettings()).load(folder.wanted(), Place())
     assert whole is not None
     alone = robot_world.new_robot()
     alone.use(whole)
