@@ -74,7 +74,7 @@ def outcome(case: str, recording: Recording, frames: str) -> Outcome:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         copy_to_mcap(recording, folder / "case.mcap")
-        order = BuildOrder(folder / "case.mcap", "hall", folder / "store", frames, report=folder / "r.json")
+        order = BuildOrder((folder / "case.mcap",), "hall", folder / "store", frames, report=folder / "r.json")
         try:
             run_build(order, MapserverConfig().survey)
         except FleetmapError as error:
