@@ -2,7 +2,7 @@
 
 `PYTHONPATH=tests python tests/benchmarks/bench_robot_memory.py [--minutes M] [--site-mb MB] [--work FOLDER] [--out FILE.json]`. The
 simulated next day again and again, by the parts of the daemon, in a process that holds nothing else. The site is the survey's map with
-copies of its tiles in a wide grid around it, as many as make it so large: the robot holds those within reach. Recording and map are
+copies of its tiles in a wide grid far from it, as many as make it so large: the robot holds those within reach. Recording and map are
 kept in the work folder, where bench_localization.py finds the same.
 """
 
@@ -50,6 +50,7 @@ PROMISES: Promises = {"resident_mb": (320, AT_MOST), "anonymous_mb": (200, AT_MO
 _RUNNER = ("--robot", "runner-1", "--day", "1")
 _SETTLED_MIN = 2  # before it, kernels are loaded and queues fill
 _MAP_EVERY = 15  # frames
+_FAR_M = 600.0  # to the copies, which are twins of every place: a robot that is carried must not have to choose
 
 
 def large_site(work: Path, megabytes: float) -> Path:
@@ -71,9 +72,9 @@ def large_site(work: Path, megabytes: float) -> Path:
     rounds = int(np.ceil(megabytes * 1e6 / sum(len(encode_tile(tile)) for tile in own)))
     wide = 1 + max(tile.tile_x for tile in own) - min(tile.tile_x for tile in own)
     high = 1 + max(tile.tile_y for tile in own) - min(tile.tile_y for tile in own)
-    columns, tiles = int(np.ceil(np.sqrt(rounds))), []
+    columns, tiles, far = int(np.ceil(np.sqrt(rounds))), [], int(np.ceil(_FAR_M / manifest.tile_size_m))
     for number in range(rounds):
-        dx, dy = wide * (number % columns), high * (number // columns)
+        dx, dy = wide * (number % columns) + far * (number > 0), high * (number // columns)
         offset_m = manifest.tile_size_m * np.array([dx, dy, 0.0])
         for tile in own:
             places = tile.map_from_cam.copy()
