@@ -19,7 +19,8 @@ from mapserver.survey.tracks import Landmarks
 class Motion:
     """What is known of motion at K keyframes; inertial is False for a rig whose gravity was never found.
 
-    velocities_mps, gyro_bias_radps, accel_bias_mps2 (K, 3); relative: odometry between neighbours, used where there is no IMU.
+    velocities_mps, gyro_bias_radps, accel_bias_mps2 (K, 3); relative: odometry between neighbours, used where there is
+    no IMU, and where pictures show nothing.
     """
 
     inertial: bool

@@ -16,6 +16,7 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.work import ALONE, Worker
 
 _LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of a frame, as its stamp may be too early
+_GIVEN_UP_RAD, _GIVEN_UP_M = 0.1, 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +78,7 @@ def run_odometry(
     guess = FirstGuess(
         estimates,
         np.array(odom_from_body),
-        np.array([e.cov_rot_trans for e in estimates]),
+        carried_on(estimates),
         np.array([e.status is not OdometryStatus.DEGRADED for e in estimates]),
         keyframes,
         inertial,
@@ -98,6 +99,24 @@ def _take(estimate: OdometryEstimate, estimates: list[OdometryEstimate], odom_fr
             estimates[earlier_number], odom_from_body=placed, status=OdometryStatus.TRACKING,
             scale_known=estimate.scale_known,
         )  # fmt: skip
+
+
+def carried_on(estimates: Sequence[OdometryEstimate]) -> Array:
+    """(F, 6, 6) covariances that go on where the odometry began anew, which knows its own place for sure then.
+
+    What it said just before it gave up its gravity is hardly worth more than that it did not jump.
+    """
+    carried = np.zeros((6, 6))
+    covariances: list[Array] = []
+    for number, estimate in enumerate(estimates):
+        change = estimate.new_odom_from_old_odom
+        if number and change is not None:
+            turn = np.kron(np.eye(2), change[:3, :3])
+            carried = turn @ covariances[-1] @ turn.T
+            if not estimate.inertial:
+                carried = carried + np.diag([_GIVEN_UP_RAD**2] * 3 + [_GIVEN_UP_M**2] * 3)
+        covariances.append(carried + estimate.cov_rot_trans)
+    return np.array(covariances)
 
 
 def _summary(frame: RectifiedFrame, estimate: OdometryEstimate) -> FrameSummary:

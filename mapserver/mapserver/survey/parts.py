@@ -16,8 +16,9 @@ from mapserver.survey.first_guess import FirstGuess
 from mapserver.survey.loops import Loops
 
 _MIN_SHARED = 15  # landmarks, as many as a loop needs matches
-_MIN_SEEN = 8  # landmarks without which a keyframe counts as blind
+MIN_SEEN = 8  # landmarks without which a keyframe counts as blind
 _MIN_KEYFRAMES = 2
+_SURE_SIGMAS = 3.0
 _LARGEST = "the largest part"
 _APART = "nothing says for sure where it lies to the largest part; drive it again"
 _BLIND = "too little was seen to tie it to anything; drive it again, with light"
@@ -78,7 +79,7 @@ class Parts:
 
     @property
     def kept(self) -> NDArray[np.bool_]:
-        """(K,) keyframes that stay in the map: those of the part with most of them."""
+        """(K,) keyframes that stay in the map: those of the part with most that see something."""
         return np.asarray(self.labels == next(n for n, part in enumerate(self.parts) if part.kept))
 
 
@@ -86,18 +87,19 @@ def find_parts(survey_map: "Sightings", odometry_sigmas_m: "SigmaBetween", join_
     """The parts of a finished survey; SurveyError where nothing hangs together.
 
     Keyframes belong together where they share landmarks, directly or through others, and where the one that saw something last
-    and the one that sees something next are known to `join_sigma_m` of each other by odometry. Blind ones belong to the part
-    before or after, as far as odometry carries.
+    and the one that sees something next are known to `join_sigma_m` of each other by odometry. Blind ones in between belong
+    there too, others to the part before or after as far as odometry carries: until three of its sigmas are as much.
     """
     count = len(survey_map.keyframe_stamps_ns)
-    seeing = np.flatnonzero(np.bincount(survey_map.obs_keyframe, minlength=count) >= _MIN_SEEN)
+    seeing = np.flatnonzero(np.bincount(survey_map.obs_keyframe, minlength=count) >= MIN_SEEN)
     rows, columns = shared_landmarks(survey_map, _MIN_SHARED)
     bridges = [(a, b) for a, b in pairwise(seeing) if odometry_sigmas_m(int(a), int(b)) <= join_sigma_m]
-    blind = np.setdiff1d(np.arange(count), seeing)
-    for k in blind.tolist():
+    bridged = {int(a) for a, _ in bridges}
+    for k in np.setdiff1d(np.arange(count), seeing).tolist():
         at = int(np.searchsorted(seeing, k))
+        limit_m = join_sigma_m if at and int(seeing[at - 1]) in bridged else join_sigma_m / _SURE_SIGMAS
         for near in (seeing[at - 1] if at else None, seeing[at] if at < len(seeing) else None):
-            if near is not None and odometry_sigmas_m(min(k, int(near)), max(k, int(near))) <= join_sigma_m:
+            if near is not None and odometry_sigmas_m(min(k, int(near)), max(k, int(near))) <= limit_m:
                 bridges.append((near, k))
                 break
     rows = np.concatenate([rows, [a for a, _ in bridges]]).astype(np.int64)
@@ -159,14 +161,14 @@ def shared_landmarks(survey_map: "Sightings", at_least: int) -> tuple[NDArray[np
 
 def _named(survey_map: "Sightings", groups: NDArray[np.int64], seeing: NDArray[np.int64]) -> Parts:
     """Parts of at least two keyframes, one of which sees something, in the order of time."""
-    sizes = np.bincount(groups)
+    sizes, seeing_sizes = np.bincount(groups), np.bincount(groups[seeing])
     real = [g for g in dict.fromkeys(groups[seeing].tolist()) if sizes[g] >= _MIN_KEYFRAMES]
     if not real:
         raise SurveyError(
             f"none of {len(groups)} keyframes shares {_MIN_SHARED} landmarks with another; look at the recording with "
             "`mapserver doctor`: dark, blurred, or too few frames?"
         )
-    largest = max(real, key=lambda g: int(sizes[g]))
+    largest = max(real, key=lambda g: int(seeing_sizes[g]))
     labels = np.full(len(groups), -1, np.int64)
     for number, group in enumerate(real):
         labels[groups == group] = number

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,21 +9,20 @@ from numpy.typing import NDArray
 from fleetmap.bow import Vocabulary
 from fleetmap.calibration import RigCalibration
 from fleetmap.errors import SurveyError
-from fleetmap.geometry import Array, se3_inverse
 from fleetmap.rectification import RectifiedFrame, Rectifier
 from fleetmap.samples import CameraFrame, ImuSamples, WheelSample
 from mapserver.survey.adjust import Motion, SurveyState, adjust, adjust_windows
-from mapserver.survey.bundle import RelativeTerm
 from mapserver.survey.culling import Culled
 from mapserver.survey.first_guess import FirstGuess, run_odometry
 from mapserver.survey.graph_marginals import GraphMarginals
 from mapserver.survey.keyframes import PictureShelf
 from mapserver.survey.loops import LoopCloser, Loops
 from mapserver.survey.matching import PairFinder, drift_allowance_m, fixed_allowance_m
+from mapserver.survey.odometry_terms import chain_edges, odometry_terms, terms_in_the_dark
 from mapserver.survey.pair_turn import NO_TURN, PairTurn, estimate_turn, without_turn
 from mapserver.survey.pairs import PairMatch
 from mapserver.survey.parts import Part, SigmaBetween, beside, find_parts, only_kept, seen_by
-from mapserver.survey.pose_graph import PoseEdge, optimize_pose_graph
+from mapserver.survey.pose_graph import optimize_pose_graph
 from mapserver.survey.result import SurveyMap
 from mapserver.survey.scaled_loops import ScaledLoopCloser, gate_covariances, rigid, solve_scaled
 from mapserver.survey.settings import SurveySettings
@@ -87,6 +85,8 @@ def survey_from(
     state.landmarks = build_landmarks(
         keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings, worker
     )
+    if state.motion.inertial:
+        state.motion = replace(state.motion, relative=terms_in_the_dark(guess, state))
     if len(state.landmarks.points_map) < _MIN_LANDMARKS:
         raise SurveyError(
             f"{len(keyframes)} keyframes share only {len(state.landmarks.points_map)} landmarks; look at the recording with "
@@ -145,7 +145,7 @@ def _first_state(
     motion = Motion(
         guess.inertial, imu, calibration.imu, rectifier.imu_minus_cam_s,
         np.array([e.velocity_odom_mps for e in estimates]), np.array([e.gyro_bias_radps for e in estimates]),
-        np.array([e.accel_bias_mps2 for e in estimates]), [] if guess.inertial else _odometry_terms(guess, map_from_body),
+        np.array([e.accel_bias_mps2 for e in estimates]), [] if guess.inertial else odometry_terms(guess, map_from_body),
     )  # fmt: skip
     camera = survey_camera(rectifier.camera)
     nothing = build_landmarks([], [], map_from_body, rectifier.body_from_cam, camera, settings)
@@ -153,33 +153,6 @@ def _first_state(
     return SurveyState(
         stamps, map_from_body.copy(), rectifier.body_from_cam, camera, motion, nothing, rectifier.has_depth
     )
-
-
-def _odometry_terms(guess: FirstGuess, map_from_body: Array) -> list[RelativeTerm]:
-    """Without an IMU, neighbours are held by odometry: weakly, so that it decides only where landmarks do not.
-
-    For one camera this also holds the scale, which its landmarks leave open.
-    """
-    numbers = [k.frame_index for k in guess.keyframes]
-    terms = []
-    for k, (a, b) in enumerate(pairwise(numbers)):
-        i_from_j = se3_inverse(map_from_body[k]) @ map_from_body[k + 1]
-        terms.append(
-            RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(25.0 * _edge_covariance(guess, a, b)).astype(np.float64))
-        )
-    return terms
-
-
-def _edge_covariance(guess: FirstGuess, a: int, b: int) -> Array:
-    """(6, 6) of i_from_j between frames a and b, axes of a: what the odometry's uncertainty gained, with a floor."""
-    rotation = guess.odom_from_body[a, :3, :3].T
-    gained = guess.covariances[b] - guess.covariances[a]
-    values, vectors = np.linalg.eigh(0.5 * (gained + gained.T))
-    gained = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    carry = np.kron(np.eye(2), rotation)
-    distance = float(np.linalg.norm(guess.odom_from_body[b, :3, 3] - guess.odom_from_body[a, :3, 3]))
-    floor = np.diag([0.004**2] * 3 + [(0.01 + 0.02 * distance) ** 2] * 3)
-    return np.asarray(carry @ gained @ carry.T + floor)
 
 
 def _match_neighbours(
@@ -226,22 +199,12 @@ def _close_loops(
         scaled = solve_scaled(state.map_from_body, chain, closer.loops.edges, closer.scales, walk)
         closer.loops.disbelieve(scaled.loop_weights)
         _move(state, rigid(scaled))
-        state.motion = replace(state.motion, relative=_odometry_terms(guess, state.map_from_body))
+        state.motion = replace(state.motion, relative=odometry_terms(guess, state.map_from_body))
     elif closer.loops.edges:
         solved = optimize_pose_graph(state.map_from_body, [*chain, *closer.loops.edges])
         closer.loops.disbelieve(solved.loop_weights)
         _move(state, solved.map_from_body)
     return closer.loops
-
-
-def chain_edges(guess: FirstGuess, state: SurveyState) -> list[PoseEdge]:
-    """Each keyframe from the one before, where the adjustment put it, as surely as odometry knows."""
-    edges = []
-    numbers = [k.frame_index for k in guess.keyframes]
-    for k, (a, b) in enumerate(pairwise(numbers)):
-        i_from_j = se3_inverse(state.map_from_body[k]) @ state.map_from_body[k + 1]
-        edges.append(PoseEdge(k, k + 1, i_from_j, _edge_covariance(guess, a, b), is_loop=False))
-    return edges
 
 
 def _move(state: SurveyState, map_from_body: NDArray[np.float64]) -> None:

@@ -103,6 +103,20 @@ def test_a_blink_is_bridged_by_odometry_and_takes_the_blind_along() -> None:
     assert not parts.stray
 
 
+def test_what_leads_nowhere_is_taken_only_as_far_as_it_is_sure() -> None:
+    """0.04 m is within the joining sigma of 0.1 m, three times that is not."""
+    dark = survey(chain(0, 8) + BLIND + chain(1000, 4))
+    parts = find_parts(seen_by(dark), sigmas([0.01] * 7 + [0.02, 0.05, 5.0] + [0.01] * 3), 0.1)
+    assert [(p.end_s, p.keyframes, p.kept) for p in parts.parts] == [(8.0, 9, True), (13.0, 4, False)]
+    assert [(p.start_s, p.keyframes) for p in parts.stray] == [(9.0, 1)]
+
+
+def test_the_largest_part_is_the_one_with_most_that_see() -> None:
+    dark = survey(chain(0, 4) + BLIND * 3 + chain(1000, 3))
+    parts = find_parts(seen_by(dark), sigmas([0.01] * 3 + [5.0] + [0.001] * 8), 0.1)
+    assert [(p.keyframes, p.kept) for p in parts.parts] == [(4, True), (9, False)]
+
+
 def test_a_bridge_is_as_long_as_the_darkness_not_as_its_steps() -> None:
     """Each step alone would be sure enough."""
     dark = survey(chain(0, 4) + BLIND * 5 + chain(1000, 6))

@@ -6,7 +6,8 @@ import numpy as np
 
 from fleetmap.geometry import Array
 from fleetmap.samples import Trajectory
-from mapserver.survey.pipeline import Survey, chain_edges
+from mapserver.survey.odometry_terms import chain_edges
+from mapserver.survey.pipeline import Survey
 from mapserver.survey.result import SurveyMap
 from mapserver.survey.sessions.base_map import BaseMap
 from mapserver.survey.sessions.changes import what_changes
