@@ -16,8 +16,7 @@ import numpy as np
 
 from benchmarks import estimator_loop, rendered_map
 from fleetmap.geometry import Array
-from fleetmap.odometry import Odometry, OdometrySettings
-from fleetmap.odometry.odometry import OdometryEstimate
+from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
 from fleetmap.rectification import RectifiedFrame, Rectifier
 from fleetsim.estimator import EstimatorSession
 from fleetsim.recorder import Order, Session, prepare

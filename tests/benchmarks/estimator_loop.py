@@ -12,8 +12,7 @@ from fleetmap.calibration import RigCalibration
 from fleetmap.features import orb
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.mapformat import Tile
-from fleetmap.odometry import Odometry, OdometrySettings
-from fleetmap.odometry.odometry import OdometryEstimate
+from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracker import MotionSince, Tracked, Tracker
 from fleetmap.rectification import RectifiedFrame, StereoCamera

@@ -1,7 +1,8 @@
 """Odometry of stereo and single cameras, with and without IMU: written once, run live by the robot and as a first guess by the survey."""
 
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.monocular import MonocularOdometry, make_odometry
-from fleetmap.odometry.odometry import Odometry, OdometryEstimate, OdometryStatus
+from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.settings import OdometrySettings
 
 __all__ = [

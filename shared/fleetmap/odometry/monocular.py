@@ -10,7 +10,8 @@ from fleetmap.calibration import RigCalibration
 from fleetmap.features.stereo import StereoSettings
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.odometry import filter_kernels
-from fleetmap.odometry.odometry import Odometry, OdometryEstimate, OdometryStatus
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.scale_start import start_with_scale
 from fleetmap.odometry.settings import OdometrySettings, TrackerSettings
 from fleetmap.odometry.start import Start, start_steady

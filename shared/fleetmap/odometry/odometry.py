@@ -4,18 +4,20 @@ Never touches a file, a socket or a clock.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.calibration import ImuNoise, RigCalibration
 from fleetmap.features.stereo import StereoSettings
-from fleetmap.geometry import Array, interpolate_se3, rotation_angle_rad, se3_inverse, skew
+from fleetmap.geometry import Array, interpolate_se3, se3_inverse, skew
+from fleetmap.odometry.doubts import Doubts
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter import InvariantFilter, NavState
 from fleetmap.odometry.imu_faults import joined, longest_gap_ns, without_spikes
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
+from fleetmap.odometry.standing import StillPictures
 from fleetmap.odometry.start import Start, is_steady, start_in_motion, start_steady
 from fleetmap.odometry.tracker import Tracked, Tracker
 from fleetmap.odometry.tracks import Observations
@@ -27,49 +29,6 @@ _WHEEL_REACH_NS = 30_000_000  # a sample serves a frame within half the period o
 _GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of freedom
 _ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
 _IMU_GAP_NS = 50_000_000  # longer without samples than this, and the IMU says nothing of the motion
-_DISAGREEMENT_RAD = 0.02  # between the turn that pictures show from one frame to the next and the gyro's
-_MOST_OFFSET_SIGMAS = 3.0  # between the clocks, beyond which it is not the clocks
-_STRAYED_M, _MOST_STRAYED = 0.5, 3  # from what the pictures show of one step, and for so many frames in a row
-_MOST_DISAGREEMENTS = 8  # frames that disagree beyond those that agree, before the IMU is no longer believed
-
-
-class OdometryStatus(StrEnum):
-    """How far an estimate can be trusted."""
-
-    INITIALISING = "initialising"
-    TRACKING = "tracking"
-    DEGRADED = "degraded"
-
-
-@dataclass(frozen=True, slots=True)
-class OdometryEstimate:
-    """The body at one frame.
-
-    odom_from_body (4, 4); cov_rot_trans (6, 6) in odom axes; velocity, biases (3,). track_ids (N,) of the points seen;
-    after_gap where they had to be matched by descriptors; inertial once gravity is known. new_odom_from_old_odom is
-    given when the frame `odom` was redefined (gravity found): earlier estimates must be multiplied by it from the left.
-    imu_minus_cam_s is the time offset as estimated so far, 0 without an IMU.
-    scale_known is False for one camera whose scale nothing has shown: lengths are then in a unit of the odometry's own. revised:
-    earlier frames that are placed anew, (frame index, odom_from_body (4, 4)).
-    """
-
-    stamp_ns: int
-    frame_index: int
-    odom_from_body: Array
-    cov_rot_trans: Array
-    velocity_odom_mps: Array
-    gyro_bias_radps: Array
-    accel_bias_mps2: Array
-    status: OdometryStatus
-    track_ids: NDArray[np.int64]
-    scene_depth_m: float
-    inlier_share: float
-    after_gap: bool
-    inertial: bool
-    new_odom_from_old_odom: Array | None
-    scale_known: bool = True
-    revised: tuple[tuple[int, Array], ...] = ()
-    imu_minus_cam_s: float = 0.0
 
 
 class Odometry:
@@ -84,10 +43,10 @@ class Odometry:
         settings: OdometrySettings,
         stereo_settings: StereoSettings | None = None,
     ) -> None:
-        self._disagreements = 0
+        self._doubts = Doubts(settings.filter.time_offset_sigma_s)
+        self._still = StillPictures(settings.filter.still_window_s, settings.filter.still_flow_px)
         self._base_from_body = calibration.base_from_body
         self._wheel: list[WheelSample] = []
-        self._looks: list[tuple[int, NDArray[np.int64], Array]] = []
         self._real_noise = calibration.imu
         self._noise = None if calibration.imu is None else _widened(calibration.imu, settings.filter)
         self._camera, self._body_from_cam = camera, body_from_cam
@@ -106,7 +65,6 @@ class Odometry:
         self._last_motion = np.eye(4)
         self._clone_stamps: dict[int, int] = {}
         self._last_odom_from_body = np.eye(4)
-        self._strayed = 0
         self._not_before_ns = -(2**62)  # the IMU of before led to a start that was wrong
 
     def handle_imu(self, samples: ImuSamples) -> None:
@@ -130,8 +88,9 @@ class Odometry:
         assert self._filter is not None
         rate = self._predict(stamp_ns)
         tracked = self._tracker.track(frame, self._predicted_since, _ROTATION_SIGMA_RAD if self._inertial else None)
-        if self._inertial:
-            self._check_turn(tracked, self._predicted_since(self._frame_index - 1))
+        before = self._predicted_since(self._frame_index - 1)
+        if self._inertial and self._doubts.is_wrong_imu(before, tracked.cam_from_previous):
+            self._give_up_imu(tracked)
         if not self._inertial:
             self._displace(tracked)
         else:
@@ -144,7 +103,7 @@ class Odometry:
         used = self._consume(tracked)
         self._prune()
         change = None
-        if self._inertial and not self._is_sound(tracked):
+        if self._inertial and self._is_wrong_start(tracked):
             change = self._begin_again(stamp_ns, tracked)
         elif not self._inertial and self._noise is not None:
             change = self._try_start(stamp_ns, tracked)
@@ -236,21 +195,10 @@ class Odometry:
         self._seed_tracks()
         return np.asarray(self._filter.state.odom_from_body @ se3_inverse(seen))
 
-    def _is_sound(self, tracked: Tracked) -> bool:
-        """Whether the inertial filter may go on.
-
-        A start that took an even acceleration for rest is tilted by degrees. The filter then explains what it sees by clocks
-        that are further apart than they can be; or it strays from the pictures, frame after frame.
-        """
+    def _is_wrong_start(self, tracked: Tracked) -> bool:
         assert self._filter is not None
-        if abs(self._filter.imu_minus_cam_s) > _MOST_OFFSET_SIGMAS * self._settings.filter.time_offset_sigma_s:
-            return False
         now = self._predicted_since(self._frame_index - 1)
-        if now is None or tracked.cam_from_previous is None:
-            return True
-        off_m = float(np.linalg.norm((now @ se3_inverse(tracked.cam_from_previous))[:3, 3]))
-        self._strayed = 0 if off_m < _STRAYED_M else self._strayed + 1
-        return self._strayed < _MOST_STRAYED
+        return self._doubts.is_wrong_start(self._filter.imu_minus_cam_s, now, tracked.cam_from_previous)
 
     def _begin_again(self, stamp_ns: int, tracked: Tracked) -> Array:
         """By sight alone from where the last frame was, until gravity is known anew; returns new_odom_from_old_odom (4, 4).
@@ -262,10 +210,11 @@ class Odometry:
         state = NavState(rotation=seen[:3, :3], position_m=seen[:3, 3])
         self._filter = self._new_filter(state, np.diag([1e-10] * 15))
         self._filter.add_clone(self._frame_index, np.zeros(3))
-        self._inertial, self._state_ns, self._not_before_ns, self._strayed = False, stamp_ns, stamp_ns, 0
+        self._inertial, self._state_ns, self._not_before_ns = False, stamp_ns, stamp_ns
+        self._doubts.begin_again()
         self._clone_stamps = {self._frame_index: stamp_ns}
         self._vision.clear()
-        self._looks.clear()
+        self._still.forget()
         self._observations.clear()
         self._seed_tracks()
         return np.eye(4)
@@ -301,19 +250,11 @@ class Odometry:
         self._filter.doubt_velocity(settings.initial_velocity_sigma_mps)
         self._state_ns = max(target_ns, self._state_ns)
 
-    def _check_turn(self, tracked: Tracked, predicted: Array | None) -> None:
-        """Counts frames whose pictures turned otherwise than the gyro; an IMU that keeps contradicting is dropped.
-
-        It belongs to another recording, or is mounted otherwise than calibrated. The estimates go on as without an IMU.
-        """
-        if predicted is None or tracked.cam_from_previous is None:
-            return
-        off_rad = rotation_angle_rad(predicted[:3, :3].T @ tracked.cam_from_previous[:3, :3])
-        step = 1 if off_rad > _DISAGREEMENT_RAD else -1
-        self._disagreements = max(self._disagreements + step, 0)
-        if self._disagreements >= _MOST_DISAGREEMENTS:
-            self._inertial, self._noise = False, None
-            self._last_motion = tracked.cam_from_previous
+    def _give_up_imu(self, tracked: Tracked) -> None:
+        """The estimates go on as without an IMU."""
+        assert tracked.cam_from_previous is not None
+        self._inertial, self._noise = False, None
+        self._last_motion = tracked.cam_from_previous
 
     def _predicted_since(self, frame_index: int) -> Array | None:
         """cam_from_earlier (4, 4): from the propagated state, or the last motion again without an IMU."""
@@ -378,18 +319,14 @@ class Odometry:
         """Zero velocity and turn where for a while neither pictures nor IMU moved."""
         assert self._filter is not None
         assert self._real_noise is not None
-        settings, now_ns = self._settings.filter, self._state_ns
-        window_ns = int(settings.still_window_s * 1e9)
-        self._looks = [look for look in self._looks if look[0] >= now_ns - 2 * window_ns]
-        self._looks.append((now_ns, tracked.ids, tracked.pixels))
-        old = [look for look in self._looks if look[0] <= now_ns - window_ns]
-        if not old or not is_picture_still(old[-1][1], old[-1][2], tracked.ids, tracked.pixels, settings.still_flow_px):
+        now_ns = self._state_ns
+        still = self._still.since(now_ns, tracked.ids, tracked.pixels)
+        if still is None:
             return
-        window = self._imu.between(old[-1][0], now_ns)
-        since = self._imu.between(self._looks[-2][0], now_ns)
+        window, since = self._imu.between(still[0], now_ns), self._imu.between(still[1], now_ns)
         if len(window) < 20 or not len(since) or not is_steady(window, self._settings.start):
             return
-        duration_s = (now_ns - self._looks[-2][0]) * 1e-9
+        duration_s = (now_ns - still[1]) * 1e-9
         sigma_radps = self._real_noise.gyro_noise_radps_rthz / np.sqrt(duration_s)
         self._filter.stand_still(since.gyro_radps.mean(axis=0), float(sigma_radps), _GATE_6)
 
@@ -490,13 +427,3 @@ def _widened(noise: ImuNoise, settings: FilterSettings) -> ImuNoise:
         gyro_noise_radps_rthz=noise.gyro_noise_radps_rthz * settings.gyro_noise_scale,
         accel_noise_mps2_rthz=noise.accel_noise_mps2_rthz * settings.accel_noise_scale,
     )
-
-
-def is_picture_still(
-    old_ids: NDArray[np.int64], old_pixels: Array, ids: NDArray[np.int64], pixels: Array, limit_px: float
-) -> bool:
-    """Whether most of at least ten points seen in both pictures, pixels (N, 3), have stayed within the limit."""
-    _, before, now = np.intersect1d(old_ids, ids, assume_unique=True, return_indices=True)
-    if len(before) < 10:
-        return False
-    return bool(np.median(np.linalg.norm(pixels[now, :2] - old_pixels[before, :2], axis=1)) < limit_px)

@@ -1,0 +1,48 @@
+"""What an odometry says of one frame."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array
+
+
+class OdometryStatus(StrEnum):
+    """How far an estimate can be trusted."""
+
+    INITIALISING = "initialising"
+    TRACKING = "tracking"
+    DEGRADED = "degraded"
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryEstimate:
+    """The body at one frame.
+
+    odom_from_body (4, 4); cov_rot_trans (6, 6) in odom axes; velocity, biases (3,). track_ids (N,) of the points seen;
+    after_gap where they had to be matched by descriptors; inertial once gravity is known. new_odom_from_old_odom is
+    given when the frame `odom` was redefined (gravity found): earlier estimates must be multiplied by it from the left.
+    imu_minus_cam_s is the time offset as estimated so far, 0 without an IMU.
+    scale_known is False for one camera whose scale nothing has shown: lengths are then in a unit of the odometry's own. revised:
+    earlier frames that are placed anew, (frame index, odom_from_body (4, 4)).
+    """
+
+    stamp_ns: int
+    frame_index: int
+    odom_from_body: Array
+    cov_rot_trans: Array
+    velocity_odom_mps: Array
+    gyro_bias_radps: Array
+    accel_bias_mps2: Array
+    status: OdometryStatus
+    track_ids: NDArray[np.int64]
+    scene_depth_m: float
+    inlier_share: float
+    after_gap: bool
+    inertial: bool
+    new_odom_from_old_odom: Array | None
+    scale_known: bool = True
+    revised: tuple[tuple[int, Array], ...] = ()
+    imu_minus_cam_s: float = 0.0
