@@ -1,9 +1,10 @@
 """Which landmarks of a survey robots get: those that localize best, within a budget per metre of path. Pure.
 
 A survey finds many times what a robot needs. Every keyframe stands for the robots that will look from there: its picture is
-divided into bins, and what a landmark adds to a bin shrinks with those that it holds already. So every view keeps enough,
-spread over the picture and over near and far, before any gets more. Landmarks that were seen often, from far apart, and
-that are known well count for more, because they will be found again.
+divided into bins, and what a landmark adds to a bin shrinks with those that it holds already, so that they are spread over the
+picture and over near and far. Every view gets what a robot needs to be sure of its place there before any gets more: at the end
+of a drive few keyframes see what others do not. Landmarks that were seen often, from far apart, and that are known well count for
+more, because they will be found again.
 """
 
 import numpy as np
@@ -15,6 +16,7 @@ from mapserver.survey.result import SurveyMap
 from mapserver.survey.settings import BudgetSettings
 
 _COLUMNS, _ROWS, _DEPTHS = 4, 3, 2
+_NO_LIMIT = 1 << 40
 _LONGEST_STEP_M = 10.0  # between keyframes; beyond it lies a break, not a path
 _CLOSE_BASELINES = 40.0
 _WIDE_RAD = np.radians(20.0)
@@ -28,7 +30,8 @@ def choose_landmarks(
 
     At most settings.landmarks_per_m for every metre of `covered_path_m` (min_landmarks are always allowed: a short survey
     covers a whole room), and tile_landmarks in a tile. Landmarks whose ids are in `published` come before all others, so that
-    robots do not fetch another choice of equal worth every night. What nothing observes is not chosen.
+    robots do not fetch another choice of equal worth every night. Of those and of the others, those come first that give every
+    keyframe view_landmarks, or as many as it sees. What nothing observes is not chosen.
     """
     limit = max(settings.min_landmarks, int(settings.landmarks_per_m * covered_path_m(survey)))
     starts, bins, weights = _views(survey)
@@ -37,9 +40,16 @@ def choose_landmarks(
     chosen = np.zeros(len(survey.landmark_ids), bool)
     seen = np.diff(starts) > 0
     first = seen & np.isin(survey.landmark_ids, [] if published is None else published)
+    per_view = _ROWS * _COLUMNS * _DEPTHS
+    needs = np.full(len(survey.map_from_body), settings.view_landmarks)
     for mask in (first, seen & ~first):
-        if mask.any() and limit > 0:
-            limit -= kernels.choose(np.flatnonzero(mask), starts, bins, weights, cells, room, limit, counts, chosen)
+        for spare in (0, _NO_LIMIT):
+            left, needs = np.flatnonzero(mask & ~chosen), needs + spare
+            if len(left) and limit > 0:
+                limit -= kernels.choose(
+                    left, starts, bins, weights, cells, room, limit, counts, chosen, needs, per_view
+                )
+            needs = needs - spare
     return chosen
 
 

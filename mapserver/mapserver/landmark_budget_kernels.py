@@ -13,15 +13,17 @@ from fleetmap.kernel import kernel
 def choose(
     candidates: NDArray[np.int64], starts: NDArray[np.int64], bins: NDArray[np.int64], weights: Array,
     cells: NDArray[np.int64], room: NDArray[np.int64], limit: int, counts: NDArray[np.int64], chosen: NDArray[np.bool_],
+    needs: NDArray[np.int64], bins_per_view: int,
 ) -> int:  # fmt: skip
     """Number of candidates (rows of landmarks) chosen, at most `limit`; marks them in chosen (N,).
 
     Landmark n is seen in bins[starts[n]:starts[n + 1]]. It is worth weights[n] times the sum over them of 1 / (1 + how many
     were chosen there): the gain of a sum of harmonic numbers, which is submodular, so that a value that was computed earlier
-    is an upper bound and only the best one has to be computed again (Minoux 1978). counts (B,) of the bins and room (C,) of
-    cells (N,), how many more fit, are carried on. Equal values: the smaller row first.
+    is an upper bound and only the best one has to be computed again (Minoux 1978). Only views that need more count, and what is
+    worth nothing to any of them is not taken. counts (B,) of the bins, room (C,) of cells (N,), how many more fit, and
+    needs (V,) of views, so many bins each, are carried on. Equal values: the smaller row first.
     """
-    heap = [(-_gain(n, starts, bins, weights, counts), n) for n in candidates]
+    heap = [(-_gain(n, starts, bins, weights, counts, needs, bins_per_view), n) for n in candidates]
     heapify(heap)
     taken = 0
     while len(heap) > 0 and taken < limit:
@@ -29,24 +31,29 @@ def choose(
         if room[cells[n]] <= 0:
             heappop(heap)
             continue
-        now = (-_gain(n, starts, bins, weights, counts), n)
+        now = (-_gain(n, starts, bins, weights, counts, needs, bins_per_view), n)
         heapreplace(heap, now)
         if heap[0][1] != n:
             continue
+        if now[0] >= 0.0:
+            break
         heappop(heap)
         chosen[n] = True
         taken += 1
         room[cells[n]] -= 1
         for i in range(starts[n], starts[n + 1]):
             counts[bins[i]] += 1
+            needs[bins[i] // bins_per_view] -= 1
     return taken
 
 
 @kernel
 def _gain(
-    n: int, starts: NDArray[np.int64], bins: NDArray[np.int64], weights: Array, counts: NDArray[np.int64]
-) -> float:
+    n: int, starts: NDArray[np.int64], bins: NDArray[np.int64], weights: Array, counts: NDArray[np.int64],
+    needs: NDArray[np.int64], bins_per_view: int,
+) -> float:  # fmt: skip
     total = 0.0
     for i in range(starts[n], starts[n + 1]):
-        total += 1.0 / (1.0 + counts[bins[i]])
+        if needs[bins[i] // bins_per_view] > 0:
+            total += 1.0 / (1.0 + counts[bins[i]])
     return float(weights[n] * total)
