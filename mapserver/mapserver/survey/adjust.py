@@ -21,6 +21,7 @@ class Motion:
 
     velocities_mps, gyro_bias_radps, accel_bias_mps2 (K, 3); relative: odometry between neighbours, used where there is
     no IMU, and where pictures show nothing.
+    goes_on (K,): whether the IMU is believed from the keyframe before on; everywhere for None.
     """
 
     inertial: bool
@@ -31,6 +32,7 @@ class Motion:
     gyro_bias_radps: Array
     accel_bias_mps2: Array
     relative: list[RelativeTerm]
+    goes_on: NDArray[np.bool_] | None = None
 
 
 @dataclass
@@ -63,13 +65,30 @@ def adjust(
         last = round_number + 1 == rounds
         how = settings.rough_bundle if not last else settings.final_bundle if final else settings.bundle
         result = optimize(problem, how)
-        _take(state, result)
+        take(state, result)
         if not last:
             keep = result.squared_sigmas < settings.noise.cut_sigmas**2
             if free is not None:
                 keep |= ~np.isin(state.landmarks.obs_keyframe, np.flatnonzero(free))
             state.landmarks = state.landmarks.keep_observations(keep, settings.min_observations)
     return result
+
+
+def state_of(state: SurveyState, chosen: NDArray[np.bool_]) -> SurveyState:
+    """A state of its own of the chosen keyframes (K,) and of the landmarks that two of them see."""
+    number, motion = np.cumsum(chosen) - 1, state.motion
+    marks = state.landmarks.keep_observations(chosen[state.landmarks.obs_keyframe], 2)
+    marks = replace(marks, obs_keyframe=number[marks.obs_keyframe].astype(np.int32))
+    relative = [
+        replace(r, i=int(number[r.i]), j=int(number[r.j])) for r in motion.relative if chosen[r.i] and chosen[r.j]
+    ]
+    return replace(
+        state, stamps_ns=state.stamps_ns[chosen], map_from_body=state.map_from_body[chosen], landmarks=marks,
+        motion=replace(
+            motion, velocities_mps=motion.velocities_mps[chosen], gyro_bias_radps=motion.gyro_bias_radps[chosen],
+            accel_bias_mps2=motion.accel_bias_mps2[chosen], relative=relative,
+        ),
+    )  # fmt: skip
 
 
 def adjust_windows(state: SurveyState, settings: SurveySettings) -> None:
@@ -148,7 +167,7 @@ def _inertial(state: SurveyState, settings: SurveySettings, held: NDArray[np.boo
     offset_ns = int(motion.imu_minus_cam_s * 1e9)
     edges = []
     for k in range(len(state.stamps_ns) - 1):
-        if held is not None and held[k] and held[k + 1]:
+        if (held is not None and held[k] and held[k + 1]) or (motion.goes_on is not None and not motion.goes_on[k + 1]):
             continue
         start, end = int(state.stamps_ns[k]) + offset_ns, int(state.stamps_ns[k + 1]) + offset_ns
         edges.append(
@@ -172,7 +191,8 @@ def widened(noise: ImuNoise, settings: SurveySettings) -> ImuNoise:
     )
 
 
-def _take(state: SurveyState, result: BundleResult) -> None:
+def take(state: SurveyState, result: BundleResult) -> None:
+    """Moves what `state` adjusts to where `result` says."""
     state.map_from_body = result.map_from_body
     state.landmarks.points_map = result.points_map
     if (

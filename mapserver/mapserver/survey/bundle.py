@@ -164,11 +164,12 @@ class _Bundle:
         damp = damping * diagonal + DAMPING_FLOOR
         if size > 6:
             damp[:, 6:] += normal.motion_diagonal[s.slot_keyframes]
-        invert_landmarks(self.point_info, damping, self.inverse)
-        reduce_to_poses(
-            state.positions_m, state.points_map, s.keyframes, s.landmarks, s.landmark_ptr, s.slots, s.slot_keyframes,
-            s.slot_ptr, s.slot_obs, self.obs_info, self.inverse, self.point_rhs, s.row_ptr, s.cols, blocks, rhs,
-        )  # fmt: skip
+        if not self.problem.points_held:  # else their inverses are zero, and so are their steps
+            invert_landmarks(self.point_info, damping, self.inverse)
+            reduce_to_poses(
+                state.positions_m, state.points_map, s.keyframes, s.landmarks, s.landmark_ptr, s.slots, s.slot_keyframes,
+                s.slot_ptr, s.slot_obs, self.obs_info, self.inverse, self.point_rhs, s.row_ptr, s.cols, blocks, rhs,
+            )  # fmt: skip
         rhs[~s.free] = 0.0
         return ReducedSystem(s, self.chains, blocks, normal.edge_blocks, damp, rhs)
 

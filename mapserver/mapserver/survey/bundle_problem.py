@@ -74,7 +74,7 @@ class BundleProblem:
     map_from_body (K, 4, 4); fixed (K,): held keyframes. With gauge "yaw_position" a held keyframe (the first one, where
     none is named) keeps its yaw and position and gravity decides its roll and pitch. points_map (N, 3). obs_pixels (M,
     3): u_left, v, u_right, NaN without a right image. obs_sigma_px (M, 2): of u_left and v, and of the disparity u_left
-    - u_right; the three are taken as independent.
+    - u_right; the three are taken as independent. points_held: keyframes alone move.
     """
 
     camera: StereoCamera
@@ -90,6 +90,7 @@ class BundleProblem:
     relative: list[RelativeTerm] = field(default_factory=list)
     priors: list[PriorTerm] = field(default_factory=list)
     gauge: Literal["pose", "yaw_position"] = "pose"
+    points_held: bool = False
 
 
 class BundleSettings(Section, frozen=True):

@@ -141,7 +141,7 @@ def _pattern(
     pair_ptr = np.searchsorted(pairs[:, 1], np.arange(len(slot_ptr)))
     row_ptr, cols = np.zeros(len(slot_ptr), np.int64), np.zeros(0, np.int32)
     shared = (
-        slot_ptr,
+        np.zeros_like(slot_ptr) if problem.points_held else slot_ptr,
         slot_obs,
         landmarks,
         keyframes,

@@ -85,9 +85,9 @@ def _slope(state: SurveyState, shift_px: float, settings: SurveySettings) -> flo
     moved = replace(state, landmarks=without_turn(state.landmarks, camera, shift_px))
     result = optimize(bundle_problem(moved, settings, None), settings.final_bundle)
     marks = moved.landmarks
-    cam_from_map = se3_inverse(result.map_from_body @ state.body_from_cam)[marks.obs_keyframe]
+    ahead = se3_inverse(result.map_from_body @ state.body_from_cam)[marks.obs_keyframe, 2]
     points = result.points_map[marks.obs_landmark]
-    depth = np.einsum("mj,mj->m", cam_from_map[:, 2, :3], points) + cam_from_map[:, 2, 3]
+    depth = np.einsum("mj,mj->m", ahead[:, :3], points) + ahead[:, 3]
     off = marks.obs_pixels[:, 0] - marks.obs_pixels[:, 2] - camera.focal_px * camera.baseline_m / depth
     pull = _weights(result, settings.final_bundle) * off / marks.obs_sigma_px[:, 1] ** 2
     return -float(np.nansum(pull * disparity_shift(camera, marks.obs_pixels)))

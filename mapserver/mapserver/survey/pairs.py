@@ -22,7 +22,7 @@ class PairMatch:
 
     i: int
     j: int
-    features: Indices
+    features: NDArray[np.int32]
     j_from_i: Array
     cov_rot_trans: Array
 
@@ -147,7 +147,8 @@ def _complete(
         :, ::-1
     ]
     fresh = ~np.isin(backward[:, 0], forward[:, 0]) & ~np.isin(backward[:, 1], forward[:, 1])
-    return PairMatch(i, j, np.vstack([forward, backward[fresh]]), found.cam_from_source, found.cov_rot_trans)
+    features = np.vstack([forward, backward[fresh]]).astype(np.int32)  # a long survey has ten million
+    return PairMatch(i, j, features, found.cam_from_source, found.cov_rot_trans)
 
 
 def view_overlap(a: Keyframe, camera: StereoCamera, b_from_a: Array) -> float:

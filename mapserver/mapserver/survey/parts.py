@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
-from mapserver.survey.adjust import SurveyState
+from mapserver.survey.adjust import SurveyState, state_of
 from mapserver.survey.first_guess import FirstGuess
 from mapserver.survey.loops import Loops
 
@@ -133,20 +133,10 @@ def only_kept(
     """The survey of the kept keyframes (K,) alone; the records of loops keep the old numbers."""
     if kept.all():
         return state, guess, loops
-    number, motion = np.cumsum(kept) - 1, state.motion
-    marks = state.landmarks.keep_observations(kept[state.landmarks.obs_keyframe], 2)
-    marks = replace(marks, obs_keyframe=number[marks.obs_keyframe].astype(np.int32))
-    relative = [replace(r, i=int(number[r.i]), j=int(number[r.j])) for r in motion.relative if kept[r.i] and kept[r.j]]
+    number = np.cumsum(kept) - 1
     edges = [replace(e, i=int(number[e.i]), j=int(number[e.j])) for e in loops.edges if kept[e.i] and kept[e.j]]
-    left = replace(
-        state, stamps_ns=state.stamps_ns[kept], map_from_body=state.map_from_body[kept], landmarks=marks,
-        motion=replace(
-            motion, velocities_mps=motion.velocities_mps[kept], gyro_bias_radps=motion.gyro_bias_radps[kept],
-            accel_bias_mps2=motion.accel_bias_mps2[kept], relative=relative,
-        ),
-    )  # fmt: skip
     keyframes = [k for k, keep in zip(guess.keyframes, kept, strict=True) if keep]
-    return left, replace(guess, keyframes=keyframes), replace(loops, edges=edges)
+    return state_of(state, kept), replace(guess, keyframes=keyframes), replace(loops, edges=edges)
 
 
 def shared_landmarks(survey_map: "Sightings", at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

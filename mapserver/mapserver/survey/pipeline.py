@@ -23,11 +23,12 @@ from mapserver.survey.pair_turn import NO_TURN, PairTurn, estimate_turn, without
 from mapserver.survey.pairs import PairMatch
 from mapserver.survey.parts import Part, SigmaBetween, beside, find_parts, only_kept, seen_by
 from mapserver.survey.pose_graph import optimize_pose_graph
+from mapserver.survey.repeats import adjust_visits, spare_keyframes, without_spare
 from mapserver.survey.result import SurveyMap
 from mapserver.survey.scaled_loops import ScaledLoopCloser, gate_covariances, rigid, solve_scaled
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.summary import summarise
-from mapserver.survey.tracks import build_landmarks, observed_again
+from mapserver.survey.tracks import build_landmarks, landmarks_of, observed_again, tracks_of
 from mapserver.survey.view_depths import ViewDepths, survey_camera
 from mapserver.survey.work import ALONE, Worker
 from mapserver.survey.zones import Zones
@@ -92,13 +93,15 @@ def survey_from(
             f"{len(keyframes)} keyframes share only {len(state.landmarks.points_map)} landmarks; look at the recording with "
             "`mapserver doctor`: dark, blurred, or the wrong calibration?"
         )
+    matched = {(p.i, p.j) for p in pairs}
+    del pairs  # as large as all else in a long survey
     progress("local adjustment", 0, 1)
     adjust_windows(state, settings)
     if state.motion.inertial:
         adjust(state, settings, rounds=2)
     guess = _with_depths(guess, state, depths)
-    loops = _close_loops(guess, state, pairs, vocabulary, settings, zones, progress, worker)
-    turn = NO_TURN
+    loops = _close_loops(guess, state, matched, vocabulary, settings, zones, progress, worker)
+    turn, spare = NO_TURN, np.zeros(len(keyframes), bool)
     for round_number in range(2):
         progress("global adjustment", round_number, 2)
         if depths is not None:
@@ -106,18 +109,20 @@ def survey_from(
             keyframes = guess.keyframes
             finder = PairFinder(keyframes, state.camera, rectifier.body_from_cam, settings, worker)
         if round_number == 0 or depths is not None:
-            pairs = _match_all(state, finder, settings, progress)
-            state.landmarks = build_landmarks(
-                keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings, worker
+            tracks = tracks_of(_match_all(state, finder, settings, progress))
+            spare = spare_keyframes(tracks, keyframes, settings)
+            state.landmarks = landmarks_of(
+                keyframes, tracks, spare, state.map_from_body, state.body_from_cam, state.camera, settings, worker
             )
+            del tracks
         else:  # a second search finds hardly a match more; its coordinates are finer
             state.landmarks = observed_again(
                 state.landmarks, keyframes, state.map_from_body, state.body_from_cam, state.camera, settings, worker
             )
         state.landmarks = without_turn(state.landmarks, state.camera, turn.correction_px)
-        adjust(state, settings, rounds=3 if round_number == 0 or depths is not None else 2, final=True)
+        adjust_visits(state, settings, spare, rounds=3 if round_number == 0 or depths is not None else 2)
         if round_number == 0:
-            turn = estimate_turn(state, settings)
+            turn = estimate_turn(without_spare(state, spare), settings)
     progress("global adjustment", 2, 2)
     frames_of = np.array([k.frame_index for k in keyframes], np.int64)
     parts = find_parts(seen_by(state), SigmaBetween(guess.covariances[frames_of]), settings.join_sigma_m)
@@ -180,8 +185,8 @@ def _match_all(state: SurveyState, finder: PairFinder, settings: SurveySettings,
 
 
 def _close_loops(
-    guess: FirstGuess, state: SurveyState, pairs: list[PairMatch], vocabulary: Vocabulary, settings: SurveySettings, zones: Zones,
-    progress: Progress, worker: Worker,
+    guess: FirstGuess, state: SurveyState, matched: set[tuple[int, int]], vocabulary: Vocabulary, settings: SurveySettings,
+    zones: Zones, progress: Progress, worker: Worker,
 ) -> Loops:  # fmt: skip
     """Finds loops, and moves the keyframes to where the pose graph with them says."""
     keyframes = guess.keyframes
@@ -190,7 +195,7 @@ def _close_loops(
     kind, known = (LoopCloser, chain) if guess.scale_known else (ScaledLoopCloser, gate_covariances(chain, walk))
     closer = kind(
         keyframes, vectors, vocabulary.word_count, state.camera, state.body_from_cam, state.map_from_body,
-        GraphMarginals(state.map_from_body, known), {(p.i, p.j) for p in pairs}, settings, zones, worker,
+        GraphMarginals(state.map_from_body, known), matched, settings, zones, worker,
     )  # fmt: skip
     for i in range(len(keyframes)):
         closer.close(i)

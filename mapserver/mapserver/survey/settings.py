@@ -98,13 +98,15 @@ class BudgetSettings(Section, frozen=True):
 
 
 class CullSettings(Section, frozen=True):
-    """What a finished survey does not hand on."""
+    """What a finished survey does not hand on, and what takes no part in adjusting it."""
 
     duplicate_m: float = 0.05
     duplicate_distance: int = 50
     min_parallax_deg: float = 0.5
     redundant_share: float = 0.9
     redundant_observers: int = 3
+    repeated_share: float = 0.8
+    repeated_visits: int = 3
 
 
 class SessionSettings(Section, frozen=True):

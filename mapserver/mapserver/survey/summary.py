@@ -22,6 +22,7 @@ from mapserver.survey.trajectory import frame_trajectory
 
 _PATCH_HALF_PX = 10  # a 9 px window seen from nearer or turned still finds all of itself
 _MIN_TIED = 8
+_CHUNK = 5000  # landmarks
 
 
 def summarise(state: SurveyState, guess: FirstGuess, settings: SurveySettings) -> tuple[SurveyMap, Culled]:
@@ -69,12 +70,16 @@ def medoid_descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[n
 
 def point_sigmas_m(state: SurveyState) -> Array:
     """(N,) largest standard deviation of each landmark, keyframes taken as known."""
-    marks = state.landmarks
-    information = point_information(
-        state.camera, (state.map_from_body @ state.body_from_cam)[marks.obs_keyframe], marks.points_map, marks.obs_landmark,
-        np.isfinite(marks.obs_pixels[:, 2]), marks.obs_sigma_px,
-    )  # fmt: skip
-    weakest = np.linalg.eigvalsh(information)[:, 0]
+    marks, map_from_cam = state.landmarks, state.map_from_body @ state.body_from_cam
+    weakest = np.empty(len(marks.points_map))
+    for start in range(0, len(weakest), _CHUNK):  # an observation's share of the work is half a kilobyte
+        some = slice(start, min(start + _CHUNK, len(weakest)))
+        rows = slice(*np.searchsorted(marks.obs_landmark, [some.start, some.stop]))
+        information = point_information(
+            state.camera, map_from_cam[marks.obs_keyframe[rows]], marks.points_map[some], marks.obs_landmark[rows] - start,
+            np.isfinite(marks.obs_pixels[rows, 2]), marks.obs_sigma_px[rows],
+        )  # fmt: skip
+        weakest[some] = np.linalg.eigvalsh(information)[:, 0]
     return np.asarray(1.0 / np.sqrt(np.maximum(weakest, 1e-6)))
 
 

@@ -59,38 +59,37 @@ def of_features(marks: Landmarks, columns: Sequence[NDArray[Any]]) -> NDArray[An
 
 def join_tracks(keyframes: list[Keyframe], pairs: list[PairMatch]) -> list[list[tuple[int, int]]]:
     """Groups of (keyframe, feature) that pairs connect, no keyframe twice in a group; strongest pairs are joined first."""
-    groups = _joined(pairs)
+    groups = tracks_of(pairs)
     members = list(zip(groups.keyframes.tolist(), groups.features.tolist(), strict=True))
     edges = np.append(groups.starts, len(members)).tolist()
     return [members[start:end] for start, end in pairwise(edges)]
 
 
 @dataclass(frozen=True, slots=True)
-class _Groups:
-    """Members (M,) of G groups, one group after the other, by rising keyframe; starts (G,) of each."""
+class Tracks:
+    """What pairs connect: members (M,) of G tracks, one track after the other, by rising keyframe; starts (G,) of each."""
 
     keyframes: NDArray[np.int64]
     features: NDArray[np.int64]
     starts: NDArray[np.int64]
 
 
-def _joined(pairs: list[PairMatch]) -> _Groups:
+def tracks_of(pairs: list[PairMatch]) -> Tracks:
+    """The tracks of all pairs, as `join_tracks` makes them."""
     ordered = sorted(pairs, key=lambda p: (-len(p.features), p.i, p.j))
     if not ordered:
         nothing = np.zeros(0, np.int64)
-        return _Groups(nothing, nothing, nothing)
-    sides = [np.concatenate([p.features[:, side] for p in ordered]).astype(np.int64) for side in range(2)]
-    counts = [len(p.features) for p in ordered]
-    owners = [np.repeat(np.array([p.i for p in ordered]), counts), np.repeat(np.array([p.j for p in ordered]), counts)]
-    stride = int(max(sides[0].max(initial=0), sides[1].max(initial=0))) + 1
-    codes = [owner * stride + feature for owner, feature in zip(owners, sides, strict=True)]
-    nodes, links = np.unique(np.concatenate(codes), return_inverse=True)
-    roots = join_kernel(links[: len(codes[0])], links[len(codes[0]) :], nodes // stride)
-    order = np.lexsort((nodes, roots))
-    _, inverse, sizes = np.unique(roots[order], return_inverse=True, return_counts=True)
-    shared = sizes[inverse] > 1
-    found, lasting = nodes[order][shared], sizes[sizes > 1]
-    return _Groups(found // stride, found % stride, np.cumsum(lasting) - lasting)
+        return Tracks(nothing, nothing, nothing)
+    # Keyframes have far fewer features than pairs have matches: any feature is a node, and links stay small.
+    stride = 1 + max(int(p.features.max(initial=0)) for p in ordered)
+    owners = np.arange(1 + max(p.j for p in ordered), dtype=np.int32).repeat(stride)
+    first = np.concatenate([(p.i * stride + p.features[:, 0]).astype(np.int32) for p in ordered])
+    second = np.concatenate([(p.j * stride + p.features[:, 1]).astype(np.int32) for p in ordered])
+    roots = join_kernel(first, second, owners)
+    shared = np.flatnonzero(np.bincount(roots, minlength=len(roots))[roots] > 1)
+    nodes = shared[np.argsort(roots[shared], kind="stable")]
+    starts = np.flatnonzero(np.diff(roots[nodes], prepend=-1))
+    return Tracks(nodes // stride, nodes % stride, starts)
 
 
 def build_landmarks(
@@ -98,8 +97,17 @@ def build_landmarks(
     settings: SurveySettings, worker: Worker = ALONE,
 ) -> Landmarks:  # fmt: skip
     """Tracks of the pairs with a stereo point to start from, each observation's coordinate refined against the reference patch."""
+    none = np.zeros(len(keyframes), bool)
+    return landmarks_of(keyframes, tracks_of(pairs), none, map_from_body, body_from_cam, camera, settings, worker)
+
+
+def landmarks_of(
+    keyframes: list[Keyframe], tracks: Tracks, spare: NDArray[np.bool_], map_from_body: Array, body_from_cam: Array,
+    camera: StereoCamera, settings: SurveySettings, worker: Worker = ALONE,
+) -> Landmarks:  # fmt: skip
+    """The same from tracks. Those that fewer than two keyframes see which are not spare (K,) give no landmark."""
     map_from_cam = map_from_body @ body_from_cam
-    table, points_cam = _tracks_from_reference(keyframes, _joined(pairs))
+    table, points_cam = _tracks_from_reference(keyframes, tracks, spare)
     if not len(table):
         nothing = np.zeros(0, np.int32)
         return Landmarks(np.zeros((0, 3)), nothing, nothing, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)))
@@ -128,28 +136,32 @@ def _is_first(table: NDArray[np.int64]) -> NDArray[np.bool_]:
     return np.asarray(np.diff(table[:, 1], prepend=-1) != 0)
 
 
-def _tracks_from_reference(keyframes: list[Keyframe], groups: _Groups) -> tuple[NDArray[np.int64], Array]:
-    """(M, 3) keyframe, landmark, feature of the groups that know a depth, each one's reference first; its points_cam (N, 3).
+def _tracks_from_reference(
+    keyframes: list[Keyframe], tracks: Tracks, spare: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], Array]:
+    """(M, 3) keyframe, landmark, feature of the tracks that know a depth, each one's reference first; its points_cam (N, 3).
 
-    The reference defines the landmark's patch: with depth, finest octave, nearest.
+    The reference defines the landmark's patch: with depth, not spare, finest octave, nearest.
     """
-    if not len(groups.keyframes):
+    if not len(tracks.keyframes):
         return np.zeros((0, 3), np.int64), np.zeros((0, 3))
     first_of = np.cumsum([0, *(len(k.features) for k in keyframes)])
-    at = first_of[groups.keyframes] + groups.features
+    at = first_of[tracks.keyframes] + tracks.features
     octaves = np.concatenate([k.features.octaves for k in keyframes])[at]
     disparities = np.concatenate([k.disparities[:, 0] for k in keyframes])[at]
-    members = np.arange(len(at))
-    group = np.repeat(np.arange(len(groups.starts)), np.diff(groups.starts, append=len(at)))
-    best = np.lexsort((members, -disparities, octaves, ~np.isfinite(disparities), group))[groups.starts]
-    known = np.isfinite(disparities[best])
+    members, is_spare = np.arange(len(at)), spare[tracks.keyframes]
+    track = np.repeat(np.arange(len(tracks.starts)), np.diff(tracks.starts, append=len(at)))
+    best = np.lexsort((members, -disparities, octaves, is_spare, ~np.isfinite(disparities), track))[tracks.starts]
+    lasting = (
+        np.isfinite(disparities[best]) & ~is_spare[best] & (np.bincount(track[~is_spare], minlength=len(best)) > 1)
+    )
     is_reference = np.zeros(len(at), bool)
     is_reference[best] = True
-    order = np.lexsort((members, ~is_reference, group))
-    order = order[known[group[order]]]
-    landmark = (np.cumsum(known) - 1)[group]
-    table = np.column_stack([groups.keyframes, landmark, groups.features])[order]
-    return table, np.concatenate([k.points_cam for k in keyframes])[at[best[known]]]
+    order = np.lexsort((members, ~is_reference, track))
+    order = order[lasting[track[order]]]
+    landmark = (np.cumsum(lasting) - 1)[track]
+    table = np.column_stack([tracks.keyframes, landmark, tracks.features])[order]
+    return table, np.concatenate([k.points_cam for k in keyframes])[at[best[lasting]]]
 
 
 def _observe(

@@ -10,13 +10,14 @@ from fleetmap.geometry import Array
 from fleetmap.kernel import inner_kernel, kernel
 
 Indices = NDArray[np.int64]
+Links = NDArray[np.int32]  # a long survey has ten million
 Octaves = NDArray[np.int8]
 Picture = NDArray[np.uint8]
 _LOG2_SCALE = math.log2(1.2)
 
 
 @kernel
-def _root(parents: Indices, node: int) -> int:
+def _root(parents: Links, node: int) -> int:
     while parents[node] != node:
         parents[node] = parents[parents[node]]
         node = parents[node]
@@ -24,15 +25,15 @@ def _root(parents: Indices, node: int) -> int:
 
 
 @kernel
-def join(first: Indices, second: Indices, keyframes: Indices) -> Indices:
+def join(first: Links, second: Links, keyframes: Links) -> Links:
     """(V,) the root of each of V nodes after joining first (L,) with second (L,) in their order.
 
     keyframes (V,): a link that would bring two nodes of one keyframe into one group is left out.
     """
     count = len(keyframes)
-    parents, sizes = np.arange(count), np.ones(count, np.int64)
-    following, last = np.full(count, -1, np.int64), np.arange(count)
-    marks = np.full(keyframes.max() + 1 if count else 0, -1, np.int64)
+    parents, sizes = np.arange(count).astype(np.int32), np.ones(count, np.int32)
+    following, last = np.full(count, -1, np.int32), np.arange(count).astype(np.int32)
+    marks = np.full(keyframes.max() + 1 if count else 0, -1, np.int32)
     for link in range(len(first)):
         a, b = _root(parents, first[link]), _root(parents, second[link])
         if a == b:

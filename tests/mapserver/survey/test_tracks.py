@@ -18,7 +18,7 @@ Node = tuple[int, int]
 
 
 def pair(i: int, j: int, features: list[tuple[int, int]]) -> PairMatch:
-    return PairMatch(i, j, np.array(features, np.int64).reshape(-1, 2), np.eye(4), np.eye(6))
+    return PairMatch(i, j, np.array(features, np.int32).reshape(-1, 2), np.eye(4), np.eye(6))
 
 
 def joined_by_hand(pairs: list[PairMatch]) -> list[list[Node]]:
