@@ -105,7 +105,7 @@ class CullSettings(Section, frozen=True):
     min_parallax_deg: float = 0.5
     redundant_share: float = 0.9
     redundant_observers: int = 3
-    repeated_share: float = 0.8
+    repeated_share: float = 0.7
     repeated_visits: int = 3
 
 
