@@ -163,15 +163,17 @@ class SparseLayout:
         place = np.empty(count, np.int64)
         place[order] = np.arange(count)
         rows, cols = _unknowns(system)
-        entries = np.flatnonzero((rows >= 0) & (cols >= 0))
         # numbers of held unknowns are dropped, but for the last ones, which are the diagonal's
-        entries = entries[~(held[rows[entries]] | held[cols[entries]]) | (entries >= len(rows) - count)]
+        used = (rows >= 0) & (cols >= 0) & ~(held[rows] | held[cols])
+        used[len(rows) - count :] = True
+        entries = np.flatnonzero(used).astype(np.int32)
         codes = place[cols[entries]] * count + place[rows[entries]]
+        del rows, cols, used  # there are millions
         sequence = np.argsort(codes, kind="stable")
-        codes = codes[sequence]
+        entries, codes = entries[sequence], codes[sequence]
         starts = np.flatnonzero(np.diff(codes, prepend=-1))
         indptr = np.searchsorted(codes[starts] // count, np.arange(count + 1))
-        return cls(order, entries[sequence], starts, (codes[starts] % count).astype(np.int32), indptr.astype(np.int32))
+        return cls(order, entries, starts, (codes[starts] % count).astype(np.int32), indptr.astype(np.int32))
 
     def matrix(self, system: ReducedSystem) -> scipy.sparse.csc_array:
         """S with rows and columns in `order`; unknowns that are held have a one on the diagonal."""
@@ -197,13 +199,14 @@ def _unknowns(system: ReducedSystem) -> tuple[AnyArray, AnyArray]:
     """Row and column of every number of a system: image blocks, those mirrored, edge blocks, diagonal; -1 for held keyframes."""
     size, s = system.rhs.shape[1], system.structure
     shape = (len(s.cols), 6, 6)
-    row = np.broadcast_to(size * _block_rows(system)[:, None, None] + np.arange(6)[:, None], shape)
-    col = np.broadcast_to(size * s.cols.astype(np.int64)[:, None, None] + np.arange(6), shape)
+    six = np.arange(6, dtype=np.int32)
+    row = np.broadcast_to(size * _block_rows(system).astype(np.int32)[:, None, None] + six[:, None], shape)
+    col = np.broadcast_to(size * s.cols.astype(np.int32)[:, None, None] + six, shape)
     below = _below(system)
     slots = np.repeat(system.chains.edge_slots.reshape(-1, 2), 15, axis=1)
-    ends = np.where(slots >= 0, size * slots + np.tile(np.arange(15), 2), -1)
+    ends = np.where(slots >= 0, size * slots + np.tile(np.arange(15), 2), -1).astype(np.int32)
     along = np.repeat(ends[:, :, None], 30, axis=2)
-    diagonal = np.arange(system.rhs.size)
+    diagonal = np.arange(system.rhs.size, dtype=np.int32)
     rows = [row.ravel(), col[below].ravel(), along.ravel(), diagonal]
     cols = [col.ravel(), row[below].ravel(), along.transpose(0, 2, 1).ravel(), diagonal]
     return np.concatenate(rows), np.concatenate(cols)
