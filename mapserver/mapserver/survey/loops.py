@@ -117,7 +117,8 @@ class LoopCloser:
         matches = self._worker.map(_verify, self._compared, [self._look(i, int(ids[n])) for n in inside])
         for n, match in zip(inside, matches, strict=True):
             j, score = int(ids[n]), float(scores[n])
-            same = [edge.j for edge, _ in believed if not self._are_apart(j, np.array([edge.j]))[0]]
+            others = np.array([edge.j for edge, _ in believed], np.int64)
+            same = others[~self._are_apart(j, others)].tolist() if len(others) else []
             if len(same) >= self._settings.loops.per_place:
                 reason = f"its place is closed with keyframe {same[0]} already"
                 self.loops.records.append(LoopRecord(i, j, score, Verdict.REJECTED, reason))
@@ -266,8 +267,9 @@ class LoopCloser:
         """Accepts what is left, unless the candidates exclude each other: then none is."""
         places = [self._map_from_body[e.j] @ se3_inverse(e.i_from_j) for e, _ in believed]
         spread = max((float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a in places for b in places), default=0.0)
-        between = [self._marginals.relative_cov(a.j, b.j) for a, _ in believed for b, _ in believed if a.j != b.j]
-        tolerance = 0.3 + max((3.0 * float(np.sqrt(np.trace(c[3:, 3:]))) for c in between), default=0.0)
+        js = np.array([edge.j for edge, _ in believed], np.int64)
+        between = [np.trace(self._marginals.relative_covs(j, js[js != j])[:, 3:, 3:], axis1=1, axis2=2) for j in js]
+        tolerance = 0.3 + 3.0 * float(np.sqrt(max((traces.max(initial=0.0) for traces in between), default=0.0)))
         for edge, record in believed:
             if spread > tolerance:
                 self.loops.records.append(
@@ -309,7 +311,7 @@ def _around(distance_m: float) -> Array:
     return distance_m * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(_SIDES)])
 
 
-def _cells(keyframe: Keyframe, features: NDArray[np.int64], camera: StereoCamera) -> int:
+def _cells(keyframe: Keyframe, features: NDArray[np.int32], camera: StereoCamera) -> int:
     """How many of 8 x 6 image cells hold one of the features."""
     pixels = keyframe.features.pixels[features]
     column = np.clip(pixels[:, 0] / camera.width_px * 8, 0, 7).astype(int)

@@ -11,7 +11,7 @@ from fleetmap.rectification import Rectifier
 from mapserver.survey.keyframes import Keyframe, make_keyframe
 from mapserver.survey.pairs import PairMatch, match_pair
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.tracks import Landmarks, build_landmarks, join_tracks
+from mapserver.survey.tracks import Landmarks, Tracks, build_landmarks, join_tracks, landmarks_of
 from recording_samples import calibration
 
 Node = tuple[int, int]
@@ -158,3 +158,23 @@ def test_sigmas_tell_refined_observations_from_others() -> None:
     assert np.median(np.abs(normal)) < 0.7
     assert (np.abs(normal) < 4).mean() > 0.97
     assert (marks.obs_sigma_px > 0).all()
+
+
+def test_spare_keyframes_observe_and_define_nothing() -> None:
+    """Keyframes 0 and 3 are spare: references are in 1 and 2, both of which see every landmark, and 0 and 3 are seen to see them."""
+    keyframes, map_from_body, rectifier, marks = views()
+    order = np.lexsort((marks.obs_keyframe, marks.obs_landmark))
+    starts = np.flatnonzero(np.diff(marks.obs_landmark, prepend=-1))
+    tracks = Tracks(marks.obs_keyframe[order].astype(np.int64), marks.obs_feature[order], starts)
+    spare = np.array([True, False, False, True])
+    left = landmarks_of(
+        keyframes, tracks, spare, map_from_body, rectifier.body_from_cam, rectifier.camera, SurveySettings()
+    )
+    first = np.flatnonzero(np.diff(left.obs_landmark, prepend=-1))
+    assert not spare[left.obs_keyframe[first]].any()
+    members = np.bincount(marks.obs_landmark[~spare[marks.obs_keyframe]], minlength=len(marks.points_map))
+    assert 100 < len(left.points_map) <= (members > 1).sum() < len(marks.points_map)
+    assert (np.bincount(left.obs_landmark[~spare[left.obs_keyframe]]) == 2).all()
+    assert np.bincount(left.obs_keyframe, minlength=4)[[0, 3]].min() > 50
+    nearest = np.linalg.norm(left.points_map[:, None] - marks.points_map, axis=2).min(axis=1)
+    assert np.median(nearest) < 0.02
