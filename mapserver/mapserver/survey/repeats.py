@@ -23,20 +23,36 @@ def spare_keyframes(tracks: Tracks, keyframes: list[Keyframe], settings: SurveyS
     """(K,) keyframes without which `repeated_visits` other visits still see `repeated_share` of their tracks, as finely.
 
     A visit ends where no keyframe has seen a track for longer than a loop takes at least. The last keyframes go first, so that
-    whole drives are left. None are spare where no place is seen on more visits than those.
+    whole drives are left. None are spare where no place is seen on more visits than those. What then stands alone beside them
+    is spare too: blind ones, whose neighbours know better where they are.
     """
     cull, spare = settings.cull, np.zeros(len(keyframes), bool)
     first_of = np.cumsum([0, *(len(k.features) for k in keyframes)])
     octaves = np.concatenate([np.zeros(0, np.int8), *(k.features.octaves for k in keyframes)])
     starts = np.append(tracks.starts, len(tracks.keyframes))
     order = np.argsort(tracks.keyframes, kind="stable")
+    track = np.repeat(np.arange(len(tracks.starts)), np.diff(starts))
     mark_repeated(
         order, np.searchsorted(tracks.keyframes[order], np.arange(len(keyframes) + 1)),
-        np.repeat(np.arange(len(tracks.starts)), np.diff(starts)), starts, tracks.keyframes,
+        track, starts, tracks.keyframes,
         octaves[first_of[tracks.keyframes] + tracks.features], settings.loops.min_gap_keyframes, cull.repeated_visits,
         cull.repeated_share, settings.loops.alone_inliers, spare,
     )  # fmt: skip
+    while (alone := _left_alone(tracks.keyframes, track, spare, settings.loops.alone_inliers)).any():
+        spare |= alone
     return spare
+
+
+def _left_alone(
+    keyframes: NDArray[np.int64], track: NDArray[np.int64], spare: NDArray[np.bool_], least: int
+) -> NDArray[np.bool_]:
+    """(K,) keyframes next to spare ones that share fewer tracks than `least` with those that are not."""
+    used = ~spare[keyframes]
+    shared = used & (np.bincount(track[used], minlength=len(track))[track] > 1)
+    beside = np.zeros(len(spare), bool)
+    beside[1:] = spare[:-1]
+    beside[1:-1] |= spare[2:]
+    return np.asarray(~spare & beside & (np.bincount(keyframes[shared], minlength=len(spare)) < least))
 
 
 def without_spare(state: SurveyState, spare: NDArray[np.bool_]) -> SurveyState:

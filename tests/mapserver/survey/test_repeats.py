@@ -83,6 +83,19 @@ def test_a_keyframe_that_sees_more_than_the_others_is_not_spare() -> None:
     assert spare[148:].all()  # these two see nothing of their own
 
 
+def test_blind_keyframes_among_spare_ones_are_spare_too() -> None:
+    """In the fourth lap 95 to 97 see nothing, and nobody else does where no keyframe is spare: in the first lap they stay."""
+    whole = drive(4, 30)
+    members = [g.tolist() for g in np.split(whole.keyframes, whole.starts[1:])]
+    dark = {3, 4, 5, 95, 96, 97}
+    spare = spare_keyframes(
+        tracks_seen_by([seen for m in members if (seen := [k for k in m if k not in dark])]), keyframes([0] * 120),
+        SurveySettings(),
+    )  # fmt: skip
+    assert spare[95:98].all()
+    assert not spare[:90].any()
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_spare_keyframes_are_those_of_a_plain_twin(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -108,7 +121,17 @@ def spare_by_hand(who: list[list[int]], octaves: list[int], settings: SurveySett
             breaks = np.cumsum(np.diff(others, prepend=others[0]) > gap) if others else []
             repeated += len(list(groupby(breaks))) >= settings.cull.repeated_visits
         gone[k] = repeated >= max(settings.cull.repeated_share * len(own), settings.loops.alone_inliers)
-    return gone
+    while True:
+        left = [[m for m in members if not gone[m]] for members in who]
+        tied = [sum(k in members and len(members) > 1 for members in left) for k in range(len(gone))]
+        alone = [
+            k
+            for k in range(1, len(gone))
+            if not gone[k] and gone[k - 1 : k + 2].any() and tied[k] < settings.loops.alone_inliers
+        ]
+        if not alone:
+            return gone
+        gone[alone] = True
 
 
 def test_held_points_stay_and_keyframes_find_their_places_among_them() -> None:
