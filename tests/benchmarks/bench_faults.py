@@ -37,8 +37,8 @@ WITHIN_S, RECOVERY_S, RECOVERY_M = 1.0, 5.0, 20.0
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a fault went: seconds until an expected status with the cause named, None for never; until tracking after its end, and
-    the way driven meanwhile."""
+    """How a fault went: seconds from its first frame until an expected status with the cause named, None for never; until tracking
+    after its end, and the way driven meanwhile."""
 
     fault: str
     said_s: float | None
@@ -73,10 +73,11 @@ def outcome(fault: str, result: ReplayResult) -> Outcome:
     statuses, cause = EXPECTED[fault]
     begin_s, end_s = window_s(fault, result)
     times_s = [(frame.stamp_ns - result.frames[0].stamp_ns) * 1e-9 for frame in result.frames]
+    told_s = next(t for t in times_s if t >= begin_s)  # without frames there is nothing to estimate
     said = [
-        t - begin_s
+        t - told_s
         for t, e in zip(times_s, result.estimates, strict=True)
-        if t >= begin_s and e.status in statuses and (not cause or e.cause == cause)
+        if t >= told_s and e.status in statuses and (not cause or e.cause == cause)
     ]
     good = [
         k
