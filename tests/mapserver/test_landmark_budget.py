@@ -86,19 +86,24 @@ def test_tiles_hold_what_was_chosen() -> None:
     assert sum(len(tile.place_ids) for tile in tiles) == 20
 
 
-def test_a_lonely_view_is_served_before_crowded_ones_get_more() -> None:
+def with_a_lonely_view(own: np.ndarray) -> SurveyMap:
+    """Keyframe 9 of ten sees some of 400 landmarks that nobody else sees, and nothing else."""
     survey = random_survey(np.random.default_rng(2), keyframes=10, landmarks=400)
-    # Keyframe 9 sees 25 landmarks that nobody else sees.
-    own = np.arange(375, 400)
     other = ~np.isin(survey.obs_landmark, own) & (survey.obs_keyframe != 9)
-    survey = replace(
+    count = len(own)
+    return replace(
         survey,
-        obs_keyframe=np.append(survey.obs_keyframe[other], np.full(25, 9)).astype(np.int32),
+        obs_keyframe=np.append(survey.obs_keyframe[other], np.full(count, 9)).astype(np.int32),
         obs_landmark=np.append(survey.obs_landmark[other], own).astype(np.int32),
-        obs_pixels=np.concatenate([survey.obs_pixels[other], survey.obs_pixels[:25]]),
-        obs_octave=np.append(survey.obs_octave[other], np.zeros(25, np.int8)),
-        obs_sigma_px=np.append(survey.obs_sigma_px[other], np.ones(25)),
+        obs_pixels=np.concatenate([survey.obs_pixels[other], survey.obs_pixels[:count]]),
+        obs_octave=np.append(survey.obs_octave[other], np.zeros(count, np.int8)),
+        obs_sigma_px=np.append(survey.obs_sigma_px[other], np.ones(count)),
     )
+
+
+def test_a_lonely_view_is_served_before_crowded_ones_get_more() -> None:
+    own = np.arange(375, 400)
+    survey = with_a_lonely_view(own)
     chosen = choose_landmarks(survey, exactly(120), 16.0)
     # All others are seen several times: by how often they are seen alone, none of these would be kept.
     assert np.bincount(survey.obs_landmark)[np.isin(np.arange(400), own)].max() == 1
@@ -107,17 +112,7 @@ def test_a_lonely_view_is_served_before_crowded_ones_get_more() -> None:
 
 def test_a_view_at_the_end_of_a_drive_keeps_what_it_needs() -> None:
     """Its own landmarks are seen from nowhere else, so that any other one helps many views at once."""
-    survey = random_survey(np.random.default_rng(2), keyframes=10, landmarks=400)
-    own = np.arange(300, 400)
-    other = ~np.isin(survey.obs_landmark, own) & (survey.obs_keyframe != 9)
-    survey = replace(
-        survey,
-        obs_keyframe=np.append(survey.obs_keyframe[other], np.full(100, 9)).astype(np.int32),
-        obs_landmark=np.append(survey.obs_landmark[other], own).astype(np.int32),
-        obs_pixels=np.concatenate([survey.obs_pixels[other], survey.obs_pixels[:100]]),
-        obs_octave=np.append(survey.obs_octave[other], np.zeros(100, np.int8)),
-        obs_sigma_px=np.append(survey.obs_sigma_px[other], np.ones(100)),
-    )
+    survey = with_a_lonely_view(np.arange(300, 400))
     served = choose_landmarks(survey, msgspec.structs.replace(exactly(160), view_landmarks=40), 16.0)
     unserved = choose_landmarks(survey, msgspec.structs.replace(exactly(160), view_landmarks=0), 16.0)
     assert served.sum() == unserved.sum() == 160
