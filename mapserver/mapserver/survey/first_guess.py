@@ -24,7 +24,8 @@ class FirstGuess:
     """Odometry of F frames and K keyframes.
 
     odom_from_body (F, 4, 4), covariances (F, 6, 6) in odom axes, rotation first; tracked (F,) false where nothing tied the frame
-    to the ones before; inertial: whether gravity was found; scale_known: whether metres are metres. Of one camera's frames only
+    to the ones before; inertial: whether gravity was found; scale_known: whether metres are metres; has_wheels: whether wheels were
+    listened to. Of one camera's frames only
     those tracked belong together, and only they give keyframes.
     """
 
@@ -35,6 +36,7 @@ class FirstGuess:
     keyframes: list[Keyframe]
     inertial: bool
     scale_known: bool = True
+    has_wheels: bool = False
 
 
 def run_odometry(
@@ -83,6 +85,7 @@ def run_odometry(
         keyframes,
         inertial,
         bool(estimates) and estimates[-1].scale_known,
+        inertial and len(wheel) > 0 and settings.odometry.filter.use_wheels,
     )
     return guess if rectifier.camera.baseline_m > 0 else connected_part(guess, rectifier.body_from_cam)
 

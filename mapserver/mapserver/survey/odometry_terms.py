@@ -30,7 +30,8 @@ def odometry_terms(guess: FirstGuess, map_from_body: Array) -> list[RelativeTerm
 def terms_in_the_dark(guess: FirstGuess, state: SurveyState) -> list[RelativeTerm]:
     """Odometry from and to keyframes that see next to nothing.
 
-    It knows from the wheels what the inertial terms do not. Where pictures speak, they say it better.
+    It knows from the wheels what the inertial terms do not; without wheels it knows nothing that those do not say better, and where
+    pictures speak, they do.
     """
     seen = np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns))
     numbers = [k.frame_index for k in guess.keyframes]

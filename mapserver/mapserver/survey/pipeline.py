@@ -86,7 +86,7 @@ def survey_from(
     state.landmarks = build_landmarks(
         keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings, worker
     )
-    if state.motion.inertial:
+    if guess.has_wheels:
         state.motion = replace(state.motion, relative=terms_in_the_dark(guess, state))
     if len(state.landmarks.points_map) < _MIN_LANDMARKS:
         raise SurveyError(
