@@ -25,8 +25,7 @@ class FirstGuess:
 
     odom_from_body (F, 4, 4), covariances (F, 6, 6) in odom axes, rotation first; tracked (F,) false where nothing tied the frame
     to the ones before; inertial: whether gravity was found; scale_known: whether metres are metres; has_wheels: whether wheels were
-    listened to. Of one camera's frames only
-    those tracked belong together, and only they give keyframes.
+    listened to. Of one camera's frames only those tracked belong together, and only they give keyframes.
     """
 
     estimates: list[OdometryEstimate]

@@ -33,6 +33,8 @@ def terms_in_the_dark(guess: FirstGuess, state: SurveyState) -> list[RelativeTer
     It knows from the wheels what the inertial terms do not; without wheels it knows nothing that those do not say better, and where
     pictures speak, they do.
     """
+    if not guess.has_wheels:
+        return []
     seen = np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns))
     numbers = [k.frame_index for k in guess.keyframes]
     terms = []

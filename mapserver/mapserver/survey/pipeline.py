@@ -86,7 +86,7 @@ def survey_from(
     state.landmarks = build_landmarks(
         keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings, worker
     )
-    if guess.has_wheels:
+    if guess.inertial:
         state.motion = replace(state.motion, relative=terms_in_the_dark(guess, state))
     if len(state.landmarks.points_map) < _MIN_LANDMARKS:
         raise SurveyError(
@@ -101,13 +101,29 @@ def survey_from(
         adjust(state, settings, rounds=2)
     guess = _with_depths(guess, state, depths)
     loops = _close_loops(guess, state, matched, vocabulary, settings, zones, progress, worker)
-    turn, spare = NO_TURN, np.zeros(len(keyframes), bool)
+    guess, turn = _adjust_globally(guess, state, finder, depths, settings, progress, worker)
+    progress("global adjustment", 2, 2)
+    frames_of = np.array([k.frame_index for k in guess.keyframes], np.int64)
+    parts = find_parts(seen_by(state), SigmaBetween(guess.covariances[frames_of]), settings.join_sigma_m)
+    state, guess, loops = only_kept(state, guess, loops, parts.kept)
+    survey_map, culled = summarise(state, guess, settings)
+    between = beside(len(survey_map.trajectory), frames_of, parts.kept)
+    survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
+    return Survey(survey_map, vocabulary, loops, guess, state, culled, turn, [*parts.parts, *parts.stray])
+
+
+def _adjust_globally(
+    guess: FirstGuess, state: SurveyState, finder: PairFinder, depths: ViewDepths | None, settings: SurveySettings,
+    progress: Progress, worker: Worker,
+) -> tuple[FirstGuess, PairTurn]:  # fmt: skip
+    """Matches all views where the loops put them and adjusts them together, twice: the first result shows how the pair is turned."""
+    turn, spare = NO_TURN, np.zeros(len(guess.keyframes), bool)
     for round_number in range(2):
         progress("global adjustment", round_number, 2)
         if depths is not None:
             guess = _with_depths(guess, state, depths)
-            keyframes = guess.keyframes
-            finder = PairFinder(keyframes, state.camera, rectifier.body_from_cam, settings, worker)
+            finder = PairFinder(guess.keyframes, state.camera, state.body_from_cam, settings, worker)
+        keyframes = guess.keyframes
         if round_number == 0 or depths is not None:
             tracks = tracks_of(_match_all(state, finder, settings, progress))
             spare = spare_keyframes(tracks, keyframes, settings)
@@ -123,14 +139,7 @@ def survey_from(
         adjust_visits(state, settings, spare, rounds=3 if round_number == 0 or depths is not None else 2)
         if round_number == 0:
             turn = estimate_turn(without_spare(state, spare), settings)
-    progress("global adjustment", 2, 2)
-    frames_of = np.array([k.frame_index for k in keyframes], np.int64)
-    parts = find_parts(seen_by(state), SigmaBetween(guess.covariances[frames_of]), settings.join_sigma_m)
-    state, guess, loops = only_kept(state, guess, loops, parts.kept)
-    survey_map, culled = summarise(state, guess, settings)
-    between = beside(len(survey_map.trajectory), frames_of, parts.kept)
-    survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
-    return Survey(survey_map, vocabulary, loops, guess, state, culled, turn, [*parts.parts, *parts.stray])
+    return guess, turn
 
 
 def _with_depths(guess: FirstGuess, state: SurveyState, depths: ViewDepths | None) -> FirstGuess:

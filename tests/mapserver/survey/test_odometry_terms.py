@@ -1,5 +1,6 @@
 """What odometry says of keyframes: through darkness, and where it began anew."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,8 +26,9 @@ def test_only_what_touches_the_dark_hangs_on_odometry_as_odometry_measured_it() 
     odom_from_body = se3_exp(np.array([0.3, 0.1, -0.2, 4.0, 2.0, 1.0])) @ truth
     keyframes = [SimpleNamespace(frame_index=k) for k in range(8)]
     guess = FirstGuess(
-        [], odom_from_body, np.arange(8)[:, None, None] * 1e-4 * np.eye(6), np.ones(8, bool), keyframes, inertial=True
-    )
+        [], odom_from_body, np.arange(8)[:, None, None] * 1e-4 * np.eye(6), np.ones(8, bool), keyframes, inertial=True,
+        has_wheels=True,
+    )  # fmt: skip
     state.map_from_body[3:5, 0, 3] += 7.0  # where an adjustment may have put them says nothing
     terms = terms_in_the_dark(guess, state)
     assert [(t.i, t.j) for t in terms] == [(2, 3), (3, 4), (4, 5)]
@@ -35,6 +37,8 @@ def test_only_what_touches_the_dark_hangs_on_odometry_as_odometry_measured_it() 
         sigmas_m = np.sqrt(np.diag(np.linalg.inv(term.information)))[3:]
         assert (sigmas_m > 0.01).all()
         assert (sigmas_m < 0.05).all()
+    # Without wheels the odometry of sparse pictures knows less than it says, and nothing that the IMU does not.
+    assert not terms_in_the_dark(replace(guess, has_wheels=False), state)
 
 
 def test_beginning_anew_does_not_join_what_nothing_joins() -> None:
