@@ -25,14 +25,7 @@ def matmul(a: Array, b: Array) -> Array:
 @kernel
 def matmul_nt(a: Array, b: Array) -> Array:
     """(n, m) product of (n, k) and the transpose of (m, k)."""
-    out = np.empty((a.shape[0], b.shape[0]))
-    for i in range(a.shape[0]):
-        for j in range(b.shape[0]):
-            total = 0.0
-            for k in range(a.shape[1]):
-                total += a[i, k] * b[j, k]
-            out[i, j] = total
-    return out
+    return matmul(a, b.T.copy())  # whole rows at once: a sum along a row waits for each of its additions
 
 
 @kernel

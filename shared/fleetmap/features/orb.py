@@ -2,6 +2,7 @@
 
 from collections.abc import Generator
 from dataclasses import dataclass
+from itertools import repeat
 from typing import cast
 
 import cv2
@@ -149,7 +150,6 @@ def _detect_level(image: Image, level: int, quota: int, settings: OrbSettings) -
     nothing = np.zeros((0, 2), np.float32)
     chosen = candidates[select_spread(candidates, order, nothing, settings.min_distance_px, quota, width, height)]
     angles = centroid_angles_deg(scaled, chosen, _PATCH_RADIUS)
-    return [
-        cv2.KeyPoint(float(x) * scale, float(y) * scale, 31.0 * scale, float(angle), 1.0, level)
-        for (x, y), angle in zip(chosen, angles, strict=True)
-    ]
+    columns, rows = (scale * chosen.astype(np.float64).T).tolist()
+    sizes, responses = repeat(31.0 * scale), repeat(1.0)
+    return list(map(cv2.KeyPoint, columns, rows, sizes, angles.tolist(), responses, repeat(level)))

@@ -41,10 +41,6 @@ class NavState:
         """(4, 4)."""
         return se3(self.rotation, self.position_m)
 
-    def copy(self) -> "NavState":
-        """One that shares nothing."""
-        return NavState(**{name: value.copy() for name, value in vars(self).items()})
-
 
 class InvariantFilter:
     """Keeps the current state and a window of past body transforms (clones) with their joint covariance.
@@ -104,31 +100,16 @@ class InvariantFilter:
         noise weighs the prediction; real_noise, where it differs, goes into the budget.
         """
         steps_s, gyro, accel = imu_intervals(imu, start_ns, end_ns)
-        _, real_process = self._integrate(self.state.copy(), steps_s, gyro, accel, real_noise or noise)
-        phi, process = self._integrate(self.state, steps_s, gyro, accel, noise)
-        self._transition(phi, process, real_process)
-        self._forget_pair(max(end_ns - start_ns, 0) * 1e-9)
-        return gyro[-1] - self.state.gyro_bias_radps if len(gyro) else np.zeros(3)
-
-    def _integrate(
-        self, s: NavState, steps_s: Array, gyro: Array, accel: Array, noise: ImuNoise
-    ) -> tuple[Array, Array]:
-        """Moves `s` in place; returns transition and process noise, (15, 15) each."""
-        phi, process = np.eye(_NAV), np.zeros((_NAV, _NAV))
-        densities = np.array(
-            [
-                noise.gyro_noise_radps_rthz,
-                noise.accel_noise_mps2_rthz,
-                noise.gyro_walk_radps2_rthz,
-                noise.accel_walk_mps3_rthz,
-            ]
-        )
+        phi, processes = np.eye(_NAV), np.zeros((2, _NAV, _NAV))
         if len(steps_s):
+            s = self.state
             filter_kernels.propagate(
                 s.rotation, s.velocity_mps, s.position_m, s.gyro_bias_radps, s.accel_bias_mps2, _GRAVITY,
-                steps_s, gyro, accel, densities, phi, process,
+                steps_s, gyro, accel, np.array([_densities(noise), _densities(real_noise or noise)]), phi, processes,
             )  # fmt: skip
-        return phi, process
+        self._transition(phi, *processes)
+        self._forget_pair(max(end_ns - start_ns, 0) * 1e-9)
+        return gyro[-1] - self.state.gyro_bias_radps if len(gyro) else np.zeros(3)
 
     def displace(
         self, body_from_next: Array, rotation_sigma_rad: float, translation_sigma_m: float, duration_s: float = 0.0,
@@ -398,6 +379,12 @@ class InvariantFilter:
         s.accel_bias_mps2 = s.accel_bias_mps2 + error[12:15]
         self.imu_minus_cam_s += float(error[_OFFSET])
         filter_kernels.turn_clones(self._rotations, self._positions, error[_CLONES:])
+
+
+def _densities(noise: ImuNoise) -> list[float]:
+    return [
+        noise.gyro_noise_radps_rthz, noise.accel_noise_mps2_rthz, noise.gyro_walk_radps2_rthz, noise.accel_walk_mps3_rthz
+    ]  # fmt: skip
 
 
 def _grown(covariance: Array, jacobian: Array) -> Array:

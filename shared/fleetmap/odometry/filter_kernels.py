@@ -35,16 +35,16 @@ def _rotate(rotation: Array, vector: Array) -> Array:
 @kernel
 def propagate(
     rotation: Array, velocity: Array, position: Array, gyro_bias: Array, accel_bias: Array, gravity: Array,
-    steps_s: Array, gyro: Array, accel: Array, noise: Array, state_to_state: Array, process: Array,
+    steps_s: Array, gyro: Array, accel: Array, noises: Array, state_to_state: Array, processes: Array,
 ) -> None:  # fmt: skip
     """Moves the state (in place) through N intervals of constant rate and specific force.
 
-    steps_s (N,), gyro and accel (N, 3) at each interval's middle. noise (4,): densities of gyro, accel, gyro walk,
-    accel walk. state_to_state (15, 15) and process (15, 15) receive the accumulated error transition and noise, order r
-    nu rho bg ba.
+    steps_s (N,), gyro and accel (N, 3) at each interval's middle. noises (D, 4): densities of gyro, accel, gyro walk,
+    accel walk, as so many may judge them. state_to_state (15, 15) and processes (D, 15, 15) receive the accumulated error
+    transition and, for each of the judgements, the noise, order r nu rho bg ba.
     """
     phi = np.eye(15)
-    q = np.zeros((15, 15))
+    processes[:, :, :] = 0.0
     for n in range(len(steps_s)):
         dt = steps_s[n]
         rate = gyro[n] - gyro_bias
@@ -67,22 +67,28 @@ def propagate(
         shape = np.zeros((15, 6))
         shape[0:3, 0:3], shape[3:6, 0:3], shape[6:9, 0:3] = middle, lever_v, lever_p
         shape[3:6, 3:6] = middle
-        diffusion = np.zeros((15, 15))
-        for k in range(6):
-            density = noise[0] if k < 3 else noise[1]
-            for a in range(9):
-                for b in range(9):
-                    diffusion[a, b] += shape[a, k] * shape[b, k] * density * density * dt
-        for a in range(3):
-            diffusion[9 + a, 9 + a] = noise[2] * noise[2] * dt
-            diffusion[12 + a, 12 + a] = noise[3] * noise[3] * dt
         phi = matmul(step, phi)
-        q = matmul_nt(matmul(step, q), step) + diffusion
+        for d in range(len(noises)):
+            processes[d] = matmul_nt(matmul(step, processes[d]), step) + _diffusion(shape, noises[d], dt)
         position += velocity * dt + 0.5 * dt * dt * acceleration
         velocity += acceleration * dt
         rotation[:, :] = matmul(rotation, exp_so3(dt * rate))
     state_to_state[:, :] = phi
-    process[:, :] = q
+
+
+@kernel
+def _diffusion(shape: Array, noise: Array, duration_s: float) -> Array:
+    """(15, 15) noise that one interval adds; shape (9, 6): how gyro and accelerometer enter rotation, velocity, position."""
+    diffusion = np.zeros((15, 15))
+    for k in range(6):
+        density = noise[0] if k < 3 else noise[1]
+        for a in range(9):
+            for b in range(9):
+                diffusion[a, b] += shape[a, k] * shape[b, k] * density * density * duration_s
+    for a in range(3):
+        diffusion[9 + a, 9 + a] = noise[2] * noise[2] * duration_s
+        diffusion[12 + a, 12 + a] = noise[3] * noise[3] * duration_s
+    return diffusion
 
 
 @kernel

@@ -12,7 +12,7 @@ class TrackerSettings(Section, frozen=True):
 
     max_points: int = 180
     min_distance_px: float = 22.0
-    window_px: int = 15
+    window_px: Annotated[int, Meta(ge=3, le=15)] = 15
     pyramid_levels: int = 3
     back_check_px: float = 0.5
     max_gap_s: float = 0.35

@@ -3,21 +3,19 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import orb, patch_align, stereo
+from fleetmap.features import flow, orb, patch_align, stereo
 from fleetmap.features.corners import spread_corners
 from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, transform_points
+from fleetmap.odometry import tracker_kernels
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.pose_solver import Resection, ransac_resection, refine_resection, resection_with_rotation
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 
-# The way back begins at its end: steps that still move it by more than the check allows show soon.
 _LEVELS_WHEN_SURE, _HELD_WHEN_SURE = 1, 0.6
-_BACK_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 8, 0.03)
 Ids = NDArray[np.int64]
 _FLOW_ITERATIONS = (
     200  # finds a motion that a third of the points share; with fewer the flow has failed, and a live robot must go on
@@ -90,6 +88,9 @@ class Tracker:
         self._stereo = stereo_settings or stereo.StereoSettings()
         self._orb = orb.OrbSettings(count=settings.match_features)
         self._previous: RectifiedFrame | None = None
+        nothing = flow.Pyramid(np.zeros((0, 0), np.uint8))
+        self._pyramids = [nothing, nothing]  # of the previous frame and of this one
+        self._lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.focal_px * camera.baseline_m])
         self._points = _Points(np.zeros(0, np.int64), np.zeros((0, 3)))
         self._next_id = 0
         self._frame_index = -1
@@ -108,6 +109,7 @@ class Tracker:
         earlier: tuple[Earlier, ...] = ()
         share, far = 1.0, False
         self._frame_index += 1
+        self._pyramids[1] = flow.Pyramid(frame.left)
         if self._previous is not None:
             far = (frame.stamp_ns - self._previous.stamp_ns) * 1e-9 > self._settings.max_gap_s
             if far:
@@ -123,6 +125,7 @@ class Tracker:
         self._renew_disparities(frame)
         self._add_corners(frame)
         self._previous = frame
+        self._pyramids[0] = self._pyramids[1]
         return Tracked(self._points.ids.copy(), self._points.pixels.copy(), earlier, motion, share, far, covariance)
 
     def _points_cam(self, pixels: Array) -> Array:
@@ -132,41 +135,34 @@ class Tracker:
 
     def _predict(self, points_cam: Array, pixels: Array, cam_from_previous: Array) -> Array:
         """Where the previous points should appear; those without depth move as if far away."""
-        rays = np.column_stack(
-            [(pixels[:, :2] - [self._camera.cx_px, self._camera.cy_px]) / self._camera.focal_px, np.ones(len(pixels))]
-        )
-        turned = rays @ cam_from_previous[:3, :3].T
-        known = np.isfinite(points_cam).all(axis=1)
-        turned[known] = transform_points(cam_from_previous, points_cam[known])
-        predicted = self._camera.pixel_from_point(turned)[:, :2]
-        lost = ~np.isfinite(predicted).all(axis=1)
-        predicted[lost] = pixels[lost, :2]
+        predicted = np.empty((len(pixels), 2))
+        tracker_kernels.predict(points_cam, pixels, np.ascontiguousarray(cam_from_previous), self._lens, predicted)
         return predicted
 
     def _follow(self, frame: RectifiedFrame, cam_from_previous: Array, sure: bool) -> tuple[Resection | None, float]:
         """sure: the motion is a prediction, not a guess."""
-        assert self._previous is not None
         if not len(self._points.ids):
             return None, 0.0
-        points_cam = self._points_cam(self._points.pixels)
-        flowed, kept = self._flow(frame, self._predict(points_cam, self._points.pixels, cam_from_previous), sure)
+        pixels, points_cam = self._points.pixels, self._points_cam(self._points.pixels)
+        flowed, kept = self._flow(frame, self._predict(points_cam, pixels, cam_from_previous), sure)
         resection = self._motion(points_cam, flowed, kept, cam_from_previous)
         before = int(kept.sum())
+        carried = np.empty((len(pixels), 3))  # the old disparity is the prior of the new one
         if resection is not None:
-            known = np.isfinite(points_cam).all(axis=1)
-            predicted = self._predict(points_cam, self._points.pixels, resection.cam_from_source)
-            off = np.linalg.norm(predicted - flowed, axis=1)
-            kept &= ~known | (off < self._settings.ransac_px)
-        share = float(kept.sum()) / max(before, 1)
-        self._points = _Points(self._points.ids[kept], np.column_stack([flowed, self._points.pixels[:, 2]])[kept])
-        # the old disparity is carried as the prior of the new one
-        if resection is not None:
-            moved = transform_points(resection.cam_from_source, points_cam[kept])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                prior = self._camera.focal_px * self._camera.baseline_m / moved[:, 2]
-            self._points.pixels[:, 2] = self._points.pixels[:, 0] - np.where(prior > 0, prior, np.nan)
+            tracker_kernels.carry(
+                points_cam,
+                pixels,
+                flowed,
+                resection.cam_from_source,
+                self._lens,
+                self._settings.ransac_px,
+                kept,
+                carried,
+            )
         else:
-            self._points.pixels[:, 2] = np.nan
+            carried[:, :2], carried[:, 2] = flowed, np.nan
+        share = float(kept.sum()) / max(before, 1)
+        self._points = _Points(self._points.ids[kept], carried[kept])
         return resection, share
 
     def _flow(self, frame: RectifiedFrame, predicted: Array, sure: bool) -> tuple[Array, NDArray[np.bool_]]:
@@ -176,36 +172,18 @@ class Tracker:
         meet they lead away from a good start. Where too little holds that way, the prediction was none: again from all levels.
         """
         levels = self._settings.pyramid_levels
-        new, kept = self._flow_from(
-            frame, self._points.pixels, predicted, min(levels, _LEVELS_WHEN_SURE) if sure else levels
-        )
+        new, kept = self._flow_from(frame, predicted, min(levels, _LEVELS_WHEN_SURE) if sure else levels)
         if sure and kept.mean() < _HELD_WHEN_SURE:
-            return self._flow_from(frame, self._points.pixels, predicted, levels)
+            return self._flow_from(frame, predicted, levels)
         return new, kept
 
-    def _flow_from(
-        self, frame: RectifiedFrame, pixels: Array, predicted: Array, levels: int
-    ) -> tuple[Array, NDArray[np.bool_]]:
-        assert self._previous is not None
+    def _flow_from(self, frame: RectifiedFrame, predicted: Array, levels: int) -> tuple[Array, NDArray[np.bool_]]:
         s = self._settings
-        old = pixels[:, :2].astype(np.float32).reshape(-1, 1, 2)
-        start = predicted.astype(np.float32).reshape(-1, 1, 2)
-        window = (s.window_px, s.window_px)
-        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
-        new, found, _ = cv2.calcOpticalFlowPyrLK(
-            self._previous.left, frame.left, old, start.copy(), winSize=window, maxLevel=levels,
-            criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )  # fmt: skip
-        back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-            frame.left, self._previous.left, new, old.copy(), winSize=window, maxLevel=0, criteria=_BACK_CRITERIA,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )  # fmt: skip
-        new, back = new.reshape(-1, 2), back.reshape(-1, 2)
+        before, now, old = self._pyramids[0], self._pyramids[1], np.ascontiguousarray(self._points.pixels[:, :2])
+        new, found = flow.follow(before, now, old, predicted, window_px=s.window_px, levels=levels)
         height, width = frame.left.shape
-        kept = (found.ravel() > 0) & (found_back.ravel() > 0)
-        kept &= np.linalg.norm(back - old.reshape(-1, 2), axis=1) < s.back_check_px
-        kept &= (new[:, 0] > 6) & (new[:, 1] > 6) & (new[:, 0] < width - 7) & (new[:, 1] < height - 7)
-        return new.astype(np.float64), kept
+        found &= (new[:, 0] > 6) & (new[:, 1] > 6) & (new[:, 0] < width - 7) & (new[:, 1] < height - 7)
+        return new, flow.leads_back(before, now, old, new, found, window_px=s.window_px, within_px=s.back_check_px)
 
     def _motion(self, points_cam: Array, flowed: Array, kept: NDArray[np.bool_], guess: Array) -> Resection | None:
         """cam_from_previous from points with depth.

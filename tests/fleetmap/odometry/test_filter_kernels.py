@@ -21,12 +21,12 @@ DENSITIES = np.array(
 def moved(state: NavState, steps_s: Array, gyro: Array, accel: Array) -> tuple[NavState, Array, Array]:
     """The state after the intervals, transition and process noise."""
     s = NavState(**{name: value.copy() for name, value in vars(state).items()})
-    phi, process = np.empty((15, 15)), np.empty((15, 15))
+    phi, processes = np.empty((15, 15)), np.empty((1, 15, 15))
     filter_kernels.propagate(
         s.rotation, s.velocity_mps, s.position_m, s.gyro_bias_radps, s.accel_bias_mps2, GRAVITY, steps_s, gyro, accel,
-        DENSITIES, phi, process,
+        DENSITIES[None], phi, processes,
     )  # fmt: skip
-    return s, phi, process
+    return s, phi, processes[0]
 
 
 @pytest.fixture(scope="module")

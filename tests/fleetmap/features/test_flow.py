@@ -1,0 +1,96 @@
+"""Optical flow against OpenCV's and against shifts that are known."""
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fleetmap.features import flow
+from fleetmap.geometry import Array
+
+CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+
+
+def painted(shift_px: tuple[float, float] = (0.0, 0.0), seed: int = 3) -> NDArray[np.uint8]:
+    """A texture of waves, moved by so much: exact at any fraction of a pixel."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[0:120, 0:160].astype(float)
+    u, v = u - shift_px[0], v - shift_px[1]
+    grey = np.full(u.shape, 128.0)
+    for _ in range(40):
+        du, dv = rng.normal(0.0, 0.35, 2)
+        grey += 9.0 * np.cos(du * u + dv * v + rng.uniform(0, 6.28))
+    return np.asarray(np.clip(np.rint(grey), 0, 255), np.uint8)
+
+
+def grid(first_px: float, step_px: float) -> Array:
+    columns, rows = np.meshgrid(
+        np.arange(first_px, 160 - first_px, step_px), np.arange(first_px, 120 - first_px, step_px)
+    )
+    return np.column_stack([columns.ravel(), rows.ravel()])
+
+
+@pytest.mark.parametrize("levels", [0, 1, 3])
+def test_as_opencv_does(levels: int) -> None:
+    """Same places to a thousandth of a pixel wherever both find one, as far as a coarse level shows the way."""
+    before, now = painted(), painted((1.7, -1.2) if levels == 0 else (4.3, -3.6))
+    pixels = grid(20.3, 11.9)
+    reference, found_too, _ = cv2.calcOpticalFlowPyrLK(
+        before, now, pixels.astype(np.float32)[:, None], pixels.astype(np.float32)[:, None].copy(), winSize=(15, 15),
+        maxLevel=levels, criteria=CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip
+    places, found = flow.follow(flow.Pyramid(before), flow.Pyramid(now), pixels, pixels, window_px=15, levels=levels)
+    both = found & (found_too.ravel() > 0)
+    assert both.mean() > 0.95
+    off = np.linalg.norm(places - reference[:, 0], axis=1)[both]
+    assert np.percentile(off, 90) < 2e-3
+    right = np.linalg.norm(places - pixels - ((1.7, -1.2) if levels == 0 else (4.3, -3.6)), axis=1) < 0.05
+    assert right.mean() > 0.9
+
+
+@pytest.mark.parametrize(("window_px", "within_px"), [(5, 0.1), (9, 0.04), (15, 0.02)])
+def test_fractions_of_a_pixel(window_px: int, within_px: float) -> None:
+    pixels = grid(25.0, 9.0)
+    places, found = flow.follow(
+        flow.Pyramid(painted()), flow.Pyramid(painted((0.37, 0.61))), pixels, pixels, window_px=window_px, levels=0
+    )
+    assert found.mean() > 0.95
+    assert np.median(np.linalg.norm(places - pixels - (0.37, 0.61), axis=1)[found]) < within_px
+
+
+def test_at_the_edge_only_what_is_in_the_picture_counts() -> None:
+    pixels = np.array([[3.0, 60.0], [156.0, 60.0], [80.0, 2.5], [80.0, 117.0], [2.0, 2.0]])
+    places, found = flow.follow(
+        flow.Pyramid(painted()), flow.Pyramid(painted((0.3, -0.4))), pixels, pixels, window_px=15, levels=0
+    )
+    assert found.all()
+    np.testing.assert_allclose(places - pixels, np.tile((0.3, -0.4), (5, 1)), atol=0.15)
+
+
+def test_nothing_is_found_without_texture_or_outside() -> None:
+    plain, pixels = np.full((120, 160), 90, np.uint8), np.array([[80.0, 60.0], [20.0, 20.0]])
+    _, found = flow.follow(flow.Pyramid(plain), flow.Pyramid(painted()), pixels, pixels, window_px=15, levels=1)
+    assert not found.any()
+    far = np.array([[500.0, 60.0], [20.0, -90.0]])
+    _, found = flow.follow(flow.Pyramid(painted()), flow.Pyramid(painted()), pixels, far, window_px=15, levels=1)
+    assert not found.any()
+
+
+def test_what_went_wrong_does_not_lead_back() -> None:
+    """A place two pixels off shows what was two pixels off before, and that is where its way back ends."""
+    pyramids, pixels = (flow.Pyramid(painted()), flow.Pyramid(painted((2.0, 0.0)))), grid(30.0, 20.0)
+    places, found = flow.follow(*pyramids, pixels, pixels, window_px=15, levels=1)
+    wrong = np.arange(len(pixels)) % 3 == 0
+    places[wrong] += (0.0, 2.0)
+    held = flow.leads_back(*pyramids, pixels, places, found, window_px=15, within_px=0.5)
+    assert found.all()
+    np.testing.assert_array_equal(held, ~wrong)
+    nothing = np.zeros(len(pixels), bool)
+    assert not flow.leads_back(*pyramids, pixels, places, nothing, window_px=15, within_px=0.5).any()
+
+
+def test_a_pyramid_is_made_once() -> None:
+    pyramid = flow.Pyramid(painted())
+    assert pyramid.level(2) is pyramid.level(2)
+    assert pyramid.level(1).shape == (60, 80)
+    np.testing.assert_array_equal(pyramid.level(1), cv2.pyrDown(painted()))
