@@ -27,7 +27,7 @@ from locclient.runtime import Parts
 from locclient.server_talk import ServerTalk
 from locclient.spool import Spool
 from locclient.tile_cache import StoreFolder, TileCache
-from locclient.warm_up import warm_up
+from locclient.warm_up import settled_memory, warm_up
 
 _PATIENCE_S = 120.0  # in the middle of fetching a version; from the next part on it goes on where it was
 _log = logging.getLogger(__name__)
@@ -73,6 +73,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[Parts]:
             _log.warning("the spool was damaged; it lies in %s now, and a new one was begun", spool.set_aside)
         begun_s = time.monotonic()
         warm_up(calibration, rectifier, config.localizer)
+        stack.enter_context(settled_memory())
         _log.info("warm after %.1f s", time.monotonic() - begun_s)
         link, maps, first = _maps(config.run, bus, site, name)
         robot = Robot(calibration, rectifier, config.localizer, config.run.trial, time.thread_time)

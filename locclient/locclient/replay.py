@@ -23,6 +23,7 @@ from locclient.localizer import Localizer
 from locclient.robot_health import FixFigures
 from locclient.settings import LocalizerSettings
 from locclient.sources import ReplaySource
+from locclient.warm_up import settled_memory
 
 _HEALTH_EVERY_S, _POSE_EVERY_S = 1.0, 0.5
 TRUTH_FLAG = "frame_from_ground_truth"  # key of the configuration: the map lies in the frame of the recordings' truth
@@ -71,6 +72,7 @@ class ReplayResult:
         return Trajectory(stamps, np.array([e.map_from_body for e in kept]).reshape(-1, 4, 4))
 
 
+@settled_memory()
 def replay(
     source: ReplaySource, link: RobotLink, settings: LocalizerSettings, prior: PositionPrior | None, *, realtime: bool,
     progress: Callable[[int], None],

@@ -1,5 +1,8 @@
 """Makes the kernels ready before the first frame: a throwaway localizer drives past a painted wall and finds itself in a map of it."""
 
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import cv2
@@ -46,6 +49,18 @@ def warm_up(calibration: RigCalibration, rectifier: Rectifier, settings: Localiz
         frame = _view(wall, camera, number)
         found += localizer.handle_stereo(frame).fix is not None
     return found
+
+
+@contextmanager
+def settled_memory() -> Iterator[None]:
+    """While it lasts, the garbage collector leaves alone what lives now: libraries hold some hundred thousand objects that nobody
+    drops, and now and then a frame would have to wait until all of them were looked at."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def _wall(camera: StereoCamera) -> NDArray[np.uint8]:
