@@ -7,12 +7,12 @@ import numpy as np
 from fleetmap.calibration import ImuNoise
 from fleetmap.geometry import Array, rotation_between_vectors, skew, so3_exp, so3_log
 from fleetmap.inertial import Preintegrated, preintegrate
+from fleetmap.odometry import start_kernels
 from fleetmap.odometry.filter import GRAVITY_MPS2, NavState
 from fleetmap.odometry.settings import FilterSettings, StartSettings
 from fleetmap.samples import ImuSamples, Trajectory
 
 _MAX_LOOK_BACK_S = 20.0
-_PARTS = 10  # of a window whose means must agree; it has twice as many samples at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,13 +36,12 @@ def start_steady(
     if not len(imu):
         return None
     first_ns = max(int(imu.stamps_ns[0]), until_ns - int(_MAX_LOOK_BACK_S * 1e9))
-    end_ns = until_ns
-    while end_ns - window_ns >= first_ns:
-        window = imu.between(end_ns - window_ns, end_ns)
-        if len(window) >= 2 * _PARTS and is_steady(window, settings):
-            return _steady_state(window, end_ns, filter_settings)
-        end_ns -= window_ns // 4
-    return None
+    end_ns = start_kernels.latest_steady(
+        imu.stamps_ns, imu.gyro_radps, imu.accel_mps2, first_ns, until_ns, window_ns, _limits(settings)
+    )
+    if end_ns < first_ns:
+        return None
+    return _steady_state(imu.between(end_ns - window_ns, end_ns), end_ns, filter_settings)
 
 
 def is_steady(window: ImuSamples, settings: StartSettings) -> bool:
@@ -50,16 +49,16 @@ def is_steady(window: ImuSamples, settings: StartSettings) -> bool:
 
     Standing still and rolling at constant speed look alike here; gravity can be read in both, so the speed stays open.
     """
-    firsts = np.linspace(0, len(window), _PARTS, endpoint=False).astype(np.int64)
-    counts = np.diff(firsts, append=len(window))[:, None]
-    gyro = np.add.reduceat(window.gyro_radps, firsts, axis=0) / counts
-    accel = np.add.reduceat(window.accel_mps2, firsts, axis=0) / counts
-    return bool(
-        gyro.std(axis=0).max() < settings.steady_gyro_sigma_radps
-        and accel.std(axis=0).max() < settings.steady_accel_sigma_mps2
-        and np.linalg.norm(gyro.mean(axis=0)) < settings.steady_gyro_mean_radps
-        and abs(np.linalg.norm(accel.mean(axis=0)) - GRAVITY_MPS2) < settings.max_gravity_error_mps2
-    )
+    return start_kernels.is_steady(window.gyro_radps, window.accel_mps2, _limits(settings))
+
+
+def _limits(settings: StartSettings) -> Array:
+    return np.array(
+        [
+            settings.steady_gyro_sigma_radps, settings.steady_accel_sigma_mps2, settings.steady_gyro_mean_radps, GRAVITY_MPS2,
+            settings.max_gravity_error_mps2,
+        ]
+    )  # fmt: skip
 
 
 def _steady_state(window: ImuSamples, stamp_ns: int, settings: FilterSettings) -> Start:
