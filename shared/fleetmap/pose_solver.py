@@ -2,15 +2,15 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap import pose_solver_kernels
-from fleetmap.geometry import Array, se3
+from fleetmap import pose_search_kernels, pose_solver_kernels
+from fleetmap.geometry import Array, se3, transform_points
 from fleetmap.rectification import StereoCamera
 
 _WIDTH = 4.0  # of the robust weight, in sigmas
+_CONFIDENCE = 0.999  # that no camera has more votes than the one that was found
 GATE_SQUARED = 11.345  # 0.99 of chi-square with 3 degrees of freedom: u, v, disparity
 
 
@@ -90,20 +90,22 @@ def ransac_resection(
 ) -> Resection | None:
     """As `refine_resection` without a start: three-point RANSAC first, of so many iterations at most.
 
-    None below min_inliers. Source: Ke and Roumeliotis 2017 (AP3P).
+    None below min_inliers. Sources are named in the kernels.
     """
     if len(points_source) < max(min_inliers, 4):
         return None
-    cv2.setRNGSeed(seed)
-    found, rotvec, translation, inliers = cv2.solvePnPRansac(
-        np.ascontiguousarray(points_source, np.float64), np.ascontiguousarray(pixels[:, :2], np.float64),
-        camera.matrix, np.zeros(4),
-        iterationsCount=iterations, reprojectionError=threshold_px, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
-    )  # fmt: skip
-    if not found or inliers is None or len(inliers) < min_inliers:
+    points, measured = np.ascontiguousarray(points_source, np.float64), np.ascontiguousarray(pixels[:, :2], np.float64)
+    intrinsics = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.focal_px * camera.baseline_m])
+    rotation, translation = np.eye(3), np.zeros(3)
+    draws = np.random.default_rng(seed).random((iterations, 3))
+    votes = pose_search_kernels.search(
+        points, measured, intrinsics, threshold_px, draws, _CONFIDENCE, rotation, translation
+    )
+    if votes < min_inliers:
         return None
-    start = se3(np.asarray(cv2.Rodrigues(rotvec)[0], np.float64), np.asarray(translation, np.float64).ravel())
-    index = inliers.ravel()
+    start = se3(rotation, translation)
+    off = np.linalg.norm(camera.pixel_from_point(transform_points(start, points))[:, :2] - measured, axis=1)
+    index = np.flatnonzero(off < threshold_px)
     first = refine_resection(camera, points_source[index], pixels[index], sigmas_px[index], start)
     if first is None:
         return None
