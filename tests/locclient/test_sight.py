@@ -7,6 +7,7 @@ import pytest
 
 from fleetmap.rectification import RectifiedFrame
 from fleetmap.samples import Image
+from locclient import sight_kernels
 from locclient.sight import Cause, SightJudge, SightSettings
 
 Spoil = Callable[[Image, np.random.Generator], Image]
@@ -65,3 +66,14 @@ def test_something_before_the_cameras_is_told_by_its_depth() -> None:
     assert {judge.judge_depth(depth_m) for depth_m in (3.0, 4.0, 2.5, 5.0)} == {Cause.NONE}
     assert judge.judge_depth(0.8) is Cause.OCCLUDED
     assert judge.judge_depth(3.0) is Cause.NONE
+
+
+def test_sums_are_those_of_numpy() -> None:
+    seen = np.random.default_rng(7).integers(0, 256, (43, 77)).astype(np.uint8)
+    small = np.empty((6, 10), np.uint8)
+    total, squares, brights = sight_kernels.thin(seen, 8, 250, small)
+    thinned = seen[::8, ::8].astype(np.int64)
+    np.testing.assert_array_equal(small, thinned)
+    assert (total, squares, brights) == (thinned.sum(), (thinned**2).sum(), (thinned >= 250).sum())
+    steps = np.diff(seen[::8].astype(np.int64), axis=1)
+    assert sight_kernels.row_steps(seen, 8) == (steps.size, steps.sum(), (steps**2).sum())

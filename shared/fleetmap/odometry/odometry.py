@@ -17,7 +17,7 @@ from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter import InvariantFilter, NavState
 from fleetmap.odometry.imu_faults import joined, longest_gap_ns, without_spikes
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
-from fleetmap.odometry.standing import StillPictures
+from fleetmap.odometry.standing import StillPictures, middle
 from fleetmap.odometry.start import Start, is_steady, start_in_motion, start_steady
 from fleetmap.odometry.tracker import Tracked, Tracker
 from fleetmap.odometry.tracks import Observations
@@ -25,6 +25,7 @@ from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import ImuSamples, Trajectory, WheelSample
 
 _IMU_MEMORY_S = 25.0
+_IMU_MEMORY_INERTIAL_S = 4.0  # with a state to go on from no start is looked for in it
 _WHEEL_REACH_NS = 30_000_000  # a sample serves a frame within half the period of slow wheel odometry
 _GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of freedom
 _ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
@@ -135,8 +136,9 @@ class Odometry:
         if self._pending:
             self._imu = without_spikes(self._imu, joined(self._pending))
             self._pending.clear()
-        oldest = min(stamp_ns, self._state_ns or stamp_ns) - int(_IMU_MEMORY_S * 1e9)
-        if len(self._imu) and self._imu.stamps_ns[0] < oldest - int(10e9):
+        memory_s = _IMU_MEMORY_INERTIAL_S if self._inertial else _IMU_MEMORY_S
+        oldest = min(stamp_ns, self._state_ns or stamp_ns) - int(memory_s * 1e9)
+        if len(self._imu) and self._imu.stamps_ns[0] < oldest - int(0.4e9 * memory_s):
             self._imu = self._imu.between(oldest, int(self._imu.stamps_ns[-1]) + 1)
 
     def _begin(self, stamp_ns: int) -> None:
@@ -388,7 +390,7 @@ class Odometry:
     def _depth_of(self, pixels: Array) -> float:
         disparities = pixels[:, 0] - pixels[:, 2]
         known = disparities[np.isfinite(disparities)]
-        return self._camera.focal_px * self._camera.baseline_m / float(np.median(known)) if len(known) else 5.0
+        return self._camera.focal_px * self._camera.baseline_m / middle(known) if len(known) else 5.0
 
     def _estimate(
         self, stamp_ns: int, tracked: Tracked, used: NDArray[np.int8], change: Array | None

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
+from fleetmap.odometry import tracker_kernels
 
 _MIN_POINTS = 10
 
@@ -35,8 +36,13 @@ class StillPictures:
 def is_picture_still(
     old_ids: NDArray[np.int64], old_pixels: Array, ids: NDArray[np.int64], pixels: Array, limit_px: float
 ) -> bool:
-    """Whether most of at least ten points seen in both pictures, pixels (N, 3), have stayed within the limit."""
-    _, before, now = np.intersect1d(old_ids, ids, assume_unique=True, return_indices=True)
-    if len(before) < _MIN_POINTS:
-        return False
-    return bool(np.median(np.linalg.norm(pixels[now, :2] - old_pixels[before, :2], axis=1)) < limit_px)
+    """Whether most of at least ten points seen in both pictures, pixels (N, 3), have stayed within the limit; ids ascend."""
+    ways_px = np.empty(len(ids))
+    count = tracker_kernels.ways_of_common(old_ids, old_pixels, ids, pixels, ways_px)
+    return count >= _MIN_POINTS and middle(ways_px[:count]) < limit_px
+
+
+def middle(values: Array) -> float:
+    """The median of some values, at a tenth of numpy's cost for so few."""
+    ordered = np.sort(values)
+    return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])

@@ -40,7 +40,7 @@ class Earlier:
 class Tracked:
     """What one frame saw.
 
-    ids (N,) and pixels (N, 3) u_left v u_right of the current frame. cam_from_previous: the motion measured since the
+    ids (N,), ascending, and pixels (N, 3) u_left v u_right of the current frame. cam_from_previous: the motion measured since the
     previous frame, None where too few points agree; cov_rot_trans (6, 6): of its left perturbation. After a gap
     (by_descriptors) `earlier` holds what was matched, best first.
     """

@@ -64,3 +64,21 @@ def carry(
         depth = _moved(cam_from_previous, x, y, z, True)[2]
         if depth > 0.0 and camera[3] > 0.0:
             carried[n, 2] = flowed[n, 0] - camera[3] / depth
+
+
+@kernel
+def ways_of_common(
+    old_ids: NDArray[np.int64], old_pixels: Array, ids: NDArray[np.int64], pixels: Array, ways_px: Array
+) -> int:
+    """Number of ids in both, ascending, lists; fills how far the pixels (N, 3) of each have moved so far in ways_px (N,)."""
+    count, k = 0, 0
+    for n in range(len(ids)):
+        while k < len(old_ids) and old_ids[k] < ids[n]:
+            k += 1
+        if k == len(old_ids):
+            break
+        if old_ids[k] == ids[n]:
+            u, v = pixels[n, 0] - old_pixels[k, 0], pixels[n, 1] - old_pixels[k, 1]
+            ways_px[count] = math.sqrt(u * u + v * v)
+            count += 1
+    return count
