@@ -95,7 +95,7 @@ def describe(image: Image, keypoints: list[cv2.KeyPoint], levels: int) -> Featur
     # OpenCV scales level pixels up from their corners; where they lie in the picture is told from their centres.
     middle = 0.5 * (SCALE_FACTOR ** octaves.astype(np.float64) - 1.0)
     return Features(
-        np.array([k.pt for k in kept], np.float64).reshape(-1, 2) + middle[:, None],
+        np.asarray(cv2.KeyPoint.convert(kept), np.float64).reshape(-1, 2) + middle[:, None],
         octaves,
         np.array([k.angle for k in kept], np.float32),
         np.asarray(descriptors, np.uint8),

@@ -153,11 +153,8 @@ class InvariantFilter:
     def remove_clone(self, clone_id: int) -> None:
         """Forgets a clone (marginalises it)."""
         index = self.clone_ids.index(clone_id)
-        keep = np.ones(len(self.covariance), bool)
-        keep[_CLONES + 6 * index : _CLONES + 6 * index + 6] = False
-        self.covariance = self.covariance[np.ix_(keep, keep)]
-        keep = np.concatenate([np.ones(_ALLOWED, bool), keep])
-        self.budget = self.budget[np.ix_(keep, keep)]
+        at = _CLONES + 6 * index
+        self.covariance, self.budget = _without(self.covariance, at), _without(self.budget, _ALLOWED + at)
         del self.clone_ids[index]
         self._rotations = np.delete(self._rotations, index, axis=0)
         self._positions = np.delete(self._positions, index, axis=0)
@@ -397,6 +394,15 @@ def _grown(covariance: Array, jacobian: Array) -> Array:
     grown[:size, size:] = cross.T
     grown[size:, size:] = cross @ jacobian.T
     return grown
+
+
+def _without(covariance: Array, at: int) -> Array:
+    """The covariance less the six errors that begin there."""
+    size = len(covariance) - 6
+    kept = np.empty((size, size))
+    kept[:at, :at], kept[:at, at:] = covariance[:at, :at], covariance[:at, at + 6 :]
+    kept[at:, :at], kept[at:, at:] = covariance[at + 6 :, :at], covariance[at + 6 :, at + 6 :]
+    return kept
 
 
 def _symmetric(covariance: Array) -> Array:
