@@ -7,6 +7,7 @@ import numpy as np
 from fleetmap.geometry import Array, se3, so3_exp, so3_log
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from locclient.settings import TrackSettings
+from locclient.telling_apart import Tally
 
 # Sigmas of one step: radians, metres, share of the way.
 _STANDING, _BEGUN_ANEW = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
@@ -38,6 +39,7 @@ class Anchor:
     misses: int = 0
     travelled_m: float = 0.0
     strangers: list["Anchor"] = field(default_factory=list)
+    tally: Tally = field(default_factory=Tally)
 
     @classmethod
     def at(cls, odometry: OdometryEstimate, map_from_body: Array, cov_rot_trans: Array) -> "Anchor":

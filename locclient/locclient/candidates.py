@@ -4,9 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fleetmap.geometry import Array, se3_inverse
 from locclient.anchors import Anchor, difference
-from locclient.relocalizer import Fix
+from locclient.relocalizer import Fix, Slices
 from locclient.settings import TrackSettings
+from locclient.telling_apart import evidence
+
+_PAIRS_AT_ONCE = 8  # comparisons in a slice of a look
 
 
 def begin_look(candidates: Sequence[Anchor], settings: TrackSettings) -> None:
@@ -16,17 +20,19 @@ def begin_look(candidates: Sequence[Anchor], settings: TrackSettings) -> None:
         candidate.fade(settings.evidence_kept_share)
 
 
-def vote(candidates: list[Anchor], fresh: Anchor, fix: Fix, settings: TrackSettings) -> None:
+def vote(candidates: list[Anchor], fresh: Anchor, fix: Fix, odom_from_body: Array, settings: TrackSettings) -> None:
     """The place of a fix, carried to the present: a vote for the candidate that is there, which takes it over, or a new candidate."""
     for candidate in candidates:
         if _is_same_place(fresh, candidate, settings):
             if candidate.misses:  # at most one vote a frame
                 candidate.support, candidate.misses = candidate.support + 1, 0
                 candidate.speak(fix.inliers, fix.hit_share)
+                _count(candidate, fresh, fix, odom_from_body)
             candidate.moved_to(fresh)
             return
     fresh.fade(0.0)
     fresh.speak(fix.inliers, fix.hit_share)
+    _count(fresh, fresh, fix, odom_from_body)
     candidates.append(fresh)
 
 
@@ -40,18 +46,49 @@ def ranked(candidates: Sequence[Anchor]) -> list[Anchor]:
     return sorted(candidates, key=lambda c: -c.evidence)
 
 
-def rivals(candidates: Sequence[Anchor], settings: TrackSettings) -> list[Anchor]:
+def rivals(candidates: Sequence[Anchor], settings: TrackSettings, best: Anchor | None = None) -> list[Anchor]:
     """Candidates besides the best for which nearly as much speaks, look by look since they were thought of: as many inliers,
     or as many of the landmarks that should be seen there. A place where the map is thin is no less likely than its twin."""
     if not candidates:
         return []
-    best, *others = ranked(candidates)
+    best = best or ranked(candidates)[0]
     return [
         c
-        for c in others
-        if c.inliers >= settings.rival_share * best.inliers
-        or (c.hits >= settings.rival_hit_share * best.hits and c.inliers >= settings.rival_least_share * best.inliers)
+        for c in candidates
+        if c is not best
+        and (
+            c.inliers >= settings.rival_share * best.inliers
+            or (
+                c.hits >= settings.rival_hit_share * best.hits
+                and c.inliers >= settings.rival_least_share * best.inliers
+            )
+        )
     ]
+
+
+def told_apart(candidates: Sequence[Anchor], settings: TrackSettings) -> Slices[Anchor | None]:
+    """The one that what stands there tells from every other that totals would name its rival; None while nothing does. In slices.
+
+    It need not be the one that totals rank first: a sign is little beside all that the places share.
+    """
+    if not rivals(candidates, settings):
+        return None
+    first, *others = ranked(candidates)
+    lead: list[float] = []
+    for number, other in enumerate(others):
+        if number and number % _PAIRS_AT_ONCE == 0:
+            yield
+        lead.append(evidence(first.tally, other.tally))
+    best, known = first, {id(o): e for o, e in zip(others, lead, strict=True)}
+    if lead and min(lead) <= -settings.telling_evidence:
+        best, known = others[int(np.argmin(lead))], {id(first): -min(lead)}
+    for number, other in enumerate(rivals(candidates, settings, best)):
+        if number and number % _PAIRS_AT_ONCE == 0:
+            yield
+        found = known[id(other)] if id(other) in known else evidence(best.tally, other.tally)
+        if found < settings.telling_evidence:
+            return None
+    return best
 
 
 def is_proven(candidate: Anchor, settings: TrackSettings) -> bool:
@@ -66,6 +103,12 @@ def is_unmistakable(fix: Fix, settings: TrackSettings) -> bool:
         and fix.share >= settings.strong_share
         and fix.twin_share < settings.strong_twin_share
     )
+
+
+def _count(candidate: Anchor, fresh: Anchor, fix: Fix, odom_from_body: Array) -> None:
+    if fix.witnessed is not None:
+        odom_from_map = odom_from_body @ se3_inverse(fresh.now_map_from_body)
+        candidate.tally.look(fix.map_from_cam, odom_from_map, fix.witnessed)
 
 
 def _is_same_place(fresh: Anchor, candidate: Anchor, settings: TrackSettings) -> bool:

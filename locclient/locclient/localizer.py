@@ -14,7 +14,7 @@ from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.anchors import Anchor, applied, difference, moved
-from locclient.candidates import begin_look, is_proven, is_unmistakable, ranked, rivals, still_held, vote
+from locclient.candidates import begin_look, is_proven, is_unmistakable, ranked, rivals, still_held, told_apart, vote
 from locclient.estimate import Estimate, Hypothesis, Status
 from locclient.map_view import MapView
 from locclient.relocalizer import Fix, Relocalizer, Seen, Slices
@@ -66,6 +66,7 @@ class Localizer:
         self._told: Anchor | None = None  # the place of a prior that is known in all directions
         self._anchor: Anchor | None = None  # the confirmed place
         self._candidates: list[Anchor] = []  # unconfirmed ones
+        self._told_apart: Anchor | None = None  # the one of them that none of the others can be
         self._given_up: Anchor | None = None  # what was said to be the place until fixes named another
         self._last_odom: Array | None = None
         self._last_ns: int | None = None
@@ -145,6 +146,8 @@ class Localizer:
         self._way_since_prior_m += float(np.linalg.norm(step[:3, 3]))
         for anchor in [*self._anchors(), *([self._moment] if self._moment else [])]:
             anchor.carry(self._odometry, odometry, step, self._settings.track)
+            if change is not None:
+                anchor.tally.carry(change)
         self._last_odom = odometry.odom_from_body
         if self._prior is not None and self._told is None and np.isfinite(self._prior.cov_rot_trans).all():
             map_from_body = self._prior.map_from_base @ self._base_from_body
@@ -204,7 +207,7 @@ class Localizer:
         seen = yield from relocalizer.look(frame)
         if self._anchor is None:
             fixes = yield from self._search(seen, relocalizer)
-            return self._weigh(fixes)
+            return (yield from self._weigh(fixes))
         map_from_body, covariance = self._anchor.then_map_from_body, self._anchor.then_cov
         map_from_cam = map_from_body @ self._body_from_cam
         near = relocalizer.near(seen, map_from_cam, self._at_camera(map_from_body, covariance))
@@ -307,25 +310,28 @@ class Localizer:
         self._anchor.strangers = still_held(strangers, settings)
         if max(c.support for c in self._anchor.strangers) >= settings.kidnap_fixes:
             self._given_up, self._candidates, self._anchor = self._anchor, self._anchor.strangers, None
+            self._told_apart = None
             self._prior = self._told = None  # whatever named that place before is as wrong
 
     # --- confirmation ----------------------------------------------------------------------------------------------------
 
-    def _weigh(self, fixes: list[Fix]) -> _Outcome:
-        """Every fix speaks for a candidate or begins one; confirmed is the one that is left with enough behind it."""
+    def _weigh(self, fixes: list[Fix]) -> Slices[_Outcome]:
+        """Every fix speaks for a candidate or begins one; confirmed is the one that is left, or told from all others, with enough
+        behind it."""
         settings = self._settings.track
         begin_look(self._candidates, settings)
         self._hear(fixes, self._candidates)
         self._candidates = still_held(self._candidates, settings)
+        self._told_apart = yield from told_apart(self._candidates, settings)
         if not fixes:
             return _Outcome(None, "nothing in the map agrees with this frame")
-        best, others = ranked(self._candidates)[0], rivals(self._candidates, settings)
+        (best, *_), others = self._standing()
         if others:
             return _Outcome(None, f"{len(others) + 1} places agree with what was seen")
         moved_m = None
         if self._is_confirmed(best, fixes):
             moved_m = self._moved_m(best)
-            self._anchor, self._candidates, self._given_up = best, [], None
+            self._anchor, self._candidates, self._given_up, self._told_apart = best, [], None, None
             self._prior = self._told = None
             self._ever_tracked = True
         assert self._moment is not None
@@ -339,11 +345,19 @@ class Localizer:
             return _Outcome(None, "the fix does not agree with those before", moved_m=moved_m)
         return _Outcome(own[0], moved_m=moved_m)
 
+    def _standing(self) -> tuple[list[Anchor], list[Anchor]]:
+        """The candidates, the likeliest first, and those of them that it may be as well."""
+        likely, best = ranked(self._candidates), self._told_apart
+        if not any(c is best for c in likely):  # it may have been dropped in a look that goes on
+            return likely, rivals(self._candidates, self._settings.track)
+        return sorted(likely, key=lambda c: c is not best), []
+
     def _hear(self, fixes: Sequence[Fix], candidates: list[Anchor]) -> None:
         """Every fix has its vote, at the present."""
-        assert self._moment is not None
+        assert self._moment is not None and self._last_odom is not None
         for fix in fixes:
-            vote(candidates, Anchor.behind(self._moment, *self._at_body(fix)), fix, self._settings.track)
+            fresh = Anchor.behind(self._moment, *self._at_body(fix))
+            vote(candidates, fresh, fix, self._last_odom, self._settings.track)
 
     def _is_confirmed(self, candidate: Anchor, fixes: list[Fix]) -> bool:
         """By a tight prior, by fixes and way enough, or by one fix so strong, and alone of all places that were tried, that no
@@ -381,7 +395,7 @@ class Localizer:
                 return replace(said, status=Status.AMBIGUOUS, cause=cause, hypotheses=doubts)
             now, covariance = self._anchor.now_map_from_body, self._published(self._anchor.now_cov)
             return replace(said, status=status, cause=cause, map_from_body=now, cov_rot_trans=covariance)
-        likely, others = ranked(self._candidates), rivals(self._candidates, self._settings.track)
+        likely, others = self._standing()
         status = Status.AMBIGUOUS if others else Status.LOST if self._ever_tracked else Status.INITIALISING
         said = replace(
             said, status=status, hypotheses=tuple(Hypothesis(c.now_map_from_body, c.support) for c in likely)

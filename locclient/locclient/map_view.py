@@ -11,6 +11,7 @@ from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile
 from fleetmap.rectification import StereoCamera
 from locclient import map_view_kernels
+from locclient.telling_apart import Expected
 
 Rows = NDArray[np.int64]
 _NEAREST_M = 0.2
@@ -89,19 +90,23 @@ class MapView:
         octaves = np.log(np.maximum(reaches_m[rows] / distances_m[:count], 0.5)) / np.log(SCALE_FACTOR)
         return rows, pixels, octaves
 
-    def witnessed(self, map_from_cam: Array, camera: StereoCamera) -> Rows:
+    def witnessed(self, map_from_cam: Array, camera: StereoCamera) -> tuple[Rows, bool]:
         """Rows of the landmarks in the picture of a camera there that the survey saw from next to it, looking the same way: what
-        racks hide is not among them. All that may be visible where the survey did not pass."""
+        racks hide is not among them. All that may be visible, and False, where the survey did not pass."""
         rows, _, _ = self.visible(map_from_cam, camera, 0.0, np.pi)
         apart_m = np.linalg.norm(self.map_from_cam[:, :3, 3] - map_from_cam[:3, 3], axis=1)
         axes_map = self.map_from_cam[:, :3, 2]
         places = np.flatnonzero((apart_m < _WITNESS_M) & (axes_map @ map_from_cam[:3, 2] > _WITNESS_COSINE))
         if not len(places):
-            return rows
+            return rows, False
         held = np.zeros(len(self), bool)
         for place in places:
             held[self.place_rows[place]] = True
-        return rows[held[rows]]
+        return rows[held[rows]], True
+
+    def expected(self, rows: Rows, is_found: NDArray[np.bool_]) -> Expected:
+        """Landmarks (E,) that should have been seen, and whether they were (E,)."""
+        return Expected(self.landmark_ids[rows], self.points_map[rows], self.descriptors[rows], is_found)
 
     def _reaches_m(self, focal_px: float) -> NDArray[np.float32]:
         """(N,) up to which distance a camera of this focal length finds each landmark."""

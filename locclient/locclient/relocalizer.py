@@ -14,6 +14,7 @@ from fleetmap.pose_solver import Resection, ransac_resection, refine_resection, 
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from locclient.map_view import MapView, Rows
 from locclient.settings import LocalizerSettings
+from locclient.telling_apart import Expected
 from locclient.twins import Twin, find_twins
 
 _NEIGHBOURHOOD_M = 3.0
@@ -35,7 +36,7 @@ class Fix:
     are among the inliers; 1 where nobody looked. twin_share: how much of
     what speaks for this place speaks for another one too, 1 where nobody looked. expected: how many landmarks the hit_share is of, and
     seen those that were found, 0 where nobody looked. matches (P, 2): features and landmarks, rows of
-    the view, of the inliers.
+    the view, of the inliers. witnessed: what the hit_share is of, None where the survey did not pass.
     """
 
     map_from_cam: Array
@@ -48,6 +49,7 @@ class Fix:
     expected: int = 0
     seen: int = 0
     matches: NDArray[np.int64] | None = field(default=None, repr=False, compare=False)
+    witnessed: Expected | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(slots=True)
@@ -239,11 +241,13 @@ class Relocalizer:
         carry[:3, :3] = carry[3:, 3:] = -rotation
         covariance = settings.covariance_scale * carry @ found.cov_rot_trans @ carry.T
         covariance += np.diag([settings.floor_rad**2] * 3 + [settings.floor_m**2] * 3)
-        witnessed = self.view.witnessed(map_from_cam, self._camera)
-        hits = int(np.isin(matches[:, 1], witnessed).sum())
+        witnessed, is_passed = self.view.witnessed(map_from_cam, self._camera)
+        is_hit = np.isin(witnessed, matches[:, 1])
+        hits = int(is_hit.sum())
+        told = self.view.expected(witnessed, is_hit) if is_passed else None
         return Fix(
             map_from_cam, covariance, int(found.inliers.sum()), cells, share, hits / max(len(witnessed), 1),
-            expected=len(witnessed), seen=hits, matches=matches,
+            expected=len(witnessed), seen=hits, matches=matches, witnessed=told,
         )  # fmt: skip
 
     def _sigmas(self, seen: Seen, features: NDArray[np.int64], rows: Rows, map_from_cam: Array | None) -> Array:

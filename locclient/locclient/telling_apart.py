@@ -1,0 +1,135 @@
+"""Tells places that look alike apart by what stands in one of them and not in the others. Pure.
+
+Totals do not: a sign at an aisle's end is ten landmarks among hundreds, and the map's budget takes other landmarks of each aisle.
+So every place that is held remembers, landmark by landmark, how often it should have been seen and how often it was. Two places
+are then laid over each other, as the robot's own way relates them. What looks the same in both says nothing and is left out. The
+rest is compared cell by cell: in almost all of them stands the same in both, of which the map holds other corners, or it was taken
+away; where what the map holds of the one is found again and what it holds of the other never is, one of the two is wrong. A cell of
+which only one place has landmarks says nothing: the budget may have chosen none, and a box may have been moved.
+"""
+
+from dataclasses import dataclass, field
+from math import lgamma
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.features.matching import packed
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
+from locclient import telling_apart_kernels as kernels
+
+_MOST_LOOKS = 40  # at one landmark; more add nothing
+_MOST_LANDMARKS = 3000  # of a place: some 30 m of way
+_STEP_M, _STEP_RAD = 0.2, 0.15  # between looks that count: two from the same spot fail for the same reasons
+_REACH_M, _ALIKE_BITS = (
+    0.15,
+    75,
+)  # between two landmarks of one thing, mapped in two aisles; others differ by 90 and more
+_CELL_M, _SHIFTS = 0.7, (0.0, 0.5)  # about a sign's size; wherever the lattice lies, half of a sign is in one cell
+_LEAST = 2.0  # landmarks whose absence says something: any single one may be one that is never found
+# How often a landmark is found: where it stands about two looks in five, and one in eight never; where it does not, by chance.
+_THERE, _NEVER_SHARE, _GONE = (2.0, 2.8), 0.12, (0.5, 10.0)
+_TAKEN_SHARE = 0.1  # of the cells in which stock was moved since the survey
+_DIFFERENT_SHARE = 0.1  # of the cells with something that looks the same nowhere in the other place
+_ODD_SHARE = 0.01  # of those that mislead: stock moved to where it makes one place look like the other
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What should have been seen from a fix: ids (E,), points_map (E, 3), descriptors (E, 32), and whether each was (E,)."""
+
+    ids: NDArray[np.uint32]
+    points_map: Array
+    descriptors: NDArray[np.uint8]
+    is_found: NDArray[np.bool_]
+
+
+@dataclass(slots=True)
+class Tally:
+    """How often each landmark of one place should have been seen and how often it was; ids (L,) rise.
+
+    points_odom (L, 3): where the looks saw them, so that they are those of another place that has seen the same. last (L,): the
+    look at which each was expected.
+    """
+
+    ids: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, np.uint32))
+    points_odom: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    descriptors: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
+    expected: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    found: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    last: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    looks: int = 0
+    last_map_from_cam: Array | None = None
+
+    def look(self, map_from_cam: Array, odom_from_map: Array, seen: Expected) -> None:
+        """One more look from there, unless the last one was from the same spot."""
+        if self.last_map_from_cam is not None:
+            since = se3_inverse(self.last_map_from_cam) @ map_from_cam
+            if np.linalg.norm(since[:3, 3]) < _STEP_M and rotation_angle_rad(since[:3, :3]) < _STEP_RAD:
+                return
+        self.last_map_from_cam, self.looks = map_from_cam, self.looks + 1
+        ids, inverse = np.unique(np.concatenate([self.ids, seen.ids]), return_inverse=True)
+        old, new = inverse[: len(self.ids)], inverse[len(self.ids) :]
+        sums, expected, found, last = np.zeros((len(ids), 3)), *np.zeros((3, len(ids)), np.int64)
+        descriptors = np.zeros((len(ids), 32), np.uint8)
+        sums[old], descriptors[old] = self.points_odom * self.expected[:, None], self.descriptors
+        expected[old], found[old], last[old] = self.expected, self.found, self.last
+        counts = expected[new] < _MOST_LOOKS
+        sums[new] += counts[:, None] * transform_points(odom_from_map, seen.points_map)
+        expected[new] += counts
+        found[new] += counts & seen.is_found
+        last[new], descriptors[new] = self.looks, seen.descriptors
+        points = sums / expected[:, None]
+        kept = np.sort(np.argsort(-last, kind="stable")[:_MOST_LANDMARKS])
+        self.ids, self.points_odom, self.descriptors = ids[kept], points[kept], descriptors[kept]
+        self.expected, self.found, self.last = expected[kept], found[kept], last[kept]
+
+    def carry(self, new_odom_from_old_odom: Array) -> None:
+        """The odometry began anew."""
+        self.points_odom = transform_points(new_odom_from_old_odom, self.points_odom)
+
+
+def evidence(one: Tally, other: Tally) -> float:
+    """How much more likely what was seen is at the first place than at the second, a natural logarithm; 0 where nothing tells."""
+    if not len(one.ids) or not len(other.ids):
+        return 0.0
+    alike, other_alike = np.zeros(len(one.ids), bool), np.zeros(len(other.ids), bool)
+    kernels.mark_alike(
+        one.points_odom, packed(one.descriptors), other.points_odom, packed(other.descriptors), _REACH_M, _ALIKE_BITS, alike,
+        other_alike,
+    )  # fmt: skip
+    slots = 1 << int(np.ceil(np.log2(2 * (len(alike) + len(other_alike)))))
+    scores = [_SCORES[tally.expected, tally.found] for tally in (one, other)]
+    total = 0.0
+    for shift in _SHIFTS:
+        cells, sums = np.zeros(slots, np.int64), np.zeros((slots, 2, 3))
+        kernels.add_to_cells(one.points_odom, scores[0], alike, 0, _CELL_M, shift, cells, sums)
+        kernels.add_to_cells(other.points_odom, scores[1], other_alike, 1, _CELL_M, shift, cells, sums)
+        total += kernels.weighed(sums, _LEAST, _TAKEN_SHARE, _DIFFERENT_SHARE, _ODD_SHARE) / len(_SHIFTS)
+    return total
+
+
+def log_found(expected: int, found: int, a: float, b: float) -> float:
+    """The logarithm of the chance of one order of so many looks that found a landmark whose own share is Beta(a, b)."""
+    return (
+        lgamma(a + found)
+        + lgamma(b + expected - found)
+        - lgamma(a + b + expected)
+        + lgamma(a + b)
+        - lgamma(a)
+        - lgamma(b)
+    )
+
+
+def _scores() -> Array:
+    """(expected, found, 2): logarithms of the chance of these counts where the thing stands, and where it does not."""
+    table = np.zeros((_MOST_LOOKS + 1, _MOST_LOOKS + 1, 2))
+    for expected in range(_MOST_LOOKS + 1):
+        for found in range(expected + 1):
+            gone = log_found(expected, found, *_GONE)
+            often = log_found(expected, found, *_THERE)
+            table[expected, found] = np.logaddexp(np.log(_NEVER_SHARE) + gone, np.log1p(-_NEVER_SHARE) + often), gone
+    return table
+
+
+_SCORES = _scores()
