@@ -24,6 +24,7 @@ from locclient.localizer import Localizer
 from locclient.relocalizer import Fix
 from locclient.settings import LocalizerSettings, TrackSettings
 from locclient.sight import Cause
+from locclient.telling_apart import Expected
 
 BODY_FROM_CAM = se3(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.05, 0.3]))
 MAP_FROM_ODOM = se3(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([12.0, -5.0, 1.0]))
@@ -402,6 +403,54 @@ def test_a_strong_fix_with_a_rival_is_not_believed(robot: Robot) -> None:
     robot.inliers = 100
     said = robot.ride(8, 0.0, [off(0.0), off(0.0, 5.0)])
     assert {e.status for e in said} == {Status.AMBIGUOUS}
+
+
+TWIN = off(0.0, 5.0)
+
+
+class Signs:
+    """What the map holds at the end of an aisle and of its twin: two signs each, which look different. The robot sees those of
+    one of them (0, 1) or, in an aisle that is not in the map, of none."""
+
+    def __init__(self, robot: Robot, seen: int | None) -> None:
+        rng = np.random.default_rng(5)
+        corners = np.concatenate([rng.uniform(0.0, 0.5, (12, 3)) + at for at in ((9.0, 2.0, 1.5), (9.0, -2.0, 1.8))])
+        ahead = corners @ MAP_FROM_ODOM[:3, :3].T + MAP_FROM_ODOM[:3, 3]
+        self.points_map = [ahead, ahead + TWIN]
+        self.looks = rng.integers(0, 256, (2, len(corners), 32), np.uint8)
+        self.seen, self.rng, self._fix = seen, rng, robot._fix
+
+    def fix(self, offset: Array) -> Fix:
+        aisle = int(np.any(offset != 0.0))
+        found = self.rng.random(24) < (0.4 if aisle == self.seen else 0.03)
+        expected = Expected(np.arange(24, dtype=np.uint32), self.points_map[aisle], self.looks[aisle], found)
+        return replace(self._fix(offset), witnessed=expected)
+
+
+@pytest.mark.parametrize("own", [0, 1])
+def test_a_twin_is_told_by_its_signs(robot: Robot, monkeypatch: pytest.MonkeyPatch, own: int) -> None:
+    """Although as many landmarks agree in the other aisle; and whichever is thought of first."""
+    monkeypatch.setattr(robot, "_fix", Signs(robot, own).fix)
+    said = robot.ride(20, 0.4, [off(0.0), TWIN])
+    assert said[1].status is Status.AMBIGUOUS
+    known = next(e for e in said if e.status is Status.TRACKING)
+    assert known.map_from_body is not None
+    assert all(e.status in (Status.AMBIGUOUS, Status.INITIALISING) for e in said[: said.index(known)])
+    truth = robot.map_from_body[:3, 3] + own * TWIN
+    assert said[-1].map_from_body is not None
+    assert np.linalg.norm(said[-1].map_from_body[:3, 3] - truth) < 0.05
+
+
+def test_signs_of_neither_twin_leave_it_open(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The robot's own aisle is a third one, which is not in the map."""
+    monkeypatch.setattr(robot, "_fix", Signs(robot, None).fix)
+    assert {e.status for e in robot.ride(30, 0.4, [off(0.0), TWIN])} == {Status.AMBIGUOUS}
+
+
+def test_signs_from_a_standing_robot_are_seen_once(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same look again and again is no more evidence."""
+    monkeypatch.setattr(robot, "_fix", Signs(robot, 0).fix)
+    assert {e.status for e in robot.ride(30, 0.0, [off(0.0), TWIN])} == {Status.AMBIGUOUS}
 
 
 def test_darkness_is_named_within_a_second(tracking: Robot) -> None:

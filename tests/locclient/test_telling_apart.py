@@ -1,0 +1,173 @@
+"""Two aisles that look alike: told apart by a sign, not by stock that was moved; and the comparison against one written plainly."""
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, se3, so3_exp
+from locclient import telling_apart
+from locclient.telling_apart import Expected, Tally, evidence, log_found
+
+PITCH_M = 5.0
+DECIDES = 6.9
+SIGNS = (((0.0, 1.0, 1.2), (0.1, 1.6, 1.8)), ((1.0, -1.7, 1.5), (1.1, -1.2, 2.0)))  # corners of boxes at an aisle's end
+BOX = ((-8.0, 1.0, 0.2), (-7.2, 1.6, 0.9))
+
+
+class Aisles:
+    """Twin aisles along x of the same things, of which a map holds some; each with two signs of its own at its end.
+
+    A landmark of a thing that stands where the robot is is found in `rate` of the looks, others by chance.
+    """
+
+    def __init__(self, seed: int, count: int = 2, *, signs: int = 12) -> None:
+        self.rng = np.random.default_rng(seed)
+        things = self.rng.uniform((-20.0, -1.5, 0.0), (0.0, 1.5, 3.0), (1500, 3))
+        looks = self._looks(1500)
+        self.points, self.looks, self.things = [], [], []
+        for aisle in range(count):
+            kept = self.rng.random(1500) < 0.55
+            own = np.concatenate([self.rng.uniform(*sign, (signs, 3)) for sign in SIGNS])
+            self.points.append(np.concatenate([things[kept], own]))
+            self.looks.append(np.concatenate([self._spoiled(looks[kept]), self._looks(len(own))]))
+            self.things.append(np.concatenate([np.zeros(int(kept.sum()), int), np.full(len(own), 1 + aisle)]))
+
+    def _looks(self, count: int) -> np.ndarray:
+        return self.rng.integers(0, 256, (count, 32), np.uint8)
+
+    def _spoiled(self, looks: np.ndarray) -> np.ndarray:
+        return np.asarray(looks ^ np.packbits(self.rng.random((*looks.shape, 8)) < 0.08, axis=-1)[..., 0])
+
+    def drive(self, aisle: int | None, *, moved: bool = False, looks: int = 12, rate: float = 0.4) -> list[Tally]:
+        """The tallies of all aisles after a drive along one of them (None: one that is not in the map). moved: the box there is gone."""
+        tallies = [Tally() for _ in self.points]
+        rates = [self.rng.beta(2 * rate * 2, 2 * (1 - rate) * 2, len(points)) for points in self.points]
+        odom_from_true = se3(so3_exp(np.array([0.0, 0.0, 0.6])), np.array([3.0, -2.0, 0.1]))
+        for number in range(looks):
+            at_m = -14.0 + number
+            for tally, points, looks_like, things, shares in zip(
+                tallies, self.points, self.looks, self.things, rates, strict=True
+            ):
+                ahead = np.flatnonzero((points[:, 0] > at_m + 1.0) & (points[:, 0] < at_m + 13.0))
+                stands = (things == 0) | (things == (-1 if aisle is None else 1 + aisle))
+                if moved:
+                    stands &= ~((points > BOX[0]) & (points < BOX[1])).all(axis=1)
+                found = self.rng.random(len(ahead)) < np.where(stands[ahead], shares[ahead], 0.04)
+                seen = Expected(ahead.astype(np.uint32), points[ahead], looks_like[ahead], found)
+                tally.look(se3(np.eye(3), np.array([at_m, 0.0, 1.0])), odom_from_true, seen)
+        return tallies
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_signs_at_an_aisles_end_decide(seed: int) -> None:
+    one, other = Aisles(seed).drive(0)
+    assert evidence(one, other) > DECIDES
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_aisles_without_signs_stay_alike(seed: int) -> None:
+    one, other = Aisles(seed, signs=0).drive(0)
+    assert abs(evidence(one, other)) < DECIDES / 2
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_box_that_was_moved_in_the_true_aisle_does_not_decide(seed: int) -> None:
+    one, other = Aisles(seed, signs=0).drive(0, moved=True)
+    assert abs(evidence(one, other)) < DECIDES / 2
+    one, other = Aisles(seed).drive(0, moved=True)
+    assert evidence(one, other) > DECIDES, "the signs still do"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_of_two_twins_none_is_right_where_the_own_aisle_is_unmapped(seed: int) -> None:
+    one, other = Aisles(seed).drive(None)
+    assert abs(evidence(one, other)) < DECIDES / 2
+
+
+def test_signs_that_the_map_holds_in_one_aisle_only_say_nothing() -> None:
+    """The budget may have chosen none of the other's, and what stands alone may have been carried there."""
+    hall = Aisles(3)
+    is_sign = hall.things[1] == 2
+    hall.points[1], hall.looks[1] = hall.points[1][~is_sign], hall.looks[1][~is_sign]
+    hall.things[1] = hall.things[1][~is_sign]
+    for aisle in (0, 1):
+        one, other = hall.drive(aisle)
+        assert abs(evidence(one, other)) < DECIDES / 2
+
+
+def test_evidence_for_one_is_evidence_against_the_other() -> None:
+    one, other = Aisles(0).drive(1)
+    assert evidence(one, other) == pytest.approx(-evidence(other, one), abs=1e-9)
+    assert evidence(one, one) == evidence(one, Tally()) == evidence(Tally(), one) == 0.0
+
+
+def test_the_odometry_may_begin_anew() -> None:
+    one, other = Aisles(0).drive(0)
+    before = evidence(one, other)
+    change = se3(np.eye(3), np.array([7.0, 1.4, 0.0]))  # whole cells, so that the lattice lies as it lay
+    one.carry(change)
+    assert abs(evidence(one, other)) < DECIDES / 2
+    other.carry(change)
+    assert evidence(one, other) == pytest.approx(before, abs=1e-6)
+
+
+def plainly(one: Tally, other: Tally) -> float:
+    """The evidence by dictionaries and loops."""
+    near = (np.abs(one.points_odom[:, None] - other.points_odom) <= 0.15).all(axis=2)
+    bits = np.bitwise_count(one.descriptors[:, None] ^ other.descriptors).sum(axis=2)
+    pairs = np.argwhere(near & (bits <= 75)).tolist()
+    total = 0.0
+    for shift in (0.0, 0.5):
+        cells: list[dict[tuple[int, ...], list[Array]]] = [{}, {}]
+        for side, (tally, alike) in enumerate(
+            zip((one, other), ({n for n, _ in pairs}, {m for _, m in pairs}), strict=True)
+        ):
+            for n in set(range(len(tally.ids))) - alike:
+                cell = tuple(np.floor(tally.points_odom[n] / 0.7 + shift).astype(int).tolist())
+                counts = int(tally.expected[n]), int(tally.found[n])
+                gone, often = np.exp(log_found(*counts, 0.5, 10.0)), np.exp(log_found(*counts, 2.0, 2.8))
+                cells[side].setdefault(cell, []).append(np.array([0.12 * gone + 0.88 * often, gone]))
+        for cell in set(cells[0]) & set(cells[1]):
+            (there, gone), (other_there, other_gone) = (np.prod(side[cell], axis=0) for side in cells)
+            gone = gone if len(cells[0][cell]) >= 2 else min(gone, there)
+            other_gone = other_gone if len(cells[1][cell]) >= 2 else min(other_gone, other_there)
+            same = 0.9 * there * other_there + 0.1 * gone * other_gone
+            first, second = there * other_gone, gone * other_there
+            total += np.log(0.9 * same + 0.1 * (0.99 * first + 0.01 * second))
+            total -= np.log(0.9 * same + 0.1 * (0.99 * second + 0.01 * first))
+    return total / 2
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_evidence_is_what_its_definition_says(seed: int) -> None:
+    for aisle in (0, None):
+        one, other = Aisles(seed).drive(aisle)
+        assert evidence(one, other) == pytest.approx(plainly(one, other), abs=1e-6)
+
+
+def test_two_looks_from_the_same_spot_count_once() -> None:
+    tally, place = Tally(), se3(np.eye(3), np.zeros(3))
+    seen = Expected(np.array([7, 3], np.uint32), np.ones((2, 3)), np.zeros((2, 32), np.uint8), np.array([True, False]))
+    ahead, turned = se3(np.eye(3), np.array([0.3, 0, 0])), se3(so3_exp(np.array([0, 0, 0.2])), np.array([0.3, 0, 0]))
+    for map_from_cam in (place, se3(np.eye(3), np.array([0.1, 0, 0])), ahead, turned, turned):
+        tally.look(map_from_cam, np.eye(4), seen)
+    assert tally.ids.tolist() == [3, 7]
+    assert tally.expected.tolist() == [3, 3]
+    assert tally.found.tolist() == [0, 3]
+
+
+def test_a_tally_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In looks at one landmark, and in landmarks: those that were expected longest ago are forgotten."""
+    monkeypatch.setattr(telling_apart, "_MOST_LANDMARKS", 30)
+    tally = Tally()
+    for number in range(60):
+        ids = np.arange(number // 10 * 10, number // 10 * 10 + 20, dtype=np.uint32)
+        points = np.tile(ids[:, None], (1, 3)).astype(float)
+        seen = Expected(ids, points, np.zeros((20, 32), np.uint8), np.ones(20, bool))
+        tally.look(se3(np.eye(3), np.array([0.5 * number, 0, 0])), np.eye(4), seen)
+    assert tally.ids.tolist() == list(range(40, 70))
+    assert tally.points_odom[:, 0].tolist() == list(range(40, 70))
+    still = se3(np.eye(3), np.zeros(3))
+    for number in range(100):
+        still[0, 3] = number
+        tally.look(still.copy(), np.eye(4), seen)
+    assert tally.expected.max() == tally.found.max() == 40
