@@ -450,7 +450,8 @@ def test_signs_of_neither_twin_leave_it_open(robot: Robot, monkeypatch: pytest.M
 def test_signs_from_a_standing_robot_are_seen_once(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same look again and again is no more evidence."""
     monkeypatch.setattr(robot, "_fix", Signs(robot, 0).fix)
-    assert {e.status for e in robot.ride(30, 0.0, [off(0.0), TWIN])} == {Status.AMBIGUOUS}
+    said = [robot.go(0.0, [off(0.0), TWIN], turn_rad=0.0) for _ in range(30)]
+    assert {e.status for e in said} == {Status.AMBIGUOUS}
 
 
 def test_darkness_is_named_within_a_second(tracking: Robot) -> None:
