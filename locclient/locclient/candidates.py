@@ -10,7 +10,7 @@ from locclient.relocalizer import Fix, Slices
 from locclient.settings import TrackSettings
 from locclient.telling_apart import evidence
 
-_PAIRS_AT_ONCE = 8  # comparisons in a slice of a look
+_PAIRS_AT_ONCE = 4  # comparisons in a slice of a look
 
 
 def begin_look(candidates: Sequence[Anchor], settings: TrackSettings) -> None:

@@ -25,12 +25,12 @@ _REACH_M, _ALIKE_BITS = (
     0.15,
     75,
 )  # between two landmarks of one thing, mapped in two aisles; others differ by 90 and more
-_CELL_M, _SHIFTS = 0.7, (0.0, 0.5)  # about a sign's size; wherever the lattice lies, half of a sign is in one cell
+_CELL_M, _SHIFTS = 0.9, (0.0, 0.25, 0.5, 0.75)  # a sign with its surroundings; some lattice has all of it in one cell
 _LEAST = 2.0  # landmarks whose absence says something: any single one may be one that is never found
 # How often a landmark is found: where it stands about two looks in five, and one in eight never; where it does not, by chance.
 _THERE, _NEVER_SHARE, _GONE = (2.0, 2.8), 0.12, (0.5, 10.0)
-_TAKEN_SHARE = 0.1  # of the cells in which stock was moved since the survey
-_DIFFERENT_SHARE = 0.1  # of the cells with something that looks the same nowhere in the other place
+_TAKEN_SHARE = 0.05  # of the cells in which stock was moved since the survey
+_DIFFERENT_SHARE = 0.15  # of the cells with something that looks the same nowhere in the other place
 _ODD_SHARE = 0.01  # of those that mislead: stock moved to where it makes one place look like the other
 
 
