@@ -21,17 +21,18 @@ from locclient import telling_apart_kernels as kernels
 _MOST_LOOKS = 40  # at one landmark; more add nothing
 _MOST_LANDMARKS = 3000  # of a place: some 30 m of way
 _STEP_M, _STEP_RAD = 0.2, 0.15  # between looks that count: two from the same spot fail for the same reasons
-_REACH_M, _ALIKE_BITS = (
-    0.15,
-    75,
-)  # between two landmarks of one thing, mapped in two aisles; others differ by 90 and more
-_CELL_M, _SHIFTS = 0.9, (0.0, 0.25, 0.5, 0.75)  # a sign with its surroundings; some lattice has all of it in one cell
+_REACH_M, _ALIKE_BITS = 0.15, 75  # of one thing's landmark, mapped in two aisles; others differ by 90 bits and more
+# A plate, a poster, a pallet: some lattice has most of a sign in one cell, and little else with it.
+_LATTICES = tuple((cell_m, shift) for cell_m in (0.35, 0.6, 0.9) for shift in (0.0, 0.5))
+_BLOCK_M, _MOST_BLOCKS = 1.8, 256
 _LEAST = 2.0  # landmarks whose absence says something: any single one may be one that is never found
 # How often a landmark is found: where it stands about two looks in five, and one in eight never; where it does not, by chance.
 _THERE, _NEVER_SHARE, _GONE = (2.0, 2.8), 0.12, (0.5, 10.0)
 _TAKEN_SHARE = 0.05  # of the cells in which stock was moved since the survey
 _DIFFERENT_SHARE = 0.15  # of the cells with something that looks the same nowhere in the other place
 _ODD_SHARE = 0.01  # of those that mislead: stock moved to where it makes one place look like the other
+_QUIET = 1.0  # a logarithm: cells say no more than this by chance, and are not heard
+_MOST = -np.log(_ODD_SHARE)  # from a block, as from a single cell
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,13 +101,27 @@ def evidence(one: Tally, other: Tally) -> float:
     )  # fmt: skip
     slots = 1 << int(np.ceil(np.log2(2 * (len(alike) + len(other_alike)))))
     scores = [_SCORES[tally.expected, tally.found] for tally in (one, other)]
-    total = 0.0
-    for shift in _SHIFTS:
-        cells, sums = np.zeros(slots, np.int64), np.zeros((slots, 2, 3))
-        kernels.add_to_cells(one.points_odom, scores[0], alike, 0, _CELL_M, shift, cells, sums)
-        kernels.add_to_cells(other.points_odom, scores[1], other_alike, 1, _CELL_M, shift, cells, sums)
-        total += kernels.weighed(sums, _LEAST, _TAKEN_SHARE, _DIFFERENT_SHARE, _ODD_SHARE) / len(_SHIFTS)
-    return total
+    blocks, said, count = np.zeros(_MOST_BLOCKS, np.int64), np.zeros((_MOST_BLOCKS, len(_LATTICES))), 0
+    for lattice, (cell_m, shift) in enumerate(_LATTICES):
+        cells, middles, sums = np.zeros(slots, np.int64), np.zeros((slots, 3)), np.zeros((slots, 2, 3))
+        for side, (tally, flags) in enumerate(((one, alike), (other, other_alike))):
+            kernels.add_to_cells(tally.points_odom, scores[side], flags, side, cell_m, shift, cells, middles, sums)
+        count = kernels.speak(
+            sums,
+            middles,
+            lattice,
+            _BLOCK_M,
+            _LEAST,
+            _TAKEN_SHARE,
+            _DIFFERENT_SHARE,
+            _ODD_SHARE,
+            _QUIET,
+            blocks,
+            count,
+            said,
+        )
+    most = np.maximum(said.max(axis=1), 0.0) - np.maximum(-said.min(axis=1), 0.0)
+    return float(np.clip(most, -_MOST, _MOST).sum())
 
 
 def log_found(expected: int, found: int, a: float, b: float) -> float:

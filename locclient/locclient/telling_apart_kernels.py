@@ -60,16 +60,13 @@ def mark_alike(
 
 @kernel
 def add_to_cells(
-    points: Array,
-    scores: Array,
-    alike: Flags,
-    side: int,
-    cell_m: float,
-    shift: float,
-    cells: NDArray[np.int64],
-    sums: Array,
-) -> None:
-    """Adds one place's landmarks that are not alike to the table: (slots, 2, 3) sums of the scores (N, 2), and how many there are."""
+    points: Array, scores: Array, alike: Flags, side: int, cell_m: float, shift: float, cells: NDArray[np.int64],
+    middles: Array, sums: Array,
+) -> None:  # fmt: skip
+    """Adds one place's landmarks that are not alike to the table: (slots, 2, 3) sums of the scores (N, 2), and how many there are.
+
+    cells (slots,), middles (slots, 3): which cell a slot stands for, and that cell's middle.
+    """
     slots = len(cells)
     for n in range(len(points)):
         if alike[n]:
@@ -79,6 +76,8 @@ def add_to_cells(
         while sums[slot, 0, 2] + sums[slot, 1, 2] > 0.0 and cells[slot] != cell:
             slot = (slot + 1) & (slots - 1)
         cells[slot] = cell
+        for k in range(3):
+            middles[slot, k] = (math.floor(points[n, k] / cell_m + shift) + 0.5 - shift) * cell_m
         sums[slot, side, 0] += scores[n, 0]
         sums[slot, side, 1] += scores[n, 1]
         sums[slot, side, 2] += 1.0
@@ -91,24 +90,48 @@ def log_sum(weight: float, a: float, other_weight: float, b: float) -> float:
     return top + math.log(weight * math.exp(a - top) + other_weight * math.exp(b - top))
 
 
-@kernel
-def weighed(sums: Array, least: float, taken_share: float, different_share: float, odd_share: float) -> float:
-    """The evidence of all cells (slots, 2, 3) for the first place against the second, a logarithm.
+@inner_kernel
+def cell_evidence(sums: Array, least: float, taken_share: float, different_share: float, odd_share: float) -> float:
+    """What one cell (2, 3) says for the first place against the second, a logarithm.
 
-    In a cell stands the same in both, or was taken away (taken_share) wherever the robot is; or (different_share) only one
+    There stands the same in both, or was taken away (taken_share) wherever the robot is; or (different_share) only one
     of them has it, and then it is the right one, but for an odd_share. Fewer than `least` landmarks are not missed.
     """
-    total = 0.0
+    there, other_there = sums[0, 0], sums[1, 0]
+    gone = sums[0, 1] if sums[0, 2] >= least else min(there, sums[0, 1])
+    other_gone = sums[1, 1] if sums[1, 2] >= least else min(other_there, sums[1, 1])
+    same = log_sum(1.0 - taken_share, there + other_there, taken_share, gone + other_gone)
+    first, second = there + other_gone, gone + other_there
+    for_first = log_sum(1.0 - odd_share, first, odd_share, second)
+    for_second = log_sum(1.0 - odd_share, second, odd_share, first)
+    return log_sum(1.0 - different_share, same, different_share, for_first) - log_sum(
+        1.0 - different_share, same, different_share, for_second
+    )
+
+
+@kernel
+def speak(
+    sums: Array, middles: Array, lattice: int, block_m: float, least: float, taken_share: float, different_share: float,
+    odd_share: float, quiet: float, blocks: NDArray[np.int64], count: int, said: Array,
+) -> int:  # fmt: skip
+    """Adds what the cells (slots, 2, 3) of one lattice say to the blocks in which their middles lie.
+
+    Of each cell only what is beyond `quiet`: hundreds that say next to nothing must not add up. blocks (room,) and said (room, lattices):
+    those held so far, `count` of them; returns how many are then.
+    """
     for slot in range(len(sums)):
         if sums[slot, 0, 2] == 0.0 or sums[slot, 1, 2] == 0.0:
             continue
-        there, other_there = sums[slot, 0, 0], sums[slot, 1, 0]
-        gone = sums[slot, 0, 1] if sums[slot, 0, 2] >= least else min(there, sums[slot, 0, 1])
-        other_gone = sums[slot, 1, 1] if sums[slot, 1, 2] >= least else min(other_there, sums[slot, 1, 1])
-        same = log_sum(1.0 - taken_share, there + other_there, taken_share, gone + other_gone)
-        first, second = there + other_gone, gone + other_there
-        for_first = log_sum(1.0 - odd_share, first, odd_share, second)
-        for_second = log_sum(1.0 - odd_share, second, odd_share, first)
-        total += log_sum(1.0 - different_share, same, different_share, for_first)
-        total -= log_sum(1.0 - different_share, same, different_share, for_second)
-    return total
+        found = cell_evidence(sums[slot], least, taken_share, different_share, odd_share)
+        if abs(found) <= quiet:
+            continue
+        block = cell_of(middles[slot, 0], middles[slot, 1], middles[slot, 2], block_m, 0.0)
+        at = 0
+        while at < count and blocks[at] != block:
+            at += 1
+        if at == count:
+            if count == len(blocks):
+                continue  # as many as ever stand around a robot; what is left out makes it no surer
+            blocks[at], count = block, count + 1
+        said[at, lattice] += found - quiet if found > 0.0 else found + quiet
+    return count
