@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3, so3_exp, so3_log
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from locclient.settings import TrackSettings
 from locclient.telling_apart import Tally
@@ -136,6 +136,15 @@ def chained(map_from_body: Array, covariance: Array, body_from_next: Array, cov_
     turn = np.kron(np.eye(2), map_from_body[:3, :3])
     lever = map_from_body[:3, :3] @ body_from_next[:3, 3]
     return map_from_body @ body_from_next, moved(covariance, lever) + turn @ cov_next @ turn.T
+
+
+def led_back(
+    map_from_body: Array, covariance: Array, earlier_from_body: Array, cov_since: Array
+) -> tuple[Array, Array]:
+    """map_from_earlier and its covariance, map axes: the other way round than `chained`, with the covariance of the way since as there."""
+    map_from_earlier = map_from_body @ se3_inverse(earlier_from_body)
+    turn, lever = np.kron(np.eye(2), map_from_earlier[:3, :3]), map_from_earlier[:3, 3] - map_from_body[:3, 3]
+    return map_from_earlier, moved(covariance, lever) + turn @ moved(cov_since, -earlier_from_body[:3, 3]) @ turn.T
 
 
 def difference(measured: Array, predicted: Array) -> Array:

@@ -13,7 +13,7 @@ from fleetmap.mapformat import Tile
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import ImuSamples, PositionPrior, WheelSample
-from locclient.anchors import Anchor, applied, difference, moved
+from locclient.anchors import Anchor, applied, difference, led_back, moved
 from locclient.candidates import begin_look, is_proven, is_unmistakable, ranked, rivals, still_held, told_apart, vote
 from locclient.estimate import Estimate, Hypothesis, Status
 from locclient.map_view import MapView
@@ -26,6 +26,7 @@ _SPREAD_SHARE = 0.45  # of the time between two looks: frames that come less oft
 
 _CANDIDATES_AT_ONCE = 3  # in one slice of a search
 _PLACE_REACH_M = 3.0  # from a place that shows the same as the robot sees
+_PRIOR_WAY_SHARE = 0.2  # of the way since a prior, by which it is doubted
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,7 @@ class Localizer:
         self._survey_focal_px = 0.0
         self._prior: PositionPrior | None = None
         self._way_since_prior_m = 0.0
+        self._prior_moment: Anchor | None = None  # the first frame after it, as the identity
         self._told: Anchor | None = None  # the place of a prior that is known in all directions
         self._anchor: Anchor | None = None  # the confirmed place
         self._candidates: list[Anchor] = []  # unconfirmed ones
@@ -87,9 +89,9 @@ class Localizer:
         self._odometry.handle_wheel(samples)
 
     def handle_prior(self, prior: PositionPrior) -> None:
-        """A coarse place at this moment; used for the search until a fix has been confirmed, widened by the way since. One whose
-        covariance is finite is a place of its own as long as the map knows none: DEGRADED, by odometry from there."""
-        self._prior, self._way_since_prior_m, self._told = prior, 0.0, None
+        """A coarse place at this moment; used for the search until a fix has been confirmed, widened by some of the way since. One
+        whose covariance is finite is a place of its own as long as the map knows none: DEGRADED, by odometry from there."""
+        self._prior, self._way_since_prior_m, self._told, self._prior_moment = prior, 0.0, None, None
 
     def handle_version(
         self, version: int, tiles: Iterable[Tile], vocabulary: Vocabulary, survey_focal_px: float
@@ -144,11 +146,13 @@ class Localizer:
         last = None if self._last_odom is None else self._last_odom if change is None else change @ self._last_odom
         step = np.eye(4) if last is None else se3_inverse(last) @ odometry.odom_from_body
         self._way_since_prior_m += float(np.linalg.norm(step[:3, 3]))
-        for anchor in [*self._anchors(), *([self._moment] if self._moment else [])]:
+        for anchor in [*self._anchors(), *(a for a in (self._moment, self._prior_moment) if a)]:
             anchor.carry(self._odometry, odometry, step, self._settings.track)
             if change is not None:
                 anchor.tally.carry(change)
         self._last_odom = odometry.odom_from_body
+        if self._prior is not None and self._prior_moment is None:
+            self._prior_moment = Anchor.at(odometry, np.eye(4), np.zeros((6, 6)))
         if self._prior is not None and self._told is None and np.isfinite(self._prior.cov_rot_trans).all():
             map_from_body = self._prior.map_from_base @ self._base_from_body
             lever_m = map_from_body[:3, 3] - self._prior.map_from_base[:3, 3]
@@ -248,24 +252,29 @@ class Localizer:
         )
 
     def _prior_cov_m2(self) -> Array:
-        """(2, 2) of the prior's horizontal position now: the way since may have led anywhere."""
+        """(2, 2) of the prior's horizontal position, wider with the way since: what odometry does not know of itself, a robot that was
+        pushed and an operator who was wrong must not keep it from its place for ever."""
         assert self._prior is not None
-        return np.asarray(self._prior.cov_rot_trans[3:5, 3:5] + (0.05**2 + self._way_since_prior_m**2) * np.eye(2))
+        wider = 0.05**2 + (_PRIOR_WAY_SHARE * self._way_since_prior_m) ** 2
+        return np.asarray(self._prior.cov_rot_trans[3:5, 3:5] + wider * np.eye(2))
 
     def _places_in_prior(self) -> NDArray[np.bool_] | None:
         if self._prior is None or self._relocalizer is None:
             return None
         off = self._relocalizer.view.map_from_cam[:, :2, 3] - self._prior.map_from_base[:2, 3]
         sigma = float(np.sqrt(np.linalg.eigvalsh(self._prior_cov_m2())[-1]))
-        return np.asarray(np.linalg.norm(off, axis=1) < 3.7 * sigma + _PLACE_REACH_M)
+        return np.asarray(np.linalg.norm(off, axis=1) < 3.7 * sigma + self._way_since_prior_m + _PLACE_REACH_M)
 
     def _in_prior(self, fix: Fix) -> bool:
-        """Whether a fix lies within the 0.999 bound of the prior's position."""
-        if self._prior is None:
+        """Whether a fix says of the prior's moment what lies within the 0.999 bound of the prior's position: the robot's own way leads
+        back there."""
+        if self._prior is None or self._prior_moment is None or self._moment is None:
             return True
-        map_from_base = fix.map_from_cam @ self._cam_from_body @ se3_inverse(self._base_from_body)
+        now, since = Anchor.behind(self._moment, *self._at_body(fix)), self._prior_moment
+        map_from_then, covariance = led_back(now.now_map_from_body, now.now_cov, since.now_map_from_body, since.now_cov)
+        map_from_base = map_from_then @ se3_inverse(self._base_from_body)
         off = map_from_base[:2, 3] - self._prior.map_from_base[:2, 3]
-        return bool(off @ np.linalg.solve(self._prior_cov_m2(), off) < 13.816)
+        return bool(off @ np.linalg.solve(self._prior_cov_m2() + covariance[3:5, 3:5], off) < 13.816)
 
     # --- tracking --------------------------------------------------------------------------------------------------------
 

@@ -214,12 +214,22 @@ def test_a_wide_prior_only_narrows_the_search(robot: Robot) -> None:
     assert robot.error_m(said[-1]) < 1e-6
 
 
-def test_a_fix_outside_a_tight_prior_is_not_believed_until_the_way_may_have_led_there(robot: Robot) -> None:
-    """3 m off with 0.3 m of doubt: never while standing; after metres of way the prior says nothing against it."""
+def test_a_fix_that_a_tight_prior_denies_is_not_believed_before_a_long_way(robot: Robot) -> None:
+    """3 m off with 0.3 m of doubt: never while standing; after metres of way the prior is doubted more."""
     robot.localizer.handle_prior(prior(robot, 0.3, off(3.0)))
     assert {e.status for e in robot.ride(8, 0.0)} == {Status.INITIALISING}
-    said = robot.ride(12, 0.4)
-    assert said[0].status is Status.INITIALISING
+    said = robot.ride(24, 0.4)
+    assert {e.status for e in said[:8]} == {Status.INITIALISING}
+    assert said[-1].status is Status.TRACKING
+    assert robot.error_m(said[-1]) < 1e-6
+
+
+def test_the_way_leads_back_to_the_prior_and_not_to_its_twin(robot: Robot) -> None:
+    """Nothing was to be seen for metres, then two places 5 m apart: the robot's own way decides which of them it was."""
+    robot.localizer.handle_prior(prior(robot, 0.5))
+    robot.ride(8, 0.5, NO_FIX)
+    said = [robot.go(0.4, [off(5.0), off(0.0)]) for _ in range(4)]
+    assert {e.status for e in said[:2]} == {Status.INITIALISING}
     assert said[-1].status is Status.TRACKING
     assert robot.error_m(said[-1]) < 1e-6
 
