@@ -13,15 +13,22 @@ from locclient.telling_apart import evidence
 _PAIRS_AT_ONCE = 4  # comparisons in a slice of a look
 
 
-def begin_look(candidates: Sequence[Anchor], settings: TrackSettings) -> None:
-    """One more look at the map, in which none of them has been spoken for yet."""
+def begin_look(candidates: Sequence[Anchor], settings: TrackSettings, *, is_elsewhere: bool) -> None:
+    """One more look at the map, in which none of them has been spoken for yet; is_elsewhere: from another spot than the last."""
     for candidate in candidates:
         candidate.misses += 1
         candidate.fade(settings.evidence_kept_share)
+        if is_elsewhere:
+            candidate.tally.begin_look()
 
 
-def vote(candidates: list[Anchor], fresh: Anchor, fix: Fix, odom_from_body: Array, settings: TrackSettings) -> None:
-    """The place of a fix, carried to the present: a vote for the candidate that is there, which takes it over, or a new candidate."""
+def vote(
+    candidates: list[Anchor], fresh: Anchor, fix: Fix, odom_from_body: Array | None, settings: TrackSettings
+) -> None:
+    """The place of a fix, carried to the present: a vote for the candidate that is there, which takes it over, or a new candidate.
+
+    odom_from_body: at present, None where the look is from the same spot as the last one and its landmarks are not counted.
+    """
     for candidate in candidates:
         if _is_same_place(fresh, candidate, settings):
             if candidate.misses:  # at most one vote a frame
@@ -105,10 +112,9 @@ def is_unmistakable(fix: Fix, settings: TrackSettings) -> bool:
     )
 
 
-def _count(candidate: Anchor, fresh: Anchor, fix: Fix, odom_from_body: Array) -> None:
-    if fix.witnessed is not None:
-        odom_from_map = odom_from_body @ se3_inverse(fresh.now_map_from_body)
-        candidate.tally.look(fix.map_from_cam, odom_from_map, fix.witnessed)
+def _count(candidate: Anchor, fresh: Anchor, fix: Fix, odom_from_body: Array | None) -> None:
+    if fix.witnessed is not None and odom_from_body is not None:
+        candidate.tally.look(odom_from_body @ se3_inverse(fresh.now_map_from_body), fix.witnessed)
 
 
 def _is_same_place(fresh: Anchor, candidate: Anchor, settings: TrackSettings) -> bool:

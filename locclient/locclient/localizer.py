@@ -20,6 +20,7 @@ from locclient.map_view import MapView
 from locclient.relocalizer import Fix, Relocalizer, Seen, Slices
 from locclient.settings import LocalizerSettings
 from locclient.sight import Cause, SightJudge
+from locclient.telling_apart import Spot
 
 _RADIUS_95 = 2.796  # of a three-dimensional normal distribution, in sigmas
 _SPREAD_SHARE = 0.45  # of the time between two looks: frames that come less often are not made to share one
@@ -69,6 +70,7 @@ class Localizer:
         self._anchor: Anchor | None = None  # the confirmed place
         self._candidates: list[Anchor] = []  # unconfirmed ones
         self._told_apart: Anchor | None = None  # the one of them that none of the others can be
+        self._spot = Spot()
         self._given_up: Anchor | None = None  # what was said to be the place until fixes named another
         self._last_odom: Array | None = None
         self._last_ns: int | None = None
@@ -150,6 +152,8 @@ class Localizer:
             anchor.carry(self._odometry, odometry, step, self._settings.track)
             if change is not None:
                 anchor.tally.carry(change)
+        if change is not None:
+            self._spot.carry(change)
         self._last_odom = odometry.odom_from_body
         if self._prior is not None and self._prior_moment is None:
             self._prior_moment = Anchor.at(odometry, np.eye(4), np.zeros((6, 6)))
@@ -314,7 +318,6 @@ class Localizer:
         """Refused fixes that agree with each other, frame after frame, end the belief in the old place; they must be confirmed anew."""
         assert self._anchor is not None
         settings, strangers = self._settings.track, self._anchor.strangers
-        begin_look(strangers, settings)
         self._hear(fixes, strangers)
         self._anchor.strangers = still_held(strangers, settings)
         if max(c.support for c in self._anchor.strangers) >= settings.kidnap_fixes:
@@ -328,7 +331,6 @@ class Localizer:
         """Every fix speaks for a candidate or begins one; confirmed is the one that is left, or told from all others, with enough
         behind it."""
         settings = self._settings.track
-        begin_look(self._candidates, settings)
         self._hear(fixes, self._candidates)
         self._candidates = still_held(self._candidates, settings)
         self._told_apart = yield from told_apart(self._candidates, settings)
@@ -362,11 +364,13 @@ class Localizer:
         return sorted(likely, key=lambda c: c is not best), []
 
     def _hear(self, fixes: Sequence[Fix], candidates: list[Anchor]) -> None:
-        """Every fix has its vote, at the present."""
+        """One more look, in which every fix has its vote, at the present."""
         assert self._moment is not None and self._last_odom is not None
+        settings, counts = self._settings.track, self._spot.is_new(self._last_odom)
+        begin_look(candidates, settings, is_elsewhere=counts)
         for fix in fixes:
             fresh = Anchor.behind(self._moment, *self._at_body(fix))
-            vote(candidates, fresh, fix, self._last_odom, self._settings.track)
+            vote(candidates, fresh, fix, self._last_odom if counts else None, settings)
 
     def _is_confirmed(self, candidate: Anchor, fixes: list[Fix]) -> bool:
         """By a tight prior, by fixes and way enough, or by one fix so strong, and alone of all places that were tried, that no

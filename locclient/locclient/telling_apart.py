@@ -18,7 +18,7 @@ from fleetmap.features.matching import packed
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
 from locclient import telling_apart_kernels as kernels
 
-_MOST_LOOKS = 40  # at one landmark; more add nothing
+_MOST_LOOKS, _ALL_LOOKS = 64, (1 << 64) - 1  # that are remembered: some 20 m of way
 _MOST_LANDMARKS = 3000  # of a place: some 30 m of way
 _STEP_M, _STEP_RAD = 0.2, 0.15  # between looks that count: two from the same spot fail for the same reasons
 _REACH_M, _ALIKE_BITS = 0.15, 75  # of one thing's landmark, mapped in two aisles; others differ by 90 bits and more
@@ -46,53 +46,94 @@ class Expected:
 
 
 @dataclass(slots=True)
-class Tally:
-    """How often each landmark of one place should have been seen and how often it was; ids (L,) rise.
+class Spot:
+    """From where the robot looked last, of the looks that count: two from the same spot fail for the same reasons."""
 
-    points_odom (L, 3): where the looks saw them, so that they are those of another place that has seen the same. last (L,): the
-    look at which each was expected.
+    odom_from_body: Array | None = None
+
+    def is_new(self, odom_from_body: Array) -> bool:
+        """Whether this look counts; it is the last one then."""
+        if self.odom_from_body is not None:
+            since = se3_inverse(self.odom_from_body) @ odom_from_body
+            if np.linalg.norm(since[:3, 3]) < _STEP_M and rotation_angle_rad(since[:3, :3]) < _STEP_RAD:
+                return False
+        self.odom_from_body = odom_from_body
+        return True
+
+    def carry(self, new_odom_from_old_odom: Array) -> None:
+        """The odometry began anew."""
+        if self.odom_from_body is not None:
+            self.odom_from_body = new_odom_from_old_odom @ self.odom_from_body
+
+
+@dataclass(slots=True)
+class Tally:
+    """In which of the last looks each landmark of one place should have been seen, and in which it was; ids (L,) rise.
+
+    Looks are bits, the newest the lowest. looks: those from this place; expected, found (L,): of each landmark. points_odom (L, 3):
+    where the looks saw them, so that they are those of another place that has seen the same.
     """
 
     ids: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, np.uint32))
     points_odom: Array = field(default_factory=lambda: np.zeros((0, 3)))
     descriptors: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
-    expected: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    found: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    last: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    expected: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(0, np.uint64))
+    found: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(0, np.uint64))
     looks: int = 0
-    last_map_from_cam: Array | None = None
 
-    def look(self, map_from_cam: Array, odom_from_map: Array, seen: Expected) -> None:
-        """One more look from there, unless the last one was from the same spot."""
-        if self.last_map_from_cam is not None:
-            since = se3_inverse(self.last_map_from_cam) @ map_from_cam
-            if np.linalg.norm(since[:3, 3]) < _STEP_M and rotation_angle_rad(since[:3, :3]) < _STEP_RAD:
-                return
-        self.last_map_from_cam, self.looks = map_from_cam, self.looks + 1
+    def begin_look(self) -> None:
+        """One more look, which says nothing of this place so far; what only the oldest knew is forgotten."""
+        self.looks = self.looks << 1 & _ALL_LOOKS
+        self.expected, self.found = self.expected << np.uint64(1), self.found << np.uint64(1)
+        self._keep(np.flatnonzero(self.expected))
+
+    def look(self, odom_from_map: Array, seen: Expected) -> None:
+        """What the look that began showed from here."""
+        self.looks |= 1
         ids, inverse = np.unique(np.concatenate([self.ids, seen.ids]), return_inverse=True)
         old, new = inverse[: len(self.ids)], inverse[len(self.ids) :]
-        sums, expected, found, last = np.zeros((len(ids), 3)), *np.zeros((3, len(ids)), np.int64)
-        descriptors = np.zeros((len(ids), 32), np.uint8)
-        sums[old], descriptors[old] = self.points_odom * self.expected[:, None], self.descriptors
-        expected[old], found[old], last[old] = self.expected, self.found, self.last
-        counts = expected[new] < _MOST_LOOKS
-        sums[new] += counts[:, None] * transform_points(odom_from_map, seen.points_map)
-        expected[new] += counts
-        found[new] += counts & seen.is_found
-        last[new], descriptors[new] = self.looks, seen.descriptors
-        points = sums / expected[:, None]
-        kept = np.sort(np.argsort(-last, kind="stable")[:_MOST_LANDMARKS])
-        self.ids, self.points_odom, self.descriptors = ids[kept], points[kept], descriptors[kept]
-        self.expected, self.found, self.last = expected[kept], found[kept], last[kept]
+        points, (expected, found) = np.zeros((len(ids), 3)), np.zeros((2, len(ids)), np.uint64)
+        descriptors, weights = np.zeros((len(ids), 32), np.uint8), np.zeros(len(ids))
+        points[old], descriptors[old], expected[old], found[old] = (
+            self.points_odom, self.descriptors, self.expected, self.found,
+        )  # fmt: skip
+        weights[old] = np.bitwise_count(self.expected)
+        step = transform_points(odom_from_map, seen.points_map) - points[new]
+        points[new] += step / (weights[new] + 1.0)[:, None]
+        descriptors[new] = seen.descriptors
+        expected[new] |= np.uint64(1)
+        found[new] |= seen.is_found.astype(np.uint64)
+        self.ids, self.points_odom, self.descriptors, self.expected, self.found = (
+            ids,
+            points,
+            descriptors,
+            expected,
+            found,
+        )
+        newest = self.expected & (~self.expected + np.uint64(1))  # the lowest bit
+        self._keep(np.sort(np.argsort(newest, kind="stable")[:_MOST_LANDMARKS]))
+
+    def counts(self, looks: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """In how many of these looks (bits) each landmark was expected (L,) and found (L,)."""
+        mask = np.uint64(looks)
+        return np.bitwise_count(self.expected & mask), np.bitwise_count(self.found & mask)
 
     def carry(self, new_odom_from_old_odom: Array) -> None:
         """The odometry began anew."""
         self.points_odom = transform_points(new_odom_from_old_odom, self.points_odom)
 
+    def _keep(self, rows: NDArray[np.int64]) -> None:
+        self.ids, self.points_odom, self.descriptors = self.ids[rows], self.points_odom[rows], self.descriptors[rows]
+        self.expected, self.found = self.expected[rows], self.found[rows]
+
 
 def evidence(one: Tally, other: Tally) -> float:
-    """How much more likely what was seen is at the first place than at the second, a natural logarithm; 0 where nothing tells."""
-    if not len(one.ids) or not len(other.ids):
+    """How much more likely what was seen is at the first place than at the second, a natural logarithm; 0 where nothing tells.
+
+    By the looks from both: one that only one of them stands for was perhaps a bad one.
+    """
+    common = one.looks & other.looks
+    if not common or not len(one.ids) or not len(other.ids):
         return 0.0
     alike, other_alike = np.zeros(len(one.ids), bool), np.zeros(len(other.ids), bool)
     kernels.mark_alike(
@@ -100,7 +141,10 @@ def evidence(one: Tally, other: Tally) -> float:
         other_alike,
     )  # fmt: skip
     slots = 1 << int(np.ceil(np.log2(2 * (len(alike) + len(other_alike)))))
-    scores = [_SCORES[tally.expected, tally.found] for tally in (one, other)]
+    counts = [tally.counts(common) for tally in (one, other)]
+    scores = [_SCORES[expected, found] for expected, found in counts]
+    alike |= counts[0][0] == 0
+    other_alike |= counts[1][0] == 0
     blocks, said, count = np.zeros(_MOST_BLOCKS, np.int64), np.zeros((_MOST_BLOCKS, len(_LATTICES))), 0
     for lattice, (cell_m, shift) in enumerate(_LATTICES):
         cells, middles, sums = np.zeros(slots, np.int64), np.zeros((slots, 3)), np.zeros((slots, 2, 3))

@@ -70,7 +70,7 @@ def _tell_apart() -> None:
     one, other = Tally(), Tally()
     seen = Expected(np.zeros(1, np.uint32), np.zeros((1, 3)), np.zeros((1, 32), np.uint8), np.ones(1, bool))
     for tally in (one, other):
-        tally.look(_MAP_FROM_CAM, np.eye(4), seen)
+        tally.look(np.eye(4), seen)
     evidence(one, other)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from fleetmap.geometry import Array, se3, so3_exp
 from locclient import telling_apart
-from locclient.telling_apart import Expected, Tally, evidence, log_found
+from locclient.telling_apart import Expected, Spot, Tally, evidence, log_found
 
 PITCH_M = 5.0
 DECIDES = 6.9
@@ -53,7 +53,8 @@ class Aisles:
                     stands &= ~((points > BOX[0]) & (points < BOX[1])).all(axis=1)
                 found = self.rng.random(len(ahead)) < np.where(stands[ahead], shares[ahead], 0.04)
                 seen = Expected(ahead.astype(np.uint32), points[ahead], looks_like[ahead], found)
-                tally.look(se3(np.eye(3), np.array([at_m, 0.0, 1.0])), odom_from_true, seen)
+                tally.begin_look()
+                tally.look(odom_from_true, seen)
         return tallies
 
 
@@ -123,7 +124,10 @@ def plainly(one: Tally, other: Tally) -> float:
         ):
             for n in set(range(len(tally.ids))) - alike:
                 cell = tuple(np.floor(tally.points_odom[n] / cell_m + shift).astype(int).tolist())
-                counts = int(tally.expected[n]), int(tally.found[n])
+                looks = one.looks & other.looks
+                counts = (int(tally.expected[n]) & looks).bit_count(), (int(tally.found[n]) & looks).bit_count()
+                if not counts[0]:
+                    continue
                 gone, often = np.exp(log_found(*counts, 0.5, 10.0)), np.exp(log_found(*counts, 2.0, 2.8))
                 cells[side].setdefault(cell, []).append(np.array([0.12 * gone + 0.88 * often, gone]))
         for cell in set(cells[0]) & set(cells[1]):
@@ -151,29 +155,56 @@ def test_evidence_is_what_its_definition_says(seed: int) -> None:
 
 
 def test_two_looks_from_the_same_spot_count_once() -> None:
-    tally, place = Tally(), se3(np.eye(3), np.zeros(3))
-    seen = Expected(np.array([7, 3], np.uint32), np.ones((2, 3)), np.zeros((2, 32), np.uint8), np.array([True, False]))
+    place, nearly = se3(np.eye(3), np.zeros(3)), se3(np.eye(3), np.array([0.1, 0, 0]))
     ahead, turned = se3(np.eye(3), np.array([0.3, 0, 0])), se3(so3_exp(np.array([0, 0, 0.2])), np.array([0.3, 0, 0]))
-    for map_from_cam in (place, se3(np.eye(3), np.array([0.1, 0, 0])), ahead, turned, turned):
-        tally.look(map_from_cam, np.eye(4), seen)
-    assert tally.ids.tolist() == [3, 7]
-    assert tally.expected.tolist() == [3, 3]
-    assert tally.found.tolist() == [0, 3]
+    spot = Spot()
+    assert [spot.is_new(at) for at in (place, nearly, ahead, turned, turned)] == [True, False, True, True, False]
+    change = se3(so3_exp(np.array([0.0, 0.0, 1.0])), np.array([5.0, 0.0, 0.0]))
+    spot.carry(change)
+    assert not spot.is_new(change @ turned)
+    assert spot.is_new(turned)
+
+
+def test_a_look_that_only_one_place_stands_for_does_not_count() -> None:
+    """A bad fix finds less of what is there; that is no evidence against the place."""
+    rng = np.random.default_rng(2)
+    one, other = Aisles(1, signs=0).drive(0)
+    before = evidence(one, other)
+    for _ in range(8):
+        one.begin_look()
+        other.begin_look()
+        one.look(np.eye(4), Expected(one.ids, one.points_odom, one.descriptors, rng.random(len(one.ids)) < 0.02))
+    assert evidence(one, other) == pytest.approx(before, abs=1e-9)
+
+
+def test_looks_are_counted_one_by_one() -> None:
+    tally = Tally()
+    for number in range(6):
+        tally.begin_look()
+        if number % 2 == 0:
+            ids = np.array([7, 3] if number < 4 else [9, 3], np.uint32)
+            seen = Expected(ids, np.full((2, 3), float(number)), np.zeros((2, 32), np.uint8), np.array([True, False]))
+            tally.look(np.eye(4), seen)
+    assert tally.ids.tolist() == [3, 7, 9]
+    assert tally.looks == 0b101010
+    expected, found = tally.counts(tally.looks)
+    assert (expected.tolist(), found.tolist()) == ([3, 2, 1], [0, 2, 1])
+    expected, found = tally.counts(0b1010)
+    assert (expected.tolist(), found.tolist()) == ([2, 1, 1], [0, 1, 1])
+    np.testing.assert_allclose(tally.points_odom[:, 0], [2.0, 1.0, 4.0])
 
 
 def test_a_tally_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In looks at one landmark, and in landmarks: those that were expected longest ago are forgotten."""
+    """In looks, and in landmarks: those that were expected longest ago are forgotten."""
     monkeypatch.setattr(telling_apart, "_MOST_LANDMARKS", 30)
     tally = Tally()
     for number in range(60):
         ids = np.arange(number // 10 * 10, number // 10 * 10 + 20, dtype=np.uint32)
         points = np.tile(ids[:, None], (1, 3)).astype(float)
-        seen = Expected(ids, points, np.zeros((20, 32), np.uint8), np.ones(20, bool))
-        tally.look(se3(np.eye(3), np.array([0.5 * number, 0, 0])), np.eye(4), seen)
+        tally.begin_look()
+        tally.look(np.eye(4), Expected(ids, points, np.zeros((20, 32), np.uint8), np.ones(20, bool)))
     assert tally.ids.tolist() == list(range(40, 70))
-    assert tally.points_odom[:, 0].tolist() == list(range(40, 70))
-    still = se3(np.eye(3), np.zeros(3))
-    for number in range(100):
-        still[0, 3] = number
-        tally.look(still.copy(), np.eye(4), seen)
-    assert tally.expected.max() == tally.found.max() == 40
+    np.testing.assert_allclose(tally.points_odom[:, 0], range(40, 70))
+    for _ in range(64):
+        tally.begin_look()
+    assert len(tally.ids) == tally.looks == 0
