@@ -108,7 +108,7 @@ class Anchor:
             self.now_map_from_body, self.now_cov = composed(
                 self.map_from_body, self.cov_rot_trans, motion[0], motion[1] + floor
             )
-        if motion is None or self.frame_index == tracker.oldest_frame_index:
+        if motion is None or tracker.will_forget(self.frame_index):
             self.frame_index = odometry.frame_index
             self.map_from_body, self.cov_rot_trans = self.now_map_from_body, self.now_cov
 

@@ -82,6 +82,14 @@ def se3_log(target_from_source: Array) -> Array:
     return np.concatenate([rotvec, translation])
 
 
+def se3_adjoint(target_from_source: Array) -> Array:
+    """(6, 6), rotation first: a left perturbation in source axes, in target axes."""
+    rotation = target_from_source[:3, :3]
+    adjoint = np.kron(np.eye(2), rotation)
+    adjoint[3:, :3] = skew(target_from_source[:3, 3]) @ rotation
+    return adjoint
+
+
 def rotation_from_quat_wxyz(quat_wxyz: Array) -> Array:
     """(3, 3) rotation of a quaternion (4,), normalised here."""
     w, x, y, z = np.asarray(quat_wxyz, dtype=np.float64) / np.linalg.norm(quat_wxyz)

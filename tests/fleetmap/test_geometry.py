@@ -18,6 +18,7 @@ from fleetmap.geometry import (
     rotation_between_vectors,
     rotation_from_quat_wxyz,
     se3,
+    se3_adjoint,
     se3_exp,
     se3_inverse,
     se3_log,
@@ -89,6 +90,14 @@ def test_inverse_of_one_and_of_a_stack() -> None:
     stack = np.array([se3_exp(rng.normal(size=6)) for _ in range(4)])
     np.testing.assert_allclose(se3_inverse(stack), np.linalg.inv(stack), atol=1e-12)
     np.testing.assert_allclose(se3_inverse(stack[0]), np.linalg.inv(stack[0]), atol=1e-12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(tangents, tangents)
+def test_adjoint_carries_a_perturbation_to_other_axes(where: Array, perturbation: Array) -> None:
+    target_from_source = se3_exp(where)
+    carried = se3_exp(se3_adjoint(target_from_source) @ perturbation) @ target_from_source
+    np.testing.assert_allclose(carried, target_from_source @ se3_exp(perturbation), atol=1e-7)
 
 
 @settings(max_examples=40, deadline=None)

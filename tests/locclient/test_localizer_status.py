@@ -59,12 +59,11 @@ class ScriptedOdometry:
             np.zeros(3), np.zeros(3), OdometryStatus.TRACKING, np.arange(50), 5.0, 1.0, False, True, change,
         )  # fmt: skip
 
-    @property
-    def oldest_frame_index(self) -> int:
-        return max(0, len(self.odom_from_body) - CLONES)
+    def will_forget(self, frame_index: int) -> bool:
+        return frame_index <= max(0, len(self.odom_from_body) - CLONES)
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
-        if frame_index < self.oldest_frame_index:
+        if frame_index < len(self.odom_from_body) - CLONES:
             return None
         motion = se3_inverse(self.odom_from_body[frame_index]) @ self.odom_from_body[-1]
         sigma_m = self.drift_share * float(np.linalg.norm(motion[:3, 3]))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fleetmap.calibration import ImuNoise, RigCalibration
 from fleetmap.features.stereo import StereoSettings
-from fleetmap.geometry import Array, interpolate_se3, se3_inverse, skew
+from fleetmap.geometry import Array, interpolate_se3, se3_adjoint, se3_inverse, skew
 from fleetmap.odometry.doubts import Doubts
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter import InvariantFilter, NavState
@@ -65,6 +65,9 @@ class Odometry:
         self._vision: list[tuple[int, Array]] = []
         self._last_motion = np.eye(4)
         self._clone_stamps: dict[int, int] = {}
+        self._merged: dict[
+            int, tuple[int, Array]
+        ] = {}  # frames dropped with the newest: a frame that is kept, kept_from_dropped
         self._last_odom_from_body = np.eye(4)
         self._not_before_ns = -(2**62)  # the IMU of before led to a start that was wrong
 
@@ -116,19 +119,24 @@ class Odometry:
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance.
 
-        None where the frame is forgotten. The covariance (6, 6) is that of a left perturbation in the earlier body's
-        axes, rotation first. Sparse pictures can revise where earlier frames were: what two estimates differ by is then
-        not the motion between them, this is.
+        None where the frame is forgotten; one that was dropped with this very frame is not yet. The covariance (6, 6) is that
+        of a left perturbation in the earlier body's axes, rotation first. Sparse pictures can revise where earlier frames were:
+        what two estimates differ by is then not the motion between them, this is.
         """
+        kept_from_frame = np.eye(4)
+        while frame_index in self._merged:
+            frame_index, kept_from_earlier = self._merged[frame_index]
+            kept_from_frame = kept_from_earlier @ kept_from_frame
         if self._filter is None or frame_index not in self._filter.clone_ids:
             return None
-        return self._filter.motion_since(frame_index)
+        kept_from_now, covariance = self._filter.motion_since(frame_index)
+        frame_from_kept = se3_inverse(kept_from_frame)
+        carry = se3_adjoint(frame_from_kept)
+        return frame_from_kept @ kept_from_now, carry @ covariance @ carry.T
 
-    @property
-    def oldest_frame_index(self) -> int:
-        """The oldest frame that `motion_since` still knows."""
-        assert self._filter is not None
-        return self._filter.clone_ids[0]
+    def will_forget(self, frame_index: int) -> bool:
+        """Whether `motion_since` may not know a frame any more after the next one: the oldest that it knows, and what was dropped."""
+        return self._filter is None or frame_index not in self._filter.clone_ids[1:]
 
     # --- start ---
 
@@ -373,6 +381,7 @@ class Odometry:
         """Drops the second newest clone where the robot hardly moved since the one before, else the oldest."""
         assert self._filter is not None
         settings = self._settings.filter
+        self._merged.clear()
         while len(self._filter.clone_ids) >= settings.clones:
             ids = self._filter.clone_ids
             earlier, candidate = self._filter.odom_from_clone(ids[-3]), self._filter.odom_from_clone(ids[-2])
@@ -381,6 +390,8 @@ class Odometry:
             parallax = float(np.linalg.norm(moved[:3, 3])) / self._scene_depth_m()
             still = angle < settings.keyframe_rotation_rad and parallax < settings.keyframe_parallax
             gone = ids[-2] if still else ids[0]
+            if still:
+                self._merged[gone] = ids[-3], moved
             self._filter.remove_clone(gone)
             self._clone_stamps.pop(gone, None)
 

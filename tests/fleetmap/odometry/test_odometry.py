@@ -104,11 +104,32 @@ def test_stereo_alone_follows_too(visual: tuple[Odometry, list[OdometryEstimate]
     assert np.degrees(np.linalg.norm(error[:3])) < 1.0
     assert sigma_m(estimates[-1]) < 0.2
     assert odometry.motion_since(-1) is None
-    since = odometry.motion_since(odometry.oldest_frame_index)
+    number = next(k for k in range(len(estimates)) if odometry.motion_since(k) is not None)
+    since, oldest = odometry.motion_since(number), estimates[number]
     assert since is not None
-    oldest = estimates[odometry.oldest_frame_index]
+    assert odometry.will_forget(number)
+    assert not odometry.will_forget(len(estimates) - 1)
     off = se3_log(se3_inverse(truth_between(oldest.stamp_ns, estimates[-1].stamp_ns)) @ since[0])
     assert np.linalg.norm(off[3:]) < 0.06
+
+
+def test_the_motion_since_a_frame_is_known_although_it_was_dropped_with_the_next() -> None:
+    """Slowly: most frames are hardly elsewhere than the one before, and are not kept."""
+    odometry = Odometry(rig(None), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    slow_ns, dropped = FRAME_NS // 10, 0
+    frames = [stereo_frame(k * slow_ns) for k in range(1, 41)]
+    for number, frame in enumerate(frames):
+        estimate = odometry.handle_stereo(frame)
+        if not number:
+            continue
+        since = odometry.motion_since(number - 1)
+        assert since is not None, number
+        off = se3_log(se3_inverse(truth_between(frames[number - 1].stamp_ns, estimate.stamp_ns)) @ since[0])
+        sigmas = np.sqrt(np.diag(since[1]))
+        assert np.linalg.norm(off[3:]) < 0.01
+        assert (np.abs(off) < 5.0 * sigmas + 1e-3).all()
+        dropped += number > 1 and odometry.will_forget(number - 1)
+    assert dropped > 10
 
 
 def test_the_same_samples_give_the_same_bits(visual: tuple[Odometry, list[OdometryEstimate]]) -> None:
