@@ -31,8 +31,8 @@ _THERE, _NEVER_SHARE, _GONE = (2.0, 2.8), 0.12, (0.5, 10.0)
 _TAKEN_SHARE = 0.05  # of the cells in which stock was moved since the survey
 _DIFFERENT_SHARE = 0.15  # of the cells with something that looks the same nowhere in the other place
 _ODD_SHARE = 0.01  # of those that mislead: stock moved to where it makes one place look like the other
-_QUIET = 1.0  # a logarithm: cells say no more than this by chance, and are not heard
-_MOST = -np.log(_ODD_SHARE)  # from a block, as from a single cell
+_QUIET = 1.25  # a logarithm: cells say hardly more than this by chance, and that much is not heard
+_MOST = 3.0  # from a block: no single thing that could have been carried here decides
 
 
 @dataclass(frozen=True, slots=True)

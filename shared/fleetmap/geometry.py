@@ -87,7 +87,7 @@ def se3_adjoint(target_from_source: Array) -> Array:
     rotation = target_from_source[:3, :3]
     adjoint = np.kron(np.eye(2), rotation)
     adjoint[3:, :3] = skew(target_from_source[:3, 3]) @ rotation
-    return adjoint
+    return np.asarray(adjoint, np.float64)
 
 
 def rotation_from_quat_wxyz(quat_wxyz: Array) -> Array:
