@@ -1,6 +1,7 @@
 """Places that fixes speak for before one of them is believed: who votes for which, who leads, who is a rival. Pure."""
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from fleetmap.geometry import Array, se3_inverse
 from locclient.anchors import Anchor, difference
 from locclient.relocalizer import Fix, Slices
 from locclient.settings import TrackSettings
-from locclient.telling_apart import evidence
+from locclient.telling_apart import evidence, mark_shared
 
 _PAIRS_AT_ONCE = 4  # comparisons in a slice of a look
 
@@ -80,20 +81,26 @@ def told_apart(candidates: Sequence[Anchor], settings: TrackSettings) -> Slices[
     """
     if not rivals(candidates, settings):
         return None
-    first, *others = ranked(candidates)
-    lead: list[float] = []
-    for number, other in enumerate(others):
+    places = ranked(candidates)
+    shared = [np.zeros(len(c.tally.ids), bool) for c in places]
+    for number, (i, j) in enumerate(combinations(range(len(places)), 2)):
         if number and number % _PAIRS_AT_ONCE == 0:
             yield
-        lead.append(evidence(first.tally, other.tally))
-    best, known = first, {id(o): e for o, e in zip(others, lead, strict=True)}
-    if lead and min(lead) <= -settings.telling_evidence:
-        best, known = others[int(np.argmin(lead))], {id(first): -min(lead)}
+        mark_shared(places[i].tally, places[j].tally, shared[i], shared[j])
+    known = {id(c): (c.tally, flags) for c, flags in zip(places, shared, strict=True)}
+
+    def lead(one: Anchor, other: Anchor) -> float:
+        (tally, flags), (other_tally, other_flags) = known[id(one)], known[id(other)]
+        return evidence(tally, other_tally, flags, other_flags)
+
+    yield
+    best = max(places[1:], key=lambda other: lead(other, places[0]))
+    if lead(best, places[0]) < settings.telling_evidence:
+        best = places[0]
     for number, other in enumerate(rivals(candidates, settings, best)):
         if number and number % _PAIRS_AT_ONCE == 0:
             yield
-        found = known[id(other)] if id(other) in known else evidence(best.tally, other.tally)
-        if found < settings.telling_evidence:
+        if lead(best, other) < settings.telling_evidence:
             return None
     return best
 

@@ -2,10 +2,14 @@
 
 Totals do not: a sign at an aisle's end is ten landmarks among hundreds, and the map's budget takes other landmarks of each aisle.
 So every place that is held remembers, landmark by landmark, how often it should have been seen and how often it was. Two places
-are then laid over each other, as the robot's own way relates them. What looks the same in both says nothing and is left out. The
-rest is compared cell by cell: in almost all of them stands the same in both, of which the map holds other corners, or it was taken
-away; where what the map holds of the one is found again and what it holds of the other never is, one of the two is wrong. A cell of
-which only one place has landmarks says nothing: the budget may have chosen none, and a box may have been moved.
+are then laid over each other, as the robot's own way relates them. What looks the same in both says nothing and is left out, and so
+is what any third place shares: a twin of an aisle that is not in the map itself would else be told from others by all that it shares
+with that aisle. The rest is compared cell by cell: in almost all of them stands the same in both, of which the map holds other
+corners, or it was taken away; where what the map holds of the one is found again and what it holds of the other never is, one of the
+two is wrong. A cell of which only one place has landmarks says nothing: the budget may have chosen none, and a box may have been
+moved. Nor do hundreds of cells that each say next to nothing: what the survey saw better in one aisle than in the other adds up as
+well. A cell has to speak up, and no block of cells can decide alone, as all that a pallet carries can be carried from one aisle to
+another.
 """
 
 from dataclasses import dataclass, field
@@ -17,6 +21,8 @@ from numpy.typing import NDArray
 from fleetmap.features.matching import packed
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
 from locclient import telling_apart_kernels as kernels
+
+Flags = NDArray[np.bool_]
 
 _MOST_LOOKS, _ALL_LOOKS = 64, (1 << 64) - 1  # that are remembered: some 20 m of way
 _MOST_LANDMARKS = 3000  # of a place: some 30 m of way
@@ -127,24 +133,30 @@ class Tally:
         self.expected, self.found = self.expected[rows], self.found[rows]
 
 
-def evidence(one: Tally, other: Tally) -> float:
+def mark_shared(one: Tally, other: Tally, one_shared: Flags, other_shared: Flags) -> None:
+    """Sets the flags of the landmarks (L,), (M,) that look the same at the same spot of the other place."""
+    if len(one.ids) and len(other.ids):
+        kernels.mark_alike(
+            one.points_odom, packed(one.descriptors), other.points_odom, packed(other.descriptors), _REACH_M, _ALIKE_BITS,
+            one_shared, other_shared,
+        )  # fmt: skip
+
+
+def evidence(one: Tally, other: Tally, one_shared: Flags, other_shared: Flags) -> float:
     """How much more likely what was seen is at the first place than at the second, a natural logarithm; 0 where nothing tells.
 
-    By the looks from both: one that only one of them stands for was perhaps a bad one.
+    By the looks from both: one that only one of them stands for was perhaps a bad one. one_shared, other_shared: landmarks that look
+    the same at the same spot of any place that the robot may be at, of which none says which of them it is.
     """
     common = one.looks & other.looks
     if not common or not len(one.ids) or not len(other.ids):
         return 0.0
-    alike, other_alike = np.zeros(len(one.ids), bool), np.zeros(len(other.ids), bool)
-    kernels.mark_alike(
-        one.points_odom, packed(one.descriptors), other.points_odom, packed(other.descriptors), _REACH_M, _ALIKE_BITS, alike,
-        other_alike,
-    )  # fmt: skip
-    slots = 1 << int(np.ceil(np.log2(2 * (len(alike) + len(other_alike)))))
     counts = [tally.counts(common) for tally in (one, other)]
     scores = [_SCORES[expected, found] for expected, found in counts]
-    alike |= counts[0][0] == 0
-    other_alike |= counts[1][0] == 0
+    alike, other_alike = (
+        flags | (expected == 0) for flags, (expected, _) in zip((one_shared, other_shared), counts, strict=True)
+    )
+    slots = 1 << int(np.ceil(np.log2(2 * (len(alike) + len(other_alike)))))
     blocks, said, count = np.zeros(_MOST_BLOCKS, np.int64), np.zeros((_MOST_BLOCKS, len(_LATTICES))), 0
     for lattice, (cell_m, shift) in enumerate(_LATTICES):
         cells, middles, sums = np.zeros(slots, np.int64), np.zeros((slots, 3)), np.zeros((slots, 2, 3))

@@ -18,7 +18,7 @@ from fleetmap.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetmap.samples import CameraFrame, ImuSamples, WheelSample
 from locclient.localizer import Localizer
 from locclient.settings import LocalizerSettings
-from locclient.telling_apart import Expected, Tally, evidence
+from locclient.telling_apart import Expected, Tally, evidence, mark_shared
 
 _FRAMES, _STANDING = 40, 20
 _FRAME_NS, _IMU_NS = 50_000_000, 5_000_000
@@ -71,7 +71,9 @@ def _tell_apart() -> None:
     seen = Expected(np.zeros(1, np.uint32), np.zeros((1, 3)), np.zeros((1, 32), np.uint8), np.ones(1, bool))
     for tally in (one, other):
         tally.look(np.eye(4), seen)
-    evidence(one, other)
+    shared = [np.zeros(1, bool) for _ in range(2)]
+    mark_shared(one, other, *shared)
+    evidence(one, other, *shared)
 
 
 def _wall(camera: StereoCamera) -> NDArray[np.uint8]:

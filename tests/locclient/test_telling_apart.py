@@ -1,11 +1,13 @@
 """Two aisles that look alike: told apart by a sign, not by stock that was moved; and the comparison against one written plainly."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, so3_exp
 from locclient import telling_apart
-from locclient.telling_apart import Expected, Spot, Tally, evidence, log_found
+from locclient.telling_apart import Expected, Spot, Tally, log_found, mark_shared
 
 PITCH_M = 5.0
 DECIDES, ONE_BLOCK = 4.0, 3.0
@@ -58,6 +60,15 @@ class Aisles:
         return tallies
 
 
+def evidence(one: Tally, other: Tally, *others: Tally) -> float:
+    """For one place against another, where the robot may be at these and others."""
+    places = [one, other, *others]
+    shared = [np.zeros(len(place.ids), bool) for place in places]
+    for i, j in combinations(range(len(places)), 2):
+        mark_shared(places[i], places[j], shared[i], shared[j])
+    return telling_apart.evidence(one, other, shared[0], shared[1])
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_signs_at_an_aisles_end_decide(seed: int) -> None:
     one, other = Aisles(seed).drive(0)
@@ -93,6 +104,27 @@ def test_signs_that_the_map_holds_in_one_aisle_only_say_nothing() -> None:
     for aisle in (0, 1):
         one, other = hall.drive(aisle)
         assert abs(evidence(one, other)) < ONE_BLOCK
+
+
+WALLS = (((2.0, 0.6, 0.4), (2.1, 1.4, 1.2)), ((2.0, -1.6, 1.0), (2.1, -0.8, 1.8)), ((2.0, -0.4, 2.2), (2.1, 0.4, 3.0)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_a_third_place_shares_does_not_tell(seed: int) -> None:
+    """The robot's own aisle is not in the map. Two of three twins end at a wall like its own, the other one at another wall."""
+    hall = Aisles(seed, count=3)
+    wall, other_wall = (np.concatenate([hall.rng.uniform(*part, (14, 3)) for part in WALLS]) for _ in range(2))
+    looks, other_looks = hall._looks(len(wall)), hall._looks(len(wall))
+    for aisle in range(3):
+        is_like = aisle != 1
+        hall.points[aisle] = np.concatenate([hall.points[aisle], wall if is_like else other_wall])
+        like = hall._spoiled(looks) if is_like else other_looks
+        hall.looks[aisle] = np.concatenate([hall.looks[aisle], like])
+        stands = np.full(len(wall), 0 if is_like else 99)
+        hall.things[aisle] = np.concatenate([hall.things[aisle], stands])
+    one, other, third = hall.drive(None)
+    assert evidence(one, other) > DECIDES, "a wall tells from the other one, and that is all that this pair knows"
+    assert abs(evidence(one, other, third)) < ONE_BLOCK
 
 
 def test_evidence_for_one_is_evidence_against_the_other() -> None:
