@@ -35,12 +35,12 @@ def vote(
             if candidate.misses:  # at most one vote a frame
                 candidate.support, candidate.misses = candidate.support + 1, 0
                 candidate.speak(fix.inliers, fix.hit_share)
-                _count(candidate, fresh, fix, odom_from_body)
+                _count(candidate, fresh, fix, odom_from_body, settings)
             candidate.moved_to(fresh)
             return
     fresh.fade(0.0)
     fresh.speak(fix.inliers, fix.hit_share)
-    _count(fresh, fresh, fix, odom_from_body)
+    _count(fresh, fresh, fix, odom_from_body, settings)
     candidates.append(fresh)
 
 
@@ -77,9 +77,10 @@ def rivals(candidates: Sequence[Anchor], settings: TrackSettings, best: Anchor |
 def told_apart(candidates: Sequence[Anchor], settings: TrackSettings) -> Slices[Anchor | None]:
     """The one that what stands there tells from every other that totals would name its rival; None while nothing does. In slices.
 
-    It need not be the one that totals rank first: a sign is little beside all that the places share.
+    It need not be the one that totals rank first: a sign is little beside all that the places share. Only where the right one must be
+    among them: of the twins of a place that the map does not hold, one is always the least unlike it.
     """
-    if not rivals(candidates, settings):
+    if not settings.is_whole_site_mapped or not rivals(candidates, settings):
         return None
     places = ranked(candidates)
     shared = [np.zeros(len(c.tally.ids), bool) for c in places]
@@ -119,8 +120,8 @@ def is_unmistakable(fix: Fix, settings: TrackSettings) -> bool:
     )
 
 
-def _count(candidate: Anchor, fresh: Anchor, fix: Fix, odom_from_body: Array | None) -> None:
-    if fix.witnessed is not None and odom_from_body is not None:
+def _count(candidate: Anchor, fresh: Anchor, fix: Fix, odom_from_body: Array | None, settings: TrackSettings) -> None:
+    if settings.is_whole_site_mapped and fix.witnessed is not None and odom_from_body is not None:
         candidate.tally.look(odom_from_body @ se3_inverse(fresh.now_map_from_body), fix.witnessed)
 
 

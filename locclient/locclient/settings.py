@@ -52,6 +52,7 @@ class TrackSettings(Section, frozen=True):
     rival_share: float = 0.6
     rival_hit_share: float = 0.8
     rival_least_share: float = 0.25
+    is_whole_site_mapped: bool = False
     telling_evidence: float = 4.0
     evidence_kept_share: float = 0.8
     max_misses: int = 4

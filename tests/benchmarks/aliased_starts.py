@@ -15,9 +15,11 @@ from fleetsim.landmarks import LandmarkField
 from fleetsim.recorder import Order, prepare
 from locclient.estimate import Estimate, Status
 from locclient.map_view import MapView
+from locclient.settings import LocalizerSettings, TrackSettings
 from mapserver.survey.settings import BudgetSettings
 
 RIGHT_M, WRONG_M = 0.5, 0.3
+WHOLE_SITE = LocalizerSettings(track=TrackSettings(is_whole_site_mapped=True))
 _EVERY_M = 0.8
 
 
@@ -146,21 +148,22 @@ def judged(frame: int, session: EstimatorSession, estimates: list[Estimate]) -> 
 
 
 def start_at(
-    site: Site, number: int, duration_s: float, prior_sigma_m: float | None, rng: np.random.Generator
-) -> Start:
+    site: Site, number: int, duration_s: float, prior_sigma_m: float | None, rng: np.random.Generator,
+    settings: LocalizerSettings = estimator_loop.SETTINGS,
+) -> Start:  # fmt: skip
     """The outcome of waking at a frame, for so long."""
     session = LateSession(site.robot, number)
     prior = None if prior_sigma_m is None else prior_at(session, prior_sigma_m, rng)
     count = int(np.searchsorted(session.stamps_ns, session.stamps_ns[0] + int(duration_s * 1e9)))
-    return judged(number, session, estimator_loop.run_localizer(session, site.view, prior, count))
+    return judged(number, session, estimator_loop.run_localizer(session, site.view, prior, count, settings=settings))
 
 
-def resolving_start_at(site: Site, number: int, beyond_m: float) -> Start:
+def resolving_start_at(site: Site, number: int, beyond_m: float, settings: LocalizerSettings) -> Start:
     """The outcome of waking at a frame among the racks without a prior, until the place is known or the robot is so far out of them."""
     session = LateSession(site.robot, number)
     count = int(np.searchsorted(ways_m(session), beyond_m))
     known = estimator_loop.run_localizer(
-        session, site.view, None, count, until=lambda estimate: estimate.status is Status.TRACKING
+        session, site.view, None, count, settings=settings, until=lambda estimate: estimate.status is Status.TRACKING
     )
     return judged(number, session, known)
 

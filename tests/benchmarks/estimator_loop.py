@@ -24,6 +24,7 @@ from locclient.map_view import MapView
 from locclient.relocalizer import Relocalizer, Seen, Slices
 from locclient.settings import LocalizerSettings
 
+SETTINGS = LocalizerSettings()
 _TILE_M = 1024.0
 _NEVER_S = 1e9
 _LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of the frame that is handled, for stamps that are too early
@@ -210,10 +211,10 @@ class SessionRelocalizer(Relocalizer):
 
 def run_localizer(
     session: EstimatorSession, view: MapView, prior: PositionPrior | None = None, frames: int | None = None, *,
-    has_wheels: bool = False, until: Callable[[Estimate], bool] = lambda _: False,
+    has_wheels: bool = False, settings: LocalizerSettings = SETTINGS, until: Callable[[Estimate], bool] = lambda _: False,
 ) -> list[Estimate]:  # fmt: skip
     """The localizer's estimates over a session in a map; the last one is that for which `until` holds."""
-    nominal, settings = session.session.nominal, LocalizerSettings()
+    nominal = session.session.nominal
     localizer = Localizer(nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s, settings)
     localizer._odometry._tracker = EstimatorTracker(session, session.camera, settings.odometry.tracker)
     localizer._relocalizer, localizer._map_version = SessionRelocalizer(view, session, settings), 1

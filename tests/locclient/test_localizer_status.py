@@ -417,6 +417,12 @@ def test_a_strong_fix_with_a_rival_is_not_believed(robot: Robot) -> None:
 TWIN = off(0.0, 5.0)
 
 
+@pytest.fixture
+def sure_robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
+    """One that may take it that its own aisle is in the map."""
+    return Robot(monkeypatch, is_whole_site_mapped=True).load()
+
+
 class Signs:
     """What the map holds at the end of an aisle and of its twin: two signs each, which look different. The robot sees those of
     one of them (0, 1) or, in an aisle that is not in the map, of none."""
@@ -437,30 +443,37 @@ class Signs:
 
 
 @pytest.mark.parametrize("own", [0, 1])
-def test_a_twin_is_told_by_its_signs(robot: Robot, monkeypatch: pytest.MonkeyPatch, own: int) -> None:
+def test_a_twin_is_told_by_its_signs(sure_robot: Robot, monkeypatch: pytest.MonkeyPatch, own: int) -> None:
     """Although as many landmarks agree in the other aisle; and whichever is thought of first."""
-    monkeypatch.setattr(robot, "_fix", Signs(robot, own).fix)
-    said = robot.ride(20, 0.4, [off(0.0), TWIN])
+    monkeypatch.setattr(sure_robot, "_fix", Signs(sure_robot, own).fix)
+    said = sure_robot.ride(20, 0.4, [off(0.0), TWIN])
     assert said[0].status is Status.AMBIGUOUS
     known = next(e for e in said if e.status is Status.TRACKING)
     assert known.map_from_body is not None
     assert all(e.status in (Status.AMBIGUOUS, Status.INITIALISING) for e in said[: said.index(known)])
-    truth = robot.map_from_body[:3, 3] + own * TWIN
+    truth = sure_robot.map_from_body[:3, 3] + own * TWIN
     assert said[-1].map_from_body is not None
     assert np.linalg.norm(said[-1].map_from_body[:3, 3] - truth) < 0.05
 
 
-def test_signs_of_neither_twin_leave_it_open(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signs_of_neither_twin_leave_it_open(sure_robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     """The robot's own aisle is a third one, which is not in the map."""
-    monkeypatch.setattr(robot, "_fix", Signs(robot, None).fix)
-    assert {e.status for e in robot.ride(30, 0.4, [off(0.0), TWIN])} == {Status.AMBIGUOUS}
+    monkeypatch.setattr(sure_robot, "_fix", Signs(sure_robot, None).fix)
+    assert {e.status for e in sure_robot.ride(30, 0.4, [off(0.0), TWIN])} == {Status.AMBIGUOUS}
 
 
-def test_signs_from_a_standing_robot_are_seen_once(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signs_from_a_standing_robot_are_seen_once(sure_robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same look again and again is no more evidence."""
-    monkeypatch.setattr(robot, "_fix", Signs(robot, 0).fix)
-    said = [robot.go(0.0, [off(0.0), TWIN], turn_rad=0.0) for _ in range(30)]
+    monkeypatch.setattr(sure_robot, "_fix", Signs(sure_robot, 0).fix)
+    said = [sure_robot.go(0.0, [off(0.0), TWIN], turn_rad=0.0) for _ in range(30)]
     assert {e.status for e in said} == {Status.AMBIGUOUS}
+
+
+def test_signs_tell_nothing_where_the_own_aisle_may_not_be_in_the_map(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(robot, "_fix", Signs(robot, 0).fix)
+    assert {e.status for e in robot.ride(20, 0.4, [off(0.0), TWIN])} == {Status.AMBIGUOUS}
 
 
 def test_darkness_is_named_within_a_second(tracking: Robot) -> None:
