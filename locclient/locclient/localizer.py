@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
 from fleetmap.calibration import RigCalibration
@@ -13,9 +12,10 @@ from fleetmap.mapformat import Tile
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import ImuSamples, PositionPrior, WheelSample
-from locclient.anchors import Anchor, applied, difference, led_back, moved
+from locclient.anchors import Anchor, applied, difference, moved
 from locclient.candidates import begin_look, is_proven, is_unmistakable, ranked, rivals, still_held, told_apart, vote
 from locclient.estimate import Estimate, Hypothesis, Status
+from locclient.held_prior import HeldPrior
 from locclient.map_view import MapView
 from locclient.relocalizer import Fix, Relocalizer, Seen, Slices
 from locclient.settings import LocalizerSettings
@@ -26,8 +26,6 @@ _RADIUS_95 = 2.796  # of a three-dimensional normal distribution, in sigmas
 _SPREAD_SHARE = 0.45  # of the time between two looks: frames that come less often are not made to share one
 
 _CANDIDATES_AT_ONCE = 3  # in one slice of a search
-_PLACE_REACH_M = 3.0  # from a place that shows the same as the robot sees
-_PRIOR_WAY_SHARE = 0.2  # of the way since a prior, by which it is doubted
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +61,7 @@ class Localizer:
         self._tiles: dict[tuple[int, int], Tile] = {}
         self._vocabulary: Vocabulary | None = None
         self._survey_focal_px = 0.0
-        self._prior: PositionPrior | None = None
-        self._way_since_prior_m = 0.0
-        self._prior_moment: Anchor | None = None  # the first frame after it, as the identity
-        self._told: Anchor | None = None  # the place of a prior that is known in all directions
+        self._prior: HeldPrior | None = None
         self._anchor: Anchor | None = None  # the confirmed place
         self._candidates: list[Anchor] = []  # unconfirmed ones
         self._told_apart: Anchor | None = None  # the one of them that none of the others can be
@@ -93,7 +88,7 @@ class Localizer:
     def handle_prior(self, prior: PositionPrior) -> None:
         """A coarse place at this moment; used for the search until a fix has been confirmed, widened by some of the way since. One
         whose covariance is finite is a place of its own as long as the map knows none: DEGRADED, by odometry from there."""
-        self._prior, self._way_since_prior_m, self._told, self._prior_moment = prior, 0.0, None, None
+        self._prior = HeldPrior(prior, self._base_from_body)
 
     def handle_version(
         self, version: int, tiles: Iterable[Tile], vocabulary: Vocabulary, survey_focal_px: float
@@ -147,24 +142,23 @@ class Localizer:
         change = odometry.new_odom_from_old_odom
         last = None if self._last_odom is None else self._last_odom if change is None else change @ self._last_odom
         step = np.eye(4) if last is None else se3_inverse(last) @ odometry.odom_from_body
-        self._way_since_prior_m += float(np.linalg.norm(step[:3, 3]))
-        for anchor in [*self._anchors(), *(a for a in (self._moment, self._prior_moment) if a)]:
+        for anchor in [*self._anchors(), *([self._moment] if self._moment else [])]:
             anchor.carry(self._odometry, odometry, step, self._settings.track)
             if change is not None:
                 anchor.tally.carry(change)
         if change is not None:
             self._spot.carry(change)
         self._last_odom = odometry.odom_from_body
-        if self._prior is not None and self._prior_moment is None:
-            self._prior_moment = Anchor.at(odometry, np.eye(4), np.zeros((6, 6)))
-        if self._prior is not None and self._told is None and np.isfinite(self._prior.cov_rot_trans).all():
-            map_from_body = self._prior.map_from_base @ self._base_from_body
-            lever_m = map_from_body[:3, 3] - self._prior.map_from_base[:3, 3]
-            self._told = Anchor.at(odometry, map_from_body, moved(self._prior.cov_rot_trans, lever_m))
+        if self._prior is not None:
+            self._prior.follow(self._odometry, odometry, step, self._settings.track)
 
     def _anchors(self) -> list[Anchor]:
         known = [self._anchor, *self._anchor.strangers] if self._anchor else []
-        return [*known, *self._candidates, *(a for a in (self._given_up, self._told) if a)]
+        return [*known, *self._candidates, *(a for a in (self._given_up, self._told()) if a)]
+
+    def _told(self) -> Anchor | None:
+        """The place of a prior that is known in all directions."""
+        return self._prior.place if self._prior is not None else None
 
     def _is_due(self, stamp_ns: int, odometry: OdometryEstimate) -> bool:
         settings, last = self._settings.track, self._begun_ns
@@ -244,7 +238,8 @@ class Localizer:
         known = None
         if len(self._candidates) == 1:
             known = (self._candidates[0].then_map_from_body @ self._body_from_cam)[:3, :3]
-        fixes = yield from relocalizer.anywhere(seen, self._places_in_prior(), known, fixes)
+        near = None if self._prior is None else self._prior.is_near(relocalizer.view.map_from_cam[:, :3, 3])
+        fixes = yield from relocalizer.anywhere(seen, near, known, fixes)
         return [f for f in fixes if self._counts(f) and self._in_prior(f)]
 
     def _counts(self, fix: Fix) -> bool:
@@ -255,30 +250,10 @@ class Localizer:
             fix.inliers >= settings.min_inliers and fix.hit_share >= settings.min_hit_share
         )
 
-    def _prior_cov_m2(self) -> Array:
-        """(2, 2) of the prior's horizontal position, wider with the way since: what odometry does not know of itself, a robot that was
-        pushed and an operator who was wrong must not keep it from its place for ever."""
-        assert self._prior is not None
-        wider = 0.05**2 + (_PRIOR_WAY_SHARE * self._way_since_prior_m) ** 2
-        return np.asarray(self._prior.cov_rot_trans[3:5, 3:5] + wider * np.eye(2))
-
-    def _places_in_prior(self) -> NDArray[np.bool_] | None:
-        if self._prior is None or self._relocalizer is None:
-            return None
-        off = self._relocalizer.view.map_from_cam[:, :2, 3] - self._prior.map_from_base[:2, 3]
-        sigma = float(np.sqrt(np.linalg.eigvalsh(self._prior_cov_m2())[-1]))
-        return np.asarray(np.linalg.norm(off, axis=1) < 3.7 * sigma + self._way_since_prior_m + _PLACE_REACH_M)
-
     def _in_prior(self, fix: Fix) -> bool:
-        """Whether a fix says of the prior's moment what lies within the 0.999 bound of the prior's position: the robot's own way leads
-        back there."""
-        if self._prior is None or self._prior_moment is None or self._moment is None:
+        if self._prior is None or self._moment is None:
             return True
-        now, since = Anchor.behind(self._moment, *self._at_body(fix)), self._prior_moment
-        map_from_then, covariance = led_back(now.now_map_from_body, now.now_cov, since.now_map_from_body, since.now_cov)
-        map_from_base = map_from_then @ se3_inverse(self._base_from_body)
-        off = map_from_base[:2, 3] - self._prior.map_from_base[:2, 3]
-        return bool(off @ np.linalg.solve(self._prior_cov_m2() + covariance[3:5, 3:5], off) < 13.816)
+        return self._prior.allows(Anchor.behind(self._moment, *self._at_body(fix)))
 
     # --- tracking --------------------------------------------------------------------------------------------------------
 
@@ -323,7 +298,7 @@ class Localizer:
         if max(c.support for c in self._anchor.strangers) >= settings.kidnap_fixes:
             self._given_up, self._candidates, self._anchor = self._anchor, self._anchor.strangers, None
             self._told_apart = None
-            self._prior = self._told = None  # whatever named that place before is as wrong
+            self._prior = None  # whatever named that place before is as wrong
 
     # --- confirmation ----------------------------------------------------------------------------------------------------
 
@@ -343,7 +318,7 @@ class Localizer:
         if self._is_confirmed(best, fixes):
             moved_m = self._moved_m(best)
             self._anchor, self._candidates, self._given_up, self._told_apart = best, [], None, None
-            self._prior = self._told = None
+            self._prior = None
             self._ever_tracked = True
         assert self._moment is not None
         seen_from = self._moment
@@ -377,10 +352,7 @@ class Localizer:
         other place of this map can be meant."""
         settings = self._settings.track
         strong = len(self._candidates) == len(fixes) == 1 and is_unmistakable(fixes[0], settings)
-        tight = (
-            self._prior is not None
-            and np.sqrt(np.linalg.eigvalsh(self._prior_cov_m2())[-1]) <= settings.tight_prior_sigma_m
-        )
+        tight = self._prior is not None and self._prior.is_tight(settings.tight_prior_sigma_m)
         return bool(tight or strong or is_proven(candidate, settings))
 
     def _moved_m(self, place: Anchor) -> float | None:
@@ -416,9 +388,10 @@ class Localizer:
         if likely and not others:
             now, covariance = likely[0].now_map_from_body, self._published(likely[0].now_cov)
             return replace(said, map_from_body=now, cov_rot_trans=covariance)
-        if likely or self._told is None or self._relocalizer is None:
+        told = self._told()
+        if likely or told is None or self._relocalizer is None:
             return said
-        return self._as_told(said, self._told)
+        return self._as_told(said, told)
 
     def _as_told(self, said: Estimate, told: Anchor) -> Estimate:
         """Nothing in the map agrees: the prior and the way since, as far as that goes."""
