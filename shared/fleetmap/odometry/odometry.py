@@ -65,9 +65,8 @@ class Odometry:
         self._vision: list[tuple[int, Array]] = []
         self._last_motion = np.eye(4)
         self._clone_stamps: dict[int, int] = {}
-        self._merged: dict[
-            int, tuple[int, Array]
-        ] = {}  # frames dropped with the newest: a frame that is kept, kept_from_dropped
+        # Frames dropped with the newest: a frame that is kept, and kept_from_dropped.
+        self._merged: dict[int, tuple[int, Array]] = {}
         self._last_odom_from_body = np.eye(4)
         self._not_before_ns = -(2**62)  # the IMU of before led to a start that was wrong
 
