@@ -73,9 +73,11 @@ class EstimatorTracker(Tracker):
         held = {number: self._begun_px[number] for number in self._points.ids.tolist()}
         self._begun_px = held | dict(zip(ids.tolist(), begun[is_new], strict=True))
         pixels, kept = self._measure(ids)
-        self._points = type(self._points)(
+        ids, pixels = (
             np.concatenate([self._points.ids, ids[kept]]), np.concatenate([self._points.pixels, pixels[kept]])
-        )
+        )  # fmt: skip
+        rising = np.argsort(ids)  # as those of the tracker, which numbers them one after another
+        self._points = type(self._points)(ids[rising], pixels[rising])
 
 
 def seen(session: EstimatorSession, frame: int) -> Seen:
