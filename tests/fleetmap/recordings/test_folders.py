@@ -149,7 +149,7 @@ def test_tumvis_export_in_eurocs_layout(tmp_path: Path) -> None:
 
 
 def test_seven_scenes_depth_is_registered_to_colour(tmp_path: Path) -> None:
-    """A step in the middle stays there; one elsewhere moves towards the middle by 525/585."""
+    """The depth lens is the longer one, 25 mm to the left: all moves towards the middle by 525/585 and left by f * 0.025 / z."""
     folder = write_seven_scenes(tmp_path / "r", SAMPLE)
     recording = open_recording(folder)
     assert recording.sensor_set is SensorSet.RGBD
@@ -158,10 +158,12 @@ def test_seven_scenes_depth_is_registered_to_colour(tmp_path: Path) -> None:
     assert depth is not None
     assert set(np.unique(depth)) == {np.float32(0), np.float32(2), np.float32(5)}
     middle = depth[HEIGHT // 2]
-    # The depth lens is the longer one: it does not see the colour image's outer 16 columns
-    assert (middle[17 : WIDTH // 2] == 2).all()
-    assert (middle[WIDTH // 2 + 1 : -17] == 5).all()
-    assert (middle[:16] == 0).all()
+    left_2m, left_5m = (525 / 640 * WIDTH * 0.025 / z for z in (2, 5))
+    near, far = np.flatnonzero(middle == 2), np.flatnonzero(middle == 5)
+    assert near[0] == pytest.approx(WIDTH / 2 * (1 - 525 / 585) - left_2m, abs=1)
+    assert near[-1] == pytest.approx(WIDTH / 2 - left_2m, abs=1)
+    assert far[0] == pytest.approx(WIDTH / 2 - left_5m, abs=1)
+    assert far[-1] == pytest.approx(WIDTH / 2 * (1 + 525 / 585) - left_5m, abs=1)
     # The unknown rows end 100 rows above the centre in the depth image, 100 * 525/585 = 89.7 in the colour image
     known_rows = np.flatnonzero(depth[:, 40] > 0)
     assert known_rows[0] == pytest.approx(HEIGHT / 2 - 100 * 525 / 585, abs=1)
