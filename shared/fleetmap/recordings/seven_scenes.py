@@ -22,6 +22,7 @@ from fleetmap.recordings.assemble import Parts, assemble, calibration_of_options
 from fleetmap.recordings.image_files import FileFrames, ImageFolder, existing_images
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_depth, decode_frame, decode_grey
 from fleetmap.recordings.recording import OpenOptions, Recording
+from fleetmap.recordings.registration_kernels import nearest_surface
 from fleetmap.recordings.streams import forward_only
 from fleetmap.samples import CameraFrame, Loss, Stamps, Trajectory
 
@@ -90,6 +91,7 @@ class DepthRegistration:
         else:
             rays = depth.ray_from_pixel(_pixels(depth))
             self._rays_depth = rays / rays[:, 2:]
+            self._has_ray = np.isfinite(self._rays_depth).all(axis=1)
 
     def registered(self, depth_m: Depth, where: str) -> Depth:
         """(H, W) metres along the colour camera's axis, 0 where unknown, of a depth image in the depth camera's pixels.
@@ -106,10 +108,12 @@ class DepthRegistration:
             )
         if self._is_same_place:
             return np.asarray(cv2.remap(depth_m, self._map, None, cv2.INTER_NEAREST, borderValue=0.0), np.float32)  # type: ignore[call-overload]
-        known = (depth_m.ravel() > 0) & np.isfinite(self._rays_depth).all(axis=1)
+        known = (depth_m.ravel() > 0) & self._has_ray
         points_depth = self._rays_depth[known] * depth_m.ravel()[known, None]
         points_colour = transform_points(self._colour_from_depth, points_depth.astype(np.float64))
-        return _nearest_surface(points_colour, self._colour)
+        image = np.empty((self._colour.height_px, self._colour.width_px), np.float32)
+        nearest_surface(points_colour, self._colour.pixel_from_ray(points_colour), image)
+        return image
 
 
 class RegisteredFrames:
@@ -220,16 +224,3 @@ def _stamps(values: Sequence[int]) -> Stamps:
 def _pixels(camera: CameraCalibration) -> Array:
     u, v = np.meshgrid(np.arange(camera.width_px, dtype=np.float64), np.arange(camera.height_px, dtype=np.float64))
     return np.stack([u.ravel(), v.ravel()], axis=1)
-
-
-def _nearest_surface(points_colour: Array, colour: CameraCalibration) -> Depth:
-    """(H, W) depth of the nearest of the points (N, 3) at each pixel, 0 where there is none."""
-    image = np.full((colour.height_px, colour.width_px), np.inf, np.float32)
-    corners = np.floor(colour.pixel_from_ray(points_colour))
-    # All four pixels around a point: with the nearest alone the background would shine through the foreground
-    for step in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        pixels = corners + step
-        inside = (pixels >= 0).all(axis=1) & (pixels < [colour.width_px, colour.height_px]).all(axis=1)
-        columns, rows = pixels[inside].astype(np.int64).T
-        np.minimum.at(image, (rows, columns), points_colour[inside, 2].astype(np.float32))
-    return np.where(np.isfinite(image), image, np.float32(0))
