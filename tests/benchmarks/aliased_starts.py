@@ -9,14 +9,18 @@ from numpy.typing import NDArray
 from benchmarks import estimator_loop
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
-from fleetmap.samples import PositionPrior
+from fleetmap.rectification import StereoCamera
+from fleetmap.samples import PositionPrior, Trajectory
 from fleetsim.estimator import EstimatorSession, Found, Ids, Sighting
 from fleetsim.landmarks import LandmarkField
 from fleetsim.recorder import Order, prepare
 from locclient.estimate import Estimate, Status
 from locclient.map_view import MapView
 from locclient.settings import LocalizerSettings, TrackSettings
+from mapserver.landmark_budget import choose_landmarks
+from mapserver.survey.result import SurveyMap
 from mapserver.survey.settings import BudgetSettings
+from mapserver.tiling import TILE_SIZE_M
 
 RIGHT_M, WRONG_M = 0.5, 0.3
 WHOLE_SITE = LocalizerSettings(track=TrackSettings(is_whole_site_mapped=True))
@@ -82,7 +86,7 @@ def surveyed_site(scenario: str, seed: int) -> Site:
     survey = EstimatorSession(session, field=field)
     robot = RememberingSession(Order(scenario, seed=seed, robot="runner-1"), field)
     (whole_tile,), vocabulary = estimator_loop.survey_map(survey, np.random.default_rng(seed), every_m=_EVERY_M)
-    tile = within_budget(whole_tile)
+    tile = within_budget(whole_tile, survey.camera, survey.body_from_cam)
     return Site(robot, tile, estimator_loop.map_view(robot, [tile], vocabulary))
 
 
@@ -189,14 +193,25 @@ def part_of(tile: Tile, kept: NDArray[np.bool_], places: NDArray[np.bool_]) -> T
     )  # fmt: skip
 
 
-def within_budget(tile: Tile) -> Tile:
-    """As many landmarks for a metre of path as a published map has, those first that most places saw."""
-    steps_m = np.linalg.norm(np.diff(tile.map_from_cam[:, :3, 3], axis=0), axis=1)
-    limit = int(BudgetSettings().landmarks_per_m * steps_m.sum())
-    seen = np.bincount(np.concatenate(tile.place_landmark_ids).astype(np.int64), minlength=len(tile.landmark_ids))
-    kept = np.zeros(len(tile.landmark_ids), bool)
-    kept[np.argsort(-seen, kind="stable")[:limit]] = True
-    return part_of(tile, kept, np.ones(len(tile.place_ids), bool))
+def within_budget(tile: Tile, camera: StereoCamera, body_from_cam: Array) -> Tile:
+    """The landmarks that `mapserver` would publish of a survey that is the tile's places."""
+    cam_from_map = se3_inverse(tile.map_from_cam)
+    counts = [len(ids) for ids in tile.place_landmark_ids]
+    keyframe = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+    landmark = np.searchsorted(tile.landmark_ids, np.concatenate(tile.place_landmark_ids)).astype(np.int32)
+    points_cam = np.einsum("mij,mj->mi", cam_from_map[keyframe, :3, :3], tile.points_map[landmark])
+    pixels = camera.pixel_from_point(points_cam + cam_from_map[keyframe, :3, 3])
+    ahead = np.isfinite(pixels[:, 0])  # the map's error may put what was close behind the camera
+    keyframe, landmark, pixels = keyframe[ahead], landmark[ahead], pixels[ahead]
+    stamps_ns = np.arange(len(counts), dtype=np.int64)
+    map_from_body = tile.map_from_cam @ se3_inverse(body_from_cam)
+    survey = SurveyMap(
+        camera, body_from_cam, stamps_ns, map_from_body, tile.landmark_ids, tile.points_map, tile.descriptors,
+        tile.sigma_m.astype(np.float64), keyframe, landmark, pixels,
+        np.zeros(len(keyframe), np.int8), np.ones((len(keyframe), 2)), Trajectory(stamps_ns, map_from_body), np.ones(len(counts), bool),
+        np.zeros((len(tile.landmark_ids), 1, 1), np.uint8),
+    )  # fmt: skip
+    return part_of(tile, choose_landmarks(survey, BudgetSettings(), TILE_SIZE_M), np.ones(len(counts), bool))
 
 
 def with_aisles(site: Site, aisles: tuple[int, ...]) -> Site:
