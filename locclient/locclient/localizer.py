@@ -13,19 +13,19 @@ from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from fleetmap.rectification import RectifiedFrame, StereoCamera
 from fleetmap.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.anchors import Anchor, applied, difference, moved
-from locclient.candidates import begin_look, is_proven, is_unmistakable, ranked, rivals, still_held, told_apart, vote
+from locclient.candidates import still_held
+from locclient.confirmation import Confirmation, Heard
 from locclient.estimate import Estimate, Hypothesis, Status
 from locclient.held_prior import HeldPrior
 from locclient.map_view import MapView
 from locclient.relocalizer import Fix, Relocalizer, Seen, Slices
 from locclient.settings import LocalizerSettings
 from locclient.sight import Cause, SightJudge
-from locclient.telling_apart import Spot
 
 _RADIUS_95 = 2.796  # of a three-dimensional normal distribution, in sigmas
 _SPREAD_SHARE = 0.45  # of the time between two looks: frames that come less often are not made to share one
-
 _CANDIDATES_AT_ONCE = 3  # in one slice of a search
+_OWN_FIX_M = 0.3  # from the place that it speaks for
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +63,7 @@ class Localizer:
         self._survey_focal_px = 0.0
         self._prior: HeldPrior | None = None
         self._anchor: Anchor | None = None  # the confirmed place
-        self._candidates: list[Anchor] = []  # unconfirmed ones
-        self._told_apart: Anchor | None = None  # the one of them that none of the others can be
-        self._spot = Spot()
-        self._given_up: Anchor | None = None  # what was said to be the place until fixes named another
+        self._confirmation = Confirmation(settings.track)  # of a place, while there is none
         self._last_odom: Array | None = None
         self._last_ns: int | None = None
         self._begun_ns: int | None = None  # of the last look
@@ -147,14 +144,15 @@ class Localizer:
             if change is not None:
                 anchor.tally.carry(change)
         if change is not None:
-            self._spot.carry(change)
+            self._confirmation.carry(change)
         self._last_odom = odometry.odom_from_body
         if self._prior is not None:
             self._prior.follow(self._odometry, odometry, step, self._settings.track)
 
     def _anchors(self) -> list[Anchor]:
         known = [self._anchor, *self._anchor.strangers] if self._anchor else []
-        return [*known, *self._candidates, *(a for a in (self._given_up, self._told()) if a)]
+        told = self._told()
+        return [*known, *self._confirmation.anchors(), *([told] if told else [])]
 
     def _told(self) -> Anchor | None:
         """The place of a prior that is known in all directions."""
@@ -226,7 +224,8 @@ class Localizer:
     def _search(self, seen: Seen, relocalizer: Relocalizer) -> Slices[list[Fix]]:
         """Fixes anywhere, around the candidates first; inside the prior where there is one."""
         fixes: list[Fix] = []
-        for number, candidate in enumerate(self._candidates):
+        candidates = self._confirmation.places
+        for number, candidate in enumerate(candidates):
             map_from_body, covariance = candidate.then_map_from_body, candidate.then_cov
             fix = relocalizer.near(
                 seen, map_from_body @ self._body_from_cam, self._at_camera(map_from_body, covariance)
@@ -236,8 +235,8 @@ class Localizer:
             if number % _CANDIDATES_AT_ONCE == _CANDIDATES_AT_ONCE - 1:
                 yield
         known = None
-        if len(self._candidates) == 1:
-            known = (self._candidates[0].then_map_from_body @ self._body_from_cam)[:3, :3]
+        if len(candidates) == 1:
+            known = (candidates[0].then_map_from_body @ self._body_from_cam)[:3, :3]
         near = None if self._prior is None else self._prior.is_near(relocalizer.view.map_from_cam[:, :3, 3])
         fixes = yield from relocalizer.anywhere(seen, near, known, fixes)
         return [f for f in fixes if self._counts(f) and self._in_prior(f)]
@@ -293,76 +292,51 @@ class Localizer:
         """Refused fixes that agree with each other, frame after frame, end the belief in the old place; they must be confirmed anew."""
         assert self._anchor is not None
         settings, strangers = self._settings.track, self._anchor.strangers
-        self._hear(fixes, strangers)
+        self._confirmation.hear(self._heard(fixes), strangers, self._odom())
         self._anchor.strangers = still_held(strangers, settings)
         if max(c.support for c in self._anchor.strangers) >= settings.kidnap_fixes:
-            self._given_up, self._candidates, self._anchor = self._anchor, self._anchor.strangers, None
-            self._told_apart = None
+            self._confirmation.reopen(self._anchor, self._anchor.strangers)
+            self._anchor = None
             self._prior = None  # whatever named that place before is as wrong
 
     # --- confirmation ----------------------------------------------------------------------------------------------------
 
     def _weigh(self, fixes: list[Fix]) -> Slices[_Outcome]:
         """Every fix speaks for a candidate or begins one; confirmed is the one that is left, or told from all others, with enough
-        behind it."""
-        settings = self._settings.track
-        self._hear(fixes, self._candidates)
-        self._candidates = still_held(self._candidates, settings)
-        self._told_apart = yield from told_apart(self._candidates, settings)
+        behind it, or with a tight prior."""
+        known = self._confirmation
+        yield from known.weigh(self._heard(fixes), self._odom())
         if not fixes:
             return _Outcome(None, "nothing in the map agrees with this frame")
-        (best, *_), others = self._standing()
+        (best, *_), others = known.standing()
         if others:
             return _Outcome(None, f"{len(others) + 1} places agree with what was seen")
         moved_m = None
-        if self._is_confirmed(best, fixes):
-            moved_m = self._moved_m(best)
-            self._anchor, self._candidates, self._given_up, self._told_apart = best, [], None, None
-            self._prior = None
+        is_told = self._prior is not None and self._prior.is_tight(self._settings.track.tight_prior_sigma_m)
+        if is_told or known.is_confirmed(best, fixes):
+            moved_m = known.moved_m(best)
+            known.close()
+            self._anchor, self._prior = best, None
             self._ever_tracked = True
-        assert self._moment is not None
-        seen_from = self._moment
-        own = []
-        for fix in fixes:
-            now = Anchor.behind(seen_from, *self._at_body(fix)).now_map_from_body
-            if np.linalg.norm(now[:3, 3] - best.now_map_from_body[:3, 3]) < 0.3:
-                own.append(fix)
+        off_m = [
+            np.linalg.norm(fresh.now_map_from_body[:3, 3] - best.now_map_from_body[:3, 3])
+            for _, fresh in self._heard(fixes)
+        ]
+        own = [fix for fix, metres in zip(fixes, off_m, strict=True) if metres < _OWN_FIX_M]
         if not own:
             return _Outcome(None, "the fix does not agree with those before", moved_m=moved_m)
         return _Outcome(own[0], moved_m=moved_m)
 
-    def _standing(self) -> tuple[list[Anchor], list[Anchor]]:
-        """The candidates, the likeliest first, and those of them that it may be as well."""
-        likely, best = ranked(self._candidates), self._told_apart
-        if not any(c is best for c in likely):  # it may have been dropped in a look that goes on
-            return likely, rivals(self._candidates, self._settings.track)
-        return sorted(likely, key=lambda c: c is not best), []
+    def _heard(self, fixes: Sequence[Fix]) -> Heard:
+        """The fixes of the look that goes on, with their places at the present."""
+        moment = self._moment
+        assert moment is not None
+        return [(fix, Anchor.behind(moment, *self._at_body(fix))) for fix in fixes]
 
-    def _hear(self, fixes: Sequence[Fix], candidates: list[Anchor]) -> None:
-        """One more look, in which every fix has its vote, at the present."""
-        assert self._moment is not None and self._last_odom is not None
-        settings, counts = self._settings.track, self._spot.is_new(self._last_odom)
-        begin_look(candidates, settings, is_elsewhere=counts)
-        for fix in fixes:
-            fresh = Anchor.behind(self._moment, *self._at_body(fix))
-            vote(candidates, fresh, fix, self._last_odom if counts else None, settings)
-
-    def _is_confirmed(self, candidate: Anchor, fixes: list[Fix]) -> bool:
-        """By a tight prior, by fixes and way enough, or by one fix so strong, and alone of all places that were tried, that no
-        other place of this map can be meant."""
-        settings = self._settings.track
-        strong = len(self._candidates) == len(fixes) == 1 and is_unmistakable(fixes[0], settings)
-        tight = self._prior is not None and self._prior.is_tight(settings.tight_prior_sigma_m)
-        return bool(tight or strong or is_proven(candidate, settings))
-
-    def _moved_m(self, place: Anchor) -> float | None:
-        """How far a place is from the one that was given up for it; None where its covariance had admitted as much."""
-        if self._given_up is None:
-            return None
-        error = difference(place.now_map_from_body, self._given_up.now_map_from_body)
-        covariance = place.now_cov + self._given_up.now_cov
-        beyond = error @ np.linalg.solve(covariance, error) > self._settings.track.innovation_limit
-        return float(np.linalg.norm(error[3:])) if beyond else None
+    def _odom(self) -> Array:
+        """The present odom_from_body."""
+        assert self._last_odom is not None
+        return self._last_odom
 
     # --- output ----------------------------------------------------------------------------------------------------------
 
@@ -380,7 +354,7 @@ class Localizer:
                 return replace(said, status=Status.AMBIGUOUS, cause=cause, hypotheses=doubts)
             now, covariance = self._anchor.now_map_from_body, self._published(self._anchor.now_cov)
             return replace(said, status=status, cause=cause, map_from_body=now, cov_rot_trans=covariance)
-        likely, others = self._standing()
+        likely, others = self._confirmation.standing()
         status = Status.AMBIGUOUS if others else Status.LOST if self._ever_tracked else Status.INITIALISING
         said = replace(
             said, status=status, hypotheses=tuple(Hypothesis(c.now_map_from_body, c.support) for c in likely)

@@ -1,155 +1,17 @@
-"""When the localizer says that it knows where it is: scripted odometry and scripted fixes, every status by its cause.
+"""When the localizer says that it knows where it is: scripted odometry and scripted fixes, every status by its cause."""
 
-The robot drives along x. Odometry is exact; what a frame's fixes say is where the robot truly is, moved by the offsets
-that the script gives for that frame.
-"""
-
-from collections.abc import Generator, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
 
-from fleetmap.bow import Vocabulary
-from fleetmap.calibration import CameraCalibration, RigCalibration
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
-from fleetmap.odometry import OdometryEstimate, OdometryStatus
-from fleetmap.rectification import RectifiedFrame, StereoCamera
+from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.samples import PositionPrior
-from locclient import localizer as module
-from locclient.estimate import Estimate, Status
-from locclient.localizer import Localizer
-from locclient.relocalizer import Fix
-from locclient.settings import LocalizerSettings, TrackSettings
+from locclient.estimate import Status
+from locclient.settings import TrackSettings
 from locclient.sight import Cause
-from locclient.telling_apart import Expected
-
-BODY_FROM_CAM = se3(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.05, 0.3]))
-MAP_FROM_ODOM = se3(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([12.0, -5.0, 1.0]))
-FRAME_NS = 200_000_000  # as often as the localizer looks
-CLONES = 8
-NO_FIX: tuple[Array, ...] = ()
-TRUE = (np.zeros(3),)
-
-
-def off(*metres: float) -> Array:
-    """A wrong place, so far from the true one."""
-    return np.array([*metres, 0.0, 0.0])[:3]
-
-
-class ScriptedOdometry:
-    """Exact, with a covariance that grows with the way; forgets frames as the real one does."""
-
-    def __init__(self) -> None:
-        self.odom_from_body: list[Array] = []
-        self.next_motion = np.eye(4)
-        self.redefine: Array | None = None
-        self.drift_share = 0.0
-
-    def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
-        change, self.redefine = self.redefine, None
-        if change is not None:
-            self.odom_from_body = [change @ earlier for earlier in self.odom_from_body]
-        last = self.odom_from_body[-1] if self.odom_from_body else np.eye(4)
-        self.odom_from_body.append(last @ self.next_motion)
-        return OdometryEstimate(
-            frame.stamp_ns, len(self.odom_from_body) - 1, self.odom_from_body[-1], 1e-6 * np.eye(6), np.zeros(3),
-            np.zeros(3), np.zeros(3), OdometryStatus.TRACKING, np.arange(50), 5.0, 1.0, False, True, change,
-        )  # fmt: skip
-
-    def will_forget(self, frame_index: int) -> bool:
-        return frame_index <= max(0, len(self.odom_from_body) - CLONES)
-
-    def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
-        if frame_index < len(self.odom_from_body) - CLONES:
-            return None
-        motion = se3_inverse(self.odom_from_body[frame_index]) @ self.odom_from_body[-1]
-        sigma_m = self.drift_share * float(np.linalg.norm(motion[:3, 3]))
-        return motion, np.diag([1e-8] * 3 + [sigma_m**2 + 1e-8] * 3)
-
-
-@dataclass
-class ScriptedRelocalizer:
-    """Offers the fixes of the present frame: near the prediction the one that lies there, anywhere all of them."""
-
-    fixes: list[Fix] = field(default_factory=list)
-    twin_share: float = 0.1
-
-    @property
-    def view(self) -> Any:
-        return type("View", (), {"map_from_cam": np.tile(np.eye(4), (4, 1, 1))})
-
-    def look(self, frame: RectifiedFrame) -> Generator[None, None, list[Fix]]:
-        seen = self.fixes
-        yield
-        return seen
-
-    def near(self, seen: list[Fix], map_from_cam: Array, cov_rot_trans: Array) -> Fix | None:
-        reach_m = 0.3 + 3 * np.sqrt(np.trace(cov_rot_trans[3:, 3:]))
-        close = [f for f in seen if np.linalg.norm(f.map_from_cam[:3, 3] - map_from_cam[:3, 3]) < reach_m]
-        return close[0] if close else None
-
-    def anywhere(
-        self, seen: list[Fix], allowed: object = None, rotation: object = None, found: object = ()
-    ) -> Generator[None, None, list[Fix]]:
-        yield
-        return list(seen)
-
-
-class Robot:
-    """A localizer on a ride; `go` plays one frame."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, **track: Any) -> None:
-        self.relocalizer = ScriptedRelocalizer()
-        monkeypatch.setattr(module, "MapView", lambda *_: None)
-        monkeypatch.setattr(module, "Relocalizer", lambda *_: self.relocalizer)
-        lens = CameraCalibration(
-            "radial-tangential", 640, 480, np.array([400, 400, 320, 240.0]), np.zeros(4), BODY_FROM_CAM
-        )
-        camera = StereoCamera(400.0, 320.0, 240.0, 0.1, 640, 480)
-        settings = LocalizerSettings(track=TrackSettings(**track))
-        self.localizer = Localizer(RigCalibration((lens,)), camera, BODY_FROM_CAM, 0.0, settings)
-        self.odometry = ScriptedOdometry()
-        self.localizer._odometry = self.odometry  # type: ignore[assignment]
-        self.frames = 0
-        self.inliers = 40
-        self.is_dark = False
-        self.rng = np.random.default_rng(0)
-        self.map_from_body = MAP_FROM_ODOM.copy()
-
-    def load(self, version: int = 1) -> "Robot":
-        self.localizer.handle_version(version, [], Vocabulary.__new__(Vocabulary), 400.0)
-        return self
-
-    def go(self, step_m: float, offsets: Iterable[Array] = TRUE, turn_rad: float = 0.02) -> Estimate:
-        """One frame after so much way along the body's x; the fixes are the true place moved by each offset."""
-        motion = se3(so3_exp(np.array([0, 0, turn_rad])), np.array([step_m, 0, 0])) if self.frames else np.eye(4)
-        self.map_from_body = self.map_from_body @ motion
-        self.odometry.next_motion = motion
-        self.relocalizer.fixes = [self._fix(offset) for offset in offsets]
-        self.frames += 1
-        picture = np.zeros((480, 640), np.uint8) if self.is_dark else self.rng.integers(0, 255, (480, 640), np.uint8)
-        return self.localizer.handle_stereo(RectifiedFrame(self.frames * FRAME_NS, picture, None, None))
-
-    def ride(self, steps: int, step_m: float, offsets: Sequence[Array] = TRUE) -> list[Estimate]:
-        return [self.go(step_m, offsets) for _ in range(steps)]
-
-    def _fix(self, offset: Array) -> Fix:
-        moved = self.map_from_body.copy()
-        moved[:3, 3] += offset
-        return Fix(
-            moved @ BODY_FROM_CAM,
-            np.diag([0.002**2] * 3 + [0.01**2] * 3),
-            self.inliers,
-            20,
-            twin_share=self.relocalizer.twin_share,
-        )
-
-    def error_m(self, estimate: Estimate) -> float:
-        assert estimate.map_from_body is not None
-        return float(np.linalg.norm(estimate.map_from_body[:3, 3] - self.map_from_body[:3, 3]))
+from scripted_robot import FRAME_NS, NO_FIX, TRUE, Robot, off
 
 
 @pytest.fixture
@@ -412,68 +274,6 @@ def test_a_strong_fix_with_a_rival_is_not_believed(robot: Robot) -> None:
     robot.inliers = 100
     said = robot.ride(8, 0.0, [off(0.0), off(0.0, 5.0)])
     assert {e.status for e in said} == {Status.AMBIGUOUS}
-
-
-TWIN = off(0.0, 5.0)
-
-
-@pytest.fixture
-def sure_robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
-    """One that may take it that its own aisle is in the map."""
-    return Robot(monkeypatch, is_whole_site_mapped=True).load()
-
-
-class Signs:
-    """What the map holds at the end of an aisle and of its twin: two signs each, which look different. The robot sees those of
-    one of them (0, 1) or, in an aisle that is not in the map, of none."""
-
-    def __init__(self, robot: Robot, seen: int | None) -> None:
-        rng = np.random.default_rng(5)
-        corners = np.concatenate([rng.uniform(0.0, 0.5, (12, 3)) + at for at in ((9.0, 2.0, 1.5), (9.0, -2.0, 1.8))])
-        ahead = corners @ MAP_FROM_ODOM[:3, :3].T + MAP_FROM_ODOM[:3, 3]
-        self.points_map = [ahead, ahead + TWIN]
-        self.looks = rng.integers(0, 256, (2, len(corners), 32), np.uint8)
-        self.seen, self.rng, self._fix = seen, rng, robot._fix
-
-    def fix(self, offset: Array) -> Fix:
-        aisle = int(np.any(offset != 0.0))
-        found = self.rng.random(24) < (0.4 if aisle == self.seen else 0.03)
-        expected = Expected(np.arange(24, dtype=np.uint32), self.points_map[aisle], self.looks[aisle], found)
-        return replace(self._fix(offset), witnessed=expected)
-
-
-@pytest.mark.parametrize("own", [0, 1])
-def test_a_twin_is_told_by_its_signs(sure_robot: Robot, monkeypatch: pytest.MonkeyPatch, own: int) -> None:
-    """Although as many landmarks agree in the other aisle; and whichever is thought of first."""
-    monkeypatch.setattr(sure_robot, "_fix", Signs(sure_robot, own).fix)
-    said = sure_robot.ride(20, 0.4, [off(0.0), TWIN])
-    assert said[0].status is Status.AMBIGUOUS
-    known = next(e for e in said if e.status is Status.TRACKING)
-    assert known.map_from_body is not None
-    assert all(e.status in (Status.AMBIGUOUS, Status.INITIALISING) for e in said[: said.index(known)])
-    truth = sure_robot.map_from_body[:3, 3] + own * TWIN
-    assert said[-1].map_from_body is not None
-    assert np.linalg.norm(said[-1].map_from_body[:3, 3] - truth) < 0.05
-
-
-def test_signs_of_neither_twin_leave_it_open(sure_robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The robot's own aisle is a third one, which is not in the map."""
-    monkeypatch.setattr(sure_robot, "_fix", Signs(sure_robot, None).fix)
-    assert {e.status for e in sure_robot.ride(30, 0.4, [off(0.0), TWIN])} == {Status.AMBIGUOUS}
-
-
-def test_signs_from_a_standing_robot_are_seen_once(sure_robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same look again and again is no more evidence."""
-    monkeypatch.setattr(sure_robot, "_fix", Signs(sure_robot, 0).fix)
-    said = [sure_robot.go(0.0, [off(0.0), TWIN], turn_rad=0.0) for _ in range(30)]
-    assert {e.status for e in said} == {Status.AMBIGUOUS}
-
-
-def test_signs_tell_nothing_where_the_own_aisle_may_not_be_in_the_map(
-    robot: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(robot, "_fix", Signs(robot, 0).fix)
-    assert {e.status for e in robot.ride(20, 0.4, [off(0.0), TWIN])} == {Status.AMBIGUOUS}
 
 
 def test_darkness_is_named_within_a_second(tracking: Robot) -> None:
