@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse
 from mapserver import landmark_budget_kernels as kernels
+from mapserver.distinct_landmarks import distinct_landmarks
 from mapserver.survey.result import SurveyMap
 from mapserver.survey.settings import BudgetSettings
 
@@ -31,7 +32,8 @@ def choose_landmarks(
     At most settings.landmarks_per_m for every metre of `covered_path_m` (min_landmarks are always allowed: a short survey
     covers a whole room), and tile_landmarks in a tile. Landmarks whose ids are in `published` come before all others, so that
     robots do not fetch another choice of equal worth every night. Of those and of the others, those come first that give every
-    keyframe view_landmarks, or as many as it sees. What nothing observes is not chosen.
+    keyframe view_distinct_landmarks that look like nothing else in the survey, then those that give it view_landmarks, or as many as
+    it sees. What nothing observes is not chosen.
     """
     limit = max(settings.min_landmarks, int(settings.landmarks_per_m * covered_path_m(survey)))
     starts, bins, weights = _views(survey)
@@ -40,16 +42,19 @@ def choose_landmarks(
     chosen = np.zeros(len(survey.landmark_ids), bool)
     seen = np.diff(starts) > 0
     first = seen & np.isin(survey.landmark_ids, [] if published is None else published)
+    distinct = distinct_landmarks(survey.points_map, survey.descriptors)
     per_view = _ROWS * _COLUMNS * _DEPTHS
-    needs = np.full(len(survey.map_from_body), settings.view_landmarks)
+    taken = np.zeros(len(survey.map_from_body), np.int64)
     for mask in (first, seen & ~first):
-        for spare in (0, _NO_LIMIT):
-            left, needs = np.flatnonzero(mask & ~chosen), needs + spare
+        for part, quota in (
+            (mask & distinct, settings.view_distinct_landmarks), (mask, settings.view_landmarks), (mask, _NO_LIMIT),
+        ):  # fmt: skip
+            left, needs = np.flatnonzero(part & ~chosen), quota - taken
             if len(left) and limit > 0:
                 limit -= kernels.choose(
                     left, starts, bins, weights, cells, room, limit, counts, chosen, needs, per_view
                 )
-            needs = needs - spare
+                taken = quota - needs
     return chosen
 
 

@@ -10,6 +10,7 @@ from fleetmap.geometry import se3_exp
 from fleetmap.mapformat import encode_tile
 from map_samples import random_survey
 from mapserver import landmark_budget_kernels as kernels
+from mapserver.distinct_landmarks import distinct_landmarks
 from mapserver.landmark_budget import choose_landmarks, covered_path_m
 from mapserver.survey.result import SurveyMap
 from mapserver.survey.settings import BudgetSettings
@@ -17,7 +18,10 @@ from mapserver.tiling import tiles_from_survey
 
 
 def exactly(count: int, tile_landmarks: int = 1 << 30) -> BudgetSettings:
-    return BudgetSettings(landmarks_per_m=0.0, min_landmarks=count, tile_landmarks=tile_landmarks)
+    """What the views need, whatever it looks like: random descriptors have no twin."""
+    return BudgetSettings(
+        landmarks_per_m=0.0, min_landmarks=count, tile_landmarks=tile_landmarks, view_distinct_landmarks=0
+    )
 
 
 def plain_greedy(
@@ -118,6 +122,31 @@ def test_a_view_at_the_end_of_a_drive_keeps_what_it_needs() -> None:
     assert served.sum() == unserved.sum() == 160
     assert seen_per_view(survey, served)[9] >= 40 > seen_per_view(survey, unserved)[9]
     assert seen_per_view(survey, served).min() >= 40
+
+
+def test_every_view_gets_what_tells_it_from_its_twins_first() -> None:
+    """A tenth of the landmarks look like no other; by their worth hardly any would be chosen, for they are seen once."""
+    rng = np.random.default_rng(9)
+    survey = random_survey(rng, keyframes=20, landmarks=800)
+    pairs = np.repeat(rng.integers(0, 256, (360, 32), dtype=np.uint8), 2, axis=0)
+    points = survey.points_map.copy()
+    points[1:720:2] = points[:720:2] + np.array([30.0, 0.0, 0.05])
+    survey = replace(survey, descriptors=np.concatenate([pairs, survey.descriptors[720:]]), points_map=points)
+    is_alone = distinct_landmarks(survey.points_map, survey.descriptors)
+    np.testing.assert_array_equal(np.flatnonzero(is_alone), np.arange(720, 800))
+    once = np.isin(survey.obs_landmark, np.arange(720)) | (np.diff(survey.obs_landmark, prepend=-1) != 0)
+    survey = replace(
+        survey, obs_keyframe=survey.obs_keyframe[once], obs_landmark=survey.obs_landmark[once],
+        obs_pixels=survey.obs_pixels[once], obs_octave=survey.obs_octave[once], obs_sigma_px=survey.obs_sigma_px[once],
+    )  # fmt: skip
+    wanted = seen_per_view(survey, is_alone)
+    told = choose_landmarks(survey, msgspec.structs.replace(exactly(200), view_distinct_landmarks=60), 16.0)
+    untold = choose_landmarks(survey, exactly(200), 16.0)
+    assert told.sum() == untold.sum() == 200
+    np.testing.assert_array_equal(seen_per_view(survey, told & is_alone), wanted)
+    assert (seen_per_view(survey, untold & is_alone) < wanted).mean() > 0.5
+    some = choose_landmarks(survey, msgspec.structs.replace(exactly(200), view_distinct_landmarks=1), 16.0)
+    assert (some & is_alone).sum() < is_alone.sum()
 
 
 def test_the_path_sets_the_budget_and_breaks_do_not_count() -> None:
