@@ -147,7 +147,8 @@ class RegisteredFrames:
         self._files.hash_into(digest)
 
     def close(self) -> None:
-        """Nothing is kept open."""
+        """Closes the other one."""
+        self._files.close()
 
 
 def _files(path: Path, kind: str, losses: list[Loss]) -> ImageFolder:
