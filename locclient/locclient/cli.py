@@ -6,7 +6,7 @@ from pkgutil import iter_modules
 
 import typer
 
-from fleetmap.command_line import run
+from fleetmap.cli_exit import run
 from locclient import commands
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)

@@ -2,11 +2,11 @@
 
 from fleetmap.config import Section
 from fleetmap.recordings import Topics
-from locclient.live import SourceSection
-from locclient.outputs import OutputSection
-from locclient.run_settings import RunSection
-from locclient.settings import LocalizerSettings
-from locclient.tile_cache import DEFAULT_MAX_BYTES
+from locclient.daemon.publishers import OutputSection
+from locclient.daemon.run_settings import RunSection
+from locclient.localization.settings import LocalizerSettings
+from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
+from locclient.sensors.source import SourceSection
 
 
 class ReplaySection(Section, frozen=True):

@@ -4,26 +4,26 @@ import os
 
 import typer
 
-from fleetmap.command_line import run
+from fleetmap.cli_exit import run
 from mapserver.commands.build import build
 from mapserver.commands.config_option import ConfigFile
 from mapserver.commands.convert import convert
-from mapserver.commands.diff import diff
 from mapserver.commands.doctor import doctor
 from mapserver.commands.evaluate import evaluate
-from mapserver.commands.export import export
 from mapserver.commands.fleet import fleet_app
-from mapserver.commands.gc import gc
-from mapserver.commands.import_ import import_
-from mapserver.commands.inspect import inspect
 from mapserver.commands.nightly import nightly
-from mapserver.commands.promote import promote
-from mapserver.commands.publish import publish
-from mapserver.commands.rollback import rollback
+from mapserver.commands.releases.diff import diff
+from mapserver.commands.releases.inspect import inspect
+from mapserver.commands.releases.promote import promote
+from mapserver.commands.releases.publish import publish
+from mapserver.commands.releases.rollback import rollback
+from mapserver.commands.releases.versions import versions
 from mapserver.commands.serve import serve
+from mapserver.commands.store.export import export
+from mapserver.commands.store.gc import gc
+from mapserver.commands.store.import_ import import_
+from mapserver.commands.store.verify import verify
 from mapserver.commands.train_vocabulary import train_vocabulary
-from mapserver.commands.verify import verify
-from mapserver.commands.versions import versions
 
 COMMANDS = (
     build, nightly, publish, promote, rollback, versions, inspect, diff, serve, verify, gc, export, import_,

@@ -11,11 +11,11 @@ from typing import Any
 import msgspec
 
 from fleetmap.config import Section, load_toml
-from fleetmap.samples import SensorSet
-from mapserver.canary import CanarySettings
-from mapserver.gate import GateSettings
-from mapserver.ingest import IngestSettings
-from mapserver.resurvey import ResurveySettings
+from fleetmap.sensors.samples import SensorSet
+from mapserver.fleet.ingest import IngestSettings
+from mapserver.fleet_statistics.canary_test import CanarySettings
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+from mapserver.quality.gate import GateSettings
 from mapserver.survey.settings import SurveySettings
 
 _PRESETS = Path(__file__).parent / "presets"

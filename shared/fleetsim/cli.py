@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from fleetmap.command_line import run
+from fleetmap.cli_exit import run
 from fleetmap.errors import UsageError
 
 app = typer.Typer(
@@ -67,9 +67,9 @@ def record(
         raise UsageError(f"pictures as {images!r}: mcap holds png, jpeg or raw ones, euroc png alone")
     if out.exists() and not (force and out.is_file()):
         raise UsageError(f"{out} exists already; choose another name{' or pass --force' if out.is_file() else ''}")
-    from fleetsim.faults import parse_fault
     from fleetsim.recorder import Order
-    from fleetsim.robots import HiddenErrors
+    from fleetsim.sensors.faults import parse_fault
+    from fleetsim.sensors.robots import HiddenErrors
 
     faults = tuple(parse_fault(text) for text in fault or [])
     hidden = HiddenErrors(camera_delay_ms * 1e-3, math.radians(camera_turn_deg), camera_shift_mm * 1e-3)

@@ -12,12 +12,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings.images import StoredFrame, StoredImage, grey_image, jpeg_image, png_image
-from fleetmap.recordings.mcap_writer import McapRecordingWriter
-from fleetmap.samples import CameraFrame, Image
+from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from fleetmap.sensors.samples import CameraFrame, Image
 from fleetsim.euroc_writer import EurocRecordingWriter
-from fleetsim.layout import Layout
 from fleetsim.recorder import Order, Session, prepare, write_session
 from fleetsim.scenarios import find_scenario
+from fleetsim.scene.layout import Layout
 
 # Measured on 640x480 pictures of day and night, one core, per pair: raw 614 kB; png 340 kB, 9 ms to write and 4 ms to
 # read, lossless; jpeg 213 kB, 1 ms and 2 ms, but it adds an error of 1.7 grey rms, as much as the sensor's noise.

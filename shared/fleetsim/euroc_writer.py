@@ -8,10 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fleetmap.calibration import CameraCalibration, RigCalibration
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation
-from fleetmap.samples import CameraFrame, Image, ImuSamples, PositionPrior, Trajectory, WheelSample
+from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples, PositionPrior, Trajectory, WheelSample
 
 _PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 _IMU_HEAD = "#timestamp [ns],w_x [rad s^-1],w_y,w_z,a_x [m s^-2],a_y,a_z"

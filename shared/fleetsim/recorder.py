@@ -8,20 +8,20 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from fleetmap.calibration import RigCalibration
 from fleetmap.errors import UsageError
-from fleetmap.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
-from fleetsim.faults import LATE_S, Fault, FaultPlan
-from fleetsim.layout import Layout
-from fleetsim.light import LIGHT_STATES
-from fleetsim.motion import CarriedMotion, Motion, RouteMotion
-from fleetsim.painter import Look
-from fleetsim.rendering import StereoRenderer
-from fleetsim.robots import HiddenErrors, nominal_calibration, true_calibration
-from fleetsim.routes import check_clear
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
+from fleetsim.motion.body_motion import CarriedMotion, Motion, RouteMotion
+from fleetsim.motion.routes import check_clear
+from fleetsim.render.painter import Look
+from fleetsim.render.renderer import StereoRenderer
 from fleetsim.scenarios import Run, find_scenario
-from fleetsim.sensors import measure_imu, measure_priors, measure_wheels, sample_times, stamps_from_s
-from fleetsim.world import World
+from fleetsim.scene.layout import Layout
+from fleetsim.scene.light import LIGHT_STATES
+from fleetsim.scene.world import World
+from fleetsim.sensors.faults import LATE_S, Fault, FaultPlan
+from fleetsim.sensors.measurements import measure_imu, measure_priors, measure_wheels, sample_times, stamps_from_s
+from fleetsim.sensors.robots import HiddenErrors, nominal_calibration, true_calibration
 
 _TRUTH_STEP_S = 0.02
 S = TypeVar("S", WheelSample, PositionPrior)

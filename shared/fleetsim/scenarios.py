@@ -3,11 +3,11 @@
 from dataclasses import dataclass, replace
 
 from fleetmap.errors import UsageError
-from fleetsim.faults import Fault
-from fleetsim.layout import Layout
-from fleetsim.movers import Mover
-from fleetsim.robots import ROBOTS, RobotKind
-from fleetsim.routes import Route
+from fleetsim.motion.routes import Route
+from fleetsim.scene.layout import Layout
+from fleetsim.scene.movers import Mover
+from fleetsim.sensors.faults import Fault
+from fleetsim.sensors.robots import ROBOTS, RobotKind
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,12 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import bench_consistency, bench_gate, bench_hard_cases, bench_loops, bench_solvers, consistency
-from benchmarks.yardstick import at_reference, slowness
+from benchmarks.back_end import bench_consistency, bench_loops, bench_solvers
+from benchmarks.common import consistency
+from benchmarks.common.yardstick import at_reference, slowness
+from benchmarks.survey import bench_gate, bench_hard_cases
 from fleetmap.recordings import open_recording
 from fleetsim.commands import record_order
 from fleetsim.recorder import Order
-from realdata import real_data
+from support.recordings.realdata import real_data
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 

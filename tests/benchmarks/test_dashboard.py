@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from benchmarks import bench_dashboard
+from benchmarks.fleet import bench_dashboard
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from benchmarks import bench_canary, bench_fleet
+from benchmarks.fleet import bench_canary, bench_fleet
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 

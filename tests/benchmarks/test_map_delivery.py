@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import bench_map_budget, bench_map_fuzz, bench_nights, bench_service
-from realdata import real_data
+from benchmarks.fleet import bench_service
+from benchmarks.maps import bench_map_budget, bench_map_fuzz
+from benchmarks.survey import bench_nights
+from support.recordings.realdata import real_data
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 

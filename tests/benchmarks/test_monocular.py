@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.bench_monocular import CASES, DRIFT, drifting, one, show
-from fleetmap.samples import SensorSet
+from benchmarks.survey.bench_monocular import CASES, DRIFT, drifting, one, show
+from fleetmap.sensors.samples import SensorSet
 from fleetsim.commands import record_order
 from fleetsim.recorder import Order
-from realdata import real_data
+from support.recordings.realdata import real_data
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from benchmarks import bench_build, bench_survey
+from benchmarks.survey import bench_build, bench_survey
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -13,9 +13,15 @@ from typing import Any
 
 import pytest
 
-from benchmarks import bench_aliased_starts, bench_faults, bench_localization, bench_real_robots, bench_robot_memory
-from benchmarks.recorded_runs import misses
-from realdata import real_data
+from benchmarks.common.recorded_runs import misses
+from benchmarks.robot import (
+    bench_aliased_starts,
+    bench_faults,
+    bench_localization,
+    bench_real_robots,
+    bench_robot_memory,
+)
+from support.recordings.realdata import real_data
 
 HERE = Path(__file__).resolve().parent
 SOURCES = os.pathsep.join(str(HERE.parents[1] / folder) for folder in ("shared", "mapserver", "locclient", "tests"))
@@ -33,7 +39,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def results(folder: Path, bench: str, *options: str | Path) -> dict[str, Any]:
     """The results of a benchmark, whose table is printed."""
     out = folder / "results.json"
-    command = [sys.executable, str(HERE / bench), *map(str, options), "--out", str(out)]
+    command = [sys.executable, str(HERE / "robot" / bench), *map(str, options), "--out", str(out)]
     subprocess.run(command, env=os.environ | {"PYTHONPATH": SOURCES}, check=True)
     found: dict[str, Any] = json.loads(out.read_text("utf-8"))
     print(json.dumps({key: value for key, value in found.items() if key != "starts"}))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks import bench_estimator, bench_simulator
+from benchmarks.simulator import bench_estimator, bench_simulator
 
 
 def test_cost_of_a_pair() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-BENCH = Path(__file__).with_name("bench_store_faults.py")
+BENCH = Path(__file__).with_name("maps") / "bench_store_faults.py"
 
 
 @pytest.mark.slow

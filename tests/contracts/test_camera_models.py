@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fleetmap.cameras import CAMERA_MODELS
 from fleetmap.geometry import Array
+from fleetmap.sensors.cameras import CAMERA_MODELS
 
 INTRINSICS = np.array([458.6, 457.3, 367.2, 248.4])
 DISTORTIONS = {

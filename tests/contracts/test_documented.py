@@ -12,18 +12,18 @@ import msgspec
 import pytest
 import typer
 
-from contracts_documents import REPOSITORY, code_words, rows, section, text
-from estimates import estimate
 from fleetmap import messages
-from locclient import failures
-from locclient.estimate import Status
-from locclient.health import METRICS
-from locclient.sight import Cause
-from mapserver.build_report import BuildReport
-from mapserver.measures import Measures
+from locclient.localization.estimate import Status
+from locclient.localization.image_quality import Cause
+from locclient.replay.run_metrics import METRICS
+from locclient.robot import failure_monitor
+from mapserver.build.report import BuildReport
+from mapserver.fleet_statistics.kpis import Measures
 from mapserver.nightly.night import Night
 from mapserver.quality import figures
-from mapserver.survey.sessions.extend import Counts
+from mapserver.survey.merge.pipeline import Counts
+from support.fleet.contracts_documents import REPOSITORY, code_words, rows, section, text
+from support.fleet.estimates import estimate
 
 COMMANDS = "docs/command_line.md"
 SERVICE = "docs/service.md"
@@ -79,7 +79,7 @@ def test_options_are_documented(path: str) -> None:
 def test_endpoints_are_documented(tmp_path: Path) -> None:
     from mapserver.api.app import create_app
     from mapserver.api.metrics import Metrics
-    from mapserver.fleet import Fleet
+    from mapserver.fleet.fleet import Fleet
     from mapserver.store import MapStore
 
     with MapStore.open(tmp_path, create=True) as store:
@@ -107,15 +107,19 @@ def test_causes_are_documented() -> None:
 
 
 def test_causes_of_failures_are_documented() -> None:
-    sharp = failures.Picture(0.5, 1.0, is_frozen=False)
-    pictures = [failures.Picture(0.0, 1.0, False), failures.Picture(0.5, 1.0, True), failures.Picture(0.5, 0.0, False)]
-    causes = {failures.cause_of(estimate(1.0), picture) for picture in pictures}
+    sharp = failure_monitor.Picture(0.5, 1.0, is_frozen=False)
+    pictures = [
+        failure_monitor.Picture(0.0, 1.0, False),
+        failure_monitor.Picture(0.5, 1.0, True),
+        failure_monitor.Picture(0.5, 0.0, False),
+    ]
+    causes = {failure_monitor.cause_of(estimate(1.0), picture) for picture in pictures}
     for lost in (
         estimate(1.0, Status.LOST), estimate(1.0, Status.LOST, version=None), estimate(1.0, Status.LOST, innovation=99.0),
         estimate(1.0, Status.AMBIGUOUS),
     ):  # fmt: skip
-        causes.add(failures.cause_of(lost, sharp))
-    monitor = failures.FailureMonitor()
+        causes.add(failure_monitor.cause_of(lost, sharp))
+    monitor = failure_monitor.FailureMonitor()
     monitor.handle(estimate(1.0, fix=True), sharp)
     silence = monitor.handle_silence(10.0)
     assert silence is not None

@@ -14,9 +14,9 @@ VAGUE = re.compile(r"^(.*_)?(poses?|transforms?|extrinsics?)$|^T$|^T_|_T$")
 # Functions act on poses and messages of that name; only one that is nothing but the word returns a matrix.
 VAGUE_FUNCTION = re.compile(r"^_?(poses?|transforms?|extrinsics?|T)$")
 ALLOWED = {
-    "mapserver/mapserver/fleet.py": {"last_pose"},  # the last PoseMessage as plain values, not a matrix
-    "shared/fleetmap/recordings/mcap_codecs.py": {"pose"},  # the codec of PoseStamped, beside those of image and imu
-    "shared/fleetmap/recordings/mcap_foxglove.py": {"pose"},
+    "mapserver/mapserver/fleet/fleet.py": {"last_pose"},  # the last PoseMessage as plain values, not a matrix
+    "shared/fleetmap/recordings/mcap/codecs.py": {"pose"},  # the codec of PoseStamped, beside those of image and imu
+    "shared/fleetmap/recordings/mcap/foxglove.py": {"pose"},
 }
 # Products are checked where both names say one of the project's own frames; others may be the same by another name.
 KNOWN = {"map", "survey", "odom", "body", "base", "cam"}

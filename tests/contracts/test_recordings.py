@@ -9,8 +9,8 @@ import pytest
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import RECORDING_FORMATS, Recording, open_recording
-from fleetmap.recordings.copying import copy_to_mcap
-from recording_samples import (
+from fleetmap.recordings.export_mcap import copy_to_mcap
+from support.recordings.recording_samples import (
     make_sample,
     world_from_cam0,
     write_euroc,

@@ -6,9 +6,9 @@ import re
 import msgspec
 import pytest
 
-from contracts_documents import REPOSITORY, code_words, rows, section, text
 from fleetmap.config import Section
 from mapserver.config import MapserverConfig
+from support.fleet.contracts_documents import REPOSITORY, code_words, rows, section, text
 
 DOCUMENT = "docs/settings.md"
 # The simulator has no configuration file: its sections are values in its code.

@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import robot_world
 from fleetmap.bus import MemoryBus, MemoryHub, ZenohBus
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
-from locclient.link import MapLink
-from locclient.spool import Spool
-from locclient.tile_cache import TileCache
-from mapserver.fleet import Fleet
+from locclient.daemon.outbox import Spool
+from locclient.maps.map_client import MapLink
+from locclient.maps.tile_cache import TileCache
+from mapserver.fleet.fleet import Fleet
+from mapserver.serving.bus_service import TileService
 from mapserver.store import MapStore
-from mapserver.tile_service import TileService
-from recording_samples import Sample, write_euroc
+from support.recordings.recording_samples import Sample, write_euroc
+from support.worlds import robot_world
 
 PATIENCE_S = 240.0  # the first start of all compiles every kernel
 

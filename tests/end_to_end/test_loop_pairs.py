@@ -18,20 +18,20 @@ import numpy as np
 import pytest
 
 from fleetmap.bow import train_vocabulary
-from fleetmap.calibration import RigCalibration
 from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_inverse, so3_exp
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.calibration_files import read_euroc_camera
-from fleetmap.rectification import Rectifier
-from fleetmap.samples import CameraFrame
-from mapserver.survey.graph_marginals import GraphMarginals
-from mapserver.survey.keyframes import Keyframe, make_keyframe
-from mapserver.survey.loops import LoopCloser, Loops, Verdict
-from mapserver.survey.pairs import PairMatch, match_pair
-from mapserver.survey.pose_graph import PoseEdge
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import CameraFrame
+from mapserver.survey.keyframes.keyframes import Keyframe, make_keyframe
+from mapserver.survey.loops.loops import LoopCloser, Loops, Verdict
+from mapserver.survey.loops.zones import Zones
+from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
+from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import LoopSettings, SurveySettings
-from mapserver.survey.zones import Zones
-from realdata import real_data
+from mapserver.survey.tracks.pairs import PairMatch, match_pair
+from support.recordings.realdata import real_data
 
 REVISITS = [(0, 1), (1, 0), (2, 3), (3, 2)]
 WRONG = [(0, 2), (2, 0), (0, 3), (3, 0), (1, 2), (2, 1), (1, 3), (3, 1)]

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from box_room import out_and_back, ride_sample
 from mapserver import cli
 from mapserver.store import MapStore
-from recording_samples import write_euroc
+from support.recordings.recording_samples import write_euroc
+from support.worlds.box_room import out_and_back, ride_sample
 
 
 @pytest.mark.slow

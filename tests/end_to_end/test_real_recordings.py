@@ -16,7 +16,7 @@ from fleetmap.geometry import Array
 from fleetmap.recordings import open_recording
 from locclient.cli import app as locclient_app
 from mapserver.cli import app as mapserver_app
-from realdata import real_data
+from support.recordings.realdata import real_data
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

@@ -12,22 +12,22 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-import box_room
-from box_room import out_and_back, ride_sample
-from fleetmap.default_vocabulary import default_vocabulary
+from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.errors import SurveyError, UsageError
 from fleetmap.geometry import Array, se3
 from fleetmap.mapformat import Tile, decode_tile
 from fleetmap.recordings import open_recording
-from fleetmap.rectification import Rectifier
+from fleetmap.sensors.rectification import Rectifier
 from mapserver.cli import app
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
+from mapserver.survey.loops.zones import Zones
+from mapserver.survey.merge.pipeline import Extension, NotJoined, extend
 from mapserver.survey.pipeline import survey
-from mapserver.survey.sessions.extend import Extension, NotJoined, extend
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.zones import Zones
-from recording_samples import Sample, make_sample, write_euroc
+from support.recordings.recording_samples import Sample, make_sample, write_euroc
+from support.worlds import box_room
+from support.worlds.box_room import out_and_back, ride_sample
 
 FRAME_S = 0.1
 WALL = 3  # the face at y = 3 that all rides look at

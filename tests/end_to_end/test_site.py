@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from box_room import out_and_back, ride_sample
 from fleetmap.errors import FleetmapError, LinkError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import blob_path
 from locclient.cli import app as locclient_app
 from mapserver.cli import app as mapserver_app
 from mapserver.store import MapStore
-from recording_samples import START_NS, Sample, write_euroc
+from support.recordings.recording_samples import START_NS, Sample, write_euroc
+from support.worlds.box_room import out_and_back, ride_sample
 
 FRAMES, FRAME_S = 50, 0.1
 REPORT_KEYS = {

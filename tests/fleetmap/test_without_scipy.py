@@ -18,7 +18,7 @@ class Refuse:
 
 sys.meta_path.insert(0, Refuse())
 import numpy as np
-from fleetmap.calibration import ImuNoise
+from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.odometry import Odometry, OdometrySettings
 from inertial_motion import sample_motion
 from textured_room import BODY_FROM_CAM, CAMERA, rig, stereo_frame

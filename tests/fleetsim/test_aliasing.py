@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from benchmarks.bench_aliasing import measure
-from fleetsim.layout import Layout
+from benchmarks.back_end.bench_aliasing import measure
+from fleetsim.scene.layout import Layout
 
 
 def test_corresponding_places_match_as_well_across_aisles_as_across_days() -> None:

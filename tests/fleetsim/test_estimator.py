@@ -5,16 +5,16 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from benchmarks import estimator_loop
+from benchmarks.common import estimator_loop
 from fleetmap.geometry import se3_inverse, transform_points
-from fleetsim.estimator import EstimatorSession
-from fleetsim.estimator_statistics import FeatureStatistics, FlowStatistics
-from fleetsim.faults import Fault
-from fleetsim.landmarks import LandmarkField
-from fleetsim.layout import Layout
+from fleetsim.estimator.landmarks import LandmarkField
+from fleetsim.estimator.simulated_run import EstimatorSession
+from fleetsim.estimator.statistics import FeatureStatistics, FlowStatistics
 from fleetsim.recorder import Order, prepare
-from fleetsim.robots import HiddenErrors
-from fleetsim.world import World
+from fleetsim.scene.layout import Layout
+from fleetsim.scene.world import World
+from fleetsim.sensors.faults import Fault
+from fleetsim.sensors.robots import HiddenErrors
 
 
 @lru_cache(maxsize=4)

@@ -7,12 +7,12 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from fleetmap.errors import UsageError
-from fleetsim.layout import Layout
-from fleetsim.motion import CarriedMotion, RouteMotion, Shake
+from fleetsim.motion.body_motion import CarriedMotion, RouteMotion, Shake
+from fleetsim.motion.routes import Limits, Route, check_clear, time_path
+from fleetsim.motion.splines import UniformSpline
 from fleetsim.recorder import drive
-from fleetsim.routes import Limits, Route, check_clear, time_path
 from fleetsim.scenarios import SCENARIOS
-from fleetsim.splines import UniformSpline
+from fleetsim.scene.layout import Layout
 
 Array = NDArray[np.float64]
 SQUARE = Route(((2.0, 2.0), (14.0, 2.0), (14.0, 9.0), (3.0, 9.0), (3.0, 3.0), (12.0, 3.0)), stops=((2, 2.0),))

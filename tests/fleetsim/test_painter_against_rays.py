@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from numba import njit
 
-from fleetmap.calibration import CameraCalibration
-from fleetsim import ray_kernels
-from fleetsim.light import Exposure
-from fleetsim.optics import make_optics
-from fleetsim.painter import Look, Painter
-from fleetsim.robots import LENSES
-from simulated_views import Array, map_from_cam, small_world
+from fleetmap.sensors.calibration import CameraCalibration
+from fleetsim.render import ray_kernels
+from fleetsim.render.optics import make_optics
+from fleetsim.render.painter import Look, Painter
+from fleetsim.scene.light import Exposure
+from fleetsim.sensors.robots import LENSES
+from support.worlds.simulated_views import Array, map_from_cam, small_world
 
 WIDTH, HEIGHT = 200, 150
 NOTHING = 1e6

@@ -13,12 +13,12 @@ from typer.testing import CliRunner
 from fleetmap.errors import UsageError
 from fleetmap.geometry import rotation_angle_rad, se3_inverse
 from fleetmap.recordings import open_recording
-from fleetmap.samples import SensorSet
+from fleetmap.sensors.samples import SensorSet
 from fleetsim.cli import app
-from fleetsim.faults import Fault
 from fleetsim.recorder import Order, prepare
-from fleetsim.robots import HiddenErrors
 from fleetsim.scenarios import SCENARIOS
+from fleetsim.sensors.faults import Fault
+from fleetsim.sensors.robots import HiddenErrors
 
 SIZE = ["--size", "160x120"]
 

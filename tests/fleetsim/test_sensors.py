@@ -5,12 +5,12 @@ import pytest
 from numpy.typing import NDArray
 
 from fleetmap.errors import UsageError
-from fleetmap.samples import ImuSamples, WheelSample
-from fleetsim.faults import FAULTS, SLIP, Fault, FaultPlan, parse_fault
-from fleetsim.motion import RouteMotion, Shake
-from fleetsim.robots import ImuErrors, WheelErrors
-from fleetsim.routes import Limits, Route
-from fleetsim.sensors import START_NS, measure_imu, measure_priors, measure_wheels
+from fleetmap.sensors.samples import ImuSamples, WheelSample
+from fleetsim.motion.body_motion import RouteMotion, Shake
+from fleetsim.motion.routes import Limits, Route
+from fleetsim.sensors.faults import FAULTS, SLIP, Fault, FaultPlan, parse_fault
+from fleetsim.sensors.measurements import START_NS, measure_imu, measure_priors, measure_wheels
+from fleetsim.sensors.robots import ImuErrors, WheelErrors
 
 Array = NDArray[np.float64]
 

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fleetmap.calibration import RigCalibration
 from fleetmap.geometry import se3_inverse, transform_points
-from fleetsim.motion import RouteMotion
-from fleetsim.painter import Look
-from fleetsim.rendering import StereoRenderer
-from fleetsim.robots import ROBOTS, nominal_calibration
-from fleetsim.routes import Route
-from simulated_views import small_world
+from fleetmap.sensors.calibration import RigCalibration
+from fleetsim.motion.body_motion import RouteMotion
+from fleetsim.motion.routes import Route
+from fleetsim.render.painter import Look
+from fleetsim.render.renderer import StereoRenderer
+from fleetsim.sensors.robots import ROBOTS, nominal_calibration
+from support.worlds.simulated_views import small_world
 
 Array = NDArray[np.float64]
 MOMENTS_S = (3.0, 6.0, 9.5, 12.0, 14.0)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from fleetsim.layout import Layout
-from fleetsim.stock import Slot, last_restock_day, mix, slot_generator
-from fleetsim.world import World
+from fleetsim.scene.layout import Layout
+from fleetsim.scene.stock import Slot, last_restock_day, mix, slot_generator
+from fleetsim.scene.world import World
 
 
 def _slots(layout: Layout) -> list[Slot]:

@@ -1,6 +1,6 @@
 """Faults of a robot's sensors: said within a second, survived without a silent failure, and over soon after they end.
 
-Without pictures: what a stuck camera or a person in the way looks like is shown by tests/benchmarks/bench_faults.py.
+Without pictures: what a stuck camera or a person in the way looks like is shown by tests/benchmarks/robot/bench_faults.py.
 """
 
 from dataclasses import replace
@@ -9,14 +9,14 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from benchmarks import estimator_loop
-from fleetsim.estimator import EstimatorSession
-from fleetsim.faults import Fault, FaultPlan
-from fleetsim.landmarks import LandmarkField
+from benchmarks.common import estimator_loop
+from fleetmap.relocalization.map_view import MapView
+from fleetsim.estimator.landmarks import LandmarkField
+from fleetsim.estimator.simulated_run import EstimatorSession
 from fleetsim.recorder import Order, Session, prepare
-from locclient.estimate import Estimate, Status
-from locclient.map_view import MapView
-from locclient.sight import Cause
+from fleetsim.sensors.faults import Fault, FaultPlan
+from locclient.localization.estimate import Estimate, Status
+from locclient.localization.image_quality import Cause
 
 BEGIN_S = 2.5  # on the way, three seconds before the end
 WRONG_M = 0.3

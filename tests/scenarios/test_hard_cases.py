@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from box_room import out_and_back, ride_sample
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, open_recording
-from fleetmap.recordings.copying import copy_to_mcap
+from fleetmap.recordings.export_mcap import copy_to_mcap
 from mapserver.cli import app
-from recording_samples import write_euroc
-from spoiled_recording import (
+from support.recordings.recording_samples import write_euroc
+from support.recordings.spoiled_recording import (
     swapped,
     with_camera_turned,
     with_clock_shift,
@@ -24,6 +23,7 @@ from spoiled_recording import (
     with_lost_frames,
     without_imu,
 )
+from support.worlds.box_room import out_and_back, ride_sample
 
 FRAMES, FRAME_S = 60, 0.1
 GOOD_M = 0.02  # what the room is mapped to when nothing is wrong, with room to spare

@@ -15,7 +15,7 @@ def check(
     from locclient.config import LocclientConfig
 
     settings = load_toml(config, LocclientConfig)
-    from locclient.self_check import FAIL, self_check
+    from locclient.daemon.preflight import FAIL, self_check
 
     failed = False
     for finding in self_check(settings, seconds):

@@ -21,11 +21,11 @@ def run(
         level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
     )
     settings = load_toml(config, LocclientConfig)
-    from locclient.daemon import check_run, daemon_parts
+    from locclient.daemon.daemon import check_run, daemon_parts
 
     check_run(settings)
-    from locclient.runtime import Runtime
-    from locclient.service_manager import ServiceManager
+    from locclient.daemon.runtime import Runtime
+    from locclient.daemon.systemd_notify import ServiceManager
 
     with daemon_parts(settings) as parts:
         runtime = Runtime(parts, ServiceManager())

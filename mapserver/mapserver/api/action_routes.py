@@ -10,11 +10,11 @@ from starlette.exceptions import HTTPException
 from mapserver.api.fleet_views import CanaryAct, CanaryView
 from mapserver.api.parameters import Site, Version
 from mapserver.api.writers import Writers, checked_by
-from mapserver.canary import CanarySettings, number_of
-from mapserver.canary_watch import find
-from mapserver.gate import GateSettings
-from mapserver.resurvey import ResurveySettings, route_geojson
-from mapserver.resurvey_list import ResurveyList, resurvey_list
+from mapserver.fleet.canary_controller import find
+from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
+from mapserver.fleet_statistics.canary_test import CanarySettings, number_of
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings, route_geojson
+from mapserver.quality.gate import GateSettings
 from mapserver.store import CanaryRow, MapStore
 
 

@@ -33,10 +33,10 @@ from mapserver.api.views import (
     VersionView,
 )
 from mapserver.api.writers import Writers
-from mapserver.canary import CanarySettings
-from mapserver.fleet import Fleet
-from mapserver.gate import GateSettings
-from mapserver.resurvey import ResurveySettings
+from mapserver.fleet.fleet import Fleet
+from mapserver.fleet_statistics.canary_test import CanarySettings
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+from mapserver.quality.gate import GateSettings
 from mapserver.store import JobInfo, MapStore
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]

@@ -7,7 +7,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from mapserver.api.views import Problem
-from mapserver.measures import Tally, measures
+from mapserver.fleet_statistics.kpis import Tally, measures
 from mapserver.store import FailureRow
 
 _PARAMETER_EXAMPLES: dict[str, Any] = {

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from mapserver.fleet import Fleet, RobotStatus
-from mapserver.measures import Tally
+from mapserver.fleet.fleet import Fleet, RobotStatus
+from mapserver.fleet_statistics.kpis import Tally
 from mapserver.store import MapStore
 
 STATUSES = ("INITIALISING", "TRACKING", "DEGRADED", "AMBIGUOUS", "LOST")

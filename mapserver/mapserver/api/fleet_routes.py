@@ -9,8 +9,8 @@ from fleetmap.messages import report_dict
 from mapserver.api.fleet_views import FailureList, FailureView, HourList, HourView, MeasuresList, MeasuresView
 from mapserver.api.pages import Limit, NumberCursor, TallyCursor, page
 from mapserver.api.parameters import Axis, FailureNumber, Hours, KeyFilter, Site, SiteFilter
-from mapserver.fleet import finite
-from mapserver.measures import HOUR_NS, hour_of, measures
+from mapserver.fleet.fleet import finite
+from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of, measures
 from mapserver.store import FailureFilter, MapStore
 
 VersionFilter = Annotated[int | None, Query(ge=1, le=1 << 31, description="on this version alone", examples=[None])]

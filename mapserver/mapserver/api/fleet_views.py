@@ -6,8 +6,8 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 
 from mapserver.api.views import Act
-from mapserver.canary import CanaryFinding
-from mapserver.measures import Measures
+from mapserver.fleet_statistics.canary_test import CanaryFinding
+from mapserver.fleet_statistics.kpis import Measures
 from mapserver.store import CanaryRow, FailureRow, PictureRow
 
 

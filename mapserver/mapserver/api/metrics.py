@@ -7,7 +7,7 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from mapserver.api.fleet_metrics import FleetCollector
-from mapserver.fleet import Fleet
+from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"

@@ -5,7 +5,7 @@ from fastapi import Depends, FastAPI
 from mapserver.api.parameters import Site, Version
 from mapserver.api.views import Act, PublishAct, QualityView, VersionView
 from mapserver.api.writers import Writers, checked_by
-from mapserver.gate import GateSettings
+from mapserver.quality.gate import GateSettings
 from mapserver.store import Difference, MapStore
 
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from mapserver.fleet import RobotStatus
+from mapserver.fleet.fleet import RobotStatus
 from mapserver.store import Actor, Event, JobInfo, SiteInfo, VerdictRow, VersionInfo
 
 

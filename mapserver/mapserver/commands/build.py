@@ -53,9 +53,9 @@ def build(
     from fleetmap.mapformat import check_name
 
     check_name(site, "site")
-    from mapserver.building import BuildOrder, run_build
+    from mapserver.build.build import BuildOrder, run_build
+    from mapserver.build.sensor_subset import named_sensor_set, sensor_set_of
     from mapserver.config import read_config, survey_settings
-    from mapserver.sensor_choice import named_sensor_set, sensor_set_of
 
     sensors = None if use is None else named_sensor_set(use)
     order = BuildOrder(

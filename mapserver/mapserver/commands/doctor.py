@@ -36,8 +36,8 @@ def doctor(
 
     from fleetmap.recordings import OpenOptions, open_recording
     from mapserver.doctor import Verdict, examine
-    from mapserver.doctor.examination import SAMPLED_FRAMES, TURN_FRAMES
     from mapserver.doctor.findings import worst
+    from mapserver.doctor.run_checks import SAMPLED_FRAMES, TURN_FRAMES
 
     with open_recording(recording, OpenOptions(calibration_file=calibration)) as source:
         with Progress(console=Console(stderr=True), transient=True) as progress:

@@ -30,7 +30,7 @@ def evaluate(
 
     from fleetmap.recordings.covariances import read_covariances
     from fleetmap.recordings.tum import read_tum
-    from mapserver.evaluation_summary import summary
+    from mapserver.evaluation.summary_table import summary
 
     found = summary(
         read_tum(estimate), read_tum(ground_truth), frames=frames, from_first=from_first,

@@ -10,7 +10,7 @@ from mapserver.commands.config_option import ConfigFile, config_path
 from mapserver.commands.print_json import print_json
 
 if TYPE_CHECKING:
-    from mapserver.resurvey_list import ResurveyList
+    from mapserver.fleet.resurvey_list import ResurveyList
 
 fleet_app = typer.Typer(
     no_args_is_help=True, add_completion=False, help="How the robots of a site do: a page, files, what to survey again."
@@ -40,8 +40,8 @@ def report(
 
     from fleetmap.errors import StoreError
     from mapserver.config import read_config
-    from mapserver.fleet_reports.page import html_page
-    from mapserver.fleet_reports.summary import summarise
+    from mapserver.fleet.shift_page import html_page
+    from mapserver.fleet.shift_summary import summarise
     from mapserver.store import MapStore
 
     settings = read_config(config_path(context))
@@ -68,7 +68,7 @@ def export(
     import time
 
     from fleetmap.errors import UsageError
-    from mapserver.fleet_reports.exports import write_json_lines, write_mcap
+    from mapserver.fleet.exports import write_json_lines, write_mcap
     from mapserver.store import FailureFilter, MapStore
 
     chosen = kind or next((known for known in ExportFormat if out.suffix == f".{known}"), None)
@@ -98,7 +98,7 @@ def resurvey(
     import time
 
     from mapserver.config import read_config
-    from mapserver.resurvey_list import resurvey_list
+    from mapserver.fleet.resurvey_list import resurvey_list
     from mapserver.store import MapStore
 
     settings = read_config(config_path(context)).resurvey
@@ -118,7 +118,7 @@ def _write_route(found: "ResurveyList", path: Path) -> None:
     import json as json_text
 
     from fleetmap.errors import StoreError
-    from mapserver.resurvey import route_csv, route_geojson
+    from mapserver.fleet_statistics.resurvey_test import route_csv, route_geojson
 
     if path.suffix == ".csv":
         text = route_csv(found.route)

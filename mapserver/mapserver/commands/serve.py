@@ -64,10 +64,10 @@ def _run(
 
     from mapserver.api.app import create_app
     from mapserver.api.metrics import Metrics
-    from mapserver.chores import run_chores, server_chores
     from mapserver.dashboard.install import install_dashboard
-    from mapserver.fleet import Fleet
-    from mapserver.tile_service import TileService
+    from mapserver.fleet.fleet import Fleet
+    from mapserver.serving.background_tasks import run_chores, server_chores
+    from mapserver.serving.bus_service import TileService
 
     # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)

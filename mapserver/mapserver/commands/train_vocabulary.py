@@ -62,8 +62,8 @@ def _descriptors(path: Path, frames: str, orb: "OrbSettings") -> "Iterator[NDArr
     """Descriptors (N, 32) of each selected left picture, rectified."""
     from fleetmap.features.orb import detect
     from fleetmap.recordings import FrameSelection, open_recording
-    from fleetmap.rectification import Rectifier
-    from fleetmap.samples import SensorSet
+    from fleetmap.sensors.rectification import Rectifier
+    from fleetmap.sensors.samples import SensorSet
 
     with open_recording(path) as recording:
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)

@@ -7,7 +7,7 @@ from nicegui import ui
 from starlette.exceptions import HTTPException
 
 from fleetmap.errors import FleetmapError
-from mapserver.dashboard.frame import Rooms, html, load, notice
+from mapserver.dashboard.layout import Rooms, html, load, notice
 from mapserver.store import Actor
 
 _MAX_NAME, _MAX_REASON = 200, 2000

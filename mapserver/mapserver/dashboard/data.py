@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from fleetmap.errors import StateError, UsageError
 from fleetmap.mapformat import Manifest, decode_tile
 from mapserver.dashboard.plan import Plan, make_plan
-from mapserver.gate import GateSettings
+from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, CanaryRow, Difference, Event, JobInfo, MapStore, SiteInfo, VerdictRow, VersionInfo
 
 _KEPT_PLANS = 8

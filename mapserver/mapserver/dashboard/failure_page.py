@@ -8,8 +8,8 @@ from fleetmap.errors import FleetmapError
 from fleetmap.messages import FailureReport
 from mapserver.dashboard import drawing
 from mapserver.dashboard.drawing import Mark
-from mapserver.dashboard.frame import RESPONSE_TIMEOUT_S, Rooms, Where, back_link, html, load, notice, number, show
-from mapserver.dashboard.health_data import FAILURES_SHOWN, Choices
+from mapserver.dashboard.fleet_health import FAILURES_SHOWN, Choices
+from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, Rooms, Where, back_link, html, load, notice, number, show
 from mapserver.dashboard.live import STATUSES
 from mapserver.dashboard.map_page import picture_address
 from mapserver.dashboard.markup import badge, choices, facts, joined, link, moment, table

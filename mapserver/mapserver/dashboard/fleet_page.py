@@ -8,14 +8,14 @@ from nicegui import ui
 
 from mapserver.dashboard import drawing
 from mapserver.dashboard.drawing import Bar, Mark
-from mapserver.dashboard.frame import RESPONSE_TIMEOUT_S, Rooms, Where, html, load, show
-from mapserver.dashboard.health_data import SiteHealth, Trial
+from mapserver.dashboard.fleet_health import SiteHealth, Trial
+from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, Rooms, Where, html, load, show
 from mapserver.dashboard.live import LiveRobot, LiveSite
 from mapserver.dashboard.map_page import picture_address
 from mapserver.dashboard.markup import age, badge, joined, link, moment, share, table
 from mapserver.dashboard.plan import Plan
-from mapserver.measures import Rate
-from mapserver.rate_words import driven_words, figure, is_telling, rate_words
+from mapserver.fleet_statistics.kpis import Rate
+from mapserver.fleet_statistics.rate_format import driven_words, figure, is_telling, rate_words
 
 _MOVE_EVERY_S, _LIST_EVERY_S = 1.0, 2.0
 _SHAPES = {"good": "circle", "warn": "triangle", "bad": "square", "quiet": "circle"}

@@ -9,16 +9,16 @@ from nicegui import ui
 
 from fleetmap.errors import FleetmapError
 from mapserver.api.writers import Writers
-from mapserver.canary import CanarySettings
 from mapserver.dashboard import failure_page, fleet_page, map_page, survey_page
+from mapserver.dashboard.compression_cache import KeptFiles
 from mapserver.dashboard.data import MapData
-from mapserver.dashboard.frame import Rooms
-from mapserver.dashboard.health_data import HealthData
-from mapserver.dashboard.kept_files import KeptFiles
+from mapserver.dashboard.fleet_health import HealthData
+from mapserver.dashboard.layout import Rooms
 from mapserver.dashboard.live import LiveRobots
-from mapserver.fleet import Fleet
-from mapserver.gate import GateSettings
-from mapserver.resurvey import ResurveySettings
+from mapserver.fleet.fleet import Fleet
+from mapserver.fleet_statistics.canary_test import CanarySettings
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+from mapserver.quality.gate import GateSettings
 from mapserver.store import MapStore
 
 PATH = "/dashboard"

@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from mapserver.fleet import Fleet, RobotStatus
+from mapserver.fleet.fleet import Fleet, RobotStatus
 
 SILENT_S = 10.0  # robots report every second
 _GONE_S = 3.0

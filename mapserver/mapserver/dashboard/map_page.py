@@ -10,7 +10,7 @@ from nicegui import ui
 from mapserver.dashboard import drawing
 from mapserver.dashboard.confirm import change_button
 from mapserver.dashboard.data import MapData, SiteHistory, VersionQuality
-from mapserver.dashboard.frame import RESPONSE_TIMEOUT_S, Rooms, Where, html, load, number, show
+from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, Rooms, Where, html, load, number, show
 from mapserver.dashboard.markup import badge, choices, facts, joined, link, moment, share, size, table
 from mapserver.dashboard.plan import Plan
 from mapserver.quality.directions import missing_words

@@ -10,7 +10,7 @@ from nicegui import ui
 
 from mapserver.dashboard import drawing
 from mapserver.dashboard.drawing import Line, Mark
-from mapserver.dashboard.frame import RESPONSE_TIMEOUT_S, Rooms, Where, html, load, number, show
+from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, Rooms, Where, html, load, number, show
 from mapserver.dashboard.map_page import picture_address
 from mapserver.dashboard.markup import badge, facts, joined, link, table
 from mapserver.store import JobInfo

@@ -3,7 +3,7 @@
 `examination` reads the frames.
 """
 
-from mapserver.doctor.examination import Examination, examine
 from mapserver.doctor.findings import Finding, Verdict
+from mapserver.doctor.run_checks import Examination, examine
 
 __all__ = ["Examination", "Finding", "Verdict", "examine"]

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from fleetmap.geometry import AnyArray, Array, se3, se3_inverse, so3_exp
-from fleetmap.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 
 _CORNERS, _MIN_POINTS = 250, 25
 _LK_WINDOW, _LK_LEVELS = (15, 15), 4

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from fleetmap.geometry import AnyArray, Array, so3_exp
-from fleetmap.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from mapserver.doctor.camera_rotation import followed
 from mapserver.doctor.findings import Finding, judge, not_judged
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap.geometry import Array, rotation_angle_rad, rotation_between_vectors
-from fleetmap.samples import ImuSamples, Stamps
+from fleetmap.sensors.samples import ImuSamples, Stamps
 from mapserver.doctor.findings import Finding, Verdict, judge, not_judged
 
 _MIN_PAIRS = 20

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleetmap.samples import ImuSamples
+from fleetmap.sensors.samples import ImuSamples
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 
 GRAVITY_MPS2 = 9.81

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from fleetmap.samples import Image
+from fleetmap.sensors.samples import Image
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 
 _BLIND, _FLAT = 1.5, 6.0  # variance in grey levels squared: a covered lens; hardly an edge

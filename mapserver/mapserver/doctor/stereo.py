@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from fleetmap.geometry import Array
-from fleetmap.rectification import RectifiedFrame
+from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.doctor.findings import Finding, judge, not_judged
 
 _MIN_MATCHES = 40

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fleetmap.samples import Loss, Stamps
+from fleetmap.sensors.samples import Loss, Stamps
 from mapserver.doctor.findings import Finding, Verdict, judge, not_judged
 
 SPARSE_S = 0.35  # frames further apart than this are keyframes, not a video

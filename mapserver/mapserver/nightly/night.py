@@ -14,12 +14,12 @@ from typing import Any
 from rich.console import Console
 
 from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, SurveyError
-from mapserver.building import BuildOrder, build_draft
-from mapserver.gate import GateSettings
-from mapserver.job_locks import INTERRUPTED, end_interrupted, held
+from mapserver.build.build import BuildOrder, build_draft
+from mapserver.build.job_lock import INTERRUPTED, end_interrupted, held
 from mapserver.nightly import inbox as boxes
 from mapserver.nightly.lock import only_one
 from mapserver.nightly.recorded import Recorded, identify
+from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore, VersionInfo
 from mapserver.survey.settings import SurveySettings
 

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
-from fleetmap.samples import Stamps
+from fleetmap.sensors.samples import Stamps
 from mapserver.quality.figures import Aliasing, Compared, Evidence, Looks, Motion
-from mapserver.quality.frames import Probe
 from mapserver.quality.locate import PRIOR_RADIUS_M, Fix, locate
+from mapserver.quality.probes import Probe
 from mapserver.quality.tile_map import Lookalikes, TileMap
 from mapserver.survey.settings import SurveySettings
 

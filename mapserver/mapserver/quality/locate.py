@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from fleetmap.features.matching import match_by_projection, match_mutual
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.pose_solver import Resection, ransac_resection, refine_resection
-from mapserver.quality.frames import Look
+from fleetmap.pnp.pnp import Resection, ransac_resection, refine_resection
+from mapserver.quality.probes import Look
 from mapserver.quality.tile_map import TileMap
 from mapserver.survey.settings import SurveySettings
 

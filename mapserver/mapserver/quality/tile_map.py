@@ -10,8 +10,8 @@ from fleetmap.bow import PlaceIndex, Vocabulary
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import AnyArray, Array, se3_inverse, transform_points
 from fleetmap.mapformat import Tile
-from fleetmap.rectification import StereoCamera
-from mapserver.quality.frames import Look
+from fleetmap.sensors.rectification import StereoCamera
+from mapserver.quality.probes import Look
 
 Rows = NDArray[np.int64]
 _NEAREST_M = 0.2

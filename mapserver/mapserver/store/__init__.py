@@ -1,7 +1,5 @@
 """Where maps are kept: content-addressed files and one SQLite database. SQL lives here alone."""
 
-from mapserver.store.collection import Garbage, Retention
-from mapserver.store.differences import Difference
 from mapserver.store.fleet_records import FleetBatch, FleetRecords, TallyKey, tile_key
 from mapserver.store.fleet_rows import (
     AXES,
@@ -13,6 +11,7 @@ from mapserver.store.fleet_rows import (
     PictureRow,
     TraceRow,
 )
+from mapserver.store.garbage_collection import Garbage, Retention
 from mapserver.store.map_store import MapStore
 from mapserver.store.rows import (
     NOBODY,
@@ -26,6 +25,7 @@ from mapserver.store.rows import (
     VersionInfo,
 )
 from mapserver.store.verification import Findings
+from mapserver.store.version_diff import Difference
 
 __all__ = [
     "AXES",

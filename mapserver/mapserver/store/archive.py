@@ -16,10 +16,10 @@ import numpy as np
 from fleetmap.errors import MapFormatError
 from fleetmap.geometry import AnyArray
 from fleetmap.mapformat import pack, unpack
-from fleetmap.rectification import StereoCamera
-from fleetmap.samples import Trajectory
-from mapserver.survey.history import history_of
-from mapserver.survey.result import History, SurveyMap
+from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.samples import Trajectory
+from mapserver.survey.merge.initial_history import history_of
+from mapserver.survey.survey_map import History, SurveyMap
 
 ARCHIVE_MAGIC = b"FMAR"
 ARCHIVE_FORMAT = 2

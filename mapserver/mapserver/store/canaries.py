@@ -4,8 +4,8 @@ import sqlite3
 
 from fleetmap.errors import StateError
 from mapserver.store.fleet_rows import CanaryRow
-from mapserver.store.ledger import Ledger
 from mapserver.store.rows import Actor, VersionInfo
+from mapserver.store.transactions import Ledger
 
 
 def canaries(ledger: Ledger, site: str | None, *, running: bool) -> list[CanaryRow]:

@@ -9,7 +9,7 @@ import msgspec
 
 from fleetmap.errors import UsageError
 from fleetmap.messages import FailureReport
-from mapserver.measures import TALLY_COLUMNS, Tally, hour_of
+from mapserver.fleet_statistics.kpis import TALLY_COLUMNS, Tally, hour_of
 from mapserver.store.fleet_rows import (
     AXES,
     FailureDetail,
@@ -19,7 +19,7 @@ from mapserver.store.fleet_rows import (
     PictureRow,
     TraceRow,
 )
-from mapserver.store.ledger import Ledger
+from mapserver.store.transactions import Ledger
 
 TallyKey = tuple[str, str, str, int]
 """Site, axis, key, hour."""

@@ -9,11 +9,11 @@ import sqlite3
 
 from fleetmap.errors import GateRefusedError, StateError
 from fleetmap.mapformat import Manifest
-from mapserver.gate import Verdict
+from mapserver.quality.gate import Verdict
 from mapserver.store.canaries import check_running, close_canary
 from mapserver.store.fleet_rows import CanaryRow
-from mapserver.store.ledger import Ledger
 from mapserver.store.rows import Actor, VersionInfo
+from mapserver.store.transactions import Ledger
 
 # The row of what was current before what is current now.
 ROLLBACK_TARGET = """

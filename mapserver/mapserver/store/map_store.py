@@ -30,19 +30,19 @@ from fleetmap.mapformat import (
     encode_manifest,
     encode_tile,
 )
-from mapserver.canary import threshold_for
-from mapserver.gate import GateSettings, judge
+from mapserver.fleet_statistics.canary_test import threshold_for
 from mapserver.quality.figures import Evidence
+from mapserver.quality.gate import GateSettings, judge
 from mapserver.store import lifecycle
 from mapserver.store.canaries import start_canary, take_back_canary
-from mapserver.store.collection import Garbage, Retention, collect
-from mapserver.store.differences import Difference, difference
+from mapserver.store.export_import import ExportReader, open_export, write_export
 from mapserver.store.files import locked, make_folder, read_file, sync_folder, write_atomically
 from mapserver.store.fleet_rows import CanaryRow
-from mapserver.store.records import StoreRecords
+from mapserver.store.garbage_collection import Garbage, Retention, collect
+from mapserver.store.queries import StoreRecords
 from mapserver.store.rows import NOBODY, Actor, DraftDetails, VersionInfo
-from mapserver.store.transfer import ExportReader, open_export, write_export
 from mapserver.store.verification import Findings, verify
+from mapserver.store.version_diff import Difference, difference
 
 _USUAL_GATE = GateSettings()
 _USUAL_RETENTION = Retention()

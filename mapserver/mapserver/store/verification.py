@@ -6,8 +6,8 @@ from pathlib import Path
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import Manifest, current_path, decode_manifest
 from mapserver.store.blobs import BlobFolder
-from mapserver.store.ledger import Ledger
 from mapserver.store.rows import VersionInfo
+from mapserver.store.transactions import Ledger
 
 
 @dataclass(slots=True)

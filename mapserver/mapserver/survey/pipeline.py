@@ -7,31 +7,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
-from fleetmap.calibration import RigCalibration
 from fleetmap.errors import SurveyError
-from fleetmap.rectification import RectifiedFrame, Rectifier
-from fleetmap.samples import CameraFrame, ImuSamples, WheelSample
-from mapserver.survey.adjust import Motion, SurveyState, adjust, adjust_windows
-from mapserver.survey.culling import Culled
-from mapserver.survey.first_guess import FirstGuess, run_odometry
-from mapserver.survey.graph_marginals import GraphMarginals
-from mapserver.survey.keyframes import PictureShelf
-from mapserver.survey.loops import LoopCloser, Loops
-from mapserver.survey.matching import PairFinder, drift_allowance_m, fixed_allowance_m
-from mapserver.survey.odometry_terms import chain_edges, odometry_terms, terms_in_the_dark
-from mapserver.survey.pair_turn import NO_TURN, PairTurn, estimate_turn, without_turn
-from mapserver.survey.pairs import PairMatch
-from mapserver.survey.parts import Part, SigmaBetween, beside, find_parts, only_kept, seen_by
-from mapserver.survey.pose_graph import optimize_pose_graph
-from mapserver.survey.repeats import adjust_visits, spare_keyframes, without_spare
-from mapserver.survey.result import SurveyMap
-from mapserver.survey.scaled_loops import ScaledLoopCloser, gate_covariances, rigid, solve_scaled
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, WheelSample
+from mapserver.survey.bundle.bundle_rounds import Motion, SurveyState, adjust, adjust_windows
+from mapserver.survey.bundle.odometry_factors import chain_edges, odometry_terms, terms_in_the_dark
+from mapserver.survey.bundle.stereo_yaw_check import NO_TURN, PairTurn, estimate_turn, without_turn
+from mapserver.survey.executor import ALONE, Worker
+from mapserver.survey.finish.culling import Culled
+from mapserver.survey.finish.map_assembly import summarise
+from mapserver.survey.keyframes.connected_components import Part, SigmaBetween, beside, find_parts, only_kept, seen_by
+from mapserver.survey.keyframes.keyframes import PictureShelf
+from mapserver.survey.keyframes.revisit_thinning import adjust_visits, spare_keyframes, without_spare
+from mapserver.survey.loops.loops import LoopCloser, Loops
+from mapserver.survey.loops.sim3_loops import ScaledLoopCloser, gate_covariances, rigid, solve_scaled
+from mapserver.survey.loops.zones import Zones
+from mapserver.survey.odometry_pass import FirstGuess, run_odometry
+from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
+from mapserver.survey.pose_graph.pose_graph import optimize_pose_graph
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.summary import summarise
-from mapserver.survey.tracks import build_landmarks, landmarks_of, observed_again, tracks_of
-from mapserver.survey.view_depths import ViewDepths, survey_camera
-from mapserver.survey.work import ALONE, Worker
-from mapserver.survey.zones import Zones
+from mapserver.survey.survey_map import SurveyMap
+from mapserver.survey.tracks.matching import PairFinder, drift_allowance_m, fixed_allowance_m
+from mapserver.survey.tracks.mono_depths import ViewDepths, survey_camera
+from mapserver.survey.tracks.pairs import PairMatch
+from mapserver.survey.tracks.tracks import build_landmarks, landmarks_of, observed_again, tracks_of
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 _MIN_KEYFRAMES = 2

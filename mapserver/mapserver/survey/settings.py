@@ -7,7 +7,7 @@ from fleetmap.features.orb import OrbSettings
 from fleetmap.features.patch_align import AlignSettings
 from fleetmap.features.stereo import StereoSettings
 from fleetmap.odometry import OdometrySettings
-from mapserver.survey.bundle import BundleSettings
+from mapserver.survey.bundle.bundle_adjustment import BundleSettings
 
 
 class KeyframeSettings(Section, frozen=True):

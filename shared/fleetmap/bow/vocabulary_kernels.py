@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from fleetmap.features.matching_kernels import FAR, Indices, Packed, hamming
 from fleetmap.geometry import Array
-from fleetmap.kernel import kernel
+from fleetmap.numerics.kernel import kernel
 
 
 @kernel

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
-from fleetmap.kernel import kernel
+from fleetmap.numerics.kernel import kernel
 
 
 @kernel

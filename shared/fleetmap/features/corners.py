@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.features.corner_kernels import min_eigenvalue_scores, select_spread
-from fleetmap.samples import Image
+from fleetmap.sensors.samples import Image
 
 Pixels = NDArray[np.float32]
 _HALF_WINDOW = 3

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from fleetmap.features import flow_kernels
 from fleetmap.geometry import Array
-from fleetmap.samples import Image
+from fleetmap.sensors.samples import Image
 
 _STEPS, _SETTLED_PX = 20, 0.01
 # The way back begins at its end: steps that still move it by more than any check allows show soon.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
-from fleetmap.kernel import inner_kernel, kernel
+from fleetmap.numerics.kernel import inner_kernel, kernel
 
 Grey = NDArray[np.uint8]
 Window = NDArray[np.float32]

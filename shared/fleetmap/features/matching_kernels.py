@@ -9,7 +9,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
-from fleetmap.kernel import inner_kernel, kernel
+from fleetmap.numerics.kernel import inner_kernel, kernel
 
 Packed = NDArray[np.uint64]
 Indices = NDArray[np.int64]

@@ -13,7 +13,7 @@ from fleetmap.config import Section
 from fleetmap.features.corner_kernels import centroid_angles_deg, min_eigenvalue_scores, select_spread
 from fleetmap.features.corners import fast_corners
 from fleetmap.geometry import Array
-from fleetmap.samples import Image
+from fleetmap.sensors.samples import Image
 
 SCALE_FACTOR = 1.2
 _PATCH_RADIUS = 15

@@ -8,8 +8,8 @@ from fleetmap.config import Section
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.features.patch_align_kernels import align_patches
 from fleetmap.geometry import Array, transform_points
-from fleetmap.rectification import StereoCamera
-from fleetmap.samples import Image
+from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.samples import Image
 
 Pyramid = tuple[Image, ...]
 _LEVELS = 3

@@ -6,8 +6,8 @@ import numpy as np
 from fleetmap.config import Section
 from fleetmap.features.stereo_kernels import match_rows
 from fleetmap.geometry import Array
-from fleetmap.rectification import RectifiedFrame, StereoCamera
-from fleetmap.samples import Image
+from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.samples import Image
 
 
 class StereoSettings(Section, frozen=True):

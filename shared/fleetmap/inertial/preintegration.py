@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.calibration import ImuNoise
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.inertial.preintegration_kernels import integrate_samples, propagate_samples
-from fleetmap.samples import ImuSamples, Stamps
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.samples import ImuSamples, Stamps
 
 GRAVITY_MPS2 = 9.81
 GRAVITY_MAP = np.array([0.0, 0.0, -GRAVITY_MPS2])

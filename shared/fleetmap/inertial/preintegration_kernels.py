@@ -11,7 +11,7 @@ from fleetmap.inertial.so3_kernels import (
     matvec3,
     right_jacobian_into,
 )
-from fleetmap.kernel import kernel
+from fleetmap.numerics.kernel import kernel
 
 
 @kernel

@@ -6,7 +6,7 @@ All matrices are (3, 3) float64, all vectors (3,).
 import numpy as np
 
 from fleetmap.geometry import Array
-from fleetmap.kernel import kernel
+from fleetmap.numerics.kernel import kernel
 
 SMALL_ANGLE_RAD = 1e-4  # below it the series' next term is under 1e-17
 

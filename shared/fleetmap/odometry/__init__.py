@@ -1,7 +1,7 @@
 """Odometry of stereo and single cameras, with and without IMU: written once, run live by the robot and as a first guess by the survey."""
 
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
-from fleetmap.odometry.monocular import MonocularOdometry, make_odometry
+from fleetmap.odometry.mono.monocular import MonocularOdometry, make_odometry
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.settings import OdometrySettings
 

@@ -9,20 +9,20 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.calibration import ImuNoise, RigCalibration
 from fleetmap.features.stereo import StereoSettings
 from fleetmap.geometry import Array, interpolate_se3, se3_adjoint, se3_inverse, skew
-from fleetmap.odometry.doubts import Doubts
+from fleetmap.odometry.checks.divergence_monitor import Doubts
+from fleetmap.odometry.checks.imu_faults import joined, longest_gap_ns, without_spikes
+from fleetmap.odometry.checks.zero_velocity import StillPictures, middle
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
-from fleetmap.odometry.filter import InvariantFilter, NavState
-from fleetmap.odometry.imu_faults import joined, longest_gap_ns, without_spikes
+from fleetmap.odometry.filter.msckf import InvariantFilter, NavState
+from fleetmap.odometry.init.filter_initialization import Start, is_steady, start_in_motion, start_steady
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
-from fleetmap.odometry.standing import StillPictures, middle
-from fleetmap.odometry.start import Start, is_steady, start_in_motion, start_steady
-from fleetmap.odometry.tracker import Tracked, Tracker
-from fleetmap.odometry.tracks import Observations
-from fleetmap.rectification import RectifiedFrame, StereoCamera
-from fleetmap.samples import ImuSamples, Trajectory, WheelSample
+from fleetmap.odometry.tracking.tracker import Tracked, Tracker
+from fleetmap.odometry.tracking.tracks import Observations
+from fleetmap.sensors.calibration import ImuNoise, RigCalibration
+from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.samples import ImuSamples, Trajectory, WheelSample
 
 _IMU_MEMORY_S = 25.0
 _IMU_MEMORY_INERTIAL_S = 4.0  # with a state to go on from no start is looked for in it

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings import euroc, kitti, mcap_reader, seven_scenes, tumvi
 from fleetmap.recordings.calibration_files import format_calibration, read_calibration
+from fleetmap.recordings.folders import euroc, kitti, seven_scenes, tumvi
 from fleetmap.recordings.images import StoredFrame, StoredImage
+from fleetmap.recordings.mcap import reader
 from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording, Topics
 from fleetmap.recordings.selection import FrameSelection
 
@@ -46,7 +47,7 @@ RECORDING_FORMATS = {
     "7scenes": RecordingFormat(
         "a folder with frame-NNNNNN.color.* and .depth.png", seven_scenes.recognises, seven_scenes.open_seven_scenes
     ),
-    "mcap": RecordingFormat("an .mcap file, or a folder with one in it", mcap_reader.recognises, mcap_reader.open_mcap),
+    "mcap": RecordingFormat("an .mcap file, or a folder with one in it", reader.recognises, reader.open_mcap),
 }
 
 

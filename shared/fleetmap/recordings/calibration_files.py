@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from fleetmap.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
 from fleetmap.errors import CalibrationError
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _MODELS = {

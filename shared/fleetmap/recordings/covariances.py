@@ -12,7 +12,7 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.tum import format_stamp, parse_stamp_ns
-from fleetmap.samples import Stamps
+from fleetmap.sensors.samples import Stamps
 
 _ROWS, _COLUMNS = np.triu_indices(6)
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import AnyArray
-from fleetmap.samples import CameraFrame, Image
+from fleetmap.sensors.samples import CameraFrame, Image
 
 RAW_ENCODINGS = {
     "mono8": (np.uint8, 1),

@@ -4,7 +4,7 @@ import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
-from fleetmap.samples import ImuSamples
+from fleetmap.sensors.samples import ImuSamples
 
 _MIN_SAMPLES = 50
 _ACCEL_IN_G = (0.8, 1.25)

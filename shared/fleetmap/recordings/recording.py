@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from fleetmap.calibration import RigCalibration
 from fleetmap.config import Section
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.images import StoredFrame
-from fleetmap.samples import (
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import (
     CameraFrame,
     ImuSamples,
     Loss,

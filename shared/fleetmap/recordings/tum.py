@@ -10,7 +10,7 @@ import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
-from fleetmap.samples import Trajectory
+from fleetmap.sensors.samples import Trajectory
 
 _NS = 1_000_000_000
 _MOST_S = 9_223_372_036  # what 64 bits of nanoseconds hold

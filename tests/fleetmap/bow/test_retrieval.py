@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from fleetmap.bow import PlaceIndex, train_vocabulary
-from fleetmap.default_vocabulary import default_vocabulary
+from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.features.orb import OrbSettings, detect
 from fleetmap.geometry import Array, rotation_angle_rad, rotation_from_quat_wxyz
-from realdata import real_data
+from support.recordings.realdata import real_data
 
 
 @lru_cache(maxsize=1)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fleetmap.features.corner_kernels import centroid_angles_deg, min_eigenvalue_scores, select_spread
 from fleetmap.features.corners import spread_corners
 from fleetmap.geometry import Array
-from synthetic_texture import picture, pixel_grid, smooth_texture
+from support.worlds.synthetic_texture import picture, pixel_grid, smooth_texture
 
 WIDTH, HEIGHT = 160, 120
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fleetmap.features import EXTRACTORS, orb
 from fleetmap.features.matching import match_mutual
-from synthetic_texture import picture, pixel_grid, smooth_texture
+from support.worlds.synthetic_texture import picture, pixel_grid, smooth_texture
 
 WIDTH, HEIGHT = 320, 240
 

@@ -7,8 +7,8 @@ from fleetmap.features import stereo_kernels
 from fleetmap.features.corners import spread_corners
 from fleetmap.features.stereo import StereoSettings, disparities
 from fleetmap.geometry import Array
-from fleetmap.rectification import RectifiedFrame, StereoCamera
-from synthetic_texture import Texture, picture, pixel_grid, smooth_texture
+from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from support.worlds.synthetic_texture import Texture, picture, pixel_grid, smooth_texture
 
 WIDTH, HEIGHT = 320, 200
 CAMERA = StereoCamera(250.0, 160.0, 100.0, 0.1, WIDTH, HEIGHT)

@@ -4,11 +4,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from fleetmap.calibration import ImuNoise
 from fleetmap.geometry import so3_left_jacobian, so3_log
 from fleetmap.inertial import preintegrate, propagate_nav
-from fleetmap.samples import ImuSamples
-from inertial_motion import analytic_motion, sample_motion
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.samples import ImuSamples
+from support.worlds.inertial_motion import analytic_motion, sample_motion
 
 NOISE = ImuNoise()
 GYRO_BIAS, ACCEL_BIAS = np.array([0.01, -0.02, 0.015]), np.array([0.1, -0.05, 0.08])

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from fleetmap.calibration import ImuNoise
 from fleetmap.geometry import rotation_from_quat_wxyz, se3, so3_log
 from fleetmap.inertial import preintegrate
-from fleetmap.samples import ImuSamples
-from realdata import real_data
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.samples import ImuSamples
+from support.recordings.realdata import real_data
 
 
 def test_two_seconds_of_flight_end_where_the_truth_does() -> None:

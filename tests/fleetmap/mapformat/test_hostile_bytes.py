@@ -7,10 +7,10 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from benchmarks.bench_map_fuzz import fuzz
+from benchmarks.maps.bench_map_fuzz import fuzz
 from fleetmap.errors import MapFormatError
 from fleetmap.mapformat import MAX_TILE_PLACES, apply_patch, decode_tile, encode_tile, pack, sha256_hex, unpack
-from map_samples import random_tile
+from support.storage.map_samples import random_tile
 
 _LIMIT = 16 << 20
 

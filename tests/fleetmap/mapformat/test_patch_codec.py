@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fleetmap.errors import MapFormatError, NewerFormatError
 from fleetmap.mapformat import Tile, apply_patch, decode_tile, encode_tile, make_patch, pack, sha256_hex, unpack
-from map_samples import random_tile
+from support.storage.map_samples import random_tile
 
 LIMIT = 64 << 20
 

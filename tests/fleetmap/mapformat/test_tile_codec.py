@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from fleetmap.errors import MapFormatError, NewerFormatError
 from fleetmap.geometry import rotation_angle_rad, se3
 from fleetmap.mapformat import LANDMARK_BYTES, MAX_TILE_PLACES, Tile, decode_tile, encode_tile, pack, sha256_hex, unpack
-from map_samples import random_tile
+from support.storage.map_samples import random_tile
 
 LIMIT = 64 << 20
 

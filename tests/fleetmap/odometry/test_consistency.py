@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from benchmarks import consistency, estimator_loop
+from benchmarks.common import consistency, estimator_loop
 from fleetmap.odometry import OdometryEstimate, OdometrySettings
 from fleetmap.odometry.settings import FilterSettings
-from fleetsim.estimator import EstimatorSession
-from fleetsim.faults import Fault
+from fleetsim.estimator.simulated_run import EstimatorSession
+from fleetsim.sensors.faults import Fault
 
 WITHOUT_WHEELS = OdometrySettings(filter=FilterSettings(use_wheels=False))
 

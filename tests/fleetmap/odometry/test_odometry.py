@@ -6,15 +6,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from fleetmap.calibration import ImuNoise
 from fleetmap.geometry import Array, se3_inverse, se3_log, so3_exp
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings, OdometryStatus
 from fleetmap.odometry.settings import TrackerSettings
-from fleetmap.odometry.tracker import Tracker
-from fleetmap.rectification import RectifiedFrame
-from inertial_motion import analytic_motion
-from point_world import noisy_imu
-from textured_room import BODY_FROM_CAM, CAMERA, black_frame, rig, stereo_frame
+from fleetmap.odometry.tracking.tracker import Tracker
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.rectification import RectifiedFrame
+from support.worlds.inertial_motion import analytic_motion
+from support.worlds.point_world import noisy_imu
+from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, black_frame, rig, stereo_frame
 
 IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
 FRAME_NS = 50_000_000

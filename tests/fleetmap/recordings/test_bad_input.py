@@ -10,7 +10,15 @@ import pytest
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings import RECORDING_FORMATS, OpenOptions, open_recording
-from recording_samples import HEIGHT, WIDTH, make_sample, write_euroc, write_euroc_imu, write_kitti, write_tumvi
+from support.recordings.recording_samples import (
+    HEIGHT,
+    WIDTH,
+    make_sample,
+    write_euroc,
+    write_euroc_imu,
+    write_kitti,
+    write_tumvi,
+)
 
 SAMPLE = make_sample(4, imu_before_ns=3_000_000_000)
 

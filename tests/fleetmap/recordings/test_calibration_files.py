@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleetmap.calibration import CameraCalibration, ImuNoise, RigCalibration
 from fleetmap.geometry import se3, se3_exp
 from fleetmap.recordings import format_calibration, read_calibration
 from fleetmap.recordings.calibration_files import load_calibration, parse_calibration, read_euroc_camera
-from realdata import real_data
-from recording_samples import calibration, kalibr_text
+from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration
+from support.recordings.realdata import real_data
+from support.recordings.recording_samples import calibration, kalibr_text
 
 
 def random_rig(seed: int, *, has_imu: bool) -> RigCalibration:

@@ -9,8 +9,8 @@ import pytest
 
 from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.recordings import OpenOptions, open_recording
-from fleetmap.samples import SensorSet
-from recording_samples import (
+from fleetmap.sensors.samples import SensorSet
+from support.recordings.recording_samples import (
     BASELINE_M,
     BODY_FROM_CAM0,
     FOCAL,

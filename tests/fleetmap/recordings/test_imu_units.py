@@ -6,9 +6,9 @@ import pytest
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.imu_units import check_imu_units
-from fleetmap.samples import ImuSamples
-from realdata import real_data
-from recording_samples import make_sample
+from fleetmap.sensors.samples import ImuSamples
+from support.recordings.realdata import real_data
+from support.recordings.recording_samples import make_sample
 
 SAMPLE = make_sample(1, imu_before_ns=6_000_000_000)
 TURNING = ImuSamples(SAMPLE.imu_stamps_ns, SAMPLE.gyro_radps, SAMPLE.accel_mps2)

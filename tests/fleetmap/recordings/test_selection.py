@@ -6,7 +6,7 @@ import pytest
 
 from fleetmap.errors import UsageError
 from fleetmap.recordings import FrameSelection, open_recording
-from recording_samples import make_sample, write_kitti
+from support.recordings.recording_samples import make_sample, write_kitti
 
 SAMPLE = make_sample(5)
 

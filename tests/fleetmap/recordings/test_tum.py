@@ -9,7 +9,7 @@ from evo.tools import file_interface
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import se3_exp
 from fleetmap.recordings.tum import format_tum, parse_tum, read_tum, write_tum
-from fleetmap.samples import Trajectory
+from fleetmap.sensors.samples import Trajectory
 
 
 def _trajectory(count: int = 30) -> Trajectory:

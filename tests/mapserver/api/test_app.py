@@ -15,12 +15,12 @@ from prometheus_client.parser import text_string_to_metric_families
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.mapformat import TILE_FORMAT, blob_path, decode_manifest, decode_tile, sha256_hex
 from fleetmap.messages import FailureReport, RobotAck, RobotHealth, Thumbnail
-from map_samples import draft_details, random_tile, save_sample_draft
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.api.writers import Writers
-from mapserver.fleet import Fleet
+from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
+from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
 
 @dataclass

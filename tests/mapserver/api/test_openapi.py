@@ -12,11 +12,11 @@ from schemathesis.specs.openapi.checks import (
 )
 
 from fleetmap.messages import FailureReport, Placement, Thumbnail
-from map_samples import save_sample_draft
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
-from mapserver.fleet import Fleet
+from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
+from support.storage.map_samples import save_sample_draft
 
 CHECKS = (not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance)
 

@@ -10,7 +10,10 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-from dashboard_scene import (
+from fleetmap.bus import ZenohBus
+from fleetmap.messages import FailureAck, decode_message, encode_message, robot_key
+from mapserver.store import MapStore
+from support.fleet.dashboard_scene import (
     SITE,
     Seen,
     Served,
@@ -22,9 +25,6 @@ from dashboard_scene import (
     talking,
     watch,
 )
-from fleetmap.bus import ZenohBus
-from fleetmap.messages import FailureAck, decode_message, encode_message, robot_key
-from mapserver.store import MapStore
 
 ROBOTS = 300
 TOKEN = "a-token-of-the-test"

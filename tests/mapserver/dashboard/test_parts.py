@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 from markupsafe import Markup
 
-from dashboard_scene import LENGTH_M, SITE, build_report, fill_store, hall_tiles
 from fleetmap.errors import StateError, UsageError
 from fleetmap.mapformat import Manifest
-from mapserver.canary import CanarySettings
+from mapserver.build.job_record import noted_job
 from mapserver.dashboard import drawing
 from mapserver.dashboard.data import MapData
-from mapserver.dashboard.health_data import HealthData, trend_words
+from mapserver.dashboard.fleet_health import HealthData, trend_words
 from mapserver.dashboard.live import LiveRobots, live_robot
 from mapserver.dashboard.map_page import one_way
 from mapserver.dashboard.markup import address, age, choices, facts, link, size, table
 from mapserver.dashboard.plan import make_plan
-from mapserver.fleet import Fleet, RobotStatus
-from mapserver.gate import GateSettings
-from mapserver.measures import Tally
-from mapserver.noted_job import noted_job
-from mapserver.resurvey import ResurveySettings
+from mapserver.fleet.fleet import Fleet, RobotStatus
+from mapserver.fleet_statistics.canary_test import CanarySettings
+from mapserver.fleet_statistics.kpis import Tally
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore
+from support.fleet.dashboard_scene import LENGTH_M, SITE, build_report, fill_store, hall_tiles
 
 EVIL = "<script>alert(1)</script>\"'&"
 

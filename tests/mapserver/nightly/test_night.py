@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from faulty_disk import Disk, install
 from fleetmap.errors import (
     BusyError,
     FleetmapError,
@@ -26,16 +25,17 @@ from fleetmap.errors import (
 )
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import open_recording
-from map_samples import draft_details, random_tile
 from mapserver import cli
-from mapserver.building import BuildOrder, Draft
-from mapserver.gate import GateSettings
+from mapserver.build.build import BuildOrder, Draft
+from mapserver.build.survey_recordings import admit_recordings
 from mapserver.nightly import NightOrder, last_report, night, run_night
 from mapserver.nightly.inbox import arrivals
+from mapserver.quality.gate import GateSettings
 from mapserver.store import MapStore
 from mapserver.survey.settings import SurveySettings
-from mapserver.surveying import admit_recordings
-from recording_samples import make_sample, write_euroc
+from support.recordings.recording_samples import make_sample, write_euroc
+from support.storage.faulty_disk import Disk, install
+from support.storage.map_samples import draft_details, random_tile
 
 LATER_NS = 3_600 * 10**9
 Build = Callable[..., Draft]

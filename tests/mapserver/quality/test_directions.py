@@ -7,9 +7,9 @@ import pytest
 
 from fleetmap.geometry import Array, se3
 from fleetmap.mapformat import Tile
-from map_samples import random_tile
 from mapserver.quality.directions import HEADINGS, missing_words, one_way_words, tile_directions
 from mapserver.quality.figures import TileDirections
+from support.storage.map_samples import random_tile
 
 SIZE_M = 16.0
 

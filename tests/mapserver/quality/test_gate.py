@@ -7,25 +7,25 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from box_room import ride_sample
 from fleetmap.bow import decode_vocabulary
-from fleetmap.calibration import RigCalibration
-from fleetmap.default_vocabulary import default_vocabulary_bytes
+from fleetmap.bow.shipped_vocabulary import default_vocabulary_bytes
 from fleetmap.geometry import Array, se3, so3_exp, transform_points
 from fleetmap.mapformat import BlobEntry, CameraEntry, Manifest, Tile, TileEntry, encode_tile
-from fleetmap.rectification import Rectifier
-from fleetmap.samples import CameraFrame, ImuSamples, Trajectory
-from mapserver.examining import Before, HeldOut, examine_draft
-from mapserver.gate import GateSettings, Verdict, judge
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, Trajectory
+from mapserver.build.draft_evidence import Before, HeldOut, examine_draft
 from mapserver.quality.evidence import trajectory_breaks
 from mapserver.quality.figures import Evidence
-from mapserver.quality.frames import held_out_frames, look_at
+from mapserver.quality.gate import GateSettings, Verdict, judge
+from mapserver.quality.probes import held_out_frames, look_at
+from mapserver.survey.loops.zones import Zones
 from mapserver.survey.pipeline import Survey, survey
-from mapserver.survey.result import SurveyMap
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.zones import Zones
-from mapserver.tiling import tiles_from_survey
-from recording_samples import calibration
+from mapserver.survey.survey_map import SurveyMap
+from mapserver.tiles.tiling import tiles_from_survey
+from support.recordings.recording_samples import calibration
+from support.worlds.box_room import ride_sample
 
 FRAMES, FRAME_S = 44, 0.1
 SETTINGS = SurveySettings()

@@ -8,8 +8,8 @@ import pytest
 
 from fleetmap.errors import MapFormatError, NewerFormatError
 from fleetmap.mapformat import pack, unpack
-from map_samples import random_survey
 from mapserver.store.archive import decode_archive, encode_archive
+from support.storage.map_samples import random_survey
 
 HISTORY = ("keyframe_ids", "is_place", "landmark_expected", "landmark_seen", "landmark_missed")
 

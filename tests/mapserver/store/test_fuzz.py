@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from fuzzed_formats import FORMATS, fuzz
+from support.storage.fuzzed_formats import FORMATS, fuzz
 
 
 @pytest.mark.parametrize("name", FORMATS)

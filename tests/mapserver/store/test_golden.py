@@ -13,8 +13,8 @@ from fleetmap.errors import NewerFormatError
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_manifest, decode_tile, encode_manifest, pack
 from mapserver.store import Actor, FailureFilter, MapStore
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
+from mapserver.store.export_import import EXPORT_FORMAT
 from mapserver.store.migrations import MIGRATIONS
-from mapserver.store.transfer import EXPORT_FORMAT
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 

@@ -11,11 +11,11 @@ import pytest
 
 from fleetmap.errors import FleetmapError, GateRefusedError, MapFormatError, StateError, StoreError, UsageError
 from fleetmap.mapformat import blob_path, current_path
-from map_samples import draft_details, random_tile, save_sample_draft
-from mapserver.gate import GateSettings
+from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore, Retention, lifecycle
-from mapserver.store.differences import SideBySide
 from mapserver.store.files import locked
+from mapserver.store.version_diff import SideBySide
+from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
 ADA = Actor("ada", "a test")
 DAY_NS = 86_400_000_000_000

@@ -13,9 +13,9 @@ import pytest
 
 from fleetmap.errors import GateRefusedError, MapFormatError, NewerFormatError, StoreError, UsageError
 from fleetmap.mapformat import blob_path, current_path, decode_tile, sha256_hex
-from map_samples import draft_details, random_tile, save_sample_draft
-from mapserver.store import MapStore, records
+from mapserver.store import MapStore, queries
 from mapserver.store.database import MIGRATIONS
+from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
 
 @pytest.fixture
@@ -247,4 +247,4 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(store: MapStore, tm
 
 def test_the_module_names_every_served_kind() -> None:
     kinds = "".join(MIGRATIONS[0])
-    assert all(f"'{kind}'" in kinds for kind in records._SERVED_KINDS)
+    assert all(f"'{kind}'" in kinds for kind in queries._SERVED_KINDS)

@@ -6,11 +6,11 @@ import pytest
 from fleetmap.features import patch_align
 from fleetmap.features.matching import packed
 from fleetmap.geometry import se3, so3_exp, transform_points
-from fleetmap.rectification import StereoCamera
-from mapserver.survey.pairs_kernels import predict_features, share_in_view
-from mapserver.survey.summary_kernels import mark_duplicates, medoids
-from mapserver.survey.tracks_kernels import align_observations
-from synthetic_texture import picture, smooth_texture
+from fleetmap.sensors.rectification import StereoCamera
+from mapserver.survey.finish.map_assembly_kernels import mark_duplicates, medoids
+from mapserver.survey.tracks.pairs_kernels import predict_features, share_in_view
+from mapserver.survey.tracks.tracks_kernels import align_observations
+from support.worlds.synthetic_texture import picture, smooth_texture
 
 CAMERA = StereoCamera(300.0, 160.0, 120.0, 0.1, 320, 240)
 LENS = np.array([300.0, 160.0, 120.0, 320.0, 240.0])

@@ -1,0 +1,1 @@
+"""`locclient run`: threads, server connection, publishers."""

@@ -1,0 +1,123 @@
+"""Makes the kernels ready before the first frame: a throwaway localizer drives past a painted wall and finds itself in a map of it."""
+
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.bow import Vocabulary
+from fleetmap.features import orb
+from fleetmap.geometry import se3
+from fleetmap.mapformat import Tile
+from fleetmap.relocalization.map_view import Expected
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, WheelSample
+from locclient.localization.alias_disambiguation import Tally, evidence, mark_shared
+from locclient.localization.localizer import Localizer
+from locclient.localization.settings import LocalizerSettings
+
+_FRAMES, _STANDING = 40, 20
+_FRAME_NS, _IMU_NS = 50_000_000, 5_000_000
+_DISPARITY_PX, _STEP_PX = 12, 3
+_WORDS = 10
+_MAP_FROM_CAM = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([1.0, 1.0, 1.0]))
+
+
+def warm_up(calibration: RigCalibration, rectifier: Rectifier, settings: LocalizerSettings) -> int:
+    """Runs everything that a frame may need once; returns how many of its frames found their place in the map."""
+    camera = rectifier.camera
+    localizer = Localizer(calibration, camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s, settings)
+    wall = _wall(camera)
+    first = _view(wall, camera, 0)
+    localizer.handle_version(1, [_tile_of(first.left, camera, settings)], _vocabulary(), camera.focal_px)
+    own = calibration.cameras[0]
+    blank = np.zeros((own.height_px, own.width_px), np.uint8)
+    depth = np.ones(blank.shape, np.float32) if len(calibration.cameras) == 1 else None
+    rectifier.rectify(CameraFrame(0, blank, None if depth is not None else blank.copy(), depth))
+    upwards = rectifier.body_from_cam[:3, :3] @ np.array([0.0, -9.81, 0.0])
+    found = 0
+    for number in range(_FRAMES):
+        stamps_ns = np.arange(number * _FRAME_NS, (number + 1) * _FRAME_NS, _IMU_NS, dtype=np.int64)
+        if calibration.imu is not None:
+            localizer.handle_imu(
+                ImuSamples(stamps_ns, np.zeros((len(stamps_ns), 3)), np.tile(upwards, (len(stamps_ns), 1)))
+            )
+        localizer.handle_wheel([WheelSample(int(stamps_ns[0]), np.zeros(3), 0.0, 0.1, 0.1)])
+        frame = _view(wall, camera, number)
+        found += localizer.handle_stereo(frame).fix is not None
+    _tell_apart()
+    return found
+
+
+@contextmanager
+def settled_memory() -> Iterator[None]:
+    """While it lasts, the garbage collector leaves alone what lives now: libraries hold some hundred thousand objects that nobody
+    drops, and now and then a frame would have to wait until all of them were looked at."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+
+
+def _tell_apart() -> None:
+    """What only an ambiguous place needs."""
+    one, other = Tally(), Tally()
+    seen = Expected(np.zeros(1, np.uint32), np.zeros((1, 3)), np.zeros((1, 32), np.uint8), np.ones(1, bool))
+    for tally in (one, other):
+        tally.look(np.eye(4), seen)
+    shared = [np.zeros(1, bool) for _ in range(2)]
+    mark_shared(one, other, *shared)
+    evidence(one, other, *shared)
+
+
+def _wall(camera: StereoCamera) -> NDArray[np.uint8]:
+    rng = np.random.default_rng(0)
+    shape = (camera.height_px, camera.width_px + _FRAMES * _STEP_PX + _DISPARITY_PX)
+    layers = (cv2.GaussianBlur(rng.normal(size=shape), (0, 0), sigma) for sigma in (1.5, 4.0, 12.0))
+    grey = 128 + sum((25 * layer / layer.std() for layer in layers), np.zeros(shape))
+    return np.asarray(np.clip(grey, 0, 255), np.uint8)
+
+
+def _view(wall: NDArray[np.uint8], camera: StereoCamera, number: int) -> RectifiedFrame:
+    """A frame that stands in front of the wall and then glides along it."""
+    left = max(0, number - _STANDING) * _STEP_PX
+    right = left + _DISPARITY_PX
+    seen, beside = (np.ascontiguousarray(wall[:, begin : begin + camera.width_px]) for begin in (left, right))
+    return RectifiedFrame((number + 1) * _FRAME_NS, seen, beside, None)
+
+
+def _tile_of(left: NDArray[np.uint8], camera: StereoCamera, settings: LocalizerSettings) -> Tile:
+    """A map of the features of one picture."""
+    features = orb.detect(left, settings.orb)
+    count = len(features)
+    points_cam = camera.point_from_pixel(features.pixels, np.full(count, float(_DISPARITY_PX)))
+    towards = -points_cam @ _MAP_FROM_CAM[:3, :3].T
+    distance_m = np.linalg.norm(towards, axis=1)
+    ids = np.arange(count, dtype=np.uint32)
+    rest: dict[str, Any] = {
+        "view_directions_map": (towards / distance_m[:, None]).astype(np.float32),
+        "view_half_angle_rad": np.full(count, 0.5, np.float32),
+        "max_distance_m": (distance_m * orb.SCALE_FACTOR ** features.octaves.astype(float)).astype(np.float32),
+        "sigma_m": np.full(count, 0.01, np.float32),
+    }
+    return Tile(
+        tile_x=0, tile_y=0, size_m=16.0, landmark_ids=ids, points_map=points_cam @ _MAP_FROM_CAM[:3, :3].T + _MAP_FROM_CAM[:3, 3],
+        descriptors=features.descriptors, place_ids=np.zeros(1, np.uint32), map_from_cam=_MAP_FROM_CAM[None],
+        place_landmark_ids=(ids,), **rest,
+    )  # fmt: skip
+
+
+def _vocabulary() -> Vocabulary:
+    """A few random words."""
+    rng = np.random.default_rng(0)
+    centres = rng.integers(0, 2**63, (1 + _WORDS, 4), dtype=np.uint64)
+    first_child, child_count = np.zeros(1 + _WORDS, np.int32), np.zeros(1 + _WORDS, np.int32)
+    first_child[0], child_count[0] = 1, _WORDS
+    return Vocabulary(centres, first_child, child_count, np.ones(_WORDS, np.float32))

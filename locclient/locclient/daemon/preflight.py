@@ -1,0 +1,223 @@
+"""Looks over a robot before it drives: each finding is ok, warn or fail, and says what to do next."""
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from fleetmap.bus import ZenohBus
+from fleetmap.errors import FleetmapError, UnreachableError
+from fleetmap.recordings import StoredFrame
+from fleetmap.sensors.calibration import RigCalibration, stereo_baseline_m
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import CameraFrame
+from locclient.config import LocclientConfig
+from locclient.daemon.daemon import check_run, spool_path
+from locclient.daemon.outbox import Spool
+from locclient.maps.connection import default_cache_folder
+from locclient.maps.map_client import MapLink, StoreFolderLink
+from locclient.maps.tile_cache import StoreFolder, TileCache
+from locclient.sensors.intake import Intake
+from locclient.sensors.source import Source, open_source
+
+OK, WARN, FAIL = "ok", "warn", "fail"
+_ANSWER_S = 5.0
+_BASELINE_M = (0.03, 0.6)
+_MIN_FREE_BYTES = 200_000_000
+_OLD_NS = 1_700_000_000_000_000_000  # before this program was written no clock was right
+_SKEW_S = 0.5
+_MIN_FRAME_HZ, _MIN_IMU_HZ = 5.0, 90.0
+_SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """level: ok, warn or fail; text says what was found and, unless it is ok, what to do."""
+
+    level: str
+    what: str
+    text: str
+
+
+def self_check(config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
+    """One finding after another; never raises for what is wrong with the robot. listen_s: how long to hear its sensors."""
+    try:
+        check_run(config)
+    except FleetmapError as error:
+        yield Finding(FAIL, "configuration", str(error))
+        return
+    yield Finding(OK, "configuration", f"{config.run.robot} at {config.run.site}, source {config.source.kind}")
+    yield from _guarded("calibration", lambda: _sensors(config, listen_s))
+    yield _clock(time.time_ns(), _SYNCHRONISED.exists())
+    yield from _guarded("spool", lambda: _spool(config))
+    if config.run.store is not None:
+        yield from _guarded("store", lambda: _store(config))
+    else:
+        yield from _guarded("cache", lambda: _cache_and_server(config))
+
+
+def _guarded(what: str, look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    try:
+        yield from look()
+    except FleetmapError as error:
+        yield Finding(FAIL, what, str(error))
+
+
+def _sensors(config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
+    source = open_source(config.source, config.topics)
+    try:
+        yield _calibration(source.calibration, Rectifier(source.calibration, has_depth=source.has_depth))
+        if listen_s > 0:
+            yield from _listened(source, config, listen_s)
+    finally:
+        source.close()
+
+
+def _calibration(calibration: RigCalibration, rectifier: Rectifier) -> Finding:
+    camera = rectifier.camera
+    said = f"{camera.width_px}x{camera.height_px} px, focal {camera.focal_px:.0f} px, baseline {1000 * camera.baseline_m:.0f} mm"
+    if len(calibration.cameras) > 1 and not _BASELINE_M[0] < stereo_baseline_m(calibration) < _BASELINE_M[1]:
+        return Finding(WARN, "calibration", f"{said}: is the baseline in metres? Calibrate again")
+    if calibration.imu is None:
+        return Finding(
+            WARN, "calibration", f"{said}, no IMU: darkness and fast turns will lose the robot; calibrate with its IMU"
+        )
+    return Finding(OK, "calibration", f"{said}, IMU {1e3 * rectifier.imu_minus_cam_s:+.1f} ms from the camera")
+
+
+def _listened(source: Source, config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
+    until_s = time.monotonic() + listen_s
+    stamps: list[int] = []
+    intake = _Listening(stamps, source.calibration)
+
+    def wait(seconds: float) -> bool:
+        time.sleep(max(0.0, min(seconds, until_s - time.monotonic())))
+        return time.monotonic() >= until_s
+
+    source.run(intake, wait)
+    counts = intake.counts
+    frame_hz = (len(stamps) - 1) / ((stamps[-1] - stamps[0]) * 1e-9) if len(stamps) > 1 else 0.0
+    said = f"{frame_hz:.1f} Hz of frames"
+    if frame_hz < _MIN_FRAME_HZ:
+        hint = "check the camera, [topics] and the endpoint of [source]"
+        yield Finding(FAIL, "frames", f"{said} in {listen_s:g} s, {counts.unreadable} unreadable messages; {hint}")
+    else:
+        bad = counts.frames_disordered + counts.unreadable
+        hint = f", {bad} of them out of order or unreadable: check the driver" if bad else ""
+        yield Finding(WARN if bad else OK, "frames", said + hint)
+    if source.calibration.imu is not None:
+        imu_hz = counts.imu_samples / listen_s
+        if config.source.kind != "recording":
+            level = OK if imu_hz >= _MIN_IMU_HZ else FAIL
+            hint = "" if level == OK else f"; at least {_MIN_IMU_HZ:g} Hz are needed, check [topics] imu"
+            yield Finding(level, "imu", f"{imu_hz:.0f} Hz{hint}")
+    if stamps and config.source.kind != "recording":
+        skew_s = (time.time_ns() - stamps[-1]) * 1e-9
+        if abs(skew_s) > _SKEW_S + 1.0 / max(frame_hz, 1.0):
+            text = f"frames are stamped {skew_s:.2f} s before now; let the driver stamp with the system's clock"
+            yield Finding(WARN, "stamps", text)
+        else:
+            yield Finding(OK, "stamps", f"{1e3 * skew_s:.0f} ms behind the system's clock")
+
+
+class _Listening(Intake):
+    """Keeps the stamps of frames that would be taken."""
+
+    def __init__(self, stamps: list[int], calibration: RigCalibration) -> None:
+        super().__init__(frames=1, imu_minus_cam_s=0.0, has_imu=calibration.imu is not None, imu_wait_s=0.0)
+        self._stamps = stamps
+
+    def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
+        """See Intake."""
+        before = self.counts.frames
+        super().put_frame(frame)
+        if self.counts.frames > before:
+            self._stamps.append(frame.stamp_ns)
+
+    def wait_for_room(self, timeout_s: float) -> bool:
+        """See Intake; there is always room, because nothing is kept."""
+        return True
+
+
+def _clock(now_ns: int, synchronised: bool) -> Finding:
+    if now_ns < _OLD_NS:
+        return Finding(
+            FAIL,
+            "clock",
+            f"the system's clock says {now_ns // 10**9} s since 1970; set it, and enable its synchronisation",
+        )
+    if not synchronised:
+        hint = "enable NTP or PTP (timedatectl); the server measures how far this robot's clock is off"
+        return Finding(WARN, "clock", f"not known to be synchronised; {hint}")
+    return Finding(OK, "clock", "synchronised")
+
+
+def _spool(config: LocclientConfig) -> Iterator[Finding]:
+    path = spool_path(config.run, str(config.run.site), str(config.run.robot))
+    spool = Spool(path, max_bytes=config.run.spool_bytes)
+    counts = spool.counts()
+    said = f"{path}: {counts['waiting']} reports wait, {counts['delivered']} delivered, {counts['dropped']} dropped"
+    if spool.set_aside is not None:
+        yield Finding(WARN, "spool", f"was damaged and begun anew; what it held is in {spool.set_aside}")
+    elif counts["dropped"]:
+        yield Finding(WARN, "spool", f"{said}; raise [run] spool_bytes or check the connection")
+    else:
+        yield Finding(OK, "spool", said)
+
+
+def _store(config: LocclientConfig) -> Iterator[Finding]:
+    link = StoreFolderLink(StoreFolder(Path(str(config.run.store))), str(config.run.site))
+    wanted = link.wanted()
+    fetched = link.tiles(link.manifest(wanted))
+    yield _tiles("store", wanted.version, len(fetched.tiles), fetched.refused)
+
+
+def _cache_and_server(config: LocclientConfig) -> Iterator[Finding]:
+    run = config.run
+    folder = Path(run.cache) if run.cache is not None else default_cache_folder()
+    cache = TileCache(folder, max_bytes=run.cache_bytes)
+    free_bytes = shutil.disk_usage(folder).free
+    if free_bytes < _MIN_FREE_BYTES:
+        yield Finding(WARN, "disk", f"{free_bytes / 1e6:.0f} MB free beside {folder}; make room for new versions")
+    bus = ZenohBus.connect(str(run.server))
+    try:
+        link = MapLink(bus, cache, str(run.site), str(run.robot), timeout_s=_ANSWER_S)
+        active = link.active()
+        if active is None:
+            yield Finding(
+                WARN, "cache", f"{folder} holds no whole version yet; the robot needs its server for the first one"
+            )
+        else:
+            record = cache.active(str(run.site))
+            damaged = sum(cache.get(sha256) is None for sha256 in record.blobs) if record is not None else 0
+            reasons = {(0, n): "missing or damaged, fetched again at the next start" for n in range(damaged)}
+            yield _tiles("cache", active.version, len(record.blobs) - damaged if record else 0, reasons)
+        try:
+            wanted = link.wanted()
+        except UnreachableError as error:
+            level = FAIL if active is None else WARN
+            hint = "" if active is None else f"; version {active.version} works without it"
+            yield Finding(level, "connection", f"{error}{hint}")
+            return
+        if wanted.version is None:
+            yield Finding(
+                FAIL, "connection", f"site {run.site} has no published version; publish one with `mapserver publish`"
+            )
+        elif wanted != active:
+            hint = "it is fetched when the robot runs"
+            yield Finding(OK, "connection", f"{run.server} wants version {wanted.version}; {hint}")
+        else:
+            yield Finding(OK, "connection", f"{run.server} wants version {wanted.version}, which is here")
+    finally:
+        bus.close()
+
+
+def _tiles(what: str, version: int | None, good: int, refused: dict[tuple[int, int], str]) -> Finding:
+    if not refused:
+        return Finding(OK, what, f"version {version} is whole: {good} pieces verified")
+    first = next(iter(refused.values()))
+    level = WARN if good else FAIL
+    return Finding(
+        level, what, f"version {version}: {len(refused)} pieces cannot be used, {good} can; the first: {first}"
+    )

@@ -1,0 +1,1 @@
+"""Fetching, caching, and selecting tiles."""

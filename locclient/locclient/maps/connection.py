@@ -1,0 +1,37 @@
+"""How a command reaches its map: over the bus, or in a store's folder."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from fleetmap.bus import ZenohBus
+from locclient.maps.map_client import MapLink, StoreFolderLink
+from locclient.maps.tile_cache import StoreFolder, TileCache
+from locclient.replay.replay import RobotLink
+
+_PATIENCE_S = 120.0  # with a server that goes away in the middle of a fetch; one that is restarted is back by then
+
+
+@contextmanager
+def connected(options: dict[str, Any]) -> Iterator[RobotLink]:
+    """A link for the options `server` or `store`, `site`, `robot`, `cache`, `cache_bytes`; closed afterwards."""
+    site, robot = options["site"], options["robot"]
+    if options["store"] is not None:
+        yield RobotLink(StoreFolderLink(StoreFolder(Path(options["store"])), site), None, site, robot)
+        return
+    folder = Path(options["cache"]) if options["cache"] is not None else default_cache_folder()
+    bus = ZenohBus.connect(options["server"])
+    try:
+        cache = TileCache(folder, max_bytes=options["cache_bytes"])
+        link = MapLink(bus, cache, site, robot, patience_s=_PATIENCE_S)
+        link.announce_presence()
+        yield RobotLink(link, link, site, robot)
+    finally:
+        bus.close()
+
+
+def default_cache_folder() -> Path:
+    """`fleetmap/tiles` in the user's cache folder (XDG_CACHE_HOME)."""
+    return Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))) / "fleetmap" / "tiles"

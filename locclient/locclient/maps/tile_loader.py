@@ -1,0 +1,72 @@
+"""Brings tiles of the versions that a robot holds from its disk into its memory. Slow work: not for the thread that localizes."""
+
+from dataclasses import dataclass, field
+
+from fleetmap.bow import Vocabulary, decode_vocabulary
+from fleetmap.errors import FleetmapError
+from fleetmap.mapformat import Manifest, Tile
+from fleetmap.messages import WantedVersion
+from locclient.maps.map_client import MapSource
+from locclient.maps.tile_selection import Cell, Place, WindowSettings, window
+from locclient.robot.robot import LoadedMap
+
+
+@dataclass
+class _Version:
+    manifest: Manifest
+    vocabulary: Vocabulary
+    tiles: dict[Cell, Tile] = field(default_factory=dict)
+    refused: dict[Cell, str] = field(default_factory=dict)
+    cells: frozenset[Cell] | None = None
+
+
+class MapRoom:
+    """Reads from one MapSource. A tile that cannot be read is left out, and its reason kept; the others stay usable."""
+
+    def __init__(self, source: MapSource, settings: WindowSettings) -> None:
+        self._source, self.settings = source, settings
+        self._versions: dict[str, _Version] = {}
+
+    def load(self, wanted: WantedVersion, place: Place) -> LoadedMap | None:
+        """The version's tiles around a place, all for anywhere; None where they are those that were loaded last.
+
+        Raises FleetmapError where its manifest or vocabulary cannot be had, or none of its tiles.
+        """
+        version = self._version(wanted)
+        cells = window(version.manifest, version.cells, place, self.settings)
+        if cells == version.cells:
+            return None
+        missing = cells - version.tiles.keys() - version.refused.keys()
+        fetched = self._source.tiles(version.manifest, missing)
+        version.refused.update(fetched.refused)
+        version.tiles = {cell: tile for cell, tile in {**version.tiles, **fetched.tiles}.items() if cell in cells}
+        if not version.tiles and version.refused:
+            reasons = "; ".join(version.refused.values())
+            raise FleetmapError(f"no tile of version {version.manifest.version} can be used: {reasons}"[:1000])
+        version.cells = cells
+        return LoadedMap(wanted, version.manifest, version.vocabulary, dict(version.tiles))
+
+    def refused(self, wanted: WantedVersion) -> dict[Cell, str]:
+        """Tiles of a version that could not be read, with the reasons."""
+        version = self._versions.get(wanted.manifest_sha256 or "")
+        return {} if version is None else dict(version.refused)
+
+    def forget_refusals(self, wanted: WantedVersion) -> None:
+        """What could not be read may be read again: it was fetched anew."""
+        version = self._versions.get(wanted.manifest_sha256 or "")
+        if version is not None and version.refused:
+            version.refused.clear()
+            version.cells = None
+
+    def keep_only(self, held: list[WantedVersion]) -> None:
+        """Lets go of all other versions."""
+        kept = {wanted.manifest_sha256 for wanted in held}
+        for sha256 in [sha256 for sha256 in self._versions if sha256 not in kept]:
+            del self._versions[sha256]
+
+    def _version(self, wanted: WantedVersion) -> _Version:
+        sha256 = wanted.manifest_sha256 or ""
+        if sha256 not in self._versions:
+            manifest = self._source.manifest(wanted)
+            self._versions[sha256] = _Version(manifest, decode_vocabulary(self._source.vocabulary(manifest)))
+        return self._versions[sha256]

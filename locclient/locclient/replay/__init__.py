@@ -1,0 +1,1 @@
+"""A recording played through the localization client."""

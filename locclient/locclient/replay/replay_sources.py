@@ -1,0 +1,88 @@
+"""Where a replay's samples come from: a recording, forwards, or backwards with new stamps and without IMU."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array
+from fleetmap.recordings import FrameSelection, Recording
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample, wheel_between
+
+_IMU_LEAD_NS = 10_000_000  # a frame is handled when the IMU has come a little past it
+
+
+@dataclass(frozen=True)
+class ReplaySource:
+    """Selected frames of a recording in the order of play.
+
+    calibration has no IMU when played backwards: its samples would be wrong in that direction.
+    """
+
+    recording: Recording
+    indices: NDArray[np.int64]
+    reverse: bool
+
+    @classmethod
+    def of(cls, recording: Recording, selection: FrameSelection, *, reverse: bool) -> "ReplaySource":
+        """Raises UsageError where nothing is selected."""
+        indices = selection.apply(recording)
+        return cls(recording, indices[::-1] if reverse else indices, reverse)
+
+    @property
+    def calibration(self) -> RigCalibration:
+        """The rig as it is played."""
+        return replace(self.recording.calibration, imu=None) if self.reverse else self.recording.calibration
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def played_stamp_ns(self, recorded_ns: int) -> int:
+        """The stamp under which a frame is played: mirrored at the last one when backwards."""
+        if not self.reverse:
+            return recorded_ns
+        return 2 * int(self.recording.frame_stamps_ns[self.indices[0]]) - recorded_ns
+
+    def recorded_stamp_ns(self, number: int) -> int:
+        """The stamp at which frame `number` of the play was taken."""
+        return int(self.recording.frame_stamps_ns[self.indices[number]])
+
+    def frame(self, number: int) -> CameraFrame:
+        """Frame `number` of the play, decoded."""
+        frame = self.recording.read_frame(int(self.indices[number]))
+        return replace(frame, stamp_ns=self.played_stamp_ns(frame.stamp_ns))
+
+    def imu_before_each(self) -> Iterator[ImuSamples]:
+        """For each frame of the play, the IMU samples that come before it is handled."""
+        fed_ns = -(2**62)
+        offset_ns = int(self.recording.calibration.cameras[0].imu_minus_cam_s * 1e9)
+        for number in range(len(self)):
+            if self.reverse:
+                yield ImuSamples.empty()
+                continue
+            until_ns = self.recorded_stamp_ns(number) + offset_ns + _IMU_LEAD_NS
+            yield self.recording.imu.between(fed_ns, until_ns)
+            fed_ns = until_ns
+
+    def priors_before(self, number: int) -> list[PositionPrior]:
+        """Coarse places that the recording tells between the frame before and frame `number`; none backwards."""
+        if self.reverse:
+            return []
+        since = self.recorded_stamp_ns(number - 1) if number else -(2**62)
+        return [p for p in self.recording.priors if since < p.stamp_ns <= self.recorded_stamp_ns(number)]
+
+    def wheel_before(self, number: int) -> Sequence[WheelSample]:
+        """Wheel odometry between the frame before and frame `number`; none backwards."""
+        if self.reverse:
+            return []
+        offset_ns = int(self.recording.calibration.cameras[0].imu_minus_cam_s * 1e9)
+        since = self.recorded_stamp_ns(number - 1) + offset_ns if number else -(2**62)
+        until = self.recorded_stamp_ns(number) + offset_ns
+        return wheel_between(self.recording.wheel, since + 1, until + 1)
+
+    def truth_map_from_body(self, number: int) -> Array | None:
+        """The recording's ground truth at frame `number`, None where there is none."""
+        truth = self.recording.ground_truth
+        return None if truth is None else truth.at(self.recorded_stamp_ns(number))

@@ -1,0 +1,235 @@
+"""What a run was worth: localised share, times, errors, failures. Pure. To add a metric: a function here and a line in METRICS."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from locclient.localization.estimate import Status
+
+SPARSE_S = 1.0  # frames farther apart than this are localised by a fix of their own
+WARM_UP_FRAMES = 20
+ERROR_LIMIT_M, ERROR_LIMIT_DEG = 0.30, 5.0
+SILENT_S, BLIND_S, GOOD_S = 1.0, 2.0, 5.0
+RADIUS_LIMIT_M = 0.30
+CHI2_3_0999 = 16.266
+_RADIUS_95 = 2.796
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRecord:
+    """One frame of a run.
+
+    Errors are unaligned against the truth in the map's frame, None where either is unknown; error_map_m (3,) is estimate minus
+    truth. cpu_s and wall_s: from decoded images to estimate. stage_s: seconds by stage, decoding included.
+    """
+
+    stamp_ns: int
+    status: Status
+    has_fix: bool
+    cov_rot_trans: Array | None
+    error_map_m: Array | None
+    error_rad: float | None
+    cpu_s: float
+    wall_s: float
+    stage_s: dict[str, float]
+
+    @property
+    def error_m(self) -> float | None:
+        """Distance between estimate and truth."""
+        return None if self.error_map_m is None else float(np.linalg.norm(self.error_map_m))
+
+    @property
+    def radius_95_m(self) -> float:
+        """Radius that holds the position with 95 %; infinite without an estimate."""
+        if self.cov_rot_trans is None:
+            return float("inf")
+        return _RADIUS_95 * float(np.sqrt(np.linalg.eigvalsh(self.cov_rot_trans[3:, 3:])[-1]))
+
+
+Frames = Sequence[FrameRecord]
+
+
+def localised(frames: Frames) -> list[bool]:
+    """For each frame: TRACKING, or a fix of its own where the recording is so sparse that frames are over a second apart."""
+    out = []
+    for index, frame in enumerate(frames):
+        neighbours = [
+            abs(frames[k].stamp_ns - frame.stamp_ns) * 1e-9 for k in (index - 1, index + 1) if 0 <= k < len(frames)
+        ]
+        sparse = bool(neighbours) and max(neighbours) > SPARSE_S
+        out.append(frame.status is Status.TRACKING or (sparse and frame.has_fix))
+    return out
+
+
+def first_fix(frames: Frames) -> int | None:
+    """Index of the first frame with a verified fix."""
+    return next((k for k, f in enumerate(frames) if f.has_fix), None)
+
+
+def localised_share(frames: Frames) -> float | None:
+    """Share of localised frames among the first fix and everything after it."""
+    start = first_fix(frames)
+    return None if start is None else float(np.mean(localised(frames)[start:]))
+
+
+def first_fix_s(frames: Frames) -> float | None:
+    """Sensor time from the first frame to the first fix."""
+    start = first_fix(frames)
+    return None if start is None else (frames[start].stamp_ns - frames[0].stamp_ns) * 1e-9
+
+
+def frame_ms(frames: Frames) -> dict[str, float] | None:
+    """CPU milliseconds of the whole process per frame, after the warm-up frames."""
+    return _spread([1e3 * f.cpu_s for f in frames[WARM_UP_FRAMES:]], ("mean", "p50", "p99", "max"))
+
+
+def frame_wall_ms(frames: Frames) -> dict[str, float] | None:
+    """Wall-clock milliseconds per frame, after the warm-up frames."""
+    return _spread([1e3 * f.wall_s for f in frames[WARM_UP_FRAMES:]], ("mean", "p50", "p99", "max"))
+
+
+def stage_ms(frames: Frames) -> dict[str, float]:
+    """Mean CPU milliseconds per frame and stage, after the warm-up frames."""
+    rows = [f.stage_s for f in frames[WARM_UP_FRAMES:]]
+    return {
+        name: 1e3 * float(np.mean([r.get(name, 0.0) for r in rows])) for name in sorted({n for r in rows for n in r})
+    }
+
+
+def error_m(frames: Frames) -> dict[str, float] | None:
+    """Unaligned position errors of localised frames with a truth."""
+    values = [f.error_m for f, good in zip(frames, localised(frames), strict=True) if good and f.error_m is not None]
+    return _spread([v for v in values if v is not None], ("median", "p95", "p99", "max"))
+
+
+def error_deg(frames: Frames) -> dict[str, float] | None:
+    """Unaligned orientation errors of localised frames with a truth."""
+    values = [
+        f.error_rad for f, good in zip(frames, localised(frames), strict=True) if good and f.error_rad is not None
+    ]
+    return _spread([float(np.degrees(v)) for v in values if v is not None], ("median", "p99"))
+
+
+def status_share(frames: Frames) -> dict[str, float]:
+    """Share of frames by status."""
+    return {status.value: float(np.mean([f.status is status for f in frames])) for status in Status} if frames else {}
+
+
+def silent_failures(frames: Frames) -> int | None:
+    """Failures in which the status was TRACKING and the place was wrong; None without truth."""
+    if all(f.error_m is None for f in frames):
+        return None
+    return len(_episodes(frames, _is_silent, SILENT_S))
+
+
+def position_failures(frames: Frames) -> int:
+    """Silent failures, blindness after the first fix, and errors outside their own covariance; overlapping ones count once.
+
+    Without truth only blindness can be seen.
+    """
+    start = first_fix(frames)
+    after = list(frames[start:]) if start is not None else []
+    spans = (
+        _episodes(frames, _is_silent, SILENT_S)
+        + _episodes(after, _is_blind, BLIND_S)
+        + _episodes(frames, _is_overconfident, SILENT_S)
+    )
+    good = localised(frames)
+    bad = [any(test(f, good[k]) for test in (_is_silent, _is_blind, _is_overconfident)) for k, f in enumerate(frames)]
+    return len(_merged(sorted(spans), [(f.stamp_ns, good[k] and not bad[k]) for k, f in enumerate(frames)]))
+
+
+def _is_silent(frame: FrameRecord, is_localised: bool) -> bool:
+    wrong = frame.error_m is not None and (
+        frame.error_m > ERROR_LIMIT_M or (frame.error_rad is not None and np.degrees(frame.error_rad) > ERROR_LIMIT_DEG)
+    )
+    return (frame.status is Status.TRACKING or is_localised) and wrong
+
+
+def _is_blind(frame: FrameRecord, is_localised: bool) -> bool:
+    if is_localised:
+        return False
+    if frame.status is Status.DEGRADED:
+        return frame.radius_95_m > RADIUS_LIMIT_M
+    return frame.status in (Status.LOST, Status.AMBIGUOUS)
+
+
+def is_outside_its_bound(frame: FrameRecord) -> bool:
+    """Whether the truth lies outside the 99.9 % bound of the position that the frame claims."""
+    if frame.error_map_m is None or frame.cov_rot_trans is None:
+        return False
+    return float(frame.error_map_m @ np.linalg.solve(frame.cov_rot_trans[3:, 3:], frame.error_map_m)) > CHI2_3_0999
+
+
+def _is_overconfident(frame: FrameRecord, is_localised: bool) -> bool:
+    return is_outside_its_bound(frame)
+
+
+def _episodes(
+    frames: Frames, is_bad: Callable[[FrameRecord, bool], bool], longer_than_s: float
+) -> list[tuple[int, int]]:
+    """(begin, end) stamps of stretches that are bad for longer than so many seconds.
+
+    A stretch lasts until the next frame that is not bad: between two frames nothing better is known. It is over only after 5 s
+    of good tracking, so that one failure is not counted as many.
+    """
+    good = localised(frames)
+    stretches: list[tuple[int, int]] = []
+    begin = None
+    for index, frame in enumerate(frames):
+        bad = is_bad(frame, good[index])
+        if bad and begin is None:
+            begin = frame.stamp_ns
+        if begin is not None and (not bad or index + 1 == len(frames)):
+            if frame.stamp_ns - begin > longer_than_s * 1e9:
+                stretches.append((begin, frame.stamp_ns))
+            begin = None if not bad else begin
+    return _merged(stretches, [(f.stamp_ns, good[k] and not is_bad(f, good[k])) for k, f in enumerate(frames)])
+
+
+def _merged(stretches: list[tuple[int, int]], fine: list[tuple[int, bool]]) -> list[tuple[int, int]]:
+    """Stretches, sorted by begin, that are not parted by 5 s of good tracking are one. fine: stamp and goodness of each frame."""
+    merged: list[tuple[int, int]] = []
+    for begin, end in stretches:
+        if merged and _longest_fine_ns(fine, merged[-1][1], begin) < GOOD_S * 1e9:
+            merged[-1] = (merged[-1][0], max(end, merged[-1][1]))
+        else:
+            merged.append((begin, end))
+    return merged
+
+
+def _longest_fine_ns(fine: list[tuple[int, bool]], since_ns: int, until_ns: int) -> int:
+    """The longest unbroken stretch of good tracking between two moments, up to the frame that ends it."""
+    longest, begin = 0, None
+    for stamp, is_fine in fine:
+        if since_ns <= stamp <= until_ns:
+            if is_fine and begin is None:
+                begin = stamp
+            if begin is not None:
+                longest = max(longest, stamp - begin)
+                begin = begin if is_fine else None
+    return longest
+
+
+def _spread(values: list[float], names: tuple[str, ...]) -> dict[str, float] | None:
+    if not values:
+        return None
+    shares = {"p50": 50, "median": 50, "p95": 95, "p99": 99, "max": 100}
+    return {name: float(np.mean(values) if name == "mean" else np.percentile(values, shares[name])) for name in names}
+
+
+METRICS: dict[str, Callable[[Frames], object]] = {
+    "frames": len,
+    "first_fix_s": first_fix_s,
+    "localised_share": localised_share,
+    "frame_ms": frame_ms,
+    "frame_wall_ms": frame_wall_ms,
+    "stage_ms": stage_ms,
+    "error_m": error_m,
+    "error_deg": error_deg,
+    "position_failures": position_failures,
+    "silent_failures": silent_failures,
+    "status_share": status_share,
+}

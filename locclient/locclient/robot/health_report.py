@@ -1,0 +1,120 @@
+"""The figures of a running robot's health report, gathered frame by frame. Pure."""
+
+from collections import deque
+from collections.abc import Mapping
+
+import numpy as np
+
+from fleetmap.messages import RobotHealth
+from locclient.localization.estimate import Estimate, Status
+from locclient.robot.failure_monitor import is_blind, radius_95_m
+from locclient.robot.robot import Outcome
+
+_RECENT = 300
+Figure = float | int | str | bool | None
+
+
+class FixFigures:
+    """What looks at the map, docks and odometry tell of a run, of those in HEALTH_FIGURES; the largest since the report before.
+
+    Metres count where the robot had claimed to know its place: who says that he is lost, and is found elsewhere, was not wrong.
+    So does a place that was said with a covariance in which the robot was not, as those fixes showed that named another.
+    """
+
+    def __init__(self) -> None:
+        self._expected = self._seen = 0
+        self._largest: dict[str, float] = {}
+        self._last: Estimate | None = None
+
+    def handle(self, estimate: Estimate, dock_error_m: float | None) -> None:
+        """Counts a frame."""
+        was_tracking = self._last is not None and self._last.status is Status.TRACKING
+        self._last = estimate
+        self._note("fix_innovation", estimate.innovation)
+        self._note("fix_innovation_m", estimate.innovation_m if was_tracking else None)
+        self._note("fix_innovation_m", estimate.moved_m)
+        self._note("dock_error_m", dock_error_m)
+        if estimate.fix is not None:
+            self._expected += estimate.fix.expected
+            self._seen += estimate.fix.seen
+
+    def take(self) -> dict[str, Figure]:
+        """The figures of a report; what was largest begins anew."""
+        figures: dict[str, Figure] = {
+            name: self._largest.get(name) for name in ("fix_innovation", "fix_innovation_m", "dock_error_m")
+        }
+        self._largest = {}
+        figures |= {"landmarks_expected": self._expected, "landmarks_seen": self._seen}
+        if self._last is not None:
+            figures["speed_mps"] = float(np.linalg.norm(self._last.odometry.velocity_odom_mps))
+            radius = radius_95_m(self._last.cov_rot_trans)
+            figures["radius_95_m"] = radius if np.isfinite(radius) else None
+        return figures
+
+    def _note(self, name: str, value: float | None) -> None:
+        if value is not None:
+            self._largest[name] = max(self._largest.get(name, 0.0), float(value))
+
+
+class HealthFigures:
+    """Counts since the start, and the times of the last frames."""
+
+    def __init__(self) -> None:
+        self._frames = self._localised = self._failures = 0
+        self._frame_ms: deque[float] = deque(maxlen=_RECENT)
+        self._first_ns: int | None = None
+        self._first_fix_s: float | None = None
+        self._first_frame_ms: float | None = None
+        self._fixes = FixFigures()
+        self._last: Outcome | None = None
+
+    @property
+    def last(self) -> Outcome | None:
+        """The last frame, None before the first."""
+        return self._last
+
+    def handle(self, outcome: Outcome) -> None:
+        """Counts a frame."""
+        estimate = outcome.estimate
+        self._last = outcome
+        self._frame_ms.append(1e3 * outcome.cpu_s)
+        if self._first_ns is None:
+            self._first_ns, self._first_frame_ms = estimate.stamp_ns, 1e3 * outcome.cpu_s
+        if estimate.fix is not None and self._first_fix_s is None:
+            self._first_fix_s = (estimate.stamp_ns - self._first_ns) * 1e-9
+        if self._first_fix_s is not None:
+            self._frames += 1
+            self._localised += estimate.status is Status.TRACKING
+        self._fixes.handle(estimate, outcome.dock_error_m)
+
+    def count_failure(self) -> None:
+        """A failure was told."""
+        self._failures += 1
+
+    def report(self, site: str, robot: str, wall_ns: int, more: Mapping[str, Figure], silent: bool) -> RobotHealth:
+        """The message; more: figures of the parts around. silent: whether the source has stopped sending frames."""
+        last = self._last
+        status = Status.INITIALISING.value if last is None else last.estimate.status.value
+        flags = [
+            name
+            for name, raised in (("no_frames", silent), ("blind", last is not None and is_blind(last.estimate)))
+            if raised
+        ]
+        if last is not None and last.picture.fault:
+            flags.append(last.picture.fault)
+        figures: dict[str, Figure] = {
+            "localised_share": self._localised / self._frames if self._frames else None,
+            "first_fix_s": self._first_fix_s,
+            "first_frame_ms": self._first_frame_ms,
+            "frame_ms_mean": float(np.mean(self._frame_ms)) if self._frame_ms else None,
+            "frame_ms_p99": float(np.percentile(self._frame_ms, 99)) if self._frame_ms else None,
+            "failures": self._failures,
+            **self._fixes.take(),
+        }
+        if last is not None:
+            figures["exposure"], figures["sharpness"] = last.picture.exposure, last.picture.sharpness
+        return RobotHealth(
+            site=site, robot=robot, stamp_ns=0 if last is None else last.estimate.stamp_ns, wall_ns=wall_ns,
+            version=None if last is None else last.estimate.map_version, status=status, flags=tuple(flags),
+            metrics={**figures, **more},
+        )  # fmt: skip

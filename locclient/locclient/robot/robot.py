@@ -1,0 +1,233 @@
+"""One robot's life, frame by frame: localizes, watches for failures, tries new versions. No thread, file or socket of its own."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+from fleetmap.bow import Vocabulary
+from fleetmap.geometry import Array
+from fleetmap.mapformat import Manifest, Tile
+from fleetmap.messages import WantedVersion
+from fleetmap.recordings.images import StoredFrame, decode_frame
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetmap.sensors.samples import Image
+from locclient.localization.estimate import Estimate
+from locclient.localization.localizer import Localizer
+from locclient.localization.settings import LocalizerSettings
+from locclient.maps.tile_selection import Cell
+from locclient.robot.continuous_odom import OdomFrame, Placed
+from locclient.robot.dock_check import DockWatch
+from locclient.robot.failure_monitor import Failure, FailureMonitor, Picture, PictureJudge
+from locclient.robot.version_trial import TrialSettings, Verdict, VersionTrial
+from locclient.sensors.intake import Moment
+
+_THUMBNAIL_EVERY_NS = 1_000_000_000
+_THUMBNAILS = 2
+
+
+@dataclass(frozen=True)
+class LoadedMap:
+    """Some tiles of one version, ready for the localizer; is_offer: of a version to begin with or to try, not only other tiles."""
+
+    wanted: WantedVersion
+    manifest: Manifest
+    vocabulary: Vocabulary
+    tiles: dict[Cell, Tile]
+    is_offer: bool = True
+
+    @property
+    def version(self) -> int:
+        """Its number."""
+        return self.manifest.version
+
+
+class Change(StrEnum):
+    """What became of a version."""
+
+    ADOPTED = "adopted"
+    REFUSED = "refused"
+    POSTPONED = "postponed"
+
+
+@dataclass(frozen=True, slots=True)
+class VersionChange:
+    """A version that was adopted for good, refused for good, or put off because nothing could be seen; reason in words."""
+
+    wanted: WantedVersion
+    change: Change
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FailureContext:
+    """A failure with what a report of it shows: small earlier pictures, and all for the match view."""
+
+    failure: Failure
+    pictures: tuple[tuple[int, Image], ...]
+    left: Image | None
+    map_from_cam: Array | None
+    running: LoadedMap | None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one frame brought. cpu_s: from encoded images to estimate. dock_error_m: as `DockWatch` says, None without an arrival."""
+
+    estimate: Estimate
+    placed: Placed
+    picture: Picture
+    cpu_s: float
+    failure: FailureContext | None
+    dock_error_m: float | None = None
+
+
+@dataclass
+class _Versions:
+    """good: the version whose fixes were confirmed; candidate: the one on trial.
+
+    is_doubt: the good one is looked at again, because of what was said.
+    """
+
+    good: LoadedMap | None = None
+    candidate: LoadedMap | None = None
+    trial: VersionTrial | None = None
+    is_doubt: bool = False
+    said: str = ""
+    changes: deque[VersionChange] = field(default_factory=deque)
+
+
+class Robot:
+    """Feeds moments and maps to the localizer and keeps two versions while one of them is on trial."""
+
+    def __init__(
+        self, calibration: RigCalibration, rectifier: Rectifier, settings: LocalizerSettings, trial: TrialSettings,
+        clock_s: Callable[[], float] = lambda: 0.0,
+    ) -> None:  # fmt: skip
+        """clock_s measures CPU; the default measures nothing."""
+        self._rectifier, self._clock_s = rectifier, clock_s
+        self.base_from_body = calibration.base_from_body
+        self.localizer = Localizer(
+            calibration, rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s, settings, clock_s
+        )
+        self._trial_settings = trial
+        self._versions = _Versions()
+        self._odom = OdomFrame(calibration.base_from_body)
+        self._judge, self.monitor = PictureJudge(), FailureMonitor()
+        self._docks = DockWatch(calibration.base_from_body)
+        self._pictures: deque[tuple[int, Image]] = deque(maxlen=_THUMBNAILS)
+        self._last: tuple[RectifiedFrame, Estimate] | None = None
+
+    @property
+    def held(self) -> list[LoadedMap]:
+        """The versions in memory, the confirmed one first."""
+        return [loaded for loaded in (self._versions.good, self._versions.candidate) if loaded is not None]
+
+    @property
+    def running(self) -> LoadedMap | None:
+        """The version that the localizer looks at."""
+        versions = self._versions
+        return versions.good if versions.candidate is None or versions.is_doubt else versions.candidate
+
+    def take_changes(self) -> list[VersionChange]:
+        """What became of versions since the last call."""
+        taken = list(self._versions.changes)
+        self._versions.changes.clear()
+        return taken
+
+    def use(self, loaded: LoadedMap) -> None:
+        """Other tiles of a version that is held, or a new version: the first is taken as it is, any other is tried."""
+        versions = self._versions
+        for name in ("good", "candidate"):
+            held = getattr(versions, name)
+            if held is not None and held.wanted == loaded.wanted:
+                setattr(versions, name, loaded)
+                if self.running is loaded:
+                    self._show(loaded)
+                return
+        if not loaded.is_offer:
+            return  # of a version that was given up while its tiles were read
+        if versions.good is None:
+            versions.good = loaded
+            versions.changes.append(VersionChange(loaded.wanted, Change.ADOPTED))
+        else:
+            versions.candidate, versions.trial, versions.is_doubt = loaded, self._new_trial(), False
+        self._show(loaded)
+
+    def handle(self, moment: Moment) -> Outcome | None:
+        """What a moment with a frame brought; None without one. RecordingError for pictures that cannot be read."""
+        self.localizer.handle_imu(moment.imu)
+        self.localizer.handle_wheel(moment.wheel)
+        for prior in moment.priors:
+            self.localizer.handle_prior(prior)
+        if moment.frame is None:
+            return None
+        begun_s = self._clock_s()
+        raw = decode_frame(moment.frame) if isinstance(moment.frame, StoredFrame) else moment.frame
+        frame = self._rectifier.rectify(raw)
+        estimate = self.localizer.handle_stereo(frame)
+        picture = self._judge.judge(frame.left)
+        cpu_s = self._clock_s() - begun_s
+        self._try(estimate, frame)
+        failure = self.monitor.handle(estimate, picture)
+        context = None if failure is None else self._context(failure)
+        if not self._pictures or estimate.stamp_ns - self._pictures[-1][0] >= _THUMBNAIL_EVERY_NS:
+            self._pictures.append((estimate.stamp_ns, frame.left))
+        dock_error_m = self._docks.handle(moment.priors, estimate)
+        return Outcome(estimate, self._odom.handle(estimate), picture, cpu_s, context, dock_error_m)
+
+    def handle_silence(self, for_s: float) -> FailureContext | None:
+        """The failure that a source which sends no frames is."""
+        failure = self.monitor.handle_silence(for_s)
+        return None if failure is None else self._context(failure)
+
+    def _context(self, failure: Failure) -> FailureContext:
+        assert self._last is not None
+        frame, estimate = self._last
+        map_from_body = estimate.map_from_body
+        map_from_cam = None if map_from_body is None else map_from_body @ self._rectifier.body_from_cam
+        return FailureContext(failure, tuple(self._pictures), frame.left, map_from_cam, self.running)
+
+    def _show(self, loaded: LoadedMap) -> None:
+        focal_px = loaded.manifest.camera.focal_px
+        self.localizer.handle_version(loaded.version, loaded.tiles.values(), loaded.vocabulary, focal_px)
+
+    def _new_trial(self) -> VersionTrial | None:
+        """From the last frame that was looked at with the version before; without any, from the first one to come."""
+        return None if self._last is None else VersionTrial(self._trial_settings, self._last[1])
+
+    def _try(self, estimate: Estimate, frame: RectifiedFrame) -> None:
+        """Counts the frame for the trial that is on, if any."""
+        self._last = (frame, estimate)
+        versions = self._versions
+        if versions.candidate is None:
+            return
+        if versions.trial is None:
+            versions.trial = VersionTrial(self._trial_settings, estimate)
+        verdict = versions.trial.handle(estimate)
+        if verdict is Verdict.UNDECIDED:
+            return
+        if versions.is_doubt:
+            self._end_doubt(verdict)
+        elif verdict is Verdict.CONFIRMED:
+            versions.changes.append(VersionChange(versions.candidate.wanted, Change.ADOPTED))
+            self._versions = replace(versions, good=versions.candidate, candidate=None, trial=None)
+        else:
+            assert versions.good is not None
+            self._show(versions.good)
+            self._versions = replace(versions, trial=self._new_trial(), is_doubt=True, said=versions.trial.said)
+
+    def _end_doubt(self, verdict: Verdict) -> None:
+        """The old version gave fixes where the new one gave none, or it did not either."""
+        versions = self._versions
+        assert versions.candidate is not None
+        assert versions.good is not None
+        said = f"of version {versions.candidate.version} {versions.said}"
+        if verdict is Verdict.CONFIRMED:
+            reason = f"{said}, where version {versions.good.version} gives fixes"
+            versions.changes.append(VersionChange(versions.candidate.wanted, Change.REFUSED, reason))
+        else:
+            reason = f"{said}, and version {versions.good.version} gives no fixes either; it is tried again later"
+            versions.changes.append(VersionChange(versions.candidate.wanted, Change.POSTPONED, reason))
+        self._versions = replace(versions, candidate=None, trial=None, is_doubt=False)

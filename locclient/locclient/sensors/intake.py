@@ -1,0 +1,161 @@
+"""What sensors deliver, in order and bounded, between the threads that bring it and the one that localizes.
+
+Stereo frames may drop, the oldest first, and are counted; inertial samples never do.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fleetmap.recordings import StoredFrame
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
+
+_IMU_LEAD_NS = 10_000_000  # a frame is handled when the IMU has come a little past it
+_STALE_NS = 60_000_000_000  # integrated over longer than this without a picture, inertial samples say nothing
+_ABSURD = 1e5
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A frame, None where none came in time, and everything that goes before it."""
+
+    frame: CameraFrame | StoredFrame | None
+    imu: ImuSamples
+    wheel: list[WheelSample]
+    priors: list[PositionPrior]
+
+
+@dataclass
+class IntakeCounts:
+    """What came, and what did not get through. imu_late: frames that were handled without all of their IMU."""
+
+    frames: int = 0
+    frames_dropped: int = 0
+    frames_disordered: int = 0
+    imu_samples: int = 0
+    imu_refused: int = 0
+    imu_stale: int = 0
+    imu_late: int = 0
+    unreadable: int = 0
+
+
+@dataclass
+class _Inertial:
+    stamps_ns: list[int] = field(default_factory=list)
+    rows: list[tuple[float, ...]] = field(default_factory=list)
+
+    def take_until(self, until_ns: int) -> ImuSamples:
+        count = int(np.searchsorted(np.array(self.stamps_ns, np.int64), until_ns)) if self.stamps_ns else 0
+        stamps, rows = np.array(self.stamps_ns[:count], np.int64), np.array(self.rows[:count], float).reshape(-1, 6)
+        del self.stamps_ns[:count], self.rows[:count]
+        return ImuSamples(stamps, np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3:]))
+
+
+class Intake:
+    """Put to from any thread; taken from by one."""
+
+    def __init__(
+        self, *, frames: int, imu_minus_cam_s: float, has_imu: bool, imu_wait_s: float, clock_s: Callable[[], float] = time.monotonic
+    ) -> None:  # fmt: skip
+        """frames: how many may wait. imu_wait_s: how long a frame waits for the inertial samples up to it."""
+        self.counts = IntakeCounts()
+        self._frames: deque[CameraFrame | StoredFrame] = deque()
+        self._limit = frames
+        self._offset_ns = int(imu_minus_cam_s * 1e9)
+        self._has_imu, self._imu_wait_s = has_imu, imu_wait_s
+        self._clock_s = clock_s
+        self._changed = threading.Condition()
+        self._imu, self._last_imu_ns, self._last_frame_ns = _Inertial(), -(2**62), -(2**62)
+        self._wheel: list[WheelSample] = []
+        self._priors: list[PositionPrior] = []
+        self._finished = False
+
+    def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
+        """A frame; the oldest that waits makes room. One that is not newer than all before is refused and counted."""
+        with self._changed:
+            if frame.stamp_ns <= self._last_frame_ns:
+                self.counts.frames_disordered += 1
+                return
+            self._last_frame_ns = frame.stamp_ns
+            self.counts.frames += 1
+            self._frames.append(frame)
+            while len(self._frames) > self._limit:
+                self._frames.popleft()
+                self.counts.frames_dropped += 1
+            self._changed.notify_all()
+
+    def put_imu(self, samples: ImuSamples) -> None:
+        """Inertial samples; what is not finite, absurd or not newer is refused and counted."""
+        with self._changed:
+            values = np.hstack([samples.gyro_radps, samples.accel_mps2])
+            possible = np.asarray((np.abs(values) < _ABSURD).all(axis=1))
+            for stamp_ns, row, good in zip(samples.stamps_ns.tolist(), values.tolist(), possible.tolist(), strict=True):
+                if not good or stamp_ns <= self._last_imu_ns:
+                    self.counts.imu_refused += 1
+                    continue
+                self._last_imu_ns = stamp_ns
+                self.counts.imu_samples += 1
+                self._imu.stamps_ns.append(stamp_ns)
+                self._imu.rows.append(tuple(row))
+            if not self._frames:
+                self.counts.imu_stale += len(self._imu.take_until(self._last_imu_ns - _STALE_NS))
+            self._changed.notify_all()
+
+    def put_wheel(self, sample: WheelSample) -> None:
+        """Wheel odometry."""
+        with self._changed:
+            self._wheel.append(sample)
+            del self._wheel[:-1000]
+
+    def put_prior(self, prior: PositionPrior) -> None:
+        """A coarse place."""
+        with self._changed:
+            self._priors.append(prior)
+            del self._priors[:-10]
+
+    def count_unreadable(self) -> None:
+        """A message or picture that could not be read."""
+        with self._changed:
+            self.counts.unreadable += 1
+
+    def finish(self) -> None:
+        """Nothing will come any more."""
+        with self._changed:
+            self._finished = True
+            self._changed.notify_all()
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether nothing will come any more and everything was taken."""
+        with self._changed:
+            return self._finished and not self._frames
+
+    def wait_for_room(self, timeout_s: float) -> bool:
+        """Whether a frame can be put without dropping another, at the latest after timeout_s."""
+        with self._changed:
+            return self._changed.wait_for(lambda: len(self._frames) < self._limit, timeout_s)
+
+    def take(self, timeout_s: float) -> Moment:
+        """The oldest frame with all that goes before it, once its inertial samples are there or have been waited for."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._frames or self._finished, timeout_s) or not self._frames:
+                return Moment(None, ImuSamples.empty(), [], [])
+            if self._has_imu and not self._changed.wait_for(self._imu_is_there, self._imu_wait_s):
+                self.counts.imu_late += 1
+            frame = self._frames.popleft()
+            body_ns = frame.stamp_ns + self._offset_ns
+            imu = self._imu.take_until(body_ns + _IMU_LEAD_NS)
+            wheel = [sample for sample in self._wheel if sample.stamp_ns <= body_ns]
+            priors = [prior for prior in self._priors if prior.stamp_ns <= frame.stamp_ns]
+            self._wheel = [sample for sample in self._wheel if sample.stamp_ns > body_ns]
+            self._priors = [prior for prior in self._priors if prior.stamp_ns > frame.stamp_ns]
+            self._changed.notify_all()
+            return Moment(frame, imu, wheel, priors)
+
+    def _imu_is_there(self) -> bool:
+        """Up to the oldest frame, which may be another one than when the wait began."""
+        return self._finished or self._last_imu_ns >= self._frames[0].stamp_ns + self._offset_ns

@@ -1,0 +1,51 @@
+"""A recording played as if it were the robot's sensors."""
+
+import time
+from collections.abc import Callable
+
+from fleetmap.errors import RecordingError
+from fleetmap.recordings import FrameSelection, Recording
+from fleetmap.sensors.samples import SensorSet
+from locclient.replay.replay_sources import ReplaySource
+from locclient.sensors.intake import Intake
+
+_ROOM_WAIT_S = 0.1
+
+
+class RecordingSource:
+    """Plays all frames once, `speed` times as fast as they were recorded; 0 plays as fast as they are taken and drops none."""
+
+    def __init__(self, recording: Recording, *, speed: float, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._recording, self._speed, self._clock_s = recording, speed, clock_s
+        self._source = ReplaySource.of(recording, FrameSelection.parse(":"), reverse=False)
+        self.calibration = recording.calibration
+        self.has_depth = recording.sensor_set is SensorSet.RGBD
+
+    def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
+        """See Source."""
+        begun_s, first_ns = self._clock_s(), self._source.recorded_stamp_ns(0)
+        for number, imu in enumerate(self._source.imu_before_each()):
+            if wait(self._ahead_s(number, first_ns, begun_s)):
+                return
+            while not self._speed and not intake.wait_for_room(_ROOM_WAIT_S):
+                if wait(0.0):
+                    return
+            intake.put_imu(imu)
+            for sample in self._source.wheel_before(number):
+                intake.put_wheel(sample)
+            for prior in self._source.priors_before(number):
+                intake.put_prior(prior)
+            try:
+                intake.put_frame(self._recording.stored_frame(int(self._source.indices[number])))
+            except RecordingError:
+                intake.count_unreadable()
+
+    def close(self) -> None:
+        """See Source."""
+        self._recording.close()
+
+    def _ahead_s(self, number: int, first_ns: int, begun_s: float) -> float:
+        if not self._speed:
+            return 0.0
+        recorded_s = (self._source.recorded_stamp_ns(number) - first_ns) * 1e-9
+        return max(0.0, recorded_s / self._speed - (self._clock_s() - begun_s))

@@ -1,0 +1,85 @@
+"""Sensors as ROS 2 topics over zenoh, as rmw_zenoh sends them: CDR under `<domain>/<topic>/<type>/<hash>`."""
+
+from collections.abc import Callable
+from functools import partial
+
+from fleetmap.bus import Bus, Handle
+from fleetmap.errors import FleetmapError
+from fleetmap.recordings import StoredFrame, Topics
+from fleetmap.recordings.ros2 import messages
+from fleetmap.recordings.ros2.keys import ros_key_expr, type_of_key
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import ImuSamples
+from locclient.sensors.intake import Intake
+from locclient.sensors.stereo_pairs import StereoPairs
+
+_IDLE_S = 1.0
+Take = Callable[[Intake, str, bytes], None]
+
+
+class Ros2Source:
+    """Subscribes to the topics; an image topic also with `/compressed` behind it. The type tells how a message is read."""
+
+    def __init__(
+        self, bus: Bus, domain: int, topics: Topics, calibration: RigCalibration, *, images: bool = True
+    ) -> None:
+        """images: False takes everything but pictures, for a camera that comes another way."""
+        self._bus, self._domain = bus, domain
+        self.calibration, self.has_depth = calibration, False
+        self._pairs = StereoPairs()
+        self._wanted: list[tuple[str, Take]] = [(topics.wheel, _take_wheel), (topics.prior, _take_prior)]
+        if calibration.imu is not None:
+            self._wanted.append((topics.imu, _take_imu))
+        if images:
+            for side, topic in (("left", topics.left), ("right", topics.right)):
+                self._wanted += [(name, partial(self._take_image, side)) for name in (topic, f"{topic}/compressed")]
+
+    def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
+        """See Source."""
+        handles = self.subscribe(intake)
+        try:
+            while not wait(_IDLE_S):
+                pass
+        finally:
+            for handle in handles:
+                handle.close()
+
+    def subscribe(self, intake: Intake) -> list[Handle]:
+        """Subscriptions that put what comes into the intake, until they are closed."""
+        return [
+            self._bus.subscribe(ros_key_expr(self._domain, topic), partial(self._hear, intake, take))
+            for topic, take in self._wanted
+            if topic
+        ]
+
+    def close(self) -> None:
+        """See Source."""
+        self._bus.close()
+
+    def _hear(self, intake: Intake, take: Take, key: str, payload: bytes) -> None:
+        try:
+            take(intake, type_of_key(key), payload)
+        except (ValueError, FleetmapError):
+            # A message that cannot be read costs itself: it is counted and told in the health report.
+            intake.count_unreadable()
+
+    def _take_image(self, side: str, intake: Intake, type_name: str, payload: bytes) -> None:
+        stamp_ns, _ = messages.header_of(payload)
+        compressed = type_name == "sensor_msgs/CompressedImage"
+        decode = messages.decode_compressed_image if compressed else messages.decode_image
+        frame: StoredFrame | None = self._pairs.add(side, stamp_ns, decode(payload, f"{side} at {stamp_ns}"))
+        if frame is not None:
+            intake.put_frame(frame)
+
+
+def _take_imu(intake: Intake, _: str, payload: bytes) -> None:
+    stamps_ns, gyro_radps, accel_mps2, _ = messages.decode_imu([payload])
+    intake.put_imu(ImuSamples(stamps_ns, gyro_radps, accel_mps2))
+
+
+def _take_wheel(intake: Intake, _: str, payload: bytes) -> None:
+    intake.put_wheel(messages.decode_odometry(payload))
+
+
+def _take_prior(intake: Intake, _: str, payload: bytes) -> None:
+    intake.put_prior(messages.decode_prior(payload))

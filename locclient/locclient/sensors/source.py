@@ -1,0 +1,91 @@
+"""Where a running robot's samples come from. To add a source: a file and a line in SOURCES."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+
+from fleetmap.bus import ZenohBus
+from fleetmap.config import Section
+from fleetmap.errors import UsageError
+from fleetmap.recordings import OpenOptions, Topics, open_recording, read_calibration
+from fleetmap.sensors.calibration import RigCalibration
+from locclient.sensors.intake import Intake
+from locclient.sensors.playback import RecordingSource
+from locclient.sensors.ros2 import Ros2Source
+from locclient.sensors.uvc import UvcSource
+
+
+class SourceSection(Section, frozen=True):
+    """Which sensors a robot has, and where. What a kind does not need is not looked at."""
+
+    kind: str = "ros2"
+    calibration: str | None = None
+    endpoint: str = "tcp/127.0.0.1:7447"
+    domain: int = 0
+    recording: str | None = None
+    speed: float = 1.0
+    device: str = "/dev/video0"
+    width_px: int = 1280
+    height_px: int = 480
+    rate_hz: float = 30.0
+    delay_s: float = 0.0
+
+
+class Source(Protocol):
+    """Sensors. calibration: of the rig; has_depth: for a depth camera in place of a second one."""
+
+    calibration: RigCalibration
+    has_depth: bool
+
+    def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
+        """Puts samples into the intake until there are no more or `wait`, which sleeps for so many seconds, says to stop."""
+
+    def close(self) -> None:
+        """Lets go of files and connections."""
+
+
+def _recording(section: SourceSection, topics: Topics) -> Source:
+    if section.recording is None:
+        raise UsageError('[source] recording is missing: kind = "recording" plays the recording at that path')
+    calibration = None if section.calibration is None else Path(section.calibration)
+    opened = open_recording(Path(section.recording), OpenOptions(calibration_file=calibration, topics=topics))
+    return RecordingSource(opened, speed=section.speed)
+
+
+def _ros2(section: SourceSection, topics: Topics) -> Source:
+    calibration = _calibration(section)
+    return Ros2Source(ZenohBus.connect(section.endpoint), section.domain, topics, calibration)
+
+
+def _uvc(section: SourceSection, topics: Topics) -> Source:
+    calibration = _calibration(section)
+    device: int | str = int(section.device) if section.device.isdecimal() else section.device
+    rest = Ros2Source(ZenohBus.connect(section.endpoint), section.domain, topics, calibration, images=False)
+    size_px = (section.width_px, section.height_px)
+    return UvcSource(lambda: cv2.VideoCapture(device), calibration, size_px, section.rate_hz, section.delay_s, rest)
+
+
+def _calibration(section: SourceSection) -> RigCalibration:
+    if section.calibration is None:
+        raise UsageError("[source] calibration is missing: a live camera needs the path of its Kalibr camchain")
+    calibration = read_calibration(Path(section.calibration))
+    if len(calibration.cameras) < 2:
+        raise UsageError(
+            f"{section.calibration} describes {len(calibration.cameras)} camera; a live source needs a stereo pair"
+        )
+    return calibration
+
+
+SOURCES: dict[str, Callable[[SourceSection, Topics], Source]] = {"recording": _recording, "ros2": _ros2, "uvc": _uvc}
+
+
+def open_source(section: SourceSection, topics: Topics) -> Source:
+    """The source that the section asks for.
+
+    UsageError for an unknown kind or what it lacks, RecordingError and CalibrationError for files that cannot be used.
+    """
+    if section.kind not in SOURCES:
+        raise UsageError(f"[source] kind = {section.kind!r}; known are {', '.join(SOURCES)}")
+    return SOURCES[section.kind](section, topics)

@@ -1,0 +1,112 @@
+"""A UVC stereo camera that delivers both pictures side by side, through OpenCV; IMU and wheels come as ROS 2 topics."""
+
+import time
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from fleetmap.errors import RecordingError
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import CameraFrame
+from locclient.sensors.intake import Intake
+from locclient.sensors.ros2 import Ros2Source
+
+_REOPEN_S = 1.0
+_CLOCKS_AGREE_S = 1.0
+
+
+class Capture(Protocol):
+    """What is used of cv2.VideoCapture."""
+
+    def isOpened(self) -> bool:  # noqa: N802
+        """Whether the device is open."""
+
+    def set(self, prop: int, value: float) -> bool:
+        """Asks for a property."""
+
+    def get(self, prop: int) -> float:
+        """A property."""
+
+    def read(self) -> tuple[bool, Any]:
+        """Waits for the next picture."""
+
+    def release(self) -> None:
+        """Closes the device."""
+
+
+class UvcSource:
+    """Frames of a side-by-side camera, stamped on the clock of the topics.
+
+    A frame's stamp is that of its driver where it has one on the monotonic clock, as Linux's has, else that of its arrival; and in
+    both cases minus delay_s, which is measured once for a camera (half its exposure and, by arrival, its transfer). A camera that
+    is unplugged is opened again until it is back.
+    """
+
+    def __init__(
+        self, open_capture: Callable[[], Capture], calibration: RigCalibration, size_px: tuple[int, int], rate_hz: float, delay_s: float,
+        topics: Ros2Source | None, *, monotonic_s: Callable[[], float] = time.monotonic, wall_ns: Callable[[], int] = time.time_ns,
+    ) -> None:  # fmt: skip
+        """size_px: width and height of both pictures together. topics: where the other sensors come from, None for none."""
+        self._open, self._size_px, self._rate_hz, self._delay_s = open_capture, size_px, rate_hz, delay_s
+        self._topics, self._monotonic_s, self._wall_ns = topics, monotonic_s, wall_ns
+        self.calibration, self.has_depth = calibration, False
+
+    def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
+        """See Source."""
+        handles = [] if self._topics is None else self._topics.subscribe(intake)
+        try:
+            while not wait(0.0):
+                capture = self._open()
+                try:
+                    self._play(capture, intake, wait)
+                finally:
+                    capture.release()
+                if wait(_REOPEN_S):
+                    return
+        finally:
+            for handle in handles:
+                handle.close()
+
+    def close(self) -> None:
+        """See Source."""
+        if self._topics is not None:
+            self._topics.close()
+
+    def _play(self, capture: Capture, intake: Intake, wait: Callable[[float], bool]) -> None:
+        """Until the camera is gone or it is time to stop."""
+        if not capture.isOpened():
+            return
+        for prop, value in (
+            (cv2.CAP_PROP_FRAME_WIDTH, self._size_px[0]),
+            (cv2.CAP_PROP_FRAME_HEIGHT, self._size_px[1]),
+            (cv2.CAP_PROP_FPS, self._rate_hz),
+            (cv2.CAP_PROP_BUFFERSIZE, 1),  # of several, the oldest would come first
+        ):
+            capture.set(prop, value)
+        while not wait(0.0):
+            there, picture = capture.read()
+            if not there:
+                return
+            try:
+                intake.put_frame(split_frame(np.asarray(picture), self._stamp_ns(capture)))
+            except RecordingError:
+                intake.count_unreadable()
+
+    def _stamp_ns(self, capture: Capture) -> int:
+        now_s, wall_ns = self._monotonic_s(), self._wall_ns()
+        driver_s = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
+        age_s = now_s - driver_s if abs(now_s - driver_s) < _CLOCKS_AGREE_S else 0.0
+        return wall_ns - round((max(age_s, 0.0) + self._delay_s) * 1e9)
+
+
+def split_frame(picture: np.ndarray, stamp_ns: int) -> CameraFrame:
+    """The left and right half of a picture (H, 2 W) or (H, 2 W, 3), grey; RecordingError for anything else."""
+    if picture.dtype != np.uint8 or picture.ndim not in (2, 3) or picture.shape[1] % 2 or not picture.size:
+        raise RecordingError(
+            f"the camera sent {picture.dtype} of shape {picture.shape}; two pictures side by side are expected"
+        )
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.ndim == 3 else picture
+    middle = grey.shape[1] // 2
+    return CameraFrame(stamp_ns, np.ascontiguousarray(grey[:, :middle]), np.ascontiguousarray(grey[:, middle:]))

@@ -1,0 +1,181 @@
+"""What a build says about itself. Pure; the keys of `BuildReport` are stable, the README lists their meanings."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+
+from fleetmap.errors import RecordingError
+from fleetmap.sensors.samples import Trajectory
+from mapserver.evaluation.trajectory_error import AteResult, absolute_trajectory_error, paired
+from mapserver.quality.figures import TileDirections
+from mapserver.survey.merge.multi_session import Joined
+from mapserver.survey.pipeline import Survey
+from mapserver.survey.survey_map import SurveyMap
+
+if TYPE_CHECKING:
+    from mapserver.build.survey_recordings import Surveyed
+
+MIN_MATCHED = 3  # stamps with a truth, below which no alignment is defined
+
+
+class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The stable keys.
+
+    recordings: their names. duration_s: from the first to the last selected frame. seconds: wall time from opening the
+    recording until the map is ready to be stored. realtime_factor: duration_s / seconds, above 1 faster than recorded.
+    path_m: length of the estimated trajectory of the selected frames. map_bytes: what a robot downloads for the whole
+    site (manifest and tiles), vocabulary apart; None until it is stored. loops: counts of candidates and their fates.
+    ate_rmse_m, ate_sim3_rmse_m: root mean square position error of every selected frame that has an estimate and a
+    known truth, after one rigid (similarity) alignment; evaluated_share: their share of the selected frames. All three
+    are None without ground truth. scale: metric, or unknown for one camera that nothing told the metres; scale_error: by how much
+    the estimate is too large (0.01 is 1 %), None without ground truth. peak_rss_mb: most memory the process held, in 10^6 bytes.
+    findings: by recording, what the doctor found wanting in it, and what was corrected.
+    culled: what the surveys did not hand on. sessions: what became of every recording, and of the map's landmarks by it.
+    directions: which way the places of each tile look, and which way none does.
+    """
+
+    recordings: list[str]
+    duration_s: float
+    seconds: float
+    realtime_factor: float
+    path_m: float
+    keyframes: int
+    landmarks: int
+    map_bytes: int | None
+    vocabulary_bytes: int
+    loops: dict[str, int]
+    ate_rmse_m: float | None
+    ate_sim3_rmse_m: float | None
+    evaluated_share: float | None
+    scale: str
+    scale_error: float | None
+    peak_rss_mb: float
+    findings: dict[str, list[str]]
+    culled: dict[str, int]
+    sessions: list[dict[str, Any]]
+    directions: list[TileDirections]
+
+
+class Accuracy(msgspec.Struct, frozen=True):
+    """A survey against ground truth; all None without one, or where too few stamps have both (see MIN_MATCHED)."""
+
+    rigid: AteResult | None = None
+    similarity: AteResult | None = None
+    evaluated_share: float | None = None
+
+
+def estimated_trajectory(survey_map: SurveyMap) -> Trajectory:
+    """The selected frames that something measured ties to the map."""
+    chosen = survey_map.trajectory_estimated
+    return Trajectory(survey_map.trajectory.stamps_ns[chosen], survey_map.trajectory.frame_from_body[chosen])
+
+
+def accuracy(survey_map: SurveyMap, truth: Trajectory | None) -> Accuracy:
+    """Errors of all estimated frames at which the truth is known; guesses between them are left out and counted."""
+    if truth is None:
+        return Accuracy()
+    estimate, frames = estimated_trajectory(survey_map), len(survey_map.trajectory)
+    matched = len(paired(estimate, truth)[0])
+    if matched < MIN_MATCHED:
+        return Accuracy(evaluated_share=matched / max(frames, 1))
+    rigid = absolute_trajectory_error(estimate, truth, frames=frames)
+    similarity = absolute_trajectory_error(estimate, truth, with_scale=True, frames=frames)
+    return Accuracy(rigid, similarity, rigid.evaluated_share)
+
+
+def check_truth(what: str, stamps_ns: Any, truth: Trajectory | None) -> None:
+    """Raises RecordingError unless enough of the stamps (F,) have a truth to place a survey in its frame."""
+    if truth is None:
+        raise RecordingError(f"{what} carries no ground truth; build it without --frame-from-ground-truth")
+    known = sum(truth.at(int(stamp)) is not None for stamp in stamps_ns)
+    if known < MIN_MATCHED:
+        raise RecordingError(
+            f"{what}: {known} of {len(stamps_ns)} selected frames have a ground truth, {MIN_MATCHED} are needed; "
+            "select others with --frames or build without --frame-from-ground-truth"
+        )
+
+
+def path_length_m(trajectory: Trajectory) -> float:
+    """Metres along the positions."""
+    return float(np.linalg.norm(np.diff(trajectory.positions_m, axis=0), axis=1).sum())
+
+
+def make_report(
+    names: list[str], joined: Joined, surveys: Sequence[Survey], found: Accuracy, vocabulary_bytes: int, seconds: float,
+    peak_rss_mb: float,
+) -> BuildReport:  # fmt: skip
+    """The report of finished surveys (those that were joined), map_bytes and sessions still unknown."""
+    survey_map = joined.map
+    duration_s = sum(float(t.stamps_ns[-1] - t.stamps_ns[0]) * 1e-9 for t in joined.trajectories)
+    loops = [survey.loops.counts() for survey in surveys]
+    culled = [asdict(survey.culled) for survey in surveys]
+    return BuildReport(
+        recordings=names,
+        duration_s=round(duration_s, 6),
+        seconds=round(seconds, 3),
+        realtime_factor=round(duration_s / max(seconds, 1e-9), 4),
+        path_m=round(sum(path_length_m(t) for t in joined.trajectories), 4),
+        keyframes=len(survey_map.keyframe_stamps_ns),
+        landmarks=len(survey_map.landmark_ids),
+        map_bytes=None,
+        vocabulary_bytes=vocabulary_bytes,
+        loops={key: sum(count[key] for count in loops) for key in loops[0]},
+        ate_rmse_m=None if found.rigid is None else found.rigid.rmse_m,
+        ate_sim3_rmse_m=None if found.similarity is None else found.similarity.rmse_m,
+        evaluated_share=found.evaluated_share,
+        scale="metric" if survey_map.scale_known else "unknown",
+        scale_error=None if found.similarity is None else 1.0 / found.similarity.scale - 1.0,
+        peak_rss_mb=round(peak_rss_mb, 1),
+        culled={key: sum(count[key] for count in culled) for key in culled[0]},
+        findings={},
+        sessions=[],
+        directions=[],
+    )
+
+
+def sessions_report(names: list[str], joined: Joined) -> list[dict[str, Any]]:
+    """What became of every recording, in their order."""
+    return [
+        {"recording": names[o.number], "joined": o.joined, "reason": o.reason}
+        | ({} if o.counts is None else asdict(o.counts))
+        for o in joined.outcomes
+    ]
+
+
+def full_report(
+    report: BuildReport, site: str, version: int, surveyed: "Sequence[Surveyed]", joined: Joined, found: Accuracy,
+    stage_s: dict[str, float],
+) -> dict[str, Any]:  # fmt: skip
+    """The stable keys, and with them what helps to understand them; those may change.
+
+    loop_records: every candidate, keyframe i against the older j of one recording. stage_s: wall seconds of each stage; reading
+    and decoding images are part of odometry. pair_turn: see survey/pair_turn.py. parts: of each survey, of which the kept one
+    is in the map.
+    """
+    survey_map, first = joined.map, surveyed[0]
+    stable: dict[str, Any] = msgspec.to_builtins(report)
+    return stable | {
+        "site": site,
+        "version": version,
+        "format": first.format,
+        "sensor_set": first.sensor_set.value,
+        "inertial": all(s.survey.first_guess.inertial for s in surveyed),
+        "losses": [{"what": loss.what, "detail": loss.detail} for s in surveyed for loss in s.losses],
+        "frames": len(survey_map.trajectory),
+        "estimated_frames": int(survey_map.trajectory_estimated.sum()),
+        "observations": len(survey_map.obs_landmark),
+        "point_sigma_median_m": float(np.median(survey_map.point_sigma_m)),
+        "ate_max_m": None if found.rigid is None else found.rigid.max_m,
+        "sim3_scale": None if found.similarity is None else found.similarity.scale,
+        "pair_turn": [msgspec.to_builtins(s.survey.pair_turn) for s in surveyed],
+        "stage_s": {stage: round(seconds, 3) for stage, seconds in stage_s.items()},
+        "parts": [msgspec.to_builtins(s.survey.parts) for s in surveyed],
+        "loop_records": [
+            {"recording": s.entry.name} | record
+            for s in surveyed
+            for record in msgspec.to_builtins(s.survey.loops.records)
+        ],
+    }

@@ -1,0 +1,88 @@
+"""A recording as a poorer set of sensors would have made it, so that one recording can show what each set is worth."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fleetmap.errors import RecordingError, UsageError
+from fleetmap.recordings import OpenOptions, Recording, open_recording
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
+
+if TYPE_CHECKING:
+    import hashlib
+
+    from fleetmap.recordings.images import StoredFrame
+    from fleetmap.recordings.recording import FrameSource
+
+# What each set can be reduced to, itself included.
+REDUCTIONS: dict[SensorSet, tuple[SensorSet, ...]] = {
+    SensorSet.STEREO_INERTIAL: (
+        SensorSet.STEREO_INERTIAL,
+        SensorSet.STEREO,
+        SensorSet.MONO_INERTIAL,
+        SensorSet.MONO,
+    ),
+    SensorSet.STEREO: (SensorSet.STEREO, SensorSet.MONO),
+    SensorSet.RGBD: (SensorSet.RGBD, SensorSet.MONO),
+    SensorSet.MONO_INERTIAL: (SensorSet.MONO_INERTIAL, SensorSet.MONO),
+    SensorSet.MONO: (SensorSet.MONO,),
+}
+_INERTIAL = (SensorSet.STEREO_INERTIAL, SensorSet.MONO_INERTIAL)
+_SINGLE = (SensorSet.MONO, SensorSet.MONO_INERTIAL)
+
+
+def sensor_set_of(path: Path, calibration: Path | None = None) -> SensorSet:
+    """What the recording at `path` carries; errors as of `open_recording`."""
+    with open_recording(path, OpenOptions(calibration_file=calibration)) as recording:
+        return recording.sensor_set
+
+
+def named_sensor_set(name: str) -> SensorSet:
+    """The sensor set of that name; UsageError for any other."""
+    try:
+        return SensorSet(name)
+    except ValueError as error:
+        raise UsageError(f"--use {name}: the sensor sets are {', '.join(SensorSet)}") from error
+
+
+def reduced(recording: Recording, use: SensorSet | None) -> Recording:
+    """The recording without the sensors that `use` does not have; the same one without `use`.
+
+    Raises RecordingError where the recording lacks a sensor that `use` has.
+    """
+    if use is None or use is recording.sensor_set:
+        return recording
+    if use not in REDUCTIONS[recording.sensor_set]:
+        possible = ", ".join(REDUCTIONS[recording.sensor_set])
+        raise RecordingError(
+            f"{recording.path} is {recording.sensor_set}, it cannot be used as {use}; use it as {possible}"
+        )
+    calibration, imu = recording.calibration, recording.imu
+    if use not in _INERTIAL:
+        calibration, imu = replace(calibration, imu=None), ImuSamples.empty()
+    if use in _SINGLE:
+        calibration = replace(calibration, cameras=calibration.cameras[:1])
+    return replace(
+        recording, sensor_set=use, calibration=calibration, imu=imu, frames=_Reduced(recording.frames, use in _SINGLE)
+    )
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """Frames of another source, of one camera where `single`. What was recorded stays what it was: stored and hashed whole."""
+
+    source: "FrameSource"
+    single: bool
+
+    def stored(self, index: int) -> "StoredFrame":
+        return self.source.stored(index)
+
+    def frame(self, index: int) -> CameraFrame:
+        frame = self.source.frame(index)
+        return CameraFrame(frame.stamp_ns, frame.left) if self.single else frame
+
+    def hash_into(self, digest: "hashlib._Hash") -> None:
+        self.source.hash_into(digest)
+
+    def close(self) -> None:
+        self.source.close()

@@ -1,0 +1,153 @@
+"""Workers for surveys: threads of this process, or processes of a dask cluster, embedded or elsewhere.
+
+Two cores are served best by threads: the kernels run without the interpreter's lock, and nothing is copied. Processes take over
+where there are many cores, or several machines.
+"""
+
+import os
+import pickle
+import secrets
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import cv2
+
+from fleetmap.errors import UsageError
+from mapserver.survey.executor import ALONE, Batch, Result, Shared, Worker
+
+Item = TypeVar("Item")
+EMBEDDED = "local"
+_AHEAD = 2  # batches for each thread or process that wait, so that long surveys are not in memory twice
+_CONNECT_WITHIN_S = "20s"
+
+
+class Threads:
+    """A Worker of threads; results are computed ahead of who asks for them."""
+
+    def __init__(self, pool: ThreadPoolExecutor, count: int) -> None:
+        self._pool, self._ahead = pool, _AHEAD * count
+
+    def map(
+        self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
+    ) -> Iterator[Result]:
+        """See Worker."""
+        return _in_order(lambda batch: self._pool.submit(function, shared, batch), Future.result, batches, self._ahead)
+
+
+class Cluster:
+    """A Worker of the processes behind a dask client.
+
+    Everything travels as pickles of ours: arrays that dask unpacks itself cannot be written to, and numba would compile every
+    kernel a second time for such.
+    """
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self._count = 0
+        self._shared: tuple[Any, Any] = (None, None)  # the last value that was shared, and where it is
+
+    def map(
+        self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
+    ) -> Iterator[Result]:
+        """See Worker."""
+        if self._shared[0] is not shared:
+            packed = (secrets.token_hex(8), pickle.dumps(shared, protocol=5))
+            self._shared = (shared, self._client.scatter([packed], broadcast=True, hash=False)[0])
+        there = self._shared[1]
+        ahead = _AHEAD * max(1, sum(self._client.nthreads().values()))
+
+        def submit(batch: Batch) -> Any:
+            return self._client.submit(_do, function, there, pickle.dumps(batch, protocol=5), pure=False)
+
+        return _in_order(submit, lambda future: pickle.loads(future.result()), batches, ahead)
+
+
+_unpacked: dict[str, Any] = {}  # in a process of the cluster: what is shared now, by its name
+
+
+def _do(function: Callable[[Any, Any], Any], packed: tuple[str, bytes], batch: bytes) -> bytes:
+    """One batch in a process of the cluster."""
+    name, data = packed
+    if name not in _unpacked:
+        _unpacked.clear()
+        _unpacked[name] = pickle.loads(data)
+    return pickle.dumps(function(_unpacked[name], pickle.loads(batch)), protocol=5)
+
+
+def _in_order(
+    submit: Callable[[Any], Any], result: Callable[[Any], Any], batches: Iterable[Any], ahead: int
+) -> Iterator[Any]:
+    """Results in the batches' order, with at most `ahead` of them on their way."""
+    waiting: deque[Any] = deque()
+    for batch in batches:
+        waiting.append(submit(batch))
+        if len(waiting) > ahead:
+            yield result(waiting.popleft())
+    while waiting:
+        yield result(waiting.popleft())
+
+
+@contextmanager
+def open_worker(threads: int | None, scheduler: str | None) -> Iterator[Worker]:
+    """Threads (as many as there are cores, without a number), or the cluster of a scheduler; `local` makes one of processes here.
+
+    Raises UsageError where the scheduler does not answer.
+    """
+    count = threads or len(os.sched_getaffinity(0))
+    if scheduler is not None:
+        with _client(scheduler, count) as client:
+            yield Cluster(client)
+    elif count == 1:
+        yield ALONE
+    else:
+        with ThreadPoolExecutor(count, thread_name_prefix="survey") as pool, _opencv_alone():
+            yield Threads(pool, count)
+
+
+@contextmanager
+def _opencv_alone() -> Iterator[None]:
+    """OpenCV without threads of its own: where ours have work for every core, its would only wait for each other."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+@contextmanager
+def _client(scheduler: str, count: int) -> Iterator[Any]:
+    from distributed import Client, LocalCluster
+
+    if scheduler == EMBEDDED:
+        cluster = LocalCluster(  # type: ignore[no-untyped-call]
+            n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None
+        )
+        with cluster, Client(cluster, set_as_default=False) as client:  # type: ignore[no-untyped-call]
+            yield client
+        return
+    try:
+        client = Client(scheduler, timeout=_CONNECT_WITHIN_S, set_as_default=False)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError, TypeError) as error:
+        raise UsageError(
+            f"--scheduler {scheduler} does not answer ({error}); start it with `dask scheduler`, or say `{EMBEDDED}`"
+        ) from error
+    with client:
+        yield client
+
+
+def read_ahead(items: Iterable[Item], ahead: int = 4) -> Iterator[Item]:
+    """The items of a generator, fetched by a thread while the ones before are used. Errors come where their item would."""
+    source = iter(items)
+    end = object()
+    with ThreadPoolExecutor(1, thread_name_prefix="reader") as pool:
+        waiting = deque(pool.submit(next, source, end) for _ in range(ahead))
+        while True:
+            item = waiting.popleft().result()
+            if item is end:
+                return
+            waiting.append(pool.submit(next, source, end))
+            yield item  # type: ignore[misc]

@@ -1,0 +1,148 @@
+"""What the pages read of the fleet's health: rates with their intervals, failures, versions that are tried."""
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from scipy.special import bdtr
+
+from mapserver.fleet.canary_controller import find
+from mapserver.fleet.resurvey_list import resurvey_list
+from mapserver.fleet_statistics.canary_test import CanarySettings
+from mapserver.fleet_statistics.kpis import HOUR_NS, Measures, Rate, Tally, hour_of, measures, rate
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings, TileConcern
+from mapserver.store import CanaryRow, FailureDetail, FailureFilter, FailureRow, MapStore
+
+DAY_H = 24
+DAYS_SHOWN = 14
+FAILURES_SHOWN = 50
+_KEPT_NS = 5_000_000_000
+_ENDED_SHOWN_NS = 7 * DAY_H * HOUR_NS
+_SURE = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A version that some robots try, or tried in the last days, and what is known of it by now."""
+
+    canary: CanaryRow
+    finding: str
+
+
+@dataclass(frozen=True, slots=True)
+class SiteHealth:
+    """A site's figures. day: the last 24 h; week: the 7 days before; days: rates of 24 h each, oldest first, the last ends now.
+
+    robots: each one's figures of the last 24 h. trend: how day compares with week, in words.
+    """
+
+    day: Measures
+    week: Measures
+    trend: str
+    days: tuple[Rate, ...]
+    robots: Mapping[str, Measures]
+    trials: tuple[Trial, ...]
+    resurvey: tuple[TileConcern, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """What failures can be filtered by: keys under which any were counted."""
+
+    robots: list[str]
+    versions: list[str]
+    tiles: list[str]
+    causes: list[str]
+
+
+class HealthData:
+    """Reads the fleet's health out of an open store. Methods may be called from any thread; errors are the store's."""
+
+    def __init__(
+        self, store: MapStore, canary: CanarySettings, resurvey: ResurveySettings, clock_ns: Callable[[], int]
+    ) -> None:
+        self._store, self._canary, self._resurvey, self._clock_ns = store, canary, resurvey, clock_ns
+        self._lock = threading.Lock()
+        self._kept: dict[str, tuple[int, SiteHealth]] = {}
+
+    def site(self, site: str) -> SiteHealth:
+        """A site's figures, some seconds old at most, put together once for all pages that are open."""
+        with self._lock:
+            known = self._kept.get(site)
+            if known is not None and self._clock_ns() - known[0] < _KEPT_NS:
+                return known[1]
+            found = self._site(site)
+            self._kept[site] = (self._clock_ns(), found)
+        return found
+
+    def failures(self, wanted: FailureFilter, before: int | None) -> list[FailureRow]:
+        """Failures, the last to arrive first; one more than is shown where there are more."""
+        return self._store.fleet.failures(wanted, before=before, limit=FAILURES_SHOWN + 1)
+
+    def failure(self, number: int) -> FailureDetail:
+        """One failure."""
+        return self._store.fleet.failure(number)
+
+    def choices(self, site: str) -> Choices:
+        """What the site's failures can be filtered by."""
+
+        def keys(axis: str) -> list[str]:
+            found = self._store.fleet.tallies(site, axis)
+            return [key for (_, key), tally in found.items() if tally.failures or tally.suspected]
+
+        def numbers_first(key: str) -> tuple[int, str]:
+            return (int(key), "") if key.isdecimal() else (1 << 40, key)
+
+        return Choices(keys("robot"), sorted(keys("version"), key=numbers_first), keys("tile"), keys("cause"))
+
+    def _site(self, site: str) -> SiteHealth:
+        now_ns = self._clock_ns()
+        next_hour = hour_of(now_ns) + 1
+        hours = self._store.fleet.hours(site, "site", since_hour=next_hour - DAY_H * DAYS_SHOWN)
+        days = [_sum(hours, next_hour - DAY_H * (n + 1), next_hour - DAY_H * n) for n in reversed(range(DAYS_SHOWN))]
+        week = _sum(hours, next_hour - DAY_H * 8, next_hour - DAY_H)
+        robots = self._store.fleet.tallies(site, "robot", since_hour=next_hour - DAY_H)
+        return SiteHealth(
+            measures(days[-1]),
+            measures(week),
+            trend_words(days[-1], week),
+            tuple(rate(tally.failures, tally.robot_days) for tally in days),
+            {robot: measures(tally) for (_, robot), tally in robots.items()},
+            self._trials(site, now_ns),
+            tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles),
+        )
+
+    def _trials(self, site: str, now_ns: int) -> tuple[Trial, ...]:
+        recent = [
+            row for row in self._store.canaries(site) if row.ended_ns is None or now_ns - row.ended_ns < _ENDED_SHOWN_NS
+        ]
+        return tuple(
+            Trial(row, row.outcome or find(self._store, row, self._canary, now_ns).reason) for row in recent[:3]
+        )
+
+
+def _sum(hours: Mapping[int, Tally], since: int, until: int) -> Tally:
+    total = Tally()
+    for hour, tally in hours.items():
+        if since <= hour < until:
+            total.add(tally)
+    return total
+
+
+def trend_words(day: Tally, week: Tally) -> str:
+    """How a day's failures compare with the week's before, as far as the counts can tell.
+
+    Given all failures of both, those of the day are binomial with the day's share of the driving if nothing changed (the
+    conditional test of two Poisson rates, Przyborowski and Wilenski 1940; twice the smaller tail).
+    """
+    if day.robot_days <= 0 or week.robot_days <= 0:
+        return "nothing to compare with yet"
+    total = day.failures + week.failures
+    if total == 0:
+        return "none in the week before either"
+    share = day.robot_days / (day.robot_days + week.robot_days)
+    if 2 * (1 - float(bdtr(day.failures - 1, total, share)) if day.failures else 1.0) < _SURE:
+        return "more than in the week before"
+    if 2 * float(bdtr(day.failures, total, share)) < _SURE:
+        return "fewer than in the week before"
+    return "no clear change from the week before"

@@ -1,0 +1,138 @@
+"""What all pages have in common: the head with its links, the look, and errors in words instead of a broken page."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TypeVar
+
+from fastapi import Request
+from markupsafe import Markup, escape
+from nicegui import ui
+
+from fleetmap.errors import FleetmapError, UsageError
+from mapserver.api.writers import Writers
+from mapserver.dashboard.data import MapData
+from mapserver.dashboard.fleet_health import HealthData
+from mapserver.dashboard.live import LiveRobots
+from mapserver.dashboard.markup import address, joined, link
+
+T = TypeVar("T")
+
+PAGES = {"": "Fleet", "map": "Map", "failures": "Failures", "surveys": "Surveys"}
+RESPONSE_TIMEOUT_S = 30.0
+_LOOK_COOKIE = "fleetmap_look"
+_SWITCH_LOOK = (
+    "const dark = !document.body.classList.contains('body--dark');"
+    f"document.cookie = '{_LOOK_COOKIE}=' + (dark ? 'dark' : 'light') + ';path=/;max-age=31536000;samesite=strict';"
+    "setDark(dark)"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Rooms:
+    """What pages work with: maps and surveys, the fleet's health, the robots now, and who may change something."""
+
+    maps: MapData
+    health: HealthData
+    robots: LiveRobots
+    writers: Writers
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """Which page of which site is looked at; root: what the addresses of all pages begin with."""
+
+    root: str
+    page: str
+    site: str
+
+    def to(self, path: str, **query: object) -> str:
+        """The address of a page of the same site."""
+        return address(f"{self.root}/{path}", site=self.site, **query)
+
+
+def html(content: Markup | str, *, classes: str = "") -> ui.html:
+    """Markup on the page. It is not sanitized: `Markup` is made by escaping everything that comes from elsewhere."""
+    shown = ui.html(str(content) if isinstance(content, Markup) else str(escape(content)), sanitize=False)
+    return shown.classes(classes) if classes else shown
+
+
+async def load(function: Callable[..., T], *arguments: object) -> T:
+    """What a function of the data gives, without holding up the other pages and the robots' messages."""
+    return await asyncio.to_thread(function, *arguments)
+
+
+async def show(
+    rooms: Rooms, request: Request, page: str, site: str | None, build: Callable[[Where], Awaitable[None]]
+) -> None:
+    """The frame of a page and what `build` puts into it; a FleetmapError is told in its place."""
+    root = str(request.scope.get("root_path", ""))
+    _set_look(request)
+    try:
+        sites = await load(rooms.maps.sites)
+        where = Where(root, page, await load(rooms.maps.chosen_site, site))
+    except FleetmapError as error:
+        _head(root, page, None, [])
+        html(notice("bad", str(error)))
+        return
+    _head(root, page, where.site, sites)
+    try:
+        await build(where)
+    except FleetmapError as error:
+        html(notice("bad", str(error)))
+
+
+def notice(tone: str, words: object) -> Markup:
+    """A sentence that must be seen."""
+    return Markup('<p class="notice {}" role="status">{}</p>').format(tone, words)
+
+
+def number(text: str | None, name: str) -> int | None:
+    """The number of a question in the address; raises UsageError for another text."""
+    if text is None or text == "":
+        return None
+    if not text.isascii() or not text.isdecimal() or len(text) > 12:
+        raise UsageError(f"{name} {text[:40]!r} is not a number; choose one from the list")
+    return int(text)
+
+
+@cache
+def _style() -> str:
+    return f"<style>{Path(__file__).with_name('style.css').read_text('utf-8')}</style>"
+
+
+def _set_look(request: Request) -> None:
+    """As the person chose with the button, else as their machine has it."""
+    ui.add_head_html(_style())
+    look = request.cookies.get(_LOOK_COOKIE)
+    if look in {"dark", "light"}:
+        ui.dark_mode(look == "dark")
+
+
+def _head(root: str, page: str, site: str | None, sites: list[str]) -> None:
+    links = joined(
+        Markup('<a href="{}"{}>{}</a>').format(
+            address(f"{root}/{path}", site=site), Markup(' aria-current="page"') if path == page else "", name
+        )
+        for path, name in PAGES.items()
+    )
+    options = joined(
+        Markup('<option value="{0}"{1}>{0}</option>').format(name, Markup(" selected") if name == site else "")
+        for name in sites
+    )
+    chooser = Markup(
+        '<form method="get" action="{}"><label>Site <select name="site" onchange="this.form.submit()">{}</select></label></form>'
+    ).format(f"{root}/{page}", options)
+    html(
+        Markup(
+            '<nav class="top"><strong>fleetmap</strong>{}<span class="space"></span>{}'
+            '<button class="plain" type="button" onclick="{}">Light or dark</button></nav>'
+        ).format(links, chooser if sites else "", _SWITCH_LOOK)
+    )
+
+
+def back_link(where: Where, path: str, words: str) -> Markup:
+    """A link to the page above."""
+    return Markup("<p>{}</p>").format(link(where.to(path), words))

@@ -1,0 +1,202 @@
+"""Reads the frames that the checks need and runs all of them."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleetmap.errors import RecordingError
+from fleetmap.geometry import Array, so3_log
+from fleetmap.recordings import Recording
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
+from fleetmap.sensors.samples import CameraFrame, Image, SensorSet
+from mapserver.doctor import inertial, timing
+from mapserver.doctor.camera_rotation import rotation_between
+from mapserver.doctor.disparity_zero import DisparityZero, disparity_zero, stereo_against_motion
+from mapserver.doctor.findings import Finding, Verdict
+from mapserver.doctor.gyro_images import CameraTurns, gyro_check
+from mapserver.doctor.sharpness import laplacian_variance, sharpness
+from mapserver.doctor.stereo import StereoMatches, epipolar_error, match_pair, swapped_cameras
+from mapserver.survey.executor import ALONE, Worker
+
+SAMPLED_FRAMES = 40
+TURN_FRAMES = 200
+_MOTION_NS, _LONGEST_MOTION_NS = 250_000_000, 350_000_000  # between the two moments of stereo against motion
+
+
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """All findings, in a fixed order, and the time offset that gyro and images show beyond the calibration's.
+
+    measured_offset_s is None where it was not measured, or hardly.
+    """
+
+    findings: list[Finding]
+    measured_offset_s: float | None
+
+
+class _Frames:
+    """Reads frames and remembers which could not be."""
+
+    def __init__(self, recording: Recording, on_frame: Callable[[], None]) -> None:
+        self._recording, self._on_frame = recording, on_frame
+        self.tried = 0
+        self.errors: list[str] = []
+
+    def read(self, index: int) -> CameraFrame | None:
+        self.tried += 1
+        self._on_frame()
+        try:
+            return self._recording.read_frame(index)
+        except RecordingError as error:
+            self.errors.append(str(error))
+            return None
+
+
+def examine(
+    recording: Recording,
+    on_frame: Callable[[], None] = lambda: None,
+    *,
+    sampled: int = SAMPLED_FRAMES,
+    turn_frames: int = TURN_FRAMES,
+    worker: Worker = ALONE,
+) -> Examination:
+    """Everything the checks say about a recording.
+
+    Reads at most twice `sampled` frames, spread over the recording, and a run of `turn_frames`; `on_frame` is called after each.
+    """
+    stamps_ns, imu = recording.frame_stamps_ns, recording.imu
+    frames = _Frames(recording, on_frame)
+    shift_s = recording.calibration.cameras[0].imu_minus_cam_s
+    findings = [
+        timing.camera_rate(stamps_ns),
+        timing.camera_gaps(stamps_ns),
+        timing.imu_rate(imu.stamps_ns),
+        timing.imu_gaps(imu.stamps_ns),
+        timing.stamp_order(recording.losses),
+        timing.camera_imu_overlap(stamps_ns, imu.stamps_ns, shift_s),
+        inertial.gravity_magnitude(imu),
+    ]
+    rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
+    seen = _sampled(recording, frames, rectifier, sampled, worker)
+    if recording.sensor_set in (SensorSet.STEREO, SensorSet.STEREO_INERTIAL):
+        findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
+        findings += [stereo_against_motion(seen.zeros, rectifier.camera)]
+    turns = _camera_turns(recording, frames, rectifier, turn_frames, worker)
+    checked, measured_offset_s = gyro_check(turns, imu, shift_s)
+    findings += [*checked, sharpness(seen.variances), _readable(frames)]
+    return Examination(findings + timing.other_losses(recording.losses), measured_offset_s)
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """What frames all over the recording show."""
+
+    pairs: list[StereoMatches]
+    zeros: list[DisparityZero]
+    variances: list[float]
+
+
+def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, worker: Worker) -> _Seen:
+    seen = _Seen([], [], [])
+    moments = _moments(recording, frames, rectifier, count)
+    for variance, pair, zero in worker.map(_look, rectifier.camera, moments):
+        seen.variances.append(variance)
+        seen.pairs.extend([] if pair is None else [pair])
+        seen.zeros.extend([] if zero is None else [zero])
+    return seen
+
+
+_Moment = tuple[
+    Image, RectifiedFrame | None, RectifiedFrame | None
+]  # left as recorded, the pair, the pair a little later
+
+
+def _moments(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int) -> Iterator[_Moment]:
+    """Frames spread over the recording; without a pair where there is no right picture."""
+    stamps_ns = recording.frame_stamps_ns
+    for index in np.unique(np.linspace(0, len(recording) - 1, min(count, len(recording))).round().astype(int)):
+        frame = frames.read(int(index))
+        if frame is None:
+            continue
+        if frame.right is None:
+            yield frame.left, None, None
+            continue
+        later = int(np.searchsorted(stamps_ns, stamps_ns[index] + _MOTION_NS))
+        near = later < len(recording) and stamps_ns[later] - stamps_ns[index] <= _LONGEST_MOTION_NS
+        after = frames.read(later) if near else None
+        yield frame.left, rectifier.rectify(frame), None if after is None else rectifier.rectify(after)
+
+
+def _look(camera: StereoCamera, moment: _Moment) -> tuple[float, StereoMatches | None, DisparityZero | None]:
+    left, pair, after = moment
+    zero = None if pair is None or after is None else disparity_zero(pair, after, camera)
+    return laplacian_variance(left), None if pair is None else match_pair(pair), zero
+
+
+def _camera_turns(
+    recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, worker: Worker
+) -> CameraTurns:
+    starts, ends, rates = [], [], []
+    pairs = _consecutive(recording, frames, rectifier, count)
+    for start_ns, end_ns, rate in worker.map(_turn, (rectifier.camera, rectifier.body_from_cam[:3, :3]), pairs):
+        if rate is not None:
+            starts.append(start_ns)
+            ends.append(end_ns)
+            rates.append(rate)
+    return CameraTurns(np.array(starts, np.int64), np.array(ends, np.int64), np.array(rates).reshape(-1, 3))
+
+
+def _turn(
+    shared: tuple[StereoCamera, Array], pair: tuple[RectifiedFrame, RectifiedFrame]
+) -> tuple[int, int, Array | None]:
+    """Stamps of two frames and the body's angular rate (3,) between them."""
+    (camera, rotation), (before, after) = shared, pair
+    before_from_after = rotation_between(before, after, camera)
+    if before_from_after is None:
+        return before.stamp_ns, after.stamp_ns, None
+    dt_s = (after.stamp_ns - before.stamp_ns) * 1e-9
+    return before.stamp_ns, after.stamp_ns, so3_log(rotation @ before_from_after @ rotation.T) / dt_s
+
+
+def _consecutive(
+    recording: Recording, frames: _Frames, rectifier: Rectifier, count: int
+) -> Iterator[tuple[RectifiedFrame, RectifiedFrame]]:
+    """Pairs of rectified frames close in time, from the run of frames in which the gyro is busiest."""
+    if len(recording.imu) == 0:
+        return
+    stamps_ns = recording.frame_stamps_ns
+    first = _busiest_start(recording, count)
+    previous: RectifiedFrame | None = None
+    for index in range(first, min(first + count, len(recording))):
+        is_close = previous is not None and stamps_ns[index] - previous.stamp_ns < timing.SPARSE_S * 1e9
+        has_next = index + 1 < len(recording) and stamps_ns[index + 1] - stamps_ns[index] < timing.SPARSE_S * 1e9
+        if not (is_close or has_next):
+            continue
+        frame = frames.read(index)
+        current = None if frame is None else rectifier.rectify(frame)
+        if previous is not None and current is not None and is_close:
+            yield previous, current
+        previous = current
+
+
+def _busiest_start(recording: Recording, count: int) -> int:
+    stamps_ns, imu = recording.frame_stamps_ns, recording.imu
+    if len(stamps_ns) <= count:
+        return 0
+    speeds = np.linalg.norm(imu.gyro_radps - np.median(imu.gyro_radps, axis=0), axis=1)
+    total = np.concatenate([[0.0], np.cumsum(np.minimum(speeds, 3.0))])
+    starts = np.arange(0, len(stamps_ns) - count, max(1, count // 4))
+    a = np.searchsorted(imu.stamps_ns, stamps_ns[starts])
+    b = np.searchsorted(imu.stamps_ns, stamps_ns[starts + count])
+    return int(starts[np.argmax(total[b] - total[a])])
+
+
+def _readable(frames: _Frames) -> Finding:
+    limit = "every frame that was looked at must be readable"
+    if not frames.errors:
+        return Finding("images", Verdict.OK, 0.0, limit, f"all {frames.tried} frames that were looked at are whole")
+    count = len(frames.errors)
+    return Finding(
+        "images", Verdict.FAIL, float(count), limit, f"{count} of {frames.tried} cannot be read; {frames.errors[0]}"
+    )

@@ -1,0 +1,1 @@
+"""Trajectories against ground truth: errors, normalised errors, tables."""

@@ -1,0 +1,121 @@
+"""Failures for other programs: JSON lines, and MCAP with Foxglove's own schemas as JSON, which Foxglove opens as it is."""
+
+import base64
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from mcap.writer import CompressionType, Writer
+
+from fleetmap.errors import StoreError
+from fleetmap.messages import report_dict
+from mapserver.fleet.export_schemas import SCHEMAS
+from mapserver.fleet.fleet import finite
+from mapserver.store import FailureDetail, FailureFilter, MapStore
+
+_PAGE = 200
+_LOG_ERROR, _LOG_WARNING = 4, 3
+
+
+def failures_oldest_first(store: MapStore, wanted: FailureFilter) -> Iterator[FailureDetail]:
+    """Failures with their context, in the order in which they happened."""
+    rows, before = [], None
+    while page := store.fleet.failures(wanted, before=before, limit=_PAGE):
+        rows += [(row.happened_ns, row.number) for row in page]
+        before = page[-1].number
+    for _, number in sorted(rows):
+        yield store.fleet.failure(number)
+
+
+def as_plain(found: FailureDetail) -> dict[str, Any]:
+    """A failure as plain values; pictures by kind and place, without their bytes."""
+    report = report_dict(found.report)
+    report.pop("thumbnails")
+    row = {name: getattr(found.failure, name) for name in found.failure.__slots__}
+    pictures = [{"place": p.place, "kind": p.kind, "stamp_ns": p.stamp_ns, "bytes": p.bytes} for p in found.pictures]
+    plain: dict[str, Any] = finite({**row, "report": report, "pictures": pictures})
+    return plain
+
+
+def write_json_lines(store: MapStore, wanted: FailureFilter, path: Path) -> int:
+    """Writes one failure a line and returns their number; the file appears when it is whole."""
+    count = 0
+    with _appearing(path) as file:
+        for found in failures_oldest_first(store, wanted):
+            file.write(json.dumps(as_plain(found), sort_keys=True).encode() + b"\n")
+            count += 1
+    return count
+
+
+def write_mcap(store: MapStore, wanted: FailureFilter, path: Path) -> int:
+    """Writes failures as a log, a place in `map`, pictures and the whole report; returns their number."""
+    count = 0
+    with _appearing(path) as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start(profile="", library="fleetmap")
+        channels = {
+            topic: writer.register_channel(
+                topic, "json", writer.register_schema(name, "jsonschema", json.dumps(SCHEMAS[name]).encode())
+            )
+            for topic, name in _TOPICS.items()
+        }
+        for found in failures_oldest_first(store, wanted):
+            for topic, message in _messages(store, found):
+                stamp_ns = max(0, found.failure.happened_ns)
+                data = json.dumps(message).encode()
+                writer.add_message(channels[topic], log_time=stamp_ns, data=data, publish_time=stamp_ns, sequence=count)
+            count += 1
+        writer.finish()  # type: ignore[no-untyped-call]
+    return count
+
+
+_TOPICS = {
+    "/failures/log": "foxglove.Log",
+    "/failures/place": "foxglove.PoseInFrame",
+    "/failures/frame": "foxglove.CompressedImage",
+    "/failures/matches": "foxglove.CompressedImage",
+    "/failures/report": "fleetmap.Failure",
+}
+
+
+def _messages(store: MapStore, found: FailureDetail) -> Iterator[tuple[str, dict[str, Any]]]:
+    row, placed = found.failure, found.report.map_from_base
+    stamp = {"sec": max(0, row.happened_ns) // 10**9, "nsec": max(0, row.happened_ns) % 10**9}
+    words = f"{row.kind}: {row.cause}, {row.duration_s:.1f} s, version {row.version}, tile {row.tile}"
+    level = _LOG_WARNING if row.kind == "suspected" else _LOG_ERROR
+    yield (
+        "/failures/log",
+        {"timestamp": stamp, "level": level, "message": words, "name": row.robot, "file": row.site, "line": row.number},
+    )
+    if placed is not None:
+        (x, y, z), (qw, qx, qy, qz) = finite(list(placed.position_m)), finite(list(placed.quat_wxyz))
+        if None not in {x, y, z, qw, qx, qy, qz}:
+            place = {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}}
+            yield "/failures/place", {"timestamp": stamp, "frame_id": "map", "pose": place}
+    for picture in found.pictures:
+        data = base64.b64encode(store.fleet.picture(row.number, picture.place)).decode()
+        topic = "/failures/matches" if picture.kind == "matches" else "/failures/frame"
+        yield topic, {"timestamp": stamp, "frame_id": "cam0", "format": "jpeg", "data": data}
+    yield "/failures/report", as_plain(found)
+
+
+class _appearing:  # noqa: N801 - used as a function
+    """The file at a path, which appears there when the block ends well. Raises StoreError where the disk refuses."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._part = path, path.with_name(path.name + ".part")
+
+    def __enter__(self) -> BinaryIO:
+        try:
+            self._file = self._part.open("wb")
+        except OSError as error:
+            raise StoreError(f"{self._part} cannot be written ({error.strerror}); choose another place") from error
+        return self._file
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        self._file.close()
+        if kind is None:
+            self._part.replace(self._path)
+        else:
+            self._part.unlink(missing_ok=True)

@@ -1,0 +1,248 @@
+"""What the server knows about its robots: which version each should run, which it runs, what it said last."""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from fleetmap.errors import LinkError, UsageError
+from fleetmap.mapformat import check_name
+from fleetmap.messages import (
+    FailureAck,
+    FailureReport,
+    PoseMessage,
+    RobotAck,
+    RobotHealth,
+    WantedVersion,
+    decode_message,
+    report_dict,
+)
+from mapserver.fleet.ingest import Ingest, IngestSettings
+from mapserver.fleet.rejected_reports import RefusedReports, refused
+from mapserver.fleet.version_assignment import SitePlan, read_plan
+from mapserver.fleet_statistics.clock_skew import ClockSkew
+from mapserver.store import MapStore
+
+MAX_ROBOTS = 10_000
+MAX_STAMP_NS = 1 << 62  # what the store can hold
+_USUAL = IngestSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class RobotStatus:
+    """One robot. version: what it runs, None before it said so; seconds_since: since it said anything.
+
+    is_canary: whether it tries a version before the others. is_present: its liveliness token, None before the first look.
+    clock_ahead_s: by how much its wall clock is ahead of the server's, None before it told. last_ack, last_health and last_pose are
+    its last messages as plain values, None before the first.
+    """
+
+    site: str
+    robot: str
+    version: int | None
+    wanted_version: int | None
+    is_canary: bool
+    is_present: bool | None
+    clock_ahead_s: float | None
+    seconds_since: float
+    last_ack: dict[str, Any] | None
+    last_health: dict[str, Any] | None
+    last_pose: dict[str, Any] | None
+
+
+@dataclass(slots=True)
+class _Robot:
+    version: int | None = None
+    seen_ns: int = 0
+    report: dict[str, Any] = field(default_factory=dict)
+    last_estimate: PoseMessage | None = None
+    skew: ClockSkew = field(default_factory=ClockSkew)
+    is_present: bool | None = None
+
+
+class Fleet:
+    """Takes the robots' messages from any thread.
+
+    Acknowledgements and failures are on the disk when the method returns, health with the next `flush`; of poses the last one
+    is in memory. Messages for sites that the store does not have are refused, as are more than MAX_ROBOTS robots, so that
+    nobody can fill the disk by inventing names.
+    """
+
+    def __init__(
+        self, store: MapStore, *, settings: IngestSettings = _USUAL, clock_ns: Callable[[], int] = time.time_ns
+    ) -> None:
+        self._store = store
+        self._clock_ns = clock_ns
+        self._lock = threading.Lock()
+        self._ingest = Ingest(store, settings)
+        self._refused = RefusedReports(store.folder / "refused")
+        self._robots: dict[tuple[str, str], _Robot] = {}
+        for info in store.robots():
+            skew = ClockSkew(info.last_report.get("clock_ahead_s"))
+            self._robots[info.site, info.robot] = _Robot(
+                info.version, info.last_seen_ns, dict(info.last_report), skew=skew
+            )
+
+    def wanted_version(self, site: str, robot: str) -> WantedVersion:
+        """The version that a robot should run: its site's current one, or that which it tries before the others.
+
+        Raises UsageError for an unknown site.
+        """
+        return read_plan(self._store, site).wanted(robot)
+
+    def wanted_versions(self, site: str) -> dict[str, WantedVersion]:
+        """The same for all robots of a site that ever asked or said something."""
+        plan = read_plan(self._store, site)
+        return {robot: plan.wanted(robot) for robot in self.known_robots(site)}
+
+    def take_question(self, site: str, robot: str) -> WantedVersion:
+        """As `wanted_version`, asked by the robot itself: from then on it is known, and told of the next version."""
+        wanted = self.wanted_version(site, robot)
+        with self._lock:
+            if (site, robot) in self._robots or len(self._robots) < MAX_ROBOTS:
+                self._robots.setdefault((site, robot), _Robot()).seen_ns = self._clock_ns()
+        return wanted
+
+    def take_ack(self, site: str, robot: str, ack: RobotAck) -> None:
+        """Keeps an acknowledgement; raises LinkError for one that speaks for another robot."""
+        _check_sender(site, robot, ack)
+        now_ns = self._clock_ns()
+        with self._lock:
+            entry = self._entry(site, robot, now_ns, ack.version)
+            entry.report["ack"] = report_dict(ack)
+            report, version = dict(entry.report), entry.version
+        self._store.record_robot_report(site, robot, report, version)
+
+    def take_health(self, site: str, robot: str, health: RobotHealth) -> None:
+        """Counts a report and keeps it until the next `flush`; raises LinkError for one that speaks for another robot."""
+        _check_sender(site, robot, health)
+        now_ns = self._clock_ns()
+        with self._lock:
+            entry = self._entry(site, robot, now_ns, health.version)
+            if health.wall_ns is not None:
+                entry.skew.take(health.wall_ns, now_ns)
+                entry.report["clock_ahead_s"] = entry.skew.ahead_s
+            entry.report["health"] = finite(report_dict(health))
+            self._ingest.take_health(health, entry.last_estimate, now_ns, dict(entry.report), entry.version)
+
+    def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
+        """Keeps an estimate in memory."""
+        now_ns = self._clock_ns()
+        with self._lock:
+            self._entry(site, robot, now_ns, message.map_version).last_estimate = message
+            self._ingest.take_pose(site, robot, message)
+
+    def take_failure(self, site: str, robot: str, report: FailureReport) -> FailureAck:
+        """Keeps a failure, once however often it comes; on the disk when this returns.
+
+        What can never be kept is refused in the answer; StoreError where it may be later.
+        """
+        now_ns = self._clock_ns()
+        try:
+            _check_sender(site, robot, report)
+            check_name(robot, "robot")
+            _check_failure(report)
+            with self._lock:
+                ahead_s = self._entry(site, robot, now_ns, None).skew.ahead_s
+        except (LinkError, UsageError) as error:
+            return FailureAck(id=report.id, refused=str(error)[:2000])
+        self._ingest.take_failure(report, now_ns, ahead_s)
+        return FailureAck(id=report.id)
+
+    def take_failure_bytes(self, site: str, robot: str, payload: bytes) -> FailureAck:
+        """As `take_failure`, of an encoded report. One that is refused for good is set aside in the store's folder.
+
+        Raises LinkError for bytes that do not even say which report they are, StoreError where it may be kept later.
+        """
+        try:
+            ack = self.take_failure(site, robot, decode_message(payload, FailureReport))
+        except LinkError as error:
+            ack = refused(payload, str(error))
+        if ack.refused:
+            self._refused.keep(site, robot, payload, ack.refused, self._clock_ns())
+        return ack
+
+    def take_presence(self, present: Iterable[tuple[str, str]]) -> None:
+        """Notes which robots (site, name) show their liveliness token now; those that were never heard stay unknown."""
+        there = set(present)
+        with self._lock:
+            for key, robot in self._robots.items():
+                robot.is_present = key in there
+
+    def flush(self) -> None:
+        """Brings what was counted to the disk; raises StoreError where it refuses, and keeps it for the next time."""
+        self._ingest.flush()
+
+    def prune(self) -> int:
+        """Removes reports from the store that are too old or too many; returns how many rows went."""
+        return self._ingest.prune()
+
+    def known_robots(self, site: str) -> list[str]:
+        """Names of the site's robots that ever asked or said something."""
+        with self._lock:
+            return sorted(robot for key_site, robot in self._robots if key_site == site)
+
+    def robots(self, site: str | None = None) -> list[RobotStatus]:
+        """All robots (of a site), by site and name."""
+        now_ns = self._clock_ns()
+        with self._lock:
+            chosen = [(key, robot) for key, robot in sorted(self._robots.items()) if site in {None, key[0]}]
+        plans: dict[str, SitePlan] = {}
+        for key, _ in chosen:
+            if key[0] not in plans:
+                plans[key[0]] = read_plan(self._store, key[0])
+        return [_status(key, robot, plans[key[0]], now_ns) for key, robot in chosen]
+
+    def _entry(self, site: str, robot: str, now_ns: int, version: int | None) -> _Robot:
+        """The robot, seen now; `version` is what it says it runs. The caller holds the lock."""
+        entry = self._robots.get((site, robot))
+        if entry is None:
+            if site not in {info.site for info in self._store.sites()}:
+                raise LinkError(f"robot {robot!r} reports for site {site!r}, which this store does not have")
+            if len(self._robots) >= MAX_ROBOTS:
+                raise LinkError(f"robot {robot!r} is one more than the {MAX_ROBOTS} that this server keeps")
+            entry = self._robots.setdefault((site, robot), _Robot())
+        entry.version = version if version is not None else entry.version
+        entry.seen_ns = now_ns
+        return entry
+
+
+def _status(key: tuple[str, str], robot: _Robot, plan: SitePlan, now_ns: int) -> RobotStatus:
+    return RobotStatus(
+        site=key[0],
+        robot=key[1],
+        version=robot.version,
+        wanted_version=plan.wanted(key[1]).version,
+        is_canary=plan.is_canary(key[1]),
+        is_present=robot.is_present,
+        clock_ahead_s=robot.skew.ahead_s,
+        seconds_since=max(0, now_ns - robot.seen_ns) / 1e9,
+        last_ack=robot.report.get("ack"),
+        last_health=robot.report.get("health"),
+        last_pose=None if robot.last_estimate is None else finite(report_dict(robot.last_estimate)),
+    )
+
+
+def finite(value: Any) -> Any:
+    """Plain values with null for every number that JSON does not have."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _check_sender(site: str, robot: str, message: RobotAck | RobotHealth | FailureReport) -> None:
+    if (message.site, message.robot) != (site, robot):
+        raise LinkError(f"robot {robot!r} of {site!r} speaks for {message.robot!r} of {message.site!r}")
+    if abs(message.stamp_ns) > MAX_STAMP_NS:
+        raise LinkError(f"robot {robot!r} of {site!r} says it is {message.stamp_ns} ns; check its clock")
+
+
+def _check_failure(report: FailureReport) -> None:
+    if abs(report.wall_ns) > MAX_STAMP_NS or not 0 <= report.duration_s < math.inf:
+        raise LinkError(f"failure {report.id!r} began at {report.wall_ns} ns for {report.duration_s} s; that cannot be")
+    if any(abs(thumbnail.stamp_ns) > MAX_STAMP_NS for thumbnail in report.thumbnails):
+        raise LinkError(f"failure {report.id!r} has a picture of an impossible time")

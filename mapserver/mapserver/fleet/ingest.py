@@ -1,0 +1,230 @@
+"""What robots report, counted by the hour for the site, each robot, version, tile, cause, and arm of a canary."""
+
+import math
+import threading
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import msgspec
+
+from fleetmap.config import Section
+from fleetmap.errors import FleetmapError
+from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
+from mapserver.fleet_statistics.clock_skew import server_time_ns
+from mapserver.fleet_statistics.health_stream import RobotWatch
+from mapserver.fleet_statistics.kpis import Tally, hour_of
+from mapserver.store import CanaryRow, FleetBatch, FleetRetention, MapStore, TallyKey, TraceRow, tile_key
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
+OUTSIDE = "outside"
+"""Key of the tiles of positions that no tile of the version covers."""
+
+_PLAN_NS = 1_000_000_000
+_MAX_CAUSES = 64
+_MAX_KEPT_TRACES = 200_000
+_DAY_NS = 86_400_000_000_000
+
+
+class IngestSettings(Section, frozen=True):
+    """How often robots' reports go to the disk, how thinned, and how long they stay there."""
+
+    flush_every_s: Positive = 2.0
+    trace_every_s: Positive = 10.0
+    trace_days: Positive = 2.0
+    trace_rows: PositiveInt = 3_000_000
+    tally_days: Positive = 400.0
+    failure_days: Positive = 400.0
+    picture_bytes: PositiveInt = 1_000_000_000
+    prune_every_s: Positive = 600.0
+    presence_every_s: Positive = 5.0
+
+    def retention(self) -> FleetRetention:
+        """What stays in the store."""
+        return FleetRetention(self.tally_days, self.failure_days, self.picture_bytes, self.trace_days, self.trace_rows)
+
+
+@dataclass(slots=True)
+class _Stream:
+    watch: RobotWatch = field(default_factory=RobotWatch)
+    trace_ns: int = -(1 << 62)
+    status: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """Tiles of one version."""
+
+    size_m: float
+    cells: frozenset[tuple[int, int]]
+
+    def key(self, x_m: float, y_m: float) -> str:
+        """Key of the tile at a place."""
+        if not (math.isfinite(x_m) and math.isfinite(y_m)):
+            return OUTSIDE
+        return self.cell_key((math.floor(x_m / self.size_m), math.floor(y_m / self.size_m)))
+
+    def cell_key(self, cell: tuple[int, int]) -> str:
+        """Key of a tile, if the version has it: robots cannot make keys up."""
+        return (tile_key(cell) or OUTSIDE) if cell in self.cells else OUTSIDE
+
+
+class Ingest:
+    """Counts in memory what `flush` brings to the disk; failures go there at once. Methods may be called from any thread."""
+
+    def __init__(self, store: MapStore, settings: IngestSettings) -> None:
+        self._store = store
+        self._settings = settings
+        self._lock = threading.Lock()
+        self._flushing = threading.Lock()
+        self._batch = FleetBatch()
+        self._streams: dict[tuple[str, str], _Stream] = {}
+        self._grids: dict[tuple[str, int], _Grid | None] = {}
+        self._canaries: dict[str, CanaryRow] = {}
+        self._canaries_ns = -(1 << 62)
+        self._causes: dict[str, set[str]] = {}
+
+    def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
+        """Follows a robot's estimate, for its speed."""
+        with self._lock:
+            self._streams.setdefault((site, robot), _Stream()).watch.take_pose(message)
+
+    def take_health(
+        self,
+        health: RobotHealth,
+        estimate: PoseMessage | None,
+        now_ns: int,
+        report: dict[str, Any],
+        version: int | None,
+    ) -> None:
+        """Counts a report; `report` and `version` are what the store shall show of the robot."""
+        site, robot, hour = health.site, health.robot, hour_of(now_ns)
+        grid = self._grid(site, health.version)
+        canary = self._canary(site, now_ns)
+        with self._lock:
+            stream = self._streams.setdefault((site, robot), _Stream())
+            tally = stream.watch.take_health(health)
+            self._batch.last_reports[site, robot] = (version, now_ns, report)
+            if tally is None:
+                return
+            place = None if estimate is None or estimate.map_version != health.version else estimate.position_map_m
+            for axis, key in _keys(robot, _version_key(health.version, grid), _arm(canary, health.version)):
+                self._batch.add(site, axis, key, hour, tally)
+            if grid is not None and place is not None:
+                self._batch.add(site, "tile", grid.key(place[0], place[1]), hour, tally)
+            if self._is_trace_due(stream, health, now_ns):
+                self._batch.traces.append(_trace(health, place, hour))
+
+    def take_failure(self, report: FailureReport, now_ns: int, ahead_s: float | None) -> bool:
+        """Brings a failure to the disk with its sums; False for one that is there already. Raises StoreError."""
+        oldest_ns = now_ns - int(self._settings.failure_days * _DAY_NS)
+        happened_ns = server_time_ns(report.wall_ns, ahead_s, now_ns, oldest_ns)
+        grid = self._grid(report.site, report.version)
+        canary = self._canary(report.site, now_ns)
+        arm = _arm(canary, report.version) if canary is not None and happened_ns >= canary.started_ns else None
+        tally = Tally(suspected=1) if report.kind == "suspected" else Tally(failures=1)
+        tally.blind_failures = int(report.kind == "blind")
+        keys = _keys(report.robot, _version_key(report.version, grid), arm)
+        keys.append(("cause", self._cause(report.site, report.cause)))
+        if grid is not None and report.tile is not None:
+            keys.append(("tile", grid.cell_key(report.tile)))
+        tallies: dict[TallyKey, Tally] = {(report.site, *key, hour_of(happened_ns)): tally for key in keys}
+        return self._store.fleet.add_failure(report, received_ns=now_ns, happened_ns=happened_ns, tallies=tallies)
+
+    def flush(self) -> None:
+        """Brings what was counted to the disk. Raises StoreError, and keeps it for the next time."""
+        with self._flushing:
+            with self._lock:
+                batch, self._batch = self._batch, FleetBatch()
+            if not (batch.tallies or batch.last_reports):
+                return
+            try:
+                self._store.fleet.add(batch)
+            except FleetmapError:
+                with self._lock:
+                    self._put_back(batch)
+                raise
+
+    def prune(self) -> int:
+        """Removes from the store what is too old or too much; returns how many rows went."""
+        return self._store.fleet.prune(self._settings.retention())
+
+    def _put_back(self, batch: FleetBatch) -> None:
+        newer, self._batch = self._batch, batch
+        for (site, axis, key, hour), tally in newer.tallies.items():
+            batch.add(site, axis, key, hour, tally)
+        batch.last_reports |= newer.last_reports
+        kept = deque((*batch.traces, *newer.traces), maxlen=_MAX_KEPT_TRACES)
+        batch.traces = list(kept)
+
+    def _is_trace_due(self, stream: _Stream, health: RobotHealth, now_ns: int) -> bool:
+        """Thinned by time; a changed status is always kept."""
+        due = now_ns - stream.trace_ns >= self._settings.trace_every_s * 1e9 or health.status != stream.status
+        if due:
+            stream.trace_ns, stream.status = now_ns, health.status
+        return due
+
+    def _grid(self, site: str, version: int | None) -> _Grid | None:
+        """The tiles of a version; None for one that the store does not have."""
+        if version is None:
+            return None
+        if (site, version) not in self._grids:
+            try:
+                manifest = self._store.manifest(site, version)
+            except FleetmapError:
+                return None  # not remembered: it may be imported later
+            cells = frozenset((tile.x, tile.y) for tile in manifest.tiles)
+            self._grids[site, version] = _Grid(manifest.tile_size_m, cells)
+        return self._grids[site, version]
+
+    def _canary(self, site: str, now_ns: int) -> CanaryRow | None:
+        if not 0 <= now_ns - self._canaries_ns < _PLAN_NS:
+            self._canaries = {row.site: row for row in self._store.canaries(running=True)}
+            self._canaries_ns = now_ns
+        return self._canaries.get(site)
+
+    def _cause(self, site: str, cause: str) -> str:
+        with self._lock:
+            known = self._causes.setdefault(site, set())
+            if cause not in known and len(known) >= _MAX_CAUSES:
+                return "other"
+            known.add(cause)
+            return cause
+
+
+def _keys(robot: str, version: str, arm: str | None) -> list[tuple[str, str]]:
+    keys = [("site", ""), ("robot", robot), ("version", version)]
+    return keys if arm is None else [*keys, ("arm", arm)]
+
+
+def _version_key(version: int | None, grid: _Grid | None) -> str:
+    """Numbers of versions that the store has; robots cannot make keys up."""
+    return "none" if version is None else str(version) if grid is not None else "unknown"
+
+
+def _arm(canary: CanaryRow | None, version: int | None) -> str | None:
+    """The side of a canary's comparison that a robot is on; None for one that runs a third version."""
+    if canary is None or version not in {canary.version, canary.base_version}:
+        return None
+    return arm_key(canary.id, is_canary=version == canary.version)
+
+
+def arm_key(canary: int, *, is_canary: bool) -> str:
+    """Key of one side of a canary's comparison."""
+    return f"{canary}:{'canary' if is_canary else 'others'}"
+
+
+def _trace(health: RobotHealth, place: tuple[float, float, float] | None, hour: int) -> TraceRow:
+    radius_m = health.metrics.get("radius_95_m")
+    return TraceRow(
+        site=health.site,
+        robot=health.robot,
+        hour=hour,
+        stamp_ns=health.stamp_ns,
+        status=health.status,
+        version=health.version,
+        x_map_m=None if place is None else place[0],
+        y_map_m=None if place is None else place[1],
+        radius_95_m=float(radius_m) if isinstance(radius_m, int | float) else None,
+    )

@@ -1,0 +1,55 @@
+"""The re-survey list of a site out of its store, and the places in the current map through which a route can lead."""
+
+import math
+from dataclasses import dataclass
+
+from fleetmap.errors import FleetmapError
+from fleetmap.mapformat import TileEntry, decode_tile
+from mapserver.fleet_statistics.kpis import hour_of
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings, TileConcern, Waypoint, concerns, route
+from mapserver.store import MapStore
+
+
+@dataclass(frozen=True, slots=True)
+class ResurveyList:
+    """Tiles to survey again, the worst first, and a way through them; version: the current one, None without."""
+
+    site: str
+    version: int | None
+    tiles: list[TileConcern]
+    route: list[Waypoint]
+
+
+def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns: int) -> ResurveyList:
+    """The list as of now; raises UsageError for an unknown site."""
+    current = store.current(site)
+    now_hour = hour_of(now_ns)
+    recent_hour = now_hour - round(settings.recent_days * 24)
+    before_hour = recent_hour - round(settings.before_days * 24)
+    recent = store.fleet.tallies(site, "tile", since_hour=recent_hour)
+    before = store.fleet.tallies(site, "tile", since_hour=before_hour, until_hour=recent_hour)
+    found = concerns(
+        {key: tally for (_, key), tally in recent.items()},
+        {key: tally for (_, key), tally in before.items()},
+        settings,
+    )
+    if current is None:
+        return ResurveyList(site, None, found, [])
+    manifest = store.manifest(site, current.version)
+    entries = {f"{tile.x},{tile.y}": tile for tile in manifest.tiles}
+    places = {
+        concern.tile: _place(store, entries[concern.tile], manifest.tile_size_m)
+        for concern in found
+        if concern.tile in entries
+    }
+    return ResurveyList(site, current.version, found, route(found, places))
+
+
+def _place(store: MapStore, entry: TileEntry, size_m: float) -> tuple[float, float]:
+    """Where the survey stood nearest to the tile's middle, which can be driven to; the middle where it never stood there."""
+    middle = ((entry.x + 0.5) * size_m, (entry.y + 0.5) * size_m)
+    try:
+        stood = decode_tile(store.blob(entry.sha256)).map_from_cam[:, :2, 3]
+    except FleetmapError:
+        return middle  # a damaged tile needs a survey most of all
+    return min(((float(x), float(y)) for x, y in stood), key=lambda place: math.dist(place, middle), default=middle)

@@ -1,0 +1,67 @@
+"""What a shift leader's page shows, read from the store."""
+
+from dataclasses import dataclass
+
+from mapserver.fleet.canary_controller import find
+from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
+from mapserver.fleet_statistics.canary_test import CanaryFinding, CanarySettings
+from mapserver.fleet_statistics.kpis import HOUR_NS, Measures, Tally, hour_of, measures
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+from mapserver.store import CanaryRow, FailureFilter, FailureRow, MapStore
+
+_SHOWN_FAILURES = 50
+
+
+@dataclass(frozen=True, slots=True)
+class FleetSummary:
+    """One site over some hours. Tables are sorted, the worst first; by_hour: hour since 1970 and its figures."""
+
+    site: str
+    until_ns: int
+    hours: int
+    current_version: int | None
+    total: Measures
+    before: Measures
+    robots: list[tuple[str, Measures]]
+    versions: list[tuple[str, Measures]]
+    causes: list[tuple[str, Measures]]
+    by_hour: list[tuple[int, Measures]]
+    failures: list[FailureRow]
+    canary: tuple[CanaryRow, CanaryFinding] | None
+    resurvey: ResurveyList
+
+
+def summarise(
+    store: MapStore, site: str, hours: int, now_ns: int, canary: CanarySettings, resurvey: ResurveySettings
+) -> FleetSummary:
+    """The last `hours` of a site beside as many before; raises UsageError for an unknown site."""
+    current = store.current(site)
+    until = hour_of(now_ns) + 1
+    since = until - hours
+    tried = store.canaries(site)
+    wanted = FailureFilter(site=site, since_ns=since * HOUR_NS)
+    return FleetSummary(
+        site=site,
+        until_ns=now_ns,
+        hours=hours,
+        current_version=None if current is None else current.version,
+        total=_total(store, site, since, until),
+        before=_total(store, site, since - hours, since),
+        robots=_table(store, site, "robot", since),
+        versions=_table(store, site, "version", since),
+        causes=_table(store, site, "cause", since),
+        by_hour=[(hour, measures(tally)) for hour, tally in store.fleet.hours(site, "site", since_hour=since).items()],
+        failures=store.fleet.failures(wanted, limit=_SHOWN_FAILURES),
+        canary=(tried[0], find(store, tried[0], canary, now_ns)) if tried else None,
+        resurvey=resurvey_list(store, site, resurvey, now_ns),
+    )
+
+
+def _total(store: MapStore, site: str, since: int, until: int) -> Measures:
+    found = store.fleet.tallies(site, "site", since_hour=since, until_hour=until)
+    return measures(found.get((site, ""), Tally()))
+
+
+def _table(store: MapStore, site: str, axis: str, since: int) -> list[tuple[str, Measures]]:
+    rows = [(key, measures(tally)) for (_, key), tally in store.fleet.tallies(site, axis, since_hour=since).items()]
+    return sorted(rows, key=lambda row: (-row[1].failures.events, -row[1].silent_estimated.events, row[0]))

@@ -1,0 +1,40 @@
+"""Which version each robot of a site should run."""
+
+from dataclasses import dataclass
+
+from fleetmap.messages import WantedVersion
+from mapserver.fleet_statistics.canary_test import number_of
+from mapserver.store import CanaryRow, MapStore
+
+
+@dataclass(frozen=True, slots=True)
+class SitePlan:
+    """The current version, and the one that some robots try before the others; None where there is none."""
+
+    current: WantedVersion
+    canary: CanaryRow | None
+    tried: WantedVersion | None
+
+    def is_canary(self, robot: str) -> bool:
+        """Whether this robot tries a version before the others."""
+        canary = self.canary
+        return canary is not None and number_of(canary.site, canary.version, robot) < canary.threshold
+
+    def wanted(self, robot: str) -> WantedVersion:
+        """The version that this robot should run."""
+        return self.tried if self.tried is not None and self.is_canary(robot) else self.current
+
+
+def read_plan(store: MapStore, site: str) -> SitePlan:
+    """The plan of a site as it is now; raises UsageError for an unknown one."""
+    info = store.current(site)
+    current = WantedVersion(
+        site=site,
+        version=None if info is None else info.version,
+        manifest_sha256=None if info is None else info.manifest_sha256,
+    )
+    running = store.canaries(site, running=True)
+    if not running:
+        return SitePlan(current, None, None)
+    address = store.version(site, running[0].version).manifest_sha256
+    return SitePlan(current, running[0], WantedVersion(site=site, version=running[0].version, manifest_sha256=address))

@@ -1,0 +1,1 @@
+"""Statistics of a fleet: rates with intervals, canary and re-survey tests. Pure."""

@@ -1,0 +1,129 @@
+"""A version tried by some robots first: which robots, and whether they fail more often than the others. Pure.
+
+Two questions are asked of the same counts. Harm: may the canary's failures still come from a rate within the margin? They are
+weighed as they come, by an e-value (a mixture of likelihood ratios given the number of all failures): by Ville's inequality one
+that ever reaches 1/alpha is an error in at most a share alpha of harmless canaries, however often it is looked at, as long as
+the arms' shares of driving stay as they are. Proof: is the canary's rate within the margin, with so much confidence, by the
+posterior of both rates (Jeffreys' prior)?
+"""
+
+import hashlib
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from scipy.special import gammainc, gammaincinv
+
+from fleetmap.config import Section
+from mapserver.fleet_statistics.kpis import Rate, Tally, rate
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Probability = Annotated[float, msgspec.Meta(gt=0, lt=1)]
+Action = Literal["wait", "promote", "roll_back"]
+DAY_NS = 86_400_000_000_000
+
+_WORSE_BY = np.geomspace(1.25, 50.0, 16)  # how much worse than the margin the alternatives are
+_QUANTILES = (np.arange(400) + 0.5) / 400
+
+
+class CanarySettings(Section, frozen=True):
+    """How a canary is chosen and judged. The margin: margin_ratio times the others' rate plus margin_per_robot_day.
+
+    share: of the robots, when a command names none. alpha: chance to take back a harmless version. confidence: to promote.
+    """
+
+    share: Probability = 0.05
+    margin_ratio: Annotated[float, msgspec.Meta(ge=1)] = 1.5
+    margin_per_robot_day: Annotated[float, msgspec.Meta(ge=0)] = 0.5
+    alpha: Probability = 0.01
+    confidence: Probability = 0.95
+    min_robot_days: Positive = 3.0
+    max_days: Positive = 7.0
+    check_every_s: Positive = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class CanaryFinding:
+    """What the counts say. evidence: against the canary, harm from 1/alpha on; within_margin: probability that it is."""
+
+    action: Action
+    reason: str
+    canary: Rate
+    others: Rate
+    evidence: float
+    within_margin: float
+
+
+def number_of(site: str, version: int, robot: str) -> float:
+    """A robot's number in [0, 1) for a canary: always the same, and as if drawn anew for each version."""
+    digest = hashlib.sha256(f"{site}/{version}/{robot}".encode()).digest()
+    return int.from_bytes(digest[:6], "big") / float(1 << 48)
+
+
+def threshold_for(share: float, site: str, version: int, robots: Iterable[str]) -> float:
+    """The number below which robots take part: `share`, or as much more as one of `robots` needs to."""
+    numbers = [number_of(site, version, robot) for robot in robots]
+    return max(share, math.nextafter(min(numbers), 1.0)) if numbers else share
+
+
+def judge_canary(canary: Tally, others: Tally, age_days: float, settings: CanarySettings) -> CanaryFinding:
+    """Whether to wait, promote or roll back, given what both arms did since the canary began."""
+    ours, theirs = rate(canary.events, canary.robot_days), rate(others.events, others.robot_days)
+    evidence = evidence_of_harm(ours, theirs, settings.margin_ratio)
+    within = within_margin(ours, theirs, settings.margin_ratio, settings.margin_per_robot_day)
+    action: Action
+    if evidence >= 1 / settings.alpha and 1 - within >= settings.confidence:
+        action, why = "roll_back", f"it fails more often than the margin allows (evidence {evidence:.0f} to 1)"
+    elif ours.robot_days >= settings.min_robot_days and within >= settings.confidence:
+        action, why = "promote", f"its rate is within the margin with {within:.1%}"
+    elif age_days >= settings.max_days:
+        action, why = (
+            "roll_back",
+            f"after {age_days:.1f} days it is still not shown to be within the margin ({within:.1%})",
+        )
+    else:
+        action, why = "wait", _why_wait(ours, theirs, within, evidence)
+    margin = f"{settings.margin_ratio:g} times the others' rate + {settings.margin_per_robot_day:g} per robot-day"
+    reason = f"{why}; canary {_told(ours)}, others {_told(theirs)}, margin {margin}"
+    return CanaryFinding(action, reason, ours, theirs, evidence, within)
+
+
+def evidence_of_harm(canary: Rate, others: Rate, margin_ratio: float) -> float:
+    """The e-value against "the canary's rate is at most margin_ratio times the others'"; 1 where nothing was driven."""
+    if canary.robot_days <= 0 or others.robot_days <= 0:
+        return 1.0
+    odds = margin_ratio * canary.robot_days / others.robot_days
+    expected, alternative = odds / (1 + odds), odds * _WORSE_BY / (1 + odds * _WORSE_BY)
+    log_ratio = canary.events * np.log(alternative / expected) + others.events * np.log(
+        (1 - alternative) / (1 - expected)
+    )
+    return float(np.mean(np.exp(np.minimum(log_ratio, 600.0))))
+
+
+def within_margin(canary: Rate, others: Rate, margin_ratio: float, margin_per_robot_day: float) -> float:
+    """The probability that the canary's rate is within the margin; 0.5 where nothing was driven."""
+    if canary.robot_days <= 0 or others.robot_days <= 0:
+        return 0.5
+    other_rates = gammaincinv(others.events + 0.5, _QUANTILES) / others.robot_days
+    limits = margin_ratio * other_rates + margin_per_robot_day
+    return float(np.mean(gammainc(canary.events + 0.5, canary.robot_days * limits)))
+
+
+def _why_wait(canary: Rate, others: Rate, within: float, evidence: float) -> str:
+    if canary.robot_days <= 0 or others.robot_days <= 0:
+        return (
+            f"nothing can be said before robots drive with {'it' if canary.robot_days <= 0 else 'the version before'}"
+        )
+    return f"too early to tell: within the margin with {within:.1%}, evidence of harm {evidence:.2g} to 1"
+
+
+def _told(found: Rate) -> str:
+    if found.per_robot_day is None:
+        return f"{found.events} failures before anything was driven"
+    return (
+        f"{found.events} in {found.robot_days:.3g} robot-days ({found.per_robot_day:.3g} per robot-day, "
+        f"{found.low:.3g} to {found.high:.3g})"
+    )

@@ -1,0 +1,164 @@
+"""What one robot's stream of messages adds to the fleet's sums. Pure: time comes with the messages."""
+
+import math
+
+from fleetmap.messages import PoseMessage, RobotHealth
+from mapserver.fleet_statistics.kpis import Tally
+
+MAX_GAP_S = 5.0  # a robot that is silent for longer was not observed meanwhile
+DRIVING_MPS = 0.05
+BLIND_S, GOOD_S, RADIUS_LIMIT_M = 2.0, 5.0, 0.30  # as docs/reports.md defines failures
+WRONG_M = 0.30
+CHI2_6_0999 = 22.458  # 99.9 % of a squared Mahalanobis distance of 6 degrees of freedom
+_MAX_COUNT = 1 << 40
+_MAX_FIGURE = 1e15
+
+
+class RobotWatch:
+    """Follows one robot: runs, driving, first fixes, blindness. Reports must come in the order of their stamps."""
+
+    def __init__(self) -> None:
+        self.duplicates = 0
+        self._stamp_ns: int | None = None
+        self._wall_ns: int | None = None
+        self._figures: dict[str, float] = {}
+        self._has_fix = False
+        self._fix_counted = False
+        self._blind_since_ns: int | None = None
+        self._good_since_ns: int | None = None
+        self._jump_ns: int | None = None
+        self._silent_ms = 0
+        self._watched_ns = 0  # time that reports cover since the first fix, by which blindness is measured
+        self._in_failure = False
+        self._place: tuple[int, float, float] | None = None
+        self._pose_mps: float | None = None
+
+    def take_pose(self, message: PoseMessage) -> None:
+        """Speed between estimates, for robots that do not report it themselves."""
+        x_m, y_m, _ = message.position_map_m
+        if self._place is not None:
+            dt_s = (message.stamp_ns - self._place[0]) * 1e-9
+            moved_m = math.hypot(x_m - self._place[1], y_m - self._place[2])
+            self._pose_mps = moved_m / dt_s if 0 < dt_s <= MAX_GAP_S and math.isfinite(moved_m) else None
+        self._place = (message.stamp_ns, x_m, y_m)
+
+    def take_health(self, health: RobotHealth) -> Tally | None:
+        """What this report adds; None for one that was taken before."""
+        if self._is_known(health):
+            self.duplicates += 1
+            return None
+        figures = _figures(health)
+        if self._is_new_run(health, figures):
+            self._begin_run()
+        dt_ms = self._elapsed_ms(health)
+        tally = Tally(reports=1, observed_ms=dt_ms)
+        speed_mps = figures.get("speed_mps", self._pose_mps)
+        tally.driving_ms = dt_ms if speed_mps is not None and abs(speed_mps) >= DRIVING_MPS else 0
+        self._count_status(tally, health, figures, dt_ms)
+        self._count_fixes(tally, health.stamp_ns, figures)
+        self._count_work(tally, figures)
+        self._stamp_ns, self._wall_ns, self._figures = health.stamp_ns, health.wall_ns, figures
+        return tally
+
+    def _is_known(self, health: RobotHealth) -> bool:
+        """A recording that is played again has old stamps, but is sent later."""
+        if self._stamp_ns is None or health.stamp_ns > self._stamp_ns:
+            return False
+        if health.wall_ns is None or self._wall_ns is None:
+            return health.stamp_ns == self._stamp_ns
+        return health.wall_ns <= self._wall_ns
+
+    def _is_new_run(self, health: RobotHealth, figures: dict[str, float]) -> bool:
+        if self._stamp_ns is None:
+            return True
+        went_back = figures.get("frames", math.inf) < self._figures.get("frames", -math.inf)
+        return went_back or health.stamp_ns < self._stamp_ns
+
+    def _begin_run(self) -> None:
+        self._stamp_ns, self._figures = None, {}
+        self._has_fix = self._fix_counted = self._in_failure = False
+        self._blind_since_ns = self._good_since_ns = self._jump_ns = None
+
+    def _elapsed_ms(self, health: RobotHealth) -> int:
+        """By the robot's wall clock, which goes on while its cameras are silent; without one by the frames' stamps."""
+        if self._stamp_ns is None:
+            return 0
+        dt_ms = (health.stamp_ns - self._stamp_ns) // 1_000_000
+        if health.wall_ns is not None and self._wall_ns is not None:
+            dt_ms = (health.wall_ns - self._wall_ns) // 1_000_000
+        return dt_ms if 0 < dt_ms <= MAX_GAP_S * 1e3 else 0
+
+    def _is_stale(self, health: RobotHealth, dt_ms: int) -> bool:
+        """Whether no frame came for so long that the status speaks of the past. Ends with the next frame."""
+        self._silent_ms = self._silent_ms + dt_ms if health.stamp_ns == self._stamp_ns else 0
+        return self._silent_ms > BLIND_S * 1e3
+
+    def _count_status(self, tally: Tally, health: RobotHealth, figures: dict[str, float], dt_ms: int) -> None:
+        is_stale = self._is_stale(health, dt_ms)
+        is_tracking = health.status == "TRACKING" and not is_stale
+        is_close = figures.get("radius_95_m", math.inf) <= RADIUS_LIMIT_M and not is_stale
+        is_blind = is_stale or health.status in {"LOST", "AMBIGUOUS"} or (health.status == "DEGRADED" and not is_close)
+        self._has_fix = self._has_fix or is_tracking or "first_fix_s" in figures
+        tally.usable_ms = dt_ms if is_tracking or (health.status == "DEGRADED" and is_close) else 0
+        if self._has_fix:
+            tally.after_fix_ms = dt_ms
+            tally.localised_ms = dt_ms if is_tracking else 0
+            self._watched_ns += dt_ms * 1_000_000
+            tally.blind_seen = self._blindness(self._watched_ns, dt_ms, is_blind, is_tracking)
+
+    def _blindness(self, watched_ns: int, dt_ms: int, is_blind: bool, is_tracking: bool) -> int:
+        """1 where a stretch of blindness became a failure with this report.
+
+        A stretch lasts until the next report that is better, and a failure until 5 s of good tracking.
+        """
+        if dt_ms == 0:
+            self._blind_since_ns = self._good_since_ns = None  # nobody knows what was in between
+        began = self._blind_since_ns is not None and watched_ns - self._blind_since_ns > BLIND_S * 1e9
+        if not is_blind:
+            self._blind_since_ns = None
+        elif self._blind_since_ns is None:
+            self._blind_since_ns = watched_ns
+        if not is_tracking:
+            self._good_since_ns = None
+        elif self._good_since_ns is None:
+            self._good_since_ns = watched_ns
+        is_new = began and not self._in_failure
+        self._in_failure = self._in_failure or began
+        if self._good_since_ns is not None and watched_ns - self._good_since_ns >= GOOD_S * 1e9:
+            self._in_failure = False
+        return int(is_new)
+
+    def _count_fixes(self, tally: Tally, stamp_ns: int, figures: dict[str, float]) -> None:
+        if "first_fix_s" in figures and not self._fix_counted:
+            self._fix_counted = True
+            tally.first_fixes, tally.first_fix_ms = 1, round(min(abs(figures["first_fix_s"]), 1e6) * 1e3)
+        innovation = figures.get("fix_innovation")
+        if innovation is not None:
+            tally.innovations, tally.innovation_sum = 1, innovation
+            tally.innovation_m_sum = figures.get("fix_innovation_m", 0.0)
+            tally.exceeded = int(innovation > CHI2_6_0999)
+        if self._has_fix and figures.get("fix_innovation_m", 0.0) > WRONG_M:
+            # The estimate was wrong before, or is now. Jumps without 5 s between them are one; one within a failure belongs to it.
+            is_new = self._jump_ns is None or stamp_ns - self._jump_ns >= GOOD_S * 1e9
+            tally.jumps = int(is_new and not self._in_failure)
+            self._jump_ns = stamp_ns
+        dock_m = figures.get("dock_error_m")
+        if dock_m is not None:
+            tally.docks, tally.docks_wrong = 1, int(dock_m > WRONG_M)
+
+    def _count_work(self, tally: Tally, figures: dict[str, float]) -> None:
+        if "frame_ms_mean" in figures:
+            tally.cpu_reports, tally.cpu_ms_sum = 1, figures["frame_ms_mean"]
+        for name in ("frames", "frames_dropped", "landmarks_expected", "landmarks_seen"):
+            if name in figures:
+                grown = figures[name] - self._figures.get(name, 0.0 if self._figures else figures[name])
+                setattr(tally, name, int(min(max(0.0, grown), _MAX_COUNT)))
+
+
+def _figures(health: RobotHealth) -> dict[str, float]:
+    """The metrics that are numbers; what is absurd or none was not told."""
+    return {
+        name: float(value)
+        for name, value in health.metrics.items()
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MAX_FIGURE
+    }

@@ -1,0 +1,140 @@
+"""Which tiles should be surveyed again, and a route through them. Pure.
+
+A tile is listed where robots fail clearly more often than before (or, without a before, than elsewhere on the site), or where they
+find clearly fewer of the landmarks that they look for.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import msgspec
+from scipy.special import betainc
+
+from fleetmap.config import Section
+from mapserver.fleet_statistics.kpis import Rate, Tally, measures, rate
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class ResurveySettings(Section, frozen=True):
+    """What is recent, what is before, and how much worse the recent must be.
+
+    rising_ratio: how often the rate before must be exceeded, with at most a chance of alpha that it is not; fading: by how much the
+    share of found landmarks fell.
+    """
+
+    recent_days: Positive = 2.0
+    before_days: Positive = 14.0
+    min_failures: Annotated[int, msgspec.Meta(ge=1)] = 3
+    rising_ratio: Annotated[float, msgspec.Meta(ge=1)] = 1.5
+    alpha: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.01
+    fading: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.15
+    min_landmarks: Annotated[int, msgspec.Meta(ge=1)] = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class TileConcern:
+    """A tile "x,y" that should be surveyed again. landmarks_seen_*: share found of those looked for, None where none was."""
+
+    tile: str
+    reasons: list[str]
+    failures: Rate
+    failures_before: Rate
+    landmarks_seen_share: float | None
+    landmarks_seen_share_before: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Waypoint:
+    """A place to drive to, in `map`."""
+
+    tile: str
+    x_map_m: float
+    y_map_m: float
+    reason: str
+
+
+def concerns(recent: Mapping[str, Tally], before: Mapping[str, Tally], settings: ResurveySettings) -> list[TileConcern]:
+    """The tiles to survey again, the worst first. recent, before: sums by tile."""
+    total = Tally()
+    for tally in recent.values():
+        total.add(tally)
+    tests = max(1, len(recent))
+    found = []
+    for tile, now in recent.items():
+        if "," not in tile:
+            continue
+        then = before.get(tile, Tally())
+        reasons = [*_rising(now, then, total, settings, tests), *_fading(now, then, settings)]
+        if reasons:
+            old, new = measures(then).landmarks_seen_share, measures(now).landmarks_seen_share
+            both = (rate(now.events, now.robot_days), rate(then.events, then.robot_days))
+            found.append(TileConcern(tile, reasons, *both, new, old))
+    return sorted(found, key=lambda concern: (-concern.failures.events, concern.tile))
+
+
+def route(concerned: Sequence[TileConcern], places: Mapping[str, tuple[float, float]]) -> list[Waypoint]:
+    """A way through the tiles, each time to the nearest that is left, from the worst on. places: where to go in each tile."""
+    left = [concern for concern in concerned if concern.tile in places]
+    way: list[Waypoint] = []
+    while left:
+        here = (way[-1].x_map_m, way[-1].y_map_m) if way else places[left[0].tile]
+        best = min(left, key=lambda concern: (math.dist(here, places[concern.tile]), concern.tile))
+        left.remove(best)
+        way.append(Waypoint(best.tile, *places[best.tile], "; ".join(best.reasons)))
+    return way
+
+
+def route_csv(way: Sequence[Waypoint]) -> str:
+    """The route as CSV: one waypoint a line, metres in `map`."""
+    lines = ["number,x_map_m,y_map_m,tile,reason"]
+    for number, point in enumerate(way, start=1):
+        reason = point.reason.replace('"', "'")
+        lines.append(f'{number},{point.x_map_m:.3f},{point.y_map_m:.3f},"{point.tile}","{reason}"')
+    return "\n".join(lines) + "\n"
+
+
+def route_geojson(site: str, version: int, way: Sequence[Waypoint]) -> dict[str, Any]:
+    """The route in GeoJSON's form (RFC 7946), with metres in `map` in the place of degrees."""
+    points: list[dict[str, Any]] = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Point", "coordinates": [round(p.x_map_m, 3), round(p.y_map_m, 3)]},
+            "properties": {"number": number, "tile": p.tile, "reason": p.reason},
+        }
+        for number, p in enumerate(way, start=1)
+    ]
+    line = [point["geometry"]["coordinates"] for point in points]
+    lines = [{"type": "Feature", "geometry": {"type": "LineString", "coordinates": line}, "properties": {}}]
+    return {
+        "type": "FeatureCollection", "site": site, "version": version, "units": "metres in map",
+        "features": points + (lines if len(line) > 1 else []),
+    }  # fmt: skip
+
+
+def _rising(now: Tally, then: Tally, total: Tally, settings: ResurveySettings, tests: int) -> list[str]:
+    """The exact conditional test of two Poisson rates (Przyborowski and Wilenski 1940), Bonferroni over the site's tiles."""
+    if now.events < settings.min_failures:
+        return []
+    elsewhere_days = total.robot_days - now.robot_days
+    if then.driving_ms > 0:
+        events, days, words = then.events, then.robot_days, "before"
+    elif elsewhere_days > 0:
+        events, days, words = total.events - now.events, elsewhere_days, "elsewhere on the site"
+    else:
+        return []
+    odds = settings.rising_ratio * max(now.robot_days, 1e-6) / days
+    chance = float(betainc(now.events, events + 1, odds / (1 + odds)))
+    if chance * tests > settings.alpha:
+        return []
+    told = f"{now.events} failures in {now.driving_ms / 3.6e6:.1f} h of driving, {events} in {days * 16:.1f} h {words}"
+    return [told]
+
+
+def _fading(now: Tally, then: Tally, settings: ResurveySettings) -> list[str]:
+    new, old = measures(now).landmarks_seen_share, measures(then).landmarks_seen_share
+    if new is None or old is None or min(now.landmarks_expected, then.landmarks_expected) < settings.min_landmarks:
+        return []
+    return [f"{new:.0%} of the landmarks are found, {old:.0%} before"] if new < old - settings.fading else []

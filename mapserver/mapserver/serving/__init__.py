@@ -1,0 +1,1 @@
+"""Maps and reports on the bus, and the server's background tasks."""

@@ -1,0 +1,65 @@
+"""What the server does by itself beside answering: announce versions, bring counts to the disk, look at canaries."""
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fleetmap.errors import FleetmapError
+from mapserver.build.job_lock import end_interrupted
+from mapserver.config import MapserverConfig
+from mapserver.fleet.canary_controller import review
+from mapserver.fleet.fleet import Fleet
+from mapserver.serving.bus_service import TileService
+from mapserver.store import MapStore
+
+_ANNOUNCE_EVERY_S = 1.0
+_LOOK_EVERY_S = 0.2
+_JOBS_EVERY_S = 20.0
+_log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class Chore:
+    """Something to do again and again."""
+
+    name: str
+    every_s: float
+    act: Callable[[], object]
+    due_s: float = 0.0
+
+
+def server_chores(store: MapStore, fleet: Fleet, service: TileService, settings: MapserverConfig) -> list[Chore]:
+    """All chores of a server."""
+    ingest = settings.ingest
+    return [
+        Chore("announcing versions", _ANNOUNCE_EVERY_S, service.announce_changes),
+        Chore("keeping reports", ingest.flush_every_s, fleet.flush),
+        Chore("looking for robots", ingest.presence_every_s, service.look_for_robots),
+        Chore("removing old reports", ingest.prune_every_s, fleet.prune),
+        Chore("looking for jobs that were killed", _JOBS_EVERY_S, lambda: end_interrupted(store, time.time_ns())),
+        Chore(
+            "looking at canaries",
+            settings.canary.check_every_s,
+            lambda: review(store, settings.canary, time.time_ns()),
+        ),
+    ]
+
+
+async def run_chores(chores: list[Chore]) -> None:
+    """Does them in turn, in a thread, until it is cancelled. One that fails is tried again at its next time."""
+    while True:
+        for chore in chores:
+            if time.monotonic() < chore.due_s:
+                continue
+            try:
+                await asyncio.to_thread(chore.act)
+            except FleetmapError as error:
+                # A store that is busy for a moment must not stop the server; robots also ask by themselves.
+                _log.warning("%s failed: %s", chore.name, error)
+            except Exception:
+                # A fault of ours in one chore must not end the others.
+                _log.exception("%s failed", chore.name)
+            chore.due_s = time.monotonic() + chore.every_s
+        await asyncio.sleep(_LOOK_EVERY_S)

@@ -1,0 +1,198 @@
+"""The server's side of the bus: answers for versions, manifests, bytes and patches, hears the robots, announces versions."""
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+
+from fleetmap.bus import Bus, Handle
+from fleetmap.errors import FleetmapError, LinkError, MapFormatError
+from fleetmap.mapformat import check_name, decode_manifest, make_patch
+from fleetmap.messages import (
+    PoseMessage,
+    RobotAck,
+    RobotHealth,
+    blob_key,
+    decode_message,
+    encode_message,
+    manifest_key,
+    part_of,
+    patch_key,
+    robot_key,
+    split_key,
+)
+from mapserver.fleet.fleet import Fleet
+from mapserver.serving.authorization_cache import RecentKinds
+from mapserver.serving.byte_cache import RecentBytes
+from mapserver.store import MapStore
+
+Count = Callable[[str, str, int], None]
+"""Counts for metrics: (what, "ok" or "refused", bytes sent)."""
+
+_log = logging.getLogger(__name__)
+_RECENT_BYTES = 64_000_000
+_RECENT_PATCHES_BYTES = 32_000_000
+_PATCH_SHARE = 0.7  # of the whole, above which a patch is not worth its work
+_PATCHED_KINDS = {"tile", "manifest"}
+_PREPARE_S = 10.0  # in all: longer would keep robots and other chores waiting
+
+
+class TileService:
+    """Serves a store on a bus from its making to `close`. Reads what other processes publish meanwhile.
+
+    Bytes go out in parts; what was sent last is kept in memory, because robots ask for the same things at the same time.
+    """
+
+    def __init__(self, store: MapStore, fleet: Fleet, bus: Bus, count: Count) -> None:
+        self._store = store
+        self._fleet = fleet
+        self._bus = bus
+        self._count = count
+        self._announced: dict[tuple[str, str], str | None] = {}
+        self._recent = RecentBytes(_RECENT_BYTES)
+        self._patches = RecentBytes(_RECENT_PATCHES_BYTES)
+        self._patching = threading.Lock()
+        self._kinds = RecentKinds(store.served_kind)
+        self._handles: list[Handle] = [
+            bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
+            bus.queryable(robot_key("*", "*", "failures"), self._counted("failure", self._failure)),
+            bus.queryable(manifest_key("*", "*"), self._counted("manifest", self._parts(self._manifest))),
+            bus.queryable(blob_key("*", "*"), self._counted("blob", self._parts(self._blob))),
+            bus.queryable(patch_key("*", "*", "*"), self._counted("patch", self._parts(self._patch))),
+            *(bus.subscribe(robot_key("*", "*", what), self._hear) for what in ("ack", "health", "pose")),
+        ]
+
+    def announce_changes(self) -> list[str]:
+        """Tells every known robot whose wanted version changed since the last call; returns the sites where somebody was told.
+
+        The first call tells all of them, because they may have missed what happened while no server ran. The patches that they will
+        ask for, all at once, are made before they are told, as far as `_PREPARE_S` goes.
+        """
+        changed, until_s = [], time.monotonic() + _PREPARE_S
+        for info in self._store.sites():
+            robots = self._fleet.wanted_versions(info.site)
+            moves = Counter((self._announced.get((info.site, robot)), w.manifest_sha256) for robot, w in robots.items())
+            for (base, result), _ in moves.most_common():
+                if base is not None and result is not None and base != result:
+                    self._prepare(info.site, base, result, until_s)
+            for robot, wanted in robots.items():
+                key, address = (info.site, robot), wanted.manifest_sha256
+                if key not in self._announced or self._announced[key] != address:
+                    self._bus.publish(robot_key(info.site, robot, "wanted"), encode_message(wanted))
+                    self._announced[key] = address
+                    changed.append(info.site)
+        return sorted(set(changed))
+
+    def look_for_robots(self) -> None:
+        """Notes which robots are present on the bus now."""
+        keys = (split_key(key) for key in self._bus.alive(robot_key("*", "*", "alive")))
+        self._fleet.take_presence((site, robot) for site, robot, _ in keys)
+
+    def close(self) -> None:
+        """Answers no more."""
+        for handle in self._handles:
+            handle.close()
+
+    def _counted(self, what: str, answer: Callable[[str, bytes], bytes]) -> Callable[[str, bytes], bytes]:
+        def counted(key: str, payload: bytes) -> bytes:
+            try:
+                data = answer(key, payload)
+            except FleetmapError:
+                self._count(what, "refused", 0)
+                raise
+            self._count(what, "ok", len(data))
+            return data
+
+        return counted
+
+    def _parts(self, whole: Callable[[str], bytes]) -> Callable[[str, bytes], bytes]:
+        return lambda key, question: part_of(whole(key), question)
+
+    def _wanted(self, key: str, _: bytes) -> bytes:
+        site, robot, _what = split_key(key)
+        return encode_message(self._fleet.take_question(site, check_name(robot, "robot")))
+
+    def _failure(self, key: str, payload: bytes) -> bytes:
+        site, robot, _what = split_key(key)
+        ack = self._fleet.take_failure_bytes(site, robot, payload)
+        if ack.refused:
+            self._count("failure refused for good", "refused", 0)
+        return encode_message(ack)
+
+    def _manifest(self, key: str) -> bytes:
+        site, _what, number = split_key(key)
+        if not number.isdecimal() or len(number) > 10:
+            raise LinkError(f"{number[:80]!r} is no version number; ask {manifest_key(site, 'NUMBER')}")
+        info = self._store.version(site, int(number))
+        if info.state == "draft":
+            raise LinkError(f"version {number} of site {site} is a draft; robots get published versions only")
+        return self._read(info.manifest_sha256)
+
+    def _blob(self, key: str) -> bytes:
+        site, _what, sha256 = split_key(key)
+        if self._kinds.get(sha256, site) is None:
+            raise LinkError(f"site {site} has no published bytes {sha256}; fetch its current manifest again")
+        return self._read(sha256)
+
+    def _patch(self, key: str) -> bytes:
+        """What makes one published thing of a site out of another; refused where it would not be much smaller."""
+        site, _what, addresses = split_key(key)
+        base, _, result = addresses.partition("-")
+        kinds = {self._kinds.get(sha256, site) for sha256 in (base, result)}
+        if len(kinds) != 1 or not kinds <= _PATCHED_KINDS:
+            raise LinkError(f"site {site} has no published pair {addresses[:160]} of one kind; fetch the whole")
+        patch = self._patches.get(addresses, lambda: self._made_patch(base, result))
+        if not patch:
+            raise LinkError(f"a patch from {base} is not much smaller than {result}; fetch the whole")
+        return patch
+
+    def _prepare(self, site: str, base: str, result: str, until_s: float) -> None:
+        """Makes the patches from one version to another, by their manifests' addresses; what fails is made, or refused, when asked."""
+        try:
+            old, new = (decode_manifest(self._read(sha256)) for sha256 in (base, result))
+            known = {(tile.x, tile.y): tile.sha256 for tile in old.tiles}
+        except FleetmapError as error:
+            _log.info("patches from %s to %s are made when they are asked for: %s", base, result, error)
+            return
+        pairs = [(base, result), *((known.get((tile.x, tile.y)), tile.sha256) for tile in new.tiles)]
+        for before, after in pairs:
+            if before is not None and before != after and time.monotonic() < until_s:
+                with suppress(FleetmapError):  # not worth it, or not to be had: whoever asks is told
+                    self._patch(patch_key(site, before, after))
+
+    def _made_patch(self, base: str, result: str) -> bytes:
+        """The patch; nothing where it is not worth it, which is kept as well.
+
+        One at a time: several threads that work on patches would take turns with an operator's request, and it waits for each.
+        """
+        whole = self._read(result)
+        try:
+            with self._patching:
+                patch = make_patch(self._read(base), whole)
+        except MapFormatError as error:
+            _log.info("no patch from %s to %s: %s", base, result, error)
+            return b""
+        return patch if len(patch) <= _PATCH_SHARE * len(whole) else b""
+
+    def _read(self, sha256: str) -> bytes:
+        return self._recent.get(sha256, lambda: self._store.blob(sha256))
+
+    def _hear(self, key: str, payload: bytes) -> None:
+        what = key.rpartition("/")[2]
+        try:
+            site, robot, _ = split_key(key)
+            check_name(robot, "robot")
+            if what == "ack":
+                self._fleet.take_ack(site, robot, decode_message(payload, RobotAck))
+            elif what == "health":
+                self._fleet.take_health(site, robot, decode_message(payload, RobotHealth))
+            else:
+                self._fleet.take_pose(site, robot, decode_message(payload, PoseMessage))
+        except FleetmapError as error:
+            # Nobody waits for an answer to what was published: the log and the metric are where it can be seen.
+            _log.warning("message under %s refused: %s", key, error)
+            self._count(what, "refused", 0)
+        else:
+            self._count(what, "ok", 0)

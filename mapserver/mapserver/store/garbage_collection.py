@@ -1,0 +1,110 @@
+"""Removing what nobody needs: versions beyond retention, bytes that nothing mentions, what killed processes left."""
+
+import sqlite3
+from dataclasses import dataclass, field
+
+from mapserver.store.blobs import BlobFolder
+from mapserver.store.lifecycle import ROLLBACK_TARGET
+from mapserver.store.rows import Actor, VersionInfo
+from mapserver.store.transactions import Ledger
+
+_DAY_NS = 86_400_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Retention:
+    """What stays. keep_versions, keep_drafts: the newest of each site, besides those that are protected anyway.
+
+    keep_days: how long a retired version or superfluous draft stays; robot_days: how long a silent robot counts as
+    using the version that it reported.
+    """
+
+    keep_versions: int = 5
+    keep_drafts: int = 3
+    keep_days: float = 7.0
+    robot_days: float = 30.0
+
+
+@dataclass(slots=True)
+class Garbage:
+    """What was done, or would be: (site, version) retired and removed, files and bytes freed."""
+
+    retired: list[tuple[str, int]] = field(default_factory=list)
+    removed: list[tuple[str, int]] = field(default_factory=list)
+    files: int = 0
+    freed_bytes: int = 0
+
+
+def collect(ledger: Ledger, blobs: BlobFolder, retention: Retention, *, dry_run: bool, actor: Actor) -> Garbage:
+    """Removes versions first, which must be on the disk before the first file goes. The caller holds the lock alone.
+
+    Never touched: current versions, those that some robots try, what a rollback would go to, what a robot runs, the vocabularies of sites.
+    """
+    garbage = Garbage()
+    if dry_run:
+        _plan(ledger, retention, garbage)
+    else:
+        with ledger.write() as connection:
+            _plan(ledger, retention, garbage)
+            _write_down(ledger, connection, garbage, actor)
+    kept = _mentioned(ledger, set(garbage.removed) if dry_run else set())
+    for sha256 in sorted(blobs.addresses() - kept):
+        path = blobs.path(sha256)
+        garbage.freed_bytes += path.stat().st_size if dry_run else blobs.remove_file(path)
+        garbage.files += 1
+    for path in blobs.strangers():
+        garbage.freed_bytes += path.stat().st_size if dry_run else blobs.remove_file(path)
+        garbage.files += 1
+    return garbage
+
+
+def _plan(ledger: Ledger, retention: Retention, garbage: Garbage) -> None:
+    now_ns = ledger.now_ns()
+    old_ns = now_ns - int(retention.keep_days * _DAY_NS)
+    for row in ledger.query("SELECT site FROM sites ORDER BY site"):
+        site = row["site"]
+        versions = [VersionInfo(**v) for v in ledger.query("SELECT * FROM versions WHERE site = ?", (site,))]
+        needed = _protected(ledger, site, now_ns - int(retention.robot_days * _DAY_NS))
+        published = sorted(
+            (v for v in versions if v.state == "published"),
+            key=lambda v: (v.published_ns or 0, v.version),
+            reverse=True,
+        )
+        surplus = [v for v in published[retention.keep_versions :] if v.version not in needed]
+        garbage.retired += [(site, v.version) for v in surplus]
+        drafts = sorted((v.version for v in versions if v.state == "draft"), reverse=True)[retention.keep_drafts :]
+        gone = [v for v in versions if v.state == "retired" and (v.retired_ns or 0) <= old_ns]
+        gone += surplus if retention.keep_days <= 0 else []
+        gone += [v for v in versions if v.version in drafts and v.saved_ns <= old_ns]
+        garbage.removed += sorted((site, v.version) for v in gone if v.version not in needed)
+
+
+def _protected(ledger: Ledger, site: str, seen_since_ns: int) -> set[int]:
+    current = ledger.query("SELECT version FROM versions WHERE site = ? AND state = 'current'", (site,))
+    robots = ledger.query(
+        "SELECT DISTINCT version FROM robots WHERE site = ? AND version IS NOT NULL AND last_seen_ns >= ?",
+        (site, seen_since_ns),
+    )
+    tried = ledger.query("SELECT version FROM canaries WHERE site = ? AND state = 'running'", (site,))
+    before = ledger.query(ROLLBACK_TARGET.replace(":site", "?1"), (site,))
+    return {row["version"] for row in (*current, *robots, *tried, *before)}
+
+
+def _write_down(ledger: Ledger, connection: sqlite3.Connection, garbage: Garbage, actor: Actor) -> None:
+    for site, version in garbage.retired:
+        connection.execute(
+            "UPDATE versions SET state = 'retired', retired_ns = ? WHERE site = ? AND version = ?",
+            (ledger.now_ns(), site, version),
+        )
+        ledger.log(connection, site, "retired", f"version {version}", version=version, actor=actor)
+    for site, version in garbage.removed:
+        for table in ("currents", "verdicts", "evidence", "version_blobs", "versions"):
+            connection.execute(f"DELETE FROM {table} WHERE site = ? AND version = ?", (site, version))
+        ledger.log(connection, site, "removed", f"version {version}", version=version, actor=actor)
+
+
+def _mentioned(ledger: Ledger, leaving: set[tuple[str, int]]) -> set[str]:
+    rows = ledger.query("SELECT site, version, sha256 FROM version_blobs")
+    kept = {row["sha256"] for row in rows if (row["site"], row["version"]) not in leaving}
+    vocabularies = ledger.query("SELECT vocabulary_sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL")
+    return kept | {row["vocabulary_sha256"] for row in vocabularies}

@@ -1,0 +1,1 @@
+"""Bundle adjustment: factors, the reduced system, rounds with outlier removal."""

@@ -1,0 +1,149 @@
+"""What bundle adjustment is asked and what it answers, as values.
+
+Perturbations, here and in every information and covariance: rotation first, in the axes of the target frame, about the
+source's origin. For map_from_body that is R <- Exp(rot) R, p <- p + trans, both in map axes; for i_from_j in the axes
+of i.
+"""
+
+from dataclasses import dataclass, field, replace
+from math import inf
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.config import Section
+from fleetmap.geometry import AnyArray, Array
+from fleetmap.inertial import Preintegrated, preintegrate
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.samples import ImuSamples
+
+
+@dataclass(frozen=True)
+class RelativeTerm:
+    """A measured i_from_j (4, 4) between keyframes i and j; information (6, 6) of a perturbation in the axes of i."""
+
+    i: int
+    j: int
+    i_from_j: Array
+    information: Array
+
+
+@dataclass(frozen=True)
+class PriorTerm:
+    """Where keyframe k is known to be: map_from_body (4, 4); information (6, 6) of a perturbation in map axes."""
+
+    k: int
+    map_from_body: Array
+    information: Array
+
+
+@dataclass(frozen=True)
+class MotionPrior:
+    """What is known of keyframe k's motion and biases; a sigma of inf says nothing.
+
+    mean (9,): velocity in map m/s, gyro bias rad/s, accelerometer bias m/s^2; sigma (9,).
+    """
+
+    k: int
+    mean: Array
+    sigma: Array
+
+
+@dataclass
+class InertialTerms:
+    """Motion between keyframes as the IMU felt it.
+
+    velocities_map_mps, gyro_bias_radps, accel_bias_mps2 (K, 3). edges: (i, j, Preintegrated), j after i.
+    fixed (K,): motion and biases that are held, none without it.
+    """
+
+    velocities_map_mps: Array
+    gyro_bias_radps: Array
+    accel_bias_mps2: Array
+    edges: list[tuple[int, int, Preintegrated]]
+    priors: list[MotionPrior] = field(default_factory=list)
+    fixed: NDArray[np.bool_] | None = None
+
+
+@dataclass
+class BundleProblem:
+    """K keyframes, N landmarks, M observations.
+
+    map_from_body (K, 4, 4); fixed (K,): held keyframes. With gauge "yaw_position" a held keyframe (the first one, where
+    none is named) keeps its yaw and position and gravity decides its roll and pitch. points_map (N, 3). obs_pixels (M,
+    3): u_left, v, u_right, NaN without a right image. obs_sigma_px (M, 2): of u_left and v, and of the disparity u_left
+    - u_right; the three are taken as independent. points_held: keyframes alone move.
+    """
+
+    camera: StereoCamera
+    body_from_cam: Array
+    map_from_body: Array
+    fixed: NDArray[np.bool_]
+    points_map: Array
+    obs_keyframe: AnyArray
+    obs_landmark: AnyArray
+    obs_pixels: Array
+    obs_sigma_px: Array
+    inertial: InertialTerms | None = None
+    relative: list[RelativeTerm] = field(default_factory=list)
+    priors: list[PriorTerm] = field(default_factory=list)
+    gauge: Literal["pose", "yaw_position"] = "pose"
+    points_held: bool = False
+
+
+class BundleSettings(Section, frozen=True):
+    """How hard bundle adjustment tries. Widths are in sigmas of an observation's residual."""
+
+    max_iterations: int = 10
+    huber_sigmas: float = 2.5
+    cutoff_sigmas: float = inf  # observations farther off have no influence
+    lambda_start: float = 1e-4
+    relative_cost_tolerance: float = 1e-4
+    dense_unknowns: int = 1500  # reduced systems up to this size are solved by dense Cholesky
+    sparse_couplings: float = (
+        40.0  # for each keyframe; up to so many sparse factorisation is quicker than conjugate gradients
+    )
+    pcg_tolerance: float = 1e-4
+    pcg_max_iterations: int = 300  # then the step is solved again by sparse factorisation
+
+
+@dataclass(frozen=True)
+class BundleResult:
+    """The optimum.
+
+    map_from_body (K, 4, 4), points_map (N, 3); velocities and biases (K, 3), None without inertial terms. costs: half
+    the robust sum of squares at the start and after every accepted step. squared_sigmas (M,): each observation's
+    squared residual in sigmas, in the problem's order, huge for points behind the camera. solver: dense, pcg or sparse,
+    the last one used.
+    """
+
+    map_from_body: Array
+    points_map: Array
+    velocities_map_mps: Array | None
+    gyro_bias_radps: Array | None
+    accel_bias_mps2: Array | None
+    costs: list[float]
+    squared_sigmas: Array
+    iterations: int
+    converged: bool
+    solver: str
+
+
+def continued(
+    problem: BundleProblem, result: BundleResult, imu: ImuSamples | None = None, noise: ImuNoise | None = None
+) -> BundleProblem:
+    """`problem` at the values of `result`; with samples, its inertial edges preintegrated again at the new biases."""
+    moved = replace(problem, map_from_body=result.map_from_body, points_map=result.points_map)
+    inertial, gyro, accel = problem.inertial, result.gyro_bias_radps, result.accel_bias_mps2
+    if inertial is None or result.velocities_map_mps is None or gyro is None or accel is None:
+        return moved
+    edges = inertial.edges
+    if imu is not None:
+        known = noise or ImuNoise()
+        edges = [(i, j, preintegrate(imu, e.start_ns, e.end_ns, gyro[i], accel[i], known)) for i, j, e in edges]
+    moved.inertial = replace(
+        inertial, velocities_map_mps=result.velocities_map_mps, gyro_bias_radps=gyro, accel_bias_mps2=accel, edges=edges
+    )
+    return moved

@@ -1,0 +1,212 @@
+"""Solving the reduced system: dense where small, else by conjugate gradients, else by sparse factorisation."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
+
+from fleetmap.geometry import AnyArray, Array
+from mapserver.survey.bundle.problem import BundleSettings
+from mapserver.survey.bundle.reduced_system_kernels import conjugate_gradients, factor_chains, fill_lower
+from mapserver.survey.bundle.sparsity import Structure
+
+
+@dataclass(frozen=True)
+class Chains:
+    """The inertial edges' order: edge_slots (E, 2), -1 for held keyframes; sequence and link (P,) as in the kernels.
+
+    layouts: that of the sparse matrix, once it was asked for.
+    """
+
+    edge_slots: AnyArray
+    sequence: AnyArray
+    link: AnyArray
+    layouts: list["SparseLayout"] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class ReducedSystem:
+    """S x = rhs over the slots; damp (P, D) is a diagonal added to S."""
+
+    structure: Structure
+    chains: Chains
+    blocks: Array
+    edge_blocks: Array
+    damp: Array
+    rhs: Array
+
+
+def build_chains(edge_slots: AnyArray, count: int) -> Chains:
+    """Every slot after its predecessor. An edge that would branch or close a ring is left out of the links only."""
+    link = np.full(count, -1, np.int64)
+    successor = np.full(count, -1, np.int64)
+    end_of = np.arange(count)  # for each chain's first slot its last one, and the other way round
+    for e, (i, j) in enumerate(edge_slots):
+        if i >= 0 and j >= 0 and link[j] < 0 and successor[i] < 0 and end_of[i] != j:
+            link[j], successor[i] = e, j
+            first, last = end_of[i], end_of[j]
+            end_of[first], end_of[last] = last, first
+    sequence = []
+    for head in np.nonzero(link < 0)[0]:
+        slot = int(head)
+        while slot >= 0:
+            sequence.append(slot)
+            slot = int(successor[slot])
+    return Chains(edge_slots, np.array(sequence, np.int64), link)
+
+
+def solve_reduced(system: ReducedSystem, settings: BundleSettings, last: str) -> tuple[Array | None, str]:
+    """The step (P, D), None where S is not positive definite, and which solver gave it.
+
+    `last` solved the problem's last system: where conjugate gradients have stalled once, they are not tried again. Along a
+    drive they need hundreds of iterations, but there few keyframes see the same, and factors stay sparse.
+    """
+    if system.rhs.size <= settings.dense_unknowns:
+        return solve_dense(system), "dense"
+    along_a_drive = len(system.blocks) <= settings.sparse_couplings * len(system.rhs)
+    step = None if last == "sparse" or along_a_drive else solve_pcg(system, settings)
+    return (step, "pcg") if step is not None else (solve_sparse(system), "sparse")
+
+
+def dense_lower(system: ReducedSystem) -> Array:
+    """S as a dense (PD, PD) array in Fortran order whose upper triangle is valid (and equals the lower one of S)."""
+    unknowns, s = system.rhs.size, system.structure
+    lower = np.zeros((unknowns, unknowns))
+    fill_lower(
+        system.blocks, s.row_ptr, s.cols, system.chains.edge_slots, system.edge_blocks, system.damp, s.free, lower
+    )
+    return lower.T
+
+
+def solve_dense(system: ReducedSystem) -> Array | None:
+    """The step by Cholesky."""
+    try:
+        factor = scipy.linalg.cho_factor(dense_lower(system), lower=False, overwrite_a=True, check_finite=False)
+    except scipy.linalg.LinAlgError:
+        return None
+    step = scipy.linalg.cho_solve(factor, system.rhs.ravel(), check_finite=False)
+    return np.asarray(step, np.float64).reshape(system.rhs.shape)
+
+
+def marginal_blocks(system: ReducedSystem, slots: AnyArray) -> Array:
+    """(n, 6, 6) pose blocks of the inverse of S, dense; scaled first, as biases and metres differ by magnitudes."""
+    upper = dense_lower(system)
+    scale = 1.0 / np.sqrt(np.diag(upper))
+    factor = scipy.linalg.cho_factor(upper * np.outer(scale, scale), lower=False, overwrite_a=True, check_finite=False)
+    rows = (system.rhs.shape[1] * slots[:, None] + np.arange(6)).astype(np.int64)
+    units = np.zeros((len(upper), rows.size))
+    units[rows.ravel(), np.arange(rows.size)] = scale[rows.ravel()]
+    columns = scipy.linalg.cho_solve(factor, units, check_finite=False) * scale[:, None]
+    return np.array([columns[rows[n], 6 * n : 6 * n + 6] for n in range(len(slots))]).reshape(-1, 6, 6)
+
+
+def solve_pcg(system: ReducedSystem, settings: BundleSettings) -> Array | None:
+    """The step by preconditioned conjugate gradients, None where they stall."""
+    count, size = system.rhs.shape
+    s, chains = system.structure, system.chains
+    inverses, couplings, step = np.empty((count, size, size)), np.empty((count, size, size)), np.empty((count, size))
+    try:
+        factor_chains(
+            system.blocks, s.row_ptr, chains.edge_slots, system.edge_blocks, system.damp, s.free, chains.sequence,
+            chains.link, inverses, couplings,
+        )  # fmt: skip
+    except np.linalg.LinAlgError:
+        return None
+    iterations = conjugate_gradients(
+        system.blocks, s.row_ptr, s.cols, chains.edge_slots, system.edge_blocks, system.damp, s.free, chains.sequence,
+        chains.link, inverses, couplings, system.rhs, settings.pcg_tolerance, settings.pcg_max_iterations, step,
+    )  # fmt: skip
+    return step if iterations >= 0 else None
+
+
+def solve_sparse(system: ReducedSystem) -> Array | None:
+    """The step by sparse LU without pivoting, fill reduced by minimum degree."""
+    layouts = system.chains.layouts
+    order = layouts[0].order if layouts else np.arange(system.rhs.size)
+    layout = layouts[0] if layouts else SparseLayout.of(system, order)
+    try:
+        factor = _factor(layout.matrix(system), "NATURAL" if layouts else "MMD_AT_PLUS_A")
+    except RuntimeError:  # exactly singular
+        return None
+    if not layouts:  # minimum degree is not asked again for systems of the same structure
+        layouts.append(SparseLayout.of(system, np.argsort(factor.perm_c)))
+    step = np.empty(system.rhs.size)
+    step[order] = factor.solve(system.rhs.ravel()[order])
+    return step.reshape(system.rhs.shape) if np.isfinite(step).all() else None
+
+
+def _factor(matrix: scipy.sparse.csc_array, order: Literal["NATURAL", "MMD_AT_PLUS_A"]) -> Any:
+    return scipy.sparse.linalg.splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+@dataclass(frozen=True)
+class SparseLayout:
+    """Where a problem's numbers lie in the sparse matrix of each of its systems, unknowns in an order that fills in little.
+
+    order (U,): the unknowns by their place in the matrix. entries: of all numbers of a system those that count, in the matrix's
+    order; starts: the first of each group that is summed; indices, indptr as in a CSC matrix.
+    """
+
+    order: AnyArray
+    entries: AnyArray
+    starts: AnyArray
+    indices: AnyArray
+    indptr: AnyArray
+
+    @classmethod
+    def of(cls, system: ReducedSystem, order: AnyArray) -> "SparseLayout":
+        """The layout of all systems with the structure of this one."""
+        count, held = system.rhs.size, ~system.structure.free.ravel()
+        place = np.empty(count, np.int64)
+        place[order] = np.arange(count)
+        rows, cols = _unknowns(system)
+        # numbers of held unknowns are dropped, but for the last ones, which are the diagonal's
+        used = (rows >= 0) & (cols >= 0) & ~(held[rows] | held[cols])
+        used[len(rows) - count :] = True
+        entries = np.flatnonzero(used).astype(np.int32)
+        codes = place[cols[entries]] * count + place[rows[entries]]
+        del rows, cols, used  # there are millions
+        sequence = np.argsort(codes, kind="stable")
+        entries, codes = entries[sequence], codes[sequence]
+        starts = np.flatnonzero(np.diff(codes, prepend=-1))
+        indptr = np.searchsorted(codes[starts] // count, np.arange(count + 1))
+        return cls(order, entries, starts, (codes[starts] % count).astype(np.int32), indptr.astype(np.int32))
+
+    def matrix(self, system: ReducedSystem) -> scipy.sparse.csc_array:
+        """S with rows and columns in `order`; unknowns that are held have a one on the diagonal."""
+        damp = np.where(system.structure.free, system.damp, 1.0)
+        values = np.concatenate(
+            [system.blocks.ravel(), system.blocks[_below(system)].ravel(), system.edge_blocks.ravel(), damp.ravel()]
+        )
+        data = np.add.reduceat(values[self.entries], self.starts)
+        return scipy.sparse.csc_array((data, self.indices, self.indptr), shape=(len(self.order),) * 2)
+
+
+def _block_rows(system: ReducedSystem) -> AnyArray:
+    s = system.structure
+    return np.repeat(np.arange(len(s.row_ptr) - 1), np.diff(s.row_ptr))
+
+
+def _below(system: ReducedSystem) -> AnyArray:
+    """(B,) which image blocks lie beside the diagonal, and so count a second time above it."""
+    return np.asarray(_block_rows(system) != system.structure.cols)
+
+
+def _unknowns(system: ReducedSystem) -> tuple[AnyArray, AnyArray]:
+    """Row and column of every number of a system: image blocks, those mirrored, edge blocks, diagonal; -1 for held keyframes."""
+    size, s = system.rhs.shape[1], system.structure
+    shape = (len(s.cols), 6, 6)
+    six = np.arange(6, dtype=np.int32)
+    row = np.broadcast_to(size * _block_rows(system).astype(np.int32)[:, None, None] + six[:, None], shape)
+    col = np.broadcast_to(size * s.cols.astype(np.int32)[:, None, None] + six, shape)
+    below = _below(system)
+    slots = np.repeat(system.chains.edge_slots.reshape(-1, 2), 15, axis=1)
+    ends = np.where(slots >= 0, size * slots + np.tile(np.arange(15), 2), -1).astype(np.int32)
+    along = np.repeat(ends[:, :, None], 30, axis=2)
+    diagonal = np.arange(system.rhs.size, dtype=np.int32)
+    rows = [row.ravel(), col[below].ravel(), along.ravel(), diagonal]
+    cols = [col.ravel(), row[below].ravel(), along.transpose(0, 2, 1).ravel(), diagonal]
+    return np.concatenate(rows), np.concatenate(cols)

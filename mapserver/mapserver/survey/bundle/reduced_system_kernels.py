@@ -1,0 +1,203 @@
+"""Inner loops of the reduced system S: blocks (B, 6, 6) of poses by row, inertial edges (E, 30, 30) and a diagonal.
+
+P slots of D = 6 or 15 unknowns. `free` (P, D) tells which move; held ones keep a unit diagonal and a zero step.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import AnyArray, Array
+from fleetmap.numerics.kernel import kernel
+
+Mask = NDArray[np.bool_]
+
+
+@kernel
+def fill_lower(
+    blocks: Array,
+    row_ptr: AnyArray,
+    cols: AnyArray,
+    edge_slots: AnyArray,
+    edge_blocks: Array,
+    damp: Array,
+    free: Mask,
+    lower: Array,
+) -> None:
+    """Adds S to the zeroed dense `lower` (PD, PD); only its lower triangle is complete."""
+    count, size = free.shape
+    width = blocks.shape[1]
+    for p in range(count):
+        for s in range(row_ptr[p], row_ptr[p + 1]):
+            q = cols[s]
+            for a in range(width):
+                for b in range(width):
+                    if free[p, a] and free[q, b]:
+                        lower[p * size + a, q * size + b] += blocks[s, a, b]
+        for a in range(size):
+            lower[p * size + a, p * size + a] += damp[p, a] if free[p, a] else 1.0
+    for e in range(len(edge_slots)):
+        for x in range(2):
+            for y in range(2):
+                p, q = edge_slots[e, x], edge_slots[e, y]
+                if p < 0 or q < 0 or q > p:
+                    continue
+                for a in range(size):
+                    for b in range(size):
+                        if free[p, a] and free[q, b]:
+                            lower[p * size + a, q * size + b] += edge_blocks[e, 15 * x + a, 15 * y + b]
+
+
+@kernel
+def multiply(
+    blocks: Array,
+    row_ptr: AnyArray,
+    cols: AnyArray,
+    edge_slots: AnyArray,
+    edge_blocks: Array,
+    damp: Array,
+    free: Mask,
+    x: Array,
+    out: Array,
+) -> None:
+    """out = S x for x (P, D) that is zero where held."""
+    count, size = free.shape
+    for p in range(count):
+        for a in range(size):
+            out[p, a] = damp[p, a] * x[p, a]
+    for p in range(count):
+        for s in range(row_ptr[p], row_ptr[p + 1]):
+            q, block = cols[s], blocks[s]
+            for a in range(6):
+                total = 0.0
+                for b in range(6):
+                    total += block[a, b] * x[q, b]
+                out[p, a] += total
+            if q != p:
+                for a in range(6):
+                    value = x[p, a]
+                    for b in range(6):
+                        out[q, b] += block[a, b] * value
+    for e in range(len(edge_slots)):
+        for side in range(2):
+            p = edge_slots[e, side]
+            if p < 0:
+                continue
+            for a in range(size):
+                total = 0.0
+                for other in range(2):
+                    q = edge_slots[e, other]
+                    if q >= 0:
+                        for b in range(size):
+                            total += edge_blocks[e, 15 * side + a, 15 * other + b] * x[q, b]
+                out[p, a] += total
+    for p in range(count):
+        for a in range(size):
+            if not free[p, a]:
+                out[p, a] = 0.0
+
+
+@kernel
+def factor_chains(
+    blocks: Array, row_ptr: AnyArray, edge_slots: AnyArray, edge_blocks: Array, damp: Array, free: Mask,
+    sequence: AnyArray, link: AnyArray, inverses: Array, couplings: Array,
+) -> None:  # fmt: skip
+    """Factors S without its off-diagonal image blocks: block-diagonal but for the inertial chains.
+
+    sequence (P,): slots, each after its predecessor. link (P,): the edge to the predecessor, -1 for none. Fills
+    inverses (P, D, D) of the pivots and couplings (P, D, D) from the predecessor. Positive definite, since the images'
+    block diagonal and the edges each are.
+    """
+    count, size = free.shape
+    for p in range(count):
+        inverses[p] = 0.0
+        couplings[p] = 0.0
+        for a in range(6):
+            for b in range(6):
+                inverses[p, a, b] = blocks[row_ptr[p + 1] - 1, a, b]
+        for a in range(size):
+            inverses[p, a, a] += damp[p, a]
+    for e in range(len(edge_slots)):
+        for side in range(2):
+            p = edge_slots[e, side]
+            if p >= 0:
+                for a in range(size):
+                    for b in range(size):
+                        inverses[p, a, b] += edge_blocks[e, 15 * side + a, 15 * side + b]
+    for n in range(count):
+        p = sequence[n]
+        for a in range(size):
+            for b in range(size):
+                if not (free[p, a] and free[p, b]):
+                    inverses[p, a, b] = 1.0 if a == b else 0.0
+        e = link[p]
+        if e >= 0:
+            side = 1 if edge_slots[e, 1] == p else 0
+            before = edge_slots[e, 1 - side]
+            for a in range(size):
+                for b in range(size):
+                    if free[p, a] and free[before, b]:
+                        couplings[p, a, b] = edge_blocks[e, 15 * side + a, 15 * (1 - side) + b]
+            inverses[p] -= np.dot(np.dot(couplings[p], inverses[before]), couplings[p].T)
+        inverses[p] = np.linalg.inv(inverses[p])
+
+
+@kernel
+def solve_chains(
+    inverses: Array, couplings: Array, edge_slots: AnyArray, sequence: AnyArray, link: AnyArray, x: Array, out: Array
+) -> None:
+    """out (P, D) = what `factor_chains` factored, applied inversely to x."""
+    count, size = x.shape
+    for n in range(count):
+        p = sequence[n]
+        for a in range(size):
+            out[p, a] = x[p, a]
+        e = link[p]
+        if e >= 0:
+            before = edge_slots[e, 0] if edge_slots[e, 1] == p else edge_slots[e, 1]
+            for a in range(size):
+                for b in range(size):
+                    out[p, a] -= couplings[p, a, b] * out[before, b]
+        # out now holds inverse pivot times the forward residual, which is all that successors need
+        out[p] = np.dot(inverses[p], out[p])
+    for n in range(count - 1, -1, -1):
+        p = sequence[n]
+        e = link[p]
+        if e >= 0:
+            before = edge_slots[e, 0] if edge_slots[e, 1] == p else edge_slots[e, 1]
+            pull = np.dot(couplings[p].T, out[p])
+            out[before] -= np.dot(inverses[before], pull)
+
+
+@kernel
+def conjugate_gradients(
+    blocks: Array, row_ptr: AnyArray, cols: AnyArray, edge_slots: AnyArray, edge_blocks: Array, damp: Array, free: Mask,
+    sequence: AnyArray, link: AnyArray, inverses: Array, couplings: Array, rhs: Array, tolerance: float,
+    max_iterations: int, x: Array,
+) -> int:  # fmt: skip
+    """Solves S x = rhs from zero; returns the iterations, -1 where the preconditioned residual stays too large.
+
+    Source: Saad, Iterative Methods for Sparse Linear Systems, algorithm 9.1.
+    """
+    x[:, :] = 0.0
+    residual, direction, image, preconditioned = rhs.copy(), np.empty_like(rhs), np.empty_like(rhs), np.empty_like(rhs)
+    solve_chains(inverses, couplings, edge_slots, sequence, link, residual, preconditioned)
+    direction[:, :] = preconditioned
+    size = np.sum(residual * preconditioned)
+    enough = tolerance * tolerance * size
+    if size == 0.0:
+        return 0
+    for iteration in range(max_iterations):
+        multiply(blocks, row_ptr, cols, edge_slots, edge_blocks, damp, free, direction, image)
+        curvature = np.sum(direction * image)
+        if not curvature > 0.0:
+            return -1
+        x += (size / curvature) * direction
+        residual -= (size / curvature) * image
+        solve_chains(inverses, couplings, edge_slots, sequence, link, residual, preconditioned)
+        smaller = np.sum(residual * preconditioned)
+        if smaller <= enough:
+            return iteration + 1
+        direction *= smaller / size
+        direction += preconditioned
+        size = smaller
+    return -1

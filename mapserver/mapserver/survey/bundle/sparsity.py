@@ -1,0 +1,157 @@
+"""Which unknown sits where: observations sorted by landmark, keyframes to slots, the reduced system's block pattern."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import SurveyError
+from fleetmap.geometry import AnyArray, Array
+from mapserver.survey.bundle.problem import BundleProblem
+from mapserver.survey.bundle.schur_kernels import count_row_blocks
+
+Indices = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Structure:
+    """The fixed part of one problem; M observations sorted by landmark, P keyframes with unknowns, B blocks.
+
+    order (M,): the problem's index of each observation. pixels (M, 3): u, v, disparity. weights (M, 2): 1 / sigma.
+    slots (K,): -1 without unknowns. free (P, 6 or 15): which unknowns move. Row p's blocks are row_ptr[p]:row_ptr[p +
+    1] with columns `cols` ascending up to p itself.
+    """
+
+    order: AnyArray
+    keyframes: Indices
+    landmarks: Indices
+    landmark_ptr: AnyArray
+    pixels: Array
+    weights: Array
+    slots: Indices
+    slot_keyframes: Indices
+    slot_ptr: AnyArray
+    slot_obs: Indices
+    free: NDArray[np.bool_]
+    row_ptr: AnyArray
+    cols: Indices
+
+    def block_of(self, row: int, col: int) -> int:
+        """Index of the block of slots (row, col), col <= row; the pattern must hold it."""
+        start, end = int(self.row_ptr[row]), int(self.row_ptr[row + 1])
+        return start + int(np.searchsorted(self.cols[start:end], col))
+
+
+def build_structure(problem: BundleProblem) -> Structure:
+    """The structure of `problem`; SurveyError where nothing holds the map in place."""
+    _check(problem)
+    order = np.argsort(problem.obs_landmark, kind="stable")
+    keyframes = np.asarray(problem.obs_keyframe, np.int32)[order]
+    landmarks = np.asarray(problem.obs_landmark, np.int32)[order]
+    landmark_ptr = np.searchsorted(landmarks, np.arange(len(problem.points_map) + 1))
+    pixels, weights = _measurements(problem, order)
+    moves = _free_unknowns(problem)
+    slot_keyframes = np.nonzero(moves.any(axis=1))[0].astype(np.int32)
+    slots = np.full(len(moves), -1, np.int32)
+    slots[slot_keyframes] = np.arange(len(slot_keyframes))
+    slot_ptr, slot_obs = _observations_by_slot(slots, keyframes, len(slot_keyframes))
+    row_ptr, cols = _pattern(problem, slots, keyframes, landmarks, landmark_ptr, slot_ptr, slot_obs)
+    return Structure(
+        order=order,
+        keyframes=keyframes,
+        landmarks=landmarks,
+        landmark_ptr=landmark_ptr,
+        pixels=pixels,
+        weights=weights,
+        slots=slots,
+        slot_keyframes=slot_keyframes,
+        slot_ptr=slot_ptr,
+        slot_obs=slot_obs,
+        free=moves[slot_keyframes],
+        row_ptr=row_ptr,
+        cols=cols,
+    )
+
+
+def _check(problem: BundleProblem) -> None:
+    count, observations = len(problem.map_from_body), len(problem.obs_keyframe)
+    assert problem.fixed.shape == (count,)
+    assert problem.obs_pixels.shape == (observations, 3)
+    assert problem.obs_sigma_px.shape == (observations, 2)
+    assert observations == 0 or (problem.obs_keyframe.min() >= 0 and problem.obs_keyframe.max() < count)
+    assert observations == 0 or (
+        problem.obs_landmark.min() >= 0 and problem.obs_landmark.max() < len(problem.points_map)
+    )
+    if problem.gauge == "yaw_position" and (problem.inertial is None or not problem.inertial.edges):
+        raise SurveyError('gauge "yaw_position" needs inertial edges, there are none; fix a keyframe, use gauge "pose"')
+    if problem.gauge == "pose" and not problem.fixed.any() and not problem.priors:
+        raise SurveyError(
+            f"bundle adjustment of {count} keyframes has none fixed and no prior: fix one, "
+            'or use gauge "yaw_position" with inertial terms'
+        )
+
+
+def _measurements(problem: BundleProblem, order: AnyArray) -> tuple[Array, Array]:
+    observed = problem.obs_pixels[order]
+    disparity = observed[:, 0] - observed[:, 2]
+    seen = np.isfinite(disparity) & (problem.camera.baseline_m > 0)
+    pixels = np.stack([observed[:, 0], observed[:, 1], np.where(seen, disparity, 0.0)], axis=1)
+    sigma = problem.obs_sigma_px[order]
+    return pixels, np.stack([1.0 / sigma[:, 0], np.where(seen, 1.0 / np.where(seen, sigma[:, 1], 1.0), 0.0)], axis=1)
+
+
+def _free_unknowns(problem: BundleProblem) -> NDArray[np.bool_]:
+    """(K, 6 or 15): rotation, translation, velocity, gyro bias, accelerometer bias."""
+    count, inertial = len(problem.map_from_body), problem.inertial
+    moves = np.zeros((count, 6 if inertial is None else 15), np.bool_)
+    if problem.gauge == "pose":
+        moves[:, :6] = ~problem.fixed[:, None]
+    else:
+        held = problem.fixed.copy()
+        held[0] |= not held.any()
+        moves[:, :2] = True
+        moves[:, 2:6] = ~held[:, None]
+    if inertial is not None:
+        for i, j, _ in inertial.edges:
+            moves[[i, j], 6:] = True
+        if inertial.fixed is not None:
+            moves[inertial.fixed, 6:] = False
+    return moves
+
+
+def _observations_by_slot(slots: Indices, keyframes: Indices, count: int) -> tuple[AnyArray, Indices]:
+    obs_slots = slots[keyframes]
+    by_slot = np.argsort(obs_slots, kind="stable")
+    held = int((obs_slots < 0).sum())
+    return np.searchsorted(obs_slots[by_slot[held:]], np.arange(count + 1)), by_slot[held:].astype(np.int32)
+
+
+def _pattern(
+    problem: BundleProblem,
+    slots: Indices,
+    keyframes: Indices,
+    landmarks: Indices,
+    landmark_ptr: AnyArray,
+    slot_ptr: AnyArray,
+    slot_obs: Indices,
+) -> tuple[AnyArray, Indices]:
+    pairs = np.array([sorted((slots[t.i], slots[t.j])) for t in problem.relative], np.int32).reshape(-1, 2)
+    pairs = pairs[pairs[:, 0] >= 0]
+    pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
+    pair_ptr = np.searchsorted(pairs[:, 1], np.arange(len(slot_ptr)))
+    row_ptr, cols = np.zeros(len(slot_ptr), np.int64), np.zeros(0, np.int32)
+    shared = (
+        np.zeros_like(slot_ptr) if problem.points_held else slot_ptr,
+        slot_obs,
+        landmarks,
+        keyframes,
+        landmark_ptr,
+        slots,
+        pair_ptr,
+        np.ascontiguousarray(pairs[:, 0]),
+        row_ptr,
+    )
+    count_row_blocks(*shared, cols)
+    cols = np.empty(int(row_ptr[-1]), np.int32)
+    count_row_blocks(*shared, cols)
+    return row_ptr, cols

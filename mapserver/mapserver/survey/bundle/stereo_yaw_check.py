@@ -1,0 +1,101 @@
+"""Whether the cameras of a pair stand to each other as the calibration says, told by the survey itself.
+
+A right camera that is turned about its vertical axis by a small angle shifts all disparities by nearly the same amount, which
+bends depth and so sets the scale of the map. Motion tells: only with the true shift do the points that the pair measures lie
+where several views put them. The shift is the minimum of the adjusted cost over it; the cost's slope needs no derivative of
+the adjustment, because at its optimum everything else is flat.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.sensors.rectification import StereoCamera
+from mapserver.survey.bundle.bundle_adjustment import BundleResult, BundleSettings, optimize
+from mapserver.survey.bundle.bundle_rounds import SurveyState, bundle_problem
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.tracks.tracks import Landmarks
+
+_FIRST_TRY_PX = 0.05
+_MAX_STEPS = 4
+_MIN_DISPARITIES = 200
+
+
+@dataclass(frozen=True, slots=True)
+class PairTurn:
+    """What disparities are too large by in the middle of the picture, how surely, and whether the survey corrects it."""
+
+    shift_px: float
+    sigma_px: float
+    corrected: bool
+
+    @property
+    def correction_px(self) -> float:
+        """What the survey subtracts."""
+        return self.shift_px if self.corrected else 0.0
+
+
+NO_TURN = PairTurn(0.0, float("inf"), corrected=False)
+
+
+def disparity_shift(camera: StereoCamera, pixels: Array) -> Array:
+    """(M,) how much the disparity at left pixels (M, >= 2) changes for one pixel of shift in the middle of the picture."""
+    return np.asarray(1.0 + ((pixels[:, 0] - camera.cx_px) / camera.focal_px) ** 2)
+
+
+def without_turn(landmarks: Landmarks, camera: StereoCamera, correction_px: float) -> Landmarks:
+    """The landmarks with all observed disparities made smaller by the shift."""
+    if correction_px == 0.0:
+        return landmarks
+    pixels = landmarks.obs_pixels.copy()
+    pixels[:, 2] += correction_px * disparity_shift(camera, pixels)
+    return replace(landmarks, obs_pixels=pixels)
+
+
+def estimate_turn(state: SurveyState, settings: SurveySettings) -> PairTurn:
+    """The turn that the adjusted survey speaks for; corrected where it is far from zero, in sigmas.
+
+    sigma_px is the adjustment's own, and with it `noise.turn_floor_px`: what matching alone pretends. NO_TURN where too few
+    disparities are known or where the cost has no minimum nearby.
+    """
+    measured = np.isfinite(state.landmarks.obs_pixels[:, 2])
+    if measured.sum() < _MIN_DISPARITIES or state.is_depth_camera:
+        return NO_TURN
+    slope = _slope(state, 0.0, settings)
+    shift, curvature = 0.0, 0.0
+    step = _FIRST_TRY_PX if slope < 0 else -_FIRST_TRY_PX
+    for _ in range(_MAX_STEPS):
+        moved = _slope(state, shift + step, settings)
+        curvature = (moved - slope) / step
+        if not curvature > 0.0:
+            return NO_TURN
+        shift, slope = shift + step, moved
+        step = -slope / curvature
+        if abs(step) < 0.2 / np.sqrt(curvature):
+            break
+    shift += step
+    sigma = float(np.hypot(1.0 / np.sqrt(curvature), settings.noise.turn_floor_px))
+    return PairTurn(float(shift), sigma, corrected=abs(shift) > settings.noise.turn_sigmas * sigma)
+
+
+def _slope(state: SurveyState, shift_px: float, settings: SurveySettings) -> float:
+    """Derivative of the adjusted cost by the shift, everything else at its optimum for this shift."""
+    camera = state.camera
+    moved = replace(state, landmarks=without_turn(state.landmarks, camera, shift_px))
+    result = optimize(bundle_problem(moved, settings, None), settings.final_bundle)
+    marks = moved.landmarks
+    ahead = se3_inverse(result.map_from_body @ state.body_from_cam)[marks.obs_keyframe, 2]
+    points = result.points_map[marks.obs_landmark]
+    depth = np.einsum("mj,mj->m", ahead[:, :3], points) + ahead[:, 3]
+    off = marks.obs_pixels[:, 0] - marks.obs_pixels[:, 2] - camera.focal_px * camera.baseline_m / depth
+    pull = _weights(result, settings.final_bundle) * off / marks.obs_sigma_px[:, 1] ** 2
+    return -float(np.nansum(pull * disparity_shift(camera, marks.obs_pixels)))
+
+
+def _weights(result: BundleResult, settings: BundleSettings) -> Array:
+    """(M,) what the robust cost leaves of each observation's weight."""
+    norm = np.sqrt(result.squared_sigmas)
+    weight = np.minimum(1.0, settings.huber_sigmas / np.maximum(norm, 1e-9))
+    weight[norm > settings.cutoff_sigmas] = 0.0
+    return np.asarray(weight)

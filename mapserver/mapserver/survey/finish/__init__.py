@@ -1,0 +1,1 @@
+"""From the adjusted state to the finished map: culling, trajectory, docks, assembly."""

@@ -1,0 +1,96 @@
+"""What a finished survey does not hand on: duplicates, landmarks that are badly known, keyframes that others make superfluous."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from fleetmap.features.matching import packed
+from fleetmap.geometry import Array
+from mapserver.survey.bundle.bundle_rounds import SurveyState
+from mapserver.survey.finish.map_assembly_kernels import mark_duplicates, mark_redundant
+from mapserver.survey.keyframes.keyframes import Keyframe
+from mapserver.survey.settings import CullSettings
+from mapserver.survey.tracks.tracks import Landmarks, of_features
+
+
+@dataclass(frozen=True, slots=True)
+class Culled:
+    """How many were taken out: landmarks_merged into another, landmarks_weak, keyframes that others repeat."""
+
+    landmarks_merged: int = 0
+    landmarks_weak: int = 0
+    keyframes_redundant: int = 0
+
+
+def cull(
+    state: SurveyState, keyframes: list[Keyframe], sigmas_m: Array, settings: CullSettings
+) -> tuple[Landmarks, NDArray[np.bool_], Culled]:
+    """The landmarks that are handed on, which keyframes (K,) are, and what was left out; `state` stays as it is.
+
+    sigmas_m (N,) of the landmarks.
+    """
+    marks = state.landmarks
+    octaves = of_features(marks, [k.features.octaves for k in keyframes]).astype(np.int64)
+    double = _duplicates(marks, keyframes, sigmas_m, settings)
+    weak = ~double & (parallax_rad(state) < np.radians(settings.min_parallax_deg))
+    lasting = ~(double | weak)
+    superfluous = redundant(marks, octaves, lasting, len(keyframes), settings)
+    keep = lasting[marks.obs_landmark] & ~superfluous[marks.obs_keyframe]
+    left = marks.keep_observations(keep, 1)
+    return left, ~superfluous, Culled(int(double.sum()), int(weak.sum()), int(superfluous.sum()))
+
+
+def parallax_rad(state: SurveyState) -> Array:
+    """(N,) the angle under which each landmark's observations see it: largest between any and the first, or across the baseline."""
+    marks = state.landmarks
+    centres = (state.map_from_body @ state.body_from_cam)[marks.obs_keyframe, :3, 3]
+    rays = centres - marks.points_map[marks.obs_landmark]
+    distances = np.maximum(np.linalg.norm(rays, axis=1), 1e-6)
+    rays /= distances[:, None]
+    first = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map)))
+    cosines = np.einsum("ij,ij->i", rays, rays[first][marks.obs_landmark])
+    angles = np.zeros(len(marks.points_map))
+    np.maximum.at(angles, marks.obs_landmark, np.arccos(np.clip(cosines, -1.0, 1.0)))
+    across = np.where(np.isfinite(marks.obs_pixels[:, 2]), state.camera.baseline_m / distances, 0.0)
+    np.maximum.at(angles, marks.obs_landmark, across)
+    return angles
+
+
+def _duplicates(
+    marks: Landmarks, keyframes: list[Keyframe], sigmas_m: Array, settings: CullSettings
+) -> NDArray[np.bool_]:
+    """(N,) landmarks that stand where a better observed one stands, look like it and were never seen beside it."""
+    double = np.zeros(len(marks.points_map), bool)
+    near = cKDTree(marks.points_map).query_pairs(settings.duplicate_m, output_type="ndarray")
+    if not len(near):
+        return double
+    starts = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map) + 1))
+    first = replace(marks, obs_keyframe=marks.obs_keyframe[starts[:-1]], obs_feature=marks.obs_feature[starts[:-1]])
+    mark_duplicates(
+        near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.int64), marks.points_map, sigmas_m, starts, marks.obs_keyframe,
+        packed(of_features(first, [k.features.descriptors for k in keyframes])), settings.duplicate_distance, double,
+    )  # fmt: skip
+    return double
+
+
+def redundant(
+    marks: Landmarks, octaves: NDArray[np.int64], lasting: NDArray[np.bool_], count: int, settings: CullSettings
+) -> NDArray[np.bool_]:
+    """(count,) keyframes of whose landmarks `redundant_share` are seen by three others at the same or a finer scale.
+
+    Taken out one by one, those with the fewest landmarks first, so that the ones that repeat each other do not all go.
+    Source: Mur-Artal and Tardos 2015 (ORB-SLAM).
+    """
+    gone = np.zeros(count, bool)
+    usable = np.flatnonzero(lasting[marks.obs_landmark])
+    own = marks.obs_keyframe[usable]
+    seen = np.bincount(own, minlength=count)
+    starts = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map) + 1))
+    order = np.array(sorted(range(1, count - 1), key=lambda k: (seen[k], k)), np.int64)
+    mark_redundant(
+        order, usable[np.argsort(own, kind="stable")], np.concatenate([[0], np.cumsum(seen)]), marks.obs_landmark,
+        marks.obs_keyframe, octaves, starts, settings.redundant_observers, settings.redundant_share, gone,
+    )  # fmt: skip
+    return gone

@@ -1,0 +1,132 @@
+"""From the adjusted state to the finished map: descriptors, patches, uncertainties, trajectory."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.features.matching import packed
+from fleetmap.features.patch_align import halvings
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.samples import Trajectory
+from mapserver.survey.bundle.bundle_rounds import SurveyState
+from mapserver.survey.finish.culling import Culled, cull
+from mapserver.survey.finish.map_assembly_kernels import medoids
+from mapserver.survey.finish.trajectory import frame_trajectory
+from mapserver.survey.keyframes.keyframes import Keyframe
+from mapserver.survey.odometry_pass import FirstGuess
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_map import SurveyMap
+from mapserver.survey.tracks.tracks import Landmarks, of_features
+
+_PATCH_HALF_PX = 10  # a 9 px window seen from nearer or turned still finds all of itself
+_MIN_TIED = 8
+_CHUNK = 5000  # landmarks
+
+
+def summarise(state: SurveyState, guess: FirstGuess, settings: SurveySettings) -> tuple[SurveyMap, Culled]:
+    """The SurveyMap of an adjusted survey, in the survey's own frame, and what was left out of it."""
+    every_sigma = point_sigmas_m(state)
+    marks, kept, culled = cull(state, guess.keyframes, every_sigma, settings.cull)
+    keyframes = [k for k, keep in zip(guess.keyframes, kept, strict=True) if keep]
+    marks = replace(marks, obs_keyframe=(np.cumsum(kept) - 1)[marks.obs_keyframe].astype(np.int32))
+    octaves = of_features(marks, [k.features.octaves for k in keyframes])
+    frame_stamps = np.array([e.stamp_ns for e in guess.estimates], np.int64)
+    numbers = [k.frame_index for k in guess.keyframes]
+    map_from_body = frame_trajectory(frame_stamps, guess.odom_from_body, numbers, state.map_from_body)
+    handed_on = replace(
+        state, stamps_ns=state.stamps_ns[kept], map_from_body=state.map_from_body[kept], landmarks=marks
+    )
+    survey_map = SurveyMap(
+        camera=state.camera,
+        body_from_cam=state.body_from_cam,
+        keyframe_stamps_ns=handed_on.stamps_ns,
+        map_from_body=handed_on.map_from_body,
+        landmark_ids=np.arange(len(marks.points_map), dtype=np.uint32),
+        points_map=marks.points_map,
+        descriptors=medoid_descriptors(marks, keyframes),
+        point_sigma_m=point_sigmas_m(handed_on),
+        obs_keyframe=marks.obs_keyframe,
+        obs_landmark=marks.obs_landmark,
+        obs_pixels=marks.obs_pixels,
+        obs_octave=octaves,
+        obs_sigma_px=marks.obs_sigma_px,
+        trajectory=Trajectory(frame_stamps, map_from_body),
+        trajectory_estimated=_estimated(state, guess),
+        patches=cut_patches(marks, keyframes),
+        scale_known=guess.scale_known,
+    )
+    return survey_map, culled
+
+
+def medoid_descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
+    """(N, 32): of each landmark's descriptors the one nearest to all others (their medoid)."""
+    rows = of_features(marks, [k.features.descriptors for k in keyframes])
+    chosen = np.zeros(len(marks.points_map), np.int64)
+    medoids(packed(rows), np.searchsorted(marks.obs_landmark, np.arange(len(chosen) + 1)), chosen)
+    return rows[chosen]
+
+
+def point_sigmas_m(state: SurveyState) -> Array:
+    """(N,) largest standard deviation of each landmark, keyframes taken as known."""
+    marks, map_from_cam = state.landmarks, state.map_from_body @ state.body_from_cam
+    weakest = np.empty(len(marks.points_map))
+    for start in range(0, len(weakest), _CHUNK):  # an observation's share of the work is half a kilobyte
+        some = slice(start, min(start + _CHUNK, len(weakest)))
+        rows = slice(*np.searchsorted(marks.obs_landmark, [some.start, some.stop]))
+        information = point_information(
+            state.camera, map_from_cam[marks.obs_keyframe[rows]], marks.points_map[some], marks.obs_landmark[rows] - start,
+            np.isfinite(marks.obs_pixels[rows, 2]), marks.obs_sigma_px[rows],
+        )  # fmt: skip
+        weakest[some] = np.linalg.eigvalsh(information)[:, 0]
+    return np.asarray(1.0 / np.sqrt(np.maximum(weakest, 1e-6)))
+
+
+def point_information(
+    camera: StereoCamera, map_from_cam: Array, points_map: Array, obs_landmark: NDArray[np.int32], has_right: NDArray[np.bool_],
+    obs_sigma_px: Array,
+) -> Array:  # fmt: skip
+    """(N, 3, 3) what M observations from known cameras map_from_cam (M, 4, 4) say about N points, in map axes."""
+    cam_from_map = se3_inverse(map_from_cam)
+    rotations = cam_from_map[:, :3, :3]
+    seen = np.einsum("mij,mj->mi", rotations, points_map[obs_landmark]) + cam_from_map[:, :3, 3]
+    z = np.maximum(seen[:, 2], 0.05)
+    f = camera.focal_px
+    rows = np.zeros((len(z), 3, 3))
+    rows[:, 0, 0] = rows[:, 1, 1] = f / z
+    rows[:, 0, 2], rows[:, 1, 2] = -f * seen[:, 0] / z**2, -f * seen[:, 1] / z**2
+    rows[:, 2, 2] = np.where(has_right, -f * camera.baseline_m / z**2, 0.0)
+    sigma = np.column_stack([obs_sigma_px[:, 0], obs_sigma_px[:, 0], obs_sigma_px[:, 1]])
+    jacobian = (rows / sigma[:, :, None]) @ rotations
+    information = np.zeros((len(points_map), 3, 3))
+    np.add.at(information, obs_landmark, jacobian.transpose(0, 2, 1) @ jacobian)
+    return information
+
+
+def cut_patches(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
+    """(N, 21, 21) windows around each landmark's first observation, at the halving nearest to its octave."""
+    size = 2 * _PATCH_HALF_PX + 1
+    out = np.zeros((len(marks.points_map), size, size), np.uint8)
+    first = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map)))
+    steps = np.arange(-_PATCH_HALF_PX, _PATCH_HALF_PX + 1)
+    owners, features = marks.obs_keyframe[first], marks.obs_feature[first]
+    for k in np.unique(owners).tolist():
+        own = np.flatnonzero(owners == k)
+        levels, pyramid = halvings(keyframes[k].features.octaves[features[own]]), keyframes[k].pyramid
+        for level, image in enumerate(pyramid):
+            index = own[levels == level]
+            x, y = np.rint(marks.obs_pixels[first[index], :2] / 2.0**level).astype(int).T
+            rows = np.clip(y[:, None] + steps, 0, image.shape[0] - 1)
+            columns = np.clip(x[:, None] + steps, 0, image.shape[1] - 1)
+            out[index] = image[rows[:, :, None], columns[:, None, :]]
+    return out
+
+
+def _estimated(state: SurveyState, guess: FirstGuess) -> NDArray[np.bool_]:
+    """(F,) frames that something measured ties to the map: landmarks, unbroken odometry, or the IMU through a gap."""
+    tied = guess.tracked.astype(bool).copy()
+    counts = np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns))
+    for keyframe, count in zip(guess.keyframes, counts, strict=True):
+        tied[keyframe.frame_index] |= bool(count >= _MIN_TIED) or state.motion.inertial
+    return tied

@@ -1,0 +1,50 @@
+"""A finished survey in another frame."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.sensors.samples import Trajectory
+from mapserver.survey.bundle.bundle_rounds import SurveyState
+from mapserver.survey.survey_map import SurveyMap
+
+
+def moved(survey_map: SurveyMap, new_from_map: Array) -> SurveyMap:
+    """The same survey in the frame `new`; new_from_map (4, 4) is rigid, so nothing measured changes."""
+    return replace(
+        survey_map,
+        map_from_body=new_from_map @ survey_map.map_from_body,
+        points_map=transform_points(new_from_map, survey_map.points_map),
+        trajectory=Trajectory(survey_map.trajectory.stamps_ns, new_from_map @ survey_map.trajectory.frame_from_body),
+    )
+
+
+def scaled(survey_map: SurveyMap, scale: float) -> SurveyMap:
+    """The same survey `scale` times as large, in metres from now on; cameras keep their mounting, which was in metres before."""
+    return replace(
+        survey_map,
+        map_from_body=_grown(survey_map.map_from_body, survey_map.body_from_cam, scale),
+        points_map=scale * survey_map.points_map,
+        point_sigma_m=scale * survey_map.point_sigma_m,
+        trajectory=Trajectory(
+            survey_map.trajectory.stamps_ns,
+            _grown(survey_map.trajectory.frame_from_body, survey_map.body_from_cam, scale),
+        ),
+        scale_known=True,
+    )
+
+
+def scaled_state(state: SurveyState, scale: float) -> SurveyState:
+    """The adjusted state as `scaled` changes its map."""
+    return replace(
+        state,
+        map_from_body=_grown(state.map_from_body, state.body_from_cam, scale),
+        landmarks=replace(state.landmarks, points_map=scale * state.landmarks.points_map),
+    )
+
+
+def _grown(map_from_body: Array, body_from_cam: Array, scale: float) -> Array:
+    map_from_cam = map_from_body @ body_from_cam
+    map_from_cam[:, :3, 3] *= scale
+    return np.asarray(map_from_cam @ se3_inverse(body_from_cam))

@@ -1,0 +1,188 @@
+"""Which keyframes hang together. What neither pictures nor a short inertial bridge tie to the rest has no place in the same map."""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from fleetmap.errors import SurveyError
+from fleetmap.geometry import Array
+from mapserver.survey.bundle.bundle_rounds import SurveyState, state_of
+from mapserver.survey.loops.loops import Loops
+from mapserver.survey.odometry_pass import FirstGuess
+
+_MIN_SHARED = 15  # landmarks, as many as a loop needs matches
+MIN_SEEN = 8  # landmarks without which a keyframe counts as blind
+_MIN_KEYFRAMES = 2
+_SURE_SIGMAS = 3.0
+_LARGEST = "the largest part"
+_APART = "nothing says for sure where it lies to the largest part; drive it again"
+_BLIND = "too little was seen to tie it to anything; drive it again, with light"
+
+
+class Sightings(Protocol):
+    """Who sees what; a SurveyMap is such a thing."""
+
+    @property
+    def keyframe_stamps_ns(self) -> NDArray[np.int64]:
+        """(K,)."""
+
+    @property
+    def landmark_ids(self) -> NDArray[Any]:
+        """(N,)."""
+
+    @property
+    def obs_keyframe(self) -> NDArray[np.int32]:
+        """(M,) numbers of keyframes."""
+
+    @property
+    def obs_landmark(self) -> NDArray[np.int32]:
+        """(M,) numbers of landmarks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Covisibility:
+    """Sightings of a survey that is no map yet."""
+
+    keyframe_stamps_ns: NDArray[np.int64]
+    landmark_ids: NDArray[np.int64]
+    obs_keyframe: NDArray[np.int32]
+    obs_landmark: NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Keyframes that hang together, seconds of the first and last after the survey's first keyframe, and what became of them."""
+
+    start_s: float
+    end_s: float
+    keyframes: int
+    kept: bool
+    reason: str
+
+    def remark(self) -> str:
+        """It in words."""
+        return f"left out: {self.keyframes} keyframes from {self.start_s:.1f} to {self.end_s:.1f} s: {self.reason}"
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """labels (K,): the part of each keyframe, -1 for those that nothing ties to any, which are listed as stray, run by run."""
+
+    labels: NDArray[np.int64]
+    parts: list[Part]
+    stray: list[Part]
+
+    @property
+    def kept(self) -> NDArray[np.bool_]:
+        """(K,) keyframes that stay in the map: those of the part with most that see something."""
+        return np.asarray(self.labels == next(n for n, part in enumerate(self.parts) if part.kept))
+
+
+def find_parts(survey_map: "Sightings", odometry_sigmas_m: "SigmaBetween", join_sigma_m: float) -> Parts:
+    """The parts of a finished survey; SurveyError where nothing hangs together.
+
+    Keyframes belong together where they share landmarks, directly or through others, and where the one that saw something last
+    and the one that sees something next are known to `join_sigma_m` of each other by odometry. Blind ones in between belong
+    there too, others to the part before or after as far as odometry carries: until three of its sigmas are as much.
+    """
+    count = len(survey_map.keyframe_stamps_ns)
+    seeing = np.flatnonzero(np.bincount(survey_map.obs_keyframe, minlength=count) >= MIN_SEEN)
+    rows, columns = shared_landmarks(survey_map, _MIN_SHARED)
+    bridges = [(a, b) for a, b in pairwise(seeing) if odometry_sigmas_m(int(a), int(b)) <= join_sigma_m]
+    bridged = {int(a) for a, _ in bridges}
+    for k in np.setdiff1d(np.arange(count), seeing).tolist():
+        at = int(np.searchsorted(seeing, k))
+        limit_m = join_sigma_m if at and int(seeing[at - 1]) in bridged else join_sigma_m / _SURE_SIGMAS
+        for near in (seeing[at - 1] if at else None, seeing[at] if at < len(seeing) else None):
+            if near is not None and odometry_sigmas_m(min(k, int(near)), max(k, int(near))) <= limit_m:
+                bridges.append((near, k))
+                break
+    rows = np.concatenate([rows, [a for a, _ in bridges]]).astype(np.int64)
+    columns = np.concatenate([columns, [b for _, b in bridges]]).astype(np.int64)
+    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    _, groups = connected_components(graph, directed=False)
+    return _named(survey_map, np.asarray(groups, np.int64), seeing)
+
+
+class SigmaBetween:
+    """By how much, in metres, odometry leaves open where keyframe b is seen from keyframe a."""
+
+    def __init__(self, covariances: Array) -> None:
+        """covariances (K, 6, 6) of the odometry at the keyframes, rotation first."""
+        self._variances = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2)
+
+    def __call__(self, a: int, b: int) -> float:
+        """What was added between them."""
+        return float(np.sqrt(max(self._variances[b] - self._variances[a], 0.0)))
+
+
+def seen_by(state: SurveyState) -> "Covisibility":
+    """Who sees what in an adjusted survey."""
+    marks = state.landmarks
+    return Covisibility(state.stamps_ns, np.arange(len(marks.points_map)), marks.obs_keyframe, marks.obs_landmark)
+
+
+def only_kept(
+    state: SurveyState, guess: FirstGuess, loops: Loops, kept: NDArray[np.bool_]
+) -> tuple[SurveyState, FirstGuess, Loops]:
+    """The survey of the kept keyframes (K,) alone; the records of loops keep the old numbers."""
+    if kept.all():
+        return state, guess, loops
+    number = np.cumsum(kept) - 1
+    edges = [replace(e, i=int(number[e.i]), j=int(number[e.j])) for e in loops.edges if kept[e.i] and kept[e.j]]
+    keyframes = [k for k, keep in zip(guess.keyframes, kept, strict=True) if keep]
+    return state_of(state, kept), replace(guess, keyframes=keyframes), replace(loops, edges=edges)
+
+
+def shared_landmarks(survey_map: "Sightings", at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of keyframes, the older one first, that share so many landmarks."""
+    ones = np.ones(len(survey_map.obs_keyframe), np.int32)
+    shape = len(survey_map.keyframe_stamps_ns), len(survey_map.landmark_ids)
+    seen = csr_matrix((ones, (survey_map.obs_keyframe, survey_map.obs_landmark)), shape)
+    shared = coo_matrix(seen @ seen.T)
+    enough = (shared.data >= at_least) & (shared.row < shared.col)
+    return shared.row[enough].astype(np.int64), shared.col[enough].astype(np.int64)
+
+
+def _named(survey_map: "Sightings", groups: NDArray[np.int64], seeing: NDArray[np.int64]) -> Parts:
+    """Parts of at least two keyframes, one of which sees something, in the order of time."""
+    sizes, seeing_sizes = np.bincount(groups), np.bincount(groups[seeing])
+    real = [g for g in dict.fromkeys(groups[seeing].tolist()) if sizes[g] >= _MIN_KEYFRAMES]
+    if not real:
+        raise SurveyError(
+            f"none of {len(groups)} keyframes shares {_MIN_SHARED} landmarks with another; look at the recording with "
+            "`mapserver doctor`: dark, blurred, or too few frames?"
+        )
+    largest = max(real, key=lambda g: int(seeing_sizes[g]))
+    labels = np.full(len(groups), -1, np.int64)
+    for number, group in enumerate(real):
+        labels[groups == group] = number
+    parts = [
+        _part(survey_map, np.flatnonzero(labels == n), group == largest, _LARGEST if group == largest else _APART)
+        for n, group in enumerate(real)
+    ]
+    return Parts(labels, parts, [_part(survey_map, run, False, _BLIND) for run in _runs(np.flatnonzero(labels < 0))])
+
+
+def _part(survey_map: "Sightings", members: NDArray[np.int64], kept: bool, reason: str) -> Part:
+    stamps_ns = survey_map.keyframe_stamps_ns
+    start_s, end_s = (round(float(stamps_ns[k] - stamps_ns[0]) * 1e-9, 3) for k in members[[0, -1]])
+    return Part(start_s, end_s, len(members), kept, reason)
+
+
+def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Numbers that follow each other without a gap, run by run."""
+    return [run for run in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1) if len(run)]
+
+
+def beside(frames: int, keyframe_frames: NDArray[np.int64], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(F,) frames whose neighbouring keyframes, the one before and the one after, are all kept."""
+    after = np.searchsorted(keyframe_frames, np.arange(frames))
+    exact = keyframe_frames[np.minimum(after, len(kept) - 1)] == np.arange(frames)
+    before = np.where(exact, after, np.maximum(after - 1, 0))
+    return np.asarray(kept[before] & kept[np.minimum(after, len(kept) - 1)])

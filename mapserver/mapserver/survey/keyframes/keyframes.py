@@ -1,0 +1,195 @@
+"""Which frames become keyframes, and what is kept of each."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.features import orb, patch_align, stereo
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from mapserver.survey.executor import ALONE, Worker
+from mapserver.survey.settings import KeyframeSettings, SurveySettings
+
+_BATCH = 2  # frames for one call: a twentieth of a second each
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """What a keyframe looks like: its rectified frame and the left picture's pyramid."""
+
+    frame: RectifiedFrame
+    pyramid: patch_align.Pyramid
+
+
+class PictureShelf(Protocol):
+    """Where the pictures of keyframes wait until they are looked at again: a long survey's do not fit in memory."""
+
+    def put(self, pictures: Pictures) -> int:
+        """The number under which `get` gives them back."""
+
+    def get(self, number: int) -> Pictures:
+        """The pictures as they were put."""
+
+
+class MemoryShelf:
+    """Keeps all pictures as they are."""
+
+    def __init__(self) -> None:
+        self._pictures: list[Pictures] = []
+
+    def put(self, pictures: Pictures) -> int:
+        """See PictureShelf."""
+        self._pictures.append(pictures)
+        return len(self._pictures) - 1
+
+    def get(self, number: int) -> Pictures:
+        """See PictureShelf."""
+        return self._pictures[number]
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """One keyframe: features (N), disparities (N, 2) with sigma, their points; its pictures wait on a shelf.
+
+    from_views: the disparities come from other keyframes, so they place points but measure nothing of their own.
+    """
+
+    frame_index: int
+    stamp_ns: int
+    features: orb.Features
+    disparities: Array
+    points_cam: Array
+    shelf: PictureShelf
+    shelf_number: int
+    from_views: bool = False
+
+    @property
+    def pictures(self) -> Pictures:
+        """What lies on the shelf."""
+        return self.shelf.get(self.shelf_number)
+
+    @property
+    def frame(self) -> RectifiedFrame:
+        """The rectified frame."""
+        return self.pictures.frame
+
+    @property
+    def pyramid(self) -> patch_align.Pyramid:
+        """The left picture and its halvings."""
+        return self.pictures.pyramid
+
+
+def make_keyframe(
+    frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings, shelf: PictureShelf | None = None
+) -> Keyframe:  # fmt: skip
+    """Detects, describes and stereo-matches one frame; its pictures go to `shelf`, into memory without one."""
+    return next(make_keyframes([(frame_index, frame)], camera, settings, shelf, ALONE))
+
+
+def make_keyframes(
+    frames: Iterable[tuple[int, RectifiedFrame]], camera: StereoCamera, settings: SurveySettings, shelf: PictureShelf | None,
+    worker: Worker,
+) -> Iterator[Keyframe]:  # fmt: skip
+    """The same of several frames, each with its number; a worker is at some of them while the next ones are still awaited."""
+    kept = MemoryShelf() if shelf is None else shelf
+    waiting: deque[tuple[int, RectifiedFrame]] = deque()
+
+    def batches() -> Iterator[list[RectifiedFrame]]:
+        source = iter(frames)
+        while batch := list(islice(source, _BATCH)):
+            waiting.extend(batch)
+            yield [frame for _, frame in batch]
+
+    for found in worker.map(_extract, (camera, settings), batches()):
+        for features, disparities in found:
+            number, frame = waiting.popleft()
+            points = camera.point_from_pixel(features.pixels, disparities[:, 0])
+            place = kept.put(Pictures(frame, patch_align.half_pyramid(frame.left)))
+            yield Keyframe(number, frame.stamp_ns, features, disparities, points, kept, place)
+
+
+def _extract(
+    shared: tuple[StereoCamera, SurveySettings], frames: list[RectifiedFrame]
+) -> list[tuple[orb.Features, Array]]:
+    """What is found in some frames: features and disparities."""
+    camera, settings = shared
+    found = []
+    for frame in frames:
+        features = orb.detect(frame.left, settings.orb)
+        found.append((features, stereo.disparities(frame, camera, features.pixels, settings.stereo)))
+    return found
+
+
+def with_pictures(keyframe: Keyframe, *, whole: bool) -> Keyframe:
+    """The same keyframe with its pictures in memory; unless `whole`, only the left one's pyramid."""
+    pictures, shelf = keyframe.shelf.get(keyframe.shelf_number), MemoryShelf()
+    if not whole:
+        frame = RectifiedFrame(keyframe.stamp_ns, pictures.pyramid[0], None, None)
+        pictures = Pictures(frame, pictures.pyramid)
+    return replace(keyframe, shelf=shelf, shelf_number=shelf.put(pictures))
+
+
+def without_pictures(keyframe: Keyframe) -> Keyframe:
+    """The same keyframe with nothing on its shelf: what travels where only features are compared."""
+    return replace(keyframe, shelf=MemoryShelf(), shelf_number=0)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSummary:
+    """What a keyframe policy looks at: where the frame is by odometry, which points it tracks, and how the picture is."""
+
+    stamp_ns: int
+    odom_from_body: Array
+    track_ids: NDArray[np.int64]
+    scene_depth_m: float
+    sharpness: float
+    after_gap: bool
+
+
+class KeyframePolicy:
+    """Chooses by overlap with the last keyframe, by motion, or by count; never a blurred frame unless tracking would break."""
+
+    def __init__(self, settings: KeyframeSettings) -> None:
+        self._settings = settings
+        self._last: FrameSummary | None = None
+        self._sharpness: deque[float] = deque(maxlen=31)
+        self._count = -1
+
+    def wants(self, frame: FrameSummary) -> bool:
+        """Whether this frame becomes a keyframe; frames must come in order."""
+        self._count += 1
+        self._sharpness.append(frame.sharpness)
+        chosen = self._chooses(frame)
+        if chosen:
+            self._last = frame
+        return chosen
+
+    def _chooses(self, frame: FrameSummary) -> bool:
+        s, last = self._settings, self._last
+        if last is None or frame.after_gap or s.policy == "every":
+            return True
+        if s.policy == "every-nth":
+            return self._count % s.every_nth == 0
+        overlap = len(np.intersect1d(frame.track_ids, last.track_ids)) / max(len(last.track_ids), 1)
+        if overlap < s.break_overlap:
+            return True
+        if frame.sharpness < s.min_sharpness * float(np.median(self._sharpness)):
+            return False
+        moved = se3_inverse(last.odom_from_body) @ frame.odom_from_body
+        return bool(
+            overlap < s.min_overlap
+            or np.degrees(rotation_angle_rad(moved[:3, :3])) > s.max_rotation_deg
+            or np.linalg.norm(moved[:3, 3]) > s.max_parallax * frame.scene_depth_m
+            or (frame.stamp_ns - last.stamp_ns) * 1e-9 > s.max_interval_s
+        )
+
+
+def sharpness(frame: RectifiedFrame) -> float:
+    """Variance of the Laplacian at half size: falls with motion blur."""
+    return float(cv2.Laplacian(stereo.halved(frame.left), cv2.CV_32F).var())

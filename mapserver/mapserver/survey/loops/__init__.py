@@ -1,0 +1,1 @@
+"""Loop closure: candidates by words, gated by position, verified by geometry."""

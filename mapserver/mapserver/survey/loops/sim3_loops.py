@@ -1,0 +1,105 @@
+"""Loops of a survey whose scale nothing observes: measured with the scale that drifted, and closed over similarities."""
+
+import numpy as np
+
+from fleetmap.geometry import Array, se3_inverse, transform_points
+from mapserver.survey.loops.loops import LoopCloser
+from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from mapserver.survey.pose_graph.sim3_pose_graph import (
+    Similarities,
+    SimilarityEdge,
+    SimilarityResult,
+    optimize_similarities,
+)
+from mapserver.survey.tracks.pairs import PairMatch
+
+_MIN_SHARED = 8  # points with depth in both keyframes below which a loop says nothing about the scale
+_CORRELATION = 3.0  # depths of one keyframe share the errors of its neighbours
+_UNKNOWN_SIGMA = 1.0
+
+
+class ScaledLoopCloser(LoopCloser):
+    """A LoopCloser that also keeps by how much each loop's two keyframes differ in scale; (log scale, sigma) by (new, old)."""
+
+    scales: dict[tuple[int, int], tuple[float, float]]
+
+    def _edge(self, match: PairMatch) -> PoseEdge:
+        if not hasattr(self, "scales"):
+            self.scales = {}
+        self.scales[match.j, match.i] = measured_log_scale(
+            self._keyframes[match.i].points_cam[match.features[:, 0]],
+            self._keyframes[match.j].points_cam[match.features[:, 1]],
+            match.j_from_i,
+        )
+        return super()._edge(match)
+
+
+def measured_log_scale(points_i: Array, points_j: Array, j_from_i: Array) -> tuple[float, float]:
+    """Logarithm of j's lengths per length of i, and its sigma, from points (N, 3) known in both cameras (NaN where not).
+
+    j_from_i was measured in lengths of i; the median over the points' distances, robust to half of them being wrong.
+    """
+    ratio = np.linalg.norm(points_j, axis=1) / np.linalg.norm(transform_points(j_from_i, points_i), axis=1)
+    ratio = np.log(ratio[np.isfinite(ratio) & (ratio > 0)])
+    if len(ratio) < _MIN_SHARED:
+        return 0.0, _UNKNOWN_SIGMA
+    middle = float(np.median(ratio))
+    spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
+    return middle, _CORRELATION * max(spread, 1e-3) / np.sqrt(len(ratio))
+
+
+def gate_covariances(chain: list[PoseEdge], scale_walk: float) -> list[PoseEdge]:
+    """The chain's edges as the position gate must see them: widened by what a wandering scale may do to the way so far.
+
+    A scale that walks by `scale_walk` for each keyframe shifts the end of n edges of length l by about scale_walk n^1.5 l / sqrt 3;
+    independent edges add up to as much where each has scale_walk times the way so far.
+    """
+    widened, way_m = [], 0.0
+    for edge in chain:
+        way_m += float(np.linalg.norm(edge.i_from_j[:3, 3]))
+        sigma = scale_walk * way_m / np.sqrt(3.0)
+        cov = edge.cov_rot_trans + np.diag([0.0] * 3 + [sigma**2] * 3)
+        widened.append(PoseEdge(edge.i, edge.j, edge.i_from_j, cov, edge.is_loop))
+    return widened
+
+
+def solve_scaled(
+    map_from_body: Array, chain: list[PoseEdge], loops: list[PoseEdge], scales: dict[tuple[int, int], tuple[float, float]],
+    scale_walk: float,
+) -> SimilarityResult:  # fmt: skip
+    """The similarities (K,) of the bodies that agree best with chain and loops, each loop with its measured change of scale.
+
+    `scales` says for loop (i, j) the logarithm of i's lengths per length of j, with sigma. The result's translations are the places.
+    """
+    edges = [_edge(edge, 0.0, scale_walk) for edge in chain]
+    edges += [_edge(edge, *scales.get((edge.i, edge.j), (0.0, _UNKNOWN_SIGMA))) for edge in loops]
+    return optimize_similarities(Similarities.rigid(map_from_body), edges)
+
+
+def _edge(edge: PoseEdge, log_scale: float, sigma: float) -> SimilarityEdge:
+    """The loop's i_from_j was measured in lengths of j: in lengths of i its translation is longer by the scale."""
+    scale = float(np.exp(log_scale))
+    carry = np.diag([1.0] * 3 + [scale] * 3)
+    cov = np.zeros((7, 7))
+    cov[:6, :6] = carry @ edge.cov_rot_trans @ carry
+    cov[6, 6] = sigma**2
+    cov[:6, :6] += 1e-12 * np.eye(6)
+    i_from_j = edge.i_from_j.copy()
+    i_from_j[:3, 3] *= scale
+    return SimilarityEdge(edge.i, edge.j, i_from_j, scale, cov, edge.is_loop)
+
+
+def rigid(result: SimilarityResult) -> Array:
+    """map_from_body (K, 4, 4) of a result: places and directions; the scales are in the distances between the places."""
+    found = result.map_from_keyframe
+    placed = np.tile(np.eye(4), (len(found.scales), 1, 1))
+    placed[:, :3, :3], placed[:, :3, 3] = found.rotations, found.translations
+    return placed
+
+
+def scale_drift(map_from_body: Array, other_map_from_body: Array) -> Array:
+    """(K - 1,) by how much each step of the first chain is longer than that of the other."""
+    first, second = (
+        np.linalg.norm((se3_inverse(m[:-1]) @ m[1:])[:, :3, 3], axis=1) for m in (map_from_body, other_map_from_body)
+    )
+    return np.asarray(first / np.maximum(second, 1e-12))

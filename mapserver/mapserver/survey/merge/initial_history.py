@@ -1,0 +1,17 @@
+"""The memory that a first survey begins with."""
+
+import numpy as np
+
+from mapserver.survey.survey_map import History, SurveyMap
+
+
+def history_of(survey_map: SurveyMap) -> History:
+    """Its history; for a survey without one, that of a map nobody has come back to."""
+    if survey_map.history is not None:
+        return survey_map.history
+    keyframes, landmarks = len(survey_map.map_from_body), len(survey_map.landmark_ids)
+    never = np.zeros(landmarks, np.uint32)
+    return History(
+        np.arange(keyframes, dtype=np.uint32), np.ones(keyframes, np.bool_), never, never.copy(), never.copy(), keyframes,
+        int(survey_map.landmark_ids.max(initial=0)) + 1 if landmarks else 0,
+    )  # fmt: skip

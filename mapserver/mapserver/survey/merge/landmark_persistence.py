@@ -1,0 +1,182 @@
+"""How landmarks fare in later surveys: expected, seen, moved, faded."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.pnp.pnp import GATE_SQUARED
+from mapserver.survey.finish.map_assembly import point_information
+from mapserver.survey.keyframes.keyframes import Keyframe
+from mapserver.survey.merge.base_map import BaseMap, Rows
+from mapserver.survey.merge.guided_matching import Sighting
+from mapserver.survey.settings import SurveySettings
+
+_EDGE_PX = 12.0
+_BESIDE_PX = 25.0  # so near a measured corner, what lies far behind it is hidden by the same thing
+_WIDER_VIEW_RAD = 0.17
+_MAX_OCTAVE = 7.0
+_PRIOR_LOOKS = 4.0  # what the whole survey's rate of being seen counts for, where a landmark has no history
+_AGAINST = 7.815  # 0.95 of chi-square with 3 degrees of freedom: an observation that speaks against a place
+_DOUBTED, _SETTLED = 0.5, 0.8  # shares of sightings: against the old place, in favour of the new one
+_MIN_SIGHTINGS = 3  # below which nothing is said about a landmark's place
+
+
+@dataclass(frozen=True, slots=True)
+class Looks:
+    """Of N landmarks: in how many keyframes of this survey each was expected and seen."""
+
+    expected: NDArray[np.int64]
+    seen: NDArray[np.int64]
+
+    @property
+    def rate(self) -> float:
+        """How often a landmark that is still there is seen when it is expected."""
+        there = self.seen > 0
+        return float(self.seen[there].sum() / max(self.expected[there].sum(), 1))
+
+
+def count_looks(
+    base: BaseMap, keyframes: Sequence[Keyframe], map_from_cam: Array, sightings: Sequence[Sighting | None]
+) -> Looks:  # fmt: skip
+    """Counts over keyframes (K) at map_from_cam (K, 4, 4); those without a sighting say nothing."""
+    expected, seen = np.zeros(len(base.points_map), np.int64), np.zeros(len(base.points_map), np.int64)
+    for keyframe, place, sighting in zip(keyframes, map_from_cam, sightings, strict=True):
+        if sighting is None:
+            continue
+        due = np.zeros(len(expected), bool)
+        due[_due(base, keyframe, place)] = True
+        due[sighting.rows] = True
+        expected += due
+        seen[sighting.rows] += 1
+    return Looks(expected, seen)
+
+
+def _due(base: BaseMap, keyframe: Keyframe, map_from_cam: Array) -> Rows:
+    """Landmarks that this keyframe should see: inside their cone and reach, and no corner beside them that is much nearer."""
+    rows, pixels, octaves = base.visible(map_from_cam, -_EDGE_PX, _WIDER_VIEW_RAD)
+    fits = (octaves > 0.0) & (octaves < _MAX_OCTAVE)
+    rows, pixels = rows[fits], pixels[fits]
+    known = np.flatnonzero(np.isfinite(keyframe.disparities[:, 0]))
+    if not len(known) or not len(rows):
+        return rows
+    away_px, nearest = cKDTree(keyframe.features.pixels[known]).query(pixels[:, :2])
+    measured, disparity = keyframe.disparities[known[nearest], 0], pixels[:, 0] - pixels[:, 2]
+    hidden = (away_px < _BESIDE_PX) & (measured > disparity + np.maximum(2.0, 0.15 * disparity))
+    return np.asarray(rows[~hidden])
+
+
+def missed_since(base: BaseMap, looks: Looks) -> NDArray[np.int64]:
+    """(N,) how often each landmark was expected since it was seen last."""
+    before = base.history.landmark_missed.astype(np.int64)
+    return np.where(looks.seen > 0, 0, before + looks.expected - looks.seen)
+
+
+def faded(base: BaseMap, looks: Looks, settings: SurveySettings) -> NDArray[np.bool_]:
+    """(N,) landmarks that were missed so often that, were they there, it would hardly ever happen.
+
+    The chance to be seen is each landmark's own from before the misses began, drawn towards the survey's where it has
+    been looked for rarely; looks of one survey are alike, so that each counts for less than one (`look_weight`).
+    """
+    history, missed = base.history, missed_since(base, looks)
+    before = history.landmark_expected.astype(np.float64) - history.landmark_missed
+    chance = (history.landmark_seen + _PRIOR_LOOKS * looks.rate) / (before + _PRIOR_LOOKS)
+    chance = np.clip(chance, 0.0, 0.95)
+    gone = missed * np.log1p(-settings.sessions.look_weight * chance) < np.log(settings.sessions.fade_probability)
+    return np.asarray(gone & (missed > 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Shift:
+    """Landmarks of the map that were seen often enough to judge: rows (R,), where the new survey alone has them, whether that differs."""
+
+    rows: Rows
+    points_map: Array
+    significant: NDArray[np.bool_]
+
+
+def shifts(base: BaseMap, map_from_cam: Array, sightings: Sequence[Sighting | None], settings: SurveySettings) -> Shift:
+    """Each landmark placed by its sightings alone, from cameras map_from_cam (K, 4, 4), against where the map has it.
+
+    The difference is judged by both covariances, keyframes taken as known, and `still_m` for what those leave out; and most
+    sightings must speak against the old place each for itself (what none of them can tell apart does robots no harm) and nearly
+    all for the new one: corners where one thing hides another stand nowhere.
+    """
+    seen = [(k, s) for k, s in enumerate(sightings) if s is not None]
+    landmark = np.concatenate([s.rows for _, s in seen]) if seen else np.zeros(0, np.int64)
+    rows, numbers, counts = np.unique(landmark, return_inverse=True, return_counts=True)
+    enough = counts >= _MIN_SIGHTINGS
+    keep = enough[numbers] if len(rows) else np.zeros(0, bool)
+    renumbered = np.cumsum(enough) - 1
+    rows, numbers = rows[enough], renumbered[numbers[keep]].astype(np.int32)
+    if not len(rows):
+        return Shift(rows, np.zeros((0, 3)), np.zeros(0, bool))
+    cameras = np.repeat(map_from_cam[[k for k, _ in seen]], [len(s.rows) for _, s in seen], axis=0)[keep]
+    pixels = np.concatenate([s.pixels for _, s in seen])[keep]
+    sigmas = np.concatenate([s.sigmas_px for _, s in seen])[keep]
+    points = base.points_map[rows].copy()
+    new = _triangulated(base, points, cameras, numbers, pixels, sigmas)
+    own = np.isin(base.map.obs_landmark, rows)
+    old_numbers = np.searchsorted(rows, base.map.obs_landmark[own]).astype(np.int32)
+    old = point_information(
+        base.camera, base.map_from_cam[base.map.obs_keyframe[own]], base.points_map[rows], old_numbers,
+        np.isfinite(base.obs_pixels[own, 2]), base.obs_sigma_px[own],
+    )  # fmt: skip
+    info = point_information(base.camera, cameras, new, numbers, np.isfinite(pixels[:, 2]), sigmas)
+    slack = 1e-6 * np.eye(3)
+    spread = np.linalg.inv(old + slack) + np.linalg.inv(info + slack) + settings.sessions.still_m**2 * np.eye(3)
+    off = new - base.points_map[rows]
+    squared = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0])
+    counts = np.bincount(numbers, minlength=len(rows))
+    old_squared, new_squared = (
+        _squared(base, p, cameras, numbers, pixels, sigmas) for p in (base.points_map[rows], new)
+    )
+    doubted = np.bincount(numbers, old_squared > _AGAINST, len(rows)) > _DOUBTED * counts
+    settled = np.bincount(numbers, new_squared < GATE_SQUARED, len(rows)) >= _SETTLED * counts
+    return Shift(rows, new, doubted & settled & (squared > settings.sessions.significance))
+
+
+def _squared(
+    base: BaseMap, points_map: Array, map_from_cam: Array, landmark: NDArray[np.int32], pixels: Array, sigmas_px: Array
+) -> Array:
+    """(M,) squared residuals of observations in sigmas."""
+    cam_from_map = se3_inverse(map_from_cam)
+    seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points_map[landmark]) + cam_from_map[:, :3, 3]
+    residual = _residuals(base, seen, pixels) / sigmas_px[:, [0, 0, 1]]
+    return np.asarray(np.square(np.nan_to_num(residual)).sum(axis=1))
+
+
+def _residuals(base: BaseMap, points_cam: Array, pixels: Array) -> Array:
+    """(M, 3) of u, v and disparity; NaN without a right match."""
+    predicted = base.camera.pixel_from_point(np.column_stack([points_cam[:, :2], np.maximum(points_cam[:, 2], 0.05)]))
+    return np.column_stack(
+        [pixels[:, :2] - predicted[:, :2], pixels[:, 0] - pixels[:, 2] - predicted[:, 0] + predicted[:, 2]]
+    )
+
+
+def _triangulated(
+    base: BaseMap, points_map: Array, map_from_cam: Array, landmark: NDArray[np.int32], pixels: Array, sigmas_px: Array
+) -> Array:
+    """Points (R, 3) that fit their observations (M) from known cameras best: some steps of Gauss-Newton."""
+    camera, points = base.camera, points_map.copy()
+    cam_from_map = se3_inverse(map_from_cam)
+    for _ in range(4):
+        seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points[landmark]) + cam_from_map[:, :3, 3]
+        residual = _residuals(base, seen, pixels)
+        z, f = np.maximum(seen[:, 2], 0.05), camera.focal_px
+        rows = np.zeros((len(z), 3, 3))
+        rows[:, 0, 0] = rows[:, 1, 1] = f / z
+        rows[:, 0, 2], rows[:, 1, 2] = -f * seen[:, 0] / z**2, -f * seen[:, 1] / z**2
+        rows[:, 2, 2] = -f * camera.baseline_m / z**2
+        sigma = np.column_stack([sigmas_px[:, 0], sigmas_px[:, 0], sigmas_px[:, 1]])
+        weight = np.where(np.isfinite(residual), 1.0 / sigma, 0.0)
+        jacobian = (rows * weight[:, :, None]) @ cam_from_map[:, :3, :3]
+        hessian, pull = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+        np.add.at(hessian, landmark, jacobian.transpose(0, 2, 1) @ jacobian)
+        np.add.at(pull, landmark, np.einsum("mij,mi->mj", jacobian, np.nan_to_num(residual) * weight))
+        step = np.linalg.solve(hessian + 1e-6 * np.eye(3), pull[:, :, None])[:, :, 0]
+        points += np.clip(step, -0.5, 0.5)
+    return points

@@ -1,0 +1,129 @@
+"""A survey and a map become the next map: found, adjusted together, compared, merged. The list of the stages."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from fleetmap.sensors.samples import Trajectory
+from mapserver.survey.bundle.odometry_factors import chain_edges
+from mapserver.survey.finish.trajectory import frame_trajectory
+from mapserver.survey.merge.base_map import BaseMap
+from mapserver.survey.merge.changes import what_changes
+from mapserver.survey.merge.guided_matching import Sighting, sight
+from mapserver.survey.merge.joint_adjustment import Joint, adjust_jointly
+from mapserver.survey.merge.landmark_persistence import count_looks, faded
+from mapserver.survey.merge.merge import merged
+from mapserver.survey.merge.session_alignment import find_fixes, follow_fixes, place_survey
+from mapserver.survey.pipeline import Survey
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_map import SurveyMap
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What joining did: fixes tried and believed, keyframes found in the map, and how its landmarks fared."""
+
+    fixes: int
+    believed_fixes: int
+    keyframes_in_map: int
+    keyframes_added: int
+    keyframes_moved: int
+    landmarks_expected: int
+    landmarks_seen: int
+    landmarks_kept: int
+    landmarks_moved: int
+    landmarks_faded: int
+    landmarks_added: int
+    seen_rate: float
+
+
+@dataclass(frozen=True, slots=True)
+class Extension:
+    """The next map (its trajectory is the new survey's), and what changed."""
+
+    map: SurveyMap
+    counts: Counts
+
+
+@dataclass(frozen=True, slots=True)
+class NotJoined:
+    """A survey that cannot be placed in the map with certainty, and why."""
+
+    reason: str
+
+
+def extend(
+    base_map: SurveyMap, survey: Survey, settings: SurveySettings, *, anchored: bool, map_from_survey: Array | None = None
+) -> Extension | NotJoined:  # fmt: skip
+    """The map with a survey joined to it.
+
+    anchored: base_map is published: what did not move significantly stays to the bit; else all of it takes its best place.
+    map_from_survey: where position priors put the survey, if they do: fixes elsewhere are left out, and without enough fixes
+    it is taken as it is.
+    """
+    state, guess = survey.state, survey.first_guess
+    if not (guess.scale_known and base_map.scale_known):
+        return NotJoined(
+            "a survey by one camera without IMU has no metres of its own: it can begin a map, not join one"
+        )
+    base = BaseMap(base_map, state.camera, state.body_from_cam)
+    fixes = find_fixes(base, guess.keyframes, state.body_from_cam, survey.vocabulary, settings)
+    survey_from_body = state.map_from_body  # the survey's own frame, named `map` before there was another
+    placed = place_survey(fixes, survey_from_body, map_from_survey, settings.sessions)
+    if isinstance(placed, str):
+        if map_from_survey is None:
+            return NotJoined(placed)
+        map_from_body, believed = map_from_survey @ survey_from_body, 0
+    else:
+        chain = [*chain_edges(guess, state), *survey.loops.edges]
+        map_from_body, believed = follow_fixes(placed, survey_from_body, chain)
+    sightings = _look(base, survey, map_from_body, settings.sessions.search_px, settings)
+    joint = adjust_jointly(base, state, map_from_body, sightings, settings, anchored=anchored)
+    sightings = _look(base, survey, joint.map_from_body, settings.sessions.guided_px, settings)
+    joint = adjust_jointly(base, state, joint.map_from_body, sightings, settings, anchored=anchored)
+    return _compare(base, survey, joint, settings, anchored, (len(fixes), believed))
+
+
+def _look(
+    base: BaseMap, survey: Survey, map_from_body: Array, radius_px: float, settings: SurveySettings
+) -> list[Sighting | None]:
+    return [
+        sight(base, keyframe, place @ survey.state.body_from_cam, radius_px, settings)
+        for keyframe, place in zip(survey.first_guess.keyframes, map_from_body, strict=True)
+    ]
+
+
+def _compare(
+    base: BaseMap, survey: Survey, joint: Joint, settings: SurveySettings, anchored: bool, fixes: tuple[int, int]
+) -> Extension:
+    state, guess = survey.state, survey.first_guess
+    map_from_cam = joint.map_from_body @ state.body_from_cam
+    looks = count_looks(base, guess.keyframes, map_from_cam, joint.sightings)
+    gone = faded(base, looks, settings) if anchored else np.zeros(len(base.points_map), bool)
+    change, moved_keyframes, moved_landmarks = what_changes(base, survey, joint, gone, settings, anchored=anchored)
+    keyframe_frames = [k.frame_index for k in guess.keyframes]
+    stamps = np.array([e.stamp_ns for e in guess.estimates], np.int64)
+    trajectory = Trajectory(
+        stamps, frame_trajectory(stamps, guess.odom_from_body, keyframe_frames, joint.map_from_body)
+    )
+    result = merged(
+        base, change, looks, guess.keyframes, trajectory, survey.map.trajectory_estimated,
+        settings.sessions.new_place_landmarks,
+    )  # fmt: skip
+    fresh = int((change.added_rows < 0).sum())
+    counts = Counts(
+        fixes=fixes[0],
+        believed_fixes=fixes[1],
+        keyframes_in_map=sum(s is not None for s in joint.sightings),
+        keyframes_added=len(np.unique(change.added.obs_keyframe)),
+        keyframes_moved=moved_keyframes,
+        landmarks_expected=int((looks.expected > 0).sum()),
+        landmarks_seen=int((looks.seen > 0).sum()),
+        landmarks_kept=len(result.landmark_ids) - fresh - moved_landmarks,
+        landmarks_moved=moved_landmarks,
+        landmarks_faded=int(gone.sum()),
+        landmarks_added=fresh,
+        seen_rate=round(looks.rate, 4),
+    )
+    return Extension(result, counts)

@@ -1,0 +1,152 @@
+"""Where a survey lies in the map: many fixes, of which the largest set that agrees is believed if no other comes near it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleetmap.bow import PlaceIndex, Vocabulary
+from fleetmap.features.matching import match_mutual
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.pnp.pnp import Resection, ransac_resection
+from mapserver.survey.keyframes.keyframes import Keyframe
+from mapserver.survey.merge.base_map import BaseMap
+from mapserver.survey.merge.guided_matching import locate
+from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
+from mapserver.survey.settings import SessionSettings, SurveySettings
+
+_CORRELATION = 3.0  # as of loops: what matched points share makes a fix worse than its own covariance says
+_RANSAC_PX = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class SessionFix:
+    """Keyframe k of the new survey found in the map: map_from_body (4, 4), the covariance of its inverse in body axes, inliers."""
+
+    k: int
+    map_from_body: Array
+    cov_rot_trans: Array
+    inliers: int
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """The fixes that agree (one for each keyframe), and map_from_survey (4, 4) of the best of them."""
+
+    fixes: tuple[SessionFix, ...]
+    map_from_survey: Array
+
+
+def find_fixes(
+    base: BaseMap, keyframes: Sequence[Keyframe], body_from_cam: Array, vocabulary: Vocabulary, settings: SurveySettings
+) -> list[SessionFix]:
+    """All verified fixes of up to `fix_keyframes` keyframes, several for one keyframe where the map looks alike in several places."""
+    words = vocabulary.words(base.descriptors) if len(base.descriptors) else np.zeros(0, np.int32)
+    index = PlaceIndex(vocabulary.word_count)
+    order = np.argsort(base.map.obs_keyframe, kind="stable")
+    bounds = np.searchsorted(base.map.obs_keyframe[order], np.arange(len(base.map_from_cam) + 1))
+    for place in range(len(base.map_from_cam)):
+        own = np.unique(base.map.obs_landmark[order[bounds[place] : bounds[place + 1]]])
+        index.add(place, vocabulary.bow_vector(words[own]))
+    step = max(1, -(-len(keyframes) // settings.sessions.fix_keyframes))
+    fixes: list[SessionFix] = []
+    for k in range(0, len(keyframes), step):
+        descriptors = keyframes[k].features.descriptors
+        places, _ = index.query(
+            vocabulary.bow_vector(vocabulary.words(descriptors)), None, settings.sessions.top_places
+        )
+        fixes += _fixes_of(k, base, keyframes[k], body_from_cam, places.tolist(), settings)
+    return fixes
+
+
+def _fixes_of(
+    k: int, base: BaseMap, keyframe: Keyframe, body_from_cam: Array, places: list[int], settings: SurveySettings
+) -> list[SessionFix]:
+    found: list[SessionFix] = []
+    for place in places:
+        there = base.map_from_body[place]
+        if any(np.linalg.norm(fix.map_from_body[:3, 3] - there[:3, 3]) < 1.0 for fix in found):
+            continue
+        solved = _fix_at(base, keyframe, place, settings)
+        if solved is None:
+            continue
+        carry = adjoint(body_from_cam)
+        covariance = _CORRELATION**2 * carry @ solved.cov_rot_trans @ carry.T + np.diag([1e-6] * 3 + [2.5e-5] * 3)
+        map_from_body = se3_inverse(body_from_cam @ solved.cam_from_source)
+        if all(np.linalg.norm(fix.map_from_body[:3, 3] - map_from_body[:3, 3]) > 0.5 for fix in found):
+            found.append(SessionFix(k, map_from_body, covariance, int(solved.inliers.sum())))
+    return found
+
+
+def _fix_at(base: BaseMap, keyframe: Keyframe, place: int, settings: SurveySettings) -> Resection | None:
+    rows = base.neighbourhood(place)
+    pairs = match_mutual(
+        base.descriptors[rows], keyframe.features.descriptors, settings.pairs.max_distance, settings.pairs.ratio
+    )
+    if len(pairs) < settings.sessions.min_inliers // 2:
+        return None
+    pixels = keyframe.features.pixels[pairs[:, 1]]
+    measured = np.column_stack([pixels, pixels[:, 0] - keyframe.disparities[pairs[:, 1], 0]])
+    sigmas = np.full((len(pairs), 2), settings.pairs.match_sigma_px)
+    found = ransac_resection(
+        base.camera, base.points_map[rows[pairs[:, 0]]], measured, sigmas, threshold_px=_RANSAC_PX,
+        min_inliers=settings.sessions.min_inliers // 2, seed=settings.seed,
+    )  # fmt: skip
+    if found is None or found.inliers.sum() < 0.15 * len(pairs):
+        return None
+    seen = locate(base, keyframe, se3_inverse(found.cam_from_source), settings.sessions.search_px, settings)
+    return None if seen is None else seen[2]
+
+
+def place_survey(
+    fixes: Sequence[SessionFix], survey_from_body: Array, expected: Array | None, settings: SessionSettings
+) -> Placed | str:
+    """The fixes that agree on where the survey lies, or why they cannot be believed.
+
+    survey_from_body (K, 4, 4). expected: map_from_survey by position priors, None without; fixes far from it are left out.
+    """
+    if expected is not None:
+        fixes = [f for f in fixes if _near_priors(f, expected @ survey_from_body[f.k])]
+    if len({fix.k for fix in fixes}) < settings.min_fixes:
+        return f"{len(fixes)} fixes in the map, {settings.min_fixes} are needed"
+    supports = [_agreeing(fix, fixes, survey_from_body, settings) for fix in fixes]
+    best = max(range(len(fixes)), key=lambda n: (len(supports[n]), sum(f.inliers for f in supports[n])))
+    chosen = supports[best]
+    if len(chosen) < settings.min_fixes:
+        return f"at most {len(chosen)} of {len(fixes)} fixes agree on where it lies, {settings.min_fixes} are needed"
+    claimed = {id(fix) for fix in chosen}
+    rival = max((len(s) for s in supports if not claimed & {id(f) for f in s}), default=0)
+    if rival >= settings.rival_share * len(chosen):
+        return f"{len(chosen)} fixes say one place and {rival} another: the map looks alike there"
+    return Placed(tuple(chosen), fixes[best].map_from_body @ se3_inverse(survey_from_body[fixes[best].k]))
+
+
+def _near_priors(fix: SessionFix, expected: Array, slack_m: float = 3.0) -> bool:
+    return bool(np.linalg.norm(fix.map_from_body[:3, 3] - expected[:3, 3]) < slack_m)
+
+
+def _agreeing(
+    seed: SessionFix, fixes: Sequence[SessionFix], survey_from_body: Array, settings: SessionSettings
+) -> list[SessionFix]:
+    """Of every keyframe the fix that lies where `seed` would have it, if there is one."""
+    map_from_survey = seed.map_from_body @ se3_inverse(survey_from_body[seed.k])
+    agreeing: dict[int, SessionFix] = {}
+    for fix in fixes:
+        off = se3_inverse(map_from_survey @ survey_from_body[fix.k]) @ fix.map_from_body
+        way_m = float(np.linalg.norm(survey_from_body[fix.k, :3, 3] - survey_from_body[seed.k, :3, 3]))
+        close = np.linalg.norm(off[:3, 3]) < settings.agreement_m + settings.agreement_share * way_m
+        turned = rotation_angle_rad(off[:3, :3])
+        if close and turned < np.radians(settings.agreement_deg) and fix.k not in agreeing:
+            agreeing[fix.k] = fix
+    return list(agreeing.values())
+
+
+def follow_fixes(placed: Placed, survey_from_body: Array, chain: Sequence[PoseEdge]) -> tuple[Array, int]:
+    """map_from_body (K, 4, 4) by the pose graph of the survey's own edges and the fixes, and how many fixes were believed."""
+    start = np.concatenate([np.eye(4)[None], placed.map_from_survey @ survey_from_body])
+    edges = [PoseEdge(e.i + 1, e.j + 1, e.i_from_j, e.cov_rot_trans, is_loop=False) for e in chain]
+    edges += [
+        PoseEdge(fix.k + 1, 0, se3_inverse(fix.map_from_body), fix.cov_rot_trans, is_loop=True) for fix in placed.fixes
+    ]
+    solved = optimize_pose_graph(start, edges)
+    return solved.map_from_body[1:], int((solved.loop_weights >= 0.5).sum())

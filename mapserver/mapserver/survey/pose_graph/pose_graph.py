@@ -1,0 +1,220 @@
+"""Keyframes held together by measured relative transforms: the best places for them, and which loops to disbelieve."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import gtsam
+import numpy as np
+from scipy.stats import chi2
+
+from fleetmap.errors import SurveyError
+from fleetmap.geometry import Array, se3_inverse, skew
+from mapserver.survey.pose_graph.gnc import loop_weights, squared_residuals
+
+_FIXED_SIGMA = 1e-6
+_FIRST_ITERATIONS = 15  # before another start is considered
+_SCALE_ROUNDS = 6
+_RIGHT_SHARE = 0.7  # of the loops, taken for right where the noise is estimated
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEdge:
+    """A measured i_from_j (4, 4) between keyframes i and j.
+
+    cov_rot_trans (6, 6) is that of a perturbation in the axes of i: true i_from_j = Exp(perturbation) @ i_from_j.
+    Loops may be wrong, other edges are taken for true.
+    """
+
+    i: int
+    j: int
+    i_from_j: Array
+    cov_rot_trans: Array
+    is_loop: bool
+
+
+@dataclass(frozen=True, slots=True)
+class PoseGraphResult:
+    """Optimised map_from_body (K, 4, 4).
+
+    loop_weights holds one number for each loop edge in their order: 1 believed, 0 disbelieved; below 0.5 a loop had
+    no part in the result. Costs are half the sum of squared normalised residuals of the believed edges, at the start
+    and at the result. iterations of the last solve.
+    """
+
+    map_from_body: Array
+    loop_weights: Array
+    cost_before: float
+    cost_after: float
+    iterations: int
+
+
+def adjoint(target_from_source: Array) -> Array:
+    """(6, 6) matrix that carries a perturbation from source to target axes, rotation first. Source: Barfoot, 7.45."""
+    rotation = target_from_source[:3, :3]
+    carried = np.zeros((6, 6))
+    carried[:3, :3] = carried[3:, 3:] = rotation
+    carried[3:, :3] = skew(target_from_source[:3, 3]) @ rotation
+    return carried
+
+
+def optimize_pose_graph(
+    map_from_body: Array,
+    edges: Sequence[PoseEdge],
+    fixed: int = 0,
+    robust: bool = True,
+    inlier_probability: float = 0.999,
+    max_iterations: int = 100,
+    noise: Literal["given", "estimated"] = "given",
+) -> PoseGraphResult:
+    """The places of K keyframes that fit the edges best, from a start map_from_body (K, 4, 4); `fixed` stays.
+
+    robust: loops that contradict the rest are disbelieved, by graduated non-convexity with truncated least squares in
+    which all other edges are known to be true; a loop counts as consistent while its squared residual stays within the
+    `inlier_probability` of chi-square. noise "estimated": within a bound that goes by the better 0.7 of the
+    loops, for graphs whose covariances are right only up to a common factor. Where the result is less likely than its edges'
+    covariances allow, a second start without any guess (chordal relaxation of the rotations) is tried, and the better
+    result taken. Raises SurveyError for edges that leave a keyframe without connection, point outside or carry no
+    proper covariance. Source: Yang et al. 2020 (GNC); Carlone et al. 2015 (chordal start), as gtsam has it.
+    """
+    check_edges(len(map_from_body), edges)
+    begin = start = _values(map_from_body)
+    loops = [index for index, edge in enumerate(edges) if edge.is_loop]
+    weights = np.ones(len(loops))
+    try:
+        if robust and loops:
+            graph = _graph(map_from_body, edges, fixed)
+            weights, begin = _believed(graph, loops, start, float(chi2.ppf(inlier_probability, 6)), noise)
+        believed = dict(zip(loops, weights >= 0.5, strict=True))
+        kept = [edge for index, edge in enumerate(edges) if believed.get(index, True)]
+        graph = _graph(map_from_body, kept, fixed)
+        optimum, iterations = _optimum(graph, begin, 6 * (len(kept) - len(map_from_body) + 1), max_iterations)
+    except RuntimeError as error:
+        raise SurveyError(
+            f"the pose graph of {len(map_from_body)} keyframes and {len(edges)} edges cannot be solved "
+            f"({str(error).strip().splitlines()[0]}); look for keyframes that only a wrong loop holds"
+        ) from error
+    solved = np.array([optimum.atPose3(k).matrix() for k in range(len(map_from_body))])
+    solved = map_from_body[fixed] @ se3_inverse(solved[fixed]) @ solved  # the prior leaves 1e-6 of play
+    solved[fixed] = map_from_body[fixed]
+    return PoseGraphResult(solved, weights, graph.error(start), graph.error(optimum), iterations)
+
+
+def check_edges(count: int, edges: Sequence[PoseEdge], *, connected: bool = True) -> None:
+    """Raises SurveyError unless every edge joins two of `count` keyframes with a proper covariance.
+
+    connected: also unless they join all keyframes.
+    """
+    for edge in edges:
+        if not (0 <= edge.i < count and 0 <= edge.j < count and edge.i != edge.j):
+            raise SurveyError(f"edge {edge.i}-{edge.j} does not join two of the {count} keyframes; drop it")
+        if not np.isfinite(edge.i_from_j).all() or not _is_covariance(edge.cov_rot_trans):
+            raise SurveyError(
+                f"edge {edge.i}-{edge.j}: its transform or covariance (diagonal {np.diag(edge.cov_rot_trans)}) is not "
+                "finite and positive; drop the edge"
+            )
+    lost = sorted(set(range(count)) - _joined_to_first(edges)) if connected and count else []
+    if lost:
+        raise SurveyError(f"keyframes {lost[:10]} ({len(lost)} in all) have no edge towards keyframe 0; leave them out")
+
+
+def _joined_to_first(edges: Sequence[PoseEdge]) -> set[int]:
+    neighbours: dict[int, list[int]] = {}
+    for edge in edges:
+        neighbours.setdefault(edge.i, []).append(edge.j)
+        neighbours.setdefault(edge.j, []).append(edge.i)
+    found, ahead = {0}, [0]
+    while ahead:
+        new = [k for k in neighbours.get(ahead.pop(), []) if k not in found]
+        found.update(new)
+        ahead.extend(new)
+    return found
+
+
+def _is_covariance(cov: Array) -> bool:
+    if not np.isfinite(cov).all():
+        return False
+    try:
+        np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def _values(map_from_body: Array) -> gtsam.Values:
+    values = gtsam.Values()
+    for k, map_from_k in enumerate(map_from_body):
+        values.insert(k, gtsam.Pose3(map_from_k))
+    return values
+
+
+def _graph(map_from_body: Array, edges: Sequence[PoseEdge], fixed: int) -> gtsam.NonlinearFactorGraph:
+    """The edges as factors, in their order, then the factor that fixes one keyframe."""
+    graph = gtsam.NonlinearFactorGraph()
+    for edge in edges:
+        j_from_i = adjoint(se3_inverse(edge.i_from_j))  # gtsam perturbs on the right, in the axes of j
+        cov = j_from_i @ edge.cov_rot_trans @ j_from_i.T
+        noise = gtsam.noiseModel.Gaussian.Covariance(0.5 * (cov + cov.T))
+        graph.add(gtsam.BetweenFactorPose3(edge.i, edge.j, gtsam.Pose3(edge.i_from_j), noise))
+    anchor = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED_SIGMA)
+    graph.add(gtsam.PriorFactorPose3(fixed, gtsam.Pose3(map_from_body[fixed]), anchor))
+    return graph
+
+
+def _optimum(
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, freedom: int, max_iterations: int
+) -> tuple[gtsam.Values, int]:
+    """The lowest minimum found, and the iterations that led there from the start that reached it."""
+    best, spent = _descend(graph, start, min(max_iterations, _FIRST_ITERATIONS))
+    if 2.0 * graph.error(best) > freedom + 5.0 * np.sqrt(2.0 * max(freedom, 1)):
+        other, other_spent = _without_guess(graph, min(max_iterations, _FIRST_ITERATIONS))
+        if other is not None and graph.error(other) < graph.error(best):
+            best, spent = other, other_spent
+    if spent < _FIRST_ITERATIONS or spent >= max_iterations:
+        return best, spent
+    best, more = _descend(graph, best, max_iterations - spent)
+    return best, spent + more
+
+
+def _without_guess(graph: gtsam.NonlinearFactorGraph, iterations: int) -> tuple[gtsam.Values | None, int]:
+    """What the chordal start leads to, None where the graph is too badly conditioned to have one."""
+    try:
+        return _descend(graph, gtsam.InitializePose3.initialize(graph), iterations)
+    except RuntimeError:
+        return None, 0
+
+
+def _descend(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, iterations: int) -> tuple[gtsam.Values, int]:
+    settings = gtsam.LevenbergMarquardtParams()
+    settings.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
+    settings.setMaxIterations(iterations)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, settings)
+    return optimizer.optimize(), int(optimizer.iterations())
+
+
+def _believed(
+    graph: gtsam.NonlinearFactorGraph, loops: list[int], start: gtsam.Values, bound: float, noise: str
+) -> tuple[Array, gtsam.Values]:
+    """(len(loops),) weight of every loop, and where the keyframes are then."""
+    doubtful, certain = [_with_noise(graph.at(n)) for n in loops], gtsam.NonlinearFactorGraph()
+    for n in sorted(set(range(graph.size())) - set(loops)):
+        certain.push_back(graph.at(n))
+    if noise == "given":
+        return loop_weights(certain, doubtful, start, bound)
+    values, scale = start, _scale(doubtful, start)
+    for _ in range(_SCALE_ROUNDS):
+        _, values = loop_weights(certain, doubtful, values, bound * scale, is_rough=True)
+        last, scale = scale, _scale(doubtful, values)
+        if scale > 0.5 * last:
+            break
+    return loop_weights(certain, doubtful, values, bound * scale)
+
+
+def _with_noise(factor: gtsam.NonlinearFactor) -> gtsam.NoiseModelFactor:
+    assert isinstance(factor, gtsam.NoiseModelFactor)
+    return factor
+
+
+def _scale(loops: list[gtsam.NoiseModelFactor], values: gtsam.Values) -> float:
+    """By how much the loops' squared residuals exceed what their covariances say, at a quantile that outliers spare."""
+    return max(float(np.quantile(squared_residuals(loops, values), _RIGHT_SHARE) / chi2.ppf(_RIGHT_SHARE, 6)), 1e-9)

@@ -1,0 +1,61 @@
+"""What a survey hands on: keyframes, landmarks, what saw what, and where every frame was."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array
+from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.samples import Stamps, Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """What a site's versions remember of K keyframes and N landmarks. An id is never given twice.
+
+    keyframe_ids (K,); is_place (K,): robots are offered the keyframe as a place. landmark_expected, landmark_seen (N,): in
+    how many keyframes of later surveys a landmark should have been seen, and was; landmark_missed (N,): how often it was not
+    since it was seen last.
+    """
+
+    keyframe_ids: NDArray[np.uint32]
+    is_place: NDArray[np.bool_]
+    landmark_expected: NDArray[np.uint32]
+    landmark_seen: NDArray[np.uint32]
+    landmark_missed: NDArray[np.uint32]
+    next_keyframe_id: int
+    next_landmark_id: int
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyMap:
+    """A finished survey in `map`; K keyframes, N landmarks, M observations, F selected frames.
+
+    map_from_body (K, 4, 4). points_map (N, 3), descriptors (N, 32) uint8, point_sigma_m (N,) largest standard deviation.
+    obs_keyframe and obs_landmark (M,) index the arrays here; obs_pixels (M, 3) is u_left, v, u_right (NaN without a right
+    match); obs_sigma_px (M, 2) of u and v, and of the disparity; the first
+    observation of each landmark is its reference. trajectory holds all F frames; where trajectory_estimated (F,) is false the transform
+    is a guess between neighbours. patches (N, P, P) uint8 are cut from each landmark's reference keyframe at its octave.
+    history: None for a survey that no other was compared with yet.
+    scale_known is False for one camera's map whose metres are of the survey's own making.
+    """
+
+    camera: StereoCamera
+    body_from_cam: Array
+    keyframe_stamps_ns: Stamps
+    map_from_body: Array
+    landmark_ids: NDArray[np.uint32]
+    points_map: Array
+    descriptors: NDArray[np.uint8]
+    point_sigma_m: Array
+    obs_keyframe: NDArray[np.int32]
+    obs_landmark: NDArray[np.int32]
+    obs_pixels: Array
+    obs_octave: NDArray[np.int8]
+    obs_sigma_px: Array
+    trajectory: Trajectory
+    trajectory_estimated: NDArray[np.bool_]
+    patches: NDArray[np.uint8]
+    history: History | None = None
+    scale_known: bool = True

@@ -1,0 +1,1 @@
+"""Landmarks from verified keyframe pairs."""

@@ -1,0 +1,130 @@
+"""Which keyframes are matched with which, and whether a match may be believed."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.sensors.rectification import StereoCamera
+from mapserver.survey.executor import ALONE, Worker, in_batches
+from mapserver.survey.keyframes.keyframes import Keyframe, without_pictures
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.tracks.pairs import PairMatch, match_pair, view_overlap
+
+_NEAR_CANDIDATES = 40
+_BATCH = 16  # pairs: a tenth of a second of work, so that handing it out costs nothing
+_MAX_VIEW_ANGLE_DEG = 75.0
+
+
+class PairFinder:
+    """Matches keyframes that should see the same things, given where they are."""
+
+    def __init__(
+        self, keyframes: list[Keyframe], camera: StereoCamera, body_from_cam: Array, settings: SurveySettings,
+        worker: Worker = ALONE,
+    ) -> None:  # fmt: skip
+        self._keyframes, self._camera, self._body_from_cam, self._settings = keyframes, camera, body_from_cam, settings
+        self._worker = worker
+        self._shared = ComparedFeatures([without_pictures(k) for k in keyframes], camera, settings)
+        self._depths = np.array([median_depth_m(k) for k in keyframes])
+
+    def candidates(self, map_from_body: Array, *, previous: int, only_near: int | None = None) -> list[tuple[int, int]]:
+        """Pairs (i, j), i < j: the last few in time, and the most covisible ones by predicted view.
+
+        only_near: no more than so many keyframes apart, before loops have been closed.
+        """
+        map_from_cam = map_from_body @ self._body_from_cam
+        positions, axes = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]
+        settings = self._settings.pairs
+        found: list[tuple[int, int]] = []
+        for j in range(1, len(map_from_cam)):
+            first = 0 if only_near is None else max(0, j - only_near)
+            chosen = set(range(max(first, j - previous), j))
+            earlier = np.arange(first, max(j - previous, first))
+            distance = np.linalg.norm(positions[earlier] - positions[j], axis=1)
+            near = (distance < 2.0 * np.maximum(self._depths[earlier], self._depths[j])) & (
+                axes[earlier] @ axes[j] > np.cos(np.radians(_MAX_VIEW_ANGLE_DEG))
+            )
+            closest = earlier[near][np.argsort(distance[near], kind="stable")][:_NEAR_CANDIDATES]
+            cam_j_from_map = se3_inverse(map_from_cam[j])
+            overlap = [
+                (view_overlap(self._keyframes[i], self._camera, cam_j_from_map @ map_from_cam[i]), int(i))
+                for i in closest
+            ]
+            best = sorted(overlap, reverse=True)[: settings.covisible]
+            chosen |= {i for share, i in best if share > settings.min_overlap}
+            found.extend((i, j) for i in sorted(chosen))
+        return found
+
+    def match(
+        self, candidates: list[tuple[int, int]], map_from_body: Array, allowed_m: Callable[[int, int], float], *,
+        rotation_sigma_rad: float | None, is_known: bool, progress: Callable[[int], None],
+    ) -> list[PairMatch]:  # fmt: skip
+        """Verified matches whose measured motion agrees with the predicted one to within allowed_m(i, j)."""
+        map_from_cam = map_from_body @ self._body_from_cam
+        looks = [(i, j, se3_inverse(map_from_cam[j]) @ map_from_cam[i]) for i, j in candidates]
+        batches = [(looks_there, rotation_sigma_rad, is_known) for looks_there in in_batches(looks, _BATCH)]
+        matches, number = [], 0
+        for (looks_there, _, _), found in zip(
+            batches, self._worker.map(_match_batch, self._shared, batches), strict=True
+        ):
+            for (i, j, predicted), match in zip(looks_there, found, strict=True):
+                if match is not None and _agrees(match.j_from_i, predicted, allowed_m(i, j)):
+                    matches.append(match)
+                progress(number)
+                number += 1
+        return matches
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedFeatures:
+    """What matching looks at of a survey: its keyframes without their pictures."""
+
+    keyframes: list[Keyframe]
+    camera: StereoCamera
+    settings: SurveySettings
+
+
+def _match_batch(
+    features: ComparedFeatures, batch: tuple[list[tuple[int, int, Array]], float | None, bool]
+) -> list[PairMatch | None]:
+    looks, rotation_sigma_rad, is_known = batch
+    return [
+        match_pair(
+            i, j, features.keyframes, features.camera, predicted, rotation_sigma_rad, features.settings.pairs, is_known=is_known
+        )
+        for i, j, predicted in looks
+    ]  # fmt: skip
+
+
+def _agrees(measured: Array, predicted: Array, allowed_m: float) -> bool:
+    off = se3_inverse(predicted) @ measured
+    return bool(np.linalg.norm(off[:3, 3]) <= allowed_m and rotation_angle_rad(off[:3, :3]) < np.radians(10.0))
+
+
+def drift_allowance_m(covariances: NDArray[np.float64], positions_m: Array) -> Callable[[int, int], float]:
+    """How far apart measured and predicted motion may be before loops are closed: three sigmas of the odometry since, and a floor.
+
+    covariances (K, 6, 6) of the keyframes' odometry; what was gained between two of them is their relative uncertainty.
+    """
+
+    def allowed_m(i: int, j: int) -> float:
+        gained = max(float(np.trace(covariances[j][3:, 3:] - covariances[i][3:, 3:])), 0.0)
+        floor = 0.05 + 0.03 * float(np.linalg.norm(positions_m[j] - positions_m[i]))
+        return 3.0 * float(np.sqrt(gained + floor**2))
+
+    return allowed_m
+
+
+def fixed_allowance_m(map_from_body: Array) -> Callable[[int, int], float]:
+    """The same after bundle adjustment: what a well-matched pair may be off by."""
+    positions = map_from_body[:, :3, 3]
+    return lambda i, j: 0.15 + 0.05 * float(np.linalg.norm(positions[j] - positions[i]))
+
+
+def median_depth_m(keyframe: Keyframe) -> float:
+    """Median depth of a keyframe's stereo points; 5 m without any."""
+    depths = keyframe.points_cam[np.isfinite(keyframe.disparities[:, 0]), 2]
+    return float(np.median(depths)) if len(depths) else 5.0

@@ -1,0 +1,93 @@
+"""Depths of one camera's features from the keyframes around each: what a second camera would have told at once."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.features.matching import match_mutual
+from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.odometry.mono.two_view import triangulate_pair
+from fleetmap.sensors.rectification import RGBD_BASELINE_M, StereoCamera
+from mapserver.survey.keyframes.keyframes import Keyframe
+from mapserver.survey.settings import SurveySettings
+
+
+def survey_camera(camera: StereoCamera) -> StereoCamera:
+    """The camera that a survey reckons with: a single one gets a baseline, so that depths have disparities, as a depth sensor's have."""
+    return camera if camera.baseline_m > 0 else replace(camera, baseline_m=RGBD_BASELINE_M)
+
+
+class ViewDepths:
+    """Places features of single-camera keyframes by triangulation with neighbours in time; matches are looked for once."""
+
+    def __init__(self, keyframes: Sequence[Keyframe], camera: StereoCamera, settings: SurveySettings) -> None:
+        self._keyframes, self._camera, self._settings = keyframes, camera, settings
+        reach = settings.monocular.depth_views
+        pairs = [(i, j) for j in range(len(keyframes)) for i in range(max(0, j - reach), j)]
+        self._matches = {
+            (i, j): match_mutual(
+                keyframes[i].features.descriptors, keyframes[j].features.descriptors, settings.pairs.max_distance,
+                settings.pairs.ratio,
+            )
+            for i, j in pairs
+        }  # fmt: skip
+
+    def placed(self, map_from_body: Array, body_from_cam: Array) -> list[Keyframe]:
+        """The keyframes with disparities and points of those features that several views agree on, the others without."""
+        map_from_cam = map_from_body @ body_from_cam
+        found: list[list[Array]] = [[] for _ in self._keyframes]  # rows of feature, inverse depth, its sigma
+        for (i, j), match in self._matches.items():
+            rows_i, rows_j = self._measure(i, j, match, se3_inverse(map_from_cam[j]) @ map_from_cam[i])
+            found[i].append(rows_i)
+            found[j].append(rows_j)
+        return [
+            self._with_depths(k, np.concatenate(rows) if rows else np.zeros((0, 3))) for k, rows in enumerate(found)
+        ]
+
+    def _measure(self, i: int, j: int, match: NDArray[np.int64], j_from_i: Array) -> tuple[Array, Array]:
+        """For both keyframes rows (P, 3) of feature, inverse depth and its sigma."""
+        a, b, s = self._keyframes[i].features, self._keyframes[j].features, self._settings.monocular
+        pixels_a, pixels_b = a.pixels[match[:, 0]], b.pixels[match[:, 1]]
+        points, angle = triangulate_pair(self._camera, j_from_i, pixels_a, pixels_b)
+        seen = transform_points(j_from_i, points)
+        limit = s.match_sigma_px * 2.5 * 1.2 ** np.maximum(a.octaves[match[:, 0]], b.octaves[match[:, 1]])
+        off_a = np.linalg.norm(self._camera.pixel_from_point(points)[:, :2] - pixels_a, axis=1)
+        off_b = np.linalg.norm(self._camera.pixel_from_point(seen)[:, :2] - pixels_b, axis=1)
+        with np.errstate(invalid="ignore"):
+            good = (off_a < limit) & (off_b < limit) & (angle > np.radians(s.min_angle_deg)) & (seen[:, 2] > 0)
+        sigma = np.sqrt(2.0) * s.match_sigma_px / (self._camera.focal_px * angle[good])  # as a share of the depth
+        return (
+            np.column_stack([match[good, 0], 1.0 / points[good, 2], sigma / points[good, 2]]),
+            np.column_stack([match[good, 1], 1.0 / seen[good, 2], sigma / seen[good, 2]]),
+        )
+
+    def _with_depths(self, k: int, rows: Array) -> Keyframe:
+        keyframe, focal_base = self._keyframes[k], self._camera.focal_px * self._camera.baseline_m
+        fused = fuse_inverse_depths(rows, len(keyframe.features), self._settings.monocular.max_depth_sigma_share)
+        disparities = focal_base * fused
+        points = self._camera.point_from_pixel(keyframe.features.pixels, disparities[:, 0])
+        return replace(keyframe, disparities=disparities, points_cam=points, from_views=True)
+
+
+def fuse_inverse_depths(rows: Array, count: int, max_sigma_share: float) -> Array:
+    """(count, 2) inverse depth and sigma of each feature; NaN where nothing is known well enough or the views disagree.
+
+    rows (P, 3): feature, inverse depth, sigma. The surest view decides; views within three sigmas of it are averaged with it, and a
+    feature that more views contradict than support is dropped.
+    """
+    out = np.full((count, 2), np.nan)
+    order = np.lexsort((rows[:, 2], rows[:, 0]))
+    features, values, sigmas = rows[order, 0].astype(np.int64), rows[order, 1], rows[order, 2]
+    starts = np.flatnonzero(np.r_[True, features[1:] != features[:-1]]) if len(features) else np.zeros(0, np.int64)
+    surest = np.repeat(starts, np.diff(np.r_[starts, len(features)]))
+    agree = np.abs(values - values[surest]) < 3.0 * np.hypot(sigmas, sigmas[surest])
+    weights = agree / sigmas**2
+    total = np.bincount(features, weights, count)
+    supported = 2 * np.bincount(features, agree, count) > np.bincount(features, minlength=count)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fused, sigma = np.bincount(features, weights * values, count) / total, 1.0 / np.sqrt(total)
+    good = (total > 0) & supported & (sigma < max_sigma_share * fused)
+    out[good] = np.column_stack([fused, sigma])[good]
+    return out

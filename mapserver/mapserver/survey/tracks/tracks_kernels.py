@@ -1,0 +1,144 @@
+"""Joining matched features to tracks by a union-find that never puts one keyframe twice into a group; aligning their patches."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.features.patch_align_kernels import align_patch
+from fleetmap.geometry import Array
+from fleetmap.numerics.kernel import inner_kernel, kernel
+
+Indices = NDArray[np.int64]
+Links = NDArray[np.int32]  # a long survey has ten million
+Octaves = NDArray[np.int8]
+Picture = NDArray[np.uint8]
+_LOG2_SCALE = math.log2(1.2)
+
+
+@kernel
+def _root(parents: Links, node: int) -> int:
+    while parents[node] != node:
+        parents[node] = parents[parents[node]]
+        node = parents[node]
+    return node
+
+
+@kernel
+def join(first: Links, second: Links, keyframes: Links) -> Links:
+    """(V,) the root of each of V nodes after joining first (L,) with second (L,) in their order.
+
+    keyframes (V,): a link that would bring two nodes of one keyframe into one group is left out.
+    """
+    count = len(keyframes)
+    parents, sizes = np.arange(count).astype(np.int32), np.ones(count, np.int32)
+    following, last = np.full(count, -1, np.int32), np.arange(count).astype(np.int32)
+    marks = np.full(keyframes.max() + 1 if count else 0, -1, np.int32)
+    for link in range(len(first)):
+        a, b = _root(parents, first[link]), _root(parents, second[link])
+        if a == b:
+            continue
+        if sizes[a] < sizes[b]:
+            a, b = b, a
+        node = a
+        while node >= 0:
+            marks[keyframes[node]] = link
+            node = following[node]
+        node, clash = b, False
+        while node >= 0 and not clash:
+            clash = marks[keyframes[node]] == link
+            node = following[node]
+        if clash:
+            continue
+        parents[b] = a
+        sizes[a] += sizes[b]
+        following[last[a]] = b
+        last[a] = last[b]
+    for node in range(count):
+        parents[node] = _root(parents, node)
+    return parents
+
+
+@inner_kernel
+def _halving(octave: int) -> int:
+    """As `patch_align.halvings`."""
+    return int(min(max(np.rint(octave * _LOG2_SCALE), 0.0), 2.0))
+
+
+@inner_kernel
+def _of_level(level: int, whole: Picture, half: Picture, quarter: Picture) -> Picture:
+    return whole if level == 0 else (half if level == 1 else quarter)
+
+
+@kernel
+def _warp_of_motion(x: float, y: float, z: float, own_from_reference: Array, warp: Array) -> bool:
+    """As `patch_align.similarity_from_motion` for one point of the reference; False where the warp is degenerate."""
+    m = own_from_reference
+    if not z > 1e-6:
+        return False
+    seen = np.empty((3, 3))  # the point, and what is a hundredth of its depth to the right and below
+    step = 0.01 * z
+    for k in range(3):
+        px, py = x + (step if k == 1 else 0.0), y + (step if k == 2 else 0.0)
+        for a in range(3):
+            seen[k, a] = m[a, 0] * px + m[a, 1] * py + m[a, 2] * z + m[a, 3]
+        if not seen[k, 2] > 1e-6:
+            return False
+    for k in range(2):
+        for a in range(2):
+            warp[a, k] = (seen[k + 1, a] / seen[k + 1, 2] - seen[0, a] / seen[0, 2]) / 0.01
+    determinant = warp[0, 0] * warp[1, 1] - warp[0, 1] * warp[1, 0]
+    if not 0.02 < abs(determinant) < 50.0:
+        return False
+    a, b, c, d = warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1]
+    warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1] = (
+        d / determinant,
+        -b / determinant,
+        -c / determinant,
+        a / determinant,
+    )
+    return True
+
+
+@kernel
+def align_observations(
+    whole: Picture, half: Picture, quarter: Picture, pixels: Array, octaves: Octaves, angles_deg: NDArray[np.float32],
+    theirs: Indices, points_reference: Array,
+    own_whole: Picture, own_half: Picture, own_quarter: Picture, own_pixels: Array, own_octaves: Octaves,
+    own_angles_deg: NDArray[np.float32], ours: Indices,
+    own_from_reference: Array, half_window: int, max_shift_px: float, min_correlation: float, out: Array,
+) -> None:  # fmt: skip
+    """Refined pixels of one keyframe's features `ours` (N,) against features `theirs` (N,) of a reference keyframe.
+
+    Pyramids, pixels, octaves, angles of both; points_reference (N, 3) as the reference's camera sees them. The warp comes
+    from the motion own_from_reference (4, 4), which is finer than octaves and angles; from those where it is degenerate.
+    out (N, 3): x, y, sigma_px in level-0 pixels, NaN where the patches do not agree.
+    """
+    side = 2 * half_window + 1
+    template, window, warp, found = (
+        np.empty((side + 2, side + 2)),
+        np.empty((side, side)),
+        np.empty((2, 2)),
+        np.empty(4),
+    )
+    for n in range(len(theirs)):
+        i, j = theirs[n], ours[n]
+        x, y, z = points_reference[n, 0], points_reference[n, 1], points_reference[n, 2]
+        if not _warp_of_motion(x, y, z, own_from_reference, warp):
+            scale = 1.2 ** float(int(octaves[i]) - int(own_octaves[j]))
+            angle = math.radians(float(angles_deg[i]) - float(own_angles_deg[j]))
+            warp[0, 0] = warp[1, 1] = scale * math.cos(angle)
+            warp[1, 0] = scale * math.sin(angle)
+            warp[0, 1] = -warp[1, 0]
+        level, own_level = _halving(int(octaves[i])), _halving(int(own_octaves[j]))
+        size, own_size = 2.0**level, 2.0**own_level
+        for a in range(2):
+            for b in range(2):
+                warp[a, b] *= own_size / size
+        align_patch(
+            _of_level(level, whole, half, quarter), _of_level(own_level, own_whole, own_half, own_quarter),
+            pixels[i, 0] / size, pixels[i, 1] / size, own_pixels[j, 0] / own_size, own_pixels[j, 1] / own_size, warp,
+            half_window, max_shift_px, template, window, found,
+        )  # fmt: skip
+        for a in range(3):
+            out[n, a] = found[a] * own_size if found[3] >= min_correlation else np.nan

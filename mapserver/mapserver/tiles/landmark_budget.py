@@ -1,0 +1,123 @@
+"""Which landmarks of a survey robots get: those that localize best, within a budget per metre of path. Pure.
+
+A survey finds many times what a robot needs. Every keyframe stands for the robots that will look from there: its picture is
+divided into bins, and what a landmark adds to a bin shrinks with those that it holds already, so that they are spread over the
+picture and over near and far. Every view gets what a robot needs to be sure of its place there before any gets more: at the end
+of a drive few keyframes see what others do not. Landmarks that were seen often, from far apart, and that are known well count for
+more, because they will be found again.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array, se3_inverse
+from mapserver.survey.settings import BudgetSettings
+from mapserver.survey.survey_map import SurveyMap
+from mapserver.tiles import landmark_budget_kernels as kernels
+from mapserver.tiles.distinctive_landmarks import distinct_landmarks
+
+_COLUMNS, _ROWS, _DEPTHS = 4, 3, 2
+_NO_LIMIT = 1 << 40
+_LONGEST_STEP_M = 10.0  # between keyframes; beyond it lies a break, not a path
+_CLOSE_BASELINES = 40.0
+_WIDE_RAD = np.radians(20.0)
+_SAME_WAY_M, _SAME_WAY_AFTER_M, _SAME_WAY_COSINE = 1.0, 5.0, 0.5
+
+
+def choose_landmarks(
+    survey: SurveyMap, settings: BudgetSettings, tile_size_m: float, published: NDArray[np.uint32] | None = None
+) -> NDArray[np.bool_]:
+    """(N,) which landmarks of the survey robots get.
+
+    At most settings.landmarks_per_m for every metre of `covered_path_m` (min_landmarks are always allowed: a short survey
+    covers a whole room), and tile_landmarks in a tile. Landmarks whose ids are in `published` come before all others, so that
+    robots do not fetch another choice of equal worth every night. Of those and of the others, those come first that give every
+    keyframe view_distinct_landmarks that look like nothing else in the survey, then those that give it view_landmarks, or as many as
+    it sees. What nothing observes is not chosen.
+    """
+    limit = max(settings.min_landmarks, int(settings.landmarks_per_m * covered_path_m(survey)))
+    starts, bins, weights = _views(survey)
+    cells, room = _cells(survey, tile_size_m, settings.tile_landmarks)
+    counts = np.zeros(int(bins.max(initial=-1)) + 1, np.int64)
+    chosen = np.zeros(len(survey.landmark_ids), bool)
+    seen = np.diff(starts) > 0
+    first = seen & np.isin(survey.landmark_ids, [] if published is None else published)
+    distinct = distinct_landmarks(survey.points_map, survey.descriptors)
+    per_view = _ROWS * _COLUMNS * _DEPTHS
+    taken = np.zeros(len(survey.map_from_body), np.int64)
+    for mask in (first, seen & ~first):
+        for part, quota in (
+            (mask & distinct, settings.view_distinct_landmarks), (mask, settings.view_landmarks), (mask, _NO_LIMIT),
+        ):  # fmt: skip
+            left, needs = np.flatnonzero(part & ~chosen), quota - taken
+            if len(left) and limit > 0:
+                limit -= kernels.choose(
+                    left, starts, bins, weights, cells, room, limit, counts, chosen, needs, per_view
+                )
+                taken = quota - needs
+    return chosen
+
+
+def covered_path_m(survey: SurveyMap) -> float:
+    """Metres from keyframe to keyframe, without breaks and what was driven before the same way.
+
+    Without the latter every night would add to a site's budget though its aisles are no longer than before.
+    """
+    map_from_cam = survey.map_from_body @ survey.body_from_cam
+    places, axes = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]
+    steps_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    way_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    total_m = 0.0
+    for k in np.flatnonzero(steps_m < _LONGEST_STEP_M) + 1:
+        before = int(np.searchsorted(way_m, way_m[k] - _SAME_WAY_AFTER_M))
+        near = np.linalg.norm(places[:before] - places[k], axis=1) < _SAME_WAY_M
+        if not (near & (axes[:before] @ axes[k] > _SAME_WAY_COSINE)).any():
+            total_m += float(steps_m[k - 1])
+    return total_m
+
+
+def _views(survey: SurveyMap) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Where each landmark's bins begin (N + 1,), the bins (M,) of all observations by landmark, and weights (N,)."""
+    count, camera = len(survey.landmark_ids), survey.camera
+    landmark, keyframe = survey.obs_landmark, survey.obs_keyframe
+    map_from_cam = survey.map_from_body @ survey.body_from_cam
+    points_cam = np.einsum(
+        "mij,mj->mi",
+        se3_inverse(map_from_cam)[keyframe, :3, :3],
+        survey.points_map[landmark] - map_from_cam[keyframe, :3, 3],
+    )
+    column = np.clip(survey.obs_pixels[:, 0] / camera.width_px * _COLUMNS, 0, _COLUMNS - 1).astype(np.int64)
+    row = np.clip(survey.obs_pixels[:, 1] / camera.height_px * _ROWS, 0, _ROWS - 1).astype(np.int64)
+    is_far = points_cam[:, 2] > _CLOSE_BASELINES * camera.baseline_m
+    bins = ((keyframe.astype(np.int64) * _ROWS + row) * _COLUMNS + column) * _DEPTHS + is_far
+    order = np.argsort(landmark, kind="stable")
+    starts = np.searchsorted(landmark[order], np.arange(count + 1))
+    return starts.astype(np.int64), bins[order], _weights(survey, map_from_cam, np.diff(starts))
+
+
+def _weights(survey: SurveyMap, map_from_cam: Array, seen: NDArray[np.int64]) -> Array:
+    """(N,) how likely a landmark is found again, and how much it then says.
+
+    Laplace's rule for n - 1 times found again; up to twice that for views 20 degrees apart; less the more pixels its own
+    uncertainty spans.
+    """
+    landmark, count = survey.obs_landmark, len(seen)
+    offsets = map_from_cam[survey.obs_keyframe, :3, 3] - survey.points_map[landmark]
+    distances_m = np.maximum(np.linalg.norm(offsets, axis=1), 1e-6)
+    rays = offsets / distances_m[:, None]
+    mean = np.stack([np.bincount(landmark, rays[:, axis], count) for axis in range(3)], axis=1)
+    mean = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+    spread = np.zeros(count)
+    np.maximum.at(spread, landmark, np.arccos(np.clip(np.einsum("ij,ij->i", rays, mean[landmark]), -1, 1)))
+    nearest_m = np.full(count, np.inf)
+    np.minimum.at(nearest_m, landmark, distances_m)
+    sigma_px = survey.camera.focal_px * survey.point_sigma_m / nearest_m
+    found = seen / (seen + 1.0)
+    return np.asarray(found * (1.0 + np.minimum(2 * spread / _WIDE_RAD, 1.0)) / (1.0 + sigma_px**2))
+
+
+def _cells(survey: SurveyMap, size_m: float, limit: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(N,) the tile of each landmark, numbered, and how many each tile may hold."""
+    squares = np.floor(survey.points_map[:, :2] / size_m)
+    names, cells = np.unique(squares, axis=0, return_inverse=True)
+    return cells.reshape(-1).astype(np.int64), np.full(len(names), limit, np.int64)

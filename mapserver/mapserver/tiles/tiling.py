@@ -1,0 +1,93 @@
+"""From a survey to the tiles that robots download. Pure."""
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import SurveyError
+from fleetmap.geometry import Array
+from fleetmap.mapformat import Tile
+from mapserver.survey.finish.landmark_visibility import Views
+from mapserver.survey.merge.initial_history import history_of
+from mapserver.survey.survey_map import SurveyMap
+
+TILE_SIZE_M = 16.0
+MAX_PLACE_LANDMARKS = 300
+_Ids = NDArray[np.uint32]
+
+
+def tiles_from_survey(
+    survey: SurveyMap,
+    tile_size_m: float = TILE_SIZE_M,
+    max_place_landmarks: int = MAX_PLACE_LANDMARKS,
+    chosen: NDArray[np.bool_] | None = None,
+) -> list[Tile]:
+    """The survey cut into squares of `tile_size_m`, ordered by x, then y.
+
+    Landmarks lie in the tile of their position, places (the keyframes that are offered as such, under their ids) in that
+    of their camera's centre. A place lists at most `max_place_landmarks` of the landmarks seen there, those with most
+    observations in the survey. Landmarks that nothing observes are left out: nothing says from where they are seen.
+    chosen (N,): the landmarks that robots get, all if None.
+    Raises SurveyError for a survey with values that are not finite.
+    """
+    map_from_cam = survey.map_from_body @ survey.body_from_cam
+    _check_finite(survey, map_from_cam)
+    views = Views(survey, map_from_cam)
+    chosen = np.ones(len(survey.landmark_ids), bool) if chosen is None else chosen
+    kept = np.flatnonzero((views.counts > 0) & chosen)
+    kept = kept[np.argsort(survey.landmark_ids[kept], kind="stable")]
+    landmark_cells = _cells(survey.points_map[kept], tile_size_m)
+    place_cells = _cells(map_from_cam[:, :3, 3], tile_size_m)
+    references = _place_landmarks(survey, views.counts, max_place_landmarks, chosen)
+    history = history_of(survey)
+    tiles = []
+    for cell in sorted({(int(x), int(y)) for x, y in np.concatenate([landmark_cells, place_cells[history.is_place]])}):
+        rows = kept[(landmark_cells == cell).all(axis=1)]
+        places = np.flatnonzero((place_cells == cell).all(axis=1) & history.is_place)
+        places = places[np.argsort(history.keyframe_ids[places], kind="stable")]
+        tiles.append(
+            Tile(
+                tile_x=cell[0],
+                tile_y=cell[1],
+                size_m=tile_size_m,
+                landmark_ids=survey.landmark_ids[rows],
+                points_map=survey.points_map[rows],
+                descriptors=survey.descriptors[rows],
+                view_directions_map=views.directions_map[rows].astype(np.float32),
+                view_half_angle_rad=views.half_angle_rad[rows].astype(np.float32),
+                max_distance_m=views.max_distance_m[rows].astype(np.float32),
+                sigma_m=survey.point_sigma_m[rows].astype(np.float32),
+                place_ids=history.keyframe_ids[places],
+                map_from_cam=map_from_cam[places],
+                place_landmark_ids=tuple(references[place] for place in places),
+            )
+        )
+    return tiles
+
+
+def _check_finite(survey: SurveyMap, map_from_cam: Array) -> None:
+    points = int((~np.isfinite(survey.points_map).all(axis=1)).sum())
+    places = int((~np.isfinite(map_from_cam).all(axis=(1, 2))).sum())
+    if points or places:
+        raise SurveyError(
+            f"{points} landmarks and {places} keyframes of the survey are not finite; its adjustment failed"
+        )
+
+
+def _cells(points_map: Array, size_m: float) -> NDArray[np.int64]:
+    return np.asarray(np.floor(points_map[:, :2] / size_m), np.int64)
+
+
+def _place_landmarks(survey: SurveyMap, counts: NDArray[np.intp], limit: int, chosen: NDArray[np.bool_]) -> list[_Ids]:
+    """For each keyframe the sorted ids of the best observed of the chosen landmarks seen in it."""
+    ids = survey.landmark_ids
+    order = np.lexsort((ids[survey.obs_landmark], -counts[survey.obs_landmark], survey.obs_keyframe))
+    order = order[chosen[survey.obs_landmark[order]]]
+    bounds = np.searchsorted(survey.obs_keyframe[order], np.arange(len(survey.map_from_body) + 1))
+    lists = []
+    for start, end in pairwise(bounds):
+        seen = ids[survey.obs_landmark[order[start:end]]]
+        _, first = np.unique(seen, return_index=True)
+        lists.append(np.unique(seen[np.sort(first)[:limit]]))
+    return lists

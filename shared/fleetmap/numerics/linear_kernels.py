@@ -1,0 +1,98 @@
+"""Small dense linear algebra for kernels.
+
+numba's own np.linalg and @ need scipy at run time, which a robot does not carry.
+"""
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from fleetmap.numerics.kernel import kernel
+
+
+@kernel
+def matmul(a: Array, b: Array) -> Array:
+    """(n, m) product of (n, k) and (k, m)."""
+    out = np.zeros((a.shape[0], b.shape[1]))
+    for i in range(a.shape[0]):
+        for k in range(a.shape[1]):
+            x = a[i, k]
+            if x != 0.0:
+                for j in range(b.shape[1]):
+                    out[i, j] += x * b[k, j]
+    return out
+
+
+@kernel
+def matmul_nt(a: Array, b: Array) -> Array:
+    """(n, m) product of (n, k) and the transpose of (m, k)."""
+    return matmul(a, b.T.copy())  # whole rows at once: a sum along a row waits for each of its additions
+
+
+@kernel
+def cholesky_in_place(a: Array) -> bool:
+    """Lower factor into the lower triangle of symmetric `a` (n, n); False where it is not positive definite."""
+    n = a.shape[0]
+    for j in range(n):
+        diagonal = a[j, j]
+        for k in range(j):
+            diagonal -= a[j, k] * a[j, k]
+        if not diagonal > 0.0:
+            return False
+        diagonal = np.sqrt(diagonal)
+        a[j, j] = diagonal
+        for i in range(j + 1, n):
+            total = a[i, j]
+            for k in range(j):
+                total -= a[i, k] * a[j, k]
+            a[i, j] = total / diagonal
+    return True
+
+
+@kernel
+def forward_substitute(lower: Array, b: Array) -> None:
+    """Solves lower @ x = b in place, b (n,)."""
+    for i in range(len(b)):
+        total = b[i]
+        for k in range(i):
+            total -= lower[i, k] * b[k]
+        b[i] = total / lower[i, i]
+
+
+@kernel
+def solve_spd(a: Array, b: Array) -> bool:
+    """Solves a @ x = b in place for symmetric positive definite `a` (n, n), destroyed; b (n,).
+
+    False where `a` is not definite.
+    """
+    if not cholesky_in_place(a):
+        return False
+    forward_substitute(a, b)
+    for i in range(len(b) - 1, -1, -1):
+        total = b[i]
+        for k in range(i + 1, len(b)):
+            total -= a[k, i] * b[k]
+        b[i] = total / a[i, i]
+    return True
+
+
+@kernel
+def exp_so3(rotvec: Array) -> Array:
+    """(3, 3) rotation of a rotation vector."""
+    x, y, z = rotvec[0], rotvec[1], rotvec[2]
+    squared = x * x + y * y + z * z
+    angle = np.sqrt(squared)
+    if angle < 1e-6:
+        a, b = 1.0 - squared / 6.0, 0.5 - squared / 24.0
+    else:
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared
+    out = np.empty((3, 3))
+    out[0, 0] = 1.0 - b * (y * y + z * z)
+    out[1, 1] = 1.0 - b * (x * x + z * z)
+    out[2, 2] = 1.0 - b * (x * x + y * y)
+    out[0, 1] = b * x * y - a * z
+    out[1, 0] = b * x * y + a * z
+    out[0, 2] = b * x * z + a * y
+    out[2, 0] = b * x * z - a * y
+    out[1, 2] = b * y * z - a * x
+    out[2, 1] = b * y * z + a * x
+    return out

@@ -1,0 +1,1 @@
+"""The right-invariant multi-state constraint Kalman filter."""

@@ -1,0 +1,1 @@
+"""Initialization of the filter: static, dynamic, and monocular-inertial."""

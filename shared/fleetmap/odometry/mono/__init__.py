@@ -1,0 +1,1 @@
+"""Odometry with one camera."""

@@ -1,0 +1,343 @@
+"""Where one camera is by its pictures alone: up to scale, from two views on, refined over a window of views."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array, se3, se3_inverse, transform_points
+from fleetmap.odometry.mono.mono_ba_kernels import adjust_window
+from fleetmap.odometry.mono.two_view import rays_from_pixels, two_view_motion
+from fleetmap.odometry.settings import MonocularSettings
+from fleetmap.pnp.pnp import ransac_resection, refine_resection
+from fleetmap.sensors.rectification import StereoCamera
+
+Ids = NDArray[np.int64]
+_HUBER_SIGMAS = 2.5
+_ITERATIONS = 8
+_CORRELATION = (
+    3.0  # points share the errors of the views they come from: a resection's own sigma is too small by about this
+)
+_LONGEST_WAIT = 60  # frames without a first pair before the search starts again from a later one
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One camera of the window: vision_from_cam (4, 4), the ids (N,) that it saw and their pixels (N, 2)."""
+
+    frame_index: int
+    vision_from_cam: Array
+    ids: Ids
+    pixels: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What one frame gave: vision_from_cam, None before the first pair of views and where tracking was lost.
+
+    cov_rot_trans (6, 6) in vision axes. revised: earlier frames that are placed only now, (frame index, vision_from_cam).
+    lost: nothing ties this frame to the ones before, and `vision` starts again. depth: median along the optical axis.
+    """
+
+    vision_from_cam: Array | None
+    cov_rot_trans: Array
+    revised: tuple[tuple[int, Array], ...] = ()
+    lost: bool = False
+    depth: float = 5.0
+
+
+@dataclass
+class _World:
+    """The window's views and the points that they made, by track id; vision_from_cam and pixel of tracks still without one."""
+
+    views: list[View] = field(default_factory=list)
+    points: dict[int, Array] = field(default_factory=dict)
+    births: dict[int, tuple[Array, Array]] = field(default_factory=dict)
+
+
+class VisualOdometry:
+    """Takes the tracked points of one frame after the other; lengths are in units of the first scene's median depth."""
+
+    def __init__(self, camera: StereoCamera, settings: MonocularSettings) -> None:
+        self._camera, self._settings = camera, settings
+        self._lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, 0.0])
+        self._world = _World()
+        self._waiting: list[tuple[int, Ids, Array]] = []
+        self._last = np.eye(4)  # vision_from_cam of the frame before
+        self._step = np.eye(4)  # previous camera from this one
+        self._covariance = np.zeros((6, 6))
+        self.depth = settings.first_depth
+
+    @property
+    def started(self) -> bool:
+        """Whether there are points to be located by."""
+        return bool(self._world.views)
+
+    def points_in_camera(self, ids: Ids) -> Array:
+        """(N, 3) points of these tracks as the last frame's camera sees them, NaN where unknown."""
+        known = np.array([self._world.points.get(i, _NOWHERE) for i in ids.tolist()]).reshape(-1, 3)
+        return transform_points(se3_inverse(self._last), known)
+
+    def motion_guess(self) -> Array:
+        """cam_from_previous (4, 4), as if the last step went on."""
+        return se3_inverse(self._step)
+
+    def add(self, frame_index: int, ids: Ids, pixels: Array) -> Sight:
+        """The sight of one frame: ids (N,) and pixels (N, 2) of what it tracks."""
+        if not self.started:
+            return self._first_views(frame_index, ids, pixels)
+        located = self._locate(ids, pixels, self._last @ self._step)
+        if located is None:
+            self._world, self._waiting = _World(), [(frame_index, ids, pixels)]
+            self._step = np.eye(4)
+            return Sight(None, self._covariance, lost=True, depth=self.depth)
+        view = View(frame_index, located[0], ids, pixels)
+        self._place_new(view)
+        if self._is_new(view):
+            self._world.views.append(view)
+            self._grow()
+            view = self._world.views[-1]
+        self._advance(view.vision_from_cam, located[1])
+        return Sight(view.vision_from_cam, self._covariance.copy(), depth=self.depth)
+
+    def _advance(self, vision_from_cam: Array, cov: Array) -> None:
+        self._step = se3_inverse(self._last) @ vision_from_cam
+        length = float(np.linalg.norm(self._step[:3, 3]))
+        rotation = np.kron(np.eye(2), vision_from_cam[:3, :3])
+        share = self._settings.drift_share
+        grown = np.diag([1e-7] * 3 + [(share * length) ** 2 + 1e-9] * 3)
+        self._covariance = self._covariance + grown + 0.1 * rotation @ (_CORRELATION**2 * cov) @ rotation.T
+        self._last = vision_from_cam
+        depths = [p[2] for p in self._seen_points(vision_from_cam)]
+        if depths:
+            self.depth = float(np.median(depths))
+
+    def _seen_points(self, vision_from_cam: Array) -> Array:
+        newest = self._world.views[-1]
+        known = [self._world.points[i] for i in newest.ids.tolist() if i in self._world.points]
+        points = transform_points(se3_inverse(vision_from_cam), np.array(known).reshape(-1, 3))
+        return points[points[:, 2] > 0]
+
+    # --- the first pair ---
+
+    def _first_views(self, frame_index: int, ids: Ids, pixels: Array) -> Sight:
+        s = self._settings
+        self._waiting.append((frame_index, ids, pixels))
+        nothing = Sight(None, self._covariance, depth=self.depth)
+        while len(self._waiting) > 1:
+            first = self._waiting[0]
+            _, a, b = np.intersect1d(first[1], ids, return_indices=True)
+            if len(a) < s.first_min_points or len(self._waiting) > _LONGEST_WAIT:
+                self._waiting.pop(0)  # too little is left of the oldest: begin later
+                continue
+            if np.median(np.linalg.norm(first[2][a] - pixels[b], axis=1)) < s.first_parallax_px:
+                return nothing
+            return self._begin(first[1][a], first[2][a], pixels[b]) or nothing
+        return nothing
+
+    def _begin(self, ids: Ids, before: Array, now: Array) -> Sight | None:
+        s = self._settings
+        found = two_view_motion(self._camera, before, now, threshold_px=1.0, seed=len(ids))
+        if (
+            found is None
+            or found.inliers.sum() < max(s.first_min_points, 0.6 * len(ids))
+            or found.parallax_rad < np.radians(s.min_angle_deg)
+        ):
+            return None
+        unit = self.depth / float(np.median(found.points_a[found.inliers, 2]))
+        first, last = self._waiting[0], self._waiting[-1]
+        vision_from_first = self._last
+        now_from_first = se3(found.b_from_a[:3, :3], unit * found.b_from_a[:3, 3])
+        points = transform_points(vision_from_first, unit * found.points_a[found.inliers])
+        self._world = _World(
+            [
+                View(first[0], vision_from_first, first[1], first[2]),
+                View(last[0], vision_from_first @ se3_inverse(now_from_first), last[1], last[2]),
+            ],
+            dict(zip(ids[found.inliers].tolist(), points, strict=True)),
+        )
+        self._adjust(held=1)
+        placed = self._place_between()
+        if placed is None or len(self._world.points) < s.first_min_points // 2:
+            self._world = _World()
+            return None
+        self._normalise(vision_from_first, placed)
+        self._waiting = []
+        located = self._locate(last[1], last[2], self._world.views[-1].vision_from_cam)
+        self._last = placed[-2][1] if len(placed) > 1 else vision_from_first
+        self._advance(self._world.views[-1].vision_from_cam, np.eye(6) * 1e-6 if located is None else located[1])
+        return Sight(
+            self._world.views[-1].vision_from_cam, self._covariance.copy(), revised=tuple(placed[:-1]), depth=self.depth
+        )
+
+    def _place_between(self) -> list[tuple[int, Array]] | None:
+        """All waiting frames located by the points of the first and the last; None where one cannot be. Some become views.
+
+        Twice, with an adjustment between: two views of a flat scene alone can leave the turn between them off by many degrees.
+        """
+        between = self._located_between()
+        if between is None:
+            return None
+        stride = max(1, -(-len(between) // (self._settings.window_views - 3)))
+        self._world.views[1:1] = between[stride // 2 :: stride]
+        self._adjust(held=1)
+        first, last = self._world.views[0], self._world.views[-1]
+        between = self._located_between()
+        if between is None:
+            return None
+        return [(v.frame_index, v.vision_from_cam) for v in (first, *between, last)]
+
+    def _located_between(self) -> list[View] | None:
+        guess = self._world.views[0].vision_from_cam
+        found = []
+        for frame_index, ids, pixels in self._waiting[1:-1]:
+            located = self._locate(ids, pixels, guess)
+            if located is None:
+                return None
+            guess = located[0]
+            found.append(View(frame_index, guess, ids, pixels))
+        return found
+
+    def _normalise(self, vision_from_first: Array, placed: list[tuple[int, Array]]) -> None:
+        """Scales the new world so that half of its points lie nearer than the depth that is the unit."""
+        points = transform_points(se3_inverse(vision_from_first), np.array(list(self._world.points.values())))
+        unit = self.depth / float(np.median(points[:, 2]))
+
+        def scaled(vision_from_cam: Array) -> Array:
+            out = vision_from_cam.copy()
+            out[:3, 3] = vision_from_first[:3, 3] + unit * (out[:3, 3] - vision_from_first[:3, 3])
+            return out
+
+        origin = vision_from_first[:3, 3]
+        self._world.points = {i: origin + unit * (p - origin) for i, p in self._world.points.items()}
+        self._world.views = [View(v.frame_index, scaled(v.vision_from_cam), v.ids, v.pixels) for v in self._world.views]
+        placed[:] = [(number, scaled(there)) for number, there in placed]
+
+    # --- one frame, and the window ---
+
+    def _locate(self, ids: Ids, pixels: Array, guess: Array) -> tuple[Array, Array] | None:
+        """vision_from_cam and covariance (6, 6, camera axes) by points that are known; None where too few agree."""
+        s = self._settings
+        rows = [n for n, i in enumerate(ids.tolist()) if i in self._world.points]
+        if len(rows) < s.min_points:
+            return None
+        points = np.array([self._world.points[i] for i in ids[rows].tolist()])
+        measured = np.column_stack([pixels[rows], np.full(len(rows), np.nan)])
+        sigmas = np.full((len(rows), 2), s.sigma_px)
+        found = refine_resection(self._camera, points, measured, sigmas, se3_inverse(guess))
+        if found is None or found.inliers.sum() < max(s.min_points, 0.6 * len(rows)):
+            again = ransac_resection(
+                self._camera,
+                points,
+                measured,
+                sigmas,
+                threshold_px=s.max_error_px,
+                min_inliers=s.min_points,
+                seed=len(rows),
+            )
+            found = again if again is not None and again.inliers.sum() >= 0.4 * len(rows) else None
+        return None if found is None else (_orthonormal(se3_inverse(found.cam_from_source)), found.cov_rot_trans)
+
+    def _is_new(self, view: View) -> bool:
+        s, last = self._settings, self._world.views[-1]
+        shared, a, b = np.intersect1d(last.ids, view.ids, return_indices=True)
+        if len(shared) < s.view_overlap * len(last.ids):
+            return True
+        known = sum(i in self._world.points for i in view.ids.tolist())
+        wanted_px = s.view_parallax_px * (0.4 if known < 0.5 * len(view.ids) else 1.0)
+        return bool(np.median(np.linalg.norm(last.pixels[a] - view.pixels[b], axis=1)) > wanted_px)
+
+    def _grow(self) -> None:
+        """The window adjusted, and what left it forgotten."""
+        self._adjust(held=2)
+        self._world.views = self._world.views[-self._settings.window_views :]
+        seen = {i for v in self._world.views for i in v.ids.tolist()}
+        self._world.points = {i: p for i, p in self._world.points.items() if i in seen}
+
+    def _place_new(self, view: View) -> None:
+        """Gives a point to every track that by now is seen at an angle large enough since it was first seen."""
+        points, births = self._world.points, self._world.births
+        wanted = np.array([i not in points for i in view.ids.tolist()], bool)
+        for track_id, pixel in zip(view.ids[wanted].tolist(), view.pixels[wanted], strict=True):
+            births.setdefault(track_id, (view.vision_from_cam, pixel))
+        alive = set(view.ids.tolist())
+        for gone in [i for i in births if i not in alive]:
+            del births[gone]
+        if not wanted.any():
+            return
+        ids, now = view.ids[wanted], view.pixels[wanted]
+        first = np.array([births[i][0] for i in ids.tolist()])
+        before = np.array([births[i][1] for i in ids.tolist()])
+        found = self._between(first, before, view.vision_from_cam, now)
+        for track_id, point in zip(ids.tolist(), found, strict=True):
+            if np.isfinite(point[0]):
+                points[track_id] = point
+                del births[track_id]
+
+    def _between(self, first: Array, before: Array, last: Array, now: Array) -> Array:
+        """(N, 3) points midway between rays of cameras first (N, 4, 4) and last (4, 4); NaN where angle or pixels forbid."""
+        rays_a = np.einsum("nij,nj->ni", first[:, :3, :3], rays_from_pixels(self._camera, before))
+        rays_b = rays_from_pixels(self._camera, now) @ last[:3, :3].T
+        apart = last[:3, 3] - first[:, :3, 3]
+        cosine = (rays_a * rays_b).sum(axis=1)
+        determinant = np.maximum(1.0 - cosine**2, 1e-12)
+        along_a = ((rays_a * apart).sum(axis=1) - cosine * (rays_b * apart).sum(axis=1)) / determinant
+        along_b = (cosine * (rays_a * apart).sum(axis=1) - (rays_b * apart).sum(axis=1)) / determinant
+        points = 0.5 * (first[:, :3, 3] + along_a[:, None] * rays_a + last[:3, 3] + along_b[:, None] * rays_b)
+        away = np.einsum("nji,nj->ni", first[:, :3, :3], points - first[:, :3, 3])
+        off_a = np.linalg.norm(self._camera.pixel_from_point(away)[:, :2] - before, axis=1)
+        off_b = np.linalg.norm(
+            self._camera.pixel_from_point(transform_points(se3_inverse(last), points))[:, :2] - now, axis=1
+        )
+        wide = cosine < np.cos(np.radians(self._settings.point_angle_deg))
+        limit = 0.5 * self._settings.max_error_px
+        with np.errstate(invalid="ignore"):
+            good = wide & (along_a > 0) & (along_b > 0) & (off_a < limit) & (off_b < limit)
+        points[~good] = np.nan
+        return np.asarray(points, np.float64)
+
+    def _adjust(self, held: int) -> None:
+        """Bundle adjustment of the window; its `held` oldest views stay, points that do not fit go."""
+        views, points = self._world.views, self._world.points
+        rows = [{i: n for n, i in enumerate(v.ids.tolist())} for v in views]
+        numbers: list[int] = []
+        starts, obs_views = [0], list[int]()
+        pixels: list[Array] = []
+        for track_id in sorted(points):
+            seen = [k for k, row in enumerate(rows) if track_id in row]
+            if len(seen) < 2:
+                continue
+            numbers.append(track_id)
+            obs_views.extend(seen)
+            pixels.extend(views[k].pixels[rows[k][track_id]] for k in seen)
+            starts.append(len(obs_views))
+        if len(numbers) < self._settings.min_points or len(views) <= held:
+            return
+        rotations = np.array([v.vision_from_cam[:3, :3] for v in views])
+        positions = np.array([v.vision_from_cam[:3, 3] for v in views])
+        values = np.array([points[i] for i in numbers])
+        squared, bounds = np.empty(len(obs_views)), np.array(starts, np.int64)
+        adjust_window(
+            rotations, positions, np.arange(len(views)) < held, values, bounds, np.array(obs_views, np.int64), np.array(pixels),
+            self._lens[:3].copy(), self._settings.sigma_px, _HUBER_SIGMAS, _ITERATIONS, squared,
+        )  # fmt: skip
+        worst = np.maximum.reduceat(squared, bounds[:-1])
+        limit = (self._settings.max_error_px / self._settings.sigma_px) ** 2
+        for track_id, value, off in zip(numbers, values, worst.tolist(), strict=True):
+            if off < limit:
+                points[track_id] = value
+            else:
+                del points[track_id]
+        self._world.views = [
+            View(v.frame_index, _orthonormal(se3(rotations[k], positions[k])), v.ids, v.pixels)
+            for k, v in enumerate(views)
+        ]
+
+
+_NOWHERE = np.full(3, np.nan)
+
+
+def _orthonormal(vision_from_cam: Array) -> Array:
+    """The nearest rigid transform: guesses are products of earlier answers, in which rounding would triple with every frame."""
+    u, _, vt = np.linalg.svd(vision_from_cam[:3, :3])
+    return se3(u @ vt, vision_from_cam[:3, 3])

@@ -1,0 +1,1 @@
+"""Feature tracking from frame to frame."""

@@ -1,0 +1,332 @@
+"""Points followed through a recording: optical flow where frames are close, descriptors where they are not."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.features import flow, orb, patch_align, stereo
+from fleetmap.features.corners import spread_corners
+from fleetmap.features.matching import match_mutual
+from fleetmap.geometry import Array, transform_points
+from fleetmap.odometry.settings import TrackerSettings
+from fleetmap.odometry.tracking import tracker_kernels
+from fleetmap.pnp.pnp import Resection, ransac_resection, refine_resection, resection_with_rotation
+from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+
+_LEVELS_WHEN_SURE, _HELD_WHEN_SURE = 1, 0.6
+Ids = NDArray[np.int64]
+_FLOW_ITERATIONS = (
+    200  # finds a motion that a third of the points share; with fewer the flow has failed, and a live robot must go on
+)
+MotionSince = Callable[[int], Array | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Earlier:
+    """Observations of an earlier frame, for tracks that were begun there only now, and the motion since.
+
+    ids (N,), pixels (N, 3) u_left v u_right, cam_from_earlier (4, 4).
+    """
+
+    frame_index: int
+    ids: Ids
+    pixels: Array
+    cam_from_earlier: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """What one frame saw.
+
+    ids (N,), ascending, and pixels (N, 3) u_left v u_right of the current frame. cam_from_previous: the motion measured since the
+    previous frame, None where too few points agree; cov_rot_trans (6, 6): of its left perturbation. After a gap
+    (by_descriptors) `earlier` holds what was matched, best first.
+    """
+
+    ids: Ids
+    pixels: Array
+    earlier: tuple[Earlier, ...]
+    cam_from_previous: Array | None
+    inlier_share: float
+    by_descriptors: bool
+    cov_rot_trans: Array | None = None
+
+    @property
+    def lost(self) -> bool:
+        """Whether nothing ties this frame to any earlier one."""
+        return self.cam_from_previous is None and not self.earlier
+
+
+@dataclass(frozen=True, slots=True)
+class _Remembered:
+    frame_index: int
+    pyramid: patch_align.Pyramid
+    features: orb.Features
+    disparities: Array
+    points_cam: Array
+
+
+@dataclass
+class _Points:
+    ids: Ids
+    pixels: Array  # (N, 3)
+
+    def take(self, keep: NDArray[np.bool_]) -> "_Points":
+        return _Points(self.ids[keep], self.pixels[keep])
+
+
+class Tracker:
+    """Feeds on rectified frames in order; ids never repeat."""
+
+    def __init__(
+        self, camera: StereoCamera, settings: TrackerSettings, stereo_settings: stereo.StereoSettings | None = None
+    ) -> None:
+        self._camera = camera
+        self._settings = settings
+        self._stereo = stereo_settings or stereo.StereoSettings()
+        self._orb = orb.OrbSettings(count=settings.match_features)
+        self._previous: RectifiedFrame | None = None
+        nothing = flow.Pyramid(np.zeros((0, 0), np.uint8))
+        self._pyramids = [nothing, nothing]  # of the previous frame and of this one
+        self._lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.focal_px * camera.baseline_m])
+        self._points = _Points(np.zeros(0, np.int64), np.zeros((0, 3)))
+        self._next_id = 0
+        self._frame_index = -1
+        self._memory: list[_Remembered] = []
+
+    def track(
+        self, frame: RectifiedFrame, motion_since: MotionSince, rotation_sigma_rad: float | None = None
+    ) -> Tracked:
+        """Follows the points into `frame`.
+
+        motion_since(frame_index) predicts cam_from_earlier (4, 4) since a frame counted from 0, None where it is
+        forgotten; rotation_sigma_rad says how well its rotation is known, None where it is only a guess.
+        """
+        motion: Array | None = None
+        covariance: Array | None = None
+        earlier: tuple[Earlier, ...] = ()
+        share, far = 1.0, False
+        self._frame_index += 1
+        self._pyramids[1] = flow.Pyramid(frame.left)
+        if self._previous is not None:
+            far = (frame.stamp_ns - self._previous.stamp_ns) * 1e-9 > self._settings.max_gap_s
+            if far:
+                earlier, share = self._rematch(frame, motion_since, rotation_sigma_rad)
+                motion = next((e.cam_from_earlier for e in earlier if e.frame_index == self._frame_index - 1), None)
+            else:
+                self._memory.clear()
+                guess = motion_since(self._frame_index - 1)
+                sure = guess is not None and rotation_sigma_rad is not None
+                resection, share = self._follow(frame, np.eye(4) if guess is None else guess, sure)
+                if resection is not None:
+                    motion, covariance = resection.cam_from_source, resection.cov_rot_trans
+        self._renew_disparities(frame)
+        self._add_corners(frame)
+        self._previous = frame
+        self._pyramids[0] = self._pyramids[1]
+        return Tracked(self._points.ids.copy(), self._points.pixels.copy(), earlier, motion, share, far, covariance)
+
+    def _points_cam(self, pixels: Array) -> Array:
+        if self._camera.baseline_m == 0:
+            return np.full((len(pixels), 3), np.nan)
+        return self._camera.point_from_pixel(pixels[:, :2], pixels[:, 0] - pixels[:, 2])
+
+    def _predict(self, points_cam: Array, pixels: Array, cam_from_previous: Array) -> Array:
+        """Where the previous points should appear; those without depth move as if far away."""
+        predicted = np.empty((len(pixels), 2))
+        tracker_kernels.predict(points_cam, pixels, np.ascontiguousarray(cam_from_previous), self._lens, predicted)
+        return predicted
+
+    def _follow(self, frame: RectifiedFrame, cam_from_previous: Array, sure: bool) -> tuple[Resection | None, float]:
+        """sure: the motion is a prediction, not a guess."""
+        if not len(self._points.ids):
+            return None, 0.0
+        pixels, points_cam = self._points.pixels, self._points_cam(self._points.pixels)
+        flowed, kept = self._flow(frame, self._predict(points_cam, pixels, cam_from_previous), sure)
+        resection = self._motion(points_cam, flowed, kept, cam_from_previous)
+        before = int(kept.sum())
+        carried = np.empty((len(pixels), 3))  # the old disparity is the prior of the new one
+        if resection is not None:
+            tracker_kernels.carry(
+                points_cam,
+                pixels,
+                flowed,
+                resection.cam_from_source,
+                self._lens,
+                self._settings.ransac_px,
+                kept,
+                carried,
+            )
+        else:
+            carried[:, :2], carried[:, 2] = flowed, np.nan
+        share = float(kept.sum()) / max(before, 1)
+        self._points = _Points(self._points.ids[kept], carried[kept])
+        return resection, share
+
+    def _flow(self, frame: RectifiedFrame, predicted: Array, sure: bool) -> tuple[Array, NDArray[np.bool_]]:
+        """Pyramidal Lucas-Kanade with back-check: pixels (N, 2) and which ones hold.
+
+        From a prediction one level above the picture is enough. Coarser ones cost as much again, and where near and far things
+        meet they lead away from a good start. Where too little holds that way, the prediction was none: again from all levels.
+        """
+        levels = self._settings.pyramid_levels
+        new, kept = self._flow_from(frame, predicted, min(levels, _LEVELS_WHEN_SURE) if sure else levels)
+        if sure and kept.mean() < _HELD_WHEN_SURE:
+            return self._flow_from(frame, predicted, levels)
+        return new, kept
+
+    def _flow_from(self, frame: RectifiedFrame, predicted: Array, levels: int) -> tuple[Array, NDArray[np.bool_]]:
+        s = self._settings
+        before, now, old = self._pyramids[0], self._pyramids[1], np.ascontiguousarray(self._points.pixels[:, :2])
+        new, found = flow.follow(before, now, old, predicted, window_px=s.window_px, levels=levels)
+        height, width = frame.left.shape
+        found &= (new[:, 0] > 6) & (new[:, 1] > 6) & (new[:, 0] < width - 7) & (new[:, 1] < height - 7)
+        return new, flow.leads_back(before, now, old, new, found, window_px=s.window_px, within_px=s.back_check_px)
+
+    def _motion(self, points_cam: Array, flowed: Array, kept: NDArray[np.bool_], guess: Array) -> Resection | None:
+        """cam_from_previous from points with depth.
+
+        Least squares from the guess, RANSAC where most points disagree with it.
+        """
+        usable = kept & np.isfinite(points_cam).all(axis=1)
+        count = int(usable.sum())
+        if count < self._settings.min_inliers:
+            return None
+        measured = np.column_stack([flowed[usable], np.full(count, np.nan)])
+        sigmas = np.full((count, 2), 1.0)
+        result = refine_resection(self._camera, points_cam[usable], measured, sigmas, guess)
+        if result is not None and result.inliers.sum() > 0.6 * count:
+            return result
+        again = ransac_resection(
+            self._camera, points_cam[usable], measured, sigmas, threshold_px=self._settings.ransac_px,
+            min_inliers=self._settings.min_inliers, seed=count, iterations=_FLOW_ITERATIONS,
+        )  # fmt: skip
+        if again is None or (result is not None and result.inliers.sum() >= again.inliers.sum()):
+            again = result
+        return again if again is not None and again.inliers.sum() >= self._settings.min_inliers else None
+
+    def _rematch(
+        self, frame: RectifiedFrame, motion_since: MotionSince, rotation_sigma_rad: float | None
+    ) -> tuple[tuple[Earlier, ...], float]:
+        """After a gap: new tracks from descriptor matches with the last few frames.
+
+        The matches with each frame are verified by one rigid motion.
+        """
+        assert self._previous is not None
+        if not self._memory or self._memory[-1].frame_index != self._frame_index - 1:
+            self._memory.append(self._remember(self._previous, self._frame_index - 1))
+        current = self._remember(frame, self._frame_index)
+        self._points = _Points(np.zeros(0, np.int64), np.zeros((0, 3)))
+        found = []
+        free = np.ones(len(current.features), bool)
+        for old in reversed(self._memory):
+            guess = motion_since(old.frame_index)
+            matched = self._match_pair(
+                old, current, free, np.eye(4) if guess is None else guess, None if guess is None else rotation_sigma_rad
+            )
+            if matched is not None:
+                found.append(matched)
+        self._memory = [*self._memory[-(self._settings.memory_frames - 1) :], current]
+        share = sum(len(e.ids) for e in found) / max(len(current.features), 1)
+        return tuple(sorted(found, key=lambda e: -len(e.ids))), share
+
+    def _remember(self, frame: RectifiedFrame, frame_index: int) -> _Remembered:
+        features = orb.detect(frame.left, self._orb)
+        depth = stereo.disparities(frame, self._camera, features.pixels, self._stereo)[:, 0]
+        points = self._camera.point_from_pixel(features.pixels, depth)
+        return _Remembered(frame_index, patch_align.half_pyramid(frame.left), features, depth, points)
+
+    def _match_pair(
+        self,
+        old: _Remembered,
+        current: _Remembered,
+        free: NDArray[np.bool_],
+        guess: Array,
+        rotation_sigma_rad: float | None,
+    ) -> Earlier | None:
+        """Matches with one earlier frame; adds their tracks to the current points and takes them out of `free`."""
+        usable = np.flatnonzero(free)
+        known = np.flatnonzero(np.isfinite(old.disparities))
+        pairs = match_mutual(old.features.descriptors[known], current.features.descriptors[usable], 70, 0.85)
+        a, b = known[pairs[:, 0]], usable[pairs[:, 1]]
+        measured = np.column_stack([current.features.pixels[b], current.features.pixels[b, 0] - current.disparities[b]])
+        found = self._wide_motion(old.points_cam[a], measured, guess, rotation_sigma_rad)
+        if found is None:
+            return None
+        a, b = a[found.inliers], b[found.inliers]
+        before, now = old.features.take(a), current.features.take(b)
+        warp = patch_align.similarity_from_features(before.octaves, before.angles_deg, now.octaves, now.angles_deg)
+        refined = patch_align.refine_matches(
+            old.pyramid,
+            current.pyramid,
+            before.pixels,
+            before.octaves,
+            now.pixels,
+            now.octaves,
+            warp,
+            patch_align.AlignSettings(),
+        )
+        sure = np.isfinite(refined[:, 0])
+        a, b = a[sure], b[sure]
+        if len(a) < self._settings.min_inliers_known_rotation:
+            return None
+        free[b] = False
+        ids = np.arange(self._next_id, self._next_id + len(a))
+        self._next_id += len(a)
+        depth = transform_points(found.cam_from_source, old.points_cam[a])[:, 2]
+        disparity = self._camera.focal_px * self._camera.baseline_m / depth
+        fresh = np.column_stack([refined[sure, :2], refined[sure, 0] - disparity])
+        self._points = _Points(np.concatenate([self._points.ids, ids]), np.concatenate([self._points.pixels, fresh]))
+        earlier = np.column_stack([old.features.pixels[a], old.features.pixels[a, 0] - old.disparities[a]])
+        return Earlier(old.frame_index, ids, earlier, found.cam_from_source)
+
+    def _wide_motion(
+        self, points_cam: Array, measured: Array, guess: Array, rotation_sigma_rad: float | None
+    ) -> Resection | None:
+        """cam_from_previous from raw descriptor matches: with a known rotation first, without any guess else."""
+        sigmas = np.full((len(points_cam), 2), 1.5)
+        least = self._settings.min_inliers
+        if rotation_sigma_rad is not None:
+            found = resection_with_rotation(
+                self._camera, points_cam, measured, sigmas, guess[:3, :3], threshold_px=4 * self._settings.ransac_px,
+                min_inliers=self._settings.min_inliers_known_rotation, rotation_sigma_rad=rotation_sigma_rad,
+            )  # fmt: skip
+            if found is not None:
+                return found
+        found = ransac_resection(
+            self._camera,
+            points_cam,
+            measured,
+            sigmas,
+            threshold_px=2 * self._settings.ransac_px,
+            min_inliers=least,
+            seed=len(measured),
+        )
+        if found is None or found.inliers.sum() < max(least, 0.25 * len(points_cam)):
+            return None
+        return found
+
+    def _renew_disparities(self, frame: RectifiedFrame) -> None:
+        if not len(self._points.ids):
+            return
+        prior = self._points.pixels[:, 0] - self._points.pixels[:, 2]
+        found = stereo.disparities(frame, self._camera, self._points.pixels[:, :2], self._stereo, prior)
+        self._points.pixels[:, 2] = self._points.pixels[:, 0] - found[:, 0]
+
+    def _add_corners(self, frame: RectifiedFrame) -> None:
+        missing = self._settings.max_points - len(self._points.ids)
+        if missing < 0.15 * self._settings.max_points:
+            return
+        corners = spread_corners(
+            frame.left,
+            missing,
+            min_distance_px=self._settings.min_distance_px,
+            taken=self._points.pixels[:, :2].astype(np.float32),
+        ).astype(np.float64)
+        found = stereo.disparities(frame, self._camera, corners, self._stereo)
+        fresh = np.column_stack([corners, corners[:, 0] - found[:, 0]])
+        ids = np.arange(self._next_id, self._next_id + len(corners))
+        self._next_id += len(corners)
+        self._points = _Points(np.concatenate([self._points.ids, ids]), np.concatenate([self._points.pixels, fresh]))

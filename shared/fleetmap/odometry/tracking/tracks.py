@@ -1,0 +1,103 @@
+"""Observations of points from frame to frame, kept as one table until the filter uses them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array
+from fleetmap.odometry.tracking import tracks_kernels
+from fleetmap.sensors.rectification import StereoCamera
+
+_FAR_DEPTH_M = 20.0
+Ids = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Observations of one point: which clones (n,), pixels (n, 3) u_left v u_right.
+
+    A first guess of the point as clone `anchor` sees it is in camera axes (3,), so that it follows the clone when an
+    iterated update moves it.
+    """
+
+    clone_ids: Ids
+    pixels: Array
+    anchor: int
+    point_cam: Array
+
+
+@dataclass(frozen=True, slots=True)
+class TrackBatch:
+    """T tracks: starts (T + 1,) delimits each one's rows of clone_ids (n,) and pixels (n, 3).
+
+    anchors (T,) and points_cam (T, 3) are as in Track.
+    """
+
+    starts: Ids
+    clone_ids: Ids
+    pixels: Array
+    anchors: Ids
+    points_cam: Array
+
+    def __len__(self) -> int:
+        return len(self.anchors)
+
+    @classmethod
+    def of(cls, tracks: Sequence[Track]) -> "TrackBatch":
+        """The same tracks as arrays."""
+        sizes = [len(track.clone_ids) for track in tracks]
+        return cls(
+            np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+            np.concatenate([np.zeros(0, np.int64), *(track.clone_ids for track in tracks)]),
+            np.concatenate([np.zeros((0, 3)), *(track.pixels for track in tracks)]),
+            np.array([track.anchor for track in tracks], np.int64),
+            np.array([track.point_cam for track in tracks]).reshape(-1, 3),
+        )
+
+
+class Observations:
+    """Every observation that no update has used yet, in order of arrival."""
+
+    def __init__(self) -> None:
+        self._ids, self._frames, self._pixels = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3))
+
+    def add(self, frame_index: int, ids: Ids, pixels: Array) -> None:
+        """What one frame saw: ids (N,), pixels (N, 3)."""
+        self._ids = np.concatenate([self._ids, ids])
+        self._frames = np.concatenate([self._frames, np.full(len(ids), frame_index)])
+        self._pixels = np.concatenate([self._pixels, pixels])
+
+    def clear(self) -> None:
+        """Forgets all."""
+        self._keep(np.zeros(len(self._ids), bool))
+
+    def take(self, alive: Ids, held: Ids, due: NDArray[np.bool_], camera: StereoCamera) -> TrackBatch:
+        """Removes and returns the tracks that ended, or are due, with two observations or more in the clones `held`.
+
+        alive (N,): ids that the newest frame saw, due (N,) which of them are to be used now. What is due but seen once
+        stays; what ended so is forgotten.
+        """
+        order = np.argsort(self._ids, kind="stable")
+        if len(alive) > 1 and not (alive[1:] > alive[:-1]).all():
+            rank = np.argsort(alive)
+            alive, due = alive[rank], due[rank]
+        size = len(order)
+        stays, rows, starts, anchors = np.zeros(size, bool), *np.empty((3, size + 1), np.int64)
+        points_cam = np.empty((size, 3))
+        focal_base = camera.focal_px * camera.baseline_m
+        count = tracks_kernels.take(
+            self._ids, self._frames, self._pixels, order, alive, due, np.asarray(held, np.int64),
+            np.array([camera.focal_px, camera.cx_px, camera.cy_px, focal_base]),
+            camera.focal_px * max(camera.baseline_m, 0.01) / _FAR_DEPTH_M, stays, rows, starts, anchors, points_cam,
+        )  # fmt: skip
+        used = rows[: starts[count]]
+        batch = TrackBatch(
+            starts[: count + 1], self._frames[used], self._pixels[used], anchors[:count], points_cam[:count]
+        )
+        self._keep(stays)
+        return batch
+
+    def _keep(self, keep: NDArray[np.bool_]) -> None:
+        self._ids, self._frames, self._pixels = self._ids[keep], self._frames[keep], self._pixels[keep]

@@ -1,0 +1,1 @@
+"""Recordings as folders: EuRoC, TUM-VI, KITTI, 7-Scenes."""

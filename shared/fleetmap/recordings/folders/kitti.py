@@ -1,0 +1,156 @@
+"""KITTI odometry folders: rectified image pairs, calib.txt, poses.txt and times.txt where they are. No IMU."""
+
+from pathlib import Path
+
+import numpy as np
+
+from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.geometry import Array, se3
+from fleetmap.recordings.finalize import Parts, assemble, calibration_of_options
+from fleetmap.recordings.folders.image_files import FileFrames, ImageFolder, existing_images
+from fleetmap.recordings.folders.table_files import forward_only, natural_key
+from fleetmap.recordings.images import StoredImage, decode_grey
+from fleetmap.recordings.recording import OpenOptions, Recording
+from fleetmap.sensors.calibration import CameraCalibration, RigCalibration, check_camera
+from fleetmap.sensors.samples import Loss, Stamps, Trajectory
+
+# Folder names and the rows of calib.txt that describe them
+_PAIRS = (("image_l", "image_r", 0, 1), ("image_0", "image_1", 0, 1), ("image_2", "image_3", 2, 3))
+_PERIOD_NS = 100_000_000
+
+
+def recognises(path: Path) -> bool:
+    """Whether `path` holds a KITTI image folder."""
+    return any((path / left).is_dir() or (path / right).is_dir() for left, right, _, _ in _PAIRS)
+
+
+def open_kitti(path: Path, options: OpenOptions) -> Recording:
+    """The recording in a KITTI folder. The body is the camera that poses.txt is about (KITTI's rectified camera 0)."""
+    losses: list[Loss] = []
+    left_name, right_name, left_row, right_row = next(
+        pair for pair in _PAIRS if (path / pair[0]).is_dir() or (path / pair[1]).is_dir()
+    )
+    for name in (left_name, right_name):
+        if not (path / name).is_dir():
+            raise RecordingError(
+                f"{path / name} is missing, the other camera's folder is there; copy the recording again"
+            )
+    stamps_of_number, read_files = _stamps(path)
+    left = _images(path / left_name, stamps_of_number, losses)
+    right = _images(path / right_name, stamps_of_number, losses)
+    both, lefts, rights = np.intersect1d(left.stamps_ns, right.stamps_ns, return_indices=True)
+    alone = len(left.paths) + len(right.paths) - 2 * len(both)
+    if alone:
+        losses.append(Loss("images without their partner", f"{alone}; {len(both)} pairs remain"))
+    left, right = left.chosen(lefts), right.chosen(rights)
+    given = calibration_of_options(options)
+    if given is not None and options.calibration_file is not None:
+        read_files.append(options.calibration_file)
+    else:
+        read_files.append(path / "calib.txt")
+    calibration = given.calibration if given else _calibration(path / "calib.txt", left.paths[0], left_row, right_row)
+    return assemble(
+        Parts(
+            path=path,
+            name=path.resolve().name,
+            format="kitti",
+            calibration=calibration,
+            frame_stamps_ns=left.stamps_ns,
+            frames=FileFrames(path, left.stamps_ns, left.paths, right.paths, read_files),
+            has_right=True,
+            ground_truth=_ground_truth(path, stamps_of_number, read_files, losses),
+            losses=losses,
+        )
+    )
+
+
+def _stamps(path: Path) -> tuple[Stamps | None, list[Path]]:
+    """Stamps by image number from times.txt, None without one, and the files that were read."""
+    file = path / "times.txt"
+    if not file.is_file():
+        return None, []
+    return np.round(_table(file, (1,))[:, 0] * 1e9).astype(np.int64), [file]
+
+
+def _stamp(number: int, stamps_of_number: Stamps | None, path: Path) -> int:
+    if stamps_of_number is None:
+        return number * _PERIOD_NS
+    if number >= len(stamps_of_number):
+        raise RecordingError(f"{path} has no line in times.txt, which ends with number {len(stamps_of_number) - 1}")
+    return int(stamps_of_number[number])
+
+
+def _images(folder: Path, stamps_of_number: Stamps | None, losses: list[Loss]) -> ImageFolder:
+    paths = sorted((p for p in folder.iterdir() if p.is_file() and p.stem.isdigit()), key=lambda p: natural_key(p.name))
+    if not paths:
+        raise RecordingError(f"{folder} holds no numbered image such as 000000.png; copy the recording again")
+    stamps_ns = np.array([_stamp(int(p.stem), stamps_of_number, p) for p in paths], np.int64)
+    kept = np.flatnonzero(forward_only(stamps_ns, folder.name, losses))
+    return existing_images(ImageFolder(stamps_ns, tuple(paths)).chosen(kept), folder.name, losses)
+
+
+def _calibration(file: Path, first_image: Path, left_row: int, right_row: int) -> RigCalibration:
+    if not file.is_file():
+        raise CalibrationError(f"{file} is missing; add it or pass a calibration with --calibration FILE")
+    rows = _projections(file)
+    height, width = decode_grey(StoredImage("file", first_image.read_bytes(), str(first_image))).shape
+    cameras = []
+    for row in (left_row, right_row):
+        if row not in rows:
+            raise CalibrationError(
+                f"{file} has no P{row}; it describes {', '.join(f'P{r}' for r in rows) or 'no camera'}"
+            )
+        matrix = rows[row][:, :3]
+        if np.linalg.det(matrix) == 0:
+            raise CalibrationError(f"{file}: P{row} is {rows[row].tolist()}, which is no projection of a camera")
+        body_from_cam = se3(np.eye(3), np.asarray(-np.linalg.solve(matrix, rows[row][:, 3]), np.float64))
+        intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+        camera = CameraCalibration("radial-tangential", width, height, intrinsics, np.zeros(0), body_from_cam)
+        cameras.append(check_camera(camera, f"{file}: P{row}"))
+    return RigCalibration(tuple(cameras))
+
+
+def _projections(file: Path) -> dict[int, Array]:
+    """The 3x4 matrices by number, of lines with or without `P0:` before twelve numbers."""
+    rows: dict[int, Array] = {}
+    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
+        label, colon, numbers = line.partition(":") if ":" in line else ("", "", line)
+        try:
+            values = [float(word) for word in numbers.split()]
+        except ValueError:
+            raise CalibrationError(f"{file}: {line[:60]!r} are not twelve numbers") from None
+        if len(values) != 12 or (colon and not (label.startswith("P") and label[1:].isdigit())):
+            continue
+        rows[int(label[1:]) if colon else len(rows)] = np.array(values).reshape(3, 4)
+    return rows
+
+
+def _ground_truth(
+    path: Path, stamps_of_number: Stamps | None, read_files: list[Path], losses: list[Loss]
+) -> Trajectory | None:
+    file = path / "poses.txt"
+    if not file.is_file():
+        return None
+    read_files.append(file)
+    rows = _table(file, (12, 16))
+    if stamps_of_number is not None and len(stamps_of_number) != len(rows):
+        losses.append(
+            Loss("ground truth not used", f"poses.txt has {len(rows)} rows, times.txt {len(stamps_of_number)}")
+        )
+        return None
+    stamps_ns = np.arange(len(rows)) * _PERIOD_NS if stamps_of_number is None else stamps_of_number
+    frame_from_body = np.tile(np.eye(4), (len(rows), 1, 1))
+    frame_from_body[:, :3] = rows[:, :12].reshape(-1, 3, 4)
+    return Trajectory(stamps_ns.astype(np.int64), frame_from_body)
+
+
+def _table(file: Path, widths: tuple[int, ...]) -> Array:
+    try:
+        table = np.loadtxt(file, ndmin=2)
+    except ValueError as error:
+        raise RecordingError(f"{file} is no table of numbers ({error}); copy the recording again") from error
+    if table.shape[1] not in widths or not np.isfinite(table).all():
+        raise RecordingError(
+            f"{file} has {table.shape[1]} columns, {' or '.join(map(str, widths))} finite numbers are expected"
+        )
+    return table

@@ -1,0 +1,227 @@
+"""RGB-D folders as 7-Scenes has them: frame-NNNNNN.color, .depth.png in mm, .pose.txt; 30 Hz by the frame number.
+
+Unless a calibration file says otherwise, colour has f = 525 px and depth f = 585 px, both centred in the image, and the
+depth camera sits 25 mm to the left: the data set's authors give no transform between the two sensors, so this is the
+nominal place of the sensor they used. A calibration file's cam0 is the colour camera, and cam1, where there is one, the
+depth camera. The poses were found from depth, so they are the depth camera's.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import RecordingError
+from fleetmap.geometry import Array, se3, se3_inverse, transform_points
+from fleetmap.recordings.finalize import Parts, assemble, calibration_of_options
+from fleetmap.recordings.folders.depth_registration_kernels import nearest_surface
+from fleetmap.recordings.folders.image_files import FileFrames, ImageFolder, existing_images
+from fleetmap.recordings.folders.table_files import forward_only
+from fleetmap.recordings.images import StoredFrame, StoredImage, decode_depth, decode_frame, decode_grey
+from fleetmap.recordings.recording import OpenOptions, Recording
+from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from fleetmap.sensors.samples import CameraFrame, Loss, Stamps, Trajectory
+
+_COLOUR_FOCAL_PX, _DEPTH_FOCAL_PX = 525.0, 585.0
+# Of a Kinect. On the red kitchen depth's edges lie on colour's edges best with 28 mm and these focal lengths.
+_DEPTH_LEFT_OF_COLOUR_M = 0.025
+_FRAME_RATE_HZ = 30
+Depth = NDArray[np.float32]
+
+
+def recognises(path: Path) -> bool:
+    """Whether `path` holds frame-NNNNNN.color files or their depth images."""
+    return path.is_dir() and any(
+        next(path.glob(pattern), None) is not None for pattern in ("frame-*.color.*", "frame-*.depth.*")
+    )
+
+
+def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
+    """The recording in a 7-Scenes folder. The body is the colour camera; depth comes registered to colour."""
+    losses: list[Loss] = []
+    colour, depth = _files(path, "color", losses), _files(path, "depth", losses)
+    stamps_ns, colours, depths = np.intersect1d(colour.stamps_ns, depth.stamps_ns, return_indices=True)
+    alone = len(colour.paths) + len(depth.paths) - 2 * len(stamps_ns)
+    if alone:
+        losses.append(Loss("images without their partner", f"{alone}; {len(stamps_ns)} pairs remain"))
+    if len(stamps_ns) == 0:
+        raise RecordingError(f"{path}: no colour image has its depth image; copy the recording again")
+    colour, depth = colour.chosen(colours), depth.chosen(depths)
+    given = calibration_of_options(options)
+    calibration = given.calibration if given else _default_calibration(colour.paths[0], depth.paths[0])
+    read_files = [options.calibration_file] if options.calibration_file is not None else []
+    files = FileFrames(path, stamps_ns, colour.paths, None, read_files, depth.paths)
+    has_depth_lens = len(calibration.cameras) > 1
+    depth_camera = calibration.cameras[1] if has_depth_lens else calibration.cameras[0]
+    ground_truth = _ground_truth(colour, se3_inverse(depth_camera.body_from_cam), read_files, losses)
+    return assemble(
+        Parts(
+            path=path,
+            name=path.resolve().name,
+            format="7scenes",
+            calibration=RigCalibration(calibration.cameras[:1], None, calibration.base_from_body),
+            frame_stamps_ns=stamps_ns,
+            frames=RegisteredFrames(files, DepthRegistration(calibration.cameras[0], depth_camera)),
+            has_right=False,
+            has_depth=True,
+            ground_truth=ground_truth,
+            losses=losses,
+        )
+    )
+
+
+class DepthRegistration:
+    """Brings depth images into the colour camera's pixels."""
+
+    def __init__(self, colour: CameraCalibration, depth: CameraCalibration) -> None:
+        self._colour = colour
+        self._depth_size = (depth.height_px, depth.width_px)
+        colour_from_depth = se3_inverse(colour.body_from_cam) @ depth.body_from_cam
+        self._is_same_place = bool(np.linalg.norm(colour_from_depth[:3, 3]) < 1e-6)
+        self._colour_from_depth = colour_from_depth
+        if self._is_same_place:
+            # The depth pixel of every colour pixel, whatever the depth
+            rays_colour = colour.ray_from_pixel(_pixels(colour))
+            pixels = depth.pixel_from_ray(rays_colour @ colour_from_depth[:3, :3])
+            self._map = np.nan_to_num(pixels, nan=-1e4).astype(np.float32).reshape(colour.height_px, colour.width_px, 2)
+        else:
+            rays = depth.ray_from_pixel(_pixels(depth))
+            self._rays_depth = rays / rays[:, 2:]
+            self._has_ray = np.isfinite(self._rays_depth).all(axis=1)
+
+    def registered(self, depth_m: Depth, where: str) -> Depth:
+        """(H, W) metres along the colour camera's axis, 0 where unknown, of a depth image in the depth camera's pixels.
+
+        From one place the nearest depth pixel is taken. From another place points are projected one by one and the
+        nearest surface wins, so that thin gaps stay unknown.
+        """
+        if depth_m.shape != self._depth_size:
+            height, width = self._depth_size
+            raise RecordingError(
+                f"{where}: the depth image is {depth_m.shape[1]}x{depth_m.shape[0]} px, the calibration says "
+                f"{width}x{height}; "
+                "pass the matching one with --calibration FILE"
+            )
+        if self._is_same_place:
+            return np.asarray(cv2.remap(depth_m, self._map, None, cv2.INTER_NEAREST, borderValue=0.0), np.float32)  # type: ignore[call-overload]
+        known = (depth_m.ravel() > 0) & self._has_ray
+        points_depth = self._rays_depth[known] * depth_m.ravel()[known, None]
+        points_colour = transform_points(self._colour_from_depth, points_depth.astype(np.float64))
+        image = np.empty((self._colour.height_px, self._colour.width_px), np.float32)
+        nearest_surface(points_colour, self._colour.pixel_from_ray(points_colour), image)
+        return image
+
+
+class RegisteredFrames:
+    """A FrameSource that registers the depth of another one."""
+
+    def __init__(self, files: FileFrames, registration: DepthRegistration) -> None:
+        self._files, self._registration = files, registration
+
+    def stored(self, index: int) -> StoredFrame:
+        """Frame `index` with its colour image as it was and its depth registered, in whole mm, as PNG."""
+        stored = self._files.stored(index)
+        if stored.depth is None:
+            return stored
+        depth_m = self._registration.registered(decode_depth(stored.depth), stored.depth.where)
+        depth_mm = np.round(depth_m * 1000).astype(np.uint16)
+        _, png = cv2.imencode(".png", depth_mm)
+        return replace(stored, depth=StoredImage("file", png.tobytes(), stored.depth.where))
+
+    def frame(self, index: int) -> CameraFrame:
+        """Frame `index`, decoded; depth has the resolution of the file, one mm."""
+        stored = self._files.stored(index)
+        frame = decode_frame(stored)
+        where = stored.depth.where if stored.depth else ""
+        if frame.depth_m is None:
+            return frame
+        depth_m = self._registration.registered(frame.depth_m, where)
+        return replace(frame, depth_m=np.round(depth_m * 1000).astype(np.float32) / np.float32(1000.0))
+
+    def hash_into(self, digest: "hashlib._Hash") -> None:
+        """The files as they are."""
+        self._files.hash_into(digest)
+
+    def close(self) -> None:
+        """Closes the other one."""
+        self._files.close()
+
+
+def _files(path: Path, kind: str, losses: list[Loss]) -> ImageFolder:
+    found = sorted((_number(file), file) for file in path.glob(f"frame-*.{kind}.*"))
+    if not found:
+        raise RecordingError(f"{path} holds no frame-NNNNNN.{kind} file; copy the recording again")
+    numbers = np.array([number for number, _ in found], np.int64)
+    stamps_ns = np.round(numbers * (1e9 / _FRAME_RATE_HZ)).astype(np.int64)
+    kept = np.flatnonzero(forward_only(stamps_ns, f"{kind} images", losses))
+    folder = ImageFolder(stamps_ns, tuple(file for _, file in found)).chosen(kept)
+    return existing_images(folder, f"{kind} images", losses)
+
+
+def _number(file: Path) -> int:
+    digits = file.name.removeprefix("frame-").partition(".")[0]
+    if not digits.isdigit():
+        raise RecordingError(f"{file}: {digits!r} is no frame number; names are frame-NNNNNN.color.png and so on")
+    return int(digits)
+
+
+def _default_calibration(colour: Path, depth: Path) -> RigCalibration:
+    colour_shape = decode_grey(StoredImage("file", colour.read_bytes(), str(colour))).shape
+    depth_shape = decode_depth(StoredImage("file", depth.read_bytes(), str(depth))).shape
+    shapes = ((colour_shape, _COLOUR_FOCAL_PX), (depth_shape, _DEPTH_FOCAL_PX))
+    colour_camera, depth_camera = (_centred(shape, focal) for shape, focal in shapes)
+    colour_from_depth = se3(np.eye(3), np.array([-_DEPTH_LEFT_OF_COLOUR_M, 0.0, 0.0]))
+    return RigCalibration((colour_camera, replace(depth_camera, body_from_cam=colour_from_depth)))
+
+
+def _centred(shape: Sequence[int], focal_px: float) -> CameraCalibration:
+    """The data set's figures are for 640x480."""
+    height, width = shape
+    focal = focal_px * width / 640
+    intrinsics = np.array([focal, focal, width / 2, height / 2])
+    return CameraCalibration("radial-tangential", width, height, intrinsics, np.zeros(0), np.eye(4))
+
+
+def _ground_truth(
+    colour: ImageFolder, depth_from_body: Array, read_files: list[Path], losses: list[Loss]
+) -> Trajectory | None:
+    stamps: list[int] = []
+    frame_from_bodies: list[Array] = []
+    bad = 0
+    for stamp_ns, path in zip(colour.stamps_ns.tolist(), colour.paths, strict=True):
+        file = path.with_name(path.name.partition(".")[0] + ".pose.txt")
+        if not file.is_file():
+            continue
+        read_files.append(file)
+        matrix = _rigid(file)
+        if matrix is None:
+            bad += 1
+            continue
+        stamps.append(stamp_ns)
+        frame_from_bodies.append(matrix @ depth_from_body)
+    if bad:
+        losses.append(Loss("ground truth: no rigid transform", f"{bad} of {bad + len(stamps)} files left out"))
+    return Trajectory(_stamps(stamps), np.stack(frame_from_bodies)) if stamps else None
+
+
+def _rigid(file: Path) -> Array | None:
+    """(4, 4) of a file; None where the tracking of the data set had failed or the file is damaged."""
+    try:
+        matrix = np.array(file.read_text(errors="replace").split(), np.float64).reshape(4, 4)
+    except ValueError:
+        return None
+    is_rotation = np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-2)
+    return matrix if is_rotation and np.isfinite(matrix).all() else None
+
+
+def _stamps(values: Sequence[int]) -> Stamps:
+    return np.array(values, np.int64)
+
+
+def _pixels(camera: CameraCalibration) -> Array:
+    u, v = np.meshgrid(np.arange(camera.width_px, dtype=np.float64), np.arange(camera.height_px, dtype=np.float64))
+    return np.stack([u.ravel(), v.ravel()], axis=1)

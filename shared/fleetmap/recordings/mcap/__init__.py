@@ -1,0 +1,1 @@
+"""Recordings as MCAP files: rosbag2 style (CDR) and Foxglove protobuf."""

@@ -1,0 +1,127 @@
+"""The calibration that an MCAP file carries.
+
+The attachment of this project, else CameraInfo messages and static transforms.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fleetmap.errors import CalibrationError
+from fleetmap.geometry import Array, se3, se3_inverse
+from fleetmap.recordings.ros2.messages import CameraInfo, FrameLink
+from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
+
+_LENSES = {
+    "": "radial-tangential",
+    "plumb_bob": "radial-tangential",
+    "radtan": "radial-tangential",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+    "kannala_brandt": "equidistant",
+}
+_BASE_FRAMES = ("base", "base_link", "base_footprint")
+
+
+def calibration_of_messages(
+    infos: Sequence[CameraInfo],
+    are_rectified: Sequence[bool],
+    links: Sequence[FrameLink],
+    imu_frame: str | None,
+    where: str,
+) -> RigCalibration:
+    """The calibration told by CameraInfo (left first) and transforms between frames.
+
+    The body is `imu_frame` where transforms lead from there to every camera (the IMU's noise is then the default),
+    else the left camera; the right camera's place then comes from the transforms or from the baseline in its
+    projection matrix.
+    """
+    frames = [info.frame_id.lstrip("/") for info in infos]
+    lenses = [_camera(info, rectified, where) for info, rectified in zip(infos, are_rectified, strict=True)]
+    body_from_cams: Sequence[Array | None] = [
+        _target_from_source(links, imu_frame, frame) if imu_frame else None for frame in frames
+    ]
+    has_imu = all(body_from_cam is not None for body_from_cam in body_from_cams)
+    if not has_imu:
+        body_from_cams = [np.eye(4)] + [_left_from_right(infos, are_rectified, links, where) for _ in infos[1:]]
+    cameras = [
+        check_camera(_on_body(lens, body_from_cam), f"{where}: {info.frame_id}")
+        for lens, body_from_cam, info in zip(lenses, body_from_cams, infos, strict=True)
+        if body_from_cam is not None
+    ]
+    body_frame = imu_frame if has_imu and imu_frame else frames[0]
+    base_from_bodies = [
+        found for found in (_target_from_source(links, name, body_frame) for name in _BASE_FRAMES) if found is not None
+    ]
+    return RigCalibration(
+        tuple(cameras), ImuNoise() if has_imu else None, base_from_bodies[0] if base_from_bodies else np.eye(4)
+    )
+
+
+def _camera(info: CameraInfo, is_rectified: bool, where: str) -> CameraCalibration:
+    matrix = info.projection[:, :3] if is_rectified else info.matrix
+    distortion = np.zeros(0) if is_rectified or not info.distortion.any() else info.distortion
+    lens = info.lens
+    if lens == "rational_polynomial" and not distortion[5:].any():
+        lens, distortion = "plumb_bob", distortion[:5]
+    if lens not in _LENSES and len(distortion):
+        raise CalibrationError(
+            f"{where}: the lens model {info.lens!r} of {info.frame_id} is not supported, known are plumb_bob and "
+            f"equidistant; "
+            "calibrate with one of these, or record rectified images, or pass a calibration with --calibration FILE"
+        )
+    model = _LENSES.get(lens, "radial-tangential") if len(distortion) else "radial-tangential"
+    intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    return CameraCalibration(model, info.width_px, info.height_px, intrinsics, distortion, np.eye(4))
+
+
+def _on_body(camera: CameraCalibration, body_from_cam: Array) -> CameraCalibration:
+    return CameraCalibration(
+        camera.model, camera.width_px, camera.height_px, camera.intrinsics_px, camera.distortion, body_from_cam
+    )
+
+
+def _left_from_right(
+    infos: Sequence[CameraInfo], are_rectified: Sequence[bool], links: Sequence[FrameLink], where: str
+) -> Array:
+    """(4, 4) cam0_from_cam1 by the transforms, else by the right camera's projection.
+
+    There, K, R and P are those of ROS's stereo calibration: P[0, 3] = -fx * baseline.
+    """
+    left, right = infos[0], infos[1]
+    cam0_from_cam1 = (
+        _target_from_source(links, left.frame_id.lstrip("/"), right.frame_id.lstrip("/"))
+        if left.frame_id != right.frame_id
+        else None
+    )
+    if cam0_from_cam1 is not None:
+        return cam0_from_cam1
+    fx = right.projection[0, 0]
+    baseline_m = -right.projection[0, 3] / fx if fx else 0.0
+    if baseline_m <= 0:
+        raise CalibrationError(
+            f"{where}: nothing says where the right camera sits (no transform from {left.frame_id} to "
+            f"{right.frame_id}, no "
+            f"baseline in its projection {right.projection[0].tolist()}); pass a calibration with --calibration FILE"
+        )
+    rect_from_rect = se3(np.eye(3), np.array([baseline_m, 0.0, 0.0]))
+    left_rotation, right_rotation = (
+        np.eye(3) if rectified else info.rect_from_cam for info, rectified in zip(infos, are_rectified, strict=True)
+    )
+    return se3_inverse(se3(left_rotation, np.zeros(3))) @ rect_from_rect @ se3(right_rotation, np.zeros(3))
+
+
+def _target_from_source(links: Sequence[FrameLink], target: str, source: str) -> Array | None:
+    """(4, 4) target_from_source along the links in either direction, None where they do not lead there."""
+    target_from: dict[str, Array] = {target.lstrip("/"): np.eye(4)}
+    waiting = list(target_from)
+    while waiting:
+        frame = waiting.pop(0)
+        for link in links:
+            if link.parent == frame and link.child not in target_from:
+                target_from[link.child] = target_from[frame] @ link.parent_from_child
+                waiting.append(link.child)
+            elif link.child == frame and link.parent not in target_from:
+                target_from[link.parent] = target_from[frame] @ se3_inverse(link.parent_from_child)
+                waiting.append(link.parent)
+    return target_from.get(source)

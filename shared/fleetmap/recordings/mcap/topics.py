@@ -1,0 +1,121 @@
+"""Which topic of an MCAP file plays which part.
+
+By the conventional name, by type and name where that leaves one choice.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from fleetmap.errors import RecordingError
+from fleetmap.recordings.mcap.scan import Channel
+from fleetmap.recordings.recording import Topics
+from fleetmap.sensors.samples import Loss
+
+IMAGE_TYPES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")
+_TYPES = {
+    "left": IMAGE_TYPES,
+    "right": IMAGE_TYPES,
+    "depth": IMAGE_TYPES,
+    "left_info": ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration"),
+    "right_info": ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration"),
+    "imu": ("sensor_msgs/Imu", "foxglove.Imu", "foxglove.IMU", "fleetmap.Imu"),
+    "wheel": ("nav_msgs/Odometry",),
+    "prior": ("geometry_msgs/PoseWithCovarianceStamped",),
+    "ground_truth": ("geometry_msgs/PoseStamped", "foxglove.PoseInFrame"),
+    "tf_static": ("tf2_msgs/TFMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms"),
+}
+KNOWN_TYPES = frozenset(name for names in _TYPES.values() for name in names)
+_ALONE = ("imu", "wheel", "prior", "ground_truth")
+_LEFT_HINTS, _RIGHT_HINTS, _DEPTH_HINTS = ("left", "cam0", "infra1"), ("right", "cam1", "infra2"), ("depth",)
+
+
+@dataclass(frozen=True, slots=True)
+class TopicParts:
+    """Channel ids by the part that they play; several where one topic was recorded on several channels."""
+
+    channels: Mapping[str, tuple[int, ...]]
+    losses: tuple[Loss, ...]
+
+
+def type_name(channel: Channel) -> str:
+    """The message type without ROS 2's `/msg/`."""
+    return channel.schema.name.replace("/msg/", "/")
+
+
+def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str) -> TopicParts:
+    """The channels for each part.
+
+    RecordingError where a topic that was asked for by name is not there, or where no left image can be told from the
+    others.
+    """
+    by_topic: dict[str, list[Channel]] = {}
+    for channel in channels:
+        by_topic.setdefault(channel.topic, []).append(channel)
+    chosen: dict[str, str] = {}
+    losses: list[Loss] = []
+    for part, types in _TYPES.items():
+        name = getattr(wanted, part)
+        found = next((t for t in (name, f"{name}/compressed") if type_name_of(by_topic, t) in types), None)
+        if found is not None:
+            chosen[part] = found
+        elif name and name != getattr(Topics(), part):
+            raise RecordingError(
+                f"{where} has no topic {name} of type {' or '.join(types)}; it has {_listed(by_topic)}"
+            )
+        elif part in _ALONE and name:
+            _choose_alone(part, by_topic, chosen, losses)
+    _choose_images(by_topic, chosen, where)
+    _choose_infos(by_topic, chosen)
+    ids = {part: tuple(channel.id for channel in by_topic[topic]) for part, topic in chosen.items()}
+    return TopicParts(ids, tuple(losses))
+
+
+def type_name_of(by_topic: Mapping[str, list[Channel]], topic: str) -> str:
+    """The type of a topic's messages, empty where there is no such topic."""
+    return type_name(by_topic[topic][0]) if topic in by_topic else ""
+
+
+def _choose_alone(part: str, by_topic: Mapping[str, list[Channel]], chosen: dict[str, str], losses: list[Loss]) -> None:
+    candidates = [topic for topic in by_topic if type_name_of(by_topic, topic) in _TYPES[part]]
+    if len(candidates) == 1:
+        chosen[part] = candidates[0]
+    elif candidates:
+        losses.append(Loss(f"{part} not chosen", f"{', '.join(sorted(candidates))} could be it; name one of them"))
+
+
+def _choose_images(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str], where: str) -> None:
+    if "left" in chosen:
+        return
+    images = sorted(topic for topic in by_topic if type_name_of(by_topic, topic) in IMAGE_TYPES)
+    depth = [topic for topic in images if _has(topic, _DEPTH_HINTS)]
+    lefts = [topic for topic in images if topic not in depth and _has(topic, _LEFT_HINTS)]
+    rights = [topic for topic in images if topic not in depth and _has(topic, _RIGHT_HINTS)]
+    others = [topic for topic in images if topic not in (*depth, *lefts, *rights)]
+    if len(lefts) == 1:
+        chosen["left"] = lefts[0]
+        if len(rights) == 1:
+            chosen.setdefault("right", rights[0])
+    elif not lefts and len(others) == 1:
+        chosen["left"] = others[0]
+    else:
+        raise RecordingError(f"{where}: no topic is clearly the left image; name it. There is {_listed(by_topic)}")
+    if len(depth) == 1 and "right" not in chosen:
+        chosen.setdefault("depth", depth[0])
+
+
+def _choose_infos(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str]) -> None:
+    for part in ("left", "right"):
+        if part not in chosen or f"{part}_info" in chosen:
+            continue
+        parent = chosen[part].removesuffix("/compressed").rpartition("/")[0]
+        for name in ("camera_info", "calibration"):
+            if type_name_of(by_topic, f"{parent}/{name}") in _TYPES["left_info"]:
+                chosen[f"{part}_info"] = f"{parent}/{name}"
+
+
+def _has(topic: str, hints: tuple[str, ...]) -> bool:
+    return any(hint in topic.lower() for hint in hints)
+
+
+def _listed(by_topic: Mapping[str, list[Channel]]) -> str:
+    return ", ".join(f"{topic} ({type_name_of(by_topic, topic)})" for topic in sorted(by_topic)) or "no topic at all"

@@ -1,0 +1,159 @@
+"""Writes recordings as MCAP in the style of rosbag2: ROS 2 messages in CDR, with the full message definitions.
+
+Topics are those of `Topics`. The mounting of the cameras is also on /tf_static (body to cam0 and cam1, base to body),
+the lenses in CameraInfo, for ROS tools; the whole calibration to the last bit is the attachment `calibration.yaml`
+(format: fleetmap.recordings.calibration_files). Chunks are not compressed, images stay as they were encoded. Equal
+calls make equal bytes.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from mcap.writer import CompressionType, Writer
+
+from fleetmap.errors import RecordingError
+from fleetmap.recordings.calibration_files import format_calibration
+from fleetmap.recordings.images import StoredFrame, StoredImage, decode_grey, file_kind, grey_image, store_frame
+from fleetmap.recordings.recording import Topics
+from fleetmap.recordings.ros2 import messages
+from fleetmap.recordings.ros2.definitions import ros2msg
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
+
+CALIBRATION_ATTACHMENT = "calibration.yaml"
+BODY_FRAME, BASE_FRAME, MAP_FRAME, ODOM_FRAME = "body", "base", "map", "odom"
+_CHUNK_BYTES = 1 << 20  # what one flipped bit costs at most
+
+
+class McapRecordingWriter:
+    """Writes one recording to `path`; the file appears there when it is closed, complete or not at all.
+
+    Samples of one kind must come in the order of their stamps; kinds may interleave in any way, ROS tools like them
+    roughly in order. name: what the recording is called when it is opened again, the file's stem unless given.
+    """
+
+    def __init__(
+        self, path: Path, calibration: RigCalibration, *, topics: Topics | None = None, name: str = ""
+    ) -> None:
+        self._path = path
+        self._part = path.with_name(path.name + ".part")
+        self._calibration = calibration
+        self._topics = topics or Topics()
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._counts: dict[str, int] = {}
+        self._links_are_written = False
+        try:
+            self._file = self._part.open("wb")
+        except OSError as error:
+            raise RecordingError(f"{self._part} cannot be written ({error.strerror}); choose another place") from error
+        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.NONE)
+        self._writer.start(profile="ros2", library="fleetmap")
+        self._writer.add_metadata("fleetmap", {"name": name or path.stem})
+        text = format_calibration(calibration).encode()
+        self._writer.add_attachment(0, 0, CALIBRATION_ATTACHMENT, "application/yaml", text)
+
+    def write_frame(self, frame: CameraFrame | StoredFrame) -> None:
+        """One frame with its CameraInfo.
+
+        Images that are JPEG or PNG already as CompressedImage, all others as Image.
+        """
+        stored = frame if isinstance(frame, StoredFrame) else store_frame(frame)
+        topics, stamp_ns = self._topics, stored.stamp_ns
+        self._write_image(topics.left, stamp_ns, "cam0", stored.left)
+        self._write_camera_info(topics.left_info, stamp_ns, 0)
+        if stored.right is not None:
+            self._write_image(topics.right, stamp_ns, "cam1", stored.right)
+            self._write_camera_info(topics.right_info, stamp_ns, 1)
+        if stored.depth is not None:
+            self._write_image(topics.depth, stamp_ns, "cam0", stored.depth, is_depth=True)
+
+    def write_imu(self, samples: ImuSamples) -> None:
+        """Inertial samples, in body axes."""
+        for stamp_ns, gyro, accel in zip(
+            samples.stamps_ns.tolist(), samples.gyro_radps, samples.accel_mps2, strict=True
+        ):
+            data = messages.encode_imu(stamp_ns, BODY_FRAME, gyro, accel)
+            self._write(self._topics.imu, "sensor_msgs/Imu", stamp_ns, data)
+
+    def write_wheel(self, samples: WheelSample | Iterable[WheelSample]) -> None:
+        """Wheel odometry, one sample or several."""
+        for sample in [samples] if isinstance(samples, WheelSample) else samples:
+            data = messages.encode_odometry(sample, ODOM_FRAME, BASE_FRAME)
+            self._write(self._topics.wheel, "nav_msgs/Odometry", sample.stamp_ns, data)
+
+    def write_prior(self, priors: PositionPrior | Iterable[PositionPrior]) -> None:
+        """Position priors, one or several."""
+        for prior in [priors] if isinstance(priors, PositionPrior) else priors:
+            data = messages.encode_prior(prior, MAP_FRAME)
+            self._write(self._topics.prior, "geometry_msgs/PoseWithCovarianceStamped", prior.stamp_ns, data)
+
+    def write_ground_truth(self, trajectory: Trajectory) -> None:
+        """True frame_from_body, all of it or a piece."""
+        for stamp_ns, frame_from_body in zip(trajectory.stamps_ns.tolist(), trajectory.frame_from_body, strict=True):
+            data = messages.encode_pose(stamp_ns, MAP_FRAME, frame_from_body)
+            self._write(self._topics.ground_truth, "geometry_msgs/PoseStamped", stamp_ns, data)
+
+    def close(self) -> None:
+        """Ends the file and gives it its name. Closing twice does nothing."""
+        if self._file.closed:
+            return
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._file.close()
+        self._part.replace(self._path)
+
+    def discard(self) -> None:
+        """Throws away what was written."""
+        self._file.close()
+        self._part.unlink(missing_ok=True)
+
+    def __enter__(self) -> "McapRecordingWriter":
+        return self
+
+    def __exit__(self, error_type: type[BaseException] | None, *_: object) -> None:
+        if error_type is None:
+            self.close()
+        else:
+            self.discard()
+
+    def _write_image(
+        self, topic: str, stamp_ns: int, frame_id: str, image: StoredImage, *, is_depth: bool = False
+    ) -> None:
+        kind = file_kind(image.data) if image.encoding == "file" else "rows"
+        if kind in ("jpeg", "png"):
+            form = f"16UC1; {kind} compressed" if is_depth else kind
+            data = messages.encode_compressed_image(stamp_ns, frame_id, image, form)
+            self._write(f"{topic}/compressed", "sensor_msgs/CompressedImage", stamp_ns, data)
+            return
+        rows = image if kind == "rows" else grey_image(decode_grey(image))
+        if rows.step_bytes == 0:
+            raise RecordingError(f"{image.where or topic} at {stamp_ns}: an image in rows needs its step_bytes")
+        self._write(topic, "sensor_msgs/Image", stamp_ns, messages.encode_image(stamp_ns, frame_id, rows))
+
+    def _write_camera_info(self, topic: str, stamp_ns: int, number: int) -> None:
+        data = messages.encode_camera_info(stamp_ns, f"cam{number}", self._calibration.cameras[number])
+        self._write(topic, "sensor_msgs/CameraInfo", stamp_ns, data)
+
+    def _write(self, topic: str, type_name: str, stamp_ns: int, data: bytes) -> None:
+        if not self._links_are_written:
+            self._links_are_written = True
+            links = [
+                messages.FrameLink(BODY_FRAME, f"cam{i}", camera.body_from_cam)
+                for i, camera in enumerate(self._calibration.cameras)
+            ]
+            links.append(messages.FrameLink(BASE_FRAME, BODY_FRAME, self._calibration.base_from_body))
+            tf_data = messages.encode_frame_links(stamp_ns, links)
+            self._write(self._topics.tf_static, "tf2_msgs/TFMessage", stamp_ns, tf_data)
+        channel = self._channel(topic, type_name)
+        self._writer.add_message(channel, stamp_ns, data, stamp_ns, self._counts[topic])
+        self._counts[topic] += 1
+
+    def _channel(self, topic: str, type_name: str) -> int:
+        if topic not in self._channels:
+            ros_name = type_name.replace("/", "/msg/")
+            if type_name not in self._schemas:
+                definition = ros2msg(type_name).encode()
+                self._schemas[type_name] = self._writer.register_schema(ros_name, "ros2msg", definition)
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[type_name])
+            self._counts[topic] = 0
+        return self._channels[topic]

@@ -1,0 +1,1 @@
+"""ROS 2 messages without ROS: CDR, definitions, rmw_zenoh keys."""

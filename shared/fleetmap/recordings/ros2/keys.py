@@ -1,0 +1,92 @@
+"""Under which keys rmw_zenoh carries ROS 2 topics: `<domain>/<topic>/<type>/<hash of the type>`, and what it attaches.
+
+Sources: rmw_zenoh's design document; REP 2011 and REP 2016 for the hash, RIHS01, of a type's description.
+"""
+
+import hashlib
+import json
+import re
+import struct
+from functools import cache
+from typing import Any
+
+from fleetmap.errors import UsageError
+from fleetmap.recordings.ros2.definitions import DEFINITIONS
+
+# type_description_interfaces/FieldType: numbers of the types, and what is added for fixed and for unbounded arrays.
+_TYPE_IDS = {
+    "int8": 2, "uint8": 3, "int16": 4, "uint16": 5, "int32": 6, "uint32": 7, "int64": 8, "uint64": 9, "float32": 10,
+    "float64": 11, "bool": 15, "byte": 16, "string": 17,
+}  # fmt: skip
+_NESTED, _FIXED_ARRAY, _SEQUENCE = 1, 48, 144
+_FIELD = re.compile(r"^([\w/]+)(?:\[(\d*)\])? (\w+)")
+_GID_BYTES = 16
+
+
+def ros_key(domain: int, topic: str, type_name: str) -> str:
+    """The key under which a publisher of `topic` with messages of `type_name` (sensor_msgs/Imu) sends."""
+    package, _, name = type_name.partition("/")
+    return f"{domain}/{_chunks(topic)}/{package}::msg::dds_::{name}_/RIHS01_{type_hash(type_name)}"
+
+
+def ros_key_expr(domain: int, topic: str) -> str:
+    """Matches the keys of a topic, whatever its type."""
+    return f"{domain}/{_chunks(topic)}/*/*"
+
+
+def type_of_key(key: str) -> str:
+    """The message type, such as sensor_msgs/Imu, of a key; empty where it names none."""
+    chunks = key.split("/")
+    parts = chunks[-2].split("::") if len(chunks) >= 4 else []
+    return f"{parts[0]}/{parts[3].removesuffix('_')}" if len(parts) == 4 and parts[1:3] == ["msg", "dds_"] else ""
+
+
+def attachment(sequence: int, source_ns: int, gid: bytes) -> bytes:
+    """What goes with every message: its number and time at this publisher, whose 16 bytes name it."""
+    assert len(gid) == _GID_BYTES
+    return struct.pack("<qqB", sequence, source_ns, _GID_BYTES) + gid
+
+
+@cache
+def type_hash(type_name: str) -> str:
+    """RIHS01 of a type in DEFINITIONS, without its prefix: SHA-256 of the type's description as canonical JSON."""
+    nested = sorted(_nested(type_name))
+    described = {
+        "type_description": _description(type_name),
+        "referenced_type_descriptions": [_description(name) for name in nested],
+    }
+    return hashlib.sha256(json.dumps(described, separators=(", ", ": ")).encode()).hexdigest()
+
+
+def _description(type_name: str) -> dict[str, Any]:
+    return {"type_name": _long(type_name), "fields": [_field(line) for line in DEFINITIONS[type_name].splitlines()]}
+
+
+def _field(line: str) -> dict[str, Any]:
+    match = _FIELD.match(line)
+    assert match is not None, line
+    base, count, name = match.groups()
+    type_id = _TYPE_IDS.get(base, _NESTED) + (0 if count is None else _FIXED_ARRAY if count else _SEQUENCE)
+    nested = "" if base in _TYPE_IDS else _long(base)
+    shape = {"type_id": type_id, "capacity": int(count or 0), "string_capacity": 0, "nested_type_name": nested}
+    return {"name": name, "type": shape}
+
+
+def _nested(type_name: str) -> set[str]:
+    found: set[str] = set()
+    for line in DEFINITIONS[type_name].splitlines():
+        base = line.split()[0].partition("[")[0]
+        if base not in _TYPE_IDS:
+            found |= {base} | _nested(base)
+    return found
+
+
+def _long(type_name: str) -> str:
+    return type_name.replace("/", "/msg/")
+
+
+def _chunks(topic: str) -> str:
+    chunks = topic.strip("/")
+    if not chunks or not all(re.fullmatch(r"[A-Za-z_]\w*", chunk) for chunk in chunks.split("/")):
+        raise UsageError(f"topic {topic!r}: write it like /cam0/image_raw, of letters, digits and _")
+    return chunks

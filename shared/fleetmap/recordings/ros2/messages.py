@@ -1,0 +1,249 @@
+"""The ROS 2 messages that recordings are made of: bytes (CDR) to the project's values and back.
+
+Decoding raises ValueError for bytes that are no such message; the reader counts them. Rotations are written as
+quaternions x y z w and covariances translation first, as ROS does; here they are wxyz and rotation first.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
+from fleetmap.recordings.images import StoredImage, file_kind
+from fleetmap.recordings.ros2.cdr import CdrReader, CdrWriter
+from fleetmap.sensors.calibration import CameraCalibration
+from fleetmap.sensors.samples import PositionPrior, Stamps, WheelSample
+
+# What odometry without a covariance is taken to be worth
+UNKNOWN_WHEEL_SIGMA_MPS, UNKNOWN_WHEEL_SIGMA_RADPS = 0.05, 0.05
+_ROT_TRANS_FROM_TRANS_ROT = [3, 4, 5, 0, 1, 2]
+_IMU_DOUBLES = 37
+_LENS_NAMES = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
+
+
+@dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """sensor_msgs/CameraInfo: sizes, lens and the projection of the rectified image."""
+
+    frame_id: str
+    width_px: int
+    height_px: int
+    lens: str
+    distortion: Array
+    matrix: Array
+    rect_from_cam: Array
+    projection: Array
+
+
+@dataclass(frozen=True, slots=True)
+class FrameLink:
+    """One transform of a /tf_static message: parent_from_child (4, 4)."""
+
+    parent: str
+    child: str
+    parent_from_child: Array
+
+
+def header_of(data: bytes) -> tuple[int, str]:
+    """Stamp in ns and frame_id of a message that begins with a header."""
+    reader = CdrReader(data)
+    return reader.stamp_ns(), reader.text()
+
+
+def decode_image(data: bytes, where: str) -> StoredImage:
+    """sensor_msgs/Image."""
+    reader = CdrReader(data)
+    reader.stamp_ns(), reader.text()
+    height, width, encoding = reader.unsigned(), reader.unsigned(), reader.text()
+    big_endian, step = bool(reader.byte()), reader.unsigned()
+    return StoredImage(encoding, reader.blob(), where, width, height, step, big_endian)
+
+
+def encode_image(stamp_ns: int, frame_id: str, image: StoredImage) -> bytes:
+    """sensor_msgs/Image of an image stored in rows."""
+    writer = CdrWriter().header(stamp_ns, frame_id).unsigned(image.height_px).unsigned(image.width_px)
+    writer.text(image.encoding).byte(image.big_endian).unsigned(image.step_bytes)
+    return writer.blob(image.data).message()
+
+
+def decode_compressed_image(data: bytes, where: str) -> StoredImage:
+    """sensor_msgs/CompressedImage.
+
+    The bytes of an image file, or of compressed_depth_image_transport behind its 12-byte head.
+    """
+    reader = CdrReader(data)
+    reader.stamp_ns(), reader.text()
+    form, content = reader.text(), reader.blob()
+    if "compressedDepth" in form and file_kind(content[12:]) == "png":
+        content = content[12:]
+    return StoredImage("file", content, where)
+
+
+def encode_compressed_image(stamp_ns: int, frame_id: str, image: StoredImage, form: str) -> bytes:
+    """sensor_msgs/CompressedImage of an image file's bytes."""
+    return CdrWriter().header(stamp_ns, frame_id).text(form).blob(image.data).message()
+
+
+def decode_camera_info(data: bytes) -> CameraInfo:
+    """sensor_msgs/CameraInfo."""
+    reader = CdrReader(data)
+    _, frame_id = reader.stamp_ns(), reader.text()
+    height, width, lens = reader.unsigned(), reader.unsigned(), reader.text()
+    distortion = reader.doubles(reader.unsigned())
+    matrix, rect, projection = reader.doubles(9), reader.doubles(9), reader.doubles(12)
+    return CameraInfo(
+        frame_id, width, height, lens, distortion, matrix.reshape(3, 3), rect.reshape(3, 3), projection.reshape(3, 4)
+    )
+
+
+def encode_camera_info(stamp_ns: int, frame_id: str, camera: CameraCalibration) -> bytes:
+    """sensor_msgs/CameraInfo of an unrectified camera: its projection is that of the camera itself."""
+    fx, fy, cx, cy = camera.intrinsics_px
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    # plumb_bob has five coefficients in ROS
+    distortion = (
+        camera.distortion
+        if camera.model == "equidistant"
+        else np.pad(camera.distortion, (0, 5 - len(camera.distortion)))
+    )
+    writer = CdrWriter().header(stamp_ns, frame_id).unsigned(camera.height_px).unsigned(camera.width_px)
+    writer.text(_LENS_NAMES[camera.model]).unsigned(len(distortion)).doubles(distortion).doubles(matrix).doubles(
+        np.eye(3)
+    )
+    writer.doubles(np.hstack([matrix, np.zeros((3, 1))]))
+    for _ in range(6):  # binning_x binning_y and the region of interest: all zero means the whole image
+        writer.unsigned(0)
+    return writer.byte(0).message()
+
+
+def decode_imu(messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
+    """Stamps (N,), gyro (N, 3), accelerometer (N, 3) of sensor_msgs/Imu messages, and the frame_id of the first.
+
+    Messages of one length and byte order are read together; ValueError names none of them: the caller reads singly to
+    find it.
+    """
+    if len({(len(data), data[:2]) for data in messages}) > 1:
+        parts = [decode_imu([data]) for data in messages]
+        return (
+            np.concatenate([part[0] for part in parts]),
+            np.concatenate([part[1] for part in parts]),
+            np.concatenate([part[2] for part in parts]),
+            parts[0][3],
+        )
+    reader = CdrReader(messages[0])
+    _, frame_id = header_of(messages[0])
+    name_bytes = int(np.frombuffer(messages[0][12:16], reader.endian + "u4")[0])
+    start = 16 + name_bytes + (-(12 + name_bytes) % 8)
+    if len(messages[0]) < start + 8 * _IMU_DOUBLES:
+        raise ValueError(f"an Imu message of {len(messages[0])} bytes is too short")
+    table = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
+    seconds = np.ascontiguousarray(table[:, 4:8]).view(reader.endian + "i4")[:, 0].astype(np.int64)
+    nanoseconds = np.ascontiguousarray(table[:, 8:12]).view(reader.endian + "u4")[:, 0].astype(np.int64)
+    values = (
+        np.ascontiguousarray(table[:, start : start + 8 * _IMU_DOUBLES]).view(reader.endian + "f8").astype(np.float64)
+    )
+    return seconds * 1_000_000_000 + nanoseconds, values[:, 13:16].copy(), values[:, 25:28].copy(), frame_id
+
+
+def encode_imu(stamp_ns: int, frame_id: str, gyro_radps: Array, accel_mps2: Array) -> bytes:
+    """sensor_msgs/Imu without orientation (marked so by -1, as ROS asks)."""
+    values = np.zeros(_IMU_DOUBLES)
+    values[3], values[4] = 1.0, -1.0
+    values[13:16], values[25:28] = gyro_radps, accel_mps2
+    return CdrWriter().header(stamp_ns, frame_id).doubles(values).message()
+
+
+def decode_odometry(data: bytes) -> WheelSample:
+    """The twist of nav_msgs/Odometry, in the axes of its child frame (the base).
+
+    A variance that is not positive is unknown.
+    """
+    reader = CdrReader(data)
+    stamp_ns, _ = reader.stamp_ns(), reader.text()
+    reader.text()
+    values = reader.doubles(7 + 36 + 6 + 36)
+    twist, variances = values[43:49], np.diag(values[49:].reshape(6, 6))
+    sigma_mps = float(np.sqrt(variances[0])) if variances[0] > 0 else UNKNOWN_WHEEL_SIGMA_MPS
+    sigma_radps = float(np.sqrt(variances[5])) if variances[5] > 0 else UNKNOWN_WHEEL_SIGMA_RADPS
+    if not np.isfinite(twist).all():
+        raise ValueError("the twist is not finite")
+    return WheelSample(stamp_ns, twist[:3].copy(), float(twist[5]), sigma_mps, sigma_radps)
+
+
+def encode_odometry(sample: WheelSample, frame_id: str, child_frame_id: str) -> bytes:
+    """nav_msgs/Odometry that carries the twist; its pose stays at the origin with an infinite variance."""
+    twist = np.concatenate([sample.velocity_base_mps, [0.0, 0.0, sample.yaw_rate_radps]])
+    variances = np.diag([sample.sigma_mps**2] * 3 + [sample.sigma_radps**2] * 3)
+    writer = CdrWriter().header(sample.stamp_ns, frame_id).text(child_frame_id)
+    writer.doubles(_position_quat_xyzw(np.eye(4))).doubles(np.diag(np.full(6, np.inf))).doubles(twist)
+    return writer.doubles(variances).message()
+
+
+def decode_prior(data: bytes) -> PositionPrior:
+    """geometry_msgs/PoseWithCovarianceStamped as map_from_base."""
+    reader = CdrReader(data)
+    stamp_ns, _ = reader.stamp_ns(), reader.text()
+    map_from_base = _target_from_source(reader.doubles(7))
+    order = _ROT_TRANS_FROM_TRANS_ROT
+    return PositionPrior(stamp_ns, map_from_base, reader.doubles(36).reshape(6, 6)[np.ix_(order, order)])
+
+
+def encode_prior(prior: PositionPrior, frame_id: str) -> bytes:
+    """geometry_msgs/PoseWithCovarianceStamped."""
+    order = _ROT_TRANS_FROM_TRANS_ROT  # swapping the halves is its own inverse
+    writer = CdrWriter().header(prior.stamp_ns, frame_id).doubles(_position_quat_xyzw(prior.map_from_base))
+    return writer.doubles(prior.cov_rot_trans[np.ix_(order, order)]).message()
+
+
+def decode_pose(data: bytes) -> tuple[int, Array]:
+    """geometry_msgs/PoseStamped: stamp and x y z qw qx qy qz (7,), not checked."""
+    reader = CdrReader(data)
+    stamp_ns, _ = reader.stamp_ns(), reader.text()
+    return stamp_ns, reader.doubles(7)[[0, 1, 2, 6, 3, 4, 5]]
+
+
+def encode_pose(stamp_ns: int, frame_id: str, frame_from_body: Array) -> bytes:
+    """geometry_msgs/PoseStamped."""
+    return CdrWriter().header(stamp_ns, frame_id).doubles(_position_quat_xyzw(frame_from_body)).message()
+
+
+def decode_frame_links(data: bytes) -> list[FrameLink]:
+    """tf2_msgs/TFMessage."""
+    reader = CdrReader(data)
+    links = []
+    for _ in range(reader.unsigned()):
+        _, parent = reader.stamp_ns(), reader.text()
+        child = reader.text()
+        links.append(FrameLink(parent.lstrip("/"), child.lstrip("/"), _target_from_source(reader.doubles(7))))
+    return links
+
+
+def encode_frame_links(stamp_ns: int, links: Sequence[FrameLink]) -> bytes:
+    """tf2_msgs/TFMessage."""
+    writer = CdrWriter().unsigned(len(links))
+    for link in links:
+        writer.header(stamp_ns, link.parent).text(link.child).doubles(_position_quat_xyzw(link.parent_from_child))
+    return writer.message()
+
+
+def encode_text(text: str) -> bytes:
+    """std_msgs/String."""
+    return CdrWriter().text(text).message()
+
+
+def decode_text(data: bytes) -> str:
+    """std_msgs/String."""
+    return CdrReader(data).text()
+
+
+def _target_from_source(position_quat_xyzw: Array) -> Array:
+    norm = float(np.linalg.norm(position_quat_xyzw[3:]))
+    if not np.isfinite(position_quat_xyzw).all() or abs(norm - 1) > 0.01:
+        raise ValueError(f"the quaternion {position_quat_xyzw[3:].tolist()} is not of unit length")
+    return se3(rotation_from_quat_wxyz(position_quat_xyzw[[6, 3, 4, 5]]), position_quat_xyzw[:3])
+
+
+def _position_quat_xyzw(target_from_source: Array) -> Array:
+    quat_wxyz = quat_wxyz_from_rotation(target_from_source[:3, :3])
+    return np.concatenate([target_from_source[:3, 3], quat_wxyz[1:], quat_wxyz[:1]])

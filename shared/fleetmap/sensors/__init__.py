@@ -1,0 +1,1 @@
+"""Sensors as values: samples, calibration, camera models, rectification."""

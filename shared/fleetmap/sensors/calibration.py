@@ -1,0 +1,86 @@
+"""What is known of a robot's sensors: lenses, mounting, noise. Values only; reading files is the recordings' job."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from fleetmap.errors import CalibrationError
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.sensors.cameras import CAMERA_MODELS
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCalibration:
+    """One camera.
+
+    model: a key of CAMERA_MODELS. intrinsics_px: fx fy cx cy. body_from_cam (4, 4).
+    imu_minus_cam_s: stamp of the IMU clock minus stamp of the camera clock at one moment (Kalibr's timeshift_cam_imu).
+    """
+
+    model: str
+    width_px: int
+    height_px: int
+    intrinsics_px: Array
+    distortion: Array
+    body_from_cam: Array
+    imu_minus_cam_s: float = 0.0
+
+    def pixel_from_ray(self, rays_cam: Array) -> Array:
+        """(N, 2) pixels of rays (N, 3)."""
+        return CAMERA_MODELS[self.model].pixel_from_ray(self.intrinsics_px, self.distortion, rays_cam)
+
+    def ray_from_pixel(self, pixels: Array) -> Array:
+        """(N, 3) unit rays of pixels (N, 2)."""
+        return CAMERA_MODELS[self.model].ray_from_pixel(self.intrinsics_px, self.distortion, pixels)
+
+
+@dataclass(frozen=True, slots=True)
+class ImuNoise:
+    """Continuous-time noise densities of the IMU; the defaults are the ADIS16448's data sheet, doubled."""
+
+    gyro_noise_radps_rthz: float = 3.4e-4
+    gyro_walk_radps2_rthz: float = 4.0e-5
+    accel_noise_mps2_rthz: float = 4.0e-3
+    accel_walk_mps3_rthz: float = 6.0e-3
+
+
+@dataclass(frozen=True, slots=True)
+class RigCalibration:
+    """All sensors of one robot. Cameras left first; `imu` is None for a rig without one."""
+
+    cameras: tuple[CameraCalibration, ...]
+    imu: ImuNoise | None = None
+    base_from_body: Array = field(default_factory=lambda: np.eye(4))
+
+    def with_base_from_body(self, base_from_body: Array) -> "RigCalibration":
+        """A copy with another mounting of the IMU on the robot."""
+        return replace(self, base_from_body=base_from_body)
+
+
+def check_camera(camera: CameraCalibration, name: str) -> CameraCalibration:
+    """`camera` itself; raises CalibrationError naming the first value that cannot be right."""
+    if camera.model not in CAMERA_MODELS:
+        raise CalibrationError(f"{name}: unknown camera model {camera.model!r}; known are {', '.join(CAMERA_MODELS)}")
+    counts = CAMERA_MODELS[camera.model].distortion_counts
+    if len(camera.distortion) not in counts:
+        raise CalibrationError(
+            f"{name}: {len(camera.distortion)} distortion coefficients for model {camera.model}, which takes {counts}"
+        )
+    fx, fy, cx, cy = (float(v) for v in camera.intrinsics_px)
+    if not (fx > 0 and fy > 0):
+        raise CalibrationError(f"{name}: focal lengths fx={fx} fy={fy} must be positive pixels")
+    if not (0 < cx < camera.width_px and 0 < cy < camera.height_px):
+        raise CalibrationError(
+            f"{name}: principal point ({cx}, {cy}) lies outside the {camera.width_px}x{camera.height_px} image; "
+            "is the calibration for another resolution?"
+        )
+    rotation = camera.body_from_cam[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise CalibrationError(f"{name}: the rotation of body_from_cam is not orthonormal: {rotation.tolist()}")
+    return camera
+
+
+def stereo_baseline_m(calibration: RigCalibration) -> float:
+    """Distance between the first two cameras' centres."""
+    left, right = calibration.cameras[:2]
+    return float(np.linalg.norm((se3_inverse(left.body_from_cam) @ right.body_from_cam)[:3, 3]))

@@ -1,0 +1,178 @@
+"""From a rig with lenses to the one camera that all geometry uses: a rectified pinhole pair.
+
+After rectification a point at (x, y, z) in `cam0` (rectified axes) is seen at u = f x/z + cx, v = f y/z + cy on the
+left and at u - f b/z on the right, same row. An RGB-D frame becomes the same thing with a baseline chosen here, a
+single camera has baseline 0.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
+from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from fleetmap.sensors.samples import CameraFrame, Image
+
+_MAX_ZOOM = 1.5  # beyond it one rig sees corners that the other cannot
+RGBD_BASELINE_M = 0.08  # a depth sensor's triangulation base: turns depth noise into disparity noise
+
+
+@dataclass(frozen=True, slots=True)
+class StereoCamera:
+    """The rectified pinhole pair. baseline_m is 0 for a single camera."""
+
+    focal_px: float
+    cx_px: float
+    cy_px: float
+    baseline_m: float
+    width_px: int
+    height_px: int
+
+    @property
+    def matrix(self) -> Array:
+        """(3, 3) camera matrix."""
+        return np.array([[self.focal_px, 0, self.cx_px], [0, self.focal_px, self.cy_px], [0, 0, 1.0]])
+
+    def pixel_from_point(self, points_cam: Array) -> Array:
+        """(N, 3) u_left, v, u_right of points (N, 3); NaN behind the camera."""
+        z = np.where(points_cam[:, 2] > 1e-6, points_cam[:, 2], np.nan)
+        u = self.focal_px * points_cam[:, 0] / z + self.cx_px
+        v = self.focal_px * points_cam[:, 1] / z + self.cy_px
+        return np.stack([u, v, u - self.focal_px * self.baseline_m / z], axis=1)
+
+    def point_from_pixel(self, pixels: Array, disparities_px: Array) -> Array:
+        """(N, 3) points in `cam0` of left pixels (N, 2) with disparities (N,); not finite where the disparity is 0."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = self.focal_px * self.baseline_m / disparities_px
+            return np.stack(
+                [(pixels[:, 0] - self.cx_px) * z / self.focal_px, (pixels[:, 1] - self.cy_px) * z / self.focal_px, z],
+                axis=1,
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class RectifiedFrame:
+    """A CameraFrame seen by the StereoCamera. disparity_px (H, W) float32 (NaN unknown) only with a depth sensor."""
+
+    stamp_ns: int
+    left: Image
+    right: Image | None
+    disparity_px: NDArray[np.float32] | None
+
+
+class Rectifier:
+    """Turns recorded frames of one rig into rectified ones; holds the look-up tables.
+
+    pinhole: the camera to rectify to, all but its baseline, so that rigs of one site see alike; one that suits the rig
+    without it. Raises CalibrationError where its focal length is too far from the rig's.
+    """
+
+    def __init__(
+        self, calibration: RigCalibration, *, has_depth: bool = False, pinhole: StereoCamera | None = None
+    ) -> None:
+        cameras = calibration.cameras
+        if not cameras:
+            raise CalibrationError("the calibration holds no camera; pass one with --calibration FILE")
+        self._sizes = [(c.height_px, c.width_px) for c in cameras[:2]]
+        self.has_depth = has_depth
+        if has_depth or len(cameras) == 1:
+            cam0_from_rect = np.eye(3)
+            baseline = RGBD_BASELINE_M if has_depth else 0.0
+            used = cameras[:1]
+        else:
+            cam0_from_rect, baseline = _rectifying_rotation(cameras[0], cameras[1])
+            used = cameras[:2]
+        self.camera = _common_pinhole(used, baseline)
+        if pinhole is not None:
+            self.camera = _as_pinhole(pinhole, self.camera)
+        self.body_from_cam = cameras[0].body_from_cam @ se3(cam0_from_rect, np.zeros(3))
+        self.imu_minus_cam_s = cameras[0].imu_minus_cam_s
+        self._maps = []
+        for camera in used:
+            body_from_rect = self.body_from_cam[:3, :3]
+            cam_from_rect = camera.body_from_cam[:3, :3].T @ body_from_rect
+            self._maps.append(_remap_tables(self.camera, camera, cam_from_rect))
+
+    def rectify(self, frame: CameraFrame) -> RectifiedFrame:
+        """The rectified frame; raises RecordingError where an image's size is not the calibration's."""
+        left = self._remap(frame.left, 0, frame.stamp_ns)
+        right = self._remap(frame.right, 1, frame.stamp_ns) if frame.right is not None and len(self._maps) > 1 else None
+        disparity = None
+        if self.has_depth and frame.depth_m is not None:
+            depth = np.where(frame.depth_m > 0, frame.depth_m, np.nan)
+            disparity = (self.camera.focal_px * self.camera.baseline_m / depth).astype(np.float32)
+            if self._maps[0] is not None:
+                nearest = cv2.remap(disparity, *self._maps[0], cv2.INTER_NEAREST, borderValue=float("nan"))
+                disparity = np.asarray(nearest, np.float32)
+        return RectifiedFrame(frame.stamp_ns, left, right, disparity)
+
+    def _remap(self, image: Image, index: int, stamp_ns: int) -> Image:
+        if image.shape != self._sizes[index]:
+            height, width = self._sizes[index]
+            raise RecordingError(
+                f"cam{index} image at {stamp_ns} is {image.shape[1]}x{image.shape[0]}, "
+                f"the calibration says {width}x{height}; pass the matching one with --calibration FILE"
+            )
+        tables = self._maps[index]
+        if tables is None:
+            return image
+        return np.asarray(cv2.remap(image, tables[0], tables[1], cv2.INTER_LINEAR), np.uint8)
+
+
+def _rectifying_rotation(left: CameraCalibration, right: CameraCalibration) -> tuple[Array, float]:
+    """cam0_from_rect (3, 3) and the baseline: x along the baseline, z as near to both optical axes as that allows."""
+    cam0_from_cam1 = se3_inverse(left.body_from_cam) @ right.body_from_cam
+    baseline_cam0 = cam0_from_cam1[:3, 3]
+    baseline_m = float(np.linalg.norm(baseline_cam0))
+    if baseline_m < 1e-3:
+        raise CalibrationError(
+            f"the two cameras are {baseline_m * 1000:.3f} mm apart; stereo needs a baseline, check body_from_cam"
+        )
+    if baseline_cam0[0] < 0.7 * baseline_m:
+        raise CalibrationError(
+            f"cam1 lies at {np.round(baseline_cam0, 4).tolist()} m in cam0's axes, not to its right; "
+            "are left and right swapped?"
+        )
+    half = so3_exp(0.5 * so3_log(cam0_from_cam1[:3, :3]))
+    x_axis = baseline_cam0 / baseline_m
+    y_axis = np.cross(half[:, 2], x_axis)
+    y_axis /= np.linalg.norm(y_axis)
+    return np.stack([x_axis, y_axis, np.cross(x_axis, y_axis)], axis=1), baseline_m
+
+
+def _common_pinhole(cameras: tuple[CameraCalibration, ...], baseline_m: float) -> StereoCamera:
+    focal = float(np.mean([c.intrinsics_px[:2].mean() for c in cameras]))
+    cx, cy = np.mean([c.intrinsics_px[2:] for c in cameras], axis=0)
+    return StereoCamera(focal, float(cx), float(cy), baseline_m, cameras[0].width_px, cameras[0].height_px)
+
+
+def _as_pinhole(pinhole: StereoCamera, own: StereoCamera) -> StereoCamera:
+    ratio = own.focal_px / pinhole.focal_px
+    if not 1 / _MAX_ZOOM < ratio < _MAX_ZOOM:
+        raise CalibrationError(
+            f"a camera of focal length {own.focal_px:.1f} px cannot be joined to a map made at {pinhole.focal_px:.1f} px; "
+            "survey the site with cameras that are alike, or as a site of its own"
+        )
+    return replace(pinhole, baseline_m=own.baseline_m)
+
+
+def _remap_tables(
+    rectified: StereoCamera, camera: CameraCalibration, cam_from_rect: Array
+) -> tuple[NDArray[np.int16], NDArray[np.uint16]] | None:
+    """Fixed-point look-up tables for cv2.remap, or None where the image is rectified already (as KITTI's are)."""
+    u, v = np.meshgrid(
+        np.arange(rectified.width_px, dtype=np.float64), np.arange(rectified.height_px, dtype=np.float64)
+    )
+    rays = np.stack(
+        [(u - rectified.cx_px) / rectified.focal_px, (v - rectified.cy_px) / rectified.focal_px, np.ones_like(u)], -1
+    )
+    pixels = camera.pixel_from_ray(rays.reshape(-1, 3) @ cam_from_rect.T).reshape(*u.shape, 2)
+    same_size = (rectified.width_px, rectified.height_px) == (camera.width_px, camera.height_px)
+    if same_size and np.nanmax(np.hypot(pixels[..., 0] - u, pixels[..., 1] - v)) < 0.02 and np.isfinite(pixels).all():
+        return None
+    pixels = np.nan_to_num(pixels, nan=-1e4).astype(np.float32)
+    first, second = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)
+    return np.asarray(first, np.int16), np.asarray(second, np.uint16)

@@ -1,0 +1,1 @@
+"""Runs without pictures: what an estimator would measure, landmark by landmark."""

@@ -1,0 +1,166 @@
+"""The landmarks of a world, chunk by chunk, and which of them each stretch of a drive can see."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array, se3_inverse
+from fleetsim.estimator import landmark_kernels
+from fleetsim.estimator.statistics import PITCH_PX
+from fleetsim.render import ray_kernels
+from fleetsim.scene.world import NEAR_COLUMNS, NEAR_ROWS, World
+
+CELLS_M = np.array([0.08, 0.16, 0.32, 0.64, 1.28])  # lattice spacings: with distance coarser ones take over
+_LARGEST = 1.4  # of the size drawn for a cell, see seed_landmarks
+_OCTAVE_SPAN = 1.2**8
+_GRID_M = 0.7
+_RICH_CONTRAST = 9.0  # grey steps per centimetre from which on every cell holds a corner
+
+
+@dataclass(frozen=True, slots=True)
+class Landmarks:
+    """N corners on surfaces, by rising cell size.
+
+    points_map, normals_map (N, 3); sizes_m (N,): extent, which decides from how far away they are seen; keys (N, 3)
+    uint64: what it looks like, what dirt lies on it, its id. firsts (levels,): first row of each cell size.
+    """
+
+    points_map: Array
+    normals_map: Array
+    sizes_m: Array
+    keys: NDArray[np.uint64]
+    firsts: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.sizes_m)
+
+    def take(self, rows: NDArray[np.integer]) -> "Landmarks":
+        """Those rows, as one piece."""
+        return Landmarks(
+            self.points_map[rows], self.normals_map[rows], self.sizes_m[rows], self.keys[rows], np.zeros(1, np.int64)
+        )
+
+
+class LandmarkField:
+    """Landmarks of a world's near chunks, made when first asked for. Far, plain chunks hold none."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._weights = _texture_weights(world)
+        self._chunks: dict[tuple[int, int], Landmarks] = {}
+        self._bounds: dict[tuple[int, int], Array] = {}
+        self._solids: dict[tuple[int, int], _Solids] = {}
+
+    def chunk(self, column: int, row: int) -> Landmarks:
+        """All landmarks of a chunk."""
+        key = (column, row)
+        if key not in self._chunks:
+            faces = self._world.detailed_faces(column, row)
+            parts, firsts, total = [], [], 0
+            for cell_m in CELLS_M:
+                part = self._seed(faces.quads, faces.values, faces.numbers, np.array([cell_m]))
+                firsts.append(total)
+                total += len(part[0])
+                parts.append(part)
+            points, normals, sizes, keys = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+            self._chunks[key] = Landmarks(points, normals, sizes, keys, np.array(firsts, np.int64))
+            self._bounds[key] = faces.bounds_m()
+        return self._chunks[key]
+
+    def seen_from(self, map_from_cam: Array, focal_px: float, widest: Array) -> Landmarks:
+        """Landmarks that a camera there may see: in a cone |x/z|, |y/z| < widest (2,), near enough, with nothing between."""
+        centre = np.ascontiguousarray(map_from_cam[:3, 3])
+        cam_from_map = np.ascontiguousarray(se3_inverse(map_from_cam)[:3, :3])
+        solids = self._solids_around(centre)
+        reach_per_m = focal_px / PITCH_PX
+        found: list[Landmarks] = []
+        for key in solids.keys:
+            chunk = self.chunk(*key)
+            gap_m = _gap(self._bounds[key], centre)
+            reaching = np.flatnonzero(CELLS_M * _LARGEST * reach_per_m > gap_m)
+            if not len(chunk) or not len(reaching):
+                continue
+            rows = np.empty(len(chunk), np.int32)
+            count = landmark_kernels.visible_from(
+                int(chunk.firsts[reaching[0]]), chunk.points_map, chunk.normals_map, chunk.sizes_m, cam_from_map, centre,
+                reach_per_m, widest, _OCTAVE_SPAN, solids.boxes, solids.starts, solids.items, solids.low, _GRID_M,
+                solids.counts, rows,
+            )  # fmt: skip
+            found.append(chunk.take(rows[:count]))
+        return _joined(found)
+
+    def _seed(
+        self, quads: Array, values: Array, numbers: NDArray[np.int32], cells_m: Array
+    ) -> tuple[Array, Array, Array, NDArray[np.uint64]]:
+        none = np.zeros((0, 3))
+        arguments = (quads, values, numbers, self._weights, cells_m)
+        count = landmark_kernels.seed_landmarks(*arguments, True, none, none, np.zeros(0), np.zeros((0, 3), np.uint64))
+        points, normals = np.empty((count, 3)), np.empty((count, 3))
+        sizes, keys = np.empty(count), np.empty((count, 3), np.uint64)
+        landmark_kernels.seed_landmarks(*arguments, False, points, normals, sizes, keys)
+        return points, normals, sizes, keys
+
+    def _solids_around(self, centre: Array) -> "_Solids":
+        layout = self._world.layout
+        middle = layout.chunk_at(float(centre[0]), float(centre[1]))
+        if middle not in self._solids:
+            columns, rows = layout.chunk_counts
+            keys = [
+                (column, row)
+                for row in range(max(0, middle[1] - NEAR_ROWS), min(rows, middle[1] + NEAR_ROWS + 1))
+                for column in range(max(0, middle[0] - NEAR_COLUMNS), min(columns, middle[0] + NEAR_COLUMNS + 1))
+            ]
+            boxes = np.concatenate([self._world.detailed_faces(*key).boxes for key in keys])
+            low = np.array([-1.0, -1.0, -1.0])
+            high = np.array([layout.length_m, layout.width_m, layout.ceiling_m]) + 1.0
+            near_low = np.maximum(low, np.append(centre[:2] - 40.0, -1.0))
+            near_high = np.minimum(high, np.append(centre[:2] + 40.0, high[2]))
+            counts = np.ceil((near_high - near_low) / _GRID_M).astype(np.int64)
+            starts, items = ray_kernels.fill_grid(boxes, near_low, _GRID_M, counts)
+            self._solids[middle] = _Solids(tuple(keys), boxes, starts, items, near_low, counts)
+        return self._solids[middle]
+
+
+@dataclass(frozen=True, slots=True)
+class _Solids:
+    """Chunks around one chunk and a grid of their boxes, see ray_kernels."""
+
+    keys: tuple[tuple[int, int], ...]
+    boxes: Array
+    starts: NDArray[np.int32]
+    items: NDArray[np.int32]
+    low: Array
+    counts: NDArray[np.int64]
+
+
+def _joined(parts: list[Landmarks]) -> Landmarks:
+    """All of them by rising id."""
+    if not parts:
+        return Landmarks(
+            np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3), np.uint64), np.zeros(1, np.int64)
+        )
+    keys = np.concatenate([part.keys for part in parts])
+    order = np.argsort(keys[:, 2], kind="stable")
+    points = np.concatenate([part.points_map for part in parts])[order]
+    normals = np.concatenate([part.normals_map for part in parts])[order]
+    sizes = np.concatenate([part.sizes_m for part in parts])[order]
+    return Landmarks(points, normals, sizes, keys[order], np.zeros(1, np.int64))
+
+
+def _gap(bounds_m: Array, place: Array) -> float:
+    """Distance from a place to a bounding box."""
+    return float(np.linalg.norm(np.maximum(np.maximum(bounds_m[:3] - place, place - bounds_m[3:]), 0.0)))
+
+
+def _texture_weights(world: World) -> Array:
+    """(T,) share of lattice cells that hold a corner: by the texture's contrast at a centimetre's scale."""
+    atlas, weights = world.textures.atlas, []
+    for row in atlas.table:
+        level = int(min(2, row[0], row[1]))
+        width, height = 1 << int(row[0] - level), 1 << int(row[1] - level)
+        first = int(row[2 + level])
+        texels = atlas.texels[first : first + width * height].reshape(height, width).astype(np.float64)
+        steps = [np.abs(np.diff(texels, axis=axis)).mean() if texels.shape[axis] > 1 else 0.0 for axis in range(2)]
+        weights.append(np.clip(max(steps) / _RICH_CONTRAST, 0.05, 1.0))
+    return np.array(weights)

@@ -1,0 +1,226 @@
+"""A run without pictures: what an estimator would measure, landmark by landmark, at many times real time.
+
+The world, its stock, the motion, IMU, wheels, priors and dropped frames are those of the rendered run; the landmarks
+lie on the same surfaces and hide behind the same boxes. Movers and faults of the pictures other than darkness have no
+effect here.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.sensors.rectification import Rectifier, StereoCamera
+from fleetsim.estimator import landmark_kernels, noise_kernels
+from fleetsim.estimator.landmarks import LandmarkField, Landmarks
+from fleetsim.estimator.statistics import PITCH_PX, FeatureStatistics, FlowStatistics
+from fleetsim.recorder import Session
+
+_STATION_M, _STATION_RAD = 0.5, 0.15
+_CONE_MARGIN = 0.3  # of the tangent: what turning and moving within a station may bring into the picture
+_TABLE = 1 << 16
+_BORDER_PX = 19.0
+_FLOW_BORDER_PX = 8.0
+_FLOOR_M = 0.05
+_FINEST_OCTAVES = 4.0  # what the flow's corners are found on
+
+Ids = NDArray[np.uint64]
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """Landmarks in one picture, exactly, by rising id.
+
+    ids (N,); points_map, normals_map (N, 3); keys (N, 3) as in Landmarks; pixels (N, 3): rectified u_left v u_right;
+    octaves (N,): at which they appear, in fractions; distances_m (N,).
+    """
+
+    ids: Ids
+    points_map: Array
+    normals_map: Array
+    keys: NDArray[np.uint64]
+    pixels: Array
+    octaves: Array
+    distances_m: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Features of one picture as a detector would report them.
+
+    rows (N,): of the sighting, -1 for clutter; pixels (N, 3), the third NaN where the disparity is unknown; octaves
+    (N,); descriptors (N, 32) uint8.
+    """
+
+    rows: NDArray[np.int32]
+    pixels: Array
+    octaves: NDArray[np.int8]
+    descriptors: NDArray[np.uint8]
+
+
+class EstimatorSession:
+    """Measurements of a prepared session, frame by frame in any order; rising order is fastest.
+
+    Equal arguments give equal bits. flow, features: statistics of the measurements. field: share it among sessions of
+    one world to make its landmarks once.
+    """
+
+    def __init__(
+        self, session: Session, *, flow: FlowStatistics | None = None, features: FeatureStatistics | None = None,
+        field: LandmarkField | None = None,
+    ) -> None:  # fmt: skip
+        self.session = session
+        self._flow, self._features = flow or FlowStatistics(), features or FeatureStatistics()
+        self._field = field or LandmarkField(session.world)
+        rectifier = Rectifier(session.nominal)
+        self.camera: StereoCamera = rectifier.camera
+        self.body_from_cam: Array = rectifier.body_from_cam
+        self.stamps_ns = session.frame_stamps_ns()
+        self.map_from_body = session.motion.map_from_body(np.array(session.frame_times_s))
+        self._rect_from_body = [
+            _rectified_from_body(nominal.body_from_cam, true.body_from_cam, self.body_from_cam)
+            for nominal, true in zip(session.nominal.cameras, session.true.cameras, strict=True)
+        ]
+        self._stations = _stations(self.map_from_body)
+        self._seed = session.order.seed * 4096 + session.order.day
+        self._table = np.random.default_rng(98).standard_normal(_TABLE)
+        self._held: tuple[int, Landmarks] | None = None
+        self._sighting: tuple[int, Sighting] | None = None
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def sighting(self, frame: int) -> Sighting:
+        """The landmarks in a frame's left picture; none where the cameras are dark."""
+        if self._sighting is None or self._sighting[0] != frame:
+            self._sighting = frame, self._look(frame)
+        return self._sighting[1]
+
+    def follow(self, frame: int, ids: Ids, begun_px: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Landmarks followed by optical flow into a frame: pixels (N, 3) (NaN where lost), and which were not lost.
+
+        begun_px (N, 2): exact pixels where each began to be followed, as `corners` gave them.
+        """
+        seen, flow = self.sighting(frame), self._flow
+        at = np.minimum(np.searchsorted(seen.ids, ids), max(len(seen.ids) - 1, 0))
+        kept = seen.ids[at] == ids if len(seen.ids) else np.zeros(len(ids), bool)
+        pixels, held = np.full((len(ids), 3), np.nan), np.zeros(int(kept.sum()), bool)
+        measured = np.empty((int(kept.sum()), 3))
+        exact, is_floor = seen.pixels[at[kept]], seen.points_map[at[kept], 2] < _FLOOR_M
+        noise_kernels.flow_noise(
+            ids[kept], exact, begun_px[kept], is_floor, frame, self._seed, flow.white_px, flow.lag, flow.along,
+            flow.across, flow.floor_lag, flow.floor_along, flow.slip_share, flow.slip, flow.lost_share,
+            flow.stretch_frames, flow.disparity_known_share, flow.disparity_px, flow.disparity_rough_share,
+            flow.disparity_rough_px, flow.disparity_rough_bias_px, flow.disparity_wrong_share, flow.disparity_wrong_px,
+            self._table, measured, held,
+        )  # fmt: skip
+        pixels[kept] = measured
+        kept[kept] = held
+        return pixels, kept
+
+    def corners(self, frame: int, taken: Array, count: int, min_distance_px: float) -> tuple[Ids, Array]:
+        """Up to `count` landmarks to follow from a frame on, and their exact pixels (N, 2).
+
+        At least min_distance_px from each other and from `taken` (M, 2), in an order of their own: a strong corner is
+        chosen in every frame.
+        """
+        seen = self.sighting(frame)
+        pixels, camera = np.ascontiguousarray(seen.pixels[:, :2]), self.camera
+        room = np.minimum(pixels, (camera.width_px - 1, camera.height_px - 1) - pixels).min(axis=1)
+        order = np.flatnonzero((room > _FLOW_BORDER_PX) & (seen.octaves < _FINEST_OCTAVES))
+        order = order[np.argsort(seen.keys[order, 0], kind="stable")]
+        chosen = noise_kernels.spread(
+            pixels,
+            order,
+            np.ascontiguousarray(taken[:, :2]),
+            min_distance_px,
+            count,
+            float(camera.width_px),
+            float(camera.height_px),
+        )
+        return seen.ids[chosen], pixels[chosen]
+
+    def features(self, frame: int) -> Found:
+        """What a detector finds in a frame's left picture, landmarks first, then clutter."""
+        seen, model = self.sighting(frame), self._features
+        room = max(len(seen.ids), model.count)
+        rows, pixels = np.full(room, -1, np.int32), np.empty((room, 3))
+        octaves, words = np.empty(room, np.int8), np.empty((room, 4), np.uint64)
+        centre = (self.map_from_body[frame] @ self.body_from_cam)[:3, 3]
+        toward = centre - seen.points_map
+        level = np.hypot(toward[:, 0], toward[:, 1])
+        directions = np.stack([np.arctan2(toward[:, 1], toward[:, 0]), np.arctan2(toward[:, 2], level)], axis=1)
+        count = noise_kernels.detect(
+            seen.keys, seen.pixels, seen.octaves, directions, frame, self._seed, model.found_share, model.view_share,
+            model.corner_px, model.slip_share, model.slip_px, model.octave_sigma, model.disparity_known_share, model.disparity_px,
+            model.disparity_wrong_share, model.disparity_wrong_px, model.dirt_bits, model.view_bits,
+            model.view_step_rad, model.noise_bits, self._table, rows, pixels, octaves, words,
+        )  # fmt: skip
+        count = min(count, model.count)
+        total = model.count if len(seen.ids) else 0
+        key = np.uint64((self._seed * 1000003 + frame) & ((1 << 63) - 1))
+        noise_kernels.add_clutter(
+            count, total, key, float(self.camera.width_px), float(self.camera.height_px), _BORDER_PX,
+            model.disparity_known_share, pixels, octaves, words,
+        )  # fmt: skip
+        rows[count:total] = -1
+        descriptors = words[:total].view(np.uint8).reshape(total, 32)
+        return Found(rows[:total], pixels[:total], octaves[:total], descriptors)
+
+    def _look(self, frame: int) -> Sighting:
+        landmarks, camera = self._landmarks(frame), self.camera
+        if self.session.renderer.faults.has("camera-dark", self.session.frame_times_s[frame]):
+            landmarks = landmarks.take(np.zeros(0, np.int64))
+        size = len(landmarks)
+        pixels, octaves, distances = np.empty((size, 3)), np.empty(size), np.empty(size)
+        rows = np.empty(size, np.int32)
+        body_from_map = se3_inverse(self.map_from_body[frame])
+        left, right = (np.ascontiguousarray((rect @ body_from_map)[:3]) for rect in self._rect_from_body)
+        pinhole = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px])
+        count = landmark_kernels.project(
+            landmarks.points_map, landmarks.sizes_m, left, right, pinhole, 0.0, camera.focal_px / PITCH_PX, pixels, octaves,
+            distances, rows,
+        )  # fmt: skip
+        rows = rows[:count]
+        keys = landmarks.keys[rows]
+        return Sighting(
+            keys[:, 2], landmarks.points_map[rows], landmarks.normals_map[rows], keys, pixels[:count], octaves[:count],
+            distances[:count],
+        )  # fmt: skip
+
+    def _landmarks(self, frame: int) -> Landmarks:
+        """Those that the frame's station can see; a station is the middle of a short stretch of the drive."""
+        station = self._stations[frame]
+        if self._held is None or self._held[0] != station:
+            half = (self.camera.width_px / 2, self.camera.height_px / 2)
+            widest = np.array(half) / self.camera.focal_px + _CONE_MARGIN
+            members = np.flatnonzero(np.array(self._stations) == station)
+            middle = self.map_from_body[members[len(members) // 2]]
+            seen = self._field.seen_from(middle @ self.body_from_cam, self.camera.focal_px, widest)
+            self._held = station, seen
+        return self._held[1]
+
+
+def _rectified_from_body(body_from_nominal: Array, body_from_true: Array, body_from_rect: Array) -> Array:
+    """(4, 4): a camera rectified as its calibration says, from where it really is.
+
+    Its own centre, the rectified axes turned by the mounting's error.
+    """
+    nominal_from_rect = body_from_nominal[:3, :3].T @ body_from_rect[:3, :3]
+    placed = np.eye(4)
+    placed[:3, :3] = body_from_true[:3, :3] @ nominal_from_rect
+    placed[:3, 3] = body_from_true[:3, 3]
+    return se3_inverse(placed)
+
+
+def _stations(map_from_body: Array) -> list[int]:
+    """The station of each frame: a new one after _STATION_M or _STATION_RAD."""
+    stations, begun = [0] * len(map_from_body), 0
+    for frame in range(1, len(map_from_body)):
+        since = se3_inverse(map_from_body[begun]) @ map_from_body[frame]
+        turned = np.linalg.norm(since[:3, :3] - np.eye(3)) / np.sqrt(2.0)
+        is_new = np.linalg.norm(since[:3, 3]) > _STATION_M or turned > _STATION_RAD
+        begun = frame if is_new else begun
+        stations[frame] = begun
+    return stations

@@ -1,0 +1,1 @@
+"""Routes, splines, and how a robot's body moves."""

@@ -1,0 +1,160 @@
+"""How a robot's body moves: a quintic spline in x, y, z, yaw, pitch, roll, so that rates and accelerations are exact.
+
+Euler angles are safe here: a floor robot never pitches anywhere near 90 degrees.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from fleetsim.motion.routes import Limits, Route, TimedPath, time_path
+from fleetsim.motion.splines import UniformSpline
+
+GRAVITY_MPS2 = 9.80665
+KNOT_S = 0.1
+_SQUAT_RAD_PER_MPS2, _LEAN_S = 0.006, 0.004
+
+
+class Motion(Protocol):
+    """Where the body is and what it feels, exactly, at times (N,) in seconds from the start."""
+
+    @property
+    def duration_s(self) -> float:
+        """Length in time."""
+        ...
+
+    def map_from_body(self, times_s: Array) -> Array:
+        """(N, 4, 4)."""
+        ...
+
+    def rates(self, times_s: Array) -> tuple[Array, Array]:
+        """Angular rate rad/s and specific force m/s^2, both (N, 3) in body axes."""
+        ...
+
+    def velocity_body(self, times_s: Array) -> Array:
+        """(N, 3) m/s in body axes."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Shake:
+    """Floor ripple at full speed, rms."""
+
+    tilt_rad: float = 0.0015
+    heave_m: float = 0.0006
+
+
+class RouteMotion:
+    """A route as driven by a body at `height_m` above the floor."""
+
+    def __init__(self, route: Route, limits: Limits, height_m: float, shake: Shake, rng: np.random.Generator) -> None:
+        path = time_path(route, limits)
+        self._duration_s = float(path.times_s[-1])
+        self._spline = UniformSpline(-6 * KNOT_S, KNOT_S, _control_points(path, height_m, shake, rng))
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last moment of rest."""
+        return self._duration_s
+
+    def map_from_body(self, times_s: Array) -> Array:
+        """(N, 4, 4) at times (N,)."""
+        values = self._spline.at(times_s)
+        stacked = np.zeros((len(values), 4, 4))
+        stacked[:, :3, :3] = rotation_from_yaw_pitch_roll(values[:, 3:])
+        stacked[:, :3, 3] = values[:, :3]
+        stacked[:, 3, 3] = 1.0
+        return stacked
+
+    def rates(self, times_s: Array) -> tuple[Array, Array]:
+        """Angular rate and specific force, (N, 3) each, body axes, in closed form. Source: ZYX Euler kinematics."""
+        values, first, second = (self._spline.at(times_s, order) for order in range(3))
+        pitch, roll = values[:, 4], values[:, 5]
+        d_yaw, d_pitch, d_roll = first[:, 3], first[:, 4], first[:, 5]
+        gyro = np.stack(
+            [
+                d_roll - np.sin(pitch) * d_yaw,
+                np.cos(roll) * d_pitch + np.sin(roll) * np.cos(pitch) * d_yaw,
+                np.cos(roll) * np.cos(pitch) * d_yaw - np.sin(roll) * d_pitch,
+            ],
+            axis=1,
+        )
+        rotation = rotation_from_yaw_pitch_roll(values[:, 3:])
+        force_map = second[:, :3] + np.array([0.0, 0.0, GRAVITY_MPS2])
+        return gyro, np.einsum("nji,nj->ni", rotation, force_map)
+
+    def velocity_body(self, times_s: Array) -> Array:
+        """(N, 3) m/s in body axes."""
+        rotation = rotation_from_yaw_pitch_roll(self._spline.at(times_s)[:, 3:])
+        return np.asarray(np.einsum("nji,nj->ni", rotation, self._spline.at(times_s, 1)[:, :3]))
+
+
+class CarriedMotion:
+    """Several motions one after another; between them the robot is carried while it stands, and feels nothing."""
+
+    def __init__(self, motions: Sequence[RouteMotion]) -> None:
+        self._motions = list(motions)
+        self._ends_s = np.cumsum([motion.duration_s for motion in motions])
+
+    @property
+    def duration_s(self) -> float:
+        """Of all pieces."""
+        return float(self._ends_s[-1])
+
+    def map_from_body(self, times_s: Array) -> Array:
+        """(N, 4, 4); jumps where one piece ends."""
+        return self._pick(times_s, lambda motion, local_s: motion.map_from_body(local_s))
+
+    def rates(self, times_s: Array) -> tuple[Array, Array]:
+        """As RouteMotion.rates of the piece in force."""
+        gyro = self._pick(times_s, lambda motion, local_s: motion.rates(local_s)[0])
+        return gyro, self._pick(times_s, lambda motion, local_s: motion.rates(local_s)[1])
+
+    def velocity_body(self, times_s: Array) -> Array:
+        """As RouteMotion.velocity_body of the piece in force."""
+        return self._pick(times_s, lambda motion, local_s: motion.velocity_body(local_s))
+
+    def _pick(self, times_s: Array, ask: "_Ask") -> Array:
+        piece = np.minimum(np.searchsorted(self._ends_s, times_s, side="right"), len(self._motions) - 1)
+        starts = np.concatenate([[0.0], self._ends_s[:-1]])
+        answers = [
+            ask(motion, times_s[piece == number] - starts[number]) for number, motion in enumerate(self._motions)
+        ]
+        merged = np.zeros((len(times_s), *answers[0].shape[1:]))
+        for number, answer in enumerate(answers):
+            merged[piece == number] = answer
+        return merged
+
+
+class _Ask(Protocol):
+    def __call__(self, motion: RouteMotion, local_s: Array) -> Array: ...
+
+
+def _control_points(path: TimedPath, height_m: float, shake: Shake, rng: np.random.Generator) -> Array:
+    """(K, 6) each KNOT_S from 6 knots before the start: the path, floor ripple with speed, squat, lean."""
+    moments = np.arange(-6, int(np.ceil(path.times_s[-1] / KNOT_S)) + 7) * KNOT_S
+    control = np.zeros((len(moments), 6))
+    for column, source in ((0, path.points_map[:, 0]), (1, path.points_map[:, 1]), (3, path.yaw_rad)):
+        control[:, column] = np.interp(moments, path.times_s, source)
+    velocity = np.gradient(control[:, :2], KNOT_S, axis=0)
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    ripple = rng.standard_normal((len(moments), 3)) * np.clip(speed / 1.5, 0.0, 1.0)[:, None]
+    accel = np.convolve(np.pad(np.gradient(speed, KNOT_S), 2, "edge"), np.ones(5) / 5, "valid")
+    control[:, 2] = height_m + shake.heave_m * ripple[:, 0]
+    control[:, 4] = -_SQUAT_RAD_PER_MPS2 * accel + shake.tilt_rad * ripple[:, 1]
+    control[:, 5] = _LEAN_S * speed * np.gradient(control[:, 3], KNOT_S) + shake.tilt_rad * ripple[:, 2]
+    return control
+
+
+def rotation_from_yaw_pitch_roll(angles_rad: Array) -> Array:
+    """(N, 3, 3) map_from_body rotations Rz(yaw) Ry(pitch) Rx(roll) of angles (N, 3)."""
+    (cy, cp, cr), (sy, sp, sr) = np.cos(angles_rad).T, np.sin(angles_rad).T
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

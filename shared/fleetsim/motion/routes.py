@@ -1,0 +1,142 @@
+"""Routes over the floor: way points rounded, timed within a robot's limits, checked against solid things."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleetmap.errors import UsageError
+from fleetmap.geometry import Array
+from fleetsim.scene.layout import Layout
+
+STEP_M = 0.01
+_CREEP_MPS = 0.02  # speed at which a standing start begins
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a robot's drive can do, and how wide it takes corners."""
+
+    speed_mps: float = 1.5
+    accel_mps2: float = 0.8
+    yaw_rate_radps: float = 1.0
+    corner_radius_m: float = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """Way points in map (x, y).
+
+    stops: number of a way point, seconds of standing near it; rest_s: standing at both ends.
+    """
+
+    way_points_map: tuple[tuple[float, float], ...]
+    stops: tuple[tuple[int, float], ...] = ()
+    rest_s: float = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class TimedPath:
+    """A route as driven: times_s (N,) from 0, points_map (N, 2), yaw_rad (N,) unwrapped."""
+
+    times_s: Array
+    points_map: Array
+    yaw_rad: Array
+
+
+def _corner_arc(before: Array, corner: Array, after: Array, radius_m: float) -> Array:
+    """(K, 2) points of the arc that replaces a corner; (1, 2) the corner itself where the way goes straight on."""
+    back, ahead = before - corner, after - corner
+    back_m, ahead_m = float(np.linalg.norm(back)), float(np.linalg.norm(ahead))
+    back, ahead = back / back_m, ahead / ahead_m
+    angle = float(np.arccos(np.clip(back @ ahead, -1.0, 1.0)))
+    if angle > np.pi - 1e-3:
+        return corner[None]
+    if angle < 1e-2:
+        raise UsageError(f"the route doubles back on itself at {corner.round(2).tolist()}; give it a loop to turn in")
+    reach = min(radius_m / np.tan(angle / 2), 0.49 * back_m, 0.49 * ahead_m)
+    radius = reach * np.tan(angle / 2)
+    bisector = (back + ahead) / np.linalg.norm(back + ahead)
+    centre = corner + bisector * np.hypot(reach, radius)
+    start, end = corner + back * reach - centre, corner + ahead * reach - centre
+    sweep = float(np.arctan2(start[0] * end[1] - start[1] * end[0], start @ end))
+    angles = np.linspace(0.0, sweep, max(4, int(abs(sweep) * radius / STEP_M)))
+    cosine, sine = np.cos(angles), np.sin(angles)
+    return np.asarray(
+        centre + np.stack([cosine * start[0] - sine * start[1], sine * start[0] + cosine * start[1]], axis=1)
+    )
+
+
+def round_path(way_points_map: Array, radius_m: float) -> Array:
+    """(N, 2) points each centimetre along the polyline with its corners rounded."""
+    pieces = [way_points_map[:1]]
+    for before, corner, after in zip(way_points_map[:-2], way_points_map[1:-1], way_points_map[2:], strict=True):
+        pieces.append(_corner_arc(before, corner, after, radius_m))
+    pieces.append(way_points_map[-1:])
+    points = np.concatenate(pieces)
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    even = np.arange(0.0, along[-1], STEP_M)
+    return np.stack([np.interp(even, along, points[:, axis]) for axis in range(2)], axis=1)
+
+
+def _smoothed(values: Array, half_width: int) -> Array:
+    window = np.ones(2 * half_width + 1) / (2 * half_width + 1)
+    return np.convolve(np.pad(values, half_width, "edge"), window, "valid")
+
+
+def time_path(route: Route, limits: Limits) -> TimedPath:
+    """The route within the limits: rest, drive, stops, rest. Speeds by a forward and a backward sweep over the path."""
+    way_points = np.array(route.way_points_map, np.float64)
+    points = round_path(way_points, limits.corner_radius_m)
+    tangents = np.gradient(points, STEP_M, axis=0)
+    yaw = np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
+    curvature = _smoothed(np.abs(np.gradient(yaw, STEP_M)), 15)
+    speed = np.minimum(limits.speed_mps, limits.yaw_rate_radps / np.maximum(curvature, 1e-6))
+    speed[[0, -1]] = _CREEP_MPS
+    stops = {
+        int(np.argmin(np.linalg.norm(points - way_points[number], axis=1))): wait_s for number, wait_s in route.stops
+    }
+    for index in stops:
+        speed[index] = _CREEP_MPS
+    gain = 2 * limits.accel_mps2 * STEP_M
+    for index in range(1, len(speed)):
+        speed[index] = min(speed[index], float(np.sqrt(speed[index - 1] ** 2 + gain)))
+    for index in range(len(speed) - 2, -1, -1):
+        speed[index] = min(speed[index], float(np.sqrt(speed[index + 1] ** 2 + gain)))
+    durations = np.concatenate([[route.rest_s], STEP_M / (0.5 * (speed[1:] + speed[:-1]))])
+    for index, wait_s in stops.items():
+        durations[index] += wait_s
+    # A wait lengthens the step before its place, which would be driven slowly: hold the place with a second sample.
+    times = np.cumsum(durations)
+    held = np.array(sorted(stops), np.int64)
+    waits = np.array([stops[int(index)] for index in held])
+    times_held = np.insert(times, held, times[held] - waits) if len(held) else times
+    points_held = np.insert(points, held, points[held], axis=0) if len(held) else points
+    yaw_held = np.insert(yaw, held, yaw[held]) if len(held) else yaw
+    ends = ([0.0], times_held, [times_held[-1] + route.rest_s])
+    return TimedPath(
+        np.concatenate(ends),
+        np.concatenate([points_held[:1], points_held, points_held[-1:]]),
+        np.concatenate([yaw_held[:1], yaw_held, yaw_held[-1:]]),
+    )
+
+
+def check_clear(points_map: Array, layout: Layout, clearance_m: float) -> None:
+    """Raises UsageError where a path (N, 2) comes nearer than clearance_m to a solid thing or a wall."""
+    x, y = points_map[:, 0], points_map[:, 1]
+    walls = np.minimum(np.minimum(x, layout.length_m - x), np.minimum(y, layout.width_m - y))
+    gap, blocker = float(walls.min()), "a wall"
+    worst = int(np.argmin(walls))
+    for x_min, y_min, x_max, y_max in layout.solid_rectangles():
+        outside_x, outside_y = (
+            np.maximum(np.maximum(x_min - x, x - x_max), 0),
+            np.maximum(np.maximum(y_min - y, y - y_max), 0),
+        )
+        distance = np.hypot(outside_x, outside_y)
+        if distance.min() < gap:
+            gap, worst = float(distance.min()), int(np.argmin(distance))
+            blocker = f"the solid at x {x_min:.1f}..{x_max:.1f}, y {y_min:.1f}..{y_max:.1f} m"
+    if gap < clearance_m:
+        raise UsageError(
+            f"the route passes {gap:.2f} m from {blocker} at ({x[worst]:.2f}, {y[worst]:.2f}) m, "
+            f"the robot needs {clearance_m:.2f} m; move the way points"
+        )

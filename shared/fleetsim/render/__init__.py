@@ -1,0 +1,1 @@
+"""From a scene and a camera's way to a picture and its depth."""

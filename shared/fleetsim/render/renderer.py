@@ -1,0 +1,106 @@
+"""The stereo pair's renderer: one thread per camera, exposure, faults that spoil pictures."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import Image
+from fleetsim.motion.body_motion import Motion
+from fleetsim.render.optics import make_optics
+from fleetsim.render.painter import Look, Painter, Shot
+from fleetsim.scene.light import LIGHT_STATES, AutoExposure, Exposure
+from fleetsim.scene.movers import AnyMover, Apparition
+from fleetsim.scene.stock import mix
+from fleetsim.scene.world import World
+from fleetsim.sensors.faults import OVER_EXPOSURE, FaultPlan
+
+_PERSON_AHEAD_M = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class StereoShot:
+    """A pair as it is recorded, and the truth of the left picture."""
+
+    left: Image
+    right: Image
+    depth_m: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    exposure: Exposure
+    subframes: int
+
+
+class StereoRenderer:
+    """Renders what a rig sees while it moves through a world. Its two threads end with `close`."""
+
+    def __init__(
+        self, world: World, rig: RigCalibration, motion: Motion, light: str, *, look: Look | None = None,
+        movers: tuple[AnyMover, ...] = (), faults: FaultPlan | None = None, key: int = 0,
+    ) -> None:  # fmt: skip
+        self._world, self._rig, self._motion = world, rig, motion
+        self._groups = np.array(LIGHT_STATES[light])
+        self.faults = faults or FaultPlan()
+        self.imu_minus_cam_s = rig.cameras[0].imu_minus_cam_s
+        self._key = key
+        self._exposure = AutoExposure()
+        if any(fault.name == "person-in-front" for fault in self.faults.faults):
+            movers = (*movers, Apparition("person", self._person_in_front))
+        look = look or Look()
+        self._painters = [Painter(world, make_optics(c), look, number, movers) for number, c in enumerate(rig.cameras)]
+        self._workers = ThreadPoolExecutor(len(self._painters))
+        self._last_right: Image | None = None
+
+    def close(self) -> None:
+        """Ends the threads."""
+        self._workers.shutdown()
+
+    def path(self, camera: int) -> Callable[[float], Array]:
+        """t_s -> map_from_cam."""
+        body_from_cam = self._rig.cameras[camera].body_from_cam
+
+        def map_from_cam(t_s: float) -> Array:
+            return np.asarray(self._motion.map_from_body(np.array([t_s]))[0] @ body_from_cam)
+
+        return map_from_cam
+
+    def exposure(self, t_s: float) -> Exposure:
+        """What the automatic exposure has settled on."""
+        moments = np.maximum(t_s - 0.25 * np.arange(5), 0.0)
+        map_from_cam = self._motion.map_from_body(moments) @ self._rig.cameras[0].body_from_cam
+        places, forward = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]
+        chosen = self._exposure.choose(self._world.lamps, self._groups, places, forward)
+        if self.faults.has("over-exposure", t_s):
+            return Exposure(chosen.time_s, chosen.gain * OVER_EXPOSURE)
+        return chosen
+
+    def shoot(self, t_s: float) -> StereoShot:
+        """The pair whose exposure is centred at t."""
+        place = self._motion.map_from_body(np.array([t_s]))[0][:3, 3]
+        scene = self._world.scene_around(float(place[0]), float(place[1]))
+        exposure = self.exposure(t_s)
+        groups = np.zeros(3) if self.faults.has("camera-dark", t_s) else self._groups
+        # Below 2^40, so that the painters' arithmetic on it stays within 64 bits.
+        noise_key = mix(self._world.seed, self._world.day, self._key, round(t_s * 1e6)) >> 24
+
+        def shoot_one(camera: int) -> Shot:
+            return self._painters[camera].shoot(scene, groups, self.path(camera), t_s, exposure, noise_key)
+
+        left, right = self._workers.map(shoot_one, (0, 1))
+        right_image = right.image
+        if self.faults.has("camera-frozen", t_s) and self._last_right is not None:
+            right_image = self._last_right
+        self._last_right = right_image
+        return StereoShot(left.image, right_image, left.depth_m, left.faces, exposure, left.subframes)
+
+    def _person_in_front(self, t_s: float) -> tuple[float, float, float] | None:
+        if not self.faults.has("person-in-front", t_s):
+            return None
+        map_from_cam = self.path(0)(t_s)
+        ahead = map_from_cam[:3, 3] + _PERSON_AHEAD_M * map_from_cam[:3, 2] / np.hypot(
+            map_from_cam[0, 2], map_from_cam[1, 2]
+        )
+        return float(ahead[0]), float(ahead[1]), float(np.arctan2(map_from_cam[1, 2], map_from_cam[0, 2])) + np.pi

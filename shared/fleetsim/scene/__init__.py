@@ -1,0 +1,1 @@
+"""The warehouse: hall, racks, stock, light, moving things."""

@@ -1,0 +1,89 @@
+"""Light states, exposure and the brightness near a place."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from fleetsim.scene.building import Lamp
+
+# Strength of the lamp groups: day lamps, night lamps, skylights and open docks.
+LIGHT_STATES = {"day": (1.0, 1.0, 1.0), "evening": (1.0, 1.0, 0.08), "night": (0.0, 0.8, 0.01)}
+LAMP_REACH_M = 14.0
+GREY_PER_MS = 70.0  # grey levels per unit radiance and millisecond of exposure at gain 1
+_AMBIENT_SHARE = 0.9  # of the unshadowed mean light on the floor
+_MEAN_REFLECTANCE = 0.32
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """How one picture is taken."""
+
+    time_s: float
+    gain: float
+
+    @property
+    def grey_per_radiance(self) -> float:
+        """Factor from radiance to grey levels."""
+        return GREY_PER_MS * 1e3 * self.time_s * self.gain
+
+
+class LampField:
+    """All lamps of a site, for questions about the light at a place without a ray."""
+
+    def __init__(self, lamps: list[Lamp], floor_area_m2: float) -> None:
+        self._places = np.array([(lamp.x_m, lamp.y_m, lamp.z_m) for lamp in lamps]).reshape(-1, 3)
+        self._powers = np.array([lamp.power for lamp in lamps])
+        self._groups = np.array([lamp.group for lamp in lamps], np.int64)
+        self._ambient = np.zeros(3)
+        for lamp in lamps:
+            self._ambient[lamp.group] += _AMBIENT_SHARE * lamp.power * _floor_integral(lamp.z_m) / floor_area_m2
+
+    def ambient(self, groups: Array) -> float:
+        """Light that reaches every surface, one bounce crudely: a share of the mean light on the floor."""
+        return float(groups @ self._ambient)
+
+    def floor_light(self, groups: Array, x_m: float, y_m: float) -> float:
+        """Unshadowed light on the floor at a place, ambient light included."""
+        offsets = self._places - (x_m, y_m, 0.0)
+        squared = np.einsum("ij,ij->i", offsets, offsets)
+        near = squared < LAMP_REACH_M**2
+        received = _received(squared[near], offsets[near, 2]) * self._powers[near] * groups[self._groups[near]]
+        return float(received.sum()) + self.ambient(groups)
+
+
+def _received(squared_m2: Array, height_m: Array) -> Array:
+    """The lamp term of the baking, for a level surface below."""
+    fade = 1.0 - squared_m2 / LAMP_REACH_M**2
+    return np.asarray(np.maximum(height_m, 0.0) / np.sqrt(squared_m2) / (squared_m2 + 3.0) * fade / np.pi)
+
+
+def _floor_integral(height_m: float) -> float:
+    """Integral of the lamp term over the floor under a lamp of power 1."""
+    radius = (np.arange(400) + 0.5) * LAMP_REACH_M / 400
+    squared = radius**2 + height_m**2
+    inside = squared < LAMP_REACH_M**2
+    ring = 2 * np.pi * radius[inside] * LAMP_REACH_M / 400
+    return float((_received(squared[inside], np.full(int(inside.sum()), height_m)) * ring).sum())
+
+
+@dataclass(frozen=True, slots=True)
+class AutoExposure:
+    """Exposure from the light on the ground ahead over the last second.
+
+    Stateless, so pictures can be made in any order.
+    """
+
+    target_grey: float = 95.0
+    longest_s: float = 0.010
+    shortest_s: float = 0.0004
+    most_gain: float = 12.0
+
+    def choose(self, lamps: LampField, groups: Array, places_map: Array, forward_map: Array) -> Exposure:
+        """Exposure for recent camera places (N, 3) that looked along forward_map (N, 3)."""
+        reaches = (1.0, 3.0, 6.0)
+        ahead = np.concatenate([places_map + reach * forward_map for reach in reaches])
+        seen = np.mean([lamps.floor_light(groups, float(x), float(y)) for x, y, _ in ahead])
+        wanted_s = self.target_grey / (GREY_PER_MS * 1e3 * max(_MEAN_REFLECTANCE * float(seen), 1e-4))
+        time_s = float(np.clip(wanted_s, self.shortest_s, self.longest_s))
+        return Exposure(time_s, float(np.clip(wanted_s / time_s, 1.0, self.most_gain)))

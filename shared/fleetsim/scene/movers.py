@@ -1,0 +1,132 @@
+"""People, forklifts and robots that move through the hall, as groups of boxes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from fleetsim.scene.faces import FaceBuilder, Faces
+from fleetsim.textures.texture_set import Textures
+
+Part = tuple[
+    tuple[float, float, float], tuple[float, float, float], str
+]  # centre and half sizes in the mover's axes, material
+# How much of the floor's light the sides xXyYzZ get.
+SIDE_LIGHT = np.array([0.55, 0.7, 0.5, 0.65, 0.3, 1.0])
+
+
+def _person(t_s: float) -> list[Part]:
+    stride = 0.22 * float(np.sin(5.5 * t_s))
+    return [
+        ((stride, 0.09, 0.42), (0.08, 0.07, 0.42), "cloth0"),
+        ((-stride, -0.09, 0.42), (0.08, 0.07, 0.42), "cloth0"),
+        ((0, 0, 1.13), (0.12, 0.21, 0.30), "vest"),
+        ((-0.6 * stride, 0.26, 1.1), (0.05, 0.05, 0.3), "cloth1"),
+        ((0.6 * stride, -0.26, 1.1), (0.05, 0.05, 0.3), "cloth1"),
+        ((0, 0, 1.56), (0.1, 0.09, 0.13), "cloth3"),
+        ((0, 0, 1.72), (0.13, 0.13, 0.06), "vest"),
+    ]
+
+
+def _forklift(t_s: float) -> list[Part]:
+    fork = 0.3 + 0.25 * float(np.sin(0.7 * t_s))
+    return [
+        ((0, 0, 0.55), (0.75, 0.5, 0.35), "hazard"),
+        ((-0.45, 0, 1.05), (0.3, 0.48, 0.2), "cloth1"),
+        ((0.85, 0.3, 1.2), (0.05, 0.06, 1.1), "grey"),
+        ((0.85, -0.3, 1.2), (0.05, 0.06, 1.1), "grey"),
+        ((0, 0.42, 1.6), (0.04, 0.04, 0.5), "dark"),
+        ((0, -0.42, 1.6), (0.04, 0.04, 0.5), "dark"),
+        ((0, 0, 2.12), (0.6, 0.5, 0.03), "grey"),
+        ((1.4, 0, fork + 0.1), (0.55, 0.5, 0.07), "wood"),
+        ((1.4, 0, fork + 0.45), (0.5, 0.45, 0.28), "goods"),
+        ((-0.1, 0, 1.4), (0.15, 0.2, 0.3), "vest"),
+        ((-0.1, 0, 1.82), (0.1, 0.1, 0.12), "cloth3"),
+    ]
+
+
+def _robot(_: float) -> list[Part]:
+    return [
+        ((0, 0, 0.14), (0.35, 0.25, 0.12), "grey"),
+        ((0, 0, 0.42), (0.3, 0.2, 0.15), "goods"),
+        ((0.3, 0, 0.62), (0.02, 0.2, 0.1), "hazard"),
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class MoverKind:
+    """parts(t) in the mover's axes (x forward), radius of its soft shadow."""
+
+    parts: Callable[[float], list[Part]]
+    shadow_m: float
+
+
+MOVER_KINDS = {
+    "person": MoverKind(_person, 0.5),
+    "forklift": MoverKind(_forklift, 1.3),
+    "robot": MoverKind(_robot, 0.6),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Mover:
+    """A thing that goes round the closed polyline `stations_map` (x, y) for ever; with two stations to and fro."""
+
+    kind: str
+    stations_map: tuple[tuple[float, float], ...]
+    speed_mps: float
+    start_m: float = 0.0
+    _path: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_path", np.array([*self.stations_map, self.stations_map[0]]))
+
+    def place(self, t_s: float) -> tuple[float, float, float]:
+        """x, y, yaw in map at t."""
+        legs = np.diff(self._path, axis=0)
+        lengths = np.hypot(legs[:, 0], legs[:, 1])
+        along = (self.start_m + self.speed_mps * t_s) % max(float(lengths.sum()), 1e-9)
+        leg = min(int(np.searchsorted(np.cumsum(lengths), along, side="right")), len(legs) - 1)
+        share = (along - float(lengths[:leg].sum())) / max(float(lengths[leg]), 1e-9)
+        x, y = self._path[leg] + share * legs[leg]
+        return float(x), float(y), float(np.arctan2(legs[leg, 1], legs[leg, 0]))
+
+
+@dataclass(frozen=True, slots=True)
+class Apparition:
+    """A mover whose place is given by a function of time; None while it is not there."""
+
+    kind: str
+    place_at: Callable[[float], tuple[float, float, float] | None]
+
+    def place(self, t_s: float) -> tuple[float, float, float]:
+        """x, y, yaw in map at t; far below the floor while it is not there."""
+        return self.place_at(t_s) or (-1e4, -1e4, 0.0)
+
+
+AnyMover = Mover | Apparition
+
+
+def add_movers(builder: FaceBuilder, movers: tuple[AnyMover, ...], textures: Textures, t_s: float) -> Array:
+    """Adds the movers as they stand at t; their soft shadows (M, 3): x, y, 1 / radius^2."""
+    materials = {f"cloth{number}": cloth for number, cloth in enumerate(textures.cloth)}
+    materials |= {"vest": textures.vest, "grey": textures.grey, "dark": textures.dark, "hazard": textures.hazard}
+    materials |= {"wood": textures.wood, "goods": textures.skus[3].front}
+    shadows = np.zeros((len(movers), 3))
+    for number, mover in enumerate(movers):
+        x, y, yaw = mover.place(t_s)
+        cosine, sine = float(np.cos(yaw)), float(np.sin(yaw))
+        for (px, py, pz), half, material in MOVER_KINDS[mover.kind].parts(t_s):
+            centre = (x + cosine * px - sine * py, y + sine * px + cosine * py, pz)
+            builder.add_box(centre, half, materials[material], yaw_rad=yaw)
+        shadows[number] = x, y, 1.0 / MOVER_KINDS[mover.kind].shadow_m ** 2
+    return shadows
+
+
+def mover_light(faces: Faces, movers: tuple[AnyMover, ...], floor_light: list[float], t_s: float) -> Array:
+    """Light samples of the movers' faces: the floor's light where each stands, by side."""
+    boxes_of = [len(MOVER_KINDS[mover.kind].parts(t_s)) for mover in movers]
+    of_box = np.repeat(np.array(floor_light), boxes_of)
+    per_face = 0.8 * of_box[faces.owners[:, 0]] * SIDE_LIGHT[faces.owners[:, 1]]
+    return np.repeat(per_face, faces.numbers[:, 4] * faces.numbers[:, 5])

@@ -1,0 +1,201 @@
+"""Rack rows with their goods: the detailed version for near chunks, a plain one for far chunks."""
+
+import numpy as np
+
+from fleetsim.scene.faces import NO_BOTTOM, FaceBuilder
+from fleetsim.scene.layout import Layout
+from fleetsim.scene.stock import Slot, mix, slot_generator
+from fleetsim.textures.texture_set import RACK_LABELS, Sku, Textures
+
+_TAG_RACK, _TAG_LABEL = 31, 32
+
+
+class RackMaker:
+    """Adds bays of one site on one day to a builder."""
+
+    def __init__(self, layout: Layout, textures: Textures, seed: int, day: int) -> None:
+        self._layout, self._textures, self._seed, self._day = layout, textures, seed, day
+
+    def add_bay(self, builder: FaceBuilder, row: int, bay: int) -> None:
+        """Everything of one bay: the frame at its low x (and high x for the last one), shelves, labels, goods."""
+        self._add_frame(builder, row, bay)
+        if bay == self._layout.bays - 1:
+            self._add_frame(builder, row, bay + 1)
+        for level in range(self._layout.levels):
+            if level:
+                self._add_shelf(builder, row, bay, level)
+            self._add_goods(builder, Slot(row, bay, level))
+
+    def add_plain_bay(self, builder: FaceBuilder, row: int, bay: int) -> None:
+        """The bay as seen from afar: one block of cartons per slot, beams, posts."""
+        layout, textures = self._layout, self._textures
+        x, y = layout.bay_x_m(bay), layout.row_y_m(row)
+        depth = layout.rack_depth_m / 2
+        post = (0.05, depth, layout.rack_top_m / 2)
+        builder.add_box((x, y, layout.rack_top_m / 2), post, textures.uprights[0], sides="yY", is_solid=False)
+        for level, height in enumerate(layout.shelf_heights_m[: layout.levels]):
+            rng = slot_generator(layout, self._seed, self._day, Slot(row, bay, level))
+            if level:
+                beam = (layout.bay_m / 2, depth - 0.03, 0.06)
+                builder.add_box(
+                    (x + layout.bay_m / 2, y, height - 0.07),
+                    beam,
+                    textures.beams[0],
+                    sides="yYZ",
+                    tint=0.75,
+                    is_solid=False,
+                )
+            if rng.random() < layout.empty_share:
+                continue
+            sku = textures.skus[int(rng.integers(0, len(textures.skus)))]
+            half = (layout.bay_m / 2 - 0.1, 0.4, 0.45)
+            scramble = mix(self._seed, row, bay, level) >> 40
+            builder.add_box(
+                (x + layout.bay_m / 2, y, height + 0.47),
+                half,
+                sku.front,
+                scramble=scramble,
+                sides=NO_BOTTOM,
+                is_solid=False,
+            )
+
+    def add_end_guards(self, builder: FaceBuilder, row: int, *, is_far_end: bool) -> None:
+        """The hazard-striped guard at a row's end, with a poster on the frame where the site has landmarks."""
+        layout, textures = self._layout, self._textures
+        x = layout.bay_x_m(layout.bays) + 0.12 if is_far_end else layout.end_m - 0.12
+        y, half = layout.row_y_m(row), layout.rack_depth_m / 2
+        scramble = self._scramble(_TAG_RACK, row, 900 + is_far_end)
+        builder.add_box((x, y, 0.25), (0.06, half, 0.25), textures.hazard, sides=NO_BOTTOM, scramble=scramble)
+        if layout.has_landmarks:
+            side, plate = 0.275, x + (0.095 if is_far_end else -0.095)
+            sign = 1.0 if is_far_end else -1.0
+            poster = textures.posters[(row * 2 + is_far_end) % len(textures.posters)]
+            builder.add_quad(
+                (plate, y - sign * side, 2.0), (0, sign * 2 * side, 0), (0, 0, -2 * side), poster, scramble=scramble
+            )
+
+    def add_parked_pallet(self, builder: FaceBuilder, number: int, x_m: float, y_m: float) -> None:
+        """A pallet with a stack of cartons on the floor by an end wall; changes as often as a slot does."""
+        layout, textures = self._layout, self._textures
+        rng = slot_generator(layout, self._seed, self._day, Slot(layout.rows + number, 0, 0))
+        builder.add_box((x_m, y_m, 0.07), (0.4, 0.6, 0.07), textures.wood, scramble=int(rng.integers(0, 1 << 24)))
+        sku = textures.skus[int(rng.integers(0, len(textures.skus)))]
+        sides = {"x": sku.front, "X": sku.front, "y": sku.side, "Y": sku.side, "z": sku.top, "Z": sku.top}
+        for floor in range(int(rng.integers(1, 5))):
+            z = 0.14 + (floor + 0.5) * sku.height_m + 0.002 * floor
+            for side in (-1, 1):
+                centre = (x_m + rng.uniform(-0.03, 0.03), y_m + side * (sku.width_m / 2 + 0.01), z)
+                half = (0.36, sku.width_m / 2, sku.height_m / 2)
+                yaw, scramble = rng.normal(0, 0.015), int(rng.integers(0, 1 << 24))
+                builder.add_box(centre, half, sides, yaw_rad=yaw, tint=rng.uniform(0.8, 1.2), scramble=scramble)
+
+    def _scramble(self, tag: int, row: int, *rest: int) -> int:
+        """Bits for the dirt of a fixed thing; the same in every aisle where aisles are identical."""
+        return mix(self._seed, tag, row % 2 if self._layout.are_aisles_identical else row, *rest) >> 40
+
+    def _add_frame(self, builder: FaceBuilder, row: int, bay: int) -> None:
+        layout, textures = self._layout, self._textures
+        x, y, top = layout.bay_x_m(bay), layout.row_y_m(row), layout.rack_top_m
+        depth = layout.rack_depth_m / 2
+        post = textures.uprights[(bay + row % 2) % len(textures.uprights)]
+        for number, offset in enumerate((depth - 0.05, 0.05 - depth)):
+            scramble = self._scramble(_TAG_RACK, row, bay, number)
+            builder.add_box((x, y + offset, top / 2), (0.05, 0.05, top / 2), post, sides="xXyY", scramble=scramble)
+        for number in range(int((top - 0.3) / 0.75) + 1):
+            half, height = (0.015, depth - 0.1, 0.025), 0.3 + 0.75 * number
+            scramble = self._scramble(_TAG_RACK, row, bay, 10 + number)
+            builder.add_box((x, y, height), half, textures.grey, sides="xXzZ", scramble=scramble, is_solid=False)
+
+    def _add_shelf(self, builder: FaceBuilder, row: int, bay: int, level: int) -> None:
+        layout, textures = self._layout, self._textures
+        x, y, z = layout.bay_x_m(bay) + layout.bay_m / 2, layout.row_y_m(row), layout.shelf_heights_m[level]
+        depth = layout.rack_depth_m / 2
+        beam, span = textures.beams[(bay + level) % 3], layout.bay_m / 2 - 0.05
+        for number, offset in enumerate((depth - 0.03, 0.03 - depth)):
+            scramble = self._scramble(_TAG_RACK, row, bay, 100 + 2 * level + number)
+            builder.add_box(
+                (x, y + offset, z - 0.07), (span, 0.03, 0.06), beam, sides="yYzZ", tint=0.75, scramble=scramble
+            )
+        deck_scramble = self._scramble(_TAG_RACK, row, bay, 200 + level)
+        builder.add_box((x, y, z - 0.012), (span, depth - 0.06, 0.01), textures.grey, tint=0.8, scramble=deck_scramble)
+        toward_aisle = 1.0 if row % 2 else -1.0
+        number = Slot(row, bay, level).number(layout) % RACK_LABELS
+        for half_bay in range(2):
+            shift = (self._scramble(_TAG_LABEL, row, bay, level, half_bay) & 255) * 0.3 / 255
+            left = layout.bay_x_m(bay) + 0.36 + half_bay * 1.3 + shift
+            start = left + 0.26 if row % 2 else left
+            front = y + toward_aisle * (depth + 0.003)
+            edge = (-0.26 * toward_aisle, 0.0, 0.0)
+            builder.add_quad((start, front, z - 0.03), edge, (0, 0, -0.08), textures.rack_labels[number])
+
+    def _add_goods(self, builder: FaceBuilder, slot: Slot) -> None:
+        layout, textures = self._layout, self._textures
+        rng = slot_generator(layout, self._seed, self._day, slot)
+        if rng.random() < layout.empty_share:
+            return
+        x, y = layout.bay_x_m(slot.bay) + 0.06, layout.row_y_m(slot.row)
+        base = layout.shelf_heights_m[slot.level]
+        above = slot.level + 1 < layout.levels
+        ceiling = layout.shelf_heights_m[slot.level + 1] - 0.2 if above else base + 1.25
+        if rng.random() < 0.55:
+            for pallet in range(2):
+                scramble = int(rng.integers(0, 1 << 24))
+                builder.add_box(
+                    (x + 0.66 + 1.28 * pallet, y, base + 0.07), (0.6, 0.5, 0.07), textures.wood, scramble=scramble
+                )
+            base += 0.14
+        end = layout.bay_x_m(slot.bay + 1) - 0.08
+        while True:
+            sku = textures.skus[int(rng.integers(0, len(textures.skus)))]
+            if x + sku.width_m > end:
+                return
+            for floor in range(int(rng.integers(1, 4))):
+                bottom = base + floor * (sku.height_m + 0.002)
+                if bottom + sku.height_m > ceiling:
+                    break
+                self._add_carton(builder, rng, sku, slot.row, (x, y, bottom))
+            x += sku.width_m + rng.uniform(0.01, 0.12)
+
+    def _add_carton(
+        self, builder: FaceBuilder, rng: np.random.Generator, sku: Sku, row: int, corner_map: tuple[float, float, float]
+    ) -> None:
+        """One carton, its front 2-12 cm behind the rack's front, turned a little; half of them carry a label."""
+        x, y, bottom = corner_map
+        toward_aisle = 1.0 if row % 2 else -1.0
+        yaw, jitter, setback = rng.normal(0, 0.02), rng.uniform(-0.01, 0.01), rng.uniform(0.02, 0.12)
+        half_depth = max(sku.depth_m, 0.5) / 2
+        centre_x = x + sku.width_m / 2 + jitter
+        centre_y = y + toward_aisle * (self._layout.rack_depth_m / 2 - setback - half_depth)
+        front, back = ("Y", "y") if row % 2 else ("y", "Y")
+        textures = {front: sku.front, back: sku.side, "x": sku.side, "X": sku.side, "z": sku.top, "Z": sku.top}
+        builder.add_box(
+            (centre_x, centre_y, bottom + sku.height_m / 2),
+            (sku.width_m / 2, half_depth, sku.height_m / 2),
+            textures,
+            yaw_rad=yaw,
+            tint=rng.uniform(0.8, 1.2),
+            scramble=int(rng.integers(0, 1 << 24)),
+        )
+        if rng.random() < 0.5:
+            side = 0.12
+            along = rng.uniform(-0.4, 0.4) * (sku.width_m - side)
+            up = rng.uniform(0.3, 0.9) * (sku.height_m - side)
+            cosine, sine = float(np.cos(yaw)), float(np.sin(yaw))
+            outward, right = (
+                (-sine * toward_aisle, cosine * toward_aisle),
+                (-cosine * toward_aisle, -sine * toward_aisle),
+            )
+            reach = half_depth + 0.003
+            origin = (
+                centre_x + outward[0] * reach + right[0] * (along - side / 2),
+                centre_y + outward[1] * reach + right[1] * (along - side / 2),
+                bottom + up + side,
+            )
+            label = self._textures.labels[int(rng.integers(0, len(self._textures.labels)))]
+            builder.add_quad(
+                origin,
+                (right[0] * side, right[1] * side, 0.0),
+                (0, 0, -side),
+                label,
+                scramble=int(rng.integers(0, 1 << 24)),
+            )

@@ -1,0 +1,218 @@
+"""A site on one day, built and lit chunk by chunk as the robot comes near.
+
+A chunk is one aisle wide and about four bays long. Near the camera chunks are detailed and lit with shadows, far away
+plain. What a chunk looks like depends on site, seed and day alone, never on the order in which chunks were visited.
+"""
+
+import itertools
+from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array
+from fleetsim.render import ray_kernels
+from fleetsim.scene.building import HallMaker, Lamp
+from fleetsim.scene.faces import FaceBuilder, Faces
+from fleetsim.scene.layout import Layout
+from fleetsim.scene.light import LAMP_REACH_M, LampField
+from fleetsim.scene.racks import RackMaker
+from fleetsim.scene.stock import mix
+from fleetsim.textures.texture_set import paint_textures
+
+LAMP_GROUPS = 3
+NEAR_COLUMNS, NEAR_ROWS = 3, 2  # detailed chunks on each side of the camera's own
+_CELL_M = 0.7
+_PLAIN_LIGHT = 0.55  # plain chunks are lit without shadows
+_MOST_BAKED_CHUNKS, _MOST_BUILT_CHUNKS = 128, 256
+_DECAL_CELLS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class LitFaces:
+    """Faces with their baked light: light (groups, samples), before lamps are weighted."""
+
+    faces: Faces
+    light: NDArray[np.float32]
+    bounds_m: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What is painted around one place: all chunks, near ones detailed. Columns as in `Faces`.
+
+    ranges (C, 2), bounds_m (C, 6): faces of each chunk and their bounding box. owners: number of the chunk, box in it,
+    side.
+    """
+
+    quads: Array
+    values: Array
+    numbers: NDArray[np.int32]
+    light: NDArray[np.float32]
+    ranges: NDArray[np.int32]
+    bounds_m: Array
+    parts: tuple[Faces, ...]
+
+    def __len__(self) -> int:
+        return len(self.quads)
+
+
+class World:
+    """One site with one day's stock. `workers` bake light; without them the caller does."""
+
+    def __init__(
+        self, layout: Layout, *, seed: int = 0, day: int = 0, workers: ThreadPoolExecutor | None = None
+    ) -> None:
+        self.layout, self.seed, self.day = layout, seed, day
+        self.textures = paint_textures(seed, layout.aisles, are_aisles_identical=layout.are_aisles_identical)
+        self._workers = workers
+        self._hall = HallMaker(layout, self.textures, seed)
+        self._racks = RackMaker(layout, self.textures, seed, day)
+        columns, rows = layout.chunk_counts
+        self._keys = [(column, row) for row in range(rows) for column in range(columns)]
+        self._lamps = {key: self._hall.lamps(*key) for key in self._keys}
+        every_lamp = [lamp for lamps in self._lamps.values() for lamp in lamps]
+        self.lamps = LampField(every_lamp, layout.length_m * layout.width_m)
+        self.decals = self._lay_decals()
+        self.floor_numbers = np.array([self.textures.concrete_coarse, self.textures.dirt], np.int32)
+        self._built: OrderedDict[tuple[int, int], Faces] = OrderedDict()
+        self._lit: OrderedDict[tuple[int, int], LitFaces] = OrderedDict()
+        self._plain: dict[tuple[int, int], LitFaces] = {}
+        self._scenes: OrderedDict[tuple[int, int], Scene] = OrderedDict()
+
+    def scene_around(self, x_m: float, y_m: float) -> Scene:
+        """The scene for a camera at (x, y) in map. Not for several threads at once."""
+        centre = self.layout.chunk_at(x_m, y_m)
+        if centre not in self._scenes:
+            self._scenes[centre] = self._assemble(centre)
+            if len(self._scenes) > 3:
+                self._scenes.popitem(last=False)
+        self._scenes.move_to_end(centre)
+        return self._scenes[centre]
+
+    def builder(self) -> FaceBuilder:
+        """An empty builder that knows the site's textures."""
+        return FaceBuilder(self.textures.atlas.table[:, :2], self.textures.stretched)
+
+    def detailed_faces(self, column: int, row: int) -> Faces:
+        """The detailed version of a chunk, without light."""
+        key = (column, row)
+        if key not in self._built:
+            self._built[key] = self._build(key, is_plain=False)
+            if len(self._built) > _MOST_BUILT_CHUNKS:
+                self._built.popitem(last=False)
+        self._built.move_to_end(key)
+        return self._built[key]
+
+    def _lay_decals(self) -> NDArray[np.int32]:
+        """(rows, columns) decal texture * 4 + quarter turns, -1 for none; the pattern repeats after 82 m."""
+        cells = np.full((_DECAL_CELLS, _DECAL_CELLS), -1, np.int32)
+        for row in range(_DECAL_CELLS):
+            for column in range(_DECAL_CELLS):
+                bits = mix(self.seed, 51, row, column)
+                if bits % 10 < 8:
+                    decal = self.textures.decals[(bits >> 8) % len(self.textures.decals)]
+                    cells[row, column] = decal * 4 + ((bits >> 32) & 3)
+        return cells
+
+    def _build(self, key: tuple[int, int], *, is_plain: bool) -> Faces:
+        layout, builder = self.layout, self.builder()
+        column, row = key
+        self._hall.add_chunk(builder, column, row)
+        add = self._racks.add_plain_bay if is_plain else self._racks.add_bay
+        bays = [bay for bay in range(layout.bays) if self._column_of(layout.bay_x_m(bay) + layout.bay_m / 2) == column]
+        for rack_row in (2 * row, 2 * row + 1):
+            for bay in bays:
+                add(builder, rack_row, bay)
+            for is_far_end, bay in ((False, 0), (True, layout.bays - 1)):
+                if bay in bays:
+                    self._racks.add_end_guards(builder, rack_row, is_far_end=is_far_end)
+        for number, (x, y) in enumerate(layout.parked_pallets_m()):
+            if layout.chunk_at(x, y) == key:
+                self._racks.add_parked_pallet(builder, number, x, y)
+        return builder.finish()
+
+    def _column_of(self, x_m: float) -> int:
+        return self.layout.chunk_at(x_m, 0.0)[0]
+
+    def _neighbours(self, key: tuple[int, int], columns: int, rows: int) -> list[tuple[int, int]]:
+        return [other for other in self._keys if abs(other[0] - key[0]) <= columns and abs(other[1] - key[1]) <= rows]
+
+    def _lamps_near(self, key: tuple[int, int]) -> Array:
+        lamps: list[Lamp] = [lamp for other in self._neighbours(key, 1, 1) for lamp in self._lamps[other]]
+        return np.array([(lamp.x_m, lamp.y_m, lamp.z_m, lamp.power, lamp.group) for lamp in lamps])
+
+    def _light_detailed(self, key: tuple[int, int]) -> LitFaces:
+        """Light with shadows from the boxes of the chunk and the eight around it; further lamps are not counted."""
+        neighbours = self._neighbours(key, 1, 1)
+        parts = [self.detailed_faces(*other) for other in neighbours]
+        shift = sum(
+            len(part.boxes) for part, other in zip(parts, neighbours, strict=True) if other < key and other != key
+        )
+        order = sorted(zip(neighbours, parts, strict=True), key=lambda pair: pair[0])
+        boxes = np.concatenate([part.boxes for _, part in order])
+        return self._bake(self.detailed_faces(*key), key, boxes, shift, has_shadows=True)
+
+    def _bake(self, faces: Faces, key: tuple[int, int], boxes: Array, shift: int, *, has_shadows: bool) -> LitFaces:
+        low, counts = self._grid_of(key)
+        starts, items = ray_kernels.fill_grid(boxes, low, _CELL_M, counts)
+        light = np.zeros((LAMP_GROUPS, faces.light_samples), np.float32)
+        lamps = self._lamps_near(key)
+
+        def bake(first: int, last: int) -> None:
+            ray_kernels.bake_faces(
+                first, last, faces.quads, faces.numbers, faces.owners, shift, boxes, starts, items,
+                low, _CELL_M, counts, lamps, LAMP_REACH_M, has_shadows, light,
+            )  # fmt: skip
+
+        cuts = np.searchsorted(faces.numbers[:, 3], faces.light_samples * np.arange(1, 4) / 4)
+        edges = [0, *(int(cut) for cut in cuts), len(faces)]
+        spans = list(itertools.pairwise(edges))
+        if self._workers is None:
+            for first, last in spans:
+                bake(first, last)
+        else:
+            list(self._workers.map(lambda span: bake(*span), spans))
+        if not has_shadows:
+            light *= _PLAIN_LIGHT
+        return LitFaces(faces, light, faces.bounds_m())
+
+    def _grid_of(self, key: tuple[int, int]) -> tuple[Array, NDArray[np.int64]]:
+        rectangles = np.array([self._hall.rectangle(*other) for other in self._neighbours(key, 1, 1)])
+        low = np.array([rectangles[:, 0].min(), rectangles[:, 1].min(), 0.0]) - 0.5
+        high = np.array([rectangles[:, 2].max(), rectangles[:, 3].max(), self.layout.ceiling_m]) + 0.5
+        return low, np.ceil((high - low) / _CELL_M).astype(np.int64)
+
+    def _part(self, key: tuple[int, int], centre: tuple[int, int]) -> LitFaces:
+        is_near = abs(key[0] - centre[0]) <= NEAR_COLUMNS and abs(key[1] - centre[1]) <= NEAR_ROWS
+        if not is_near:
+            if key not in self._plain:
+                self._plain[key] = self._bake(
+                    self._build(key, is_plain=True), key, np.zeros((0, 8)), 0, has_shadows=False
+                )
+            return self._plain[key]
+        if key not in self._lit:
+            self._lit[key] = self._light_detailed(key)
+            if len(self._lit) > _MOST_BAKED_CHUNKS:
+                self._lit.popitem(last=False)
+        self._lit.move_to_end(key)
+        return self._lit[key]
+
+    def _assemble(self, centre: tuple[int, int]) -> Scene:
+        parts = [self._part(key, centre) for key in self._keys]
+        counts = np.array([len(part.faces) for part in parts])
+        samples = np.array([part.faces.light_samples for part in parts])
+        ends, first_sample = np.cumsum(counts), np.concatenate([[0], np.cumsum(samples)[:-1]])
+        numbers = np.concatenate([part.faces.numbers for part in parts])
+        numbers[:, 3] += np.repeat(first_sample, counts).astype(np.int32)
+        return Scene(
+            quads=np.concatenate([part.faces.quads for part in parts]),
+            values=np.concatenate([part.faces.values for part in parts]),
+            numbers=numbers,
+            light=np.concatenate([part.light for part in parts], axis=1),
+            ranges=np.stack([ends - counts, ends], axis=1).astype(np.int32),
+            bounds_m=np.stack([part.bounds_m for part in parts]),
+            parts=tuple(part.faces for part in parts),
+        )

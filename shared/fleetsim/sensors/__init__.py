@@ -1,0 +1,1 @@
+"""Robots, their sensors, and what goes wrong with them."""

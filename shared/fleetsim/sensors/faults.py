@@ -1,0 +1,85 @@
+"""Things that go wrong, by name and time. To add one: a line in FAULTS and its effect below."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleetmap.errors import UsageError
+from fleetmap.sensors.samples import ImuSamples, WheelSample
+from fleetsim.sensors.measurements import START_NS
+
+FAULTS = {
+    "camera-dark": "both cameras see nothing",
+    "camera-frozen": "the right camera repeats its last picture",
+    "frames-dropped": "frames do not arrive",
+    "frames-late": "frames are stamped 50 ms late",
+    "imu-gap": "no IMU samples",
+    "imu-spike": "one wild IMU sample",
+    "over-exposure": "eight times too much gain",
+    "person-in-front": "a person stands 0.8 m before the cameras",
+    "wheel-slip": "the wheels turn 1.6 times as fast as the robot moves",
+}
+LATE_S, OVER_EXPOSURE, SLIP = 0.05, 8.0, 1.6
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A fault in force from start_s to end_s of a recording."""
+
+    name: str
+    start_s: float
+    end_s: float
+
+    def covers(self, time_s: float) -> bool:
+        """Whether it is in force."""
+        return self.start_s <= time_s < self.end_s
+
+
+def parse_fault(text: str) -> Fault:
+    """The fault written as NAME@START+DURATION, seconds; UsageError otherwise."""
+    name, _, times = text.partition("@")
+    start, _, duration = times.partition("+")
+    if name not in FAULTS:
+        raise UsageError(f"unknown fault {name!r}; known are {', '.join(FAULTS)}")
+    try:
+        start_s, duration_s = float(start), float(duration or 1.0)
+    except ValueError as error:
+        raise UsageError(
+            f"fault {text!r} should read NAME@START+DURATION in seconds, such as camera-dark@8+2"
+        ) from error
+    if start_s < 0 or duration_s <= 0:
+        raise UsageError(f"fault {text!r} has a negative start or no duration")
+    return Fault(name, start_s, start_s + duration_s)
+
+
+@dataclass(frozen=True, slots=True)
+class FaultPlan:
+    """All faults of one recording."""
+
+    faults: tuple[Fault, ...] = ()
+
+    def has(self, name: str, time_s: float) -> bool:
+        """Whether a fault of that name is in force."""
+        return any(fault.name == name and fault.covers(time_s) for fault in self.faults)
+
+    def spoil_imu(self, samples: ImuSamples) -> ImuSamples:
+        """The samples without those in gaps and with spikes: one sample of 20 rad/s and 60 m/s^2 per fault."""
+        times = (samples.stamps_ns - START_NS) * 1e-9
+        gyro, accel = samples.gyro_radps.copy(), samples.accel_mps2.copy()
+        for fault in self.faults:
+            if fault.name == "imu-spike" and len(times):
+                index = min(int(np.searchsorted(times, fault.start_s)), len(times) - 1)
+                gyro[index] += (20.0, -20.0, 20.0)
+                accel[index] += (60.0, 60.0, -60.0)
+        kept = np.array([not self.has("imu-gap", float(time_s)) for time_s in times], bool)
+        return ImuSamples(samples.stamps_ns[kept], gyro[kept], accel[kept])
+
+    def spoil_wheels(self, samples: tuple[WheelSample, ...]) -> tuple[WheelSample, ...]:
+        """The samples with slip."""
+        return tuple(self._slipped(sample) for sample in samples)
+
+    def _slipped(self, sample: WheelSample) -> WheelSample:
+        if not self.has("wheel-slip", (sample.stamp_ns - START_NS) * 1e-9):
+            return sample
+        velocity = sample.velocity_base_mps * SLIP
+        return WheelSample(sample.stamp_ns, velocity, sample.yaw_rate_radps, sample.sigma_mps, sample.sigma_radps)

@@ -1,0 +1,93 @@
+"""What IMU, wheels and coarse position sources report, from the exact motion."""
+
+import numpy as np
+
+from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.sensors.samples import ImuSamples, PositionPrior, Stamps, WheelSample
+from fleetsim.motion.body_motion import Motion
+from fleetsim.sensors.robots import ImuErrors, WheelErrors
+
+START_NS = 1_700_000_000_000_000_000  # the sensor clock at the start of every recording
+
+
+def stamps_from_s(times_s: Array) -> Stamps:
+    """Stamps on the sensor clock of times from the start."""
+    return START_NS + np.rint(times_s * 1e9).astype(np.int64)
+
+
+def sample_times(duration_s: float, rate_hz: float) -> Array:
+    """Times from 0 to the end, both included where they fit."""
+    return np.arange(int(np.floor(duration_s * rate_hz + 1e-9)) + 1) / rate_hz
+
+
+def measure_imu(motion: Motion, errors: ImuErrors, rng: np.random.Generator) -> ImuSamples:
+    """IMU samples with white noise, bias walks and random first biases.
+
+    Source of the discrete noise: density / sqrt(dt).
+    """
+    times = sample_times(motion.duration_s, errors.rate_hz)
+    gyro, accel = motion.rates(times)
+    dt_s, noise = 1.0 / errors.rate_hz, errors.noise
+    gyro_bias = _bias(rng, len(times), errors.gyro_bias_radps, noise.gyro_walk_radps2_rthz, dt_s)
+    accel_bias = _bias(rng, len(times), errors.accel_bias_mps2, noise.accel_walk_mps3_rthz, dt_s)
+    gyro_noise = rng.standard_normal((len(times), 3)) * noise.gyro_noise_radps_rthz / np.sqrt(dt_s)
+    accel_noise = rng.standard_normal((len(times), 3)) * noise.accel_noise_mps2_rthz / np.sqrt(dt_s)
+    return ImuSamples(stamps_from_s(times), gyro + gyro_bias + gyro_noise, accel + accel_bias + accel_noise)
+
+
+def _bias(rng: np.random.Generator, count: int, first: float, walk: float, dt_s: float) -> Array:
+    steps = rng.standard_normal((count, 3)) * walk * np.sqrt(dt_s)
+    return np.asarray(rng.normal(0.0, first, 3) + np.cumsum(steps, axis=0))
+
+
+def measure_wheels(
+    motion: Motion, height_m: float, errors: WheelErrors, rng: np.random.Generator
+) -> tuple[WheelSample, ...]:
+    """Wheel odometry of the base, height_m straight below the body: scale errors of this robot, noise per sample.
+
+    Wheels cannot feel sideways slip: they report 0 to the left, whatever the motion does.
+    """
+    times = sample_times(motion.duration_s, errors.rate_hz)
+    velocity, (gyro, _) = motion.velocity_body(times), motion.rates(times)
+    forward = velocity[:, 0] - gyro[:, 1] * height_m
+    speed_scale, yaw_scale = 1.0 + rng.normal(0.0, 1.0, 2) * (errors.speed_scale, errors.yaw_scale)
+    standing = np.abs(forward) < 1e-3
+    noise = rng.standard_normal((len(times), 2)) * np.where(standing[:, None], 0.0, 1.0)
+    speeds = forward * speed_scale + noise[:, 0] * errors.noise_mps
+    turns = gyro[:, 2] * yaw_scale + noise[:, 1] * errors.noise_radps
+    sigma_mps = float(np.hypot(errors.noise_mps, errors.speed_scale))
+    sigma_radps = float(np.hypot(errors.noise_radps, errors.yaw_scale * 0.5))
+    return tuple(
+        WheelSample(int(stamp), np.array([speed, 0.0, 0.0]), float(turn), sigma_mps, sigma_radps)
+        for stamp, speed, turn in zip(stamps_from_s(times), speeds, turns, strict=True)
+    )
+
+
+def measure_priors(
+    motion: Motion, base_from_body: Array, zone_period_s: float, rng: np.random.Generator
+) -> tuple[PositionPrior, ...]:
+    """A dock at the start (5 cm, 1 degree), then a zone each zone_period_s (1 m, heading unknown) unless that is 0."""
+    dock_sigma, zone_sigma = (0.0, 0.0, 0.02, 0.05, 0.05, 0.02), (0.0, 0.0, np.inf, 1.0, 1.0, 0.02)
+    priors = [_prior(motion, base_from_body, 0.0, np.array(dock_sigma), rng)]
+    if zone_period_s > 0:
+        times = np.arange(zone_period_s, motion.duration_s, zone_period_s)
+        priors += [_prior(motion, base_from_body, float(t), np.array(zone_sigma), rng) for t in times]
+    return tuple(priors)
+
+
+def _prior(
+    motion: Motion, base_from_body: Array, time_s: float, sigma: Array, rng: np.random.Generator
+) -> PositionPrior:
+    map_from_body = motion.map_from_body(np.array([time_s]))[0]
+    map_from_base = map_from_body @ np.linalg.inv(base_from_body)
+    known = np.where(np.isfinite(sigma), sigma, 0.0) * rng.standard_normal(6)
+    turned = map_from_base.copy()
+    turned[:3, :3] = so3_exp(known[:3]) @ map_from_base[:3, :3]
+    if not np.isfinite(sigma[2]):
+        turned[:3, :3] = np.eye(3)
+    turned[:3, 3] += known[3:]
+    tilt = np.where(sigma[:2] == 0.0, 0.05, sigma[:2])
+    variance = np.concatenate([tilt, sigma[2:]]) ** 2
+    return PositionPrior(
+        int(stamps_from_s(np.array([time_s]))[0]), se3(turned[:3, :3], turned[:3, 3]), np.diag(variance)
+    )

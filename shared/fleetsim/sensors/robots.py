@@ -1,0 +1,124 @@
+"""The robots: drive, mounting, cameras, sensor errors. To add one: a line in ROBOTS."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from fleetmap.errors import UsageError
+from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
+from fleetsim.motion.body_motion import Shake
+from fleetsim.motion.routes import Limits
+
+_BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looking along body x
+# Model, distortion, focal length as a share of the image width.
+LENSES: dict[str, tuple[str, tuple[float, ...], float]] = {
+    "pinhole": ("radial-tangential", (), 420 / 640),
+    "radial-tangential": ("radial-tangential", (-0.28, 0.074, 0.0002, 0.0002), 0.62),
+    "equidistant": ("equidistant", (-0.013, 0.02, -0.015, 0.004), 0.55),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ImuErrors:
+    """White noise and walks are those of `noise`; the biases start at random with these rms."""
+
+    noise: ImuNoise = field(default_factory=lambda: ImuNoise(1.7e-4, 2e-5, 2e-3, 3e-4))
+    gyro_bias_radps: float = 2e-3
+    accel_bias_mps2: float = 0.02
+    rate_hz: float = 200.0
+
+
+@dataclass(frozen=True, slots=True)
+class WheelErrors:
+    """Wheel odometry: scale errors' rms per robot, noise per sample, sideways slip is in the motion already."""
+
+    speed_scale: float = 0.005
+    yaw_scale: float = 0.01
+    noise_mps: float = 0.01
+    noise_radps: float = 0.005
+    rate_hz: float = 50.0
+
+
+@dataclass(frozen=True, slots=True)
+class HiddenErrors:
+    """What the calibration does not say.
+
+    imu_minus_cam_s: of both cameras. turn_rad, shift_m: of each camera by itself, in a direction of its own.
+    """
+
+    imu_minus_cam_s: float = 0.0
+    turn_rad: float = 0.0
+    shift_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class RobotKind:
+    """One model of robot.
+
+    The IMU is the body, straight above the base; cameras sit baseline_m apart around their mount.
+
+    pitch_rad: cameras look down by this.
+    hidden: by how much the true mounting and clock differ from the calibration.
+    """
+
+    limits: Limits
+    shake: Shake
+    body_height_m: float = 0.25
+    camera_height_m: float = 0.9
+    camera_forward_m: float = 0.2
+    pitch_rad: float = 0.05
+    baseline_m: float = 0.12
+    width_px: int = 640
+    height_px: int = 480
+    lens: str = "pinhole"
+    clearance_m: float = 0.3
+    imu: ImuErrors = field(default_factory=ImuErrors)
+    wheels: WheelErrors = field(default_factory=WheelErrors)
+    hidden: HiddenErrors = field(default_factory=HiddenErrors)
+
+    def with_lens(self, lens: str) -> "RobotKind":
+        """A copy with another lens; UsageError naming the known ones."""
+        if lens not in LENSES:
+            raise UsageError(f"unknown lens {lens!r}; known are {', '.join(LENSES)}")
+        return replace(self, lens=lens)
+
+
+ROBOTS = {
+    "surveyor": RobotKind(Limits(1.5, 0.8, 1.0, 0.8), Shake()),
+    "tote": RobotKind(Limits(2.0, 1.2, 1.6, 0.7), Shake(), camera_height_m=0.38, camera_forward_m=0.3, pitch_rad=-0.03),
+    "runner": RobotKind(Limits(2.0, 1.2, 1.6, 0.7), Shake()),
+    "pallet-mover": RobotKind(
+        Limits(1.6, 0.7, 0.9, 1.0), Shake(0.002, 0.0009), camera_height_m=0.6, pitch_rad=0.0, clearance_m=0.4
+    ),
+}
+
+
+def nominal_calibration(kind: RobotKind) -> RigCalibration:
+    """What the robot believes about its sensors."""
+    model, distortion, focal_share = LENSES[kind.lens]
+    focal = focal_share * kind.width_px
+    intrinsics = np.array([focal, focal, (kind.width_px - 1) / 2, (kind.height_px - 1) / 2])
+    cosine, sine = np.cos(kind.pitch_rad), np.sin(kind.pitch_rad)
+    rotation = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]) @ _BODY_FROM_OPTICAL
+    cameras = []
+    for number, side in enumerate((0.5, -0.5)):
+        place = np.array([kind.camera_forward_m, side * kind.baseline_m, kind.camera_height_m - kind.body_height_m])
+        camera = CameraCalibration(
+            model, kind.width_px, kind.height_px, intrinsics, np.array(distortion), se3(rotation, place)
+        )
+        cameras.append(check_camera(camera, f"cam{number}"))
+    base_from_body = se3(np.eye(3), np.array([0.0, 0.0, kind.body_height_m]))
+    return RigCalibration(tuple(cameras), kind.imu.noise, base_from_body)
+
+
+def true_calibration(kind: RobotKind, rng: np.random.Generator) -> RigCalibration:
+    """What the sensors really are: the nominal values with this robot's hidden errors, in directions drawn from rng."""
+    nominal, hidden = nominal_calibration(kind), kind.hidden
+    cameras = []
+    for camera in nominal.cameras:
+        turn, shift = (direction / np.linalg.norm(direction) for direction in rng.standard_normal((2, 3)))
+        error = se3(so3_exp(turn * hidden.turn_rad), shift * hidden.shift_m)
+        body_from_cam: Array = camera.body_from_cam @ error
+        cameras.append(replace(camera, body_from_cam=body_from_cam, imu_minus_cam_s=hidden.imu_minus_cam_s))
+    return RigCalibration(tuple(cameras), nominal.imu, nominal.base_from_body)

@@ -1,0 +1,1 @@
+"""Textures, painted from one seed."""

@@ -1,0 +1,305 @@
+"""Solvers beside gtsam in one run: pose graphs, wrong loops, BAL, local and global bundle adjustment; and the place query.
+
+`PYTHONPATH=tests python tests/benchmarks/back_end/bench_solvers.py [--only NAME ...] [--out FILE.json]`; without --only a quarter of an
+hour. The reference problems lie beside the project, in `../shared/data`; without them their sections are left out, loudly.
+"""
+
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
+import argparse
+import json
+import platform
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from importlib import metadata
+from pathlib import Path
+from typing import TypeVar
+
+import gtsam
+import numpy as np
+
+from benchmarks.back_end.bal_reference import reference_cost
+from fleetmap.bow import BowVector, PlaceIndex
+from fleetmap.geometry import Array, align_points, se3, se3_inverse, so3_exp, transform_points
+from mapserver.survey.bundle.bal import BalProblem, optimize_bal, parse_bal
+from mapserver.survey.bundle.bundle_adjustment import BundleProblem, BundleSettings, optimize
+from mapserver.survey.pose_graph.g2o import parse_g2o
+from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
+from support.recordings.realdata import DATA
+from support.worlds.bundle_gtsam import gtsam_graph
+from support.worlds.bundle_scene import BODY_FROM_CAM, CAMERA, disturbed
+
+Figures = dict[str, float]
+T = TypeVar("T")
+GRAPHS = ("sphere2500", "parking-garage", "sphere_bignoise_vertex3")
+HUBER = 2.5
+TOLERANCE = 1e-4  # of the cost: with none, gtsam ends by trying ever smaller steps, which would be unfair to it
+
+
+def timed(work: Callable[[], T]) -> tuple[float, T]:
+    """CPU seconds of this process, and what the work gave."""
+    begun = time.process_time()
+    result = work()
+    return time.process_time() - begun, result
+
+
+def pose_graphs(names: Sequence[str] = GRAPHS) -> dict[str, Figures]:
+    """Cost from the file's own start against the best of several starts; then with a tenth of random wrong loops.
+
+    off_clean: root mean square distance of the keyframes from where they are without wrong loops, after SE(3) alignment as
+    everywhere (else the edges of the one keyframe that is held would decide), as a share of the extent (the diagonal of the
+    box around all of them) and of the way that joins them in order; held_off_clean: without alignment.
+    """
+    found = {}
+    for name in names:
+        map_from_body, edges = parse_g2o((DATA / "pose_graphs" / f"{name}.g2o").read_text())
+        seconds, own = timed(lambda: optimize_pose_graph(map_from_body, edges, robust=False))  # noqa: B023
+        starts = {"odometry": _chained(map_from_body, edges), "shaken": _shaken(own.map_from_body)}
+        costs = [optimize_pose_graph(start, edges, robust=False).cost_after for start in starts.values()]
+        best = min([own.cost_after, *costs])
+        found[name] = {"cost": own.cost_after, "above_best": own.cost_after / best - 1.0, "cpu_s": seconds}
+        found[name] |= _with_wrong_loops(map_from_body, edges, own.map_from_body)
+    return found
+
+
+def _chained(map_from_body: Array, edges: list[PoseEdge]) -> Array:
+    following = {e.i: e.i_from_j for e in edges if e.j == e.i + 1}
+    places = [map_from_body[0]]
+    for k in range(len(map_from_body) - 1):
+        places.append(places[-1] @ following[k])
+    return np.array(places)
+
+
+def _shaken(map_from_body: Array) -> Array:
+    rng = np.random.default_rng(4)
+    return np.array([placed @ se3(so3_exp(0.1 * rng.normal(size=3)), rng.normal(size=3)) for placed in map_from_body])
+
+
+def _with_wrong_loops(map_from_body: Array, edges: list[PoseEdge], clean: Array) -> Figures:
+    rng = np.random.default_rng(0)
+    right = sum(edge.is_loop for edge in edges)
+    extent_m = float(np.linalg.norm(np.ptp(clean[:, :3, 3], axis=0)))
+    way_m = float(np.linalg.norm(np.diff(clean[:, :3, 3], axis=0), axis=1).sum())
+    wrong: list[PoseEdge] = []
+    while len(wrong) < right // 10:
+        i, j = (int(k) for k in rng.integers(0, len(map_from_body), 2))
+        if abs(i - j) > 1:
+            i_from_j = se3(so3_exp(rng.normal(size=3)), rng.normal(size=3) * extent_m / 6)
+            wrong.append(PoseEdge(i, j, i_from_j, edges[-1].cov_rot_trans, is_loop=True))
+    seconds, robust = timed(lambda: optimize_pose_graph(map_from_body, [*edges, *wrong], noise="estimated"))
+    kept = robust.loop_weights >= 0.5
+    held_m, rms_m = (_rms_m(places, clean[:, :3, 3]) for places in _held_and_aligned(robust.map_from_body, clean))
+    return {
+        "loops_right": right, "right_kept": float(kept[:right].sum()), "loops_wrong": len(wrong),
+        "wrong_kept": float(kept[right:].sum()), "off_clean_share_of_extent": rms_m / extent_m,
+        "off_clean_share_of_way": rms_m / way_m, "held_off_clean_share_of_extent": held_m / extent_m, "robust_cpu_s": seconds,
+    }  # fmt: skip
+
+
+def _held_and_aligned(map_from_body: Array, clean: Array) -> tuple[Array, Array]:
+    """Places as they are, and after the rigid motion that brings them nearest to `clean`."""
+    places = map_from_body[:, :3, 3]
+    return places, transform_points(align_points(clean[:, :3, 3], places)[0], places)
+
+
+def _rms_m(places: Array, wanted: Array) -> float:
+    return float(np.sqrt(((places - wanted) ** 2).sum(axis=1).mean()))
+
+
+def bal() -> Figures:
+    """Ladybug-49, all of it against a solver that shares nothing with ours; and a part of it against gtsam.
+
+    gtsam leaves out observations from behind, so landmarks where that happens go from both.
+    """
+    file = DATA / "pose_graphs" / "problem-49-7776-pre.txt"
+    problem = parse_bal(file.read_text())
+    whole = optimize_bal(problem, BundleSettings(max_iterations=100, relative_cost_tolerance=1e-8))
+    dropped = _seen_from_behind(problem, *_as_arrays(whole.state)) | _seen_from_behind(
+        problem, *_as_arrays(problem.start)
+    )
+    for _ in range(3):
+        graph, values = _bal_graph(file, dropped)
+        theirs_s, optimum = timed(lambda: _gtsam_optimum(graph, values, 100))  # noqa: B023
+        more = _seen_from_behind(problem, *_places_of(optimum, problem, whole.state.points_map)) - dropped
+        if not more:
+            break
+        dropped |= more
+    keep = ~np.isin(problem.landmarks, sorted(dropped))
+    part = BalProblem(problem.start, problem.cameras[keep], problem.landmarks[keep], problem.pixels[keep])
+    ours_s, ours = timed(lambda: optimize_bal(part, BundleSettings(max_iterations=100, relative_cost_tolerance=1e-8)))
+    theirs, second = graph.error(optimum), reference_cost(file)
+    return {
+        "cost_all": whole.costs[-1], "reference_cost_all": second, "above_reference": whole.costs[-1] / second - 1.0,
+        "landmarks_left_out": len(dropped), "cost": ours.costs[-1], "gtsam_cost": theirs,
+        "above_gtsam": ours.costs[-1] / theirs - 1.0, "cpu_s": ours_s, "gtsam_cpu_s": theirs_s,
+    }  # fmt: skip
+
+
+def _as_arrays(state) -> tuple[Array, Array, Array]:
+    return state.rotations[:, 2], state.shifts_m[:, 2], state.points_map
+
+
+def _places_of(values: gtsam.Values, problem: BalProblem, points: Array) -> tuple[Array, Array, Array]:
+    cameras = [values.atPinholeCameraCal3Bundler(gtsam.symbol("c", c)) for c in range(len(problem.start.rotations))]
+    inverse = np.array([se3_inverse(camera.pose().matrix()) for camera in cameras])
+    keys = [gtsam.symbol("p", n) for n in range(len(points))]
+    placed = np.array([values.atPoint3(k) if values.exists(k) else p for k, p in zip(keys, points, strict=True)])
+    return -inverse[:, 2, :3], -inverse[:, 2, 3], placed
+
+
+def _seen_from_behind(problem: BalProblem, axes: Array, shifts_m: Array, points: Array) -> set[int]:
+    z = np.einsum("ma,ma->m", axes[problem.cameras], points[problem.landmarks]) + shifts_m[problem.cameras]
+    return set(problem.landmarks[z >= -1e-3].tolist())
+
+
+def _bal_graph(file: Path, dropped: set[int]) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    data, noise = gtsam.SfmData.FromBalFile(str(file)), gtsam.noiseModel.Unit.Create(2)
+    for c in range(data.numberCameras()):
+        values.insert(gtsam.symbol("c", c), data.camera(c))
+    for n in sorted(set(range(data.numberTracks())) - dropped):
+        track = data.track(n)
+        values.insert(gtsam.symbol("p", n), track.point3())
+        for m in range(track.numberMeasurements()):
+            c, pixel = track.measurement(m)
+            graph.add(gtsam.GeneralSFMFactorCal3Bundler(pixel, noise, gtsam.symbol("c", c), gtsam.symbol("p", n)))
+    return graph, values
+
+
+def _gtsam_optimum(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int) -> gtsam.Values:
+    settings = gtsam.LevenbergMarquardtParams.CeresDefaults()
+    settings.setMaxIterations(iterations)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
+
+
+def corridor(keyframes: int, landmarks: int, observations: int, fixed: int) -> BundleProblem:
+    """A drive along two walls with noisy sightings: every landmark from its nearest keyframes that see it."""
+    rng = np.random.default_rng(2)
+    length_m = 0.3 * keyframes
+    body_from_cam = BODY_FROM_CAM
+    map_from_body = np.array(
+        [se3(so3_exp(np.array([0, 0, 0.02 * np.sin(k)])), [0.3 * k, 0, 0]) for k in range(keyframes)]
+    )
+    side = rng.choice([-1.0, 1.0], landmarks)
+    points = np.column_stack(
+        [rng.uniform(2.0, length_m + 4.0, landmarks), 2.0 * side, rng.uniform(-1.5, 1.5, landmarks)]
+    )
+    rows = []
+    for k, placed in enumerate(map_from_body):
+        near = np.flatnonzero(np.abs(points[:, 0] - 0.3 * k - 5.0) < 6.0)
+        seen = transform_points(se3_inverse(placed @ body_from_cam), points[near])
+        pixels = CAMERA.pixel_from_point(seen)
+        good = (seen[:, 2] > 0.8) & (pixels[:, :2] > 0).all(axis=1) & (pixels[:, 0] < 640) & (pixels[:, 1] < 480)
+        rows.append(np.column_stack([np.full(good.sum(), k), near[good], pixels[good], seen[good, 2]]))
+    table = np.concatenate(rows)
+    table = table[np.argsort(rng.random(len(table)), kind="stable")]
+    share = observations / len(table)
+    table = table[: int(len(table) * min(share, 1.0))]
+    counts = np.bincount(table[:, 1].astype(int), minlength=landmarks)
+    table = table[counts[table[:, 1].astype(int)] >= 2]
+    pixels = table[:, 2:5] + 0.4 * rng.normal(size=(len(table), 3))
+    held = np.zeros(keyframes, np.bool_)
+    held[:fixed] = True
+    return BundleProblem(
+        CAMERA, body_from_cam, map_from_body, held, points, table[:, 0].astype(np.int32), table[:, 1].astype(np.int32),
+        pixels, np.tile([0.4, 0.5], (len(table), 1)),
+    )  # fmt: skip
+
+
+def _held_by_priors(problem: BundleProblem) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Held keyframes by tight priors: equality constraints would send gtsam from Cholesky to QR, many times slower."""
+    graph, values = gtsam_graph(replace(problem, fixed=np.zeros_like(problem.fixed)), HUBER)
+    tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    for k in np.flatnonzero(problem.fixed).tolist():
+        graph.add(gtsam.PriorFactorPose3(gtsam.symbol("x", k), gtsam.Pose3(problem.map_from_body[k]), tight))
+    return graph, values
+
+
+def adjustment(keyframes: int, landmarks: int, observations: int, fixed: int, repeats: int) -> Figures:
+    """Up to five iterations of each solver from one start; gtsam's time without and with making its graph."""
+    true = corridor(keyframes, landmarks, observations, fixed)
+    start = disturbed(true, seed=3, rot_rad=0.003, trans_m=0.01, points_m=0.02)
+    settings = BundleSettings(max_iterations=5, relative_cost_tolerance=TOLERANCE, huber_sigmas=HUBER)
+    optimize(start, settings)  # compiles
+    ours_s, theirs_s, making_s = [], [], []
+    for _ in range(repeats):
+        seconds, ours = timed(lambda: optimize(start, settings))
+        ours_s.append(seconds)
+        seconds, (graph, values) = timed(lambda: _held_by_priors(start))
+        making_s.append(seconds)
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setMaxIterations(5)
+        parameters.setRelativeErrorTol(TOLERANCE)
+        parameters.setAbsoluteErrorTol(0.0)
+        seconds, optimum = timed(
+            lambda: gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()  # noqa: B023
+        )
+        theirs_s.append(seconds)
+    theirs = graph.error(optimum)
+    ours_median, theirs_median = float(np.median(ours_s)), float(np.median(theirs_s))
+    return {
+        "keyframes": keyframes, "landmarks": len(np.unique(start.obs_landmark)), "observations": len(start.obs_pixels),
+        "cost": ours.costs[-1], "gtsam_cost": theirs, "above_gtsam": ours.costs[-1] / theirs - 1.0,
+        "ms": 1e3 * ours_median, "gtsam_ms": 1e3 * theirs_median, "gtsam_making_ms": 1e3 * float(np.median(making_s)),
+        "times_faster": theirs_median / ours_median,
+    }  # fmt: skip
+
+
+def place_query(places: int = 10_000, words: int = 800, vocabulary: int = 10_000) -> Figures:
+    """CPU ms of one query; words fall as unevenly as in pictures."""
+    rng = np.random.default_rng(5)
+    index = PlaceIndex(vocabulary)
+    frequency = 1.0 / (np.arange(vocabulary) + 200.0)
+
+    def vector() -> BowVector:
+        drawn = np.unique(rng.choice(vocabulary, words, p=frequency / frequency.sum()))
+        weights = rng.random(len(drawn)).astype(np.float32)
+        return BowVector(drawn.astype(np.int32), weights / weights.sum())
+
+    for place in range(places):
+        index.add(place, vector())
+    queries = [vector() for _ in range(50)]
+    index.query(queries[0])
+    spent = [timed(lambda q=q: index.query(q))[0] for q in queries]
+    return {"places": places, "ms_median": 1e3 * float(np.median(spent)), "ms_worst": 1e3 * max(spent)}
+
+
+SECTIONS: dict[str, Callable[[], object]] = {
+    "place query": place_query,
+    "local adjustment": lambda: adjustment(30, 2000, 8000, 15, 5),
+    "bal": bal,
+    "pose graphs": pose_graphs,
+    "global adjustment": lambda: adjustment(1000, 60_000, 360_000, 1, 1),
+}
+NEEDS_DATA = ("bal", "pose graphs")
+
+
+def main() -> None:
+    """Prints the figures; writes them as JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="*", choices=list(SECTIONS))
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    found: dict[str, object] = {
+        "machine": platform.machine(),
+        "python": platform.python_version(),
+        "gtsam": metadata.version("gtsam"),
+    }
+    for name in options.only or SECTIONS:
+        if name in NEEDS_DATA and not (DATA / "pose_graphs").exists():
+            print(f"SKIPPED {name}: no reference problems at {DATA / 'pose_graphs'}", flush=True)
+            continue
+        found[name] = SECTIONS[name]()
+        rows = found[name] if name == "pose graphs" else {name: found[name]}
+        for title, figures in rows.items():
+            print(f"\n{title}", flush=True)
+            for key, value in figures.items():
+                print(f"  {key:28s} {value:14.6g}", flush=True)
+    if options.out is not None:
+        options.out.write_text(json.dumps(found, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,261 @@
+"""Odometry and localization fed by `fleetsim.estimator.simulated_run` instead of pictures.
+
+The loop is closed here because the simulator and the estimators may not know each other.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.bow import Vocabulary, train_vocabulary
+from fleetmap.features import orb
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
+from fleetmap.mapformat import Tile
+from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
+from fleetmap.odometry.settings import TrackerSettings
+from fleetmap.odometry.tracking.tracker import MotionSince, Tracked, Tracker
+from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.relocalizer import Relocalizer, Seen, Slices
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.samples import PositionPrior, wheel_between
+from fleetsim.estimator.simulated_run import EstimatorSession, Found
+from locclient.localization.estimate import Estimate
+from locclient.localization.localizer import Localizer
+from locclient.localization.settings import LocalizerSettings
+
+SETTINGS = LocalizerSettings()
+_TILE_M = 1024.0
+_NEVER_S = 1e9
+_LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of the frame that is handled, for stamps that are too early
+_EVERY_M, _EVERY_RAD = 0.4, 0.2
+_NOISE = np.random.default_rng(0).integers(0, 255, (7, 48, 64), np.uint8)
+
+
+class EstimatorTracker(Tracker):
+    """The tracker with its eyes replaced: flow, disparities and corners come from a session, everything else is its own.
+
+    Track ids are the landmarks'. After a gap the flow simply goes on.
+    """
+
+    def __init__(self, session: EstimatorSession, camera: StereoCamera, settings: TrackerSettings) -> None:
+        fields = {name: getattr(settings, name) for name in settings.__struct_fields__}
+        super().__init__(camera, TrackerSettings(**(fields | {"max_gap_s": _NEVER_S})))
+        self._session = session
+        self._begun_px: dict[int, Array] = {}
+
+    def track(
+        self, frame: RectifiedFrame, motion_since: MotionSince, rotation_sigma_rad: float | None = None
+    ) -> Tracked:
+        """As the tracker's; frames must come one by one from the session's first."""
+        return super().track(frame, motion_since, rotation_sigma_rad)
+
+    def _measure(self, ids: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
+        begun = np.array([self._begun_px[number] for number in ids.tolist()]).reshape(-1, 2)
+        return self._session.follow(self._frame_index, ids.astype(np.uint64), begun)
+
+    def _flow(self, frame: RectifiedFrame, predicted: Array, sure: bool) -> tuple[Array, NDArray[np.bool_]]:
+        pixels, kept = self._measure(self._points.ids)
+        return np.where(kept[:, None], pixels[:, :2], predicted), kept
+
+    def _renew_disparities(self, frame: RectifiedFrame) -> None:
+        pixels, _ = self._measure(self._points.ids)
+        self._points.pixels[:, 2] = pixels[:, 2]
+
+    def _add_corners(self, frame: RectifiedFrame) -> None:
+        missing = self._settings.max_points - len(self._points.ids)
+        if missing < 0.15 * self._settings.max_points:
+            return
+        distance_px = self._settings.min_distance_px
+        wanted, begun = self._session.corners(self._frame_index, self._points.pixels, missing, distance_px)
+        is_new = ~np.isin(wanted.astype(np.int64), self._points.ids)
+        ids = wanted[is_new].astype(np.int64)
+        held = {number: self._begun_px[number] for number in self._points.ids.tolist()}
+        self._begun_px = held | dict(zip(ids.tolist(), begun[is_new], strict=True))
+        pixels, kept = self._measure(ids)
+        ids, pixels = (
+            np.concatenate([self._points.ids, ids[kept]]), np.concatenate([self._points.pixels, pixels[kept]])
+        )  # fmt: skip
+        rising = np.argsort(ids)  # as those of the tracker, which numbers them one after another
+        self._points = type(self._points)(ids[rising], pixels[rising])
+
+
+def seen(session: EstimatorSession, frame: int) -> Seen:
+    """What Relocalizer.look would have made of the picture."""
+    found = session.features(frame)
+    angles = np.zeros(len(found.rows), np.float32)
+    return Seen(orb.Features(found.pixels[:, :2].copy(), found.octaves, angles, found.descriptors), found.pixels)
+
+
+def blank(session: EstimatorSession, frame: int) -> RectifiedFrame:
+    """A frame that carries its stamp alone: noise for the judge of pictures, nothing at all where nothing is to be seen."""
+    is_dark = not len(session.sighting(frame).ids)
+    left = np.zeros_like(_NOISE[0]) if is_dark else _NOISE[frame % len(_NOISE)]
+    return RectifiedFrame(session.stamps_ns[frame], left, None, None)
+
+
+def run_odometry(
+    session: EstimatorSession, frames: int | None = None, calibration: RigCalibration | None = None,
+    settings: OdometrySettings | None = None,
+) -> list[OdometryEstimate]:  # fmt: skip
+    """The odometry's estimates over a session; `calibration` in the place of the rig's nominal one."""
+    nominal, settings = calibration or session.session.nominal, settings or OdometrySettings()
+    odometry = Odometry(nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s, settings)
+    odometry._tracker = EstimatorTracker(session, session.camera, settings.tracker)
+    estimates, last_ns = [], 0
+    for frame in range(len(session) if frames is None else min(frames, len(session))):
+        stamp_ns = session.stamps_ns[frame]
+        until_ns = stamp_ns + _LEAD_NS
+        odometry.handle_imu(session.session.imu.between(last_ns, until_ns))
+        odometry.handle_wheel(wheel_between(session.session.wheel, last_ns, until_ns))
+        last_ns = until_ns
+        estimates.append(odometry.handle_stereo(blank(session, frame)))
+    return estimates
+
+
+@dataclass
+class Observed:
+    """The sightings of one landmark: where it was seen from (unit vectors), up to which distance it would be found, its descriptors."""
+
+    point_map: Array
+    directions: list[Array] = field(default_factory=list)
+    reaches_m: list[float] = field(default_factory=list)
+    descriptors: list[NDArray[np.uint8]] = field(default_factory=list)
+
+    def add(self, direction: Array, reach_m: float, descriptor: NDArray[np.uint8]) -> None:
+        """One more sighting."""
+        self.directions.append(direction)
+        self.reaches_m.append(reach_m)
+        self.descriptors.append(descriptor)
+
+
+def is_new_place(last_map_from_cam: Array, map_from_cam: Array, every_m: float = _EVERY_M) -> bool:
+    """Whether a map holds one more place here."""
+    since = se3_inverse(last_map_from_cam) @ map_from_cam
+    return bool(np.linalg.norm(since[:3, 3]) >= every_m or rotation_angle_rad(since[:3, :3]) >= _EVERY_RAD)
+
+
+def survey_map(
+    session: EstimatorSession, rng: np.random.Generator, *, every_m: float = _EVERY_M, sigma_m: float = 0.01
+) -> tuple[list[Tile], Vocabulary]:
+    """A map as a survey would have left it: landmarks found at least twice, with an error of sigma_m, a place each every_m.
+
+    The vocabulary is trained on its descriptors.
+    """
+    observed: dict[int, Observed] = {}
+    places: list[tuple[Array, list[int]]] = []
+    for frame in range(len(session)):
+        map_from_cam = session.map_from_body[frame] @ session.body_from_cam
+        if places and not is_new_place(places[-1][0], map_from_cam, every_m):
+            continue
+        sighting, found = session.sighting(frame), session.features(frame)
+        members = []
+        points = _features_map(session, frame, found)
+        for feature in np.flatnonzero(found.rows >= 0).tolist():
+            row = int(found.rows[feature])
+            landmark = int(sighting.ids[row])
+            entry = observed.setdefault(landmark, Observed(points[feature]))
+            away = map_from_cam[:3, 3] - sighting.points_map[row]
+            reach = float(sighting.distances_m[row]) * orb.SCALE_FACTOR ** float(found.octaves[feature])
+            entry.add(away / np.linalg.norm(away), reach, found.descriptors[feature])
+            members.append(landmark)
+        places.append((map_from_cam, members))
+    return tile_of(observed, places, rng, sigma_m)
+
+
+def _features_map(session: EstimatorSession, frame: int, found: Found) -> Array:
+    """(N, 3) what features show: at the landmark's true depth, but through the pixel where it was found."""
+    exact = session.sighting(frame).pixels[found.rows]
+    points_cam = session.camera.point_from_pixel(found.pixels[:, :2], exact[:, 0] - exact[:, 2])
+    return transform_points(session.map_from_body[frame] @ session.body_from_cam, points_cam)
+
+
+def tile_of(
+    observed: dict[int, Observed], places: list[tuple[Array, list[int]]], rng: np.random.Generator, sigma_m: float
+) -> tuple[list[Tile], Vocabulary]:
+    """The map of all landmarks that were seen at least twice, with an error of sigma_m added to each."""
+    kept = sorted(landmark for landmark, entry in observed.items() if len(entry.descriptors) >= 2)
+    number = {landmark: index for index, landmark in enumerate(kept)}
+    entries = [observed[landmark] for landmark in kept]
+    directions = np.array([np.mean(entry.directions, axis=0) for entry in entries])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    half = [
+        np.arccos(np.clip((np.array(e.directions) @ d).min(), -1, 1)) for e, d in zip(entries, directions, strict=True)
+    ]
+    points = np.array([entry.point_map for entry in entries]) + rng.normal(0.0, sigma_m, (len(entries), 3))
+    descriptors = np.array([entry.descriptors[len(entry.descriptors) // 2] for entry in entries])
+    lists = tuple(np.array(sorted({number[i] for i in members if i in number}), np.uint32) for _, members in places)
+    tile = Tile(
+        0, 0, _TILE_M, np.arange(len(kept), dtype=np.uint32), np.clip(points, 0.0, _TILE_M), descriptors,
+        directions.astype(np.float32), np.array(half, np.float32),
+        np.array([np.median(entry.reaches_m) for entry in entries], np.float32), np.full(len(kept), sigma_m, np.float32),
+        np.arange(len(places), dtype=np.uint32), np.array([placed for placed, _ in places]), lists,
+    )  # fmt: skip
+    images = np.zeros(len(kept), np.int64)
+    for place, ids in enumerate(lists):
+        images[ids] = place
+    return [tile], train_vocabulary(descriptors, 10, 4, rng, images)
+
+
+class SessionRelocalizer(Relocalizer):
+    """A relocalizer with its eyes replaced: what a frame shows comes from a session. One view serves many of them."""
+
+    def __init__(self, view: MapView, session: EstimatorSession, settings: LocalizerSettings) -> None:
+        super().__init__(view, session.camera, settings.relocalizer)
+        self._session = session
+        self._index_of = {stamp: index for index, stamp in enumerate(session.stamps_ns)}
+
+    def look(self, frame: RectifiedFrame) -> Slices[Seen]:
+        """As the relocalizer's."""
+        yield
+        return seen(self._session, self._index_of[frame.stamp_ns])
+
+
+def run_localizer(
+    session: EstimatorSession, view: MapView, prior: PositionPrior | None = None, frames: int | None = None, *,
+    has_wheels: bool = False, settings: LocalizerSettings = SETTINGS, until: Callable[[Estimate], bool] = lambda _: False,
+) -> list[Estimate]:  # fmt: skip
+    """The localizer's estimates over a session in a map; the last one is that for which `until` holds."""
+    nominal = session.session.nominal
+    localizer = Localizer(nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s, settings)
+    localizer._odometry._tracker = EstimatorTracker(session, session.camera, settings.odometry.tracker)
+    localizer._relocalizer, localizer._map_version = SessionRelocalizer(view, session, settings), 1
+    if prior is not None:
+        localizer.handle_prior(prior)
+    estimates, last_ns = [], 0
+    for frame in range(len(session) if frames is None else min(frames, len(session))):
+        stamp_ns = session.stamps_ns[frame]
+        localizer.handle_imu(session.session.imu.between(last_ns, stamp_ns + 1))
+        if has_wheels:
+            localizer.handle_wheel(wheel_between(session.session.wheel, last_ns, stamp_ns + 1))
+        last_ns = stamp_ns + 1
+        estimates.append(localizer.handle_stereo(blank(session, frame)))
+        if until(estimates[-1]):
+            break
+    return estimates
+
+
+def map_view(session: EstimatorSession, tiles: list[Tile], vocabulary: Vocabulary) -> MapView:
+    """What a robot with the session's camera holds of a map that was surveyed with the same."""
+    return MapView(tiles, vocabulary, session.camera.focal_px)
+
+
+def relative_errors_m(estimates: list[OdometryEstimate], map_from_body: Array, step: int = 15) -> Array:
+    """(N,) errors of the motion over `step` frames, of estimates that know gravity."""
+    known = [k for k in range(len(estimates) - step) if estimates[k].inertial]
+    errors = []
+    for k in known:
+        moved = se3_inverse(estimates[k].odom_from_body) @ estimates[k + step].odom_from_body
+        truly = se3_inverse(map_from_body[k]) @ map_from_body[k + step]
+        errors.append(float(np.linalg.norm(moved[:3, 3] - truly[:3, 3])))
+    return np.array(errors)
+
+
+def position_errors_m(estimates: list[Estimate], map_from_body: Array) -> Array:
+    """(N,) distances from the truth of the estimates that are there."""
+    pairs = zip(estimates, map_from_body, strict=False)
+    return np.array(
+        [np.linalg.norm(e.map_from_body[:3, 3] - truth[:3, 3]) for e, truth in pairs if e.map_from_body is not None]
+    )

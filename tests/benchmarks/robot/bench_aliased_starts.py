@@ -1,0 +1,119 @@
+"""What the localizer says where aisles are truly identical: starts at the estimator's level, beside what is promised of them.
+
+`PYTHONPATH=tests python tests/benchmarks/robot/bench_aliased_starts.py [--starts N] [--seeds N...] [--only NAME...] [--out FILE.json]`.
+Six aisles 5 m apart that were surveyed both ways, so that each has five twins; N starts (200) of each kind, shared among the sites
+of the seeds. With signs at the aisles' ends the starts are followed out of the racks. "whole site": the robot may take it that its own
+aisle is in the map. Where it may not, it must not be misled by signs out of an aisle that is not in the map, nor where two of five twins
+are not; from the only twin of an aisle that is not in the map nothing protects.
+"""
+
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
+import argparse
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.common.recorded_runs import AT_LEAST, AT_MOST, Promises, show_against, write_results
+from benchmarks.robot.aliased_starts import (
+    WHOLE_SITE,
+    Site,
+    Start,
+    among_racks,
+    resolving_start_at,
+    start_at,
+    summary,
+    surveyed_site,
+    with_aisles,
+)
+from locclient.localization.settings import LocalizerSettings
+
+WITHIN_S, WITHIN_M = 3.0, 5.0
+_FOLLOWED_S = 3.2
+_NEVER_WRONG: Promises = {"wrong_starts": (0, AT_MOST)}
+_AMONG = _NEVER_WRONG | {"right_among_hypotheses_share": (1.0, AT_LEAST)}
+_WHOLE = "no prior, whole site"
+_OUT, _OUT_M, _SPEED_MPS, _RATE_HZ = "out of the aisle, whole site", 8.0, 2.0, 15.0
+_FOREIGN, _FOREIGN_MAPPED = "out of an aisle that is not in the map", (0, 1, 3, 4, 5)
+_MAPPED = {"own aisle and all twins but one unmapped": (5,), "own aisle and two of five twins unmapped": (3, 4, 5)}
+PROMISES: dict[str, Promises] = {
+    "no prior": _AMONG,
+    _WHOLE: _AMONG,
+    "prior of 0.5 m": _NEVER_WRONG | {"right_in_time_share": (0.99, AT_LEAST)},
+    "prior of 2 m": _NEVER_WRONG,
+    _OUT: _NEVER_WRONG | {"resolved_share": (1.0, AT_LEAST)},
+    _FOREIGN: _NEVER_WRONG,
+    **dict(zip(_MAPPED, ({}, _NEVER_WRONG), strict=True)),
+}
+_PRIORS_M = {"no prior": None, _WHOLE: None, "prior of 0.5 m": 0.5, "prior of 2 m": 2.0}
+
+
+def starts_of(name: str, site: Site, count: int, seed: int) -> list[Start]:
+    """So many starts of one kind, spread over the drive."""
+    rng, robot = np.random.default_rng([seed, 1]), site.robot
+    if name in _PRIORS_M:
+        settings = WHOLE_SITE if name == _WHOLE else LocalizerSettings()
+        numbers = _spread(30, len(robot) - 60, count)
+        return [start_at(site, n, _FOLLOWED_S, _PRIORS_M[name], rng, settings) for n in numbers]
+    frames = among_racks(robot)
+    if name in (_OUT, _FOREIGN):
+        late = frames[-int(_OUT_M / _SPEED_MPS * _RATE_HZ) :]
+        part = site if name == _OUT else with_aisles(site, _FOREIGN_MAPPED)
+        settings = WHOLE_SITE if name == _OUT else LocalizerSettings()
+        return [resolving_start_at(part, n, WITHIN_M, settings) for n in _spread(late[0], late[-1], count)]
+    part = with_aisles(site, _MAPPED[name])
+    return [start_at(part, n, _FOLLOWED_S, None, rng) for n in _spread(frames[0], frames[-1] - 46, count)]
+
+
+def _site_of(name: str) -> str:
+    return "marked-ends" if name in (_OUT, _FOREIGN) else "identical-aisles"
+
+
+def _spread(first: int, last: int, count: int) -> list[int]:
+    return [int(number) for number in np.linspace(first, last, count)]
+
+
+def judged(name: str, found: list[Start]) -> dict[str, float]:
+    """The figures of one kind of start."""
+    figures = summary(found, WITHIN_S)
+    if name == _OUT:
+        late_m = [s.late_m for s in found if s.late_m is not None]
+        figures["resolved_share"] = len([m for m in late_m if m <= WITHIN_M]) / len(found)
+        figures["resolved_median_m"] = float(np.median(late_m)) if late_m else np.nan
+        figures["resolved_last_m"] = float(np.max(late_m)) if late_m else np.nan
+    return figures
+
+
+def main() -> None:
+    """Prints the tables; writes them as JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--starts", type=int, default=200)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[11, 12])
+    parser.add_argument("--only", action="append", default=[], choices=list(PROMISES))
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    found: dict[str, list[Start]] = {name: [] for name in arguments.only or PROMISES}
+    for seed in arguments.seeds:
+        begun_s = time.process_time()
+        sites = {name: surveyed_site(name, seed) for name in {_site_of(name) for name in found}}
+        print(f"seed {seed}: sites in {time.process_time() - begun_s:.0f} s", flush=True)
+        for name, starts in found.items():
+            begun_s = time.process_time()
+            share = starts_of(name, sites[_site_of(name)], max(1, arguments.starts // len(arguments.seeds)), seed)
+            starts.extend(share)
+            print(f"seed {seed}, {name}: {len(share)} starts in {time.process_time() - begun_s:.0f} s", flush=True)
+            for start in share:
+                if start.wrong_frames:
+                    print("  wrong:", start, flush=True)
+    figures = {name: judged(name, starts) for name, starts in found.items()}
+    for name, row in figures.items():
+        show_against(name, row, PROMISES[name])
+    outcomes = {name: [asdict(start) for start in starts] for name, starts in found.items()}
+    write_results(arguments.out, {"figures": figures, "starts": outcomes})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""What the localizer says while something is broken, and how soon all is well again: one line for each fault of the simulator.
+
+`PYTHONPATH=tests python tests/benchmarks/robot/bench_faults.py [--only NAME...] [--work FOLDER] [--out FILE.json]`; recordings and map are
+kept in the work folder, where bench_localization.py finds the same. A row is right when the status within a second of the fault's
+beginning is one of those that are promised, nothing fails silently, and the robot tracks again soon after the fault's end.
+"""
+
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from benchmarks.common.recorded_runs import parsed, played, recorded, surveyed, write_results
+from fleetsim.scenarios import find_scenario
+from locclient.localization.estimate import Status
+from locclient.localization.settings import LocalizerSettings
+from locclient.replay import run_metrics
+from locclient.replay.replay import ReplayResult
+
+TRACKING, DEGRADED = {Status.TRACKING}, {Status.DEGRADED, Status.LOST}
+# Robot of the scenario `faults`: statuses of which one must be said within WITHIN_S, cause that must be named ("" for none).
+EXPECTED: dict[str, tuple[set[Status], str]] = {
+    "dark": (DEGRADED, "dark"),
+    "frozen": (DEGRADED, "frozen"),
+    "person": (DEGRADED | TRACKING, ""),
+    "dropped": (DEGRADED | TRACKING, ""),
+    "imu-gap": (DEGRADED | TRACKING, ""),
+    "imu-spike": (TRACKING, ""),
+    "slip": (TRACKING, ""),
+    "glare": (DEGRADED | TRACKING, ""),
+    "kidnapped": ({Status.AMBIGUOUS, Status.LOST}, ""),
+}
+WITHIN_S, RECOVERY_S, RECOVERY_M = 1.0, 5.0, 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a fault went: seconds from its first frame until an expected status with the cause named, None for never; until tracking
+    after its end, and the way driven meanwhile."""
+
+    fault: str
+    said_s: float | None
+    recovered_s: float | None
+    recovered_m: float | None
+    silent_failures: int | None
+    truth_outside_share: float
+
+    @property
+    def is_right(self) -> bool:
+        """As promised."""
+        soon = self.said_s is not None and self.said_s <= WITHIN_S
+        if self.recovered_s is None or self.recovered_m is None:
+            return False
+        back = self.recovered_m <= RECOVERY_M if self.fault == "kidnapped" else self.recovered_s <= RECOVERY_S
+        return soon and back and not self.silent_failures
+
+
+def window_s(fault: str, result: ReplayResult) -> tuple[float, float]:
+    """When the fault is in force, from the first frame on; a kidnapped robot's is the moment at which the truth jumps."""
+    run = find_scenario("faults").run(fault)[1]
+    if run.faults:
+        return run.faults[0].start_s, run.faults[0].end_s
+    positions = [truth[:3, 3] for truth in result.truths if truth is not None]
+    jump = int(np.argmax(np.linalg.norm(np.diff(positions, axis=0), axis=1))) + 1
+    moment_s = (result.frames[jump].stamp_ns - result.frames[0].stamp_ns) * 1e-9
+    return moment_s, moment_s
+
+
+def outcome(fault: str, result: ReplayResult) -> Outcome:
+    """What was said about it."""
+    statuses, cause = EXPECTED[fault]
+    begin_s, end_s = window_s(fault, result)
+    times_s = [(frame.stamp_ns - result.frames[0].stamp_ns) * 1e-9 for frame in result.frames]
+    told_s = next(t for t in times_s if t >= begin_s)  # without frames there is nothing to estimate
+    said = [
+        t - told_s
+        for t, e in zip(times_s, result.estimates, strict=True)
+        if t >= told_s and e.status in statuses and (not cause or e.cause == cause)
+    ]
+    good = [
+        k
+        for k, (t, frame) in enumerate(zip(times_s, result.frames, strict=True))
+        if t >= end_s
+        and frame.status is Status.TRACKING
+        and frame.error_m is not None
+        and frame.error_m < run_metrics.ERROR_LIMIT_M
+    ]
+    first = next(k for k, t in enumerate(times_s) if t >= end_s)
+    way = [truth[:3, 3] for truth in result.truths[first : good[0] + 1] if truth is not None] if good else []
+    outside = [run_metrics.is_outside_its_bound(frame) for frame in result.frames]
+    return Outcome(
+        fault,
+        said[0] if said else None,
+        times_s[good[0]] - end_s if good else None,
+        float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()) if good else None,
+        run_metrics.silent_failures(result.frames),
+        float(np.mean(outside)),
+    )
+
+
+def show(found: Outcome) -> None:
+    """One line."""
+    figures = (found.said_s, found.recovered_s, found.recovered_m, found.truth_outside_share)
+    shown = " ".join(f"{'-' if value is None else format(value, '.2f'):>9}" for value in figures)
+    print(f"{found.fault:10} {'yes' if found.is_right else 'NO':5} {shown} {found.silent_failures!s:>7}")
+
+
+def main() -> None:
+    """Prints the table; writes JSON where asked."""
+    arguments = parsed(__doc__, EXPECTED)
+    store, found = surveyed(arguments.work), []
+    print(f"{'fault':10} {'right':5} {'said s':>9} {'back s':>9} {'back m':>9} {'outside':>9} {'silent':>7}")
+    for name in arguments.only or EXPECTED:
+        recording = recorded(arguments.work, ("--robot", name, "--day", "1"), "faults")
+        found.append(outcome(name, played(recording, store, LocalizerSettings())))
+        show(found[-1])
+    write_results(arguments.out, {"faults": [asdict(o) for o in found]})
+
+
+if __name__ == "__main__":
+    main()

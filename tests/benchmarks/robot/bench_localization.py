@@ -1,0 +1,140 @@
+"""A robot in the map of another day: every figure that the project promises for it, beside its target.
+
+`PYTHONPATH=tests python tests/benchmarks/robot/bench_localization.py [--only NAME...] [--work FOLDER] [--out FILE.json]`; recordings of
+`fleetsim record small-loop` and the map made of its survey stay in the work folder (FLEETMAP_BENCH_WORK, else the temporary
+folder) and serve again. CPU times are the process's, as they are and as the machine would take that the limits are for (yardstick.py).
+"""
+
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.common.recorded_runs import (
+    AT_LEAST,
+    AT_MOST,
+    Promises,
+    parsed,
+    played,
+    recorded,
+    resident_mb,
+    show_against,
+    surveyed,
+    warmed_up,
+    write_results,
+)
+from benchmarks.common.yardstick import at_reference, mean_of, slowness
+from fleetmap.odometry import Odometry
+from fleetmap.recordings import FrameSelection, open_recording
+from fleetmap.sensors.rectification import Rectifier
+from locclient.localization.settings import LocalizerSettings
+from locclient.replay import run_metrics
+from locclient.replay.replay import ReplayResult
+from locclient.replay.replay_sources import ReplaySource
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A recording against the survey's map, and what is promised of it: figure -> (limit, how)."""
+
+    record: tuple[str, ...]
+    promises: Promises
+
+
+_CHEAP: Promises = {
+    "cpu_mean_ms_at_reference": (10, AT_MOST),
+    "cpu_p99_ms_at_reference": (20, AT_MOST),
+    "rss_mb": (320, AT_MOST),
+}
+_HONEST: Promises = {"silent_failures": (0, AT_MOST), "truth_outside_share": (0.01, AT_MOST)}
+_NEXT_DAY: Promises = {
+    "localised_share": (0.99, AT_LEAST), "median_mm": (15, AT_MOST), "p99_mm": (35, AT_MOST), "heading_p99_deg": (0.3, AT_MOST),
+}  # fmt: skip
+CASES: dict[str, Case] = {
+    "next day": Case(("--robot", "runner-1", "--day", "1"), _NEXT_DAY | _HONEST | _CHEAP),
+    "night, stock three days on": Case(
+        ("--robot", "runner-1", "--day", "3", "--light", "night"),
+        {"localised_share": (0.97, AT_LEAST), "median_mm": (17, AT_MOST)} | _HONEST | _CHEAP,
+    ),
+    "camera 0.5 m lower": Case(("--robot", "tote-1", "--day", "1"), _HONEST | _CHEAP),
+    "opposite direction": Case(("--robot", "opposite-1", "--day", "1"), _HONEST | _CHEAP),
+}
+
+
+def odometry_ms(path: Path, settings: LocalizerSettings, frames: str = ":") -> list[float]:
+    """CPU milliseconds of each frame by odometry alone, rectification included."""
+    out = []
+    with open_recording(path) as recording:
+        source = ReplaySource.of(recording, FrameSelection.parse(frames), reverse=False)
+        rectifier = Rectifier(source.calibration)
+        odometry = Odometry(
+            source.calibration, rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s, settings.odometry,
+            settings.stereo,
+        )  # fmt: skip
+        for number, imu in enumerate(source.imu_before_each()):
+            raw = source.frame(number)
+            begun_s = time.process_time()
+            odometry.handle_imu(imu)
+            odometry.handle_wheel(source.wheel_before(number))
+            odometry.handle_stereo(rectifier.rectify(raw))
+            out.append(1e3 * (time.process_time() - begun_s))
+    return out[run_metrics.WARM_UP_FRAMES :]
+
+
+def figures(result: ReplayResult) -> dict[str, Any]:
+    """What a run was worth, flat."""
+    frames = result.frames
+    errors, angles, cpu = run_metrics.error_m(frames), run_metrics.error_deg(frames), run_metrics.frame_ms(frames)
+    outside = [run_metrics.is_outside_its_bound(frame) for frame in frames if frame.error_map_m is not None]
+    first = run_metrics.first_fix(frames)
+    return {
+        "frames": len(frames),
+        "first_fix_frame": first,
+        "localised_share": run_metrics.localised_share(frames),
+        "median_mm": None if errors is None else 1e3 * errors["median"],
+        "p99_mm": None if errors is None else 1e3 * errors["p99"],
+        "max_mm": None if errors is None else 1e3 * errors["max"],
+        "heading_p99_deg": None if angles is None else angles["p99"],
+        "silent_failures": run_metrics.silent_failures(frames),
+        "position_failures": run_metrics.position_failures(frames),
+        "truth_outside_share": float(np.mean(outside)) if outside else None,
+        "cpu_mean_ms": None if cpu is None else cpu["mean"],
+        "cpu_p99_ms": None if cpu is None else cpu["p99"],
+        "rss_mb": resident_mb()["resident"],
+        "rss_anonymous_mb": resident_mb()["anonymous"],
+        "stage_ms": run_metrics.stage_ms(frames),
+        "status_share": run_metrics.status_share(frames),
+    }
+
+
+def main() -> None:
+    """Prints the tables; writes them as JSON where asked."""
+    arguments = parsed(__doc__, CASES)
+    store, settings, found = surveyed(arguments.work), LocalizerSettings(), {}
+    for name in arguments.only or CASES:
+        recording = recorded(arguments.work, CASES[name].record)
+        warmed_up(recording, store)
+        played(recording, store, settings, ":60")
+        slow = [slowness()]
+        found[name] = figures(played(recording, store, settings))
+        slow.append(slowness())
+        alone = odometry_ms(recording, settings)
+        found[name] |= {
+            "odometry_alone_mean_ms": float(np.mean(alone)),
+            "odometry_alone_p99_ms": float(np.percentile(alone, 99)),
+            "slowness": mean_of(slow),
+            "cpu_mean_ms_at_reference": at_reference(found[name]["cpu_mean_ms"], slow),
+            "cpu_p99_ms_at_reference": at_reference(found[name]["cpu_p99_ms"], slow),
+        }
+        title = f"{name} (fleetsim record small-loop {' '.join(CASES[name].record)})"
+        show_against(title, found[name], CASES[name].promises)
+    write_results(arguments.out, {"cases": found})
+
+
+if __name__ == "__main__":
+    main()

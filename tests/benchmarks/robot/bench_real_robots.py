@@ -1,0 +1,142 @@
+"""Robots in maps of real recordings: frames that did not make the map, backwards, and starts from nothing.
+
+`PYTHONPATH=tests python tests/benchmarks/robot/bench_real_robots.py [--only NAME...] [--work FOLDER] [--out FILE.json]`.
+The map is made of the recording's even frames; robots see the odd ones, so with the survey's light and camera. Maps stay in the work
+folder. CPU times are
+the process's.
+"""
+
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.common.recorded_runs import (
+    AT_LEAST,
+    AT_MOST,
+    SITE,
+    Promises,
+    parsed,
+    played,
+    show_against,
+    tool,
+    write_results,
+)
+from benchmarks.common.yardstick import at_reference, mean_of, slowness
+from fleetmap.recordings import open_recording
+from locclient.localization.settings import LocalizerSettings
+from locclient.replay import run_metrics
+from support.recordings.realdata import DATA
+
+MAPPED, UNSEEN = "0::2", "1::2"
+_STARTS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """How the odd frames of a recording are met, and what is promised: figure -> (limit, how)."""
+
+    recording: str
+    how: Callable[[Path, Path], dict[str, Any]]
+    promises: Promises
+
+
+def drive(path: Path, store: Path, *, reverse: bool) -> dict[str, Any]:
+    """All odd frames in a row."""
+    frames = played(path, store, LocalizerSettings(), UNSEEN, reverse=reverse).frames
+    errors, cpu = run_metrics.error_m(frames), run_metrics.frame_ms(frames)
+    return {
+        "frames": len(frames),
+        "localised": sum(run_metrics.localised(frames)),
+        "localised_share": run_metrics.localised_share(frames),
+        "median_mm": None if errors is None else 1e3 * errors["median"],
+        "max_mm": None if errors is None else 1e3 * errors["max"],
+        "silent_failures": run_metrics.silent_failures(frames),
+        "cpu_mean_ms": None if cpu is None else cpu["mean"],
+    }
+
+
+def start_anywhere(path: Path, store: Path) -> dict[str, Any]:
+    """The robot is switched on at one odd frame after another, spread over the recording, knowing nothing: the first frame's fix."""
+    with open_recording(path) as recording:
+        odd = np.arange(1, len(recording.frame_stamps_ns), 2)
+    fixed, cpu_ms, errors_mm, slow = 0, [], [], []
+    played(path, store, LocalizerSettings(), ":40")  # loads the kernels
+    for number in odd[np.linspace(0, len(odd) - 1, _STARTS).astype(int)].tolist():
+        (frame,) = played(path, store, LocalizerSettings(), f"{number}:{number + 1}").frames
+        fixed += frame.has_fix
+        slow.append(slowness())
+        cpu_ms.append(at_reference(1e3 * frame.cpu_s, slow[-1:]) or np.inf)
+        if frame.has_fix and frame.error_m is not None:
+            errors_mm.append(1e3 * frame.error_m)
+    return {
+        "starts": _STARTS,
+        "fixed_on_first_frame": fixed,
+        "slowness": mean_of(slow),
+        "ready_in_60_ms_at_reference": sum(ms <= 60 for ms in cpu_ms),
+        "cpu_median_ms_at_reference": float(np.median(cpu_ms)),
+        "cpu_max_ms_at_reference": max(cpu_ms),
+        "error_max_mm": max(errors_mm, default=None),
+    }
+
+
+CASES: dict[str, Case] = {
+    "euroc_v101_keyframes, held out": Case(
+        "euroc_v101_keyframes",
+        lambda path, store: drive(path, store, reverse=False),
+        {"localised_share": (0.95, AT_LEAST), "median_mm": (30, AT_MOST), "silent_failures": (0, AT_MOST)},
+    ),
+    "euroc_mh01_start, held out, backwards": Case(
+        "euroc_mh01_start",
+        lambda path, store: drive(path, store, reverse=True),
+        {"localised": (150, AT_LEAST), "median_mm": (4, AT_MOST), "silent_failures": (0, AT_MOST)},
+    ),
+    "euroc_mh01_start, first fix from nothing": Case(
+        "euroc_mh01_start",
+        start_anywhere,
+        {"fixed_on_first_frame": (19, AT_LEAST), "ready_in_60_ms_at_reference": (19, AT_LEAST)},
+    ),
+}
+
+
+def mapped(work: Path, path: Path) -> Path:
+    """A store with the map of the even frames, in the frame of the truth."""
+    store = work / path.stem / "store"
+    if not (store / "built").exists():
+        to_store = ["--site", SITE, "--store", str(store)]
+        options = ["--frames", MAPPED, "--frame-from-ground-truth", "--report", str(work / f"{path.stem}.json")]
+        store.parent.mkdir(parents=True, exist_ok=True)
+        subprocess.run([*tool("mapserver"), "build", str(path), *to_store, *options], check=True)
+        subprocess.run([*tool("mapserver"), "publish", *to_store], check=True)
+        (store / "built").touch()
+    return store
+
+
+def bench(name: str, work: Path) -> dict[str, Any] | None:
+    """The figures of a case, None where its recording is not there."""
+    folder = DATA / CASES[name].recording
+    return CASES[name].how(folder, mapped(work, folder)) if folder.is_dir() else None
+
+
+def main() -> None:
+    """Prints the tables; writes them as JSON where asked."""
+    arguments = parsed(__doc__, CASES)
+    found = {}
+    for name in arguments.only or CASES:
+        figures = bench(name, arguments.work)
+        if figures is None:
+            print(f"\n{name}: REAL DATA MISSING, nothing is shown")
+            continue
+        found[name] = figures
+        show_against(name, figures, CASES[name].promises)
+    write_results(arguments.out, {"cases": found})
+
+
+if __name__ == "__main__":
+    main()

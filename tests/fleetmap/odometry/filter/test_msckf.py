@@ -1,0 +1,296 @@
+"""The multi-state filter on synthetic features: consistency, observability, large corrections, relative motion."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log, so3_exp
+from fleetmap.odometry.filter.msckf import InvariantFilter, NavState
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.samples import ImuSamples, WheelSample
+from support.worlds.inertial_motion import analytic_motion
+from support.worlds.point_world import (
+    BODY_FROM_CAM,
+    CAMERA,
+    NOISE,
+    SETTINGS,
+    error_of,
+    observe,
+    perturbed,
+    room,
+    run_filter,
+    tracks_of,
+    true_state,
+)
+
+START_SIGMAS = np.repeat([0.02, 0.2, 0.05, 0.005, 0.05], 3)
+
+
+def clones_at(
+    times_s: list[float], seen_by: Array, rng: np.random.Generator | None, last_body_from_guess: Array | None = None
+) -> tuple[InvariantFilter, dict[int, Array]]:
+    """A vision-only filter with a clone at each true place, uncertain by 0.3 rad and 1.5 m each, and what each saw.
+
+    last_body_from_guess (4, 4) is how far off the last clone is predicted.
+    """
+    state = true_state(times_s[0])
+    estimate = InvariantFilter(state, 1e-12 * np.eye(15), SETTINGS, CAMERA, BODY_FROM_CAM)
+    seen = {}
+    for k, time_s in enumerate(times_s):
+        if k:
+            step = se3_inverse(analytic_motion(times_s[k - 1]).map_from_body) @ analytic_motion(time_s).map_from_body
+            if last_body_from_guess is not None and k == len(times_s) - 1:
+                step = step @ last_body_from_guess
+            estimate.displace(step, 0.3, 1.5)
+        estimate.add_clone(k, np.zeros(3))
+        seen[k] = observe(seen_by, time_s, rng)
+    return estimate, seen
+
+
+def test_errors_stay_as_large_as_the_covariance_says() -> None:
+    """Normalised error squared per dof over 16 runs: navigation state (15 dof) and body transform (6 dof)."""
+    whole, body = [], []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        gyro_bias, accel_bias = np.array([0.01, -0.02, 0.005]), np.array([0.05, 0.1, -0.03])
+        run = run_filter(
+            rng, np.diag(START_SIGMAS**2), START_SIGMAS * rng.normal(size=15), duration_s=3.4, gyro_bias=gyro_bias,
+            accel_bias=accel_bias,
+        )  # fmt: skip
+        error = error_of(run.filter.state, run.truth)
+        whole.append(error @ np.linalg.solve(run.filter.covariance[:15, :15], error) / 15)
+        # the same in the terms of the estimate: rotation in odom axes, then position
+        turned = np.concatenate([error[:3], run.truth.position_m - run.filter.state.position_m])
+        body.append(turned @ np.linalg.solve(run.filter.body_covariance(), turned) / 6)
+        assert run.accepted_share > 0.95
+    assert 0.7 < np.mean(whole) < 1.4
+    assert 0.7 < np.mean(body) < 1.4
+
+
+def test_yaw_and_position_never_become_known() -> None:
+    """What no measurement can tell (turn about gravity, shift) keeps its variance; tilt, velocity and biases do not."""
+    rng = np.random.default_rng(31)
+    covariance = np.diag(START_SIGMAS**2)
+    covariance[0:3, 0:3] = 0.1**2 * np.eye(3)
+    run = run_filter(rng, covariance, np.zeros(15), duration_s=3.4)
+    sigma = np.sqrt(np.diag(run.filter.covariance))
+    assert sigma[2] >= 0.1 * (1 - 1e-6)
+    assert (sigma[6:9] >= 0.05 * (1 - 1e-6)).all()
+    assert (sigma[0:2] < 0.02).all()
+    assert (sigma[9:12] < 0.5 * START_SIGMAS[9:12]).all()
+
+
+def test_biases_and_velocity_are_found() -> None:
+    rng = np.random.default_rng(3)
+    gyro_bias, accel_bias = np.array([0.01, -0.008, 0.006]), np.array([0.05, -0.08, 0.06])
+    start_error = np.concatenate([np.zeros(3), [0.2, -0.1, 0.15], np.zeros(3), gyro_bias, accel_bias])
+    run = run_filter(
+        rng, np.diag(START_SIGMAS**2), start_error, duration_s=5.4, gyro_bias=gyro_bias, accel_bias=accel_bias
+    )
+    error = error_of(run.filter.state, run.truth)
+    assert np.linalg.norm(error[9:12]) < 0.003
+    assert np.linalg.norm(error[12:15]) < 0.05
+    assert np.linalg.norm(run.truth.velocity_mps - run.filter.state.velocity_mps) < 0.05
+
+
+@pytest.mark.parametrize("offset_s", [0.008, -0.008])
+def test_time_offset_converges(offset_s: float) -> None:
+    """With the gyro of a robot: a noisier one would blur the rates that tell one moment from another."""
+    run = run_filter(
+        np.random.default_rng(4), np.diag(START_SIGMAS**2), np.zeros(15), duration_s=6.0, imu_minus_cam_s=offset_s,
+        noise=ImuNoise(3e-4, 1e-5, 5e-3, 1e-4), settings=replace(SETTINGS, time_offset_sigma_s=0.01),
+    )  # fmt: skip
+    sigma_s = float(np.sqrt(run.filter.covariance[15, 15]))
+    assert sigma_s < 0.002
+    assert abs(run.filter.imu_minus_cam_s - offset_s) < 2.5 * sigma_s
+
+
+def test_iterated_update_recovers_from_a_bad_prediction() -> None:
+    """The newest of three clones is predicted 17 degrees and 0.9 m off; vision pulls it to within a centimetre."""
+    rng = np.random.default_rng(6)
+    points = room(rng)
+    off = se3_exp(np.array([0.1, -0.2, 0.2, 0.5, -0.6, 0.4]))
+    estimate, seen = clones_at([0.0, 0.15, 0.3], points, rng, last_body_from_guess=off)
+    truth = se3_inverse(analytic_motion(0.0).map_from_body) @ analytic_motion(0.3).map_from_body
+    estimate.update(tracks_of(seen, np.arange(len(points))), iterations=6)
+    moved = se3_inverse(estimate.odom_from_clone(0)) @ estimate.odom_from_clone(2)
+    off = se3_log(se3_inverse(truth) @ moved)
+    assert np.linalg.norm(off[:3]) < 0.003
+    assert np.linalg.norm(off[3:]) < 0.015
+    np.testing.assert_allclose(estimate.state.odom_from_body, estimate.odom_from_clone(2), atol=1e-6)
+
+
+def test_a_hint_of_the_newest_place_adds_no_information() -> None:
+    """Linearising first elsewhere ends at the same estimate and covariance once iterated."""
+    rng = np.random.default_rng(7)
+    points = room(rng)
+    ends = []
+    for hint in (None, se3_exp(np.array([0.02, -0.01, 0.03, 0.05, -0.04, 0.02]))):
+        estimate, seen = clones_at([0.0, 0.15, 0.3], points, np.random.default_rng(70))
+        newest = None if hint is None else hint @ estimate.odom_from_clone(2)
+        estimate.update(tracks_of(seen, np.arange(len(points))), iterations=6, newest_odom_from_body=newest)
+        ends.append((estimate.state.odom_from_body, estimate.covariance))
+    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=1e-5)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], rtol=2e-2, atol=1e-5)
+
+
+def test_wrong_matches_are_refused() -> None:
+    rng = np.random.default_rng(9)
+    points = room(rng)
+    state = true_state(0.0)
+    estimate = InvariantFilter(state, 1e-12 * np.eye(15), SETTINGS, CAMERA, BODY_FROM_CAM)
+    seen = {}
+    for k, time_s in enumerate([0.0, 0.15, 0.3]):
+        if k:
+            before = analytic_motion(time_s - 0.15).map_from_body
+            estimate.displace(se3_inverse(before) @ analytic_motion(time_s).map_from_body, 0.005, 0.02)
+        estimate.add_clone(k, np.zeros(3))
+        seen[k] = observe(points, time_s, rng)
+    tracks = tracks_of(seen, np.arange(len(points)))
+    for track in tracks[::4]:
+        track.pixels[0, :] += rng.choice([-25.0, 25.0])
+        track.pixels[0, 1] += 30.0
+    used = estimate.update(tracks)
+    wrong = np.zeros(len(tracks), bool)
+    wrong[::4] = True
+    assert (used[wrong] == 1).mean() < 0.1
+    assert (used[~wrong] == 1).mean() > 0.95
+
+
+def test_relative_motion_is_the_composition_and_its_covariance_the_scatter() -> None:
+    rng = np.random.default_rng(10)
+    points = room(rng)
+    estimate, seen = clones_at([0.0, 0.15, 0.3], points, rng)
+    estimate.update(tracks_of(seen, np.arange(len(points))))
+    earlier_from_now, covariance = estimate.motion_since(1)
+    np.testing.assert_allclose(
+        earlier_from_now, se3_inverse(estimate.odom_from_clone(1)) @ estimate.odom_from_clone(2), atol=1e-12
+    )
+    same, nothing = estimate.motion_since(2)
+    np.testing.assert_allclose(same, np.eye(4), atol=1e-12)
+    assert np.abs(nothing).max() < 1e-12
+    # scatter of the relative motion when the clones are drawn from their joint covariance
+    joint = 1e-4 * estimate.budget[20:, 20:]  # scaled down so that first order holds
+    drawn = rng.multivariate_normal(np.zeros(len(joint)), joint, size=4000, method="eigh")
+    offs = []
+    for error in drawn:
+        bodies = []
+        for index in (1, 2):
+            body, at = estimate.odom_from_clone(index), 6 * index
+            turn = so3_exp(error[at : at + 3])
+            left = np.eye(4)
+            left[:3, :3], left[:3, 3] = turn, error[at + 3 : at + 6]
+            bodies.append(left @ body)
+        offs.append(se3_log(se3_inverse(bodies[0]) @ bodies[1] @ se3_inverse(earlier_from_now)))
+    scatter = np.cov(np.array(offs).T) * 1e4
+    scale = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(scatter / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.08)
+
+
+def test_forgetting_a_clone_leaves_the_others_alone() -> None:
+    estimate, _ = clones_at([0.0, 0.15, 0.3], room(np.random.default_rng(1)), None)
+    kept = estimate.odom_from_clone(2)
+    covariance = estimate.covariance.copy()
+    estimate.remove_clone(1)
+    assert estimate.clone_ids == [0, 2]
+    np.testing.assert_array_equal(estimate.odom_from_clone(2), kept)
+    rest = np.r_[0:22, 28:34]
+    np.testing.assert_array_equal(estimate.covariance, covariance[np.ix_(rest, rest)])
+
+
+def test_displacement_noise_is_relative_to_the_body() -> None:
+    """Scatter of noisy relative motions against the covariance of the body, far from the origin."""
+    rng = np.random.default_rng(12)
+    state = true_state(1.0)
+    step = se3_exp(np.array([0.1, 0.0, 0.2, 0.3, 0.1, 0.0]))
+    estimate = InvariantFilter(state, np.zeros((15, 15)), SETTINGS, CAMERA, BODY_FROM_CAM)
+    start = estimate.state.odom_from_body
+    estimate.displace(step, 0.01, 0.02)
+    errors = []
+    for _ in range(3000):
+        noise = np.concatenate([0.01 * rng.normal(size=3), 0.02 * rng.normal(size=3)])
+        off = start @ step @ se3_exp(noise) @ se3_inverse(start @ step)
+        errors.append(np.concatenate([se3_log(off)[:3], (off @ start @ step - start @ step)[:3, 3]]))
+    scatter = np.cov(np.array(errors).T)
+    np.testing.assert_allclose(scatter, estimate.body_covariance(), atol=0.05 * scatter.diagonal().max())
+
+
+def test_vision_that_contradicts_widens_and_vision_that_agrees_does_not() -> None:
+    run = run_filter(np.random.default_rng(2), np.diag(START_SIGMAS**2), np.zeros(15), duration_s=0.8)
+    estimate = run.filter
+    newest = estimate.clone_ids[-1]
+    before = estimate.covariance.copy()
+    here = estimate.state.odom_from_body
+    assert not estimate.open_up(newest, here, 1.0)
+    np.testing.assert_array_equal(estimate.covariance, before)
+    away = here.copy()
+    away[:3, 3] += [0.0, 2.0, 0.0]
+    assert estimate.open_up(newest, away, 1.0)
+    assert (np.diag(estimate.covariance)[6:9] > np.diag(before)[6:9] + 3.9).all()
+    assert (np.diag(estimate.covariance)[3:6] > np.diag(before)[3:6] + 3.9).all()
+
+
+def test_linear_measurement_is_the_kalman_update() -> None:
+    rng = np.random.default_rng(13)
+    half = rng.normal(size=(15, 15))
+    covariance = 1e-4 * half @ half.T
+    estimate = InvariantFilter(NavState(), covariance, SETTINGS, CAMERA, BODY_FROM_CAM)
+    jacobian = np.zeros((3, 16))
+    jacobian[:, 12:15] = np.eye(3)
+    residual, noise = np.array([0.01, -0.02, 0.005]), 1e-4 * np.eye(3)
+    innovation = estimate.correct_with(jacobian, residual, noise)
+    information = np.linalg.inv(covariance) + jacobian[:, :15].T @ np.linalg.inv(noise) @ jacobian[:, :15]
+    np.testing.assert_allclose(estimate.covariance[:15, :15], np.linalg.inv(information), atol=1e-9)
+    expected = np.linalg.solve(information, jacobian[:, :15].T @ np.linalg.solve(noise, residual))
+    np.testing.assert_allclose(estimate.state.accel_bias_mps2, expected[12:15], atol=1e-9)
+    spread = jacobian[:, :15] @ covariance @ jacobian[:, :15].T + noise
+    assert innovation == pytest.approx(residual @ np.linalg.solve(spread, residual))
+
+
+def test_propagation_without_samples_stays_put() -> None:
+    estimate = InvariantFilter(true_state(0.0), np.eye(15), SETTINGS, CAMERA, BODY_FROM_CAM)
+    before = estimate.state.odom_from_body
+    assert (estimate.propagate(ImuSamples.empty(), 0, 100, NOISE) == 0).all()
+    np.testing.assert_array_equal(estimate.state.odom_from_body, before)
+
+
+def test_perturbing_and_measuring_errors_are_inverse() -> None:
+    """The test's own instruments."""
+    error = np.linspace(-0.2, 0.3, 15)
+    truth = true_state(0.7)
+    np.testing.assert_allclose(error_of(perturbed(truth, so3_exp(error[:3]), error), truth), error, atol=1e-12)
+
+
+def test_a_clone_follows_the_time_offset_as_the_motion_does() -> None:
+    """Its covariance with the offset, against the invariant error between the motion a little later and now."""
+    state, motion, step_s = true_state(1.3), analytic_motion(1.3), 1e-6
+    estimate = InvariantFilter(state, np.zeros((15, 15)), SETTINGS, CAMERA, BODY_FROM_CAM)
+    estimate.add_clone(0, motion.gyro_radps)
+    by_offset = estimate.covariance[16:22, 15] / SETTINGS.time_offset_sigma_s**2
+    numeric = (error_of(state, true_state(1.3 + step_s)) - error_of(state, true_state(1.3 - step_s))) / (2 * step_s)
+    np.testing.assert_allclose(by_offset, numeric[[0, 1, 2, 6, 7, 8]], atol=1e-5)
+
+
+def test_wheels_and_standing_measure_what_they_say() -> None:
+    """Residuals vanish at the truth, and their derivatives take a small error away."""
+    motion, base_from_body = analytic_motion(1.3), se3_exp(np.array([0.1, -0.2, 0.3, 0.1, 0.2, 0.25]))
+    truth = true_state(1.3)
+    base_body = se3_inverse(base_from_body)[:3, 3]
+    velocity_body = truth.rotation.T @ truth.velocity_mps + np.cross(motion.gyro_radps, base_body)
+    turn = base_from_body[:3, :3]
+    sample = WheelSample(0, turn @ velocity_body, float((turn @ motion.gyro_radps)[2]), 1e-4, 1e-4)
+    settings = replace(SETTINGS, wheel_slip_mps=1e-4, wheel_sigma_scale=1.0, wheel_speed_scale_sigma=0.0)
+    error = np.concatenate([np.zeros(3), 0.02 * np.array([1.0, -2.0, 1.5]), np.zeros(9)])
+    covariance = np.diag(np.repeat([1e-9, 0.05, 1e-9, 1e-9, 1e-9], 3) ** 2)
+    estimate = InvariantFilter(perturbed(truth, np.eye(3), error), covariance, settings, CAMERA, BODY_FROM_CAM)
+    assert estimate.roll(sample, motion.gyro_radps, base_from_body, gate=100.0) < 100.0
+    np.testing.assert_allclose(estimate.state.velocity_mps, truth.velocity_mps, atol=1e-4)
+    slipped = WheelSample(0, 1.6 * sample.velocity_base_mps, sample.yaw_rate_radps, 1e-4, 1e-4)
+    before = estimate.covariance.copy()
+    assert estimate.roll(slipped, motion.gyro_radps, base_from_body, gate=100.0) > 100.0
+    np.testing.assert_array_equal(estimate.covariance, before)
+    standing = NavState(velocity_mps=np.array([0.02, -0.01, 0.03]))
+    estimate = InvariantFilter(standing, np.diag(START_SIGMAS**2), SETTINGS, CAMERA, BODY_FROM_CAM)
+    assert estimate.stand_still(np.array([0.004, 0.0, -0.003]), 1e-5, gate=22.0) < 22.0
+    assert np.linalg.norm(estimate.state.velocity_mps) < 1e-3
+    np.testing.assert_allclose(estimate.state.gyro_bias_radps, [0.004, 0.0, -0.003], atol=1e-5)

@@ -1,0 +1,172 @@
+"""How the filter begins, on analytic motion and at rest."""
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, se3_exp, so3_exp
+from fleetmap.odometry.filter.msckf import InvariantFilter
+from fleetmap.odometry.init.filter_initialization import start_in_motion, start_steady
+from fleetmap.odometry.settings import FilterSettings, StartSettings
+from fleetmap.sensors.samples import ImuSamples, Trajectory
+from support.worlds.inertial_motion import analytic_motion
+from support.worlds.point_world import BODY_FROM_CAM, CAMERA, NOISE, noisy_imu
+
+SETTINGS, FILTER = StartSettings(), FilterSettings()
+GYRO_BIAS = np.array([0.02, -0.015, 0.01])
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def at_rest(rng: np.random.Generator, odom_from_body: Array, accel_bias: Array, duration_s: float = 2.0) -> ImuSamples:
+    count = round(duration_s * 200)
+    force = odom_from_body.T @ np.array([0, 0, 9.81]) + accel_bias
+    return ImuSamples(
+        np.arange(count) * 5_000_000,
+        GYRO_BIAS + 0.005 * rng.normal(size=(count, 3)),
+        force + 0.05 * rng.normal(size=(count, 3)),
+    )
+
+
+def means_agree(window: ImuSamples) -> bool:
+    """The rule of a steady window, by numpy."""
+    parts = [np.hstack([window.gyro_radps, window.accel_mps2])[k] for k in np.array_split(np.arange(len(window)), 10)]
+    means = np.array([part.mean(axis=0) for part in parts])
+    spread, mean = means.std(axis=0), means.mean(axis=0)
+    return bool(
+        spread[:3].max() < SETTINGS.steady_gyro_sigma_radps
+        and spread[3:].max() < SETTINGS.steady_accel_sigma_mps2
+        and np.linalg.norm(mean[:3]) < SETTINGS.steady_gyro_mean_radps
+        and abs(np.linalg.norm(mean[3:]) - 9.81) < SETTINGS.max_gravity_error_mps2
+    )
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_latest_steady_window_is_found(seed: int) -> None:
+    """Rest with jolts of growing size: where all windows are steady, the last one counts, else the latest that is."""
+    rng = np.random.default_rng(seed)
+    imu = at_rest(rng, np.eye(4)[:3, :3], np.zeros(3), duration_s=4.0)
+    for at in rng.integers(400, 800, 3):
+        imu.gyro_radps[at : at + 20] += rng.normal(0, 0.02 * (1 + seed), 3)
+        imu.accel_mps2[at : at + 20] += rng.normal(0, 0.1 * (1 + seed), 3)
+    until_ns, window_ns = int(imu.stamps_ns[-1]), 800_000_000
+    ends = [until_ns - k * window_ns // 4 for k in range(17)]
+    steady = [end for end in ends if end >= window_ns and means_agree(imu.between(end - window_ns, end))]
+    start = start_steady(imu, until_ns, SETTINGS, FILTER)
+    assert (None if start is None else start.stamp_ns) == (max(steady) if steady else None)
+
+
+def test_shaken_all_the_time_there_is_no_start() -> None:
+    imu = at_rest(np.random.default_rng(4), np.eye(3), np.zeros(3))
+    wave = np.sin(np.arange(len(imu)) / 9.0)[:, None] * np.array([0.3, 0.0, 0.0])
+    shaken = ImuSamples(imu.stamps_ns, imu.gyro_radps + wave, imu.accel_mps2)
+    assert start_steady(shaken, int(imu.stamps_ns[-1]), SETTINGS, FILTER) is None
+
+
+def angle_deg(a: Array, b: Array) -> float:
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+
+
+@pytest.mark.parametrize("tilt", [[0.0, 0.0, 0.0], [0.4, -0.2, 1.0], [np.pi / 2, 0.0, 0.0], [3.0, 0.3, 0.0]])
+def test_rest_tells_gravity_and_gyro_bias(tilt: list[float]) -> None:
+    rotation = so3_exp(np.array(tilt))
+    imu = at_rest(np.random.default_rng(1), rotation, np.zeros(3))
+    start = start_steady(imu, int(imu.stamps_ns[-1]), SETTINGS, FILTER)
+    assert start is not None
+    assert angle_deg(start.state.rotation.T @ DOWN, rotation.T @ DOWN) < 0.1
+    np.testing.assert_allclose(start.state.gyro_bias_radps, GYRO_BIAS, atol=1.5e-3)
+    assert (start.state.velocity_mps == 0).all()
+    assert start.stamp_ns <= imu.stamps_ns[-1]
+    np.linalg.cholesky(start.covariance + 1e-15 * np.eye(15))
+
+
+def test_learning_the_accelerometer_bias_sets_the_tilt_right() -> None:
+    """At rest bias and tilt cannot be told apart; the covariance must know, so that a measured bias corrects the tilt."""
+    rotation, accel_bias = so3_exp(np.array([0.3, -0.2, 0.5])), np.array([0.1, -0.08, 0.05])
+    imu = at_rest(np.random.default_rng(2), rotation, accel_bias)
+    start = start_steady(imu, int(imu.stamps_ns[-1]), SETTINGS, FILTER)
+    assert start is not None
+    before = angle_deg(start.state.rotation.T @ DOWN, rotation.T @ DOWN)
+    assert before > 0.4
+    estimate = InvariantFilter(start.state, start.covariance, FILTER, CAMERA, BODY_FROM_CAM)
+    jacobian = np.zeros((3, 16))
+    jacobian[:, 12:15] = np.eye(3)
+    estimate.correct_with(jacobian, accel_bias - estimate.state.accel_bias_mps2, 1e-8 * np.eye(3))
+    assert angle_deg(estimate.state.rotation.T @ DOWN, rotation.T @ DOWN) < 0.05
+
+
+def test_the_latest_steady_window_counts() -> None:
+    """Rest for two seconds, then motion: the start lies at the end of the rest."""
+    rng = np.random.default_rng(3)
+    rest = at_rest(rng, np.eye(3), np.zeros(3))
+    moving = noisy_imu(rng, 1.5, NOISE, GYRO_BIAS, np.zeros(3))
+    both = ImuSamples(
+        np.concatenate([rest.stamps_ns, rest.stamps_ns[-1] + 5_000_000 + moving.stamps_ns]),
+        np.concatenate([rest.gyro_radps, moving.gyro_radps]),
+        np.concatenate([rest.accel_mps2, moving.accel_mps2]),
+    )
+    start = start_steady(both, int(both.stamps_ns[-1]), SETTINGS, FILTER)
+    assert start is not None
+    assert 1.7e9 < start.stamp_ns < 2.1e9
+
+
+def test_motion_is_not_rest() -> None:
+    imu = noisy_imu(np.random.default_rng(4), 2.0, NOISE, np.zeros(3), np.zeros(3))
+    assert start_steady(imu, int(imu.stamps_ns[-1]), SETTINGS, FILTER) is None
+    assert start_steady(ImuSamples.empty(), 10**9, SETTINGS, FILTER) is None
+
+
+def seen_motion(rng: np.random.Generator, sigma_rad: float, sigma_m: float) -> tuple[Trajectory, Array]:
+    """Visual odometry of 20 frames in a frame of its own, tilted and shifted; and old_from_map."""
+    old_from_map = se3_exp(np.array([0.5, -0.8, 0.3, 1.0, 2.0, 3.0]))
+    times_s = 0.2 + 0.1 * np.arange(20)
+    noise = [se3_exp(np.r_[sigma_rad * rng.normal(size=3), sigma_m * rng.normal(size=3)]) for _ in times_s]
+    bodies = [old_from_map @ analytic_motion(t).map_from_body @ n for t, n in zip(times_s, noise, strict=True)]
+    return Trajectory(np.round(times_s * 1e9).astype(np.int64), np.array(bodies)), old_from_map
+
+
+@pytest.mark.parametrize("accel_bias", [np.zeros(3), np.array([0.06, -0.04, 0.05])], ids=["unbiased", "biased"])
+def test_motion_tells_gravity_velocity_and_biases(accel_bias: Array) -> None:
+    rng = np.random.default_rng(5)
+    imu = noisy_imu(rng, 2.5, NOISE, GYRO_BIAS, accel_bias)
+    vision, old_from_map = seen_motion(rng, 3e-4, 1e-3)
+    start = start_in_motion(vision, imu, NOISE, SETTINGS, FILTER)
+    assert start is not None
+    truth = analytic_motion(2.1)
+    assert start.stamp_ns == 2_100_000_000
+    rotation = truth.map_from_body[:3, :3]
+    assert angle_deg(start.state.rotation.T @ DOWN, rotation.T @ DOWN) < (0.45 if accel_bias.any() else 0.3)
+    velocity_body = start.state.rotation.T @ start.state.velocity_mps
+    np.testing.assert_allclose(velocity_body, rotation.T @ truth.velocity_map_mps, atol=0.02)
+    np.testing.assert_allclose(start.state.gyro_bias_radps, GYRO_BIAS, atol=4e-3)
+    # earlier transforms move along: the new frame is the old one, turned so that gravity points down
+    odom_from_map = start.odom_from_old @ old_from_map
+    np.testing.assert_allclose(odom_from_map[:3, :3] @ DOWN, DOWN, atol=0.008)
+    np.testing.assert_allclose(start.odom_from_old @ vision.frame_from_body[-1], start.state.odom_from_body, atol=1e-9)
+
+
+def test_its_covariance_covers_its_error() -> None:
+    """Tilt and velocity of 16 starts from shaky vision: mean normalised errors per dof, for a covariance meant wide."""
+    tilts, speeds = [], []
+    truth = analytic_motion(2.1)
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        imu = noisy_imu(rng, 2.5, NOISE, GYRO_BIAS, 0.04 * rng.normal(size=3))
+        vision, old_from_map = seen_motion(rng, 1e-3, 8e-3)
+        start = start_in_motion(vision, imu, NOISE, SETTINGS, FILTER)
+        assert start is not None
+        tilt = np.cross(DOWN, start.odom_from_old[:3, :3] @ old_from_map[:3, :3] @ DOWN)[:2]
+        tilts.append(tilt @ np.linalg.solve(start.covariance[:2, :2], tilt) / 2)
+        # to first order the velocity error in body axes is the invariant one turned into them
+        rotation = start.state.rotation
+        off = truth.map_from_body[:3, :3].T @ truth.velocity_map_mps - rotation.T @ start.state.velocity_mps
+        speeds.append(off @ np.linalg.solve(rotation.T @ start.covariance[3:6, 3:6] @ rotation, off) / 3)
+    assert 0.02 < np.mean(tilts) < 2.0
+    assert 0.02 < np.mean(speeds) < 2.0
+
+
+def test_gravity_of_the_wrong_size_is_refused() -> None:
+    """An accelerometer that reads four fifths of the truth does not start the filter."""
+    rng = np.random.default_rng(6)
+    imu = noisy_imu(rng, 2.5, NOISE, GYRO_BIAS, np.zeros(3))
+    vision, _ = seen_motion(rng, 0.0, 0.0)
+    weak = ImuSamples(imu.stamps_ns, imu.gyro_radps, 0.8 * imu.accel_mps2)
+    assert start_in_motion(vision, weak, NOISE, SETTINGS, FILTER) is None

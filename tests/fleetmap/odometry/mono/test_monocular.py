@@ -1,0 +1,140 @@
+"""Odometry with one camera on pictures of a painted room: up to scale and labelled, metric with an IMU."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, align_points, transform_points
+from fleetmap.odometry import (
+    MonocularOdometry,
+    Odometry,
+    OdometryEstimate,
+    OdometrySettings,
+    OdometryStatus,
+    make_odometry,
+)
+from fleetmap.odometry.init.mono_inertial_init import start_with_scale
+from fleetmap.odometry.settings import FilterSettings, MonocularSettings, StartSettings
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.samples import Trajectory
+from support.worlds.inertial_motion import analytic_motion
+from support.worlds.point_world import noisy_imu
+from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, rig, stereo_frame
+
+IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
+GYRO_BIAS, ACCEL_BIAS = np.array([0.01, -0.02, 0.015]), np.array([0.03, -0.02, 0.04])
+FRAME_NS = 50_000_000
+SINGLE = replace(CAMERA, baseline_m=0.0)
+FRAMES = 90
+
+
+def run(imu: ImuNoise | None) -> tuple[list[OdometryEstimate], dict[int, Array]]:
+    """Estimates, and where each frame was in the end (4, 4), revisions included."""
+    calibration = rig(imu)
+    odometry = make_odometry(
+        replace(calibration, cameras=calibration.cameras[:1]), SINGLE, BODY_FROM_CAM, 0.0, OdometrySettings()
+    )
+    assert isinstance(odometry, MonocularOdometry)
+    samples = noisy_imu(np.random.default_rng(1), 6.0, IMU, GYRO_BIAS, ACCEL_BIAS)
+    estimates, placed, fed_ns = [], {}, 0
+    for k in range(1, FRAMES + 1):
+        pair = stereo_frame(k * FRAME_NS)
+        frame = RectifiedFrame(pair.stamp_ns, pair.left, None, None)
+        odometry.handle_imu(samples.between(fed_ns, frame.stamp_ns + 1))
+        fed_ns = frame.stamp_ns + 1
+        estimate = odometry.handle_stereo(frame)
+        placed.update(dict(estimate.revised))
+        placed[estimate.frame_index] = estimate.odom_from_body
+        estimates.append(estimate)
+    return estimates, placed
+
+
+def aligned(placed: dict[int, Array], first: int, *, with_scale: bool) -> tuple[float, float]:
+    """Root mean square error in metres of the frames from `first` on, and the scale of the alignment."""
+    numbers = range(first, FRAMES)
+    estimated = np.array([placed[n][:3, 3] for n in numbers])
+    true = np.array([analytic_motion((n + 1) * FRAME_NS * 1e-9).map_from_body[:3, 3] for n in numbers])
+    there, scale = align_points(true, estimated, with_scale=with_scale)
+    errors = np.linalg.norm(transform_points(there, scale * estimated) - true, axis=1)
+    return float(np.sqrt((errors**2).mean())), scale
+
+
+def test_the_class_goes_by_the_camera() -> None:
+    both = make_odometry(rig(None), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    assert type(both) is Odometry
+
+
+@pytest.mark.slow
+def test_pictures_alone_give_the_way_up_to_scale_and_say_so() -> None:
+    estimates, placed = run(None)
+    assert not any(e.scale_known or e.inertial for e in estimates)
+    began = next(e.frame_index for e in estimates if e.status is OdometryStatus.TRACKING)
+    assert began < 20
+    assert all(e.status is OdometryStatus.TRACKING for e in estimates[began:])
+    rmse_m, scale = aligned(placed, 0, with_scale=True)
+    assert rmse_m < 0.05
+    assert abs(np.log(scale)) > 0.02  # the room's half width is no 5 m: an untold scale is not guessed right
+
+
+@pytest.mark.slow
+def test_an_imu_makes_it_metric() -> None:
+    estimates, placed = run(IMU)
+    metric = next(e.frame_index for e in estimates if e.scale_known)
+    assert metric < 75
+    assert not any(e.scale_known for e in estimates[:metric])
+    assert all(e.scale_known and e.inertial for e in estimates[metric:])
+    assert estimates[metric].revised
+    rmse_m, scale = aligned(placed, 0, with_scale=False)
+    assert rmse_m < 0.08
+    _, scale = aligned(placed, 0, with_scale=True)
+    assert scale == pytest.approx(1.0, abs=0.03)
+    down = placed[FRAMES - 1][:3, :3].T @ np.array([0.0, 0.0, -1.0])
+    true = analytic_motion(FRAMES * FRAME_NS * 1e-9).map_from_body[:3, :3].T @ np.array([0.0, 0.0, -1.0])
+    assert down @ true > np.cos(np.radians(1.0))
+
+
+def vision(times_s: Array, unit_m: float, rng: np.random.Generator) -> Trajectory:
+    """vision_from_cam along the analytic motion, in units of its own and some axes of its own, with a little noise."""
+    odd = analytic_motion(1.234).map_from_body
+    odd[:3, 3] = 0
+    cams = np.array([odd @ analytic_motion(float(t)).map_from_body @ BODY_FROM_CAM for t in times_s])
+    cams[:, :3, 3] = (cams[:, :3, 3] + 0.002 * rng.normal(size=(len(cams), 3))) / unit_m
+    return Trajectory(np.round(times_s * 1e9).astype(np.int64), cams)
+
+
+@pytest.mark.parametrize("unit_m", [0.4, 2.5])
+def test_the_start_finds_scale_gravity_and_speed(unit_m: float) -> None:
+    rng = np.random.default_rng(3)
+    imu = noisy_imu(rng, 6.0, IMU, GYRO_BIAS, ACCEL_BIAS)
+    times_s = np.arange(0.5, 4.5, 0.2)
+    found = start_with_scale(
+        vision(times_s, unit_m, rng), imu, IMU, BODY_FROM_CAM, MonocularSettings(), StartSettings(), FilterSettings()
+    )
+    assert found is not None
+    assert found.metres_per_unit == pytest.approx(unit_m, rel=0.04)  # noise of the places hides some of the way
+    assert abs(found.metres_per_unit / unit_m - 1) < 4 * found.scale_sigma_share
+    true = analytic_motion(float(times_s[-1]))
+    up = found.start.state.rotation.T @ np.array([0.0, 0.0, 1.0])
+    assert up @ true.map_from_body[:3, :3].T @ np.array([0.0, 0.0, 1.0]) > np.cos(np.radians(0.8))
+    assert found.start.state.gyro_bias_radps == pytest.approx(GYRO_BIAS, abs=0.003)
+    speed = np.linalg.norm(found.start.state.velocity_mps)
+    assert speed == pytest.approx(np.linalg.norm(true.velocity_map_mps), rel=0.05)
+
+
+def test_a_steady_way_shows_no_scale() -> None:
+    """Constant speed without turns: every scale fits with its own bias, so there is no start."""
+    times_s = np.arange(0.0, 4.0, 0.2)
+    cams = np.tile(np.eye(4), (len(times_s), 1, 1)) @ BODY_FROM_CAM
+    cams[:, 0, 3] += 0.6 * times_s / 1.7
+    rng = np.random.default_rng(2)
+    cams[:, :3, 3] += 0.001 * rng.normal(size=(len(cams), 3))
+    samples = noisy_imu(rng, 5.0, IMU, np.zeros(3), np.zeros(3))
+    level = np.tile([0.0, 0.0, 9.81], (len(samples), 1)) + 0.02 * rng.normal(size=(len(samples), 3))
+    still = replace(samples, gyro_radps=1e-3 * rng.normal(size=level.shape), accel_mps2=level)
+    found = start_with_scale(
+        Trajectory(np.round(times_s * 1e9).astype(np.int64), cams), still, IMU, BODY_FROM_CAM, MonocularSettings(),
+        StartSettings(), FilterSettings(),
+    )  # fmt: skip
+    assert found is None

@@ -1,0 +1,175 @@
+"""The camera resection against OpenCV, numeric derivatives and Monte-Carlo scatter."""
+
+import cv2
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, rotation_angle_rad, se3_exp, se3_inverse, se3_log, transform_points
+from fleetmap.pnp.pnp import ransac_resection, refine_resection, resection_with_rotation
+from fleetmap.pnp.pnp_kernels import linearize
+from fleetmap.sensors.rectification import StereoCamera
+
+CAMERA = StereoCamera(400.0, 320.0, 240.0, 0.12, 640, 480)
+CAM_FROM_MAP = se3_exp(np.array([0.3, -1.2, 0.5, 1.0, -2.0, 0.7]))
+SIGMAS_PX = (0.5, 0.3)  # of u and v, of the disparity
+
+
+def seen(rng: np.random.Generator, count: int, *, noise: float = 0.0) -> tuple[Array, Array, Array]:
+    """points_map (N, 3), pixels (N, 3) and sigmas (N, 2) of points in view."""
+    depth = rng.uniform(1.5, 8.0, count)
+    points_cam = np.column_stack([rng.uniform(-0.7, 0.7, (count, 2)) * [1.0, 0.75] * depth[:, None], depth])
+    pixels = CAMERA.pixel_from_point(points_cam)
+    disparity = pixels[:, 0] - pixels[:, 2] + noise * SIGMAS_PX[1] * rng.normal(size=count)
+    pixels[:, :2] += noise * SIGMAS_PX[0] * rng.normal(size=(count, 2))
+    pixels[:, 2] = pixels[:, 0] - disparity
+    return transform_points(se3_inverse(CAM_FROM_MAP), points_cam), pixels, np.tile(SIGMAS_PX, (count, 1))
+
+
+def error(cam_from_map: Array) -> Array:
+    return se3_log(CAM_FROM_MAP @ se3_inverse(cam_from_map))
+
+
+def test_clean_data_gives_the_camera_and_agrees_with_opencv() -> None:
+    points, pixels, sigmas = seen(np.random.default_rng(1), 40)
+    start = se3_exp(np.array([0.1, -0.1, 0.08, 0.2, -0.3, 0.2])) @ CAM_FROM_MAP
+    found = refine_resection(CAMERA, points, pixels, sigmas, start)
+    assert found is not None
+    assert found.inliers.all()
+    np.testing.assert_allclose(error(found.cam_from_source), 0, atol=1e-6)
+    solved, rotvec, translation = cv2.solvePnP(points, pixels[:, :2].copy(), CAMERA.matrix, np.zeros(4))
+    assert solved
+    np.testing.assert_allclose(found.cam_from_source[:3, :3], cv2.Rodrigues(rotvec)[0], atol=1e-5)
+    np.testing.assert_allclose(found.cam_from_source[:3, 3], translation.ravel(), atol=1e-5)
+
+
+def test_without_disparities_it_still_solves() -> None:
+    points, pixels, sigmas = seen(np.random.default_rng(2), 30)
+    pixels[:, 2] = np.nan
+    found = refine_resection(CAMERA, points, pixels, sigmas, se3_exp(np.full(6, 0.05)) @ CAM_FROM_MAP)
+    assert found is not None
+    np.testing.assert_allclose(error(found.cam_from_source), 0, atol=1e-6)
+
+
+def test_gradient_and_hessian_agree_with_numeric_derivatives() -> None:
+    rng = np.random.default_rng(3)
+    points, pixels, sigmas = seen(rng, 12, noise=3.0)
+    pixels[3, 2] = np.nan
+    intrinsics = np.array([CAMERA.focal_px, CAMERA.cx_px, CAMERA.cy_px, CAMERA.focal_px * CAMERA.baseline_m])
+
+    def at(rot_trans: Array, width: float) -> tuple[float, Array, Array]:
+        cam_from_map = se3_exp(rot_trans) @ CAM_FROM_MAP
+        hessian, gradient, squared = np.empty((6, 6)), np.empty(6), np.empty(len(points))
+        cost = linearize(
+            cam_from_map[:3, :3].copy(), cam_from_map[:3, 3].copy(), points, pixels, 1 / sigmas, intrinsics, width,
+            hessian, gradient, squared,
+        )  # fmt: skip
+        return cost, gradient, hessian
+
+    step = 1e-5
+    numeric = [(at(d, 4.0)[0] - at(-d, 4.0)[0]) / (2 * step) for d in step * np.eye(6)]
+    np.testing.assert_allclose(-at(np.zeros(6), 4.0)[1], numeric, rtol=1e-4, atol=1e-3)
+    # on clean pixels and without robust weight the Gauss-Newton Hessian is the cost's own
+    pixels[:] = np.where(np.isnan(pixels), np.nan, CAMERA.pixel_from_point(transform_points(CAM_FROM_MAP, points)))
+    curvature = [-(at(d, 1e6)[1] - at(-d, 1e6)[1]) / (2 * step) for d in step * np.eye(6)]
+    hessian = at(np.zeros(6), 1e6)[2]
+    np.testing.assert_allclose(np.array(curvature), hessian, rtol=1e-4, atol=1e-5 * np.abs(hessian).max())
+
+
+def test_covariance_is_the_scatter_of_many_solutions() -> None:
+    """Mean normalised error squared per dof of 150 solutions, 900 dof.
+
+    The robust weight of good residuals is 0.75 on average, so the covariance is that much too wide; never too narrow.
+    """
+    rng = np.random.default_rng(4)
+    nees = []
+    for _ in range(150):
+        points, pixels, sigmas = seen(rng, 40, noise=1.0)
+        found = refine_resection(CAMERA, points, pixels, sigmas, CAM_FROM_MAP)
+        assert found is not None
+        off = error(found.cam_from_source)
+        nees.append(off @ np.linalg.solve(found.cov_rot_trans, off) / 6)
+    assert 0.65 < np.mean(nees) < 1.1
+
+
+def test_gross_outliers_do_not_pull() -> None:
+    rng = np.random.default_rng(5)
+    points, pixels, sigmas = seen(rng, 60, noise=1.0)
+    pixels[:18, :2] += rng.uniform(20, 60, (18, 2))
+    found = refine_resection(CAMERA, points, pixels, sigmas, se3_exp(np.full(6, 0.01)) @ CAM_FROM_MAP)
+    assert found is not None
+    assert not found.inliers[:18].any()
+    assert found.inliers[18:].mean() > 0.9
+    assert np.linalg.norm(error(found.cam_from_source)[3:]) < 0.02
+
+
+def test_ransac_needs_no_start() -> None:
+    rng = np.random.default_rng(6)
+    points, pixels, sigmas = seen(rng, 60, noise=1.0)
+    points[:24] = rng.permutation(points[:24])
+    found = ransac_resection(CAMERA, points, pixels, sigmas, threshold_px=2.0, min_inliers=12, seed=1)
+    assert found is not None
+    assert found.inliers[24:].mean() > 0.9
+    assert np.linalg.norm(error(found.cam_from_source)[3:]) < 0.03
+    again = ransac_resection(CAMERA, points, pixels, sigmas, threshold_px=2.0, min_inliers=12, seed=1)
+    assert again is not None
+    np.testing.assert_array_equal(again.cam_from_source, found.cam_from_source)
+
+
+def test_known_rotation_survives_70_percent_outliers() -> None:
+    rng = np.random.default_rng(7)
+    points, pixels, sigmas = seen(rng, 60, noise=1.0)
+    wrong = 42
+    pixels[:wrong, 0], pixels[:wrong, 1] = rng.uniform(0, 640, wrong), rng.uniform(0, 480, wrong)
+    pixels[:wrong, 2] = pixels[:wrong, 0] - rng.uniform(5, 40, wrong)
+    nearly = se3_exp(np.array([0.004, -0.003, 0.005, 0, 0, 0]))[:3, :3] @ CAM_FROM_MAP[:3, :3]
+    found = resection_with_rotation(
+        CAMERA, points, pixels, sigmas, nearly, threshold_px=8.0, min_inliers=8, rotation_sigma_rad=0.01
+    )
+    assert found is not None
+    assert found.inliers[wrong:].mean() > 0.85
+    assert found.inliers[:wrong].mean() < 0.1
+    assert np.linalg.norm(error(found.cam_from_source)[3:]) < 0.03
+    assert np.linalg.norm(error(found.cam_from_source)[:3]) < 0.004
+
+
+@pytest.mark.parametrize("sigma_rad", [1e-5, 0.1])
+def test_known_rotation_is_held_as_firmly_as_it_says(sigma_rad: float) -> None:
+    points, pixels, sigmas = seen(np.random.default_rng(11), 30)
+    given = se3_exp(np.array([0.004, 0, 0, 0, 0, 0]))[:3, :3] @ CAM_FROM_MAP[:3, :3]
+    found = resection_with_rotation(
+        CAMERA, points, pixels, sigmas, given, threshold_px=8.0, min_inliers=8, rotation_sigma_rad=sigma_rad
+    )
+    assert found is not None
+    turned = rotation_angle_rad(found.cam_from_source[:3, :3] @ given.T)
+    assert turned < 0.001 if sigma_rad < 0.01 else turned == pytest.approx(0.004, abs=1e-4)
+
+
+def test_nothing_that_agrees_gives_nothing() -> None:
+    rng = np.random.default_rng(8)
+    points, pixels, sigmas = seen(rng, 40)
+    points = rng.uniform(-3, 3, points.shape)
+    rotation = CAM_FROM_MAP[:3, :3]
+    assert ransac_resection(CAMERA, points, pixels, sigmas, threshold_px=2.0, min_inliers=12, seed=1) is None
+    assert (
+        resection_with_rotation(
+            CAMERA, points, pixels, sigmas, rotation, threshold_px=4.0, min_inliers=12, rotation_sigma_rad=0.01
+        )
+        is None
+    )
+    empty = np.zeros((0, 3))
+    assert refine_resection(CAMERA, empty, empty, np.zeros((0, 2)), CAM_FROM_MAP) is None
+    behind = transform_points(se3_inverse(CAM_FROM_MAP), np.array([[0.0, 0.0, -2.0]] * 5))
+    found = refine_resection(CAMERA, behind, np.ones((5, 3)), np.ones((5, 2)), CAM_FROM_MAP)
+    assert found is None
+
+
+@pytest.mark.parametrize("sigma_rad", [1e-4, 10.0])
+def test_prior_holds_the_start_as_firmly_as_it_says(sigma_rad: float) -> None:
+    points, pixels, sigmas = seen(np.random.default_rng(9), 40)
+    start = se3_exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0])) @ CAM_FROM_MAP
+    prior = np.zeros((6, 6))
+    prior[:3, :3] = np.eye(3) / sigma_rad**2
+    found = refine_resection(CAMERA, points, pixels, sigmas, start, prior)
+    assert found is not None
+    turned = np.linalg.norm(se3_log(found.cam_from_source @ se3_inverse(start))[:3])
+    assert turned < 0.01 if sigma_rad < 1 else turned == pytest.approx(0.02, abs=1e-4)

@@ -1,0 +1,347 @@
+"""MCAP: what other people's readers see in our files, and what ours sees in theirs."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap_ros2.decoder import DecoderFactory
+
+from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.geometry import se3, se3_exp, so3_exp
+from fleetmap.recordings import OpenOptions, Recording, Topics, open_recording
+from fleetmap.recordings.images import StoredFrame, StoredImage
+from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from fleetmap.recordings.ros2 import messages as ros_messages
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import CameraFrame, PositionPrior, SensorSet, Trajectory, WheelSample
+from support.recordings.mcap_samples import IMU, SAMPLE, Message, foreign_messages, write_foreign
+from support.recordings.recording_samples import BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH, calibration, kalibr_text
+
+WHEEL = WheelSample(int(SAMPLE.stamps_ns[1]), np.array([0.5, 0.01, 0.0]), 0.25, 0.02, 0.03)
+PRIOR = PositionPrior(
+    int(SAMPLE.stamps_ns[0]),
+    se3(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([1.0, 2.0, 0.0])),
+    np.diag([np.inf, np.inf, 0.1, 0.04, 0.05, np.inf]),
+)
+TRUTH = Trajectory(SAMPLE.stamps_ns, np.stack(SAMPLE.world_from_body))
+
+
+def write(path: Path, **keywords: Any) -> Path:
+    with McapRecordingWriter(path, keywords.pop("calibration", calibration()), **keywords) as writer:
+        writer.write_imu(IMU)
+        writer.write_wheel(WHEEL)
+        writer.write_prior([PRIOR])
+        writer.write_ground_truth(TRUTH)
+        for stamp, left, right in zip(SAMPLE.stamps_ns.tolist(), SAMPLE.left, SAMPLE.right, strict=True):
+            writer.write_frame(CameraFrame(stamp, left, right))
+    return path
+
+
+def test_all_that_is_written_is_read(tmp_path: Path) -> None:
+    with open_recording(write(tmp_path / "a.mcap", name="aisle")) as recording:
+        assert (recording.name, recording.format, recording.losses) == ("aisle", "mcap", ())
+        assert recording.sensor_set is SensorSet.STEREO_INERTIAL
+        np.testing.assert_array_equal(recording.read_frame(2).left, SAMPLE.left[2])
+        np.testing.assert_array_equal(recording.read_frame(0).right, SAMPLE.right[0])
+        np.testing.assert_array_equal(recording.imu.accel_mps2, IMU.accel_mps2)
+        np.testing.assert_array_equal(recording.imu.stamps_ns, IMU.stamps_ns)
+        (wheel,) = recording.wheel
+        np.testing.assert_array_equal(wheel.velocity_base_mps, WHEEL.velocity_base_mps)
+        assert (wheel.stamp_ns, wheel.yaw_rate_radps) == (WHEEL.stamp_ns, WHEEL.yaw_rate_radps)
+        assert (wheel.sigma_mps, wheel.sigma_radps) == pytest.approx((WHEEL.sigma_mps, WHEEL.sigma_radps))
+        (prior,) = recording.priors
+        np.testing.assert_allclose(prior.map_from_base, PRIOR.map_from_base, atol=1e-12)
+        np.testing.assert_array_equal(prior.cov_rot_trans, PRIOR.cov_rot_trans)
+        assert recording.ground_truth is not None
+        np.testing.assert_allclose(recording.ground_truth.frame_from_body, TRUTH.frame_from_body, atol=1e-12)
+
+
+def test_equal_calls_make_equal_bytes(tmp_path: Path) -> None:
+    assert write(tmp_path / "a.mcap", name="n").read_bytes() == write(tmp_path / "b.mcap", name="n").read_bytes()
+
+
+def test_nothing_is_left_of_a_recording_that_was_not_finished(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), McapRecordingWriter(tmp_path / "a.mcap", calibration()) as writer:
+        writer.write_imu(IMU)
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="cannot be written"):
+        McapRecordingWriter(tmp_path / "no" / "a.mcap", calibration())
+
+
+def test_encoded_images_keep_their_bytes(tmp_path: Path) -> None:
+    jpeg = cv2.imencode(".jpg", SAMPLE.left[0])[1].tobytes()
+    png = cv2.imencode(".png", SAMPLE.right[0])[1].tobytes()
+    with McapRecordingWriter(tmp_path / "a.mcap", calibration()) as writer:
+        writer.write_frame(StoredFrame(5, StoredImage("file", jpeg), StoredImage("file", png)))
+    stored = open_recording(tmp_path / "a.mcap").stored_frame(0)
+    assert stored.right is not None
+    assert (stored.left.data, stored.right.data) == (jpeg, png)
+
+
+def decoded(path: Path) -> Iterator[tuple[str, str, Any]]:
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        assert reader.get_header().profile == "ros2"
+        for schema, channel, _, message in reader.iter_decoded_messages():
+            assert schema is not None
+            assert (schema.encoding, channel.message_encoding) == ("ros2msg", "cdr")
+            yield channel.topic, schema.name, message
+
+
+def test_the_ros_2_decoder_of_others_reads_every_message(tmp_path: Path) -> None:
+    seen: dict[str, Any] = {}
+    for topic, name, message in decoded(write(tmp_path / "a.mcap")):
+        seen.setdefault(topic, (name, message))
+    name, image = seen["/cam1/image_raw"]
+    assert name == "sensor_msgs/msg/Image"
+    assert (image.width, image.height, image.encoding, image.step) == (WIDTH, HEIGHT, "mono8", WIDTH)
+    assert bytes(image.data) == SAMPLE.right[0].tobytes()
+    assert image.header.stamp.sec * 10**9 + image.header.stamp.nanosec == SAMPLE.stamps_ns[0]
+    _, info = seen["/cam0/camera_info"]
+    assert (info.distortion_model, len(info.d), info.width, info.k[0]) == ("plumb_bob", 5, WIDTH, FOCAL)
+    _, imu = seen["/imu0"]
+    assert (imu.angular_velocity.y, imu.linear_acceleration.z) == (IMU.gyro_radps[0, 1], IMU.accel_mps2[0, 2])
+    assert imu.orientation_covariance[0] == -1
+    _, odometry = seen["/odom"]
+    assert (odometry.twist.twist.linear.x, odometry.twist.twist.angular.z) == (0.5, 0.25)
+    assert odometry.twist.covariance[35] == pytest.approx(0.03**2)
+    _, prior = seen["/prior"]
+    assert prior.pose.pose.orientation.z == pytest.approx(np.sin(0.35))
+    assert (prior.pose.covariance[0], prior.pose.covariance[35]) == (0.04, 0.1)  # x, yaw
+    _, truth = seen["/ground_truth"]
+    assert truth.pose.position.x == TRUTH.frame_from_body[0, 0, 3]
+    name, tf = seen["/tf_static"]
+    assert name == "tf2_msgs/msg/TFMessage"
+    assert [(t.header.frame_id, t.child_frame_id) for t in tf.transforms] == [
+        ("body", "cam0"),
+        ("body", "cam1"),
+        ("base", "body"),
+    ]
+    assert tf.transforms[0].transform.translation.x == BODY_FROM_CAM0[0, 3]
+
+
+def assert_is_the_sample(recording: Recording) -> None:
+    np.testing.assert_array_equal(recording.frame_stamps_ns, SAMPLE.stamps_ns)
+    np.testing.assert_array_equal(recording.imu.gyro_radps, IMU.gyro_radps)
+    for index in (3, 0, 1):
+        frame = recording.read_frame(index)
+        np.testing.assert_array_equal(frame.left, SAMPLE.left[index])
+        np.testing.assert_array_equal(frame.right, SAMPLE.right[index])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": CompressionType.ZSTD},
+        {"compression": CompressionType.LZ4},
+        {"use_chunking": False},
+        {"use_summary_offsets": False, "use_statistics": False, "repeat_channels": False, "repeat_schemas": False},
+        {"enable_crcs": False},
+    ],
+    ids=["zstd", "lz4", "unchunked", "no summary", "no checksums"],
+)
+def test_all_ways_to_store_it(tmp_path: Path, options: dict[str, Any]) -> None:
+    with open_recording(write_foreign(tmp_path / "a.mcap", foreign_messages(), **options)) as recording:
+        assert recording.losses == ()
+        assert_is_the_sample(recording)
+
+
+def test_calibration_by_camera_info_and_transforms(tmp_path: Path) -> None:
+    recording = open_recording(write_foreign(tmp_path / "a.mcap", foreign_messages()))
+    assert recording.calibration.imu is not None
+    for ours, wanted in zip(recording.calibration.cameras, calibration().cameras, strict=True):
+        np.testing.assert_allclose(ours.body_from_cam, wanted.body_from_cam, atol=1e-9)
+        np.testing.assert_array_equal(ours.intrinsics_px, wanted.intrinsics_px)
+    base_from_imu = se3_exp(np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]))
+    np.testing.assert_allclose(recording.calibration.base_from_body, base_from_imu, atol=1e-9)
+
+
+def test_no_transform_to_the_imu_nor_between_cameras(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"where the right camera sits.*--calibration"):
+        open_recording(write_foreign(tmp_path / "a.mcap", foreign_messages(tf=False)))
+
+
+def test_topics_by_their_type_and_name(tmp_path: Path) -> None:
+    messages = foreign_messages(left="/camera/left/image_raw", right="/camera/right/image_raw", imu="/sensors/imu")
+    with open_recording(write_foreign(tmp_path / "a.mcap", messages)) as recording:
+        assert_is_the_sample(recording)
+
+
+def test_topics_that_leave_a_choice(tmp_path: Path) -> None:
+    messages = foreign_messages(left="/a/image", right="/b/image")
+    path = write_foreign(tmp_path / "a.mcap", messages)
+    with pytest.raises(RecordingError, match=r"no topic is clearly the left image.*/a/image"):
+        open_recording(path)
+    with open_recording(path, OpenOptions(topics=Topics(left="/a/image", right="/b/image"))) as recording:
+        assert_is_the_sample(recording)
+    with pytest.raises(RecordingError, match=r"has no topic /c/image.*/b/image"):
+        open_recording(path, OpenOptions(topics=Topics(left="/c/image")))
+
+
+def test_two_imus_are_not_guessed(tmp_path: Path) -> None:
+    imu = ros_messages.encode_imu(5, "x", np.zeros(3), np.ones(3))
+    messages = [*foreign_messages(imu="/imu/a"), ("/imu/b", "sensor_msgs/Imu", 5, imu)]
+    recording = open_recording(write_foreign(tmp_path / "a.mcap", messages))
+    assert recording.sensor_set is SensorSet.STEREO
+    assert any(loss.what == "imu not chosen" and "/imu/a, /imu/b" in loss.detail for loss in recording.losses)
+
+
+def test_topics_noted_in_the_calibration_file(tmp_path: Path) -> None:
+    text = kalibr_text().replace("/cam0/image_raw", "/a/image").replace("/cam1/image_raw", "/b/image")
+    (tmp_path / "rig.yaml").write_text(text)
+    path = write_foreign(tmp_path / "a.mcap", foreign_messages(left="/a/image", right="/b/image", tf=False))
+    with open_recording(path, OpenOptions(calibration_file=tmp_path / "rig.yaml")) as recording:
+        assert_is_the_sample(recording)
+
+
+def camera_info(lens: str, distortion: list[float]) -> bytes:
+    """sensor_msgs/CameraInfo built by another CDR writer than ours."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = store.types
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 7), "cam0_optical")
+    k = np.array([FOCAL, 0, WIDTH / 2, 0, FOCAL, HEIGHT / 2, 0, 0, 1.0])
+    p = np.array([FOCAL, 0, WIDTH / 2, 0, 0, FOCAL, HEIGHT / 2, 0, 0, 0, 1.0, 0])
+    roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    message = types["sensor_msgs/msg/CameraInfo"](
+        header, HEIGHT, WIDTH, lens, np.array(distortion), k, np.eye(3).ravel(), p, 0, 0, roi
+    )
+    return bytes(store.serialize_cdr(message, "sensor_msgs/msg/CameraInfo"))
+
+
+def mono(tmp_path: Path, info: bytes) -> Recording:
+    messages = [m for m in foreign_messages() if m[0] == "/cam0/image_raw"]
+    return open_recording(
+        write_foreign(tmp_path / "a.mcap", [*messages, ("/cam0/camera_info", "sensor_msgs/CameraInfo", 1, info)])
+    )
+
+
+@pytest.mark.parametrize(
+    ("lens", "distortion", "model", "kept"),
+    [
+        ("plumb_bob", [0.1, 0.2, 0.0, 0.0, 0.05], "radial-tangential", 5),
+        ("plumb_bob", [0.0] * 5, "radial-tangential", 0),
+        ("equidistant", [0.1, 0.2, 0.0, 0.01], "equidistant", 4),
+        ("rational_polynomial", [0.1, 0.2, 0.0, 0.0, 0.05, 0.0, 0.0, 0.0], "radial-tangential", 5),
+        ("", [], "radial-tangential", 0),
+    ],
+)
+def test_lenses(tmp_path: Path, lens: str, distortion: list[float], model: str, kept: int) -> None:
+    recording = mono(tmp_path, camera_info(lens, distortion))
+    camera = recording.calibration.cameras[0]
+    assert (recording.sensor_set, camera.model) == (SensorSet.MONO, model)
+    assert camera.distortion.tolist() == distortion[:kept]
+
+
+def test_a_rational_lens_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"rational_polynomial.*not supported.*--calibration"):
+        mono(tmp_path, camera_info("rational_polynomial", [0.1] * 8))
+
+
+def test_images_of_every_encoding(tmp_path: Path) -> None:
+    grey = SAMPLE.left[0]
+    colour = cv2.merge([grey, grey // 2, 255 - grey])
+    wanted = cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY)
+    padded = np.zeros((HEIGHT, WIDTH + 12), np.uint8)
+    padded[:, :WIDTH] = grey
+    cases = [
+        (StoredImage("bgr8", colour.tobytes(), "", WIDTH, HEIGHT, 3 * WIDTH), wanted),
+        (StoredImage("rgb8", colour[..., ::-1].tobytes(), "", WIDTH, HEIGHT, 3 * WIDTH), wanted),
+        (StoredImage("mono16", (grey.astype("<u2") * 256).tobytes(), "", WIDTH, HEIGHT, 2 * WIDTH), grey),
+        (
+            StoredImage(
+                "mono16", (grey.astype(np.uint16) * 256).astype(">u2").tobytes(), "", WIDTH, HEIGHT, 2 * WIDTH, True
+            ),
+            grey,
+        ),
+        (StoredImage("mono8", padded.tobytes(), "", WIDTH, HEIGHT, WIDTH + 12), grey),
+    ]
+    messages: list[Message] = [("/cam0/camera_info", "sensor_msgs/CameraInfo", 1, camera_info("", []))]
+    for stamp, (image, _) in enumerate(cases, start=1):
+        messages.append(("/cam0/image_raw", "sensor_msgs/Image", stamp, ros_messages.encode_image(stamp, "c", image)))
+    recording = open_recording(write_foreign(tmp_path / "a.mcap", messages))
+    for index, (_, expected) in enumerate(cases):
+        np.testing.assert_array_equal(recording.read_frame(index).left, expected)
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1", "png"])
+def test_depth_beside_colour(tmp_path: Path, encoding: str) -> None:
+    depth_mm = np.full((HEIGHT, WIDTH), 2500, np.uint16)
+    depth_mm[:5], depth_mm[5:9] = 0, 65535
+    if encoding == "png":
+        name, data = "sensor_msgs/CompressedImage", cv2.imencode(".png", depth_mm)[1].tobytes()
+        message = ros_messages.encode_compressed_image(10, "c", StoredImage("file", data), "16UC1; png compressed")
+    else:
+        pixels = depth_mm if encoding == "16UC1" else np.where(depth_mm == 2500, np.float32(2.5), np.float32(np.nan))
+        rows = StoredImage(encoding, pixels.tobytes(), "", WIDTH, HEIGHT, pixels.strides[0])
+        name, message = "sensor_msgs/Image", ros_messages.encode_image(10, "c", rows)
+    left = StoredImage("mono8", SAMPLE.left[0].tobytes(), "", WIDTH, HEIGHT, WIDTH)
+    topic = "/depth/image_raw" + ("/compressed" if encoding == "png" else "")
+    recording = open_recording(
+        write_foreign(
+            tmp_path / "a.mcap",
+            [
+                ("/cam0/image_raw", "sensor_msgs/Image", 5, ros_messages.encode_image(5, "c", left)),
+                (topic, name, 10, message),
+                ("/cam0/camera_info", "sensor_msgs/CameraInfo", 1, camera_info("", [])),
+            ],
+        )
+    )
+    assert recording.sensor_set is SensorSet.RGBD
+    depth = recording.read_frame(0).depth_m
+    assert depth is not None
+    np.testing.assert_array_equal(depth, np.where(depth_mm == 2500, np.float32(2.5), np.float32(0)))
+
+
+def test_rosbags_reads_what_we_write(tmp_path: Path) -> None:
+    """An independent implementation of CDR and of the ROS 2 types."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    write(tmp_path / "a.mcap")
+    with (tmp_path / "a.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
+            value: Any = store.deserialize_cdr(message.data, schema.name)
+            again = store.serialize_cdr(value, schema.name)
+            assert bytes(again) == message.data, channel.topic
+
+
+def test_base_and_time_shift_travel(tmp_path: Path) -> None:
+    rig = calibration()
+    rig = RigCalibration(
+        tuple(replace(c, imu_minus_cam_s=0.0123) for c in rig.cameras), rig.imu, se3_exp(np.arange(6) / 10.0)
+    )
+    recording = open_recording(write(tmp_path / "a.mcap", calibration=rig))
+    np.testing.assert_array_equal(recording.calibration.base_from_body, rig.base_from_body)
+    assert [c.imu_minus_cam_s for c in recording.calibration.cameras] == [0.0123, 0.0123]
+
+
+def test_a_rosbag2_folder(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    write_foreign(bag / "bag_0.mcap", foreign_messages())
+    with open_recording(bag) as recording:
+        assert_is_the_sample(recording)
+    write_foreign(bag / "bag_1.mcap", foreign_messages())
+    with pytest.raises(RecordingError, match=r"holds 2 \.mcap files"):
+        open_recording(bag)
+
+
+def test_a_closed_recording_says_so(tmp_path: Path) -> None:
+    recording = open_recording(write(tmp_path / "a.mcap"))
+    recording.close()
+    with pytest.raises(RecordingError, match="after the recording was closed"):
+        recording.read_frame(0)

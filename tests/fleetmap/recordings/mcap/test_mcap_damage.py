@@ -1,0 +1,149 @@
+"""MCAP files cut off and with flipped bits: read as far as they are whole, the loss said, nothing invented."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType
+
+from fleetmap.errors import RecordingError
+from fleetmap.geometry import Array
+from fleetmap.recordings import Recording, open_recording
+from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, Trajectory
+from support.recordings.mcap_samples import foreign_messages, write_foreign
+from support.recordings.recording_samples import calibration, make_sample
+
+SAMPLE = make_sample(16)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """2.5 MB in three chunks, the sensors interleaved in the order of time."""
+    path = tmp_path_factory.mktemp("mcap") / "whole.mcap"
+    with McapRecordingWriter(path, calibration()) as writer:
+        since = 0
+        for i, stamp in enumerate(SAMPLE.stamps_ns.tolist()):
+            now = int(np.searchsorted(SAMPLE.imu_stamps_ns, stamp))
+            part = slice(since, now)
+            writer.write_imu(ImuSamples(SAMPLE.imu_stamps_ns[part], SAMPLE.gyro_radps[part], SAMPLE.accel_mps2[part]))
+            writer.write_ground_truth(Trajectory(SAMPLE.stamps_ns[i : i + 1], SAMPLE.world_from_body[i][None]))
+            writer.write_frame(CameraFrame(stamp, SAMPLE.left[i], SAMPLE.right[i]))
+            since = now
+    return path.read_bytes()
+
+
+def assert_nothing_is_invented(recording: Recording) -> None:
+    """Everything that is there equals what was written at that stamp."""
+    for index, stamp_ns in enumerate(recording.frame_stamps_ns):
+        wanted = int(np.flatnonzero(stamp_ns == SAMPLE.stamps_ns)[0])
+        frame = recording.read_frame(index)
+        np.testing.assert_array_equal(frame.left, SAMPLE.left[wanted])
+        np.testing.assert_array_equal(frame.right, SAMPLE.right[wanted])
+    places = np.searchsorted(SAMPLE.imu_stamps_ns, recording.imu.stamps_ns)
+    np.testing.assert_array_equal(recording.imu.stamps_ns, SAMPLE.imu_stamps_ns[places])
+    np.testing.assert_array_equal(recording.imu.gyro_radps, SAMPLE.gyro_radps[places])
+    if recording.ground_truth is not None:
+        truth: dict[int, Array] = dict(zip(SAMPLE.stamps_ns.tolist(), SAMPLE.world_from_body, strict=True))
+        for stamp_ns, frame_from_body in zip(
+            recording.ground_truth.stamps_ns.tolist(), recording.ground_truth.frame_from_body, strict=True
+        ):
+            np.testing.assert_allclose(frame_from_body, truth[stamp_ns], atol=1e-12)
+
+
+def write_bytes(tmp_path: Path, data: bytes) -> Path:
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("share", [0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 0.99, 0.9999])
+def test_cut_off(whole: bytes, tmp_path: Path, share: float) -> None:
+    with open_recording(write_bytes(tmp_path, whole[: int(share * len(whole))])) as recording:
+        assert len(recording) >= int(share * 0.95 * len(SAMPLE.left)) - 1, (
+            "most of what is whole is used, also of the last chunk"
+        )
+        assert_nothing_is_invented(recording)
+        assert recording.losses
+        assert "the file" in recording.losses[0].what
+
+
+def test_cut_at_every_byte_around_a_message(whole: bytes, tmp_path: Path) -> None:
+    for size in range(1_200_000, 1_200_000 + 900, 37):
+        with open_recording(write_bytes(tmp_path, whole[:size])) as recording:
+            assert_nothing_is_invented(recording)
+
+
+def test_a_tail_of_zeros_as_a_power_loss_leaves_it(whole: bytes, tmp_path: Path) -> None:
+    cut = len(whole) // 2
+    with open_recording(write_bytes(tmp_path, whole[:cut] + bytes(len(whole) - cut))) as recording:
+        assert_nothing_is_invented(recording)
+        assert recording.losses
+
+
+@pytest.mark.parametrize("size", [0, 3, 8, 60, 3000])
+def test_cut_before_anything_usable(whole: bytes, tmp_path: Path, size: int) -> None:
+    with pytest.raises(RecordingError, match=r"damaged\.mcap"):
+        open_recording(write_bytes(tmp_path, whole[:size]))
+
+
+def test_single_flipped_bits_anywhere(whole: bytes, tmp_path: Path) -> None:
+    """Whatever bit is flipped: either what is read is what was written, or the error is a RecordingError."""
+    rng = np.random.default_rng(11)
+    complete, refused = 0, 0
+    for position in [*rng.integers(0, len(whole), 40).tolist(), *rng.integers(0, 4000, 40).tolist()]:
+        data = bytearray(whole)
+        data[position] ^= 1 << int(rng.integers(8))
+        try:
+            with open_recording(write_bytes(tmp_path, bytes(data))) as recording:
+                assert_nothing_is_invented(recording)
+                complete += len(recording) == len(SAMPLE.left)
+        except RecordingError:
+            refused += 1
+    assert refused < 40
+    assert complete > 0
+
+
+def test_one_bad_chunk_costs_itself_alone(whole: bytes, tmp_path: Path) -> None:
+    data = bytearray(whole)
+    data[len(whole) // 2] ^= 4
+    with open_recording(write_bytes(tmp_path, bytes(data))) as recording:
+        assert 5 <= len(recording) < len(SAMPLE.left)
+        assert recording.frame_stamps_ns[0] == SAMPLE.stamps_ns[0]
+        assert recording.frame_stamps_ns[-1] == SAMPLE.stamps_ns[-1]
+        assert any("damaged chunks" in loss.what and loss.detail.startswith("1 with") for loss in recording.losses)
+        assert_nothing_is_invented(recording)
+
+
+def test_a_bad_record_length_is_stepped_over_by_the_index(whole: bytes, tmp_path: Path) -> None:
+    """The length of the second chunk becomes absurd; the third is found by the index at the file's end."""
+    data = bytearray(whole)
+    second = _chunk_positions(whole)[1]
+    data[second + 6] ^= 0x40
+    with open_recording(write_bytes(tmp_path, bytes(data))) as recording:
+        assert recording.frame_stamps_ns[-1] == SAMPLE.stamps_ns[-1]
+        assert len(recording) < len(SAMPLE.left)
+        assert recording.losses
+        assert_nothing_is_invented(recording)
+
+
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE])
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_cut_files_of_other_writers(tmp_path: Path, compression: CompressionType, use_chunking: bool) -> None:
+    options: dict[str, Any] = {"compression": compression, "use_chunking": use_chunking, "chunk_size": 150_000}
+    messages = sorted(foreign_messages(), key=lambda message: message[2])
+    path = write_foreign(tmp_path / "damaged.mcap", messages, **options)
+    path.write_bytes(path.read_bytes()[: int(0.8 * path.stat().st_size)])
+    with open_recording(path) as recording:
+        assert len(recording) >= 1
+        assert recording.losses
+
+
+def _chunk_positions(data: bytes) -> list[int]:
+    at, found = 8, []
+    while at < len(data) - 9 and data[at] != 15:
+        if data[at] == 6:
+            found.append(at)
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    return found

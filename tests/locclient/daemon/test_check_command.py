@@ -1,0 +1,90 @@
+"""`locclient check` and `locclient run`: what is wrong is told with the next step, before any work."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from locclient import cli
+from locclient.daemon.preflight import _clock
+from mapserver.store import MapStore
+from support.recordings.recording_samples import make_sample, write_euroc
+from support.storage.map_samples import save_sample_draft
+
+Said = pytest.CaptureFixture[str]
+
+
+def status(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """What the process would end with."""
+    monkeypatch.setattr(sys, "argv", ["locclient", *(str(a) for a in arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    """A robot that lacks nothing."""
+    write_euroc(tmp_path / "walk", make_sample(12))
+    with MapStore.open(tmp_path / "store", create=True) as maps:
+        save_sample_draft(maps)
+        maps.publish("lab")
+    path = tmp_path / "robot.toml"
+    path.write_text(
+        f'[run]\nstore = "{tmp_path}/store"\nsite = "lab"\nrobot = "r1"\nspool = "{tmp_path}/spool"\n'
+        f'[source]\nkind = "recording"\nrecording = "{tmp_path}/walk"\nspeed = 0\n'
+    )
+    return path
+
+
+def test_a_good_robot_passes(monkeypatch: pytest.MonkeyPatch, config: Path, capsys: Said) -> None:
+    assert status(monkeypatch, "check", "--config", config, "--seconds", "0.5") == 0
+    lines = dict(line.split(":", 1) for line in capsys.readouterr().out.splitlines())
+    assert set(lines) >= {"ok    configuration", "ok    calibration", "ok    frames", "ok    spool", "ok    store"}
+    assert "20.0 Hz" in lines["ok    frames"]
+    assert "baseline 200 mm" in lines["ok    calibration"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "said"),
+    [
+        ('site = "lab"', "", "fail  configuration", "[run] site is missing"),
+        ('site = "lab"', 'site = "else"', "fail  store", "else"),
+        ('kind = "recording"', 'kind = "radar"', "fail  calibration", "'radar'; known are recording, ros2, uvc"),
+        ('kind = "recording"', 'kind = "ros2"', "fail  calibration", "camchain"),
+        ("/walk", "/nowhere", "fail  calibration", "does not exist"),
+        ('store = "', 'server = "tcp/127.0.0.1:1"\n#', "fail  connection", "is the server running"),
+        ('store = "', 'server = "tcp/127.0.0.1:1"\nstore = "', "fail  configuration", "either"),
+    ],
+)
+def test_what_is_wrong_is_told(
+    monkeypatch: pytest.MonkeyPatch, config: Path, capsys: Said, old: str, new: str, line: str, said: str
+) -> None:
+    monkeypatch.setattr("locclient.daemon.preflight._ANSWER_S", 0.3)
+    config.write_text(config.read_text().replace(old, new))
+    assert status(monkeypatch, "check", "--config", config, "--seconds", "0") == 3
+    out = capsys.readouterr().out
+    assert any(found.startswith(line) and said in found for found in out.splitlines()), out
+
+
+def test_a_robot_that_cannot_run_says_so_at_once(monkeypatch: pytest.MonkeyPatch, config: Path, capsys: Said) -> None:
+    good = config.read_text()
+    for old, new, code, said in (
+        ('robot = "r1"', "", 2, "[run] robot is missing"),
+        ('robot = "r1"', 'robot = "r 1"', 2, "r 1"),
+        ("speed = 0", "speed = 0\nspede = 1", 2, "spede"),
+        ("/walk", "/nowhere", 3, "does not exist"),
+        ("[source]", "[run.trial]\ncontradicting_looks = 9\n[source]", 2, "kidnap_fixes"),
+        ("[source]", '[output]\nformat = "xml"\nendpoint = "tcp/127.0.0.1:1"\n[source]', 2, "xml"),
+    ):
+        config.write_text(good.replace(old, new))
+        assert status(monkeypatch, "run", "--config", config) == code, said
+        told = capsys.readouterr()
+        assert said in told.err, told.err
+        assert "Traceback" not in told.err
+
+
+def test_clocks_are_judged() -> None:
+    assert _clock(5, True).level == "fail"
+    assert _clock(1_800_000_000 * 10**9, False).level == "warn"
+    assert _clock(1_800_000_000 * 10**9, True).level == "ok"

@@ -1,0 +1,76 @@
+"""Reports outlive the process, the order is kept, room is bounded and what is lost is counted."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fleetmap.errors import StoreError
+from locclient.daemon.outbox import Spool, SpooledReport
+
+
+def report(name: str, size: int = 10) -> SpooledReport:
+    return SpooledReport(name, name.encode() * size)
+
+
+def test_what_waits_survives_a_restart_in_order(tmp_path: Path) -> None:
+    spool = Spool(tmp_path / "new" / "spool.sqlite3", max_bytes=10_000)
+    for name in ("a", "b", "c"):
+        spool.put(report(name))
+    spool.put(report("a", size=20))
+    again = Spool(tmp_path / "new" / "spool.sqlite3", max_bytes=10_000)
+    assert again.waiting(10) == [report("a"), report("b"), report("c")]
+    again.done("a")
+    again.done("a")
+    again.refused("c")
+    assert again.waiting() == [report("b")]
+    assert again.counts() == {"waiting": 1, "delivered": 1, "dropped": 0, "refused": 1}
+
+
+def test_the_oldest_are_dropped_and_counted(tmp_path: Path) -> None:
+    spool = Spool(tmp_path / "spool", max_bytes=250)
+    for name in "abcde":
+        spool.put(report(name, size=100))
+    assert [kept.id for kept in spool.waiting(10)] == ["d", "e"]
+    assert spool.counts()["dropped"] == 3
+    spool.put(report("f", size=1000))
+    assert [kept.id for kept in spool.waiting(10)] == ["f"]
+
+
+def test_a_killed_process_loses_nothing_that_was_put(tmp_path: Path) -> None:
+    script = (
+        "import os, signal, sys; from pathlib import Path; from locclient.daemon.outbox import Spool, SpooledReport\n"
+        "spool = Spool(Path(sys.argv[1]), max_bytes=10**6)\n"
+        "for n in range(1000):\n"
+        "    spool.put(SpooledReport(str(n), b'x' * 5000)); print(n, flush=True)\n"
+        "    if n == 20: os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path / "spool")], capture_output=True, text=True, check=False,
+        env={"PYTHONPATH": ":".join(sys.path)},
+    )  # fmt: skip
+    said = done.stdout.split()
+    assert said[-1] == "20", done.stderr
+    assert [kept.id for kept in Spool(tmp_path / "spool", max_bytes=10**6).waiting(100)] == said
+
+
+@pytest.mark.parametrize("content", [b"no database at all" * 300, b"SQLite format 3\0" + b"\xff" * 8000])
+def test_a_damaged_file_is_set_aside(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "spool").write_bytes(content)
+    spool = Spool(tmp_path / "spool", max_bytes=1000)
+    assert spool.set_aside == tmp_path / "spool.damaged"
+    assert spool.set_aside.read_bytes() == content
+    spool.put(report("a"))
+    assert spool.waiting() == [report("a")]
+
+
+def test_a_place_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="spool"):
+        Spool(tmp_path / "file" / "spool", max_bytes=1000)
+    spool = Spool(tmp_path / "spool", max_bytes=1000)
+    (tmp_path / "spool").unlink()
+    (tmp_path / "spool").mkdir()
+    with pytest.raises(StoreError, match="refused"):
+        spool.put(report("a"))

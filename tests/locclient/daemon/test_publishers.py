@@ -1,0 +1,86 @@
+"""What a running robot tells its own programs, and the frame odom in which nothing jumps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleetmap.bus import MemoryBus, MemoryHub
+from fleetmap.errors import UsageError
+from fleetmap.geometry import se3, se3_inverse, so3_exp
+from fleetmap.messages import EstimateMessage, decode_message
+from fleetmap.recordings.ros2.keys import ros_key
+from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior, decode_text
+from locclient.daemon.publishers import OutputSection, open_output
+from locclient.localization.estimate import Status
+from locclient.localization.image_quality import Cause
+from locclient.robot.continuous_odom import OdomFrame
+from support.fleet.estimates import estimate
+
+BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([0.2, 0.0, 0.5]))
+
+
+def published(section: OutputSection, *estimates: object) -> dict[str, list[bytes]]:
+    """Payloads by key, of estimates one after another."""
+    hub, heard = MemoryHub(), {}  # type: ignore[var-annotated]
+    with MemoryBus(hub) as bus, MemoryBus(hub) as other:
+        other.subscribe("**", lambda key, payload: heard.setdefault(key, []).append(payload))
+        output, odom = open_output(bus, "hall", "r1", section), OdomFrame(BASE_FROM_BODY)
+        for one in estimates:
+            output.publish(one, odom.handle(one), BASE_FROM_BODY)  # type: ignore[arg-type]
+    return heard
+
+
+def test_messagepack_holds_both_transforms() -> None:
+    tracked = estimate(5.0, x_m=2.0, sigma_m=0.1)
+    lost = replace(estimate(6.0, Status.AMBIGUOUS, known=False, hypotheses=2), cause=Cause.DARK)
+    told = published(OutputSection(), tracked, lost)
+    assert list(told) == ["fleetmap/hall/robots/r1/estimate"]
+    first, second = (decode_message(payload, EstimateMessage) for payload in told["fleetmap/hall/robots/r1/estimate"])
+    assert (first.stamp_ns, first.status, first.map_version) == (5 * 10**9, "TRACKING", 3)
+    assert first.map_from_odom is not None
+    map_from_base = first.map_from_odom.target_from_source @ first.odom_from_base.target_from_source
+    np.testing.assert_allclose(map_from_base, tracked.map_from_body @ se3_inverse(BASE_FROM_BODY), atol=1e-12)
+    assert first.cov_rot_trans is not None
+    assert first.cov_rot_trans[35] == pytest.approx(0.01)
+    assert (first.cause, second.cause) == ("", "dark")
+    assert (second.map_from_odom, second.cov_rot_trans, len(second.hypotheses)) == (None, None, 2)
+
+
+def test_ros_topics_hold_the_same() -> None:
+    tracked = estimate(5.0, x_m=2.0, sigma_m=0.1)
+    told = published(OutputSection(format="ros2", domain=3), tracked, estimate(6.0, Status.LOST, known=False))
+    expected = tracked.map_from_body @ se3_inverse(BASE_FROM_BODY)
+    stamped = told[ros_key(3, "/localization/pose", "geometry_msgs/PoseWithCovarianceStamped")]
+    assert len(stamped) == 1
+    prior = decode_prior(stamped[0])
+    np.testing.assert_allclose(prior.map_from_base, expected, atol=1e-12)
+    np.testing.assert_allclose(np.diag(prior.cov_rot_trans), [1e-4] * 3 + [0.01] * 3)
+    first, second = (decode_frame_links(payload) for payload in told[ros_key(3, "/tf", "tf2_msgs/TFMessage")])
+    assert [(link.parent, link.child) for link in first] == [("map", "odom"), ("odom", "base_link")]
+    np.testing.assert_allclose(first[0].parent_from_child @ first[1].parent_from_child, expected, atol=1e-12)
+    assert [(link.parent, link.child) for link in second] == [("odom", "base_link")]
+    states = told[ros_key(3, "/localization/status", "std_msgs/String")]
+    assert [decode_text(state) for state in states] == ["TRACKING", "LOST"]
+
+
+@pytest.mark.parametrize(
+    ("section", "said"), [({"format": "xml"}, "xml"), ({"format": "ros2", "tf_topic": "a b"}, "a b")]
+)
+def test_what_cannot_be_told_is_refused_at_once(section: dict[str, str], said: str) -> None:
+    with MemoryBus(MemoryHub()) as bus, pytest.raises(UsageError, match=said):
+        open_output(bus, "hall", "r1", OutputSection(**section))
+
+
+def test_odom_is_continuous_once_a_place_was_named() -> None:
+    change = se3(so3_exp(np.array([0.0, 0.0, 0.4])), np.array([3.0, 1.0, 0.0]))
+    frame = OdomFrame(np.eye(4))
+    early = frame.handle(estimate(0.0, known=False, change=change))
+    np.testing.assert_array_equal(early.odom_from_base, estimate(0.0).odometry.odom_from_body)
+    before = frame.handle(estimate(1.0, x_m=1.0))
+    redefined = estimate(1.1, x_m=1.1, change=change)
+    object.__setattr__(redefined.odometry, "odom_from_body", change @ redefined.odometry.odom_from_body)
+    after = frame.handle(redefined)
+    np.testing.assert_allclose(after.odom_from_base[:3, 3] - before.odom_from_base[:3, 3], [0.1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(after.map_from_odom @ after.odom_from_base, redefined.map_from_body, atol=1e-12)
+    np.testing.assert_allclose(after.map_from_odom, before.map_from_odom, atol=1e-12)

@@ -1,0 +1,197 @@
+"""The daemon's threads together: what the network does changes nothing of what the robot knows, and nothing is lost."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.bus import MemoryBus, MemoryHub
+from fleetmap.errors import RecordingError
+from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
+from locclient.daemon.outbox import Spool
+from locclient.daemon.runtime import Parts, Runtime
+from locclient.daemon.server_sync import ServerTalk
+from locclient.daemon.systemd_notify import ServiceManager
+from locclient.localization.estimate import Estimate
+from locclient.maps.map_client import CachedMap, MapLink, StoreFolderLink
+from locclient.maps.tile_cache import StoreFolder, TileCache
+from locclient.maps.tile_loader import MapRoom
+from locclient.maps.tile_selection import Place, WindowSettings
+from locclient.robot.continuous_odom import Placed
+from locclient.robot.robot import Robot
+from locclient.sensors.intake import Intake, Moment
+from mapserver.fleet.fleet import Fleet
+from mapserver.serving.bus_service import TileService
+from mapserver.store import MapStore
+from support.recordings.recording_samples import calibration
+from support.worlds import robot_world
+
+
+@dataclass
+class ScriptedSource:
+    """Puts moments one after another, each once the one before was taken; does something before some of them."""
+
+    moments: list[Moment]
+    before: dict[int, Callable[[], None]] = field(default_factory=dict)
+    ready: Callable[[], bool] = lambda: True
+    calibration = calibration()
+    has_depth = False
+
+    def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
+        while not self.ready() and not wait(0.01):
+            pass
+        for number, moment in enumerate(self.moments):
+            while not intake.wait_for_room(0.1) and not wait(0.0):
+                pass
+            self.before.get(number, lambda: None)()
+            intake.put_imu(moment.imu)
+            assert moment.frame is not None
+            intake.put_frame(moment.frame)
+
+    def close(self) -> None:
+        pass
+
+
+@dataclass
+class Listener:
+    """Keeps what the robot tells its own programs."""
+
+    estimates: list[Estimate] = field(default_factory=list)
+
+    def publish(self, estimate: Estimate, placed: Placed, base_from_body: np.ndarray) -> None:
+        self.estimates.append(estimate)
+
+
+@dataclass
+class World:
+    hub: MemoryHub
+    store: MapStore
+    fleet: Fleet
+    bus: MemoryBus
+    folder: Path
+    table: list[str] = field(default_factory=list)
+
+    def parts(self, source: ScriptedSource, robot: Robot, listener: Listener) -> Parts:
+        cache = self.folder / "cache"
+        link = MapLink(self.bus, TileCache(cache), "room", "r1")
+        spool = Spool(self.folder / "spool", max_bytes=10**7)
+        intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=True, imu_wait_s=1.0)
+        return Parts(
+            site="room", robot_name="r1", source=source, intake=intake, robot=robot,
+            room=MapRoom(CachedMap(TileCache(cache), "room"), WindowSettings()), spool=spool,
+            camera=robot_world.rectifier().camera, settings=robot_world.SETTINGS, output=listener, link=link,
+            talk=ServerTalk(link, spool, retry_s=600.0), first=link.active(),
+        )  # fmt: skip
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    hub = MemoryHub()
+    with MapStore.open(tmp_path / "store", create=True) as store, MemoryBus(hub) as bus, MemoryBus(hub) as robot_bus:
+        robot_world.save(store)
+        fleet = Fleet(store)
+        made = World(hub, store, fleet, robot_bus, tmp_path)
+
+        def take(_: str, payload: bytes) -> bytes:
+            made.table.append(decode_message(payload, FailureReport).id)
+            return encode_message(FailureAck(id=made.table[-1]))
+
+        bus.queryable(
+            robot_key("*", "*", "failures"), take
+        )  # before the service's own table: what arrives is looked at here
+        service = TileService(store, fleet, bus, lambda *_: None)
+        yield made
+        service.close()
+
+
+def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world: World) -> None:
+    """Without a network from frame 30 to 120, dark from 60 to 100: the estimates are to the bit those of a robot alone."""
+    moments = list(robot_world.moments(130, dark=range(60, 100)))
+    folder = StoreFolderLink(StoreFolder(world.folder / "store"), "room")
+    whole = MapRoom(folder, WindowSettings()).load(folder.wanted(), Place())
+    assert whole is not None
+    alone = robot_world.new_robot()
+    alone.use(whole)
+    expected = [outcome.estimate for outcome in map(alone.handle, moments) if outcome is not None]
+
+    robot, listener = robot_world.new_robot(), Listener()
+    away, back = (lambda: setattr(world.hub, "reachable", False)), (lambda: setattr(world.hub, "reachable", True))
+    delivered_while_away: list[int] = []
+    steps = {30: away, 119: lambda: delivered_while_away.append(len(world.table)), 120: back}
+    source = ScriptedSource(moments, steps, ready=lambda: robot.running is not None)
+    parts = world.parts(source, robot, listener)
+    runtime = Runtime(parts, ServiceManager(""))
+    runtime.run()
+    assert [e.stamp_ns for e in listener.estimates] == [e.stamp_ns for e in expected]
+    for got, wanted in zip(listener.estimates, expected, strict=True):
+        assert (got.status, got.refused) == (wanted.status, wanted.refused)
+        if wanted.map_from_body is not None:
+            np.testing.assert_array_equal(got.map_from_body, wanted.map_from_body)
+    assert parts.intake.counts.frames_dropped == 0
+    assert delivered_while_away == [0]
+    waiting = [report.id for report in parts.spool.waiting(10)]
+    world.hub.reachable = True
+    assert parts.talk is not None
+    last = ServerTalk(parts.link, parts.spool, retry_s=600.0)  # the next start delivers what was not yet
+    last.step()
+    assert len(world.table) == len(set(world.table)) == 1
+    assert waiting in ([], world.table)
+    assert world.fleet.robots("room")[0].last_ack["version"] == 1
+
+
+def test_a_new_version_is_taken_while_driving(world: World) -> None:
+    robot, listener = robot_world.new_robot(), Listener()
+    source = ScriptedSource(list(robot_world.moments(200)), ready=lambda: robot.running is not None)
+    parts = world.parts(source, robot, listener)
+
+    def publish() -> None:
+        robot_world.save(world.store)
+        current = robot_world.wanted(world.store)
+        with MemoryBus(world.hub) as server:
+            server.publish(robot_key("room", "r1", "wanted"), encode_message(current))
+        deadline = time.monotonic() + 20
+        while len(robot.held) < 2 and time.monotonic() < deadline:  # the thread that localizes takes it between frames
+            time.sleep(0.01)
+
+    source.before[70] = publish
+    runtime = Runtime(parts, ServiceManager(""))
+    runtime.run()
+    assert listener.estimates[-1].map_version == 2
+    assert [e.cause for e in listener.estimates[60:] if e.status != "TRACKING"] == []
+    assert parts.link is not None
+    active = parts.link.active()
+    assert active is not None
+    assert active.version == 2
+    assert world.fleet.robots("room")[0].version == 2
+
+
+def test_what_kills_a_thread_ends_the_daemon(world: World) -> None:
+    robot = robot_world.new_robot()
+
+    def die() -> None:
+        raise RuntimeError("the driver broke")
+
+    source = ScriptedSource(list(robot_world.moments(3)), {1: die})
+    with pytest.raises(RuntimeError, match="the driver broke"):
+        Runtime(world.parts(source, robot, Listener()), ServiceManager("")).run()
+    assert not [thread for thread in threading.enumerate() if thread.name in {"sensors", "disk", "network"}]
+
+
+def test_a_picture_that_cannot_be_read_costs_itself(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot, listener = robot_world.new_robot(), Listener()
+    handle, moments = robot.handle, list(robot_world.moments(6))
+
+    def sometimes(moment: Moment) -> object:
+        if moment.frame is moments[2].frame:
+            raise RecordingError("cut off")
+        return handle(moment)
+
+    monkeypatch.setattr(robot, "handle", sometimes)
+    parts = world.parts(ScriptedSource(moments), robot, listener)
+    Runtime(parts, ServiceManager("")).run()
+    assert len(listener.estimates) == 5
+    assert parts.intake.counts.unreadable == 1

@@ -1,0 +1,281 @@
+"""A running robot and its server: versions that cannot be used, a network that is away, reports that must arrive once."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from fleetmap.bus import MemoryBus, MemoryHub
+from fleetmap.errors import LinkError
+from fleetmap.mapformat import blob_path
+from fleetmap.messages import (
+    FailureAck,
+    FailureReport,
+    RobotHealth,
+    WantedVersion,
+    decode_message,
+    encode_message,
+    robot_key,
+)
+from locclient.daemon.outbox import Spool, SpooledReport
+from locclient.daemon.server_sync import ServerTalk
+from locclient.maps.map_client import MapLink
+from locclient.maps.tile_cache import TileCache
+from locclient.robot.robot import Change, VersionChange
+from mapserver.fleet.fleet import Fleet
+from mapserver.serving.bus_service import TileService
+from mapserver.store import MapStore
+from support.storage.map_samples import save_sample_draft
+
+
+@dataclass
+class World:
+    """A server, one robot's talk with it, and the table of failures that the server keeps."""
+
+    hub: MemoryHub
+    store: MapStore
+    folder: Path
+    fleet: Fleet
+    talk: ServerTalk
+    link: MapLink
+    spool: Spool
+    clock: dict[str, float]
+    table: list[str] = field(default_factory=list)
+    lose_answers: bool = False
+    refuse: str = ""
+
+    def take_failure(self, key: str, payload: bytes) -> bytes:
+        report = decode_message(payload, FailureReport)
+        assert key == robot_key("lab", "r1", "failures")
+        if self.refuse:
+            raise LinkError(self.refuse)
+        if report.id not in self.table:
+            self.table.append(report.id)
+        if self.lose_answers:
+            self.hub.reachable = False
+            return encode_message(FailureAck(id="lost on its way"))
+        return encode_message(FailureAck(id=report.id))
+
+    def step(self, seconds: float = 0.1) -> None:
+        self.clock["s"] += seconds
+        self.talk.step()
+
+    def ack(self) -> dict[str, object]:
+        return self.fleet.robots("lab")[0].last_ack or {}
+
+    def publish(self, seed: int) -> int:
+        number = save_sample_draft(self.store, seed=seed)
+        self.store.publish("lab")
+        return number
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    hub, clock = MemoryHub(), {"s": 1000.0}
+    with MapStore.open(tmp_path / "store", create=True) as store, MemoryBus(hub) as bus, MemoryBus(hub) as robot_bus:
+        save_sample_draft(store)
+        store.publish("lab")
+        fleet = Fleet(store)
+        made_late: list[World] = []
+
+        def take(key: str, payload: bytes) -> bytes:  # before the service's own table: what arrives is looked at here
+            return made_late[0].take_failure(key, payload)
+
+        bus.queryable(robot_key("*", "*", "failures"), take)
+        service = TileService(store, fleet, bus, lambda *_: None)
+        link = MapLink(robot_bus, TileCache(tmp_path / "cache"), "lab", "r1")
+        spool = Spool(tmp_path / "spool", max_bytes=10**6)
+        talk = ServerTalk(link, spool, retry_s=600.0, clock_s=lambda: clock["s"])
+        made = World(hub, store, tmp_path / "store", fleet, talk, link, spool, clock)
+        made_late.append(made)
+        yield made
+        talk.close()
+        service.close()
+
+
+def report(name: str) -> SpooledReport:
+    message = FailureReport(
+        site="lab", robot="r1", id=name, stamp_ns=1, wall_ns=1, duration_s=2.0, kind="blind", status="LOST", cause="dark", version=1
+    )  # fmt: skip
+    return SpooledReport(name, encode_message(message))
+
+
+def adopt(world: World) -> WantedVersion:
+    """What the main thread does with a fetched version."""
+    wanted = world.talk.fetched.popleft()
+    world.talk.changes.append(VersionChange(wanted, Change.ADOPTED))
+    world.step()
+    return wanted
+
+
+def test_a_version_is_active_only_once_it_was_adopted(world: World) -> None:
+    world.step()
+    assert [wanted.version for wanted in world.talk.fetched] == [1]
+    assert world.link.active() is None
+    assert adopt(world).version == 1
+    assert world.link.active() == world.link.wanted()
+    assert world.ack()["version"] == 1
+    world.publish(seed=1)
+    world.step(61.0)
+    assert [wanted.version for wanted in world.talk.fetched] == [2]
+    assert world.link.active().version == 1
+    wanted = world.talk.fetched.popleft()
+    world.talk.changes.append(VersionChange(wanted, Change.REFUSED, "it puts the robot 2 m away"))
+    world.step()
+    assert world.link.active().version == 1
+    assert (world.ack()["version"], world.ack()["refused"]) == (1, "version 2: it puts the robot 2 m away")
+    world.step(61.0)
+    assert not world.talk.fetched, "refused is refused"
+
+
+def test_what_was_put_off_is_offered_again_later(world: World) -> None:
+    world.step()
+    adopt(world)
+    world.publish(seed=1)
+    world.step(61.0)
+    world.talk.changes.append(VersionChange(world.talk.fetched.popleft(), Change.POSTPONED, "dark"))
+    world.step(61.0)
+    assert not world.talk.fetched
+    world.step(600.0)
+    assert [wanted.version for wanted in world.talk.fetched] == [2]
+
+
+def test_an_announcement_is_heard_at_once(world: World) -> None:
+    world.step()
+    adopt(world)
+    number = world.publish(seed=1)
+    current = world.store.current("lab")
+    told = WantedVersion(site="lab", version=number, manifest_sha256=current.manifest_sha256)
+    with MemoryBus(world.hub) as server:
+        server.publish(robot_key("lab", "r1", "wanted"), encode_message(told))
+    world.step()
+    assert [wanted.version for wanted in world.talk.fetched] == [2]
+
+
+@pytest.mark.parametrize("damage", ["flipped", "truncated", "missing", "hostile"])
+def test_a_version_with_a_bad_tile_is_refused_and_the_good_one_goes_on(world: World, damage: str) -> None:
+    world.step()
+    adopt(world)
+    number = world.publish(seed=1)
+    victim = world.folder / blob_path(world.store.manifest("lab", number).tiles[0].sha256)
+    data = bytearray(victim.read_bytes())
+    victim.chmod(0o644)
+    if damage == "missing":
+        victim.unlink()
+    else:
+        data[len(data) // 2] ^= 0x40
+        content = {"flipped": bytes(data), "truncated": bytes(data[:-9]), "hostile": b"\xff" * len(data)}
+        victim.write_bytes(content[damage])
+    world.step(61.0)
+    assert not world.talk.fetched
+    assert world.link.active().version == 1
+    said = world.ack()
+    assert said["version"] == 1
+    assert str(said["refused"]).startswith(f"version {number}: ")
+    assert len(str(said["refused"])) > 20
+
+
+def test_a_manifest_of_another_site_is_refused(world: World) -> None:
+    world.step()
+    adopt(world)
+    save_sample_draft(world.store, site="elsewhere", seed=3)
+    world.store.publish("elsewhere")
+    foreign = world.store.current("elsewhere")
+    told = WantedVersion(site="lab", version=7, manifest_sha256=foreign.manifest_sha256)
+    with MemoryBus(world.hub) as server:
+        # In front of the real server's answers: a server that lies, or whose store was mixed up.
+        world.hub.queryables.insert(0, (robot_key("lab", "r1", "wanted"), lambda *_: encode_message(told)))
+        world.hub.queryables.insert(0, ("fleetmap/lab/manifests/7", _parts(world.store.blob(foreign.manifest_sha256))))
+        assert not server.closed()
+    world.step(61.0)
+    assert not world.talk.fetched
+    assert world.link.active().version == 1
+    assert "manifest is of elsewhere" in str(world.ack()["refused"])
+
+
+def _parts(data: bytes):  # type: ignore[no-untyped-def]
+    from fleetmap.messages import part_of
+
+    return lambda _, question: part_of(data, question)
+
+
+def test_of_a_first_version_what_came_is_used(world: World) -> None:
+    entry = world.store.manifest("lab", 1).tiles[0]
+    victim = world.folder / blob_path(entry.sha256)
+    victim.chmod(0o644)
+    victim.write_bytes(b"x" * entry.bytes)
+    world.step()
+    assert [wanted.version for wanted in world.talk.fetched] == [1]
+    assert adopt(world).version == 1
+    assert world.link.active() is None, "it is not whole"
+
+
+def test_ten_minutes_without_a_network_cost_no_report_and_double_none(world: World) -> None:
+    """Every report is in the server's table once, in order, though answers were lost and the robot was started again."""
+    world.step()
+    adopt(world)
+    world.spool.put(report("before"))
+    world.step()
+    world.hub.reachable = False
+    for minute in range(10):
+        world.spool.put(report(f"away {minute}"))
+        for _ in range(60):
+            world.step(1.0)
+    assert world.table == ["before"]
+    assert world.spool.counts()["waiting"] == 10
+    # The program dies, and begins anew with what its disk holds.
+    world.talk.close()
+    world.talk = ServerTalk(world.link, world.spool, retry_s=600.0, clock_s=lambda: world.clock["s"])
+    world.hub.reachable, world.lose_answers = True, True
+    world.step()
+    world.hub.reachable, world.lose_answers = True, False
+    world.spool.put(report("after"))
+    for _ in range(40):
+        world.step(1.0)
+    assert world.table == ["before", *(f"away {minute}" for minute in range(10)), "after"]
+    assert world.spool.counts() == {"waiting": 0, "delivered": 12, "dropped": 0, "refused": 0}
+
+
+def test_a_report_that_the_server_refuses_does_not_hold_up_the_others(world: World) -> None:
+    world.refuse = "the disk is full"
+    world.spool.put(report("a"))
+    world.step()
+    assert world.spool.counts()["waiting"] == 1
+    world.refuse = ""
+    world.step(60.0)
+    assert world.table == ["a"]
+    assert world.spool.counts()["delivered"] == 1
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"\x00" * 40, report("damaged").payload[:-3], report("of another failure").payload],
+    ids=["empty", "zeros", "truncated", "another"],
+)
+def test_a_report_that_the_disk_has_damaged_is_dropped_and_counted(world: World, payload: bytes) -> None:
+    """It is told neither once nor for ever, and those before and behind it arrive."""
+    world.spool.put(report("before"))
+    world.spool.put(SpooledReport("damaged", payload))
+    world.spool.put(report("behind"))
+    world.step()
+    assert world.table == ["before", "behind"]
+    assert world.spool.counts() == {"waiting": 0, "delivered": 2, "dropped": 0, "refused": 1}
+
+
+def test_health_is_the_last_one_only(world: World) -> None:
+    for stamp_ns in (1, 2, 3):
+        world.talk.health.append(
+            RobotHealth(site="lab", robot="r1", stamp_ns=stamp_ns, version=1, status="TRACKING", wall_ns=5)
+        )
+    world.step()
+    assert world.fleet.robots("lab")[0].last_health["stamp_ns"] == 3
+    assert not world.talk.health
+
+
+def test_tiles_that_a_robot_cannot_read_are_fetched_again(world: World) -> None:
+    world.step()
+    wanted = adopt(world)
+    world.talk.refetch.append(wanted)
+    world.step()
+    assert list(world.talk.fetched) == [wanted]

@@ -1,0 +1,79 @@
+"""What is wrong with pictures: each fault named, good pictures not."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.samples import Image
+from locclient.localization import image_quality_kernels
+from locclient.localization.image_quality import Cause, SightJudge, SightSettings
+
+Spoil = Callable[[Image, np.random.Generator], Image]
+
+
+def picture(number: int) -> Image:
+    """Blocks as racks have them, with a sensor's noise."""
+    rng = np.random.default_rng(number)
+    blocks = np.kron(np.random.default_rng(0).integers(20, 200, (30, 40)), np.ones((16, 16)))
+    return np.clip(blocks + rng.normal(0, 2, blocks.shape), 0, 255).astype(np.uint8)
+
+
+def frame(number: int, left: Image | None = None, right: Image | None = None) -> RectifiedFrame:
+    return RectifiedFrame(
+        number,
+        picture(2 * number) if left is None else left,
+        picture(2 * number + 1) if right is None else right,
+        None,
+    )
+
+
+def judged() -> SightJudge:
+    """After ten good frames, none of which it found fault with."""
+    judge = SightJudge(SightSettings())
+    assert {judge.judge(frame(number)) for number in range(10)} == {Cause.NONE}
+    return judge
+
+
+SPOILT: dict[Cause, Spoil] = {
+    Cause.DARK: lambda image, rng: rng.integers(0, 5, image.shape).astype(np.uint8),
+    Cause.GLARE: lambda image, _: np.minimum(image.astype(int) * 8, 255).astype(np.uint8),
+    Cause.BLURRED: lambda image, _: np.repeat(image.mean(axis=1, keepdims=True), image.shape[1], 1).astype(np.uint8),
+}
+
+
+@pytest.mark.parametrize("cause", SPOILT)
+def test_a_fault_is_named(cause: Cause) -> None:
+    judge = judged()
+    assert judge.judge(frame(11, SPOILT[cause](picture(22), np.random.default_rng(5)))) is cause
+    assert judge.judge(frame(12)) is Cause.NONE
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_camera_that_repeats_itself_is_frozen(side: int) -> None:
+    judge = judged()
+    stuck = picture(18 + side)
+    spoilt = frame(11, stuck, None) if side == 0 else frame(11, None, stuck)
+    assert judge.judge(spoilt) is Cause.FROZEN
+    left = judge.without_frozen(spoilt)
+    assert left.right is None
+    assert left.left.any() == (side == 1)
+
+
+def test_something_before_the_cameras_is_told_by_its_depth() -> None:
+    judge = judged()
+    assert {judge.judge_depth(depth_m) for depth_m in (3.0, 4.0, 2.5, 5.0)} == {Cause.NONE}
+    assert judge.judge_depth(0.8) is Cause.OCCLUDED
+    assert judge.judge_depth(3.0) is Cause.NONE
+
+
+def test_sums_are_those_of_numpy() -> None:
+    seen = np.random.default_rng(7).integers(0, 256, (43, 77)).astype(np.uint8)
+    small = np.empty((6, 10), np.uint8)
+    total, squares, brights = image_quality_kernels.thin(seen, 8, 250, small)
+    thinned = seen[::8, ::8].astype(np.int64)
+    np.testing.assert_array_equal(small, thinned)
+    assert (total, squares, brights) == (thinned.sum(), (thinned**2).sum(), (thinned >= 250).sum())
+    steps = np.diff(seen[::8].astype(np.int64), axis=1)
+    assert image_quality_kernels.row_steps(seen, 8) == (steps.size, steps.sum(), (steps**2).sum())

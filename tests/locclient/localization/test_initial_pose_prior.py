@@ -1,0 +1,111 @@
+"""A prior against places that a robot finds later: what leads back to it, how far it reaches, and when it is got over."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.sensors.samples import PositionPrior
+from locclient.localization.initial_pose_prior import HeldPrior
+from locclient.localization.pose_hypothesis import Anchor
+from locclient.localization.settings import TrackSettings
+
+BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, 1.5])), np.array([0.4, 0.0, 0.2]))
+STEP = se3(so3_exp(np.array([0.0, 0.0, 0.05])), np.array([0.5, 0.0, 0.0]))
+SETTINGS = TrackSettings()
+
+
+class Steady:
+    """An odometry that knows the motion since every frame, exactly."""
+
+    def __init__(self) -> None:
+        self.frame = 0
+
+    def motion_since(self, frame_index: int) -> tuple[Array, Array]:
+        return np.linalg.matrix_power(STEP, self.frame - frame_index), 1e-8 * np.eye(6)
+
+    def will_forget(self, frame_index: int) -> bool:
+        return frame_index < self.frame - 5
+
+
+class Ride:
+    """A robot whose prior is off_m beside where it was, and which drives on."""
+
+    def __init__(self, sigma_m: float, off_m: float = 0.0, whole: bool = False) -> None:
+        self.map_from_body = se3(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([20.0, 8.0, 0.3]))
+        map_from_base = self.map_from_body @ np.linalg.inv(BASE_FROM_BODY)
+        map_from_base[1, 3] += off_m
+        unknown = 0.01**2 if whole else np.inf
+        covariance = np.diag([unknown] * 3 + [sigma_m**2, sigma_m**2, unknown])
+        self.prior = HeldPrior(PositionPrior(0, map_from_base, covariance), BASE_FROM_BODY)
+        self.odometry: Any = Steady()
+        self.prior.follow(self.odometry, self._estimate(), np.eye(4), SETTINGS)
+
+    def _estimate(self) -> OdometryEstimate:
+        return OdometryEstimate(
+            self.odometry.frame, self.odometry.frame, np.eye(4), 1e-6 * np.eye(6), np.zeros(3), np.zeros(3), np.zeros(3),
+            OdometryStatus.TRACKING, np.arange(50), 5.0, 1.0, False, True, None,
+        )  # fmt: skip
+
+    def drive(self, steps: int) -> None:
+        for _ in range(steps):
+            self.odometry.frame += 1
+            self.map_from_body = self.map_from_body @ STEP
+            self.prior.follow(self.odometry, self._estimate(), STEP, SETTINGS)
+
+    def place(self, x_m: float = 0.0, y_m: float = 0.0, turned_rad: float = 0.0) -> Anchor:
+        beside = self.map_from_body.copy()
+        beside[:3, :3] = so3_exp(np.array([0.0, 0.0, turned_rad])) @ beside[:3, :3]
+        beside[:2, 3] += x_m, y_m
+        return Anchor.at(self._estimate(), beside, np.diag([0.002**2] * 3 + [0.01**2] * 3))
+
+
+@pytest.mark.parametrize("steps", [0, 3, 9])
+def test_the_robots_own_place_is_allowed_and_its_twin_is_not(steps: int) -> None:
+    ride = Ride(0.5)
+    ride.drive(steps)
+    assert ride.prior.allows(ride.place())
+    assert ride.prior.allows(ride.place(y_m=0.8))
+    assert not ride.prior.allows(ride.place(y_m=5.0))
+    assert not ride.prior.allows(ride.place(x_m=-5.0))
+
+
+def test_a_place_that_is_right_but_turned_round_does_not_lead_back() -> None:
+    ride = Ride(0.3)
+    ride.drive(12)
+    assert ride.prior.allows(ride.place())
+    assert not ride.prior.allows(ride.place(turned_rad=np.pi))
+
+
+def test_a_wrong_prior_is_got_over() -> None:
+    ride = Ride(0.3, off_m=3.0)
+    assert not ride.prior.allows(ride.place())
+    ride.drive(4)
+    assert not ride.prior.allows(ride.place())
+    ride.drive(20)
+    assert ride.prior.allows(ride.place())
+
+
+def test_a_prior_is_tight_only_for_some_way() -> None:
+    ride = Ride(0.5)
+    assert ride.prior.is_tight(0.6)
+    assert not ride.prior.is_tight(0.4)
+    ride.drive(6)
+    assert not ride.prior.is_tight(0.6)
+
+
+def test_what_is_near_grows_with_the_way() -> None:
+    ride = Ride(0.5)
+    positions = ride.map_from_body[:3, 3] + np.array([[0.0, 0.0, 0.0], [0.0, 7.0, 0.0], [0.0, 30.0, 0.0]])
+    assert ride.prior.is_near(positions).tolist() == [True, False, False]
+    ride.drive(8)
+    assert ride.prior.is_near(positions).tolist() == [True, True, False]
+
+
+def test_only_a_prior_with_a_heading_is_a_place() -> None:
+    assert Ride(0.1).prior.place is None
+    place = Ride(0.1, whole=True).prior.place
+    assert place is not None
+    np.testing.assert_allclose(place.map_from_body, Ride(0.1).map_from_body, atol=1e-9)

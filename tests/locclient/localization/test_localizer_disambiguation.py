@@ -1,0 +1,74 @@
+"""Twins that are told apart by what stands in one of them alone: scripted odometry, fixes and landmarks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array
+from fleetmap.relocalization.map_view import Expected
+from fleetmap.relocalization.relocalizer import Fix
+from locclient.localization.estimate import Status
+from support.fleet.scripted_robot import MAP_FROM_ODOM, Robot, off
+
+TWIN = off(0.0, 5.0)
+
+
+@pytest.fixture
+def sure_robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
+    """One that may take it that its own aisle is in the map."""
+    return Robot(monkeypatch, is_whole_site_mapped=True).load()
+
+
+class Signs:
+    """What the map holds at the end of an aisle and of its twin: two signs each, which look different. The robot sees those of
+    one of them (0, 1) or, in an aisle that is not in the map, of none."""
+
+    def __init__(self, robot: Robot, seen: int | None) -> None:
+        rng = np.random.default_rng(5)
+        corners = np.concatenate([rng.uniform(0.0, 0.5, (12, 3)) + at for at in ((9.0, 2.0, 1.5), (9.0, -2.0, 1.8))])
+        ahead = corners @ MAP_FROM_ODOM[:3, :3].T + MAP_FROM_ODOM[:3, 3]
+        self.points_map = [ahead, ahead + TWIN]
+        self.looks = rng.integers(0, 256, (2, len(corners), 32), np.uint8)
+        self.seen, self.rng, self._fix = seen, rng, robot._fix
+
+    def fix(self, offset: Array) -> Fix:
+        aisle = int(np.any(offset != 0.0))
+        found = self.rng.random(24) < (0.4 if aisle == self.seen else 0.03)
+        expected = Expected(np.arange(24, dtype=np.uint32), self.points_map[aisle], self.looks[aisle], found)
+        return replace(self._fix(offset), witnessed=expected)
+
+
+@pytest.mark.parametrize("own", [0, 1])
+def test_a_twin_is_told_by_its_signs(sure_robot: Robot, monkeypatch: pytest.MonkeyPatch, own: int) -> None:
+    """Although as many landmarks agree in the other aisle; and whichever is thought of first."""
+    monkeypatch.setattr(sure_robot, "_fix", Signs(sure_robot, own).fix)
+    said = sure_robot.ride(20, 0.4, [off(0.0), TWIN])
+    assert said[0].status is Status.AMBIGUOUS
+    known = next(e for e in said if e.status is Status.TRACKING)
+    assert known.map_from_body is not None
+    assert all(e.status in (Status.AMBIGUOUS, Status.INITIALISING) for e in said[: said.index(known)])
+    truth = sure_robot.map_from_body[:3, 3] + own * TWIN
+    assert said[-1].map_from_body is not None
+    assert np.linalg.norm(said[-1].map_from_body[:3, 3] - truth) < 0.05
+
+
+def test_signs_of_neither_twin_leave_it_open(sure_robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The robot's own aisle is a third one, which is not in the map."""
+    monkeypatch.setattr(sure_robot, "_fix", Signs(sure_robot, None).fix)
+    assert {e.status for e in sure_robot.ride(30, 0.4, [off(0.0), TWIN])} == {Status.AMBIGUOUS}
+
+
+def test_signs_from_a_standing_robot_are_seen_once(sure_robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same look again and again is no more evidence."""
+    monkeypatch.setattr(sure_robot, "_fix", Signs(sure_robot, 0).fix)
+    said = [sure_robot.go(0.0, [off(0.0), TWIN], turn_rad=0.0) for _ in range(30)]
+    assert {e.status for e in said} == {Status.AMBIGUOUS}
+
+
+def test_signs_tell_nothing_where_the_own_aisle_may_not_be_in_the_map(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robot = Robot(monkeypatch).load()
+    monkeypatch.setattr(robot, "_fix", Signs(robot, 0).fix)
+    assert {e.status for e in robot.ride(20, 0.4, [off(0.0), TWIN])} == {Status.AMBIGUOUS}

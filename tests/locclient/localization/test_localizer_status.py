@@ -1,0 +1,309 @@
+"""When the localizer says that it knows where it is: scripted odometry and scripted fixes, every status by its cause."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.sensors.samples import PositionPrior
+from locclient.localization.estimate import Status
+from locclient.localization.image_quality import Cause
+from locclient.localization.settings import TrackSettings
+from support.fleet.scripted_robot import FRAME_NS, NO_FIX, TRUE, Robot, off
+
+
+@pytest.fixture
+def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
+    return Robot(monkeypatch).load()
+
+
+@pytest.fixture
+def tracking(robot: Robot) -> Robot:
+    """One that knows where it is."""
+    assert robot.ride(6, 0.4)[-1].status is Status.TRACKING
+    return robot
+
+
+def prior(robot: Robot, sigma_m: float, offset: Array | None = None) -> PositionPrior:
+    map_from_base = robot.map_from_body.copy()
+    map_from_base[:3, 3] += np.zeros(3) if offset is None else offset
+    covariance = np.diag([np.inf, np.inf, np.inf, sigma_m**2, sigma_m**2, np.inf])
+    return PositionPrior(0, map_from_base, covariance)
+
+
+def test_without_a_map_there_is_nothing_to_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimate = Robot(monkeypatch).go(0.1)
+    assert estimate.status is Status.INITIALISING
+    assert estimate.map_from_body is estimate.cov_rot_trans is estimate.map_version is estimate.fix is None
+
+
+def test_tracking_takes_three_fixes_however_far_the_way(robot: Robot) -> None:
+    said = [e.status for e in robot.ride(3, 3.0)]
+    assert said == [Status.INITIALISING, Status.INITIALISING, Status.TRACKING]
+
+
+def test_tracking_takes_a_metre_however_many_the_fixes(robot: Robot) -> None:
+    said = robot.ride(12, 0.13)  # the first frame stands; 8 steps are 1.04 m
+    assert [e.status for e in said] == [Status.INITIALISING] * 8 + [Status.TRACKING] * 4
+    assert all(e.fix is not None for e in said[:10])
+    assert all(robot.error_m(e) < 1e-6 for e in said[-1:])
+
+
+def test_fixes_that_do_not_agree_never_confirm(robot: Robot) -> None:
+    """Each frame shows another place."""
+    rng = np.random.default_rng(4)
+    for _ in range(30):
+        estimate = robot.go(0.4, [rng.uniform(-30, 30, 3)])
+        assert estimate.status is not Status.TRACKING
+
+
+def test_a_tight_prior_confirms_the_first_fix(robot: Robot) -> None:
+    robot.localizer.handle_prior(prior(robot, 0.5))
+    estimate = robot.go(0.0)
+    assert estimate.status is Status.TRACKING
+    assert robot.error_m(estimate) < 1e-6
+
+
+def test_a_wide_prior_only_narrows_the_search(robot: Robot) -> None:
+    """Aliased places 9 m apart: the one outside the prior is never believed, the other must still be confirmed."""
+    robot.localizer.handle_prior(prior(robot, 2.0))
+    said = [robot.go(0.4, [off(9.0), off(0.0)]) for _ in range(4)]
+    assert said[0].status is Status.INITIALISING
+    assert said[-1].status is Status.TRACKING
+    assert robot.error_m(said[-1]) < 1e-6
+
+
+def test_a_fix_that_a_tight_prior_denies_is_not_believed_before_a_long_way(robot: Robot) -> None:
+    """3 m off with 0.3 m of doubt: never while standing; after metres of way the prior is doubted more."""
+    robot.localizer.handle_prior(prior(robot, 0.3, off(3.0)))
+    assert {e.status for e in robot.ride(8, 0.0)} == {Status.INITIALISING}
+    said = robot.ride(24, 0.4)
+    assert {e.status for e in said[:8]} == {Status.INITIALISING}
+    assert said[-1].status is Status.TRACKING
+    assert robot.error_m(said[-1]) < 1e-6
+
+
+def test_the_way_leads_back_to_the_prior_and_not_to_its_twin(robot: Robot) -> None:
+    """Nothing was to be seen for metres, then two places 5 m apart: the robot's own way decides which of them it was."""
+    robot.localizer.handle_prior(prior(robot, 0.5))
+    robot.ride(8, 0.5, NO_FIX)
+    said = [robot.go(0.4, [off(5.0), off(0.0)]) for _ in range(4)]
+    assert {e.status for e in said[:2]} == {Status.INITIALISING}
+    assert said[-1].status is Status.TRACKING
+    assert robot.error_m(said[-1]) < 1e-6
+
+
+def test_a_prior_is_no_longer_tight_after_some_way(robot: Robot) -> None:
+    """Two metres without a fix: the next ones must be confirmed as anywhere else."""
+    robot.localizer.handle_prior(prior(robot, 0.5))
+    robot.ride(6, 0.4, NO_FIX)
+    said = [e.status for e in robot.ride(4, 0.6)]
+    assert said == [Status.INITIALISING] * 2 + [Status.TRACKING] * 2
+
+
+def whole_prior(robot: Robot, sigma_m: float, offset: Array) -> PositionPrior:
+    """As a dock tells it: with a heading and a height."""
+    known = prior(robot, sigma_m, offset)
+    return replace(known, cov_rot_trans=np.diag([0.02**2] * 3 + [sigma_m**2] * 3))
+
+
+def test_where_the_map_shows_nothing_a_dock_is_a_place_with_a_covariance(robot: Robot) -> None:
+    """An aisle that was surveyed the other way only: never tracking, never silent about what is known."""
+    robot.odometry.drift_share = 0.1
+    robot.localizer.handle_prior(whole_prior(robot, 0.1, off(0.1)))
+    for _ in range(6):
+        estimate = robot.go(0.5, NO_FIX)
+        assert (estimate.status, estimate.cause) == (Status.DEGRADED, Cause.UNMATCHED)
+        assert estimate.cov_rot_trans is not None
+        assert 0.05 < robot.error_m(estimate) < 3 * np.sqrt(np.trace(estimate.cov_rot_trans[3:, 3:]))
+    far = robot.ride(54, 0.5, NO_FIX)[-1]
+    assert far.status is Status.INITIALISING, "so far from the dock it is no place any more"
+    assert robot.ride(3, 1.0)[-1].status is Status.TRACKING
+    assert robot.error_m(robot.go(0.1)) < 0.01
+
+
+def test_a_kidnapped_robot_does_not_trust_the_dock_that_it_was_carried_from(tracking: Robot) -> None:
+    tracking.localizer.handle_prior(whole_prior(tracking, 0.1, off(0.0)))
+    tracking.map_from_body[:3, 3] += off(-8.0)
+    after = tracking.ride(9, 0.25)
+    assert Status.DEGRADED not in {estimate.status for estimate in after}
+    assert after[-1].status is Status.TRACKING
+    assert tracking.error_m(after[-1]) < 1e-6
+
+
+def test_two_places_that_fit_are_ambiguous_until_motion_decides(robot: Robot) -> None:
+    places = [off(0.0), off(0.0, 5.0)]
+    said = [robot.go(0.4, places) for _ in range(8)]
+    assert {e.status for e in said} == {Status.AMBIGUOUS}
+    last = said[-1]
+    assert last.map_from_body is None
+    assert last.fix is None
+    assert "2 places" in last.refused
+    found = sorted(float(np.linalg.norm(h.map_from_body[:3, 3] - robot.map_from_body[:3, 3])) for h in last.hypotheses)
+    assert found == pytest.approx([0.0, 5.0], abs=1e-6)
+    after = [robot.go(0.4, places[:1]) for _ in range(10)]
+    assert after[-1].status is Status.TRACKING
+    assert robot.error_m(after[-1]) < 1e-6
+
+
+def test_a_wrong_fix_is_refused_and_said(tracking: Robot) -> None:
+    for metres in (0.4, 2.0, 30.0):
+        estimate = tracking.go(0.2, [off(metres)])
+        assert estimate.status is Status.TRACKING
+        assert estimate.fix is None
+        assert f"{metres:.2f} m off" in estimate.refused
+        assert estimate.innovation is not None
+        assert estimate.innovation > TrackSettings().innovation_limit
+        assert tracking.error_m(estimate) < 0.01
+        assert tracking.go(0.2).fix is not None
+
+
+def test_a_kidnapped_robot_leaves_tracking_and_finds_its_new_place(tracking: Robot) -> None:
+    """Carried 8 m away without a turn of its wheels: the fixes say so, three times in a row."""
+    tracking.map_from_body[:3, 3] += off(-8.0)
+    said = [tracking.go(0.25).status for _ in range(3)]
+    assert said[:2] == [Status.TRACKING] * 2
+    assert said[2] is not Status.TRACKING
+    after = tracking.ride(6, 0.25)
+    assert after[-1].status is Status.TRACKING
+    assert tracking.error_m(after[-1]) < 1e-6
+    moved = [estimate.moved_m for estimate in after if estimate.moved_m is not None]
+    assert moved == pytest.approx([float(np.linalg.norm(off(-8.0)))], abs=0.1), "told once, when it was sure"
+
+
+def test_who_knew_that_he_might_be_anywhere_has_not_moved(tracking: Robot) -> None:
+    """Odometry that begins anew far off in its own view: what was said before the gap is given up, but had admitted as much."""
+    tracking.odometry.drift_share = 0.5
+    tracking.ride(30, 0.5, NO_FIX)
+    tracking.map_from_body[:3, 3] += off(-1.0)
+    after = tracking.ride(12, 0.25)
+    assert after[-1].status is Status.TRACKING
+    assert all(estimate.moved_m is None for estimate in after)
+
+
+def test_wrong_fixes_that_disagree_kidnap_nobody(tracking: Robot) -> None:
+    rng = np.random.default_rng(8)
+    for number in range(12):
+        place = [rng.uniform(10, 40, 3)] if number % 4 else TRUE
+        estimate = tracking.go(0.05, place)
+        assert estimate.status is Status.TRACKING
+        assert tracking.error_m(estimate) < 0.01
+
+
+def test_without_fixes_tracking_ages_into_degraded(tracking: Robot) -> None:
+    """Standing still, odometry without drift: only the age tells."""
+    said = tracking.ride(12, 0.0, NO_FIX)
+    ages = [(k + 1) * FRAME_NS * 1e-9 for k in range(12)]
+    for age_s, estimate in zip(ages, said, strict=True):
+        expected = Status.DEGRADED if age_s > TrackSettings().degraded_after_s + 1e-9 else Status.TRACKING
+        assert estimate.status is expected
+        assert "nothing in the map" in estimate.refused
+    assert tracking.go(0.0).status is Status.TRACKING
+
+
+def test_drift_without_fixes_ends_lost_and_the_radius_says_so(tracking: Robot) -> None:
+    tracking.odometry.drift_share = 0.2
+    said = tracking.ride(60, 0.5, NO_FIX)
+    order = [Status.TRACKING, Status.DEGRADED, Status.LOST]
+    ranks = [order.index(e.status) for e in said]
+    assert ranks == sorted(ranks)
+    assert ranks[-1] == 2
+    assert 1 in ranks
+    radii = []
+    for estimate in said:
+        assert estimate.cov_rot_trans is not None
+        radii.append(2.796 * float(np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[3:, 3:])[-1])))
+    assert all(later > earlier for earlier, later in pairwise(radii))
+    first_lost = ranks.index(2)
+    assert radii[first_lost] > TrackSettings().lost_radius_m > 0.95 * radii[first_lost - 1]
+
+
+def test_a_new_version_is_taken_over_without_losing_the_place(tracking: Robot) -> None:
+    tracking.load(2)
+    estimate = tracking.go(0.1)
+    assert (estimate.status, estimate.map_version) == (Status.TRACKING, 2)
+    assert tracking.error_m(estimate) < 1e-6
+
+
+def test_odometry_that_redefines_its_frame_moves_nothing(tracking: Robot) -> None:
+    tracking.odometry.redefine = se3(so3_exp(np.array([0.1, -0.2, 2.0])), np.array([4.0, 5.0, -1.0]))
+    estimate = tracking.go(0.2, NO_FIX)
+    assert tracking.error_m(estimate) < 1e-6
+
+
+def test_no_number_of_fixes_claims_more_than_the_map_knows(tracking: Robot) -> None:
+    estimate = tracking.ride(40, 0.05)[-1]
+    assert estimate.cov_rot_trans is not None
+    settings = TrackSettings()
+    assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[3:, 3:])[0]) >= settings.map_sigma_m
+    assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[:3, :3])[0]) >= settings.map_sigma_rad
+
+
+def test_the_map_is_looked_at_as_often_as_set_over_frames_that_lie_closer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first look is done at once, the others go on in the frame after, while the robot moves on; nothing is lost by that."""
+    robot = Robot(monkeypatch, fix_interval_s=0.6, settled_interval_s=0.6).load()
+    robot.inliers = 100
+    said = [robot.go(0.5, [off(0.0)]) for _ in range(11)]
+    numbers = {(e.stamp_ns // FRAME_NS, e.fix_stamp_ns // FRAME_NS) for e in said if e.fix_stamp_ns is not None}
+    assert numbers == {(1, 1), (5, 4), (8, 7), (11, 10)}
+
+
+def test_a_look_that_took_two_frames_corrects_the_present(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fixes are those of the frame that was looked at; the robot has turned and moved since."""
+    robot = Robot(monkeypatch, fix_interval_s=0.6).load()
+    said = [robot.go(0.4, turn_rad=0.2) for _ in range(30)]
+    assert said[-1].status is Status.TRACKING
+    assert all(robot.error_m(e) < 1e-6 for e in said[-1:])
+
+
+def test_one_strong_fix_alone_is_believed(robot: Robot) -> None:
+    robot.inliers = 100
+    estimate = robot.go(0.0)
+    assert estimate.status is Status.TRACKING
+    assert robot.error_m(estimate) < 1e-6
+
+
+def test_a_strong_fix_where_the_map_has_a_twin_must_be_confirmed(robot: Robot) -> None:
+    robot.inliers, robot.relocalizer.twin_share = 100, 0.55
+    assert [e.status for e in robot.ride(3, 0.6)] == [Status.INITIALISING] * 2 + [Status.TRACKING]
+
+
+def test_a_strong_fix_with_a_rival_is_not_believed(robot: Robot) -> None:
+    robot.inliers = 100
+    said = robot.ride(8, 0.0, [off(0.0), off(0.0, 5.0)])
+    assert {e.status for e in said} == {Status.AMBIGUOUS}
+
+
+def test_darkness_is_named_within_a_second(tracking: Robot) -> None:
+    tracking.is_dark = True
+    said = [tracking.go(0.2, NO_FIX) for _ in range(5)]
+    assert said[-1].status is Status.DEGRADED
+    assert said[-1].cause is Cause.DARK
+    assert said[0].cause is Cause.NONE
+    tracking.is_dark = False
+    after = tracking.ride(3, 0.2)[-1]
+    assert (after.status, after.cause) == (Status.TRACKING, Cause.NONE)
+
+
+def test_what_was_never_seen_says_so(tracking: Robot) -> None:
+    said = [tracking.go(0.2, NO_FIX) for _ in range(9)]
+    assert said[-1].status is Status.DEGRADED
+    assert said[-1].cause is Cause.UNMATCHED
+
+
+def test_metres_of_an_innovation_are_told_of_what_lies_near_or_was_believed(tracking: Robot) -> None:
+    """Believed: where it was found. Refused beside the prediction: how far. Refused elsewhere: it may be a twin, which says nothing."""
+    tracking.go(0.4, [off(0.03)])
+    near = tracking.go(0.4, [off(0.04)])
+    assert near.fix is not None
+    assert near.innovation_m == pytest.approx(0.04, abs=0.02)
+    beside = tracking.go(0.4, [off(0.25)])
+    assert beside.fix is None
+    assert beside.innovation_m == pytest.approx(0.25, abs=0.05)
+    assert tracking.go(0.4, []).innovation_m is None
+    for _ in range(TrackSettings().search_after_failed):
+        elsewhere = tracking.go(0.4, [off(9.0)])
+    assert elsewhere.innovation is not None
+    assert elsewhere.innovation_m is None

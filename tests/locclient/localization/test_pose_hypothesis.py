@@ -1,0 +1,49 @@
+"""Covariances that are carried along a way and back, against samples drawn of them."""
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
+from locclient.localization.pose_hypothesis import applied, chained, difference, led_back
+
+SAMPLES = 4000
+
+
+def spd(rng: np.random.Generator) -> Array:
+    """(6, 6) of some hundredths of radians and some tenths of metres."""
+    factor = rng.normal(size=(6, 6)) * np.repeat([0.01, 0.1], 3)[:, None]
+    return np.asarray(factor @ factor.T)
+
+
+def place(rng: np.random.Generator) -> Array:
+    return se3(so3_exp(rng.normal(size=3)), rng.normal(size=3) * 4.0)
+
+
+def drawn(mean: Array, covariance: Array, rng: np.random.Generator) -> list[Array]:
+    return [applied(error, mean) for error in rng.multivariate_normal(np.zeros(6), covariance, SAMPLES)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_place_led_back_along_the_way_and_a_place_led_on(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    map_from_body, covariance, way, cov_way = place(rng), spd(rng), place(rng), spd(rng)
+    pairs = list(zip(drawn(map_from_body, covariance, rng), drawn(way, cov_way, rng), strict=True))
+    for (mean, claimed), found in (
+        (led_back(map_from_body, covariance, way, cov_way), [at @ se3_inverse(since) for at, since in pairs]),
+        (chained(map_from_body, covariance, way, cov_way), [at @ since for at, since in pairs]),
+    ):
+        errors = np.array([difference(sample, mean) for sample in found])
+        scale = np.sqrt(np.diag(claimed))
+        np.testing.assert_allclose(
+            np.cov(errors.T) / np.outer(scale, scale), claimed / np.outer(scale, scale), atol=0.08
+        )
+        assert (np.abs(errors.mean(axis=0)) < 0.1 * scale).all()
+
+
+def test_there_and_back_is_where_one_began() -> None:
+    rng = np.random.default_rng(5)
+    map_from_body, way, nothing = place(rng), place(rng), np.zeros((6, 6))
+    covariance = spd(rng)
+    again, claimed = led_back(*chained(map_from_body, covariance, way, nothing), way, nothing)
+    np.testing.assert_allclose(again, map_from_body, atol=1e-12)
+    np.testing.assert_allclose(claimed, covariance, atol=1e-12)

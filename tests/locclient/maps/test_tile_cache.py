@@ -1,0 +1,201 @@
+"""The robot's cache trusts neither its disk nor its size."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from fleetmap.errors import MapFormatError, StoreError
+from fleetmap.mapformat import blob_path, sha256_hex
+from locclient.maps.tile_cache import ActiveVersion, StoreFolder, TileCache
+
+
+def put(cache: TileCache, data: bytes) -> str:
+    sha256 = sha256_hex(data)
+    cache.put(sha256, data)
+    return sha256
+
+
+def test_bytes_survive_a_restart(tmp_path: Path) -> None:
+    sha256 = put(TileCache(tmp_path), b"tile")
+    again = TileCache(tmp_path)
+    assert sha256 in again
+    assert again.get(sha256) == b"tile"
+    assert again.total_bytes == 4
+    assert again.get("0" * 64) is None
+    assert again.take_faults() == []
+
+
+def test_damaged_bytes_are_removed_and_told(tmp_path: Path) -> None:
+    cache = TileCache(tmp_path)
+    sha256 = put(cache, b"tile")
+    (tmp_path / blob_path(sha256)).write_bytes(b"tilt")
+    assert cache.get(sha256) is None
+    assert sha256 not in cache
+    faults = cache.take_faults()
+    assert len(faults) == 1
+    assert sha256 in faults[0]
+    assert cache.take_faults() == []
+    assert not (tmp_path / blob_path(sha256)).exists()
+    with pytest.raises(MapFormatError, match="damaged"):
+        cache.put(sha256, b"tilt")
+
+
+def test_least_recently_used_goes_first_also_after_a_restart(tmp_path: Path) -> None:
+    cache = TileCache(tmp_path, max_bytes=300)
+    a, b, c = (put(cache, bytes([value]) * 100) for value in range(3))
+    assert cache.get(a) is not None
+    d = put(cache, b"d" * 100)
+    assert [sha256 in cache for sha256 in (a, b, c, d)] == [True, False, True, True]
+    for age, sha256 in enumerate((c, a, d)):
+        os.utime(tmp_path / blob_path(sha256), ns=(age, age))
+    again = TileCache(tmp_path, max_bytes=300)
+    put(again, b"e" * 150)
+    assert [sha256 in again for sha256 in (a, c, d)] == [False, False, True]
+    assert again.total_bytes == 250
+    # What is larger than the cache is kept until something else comes, because it was asked for now.
+    f = put(again, b"f" * 400)
+    assert again.get(f) is not None
+    assert again.total_bytes == 400
+
+
+def test_leftovers_of_a_dead_process_are_removed(tmp_path: Path) -> None:
+    put(TileCache(tmp_path), b"tile")
+    leftover = next(tmp_path.glob("blobs/??")) / ".x.tmp"
+    leftover.write_bytes(b"half")
+    assert TileCache(tmp_path).total_bytes == 4
+    assert not leftover.exists()
+
+
+def test_a_full_disk_costs_the_cache_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache = TileCache(tmp_path)
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("locclient.maps.tile_cache.os.fsync", full)
+    sha256 = put(cache, b"tile")
+    assert sha256 not in cache
+    assert "No space left" in cache.take_faults()[0]
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+def test_a_file_is_no_cache_and_no_store(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cache"):
+        TileCache(tmp_path / "file")
+    with pytest.raises(StoreError, match="no map store"):
+        StoreFolder(tmp_path)
+
+
+def test_a_damaged_current_file_is_told(tmp_path: Path) -> None:
+    (tmp_path / "sites" / "lab").mkdir(parents=True)
+    folder = StoreFolder(tmp_path)
+    assert folder.current_manifest("lab") is None
+    (tmp_path / "sites" / "lab" / "current").write_bytes(b"\xff\xfe nonsense")
+    with pytest.raises(StoreError, match="repair"):
+        folder.current_manifest("lab")
+    with pytest.raises(StoreError, match="incomplete"):
+        folder.blob("0" * 64)
+
+
+def test_what_is_in_use_is_not_removed(tmp_path: Path) -> None:
+    cache = TileCache(tmp_path, max_bytes=300)
+    a, b = put(cache, b"a" * 100), put(cache, b"b" * 100)
+    cache.activate("lab", 1, [a, b])
+    c, d, e = (put(cache, letter * 100) for letter in (b"c", b"d", b"e"))
+    assert [sha256 in cache for sha256 in (a, b, c, d, e)] == [True, True, False, False, True]
+    # The next version on its way: nothing of both goes, even where that is more than the limit.
+    later = [sha256_hex(letter * 100) for letter in (b"f", b"g")]
+    cache.hold("lab", [a, *later])
+    put(cache, b"f" * 100)
+    put(cache, b"g" * 100)
+    assert [sha256 in cache for sha256 in (a, b, e, *later)] == [True, True, False, True, True]
+    assert cache.total_bytes == 400
+    cache.activate("lab", 2, [a, *later])
+    assert b not in cache
+    again = TileCache(tmp_path, max_bytes=100)
+    assert again.active("lab") == ActiveVersion(2, (a, *later))
+    put(again, b"h" * 50)
+    assert all(sha256 in again for sha256 in (a, *later))
+
+
+def test_a_version_with_a_missing_piece_is_not_activated(tmp_path: Path) -> None:
+    cache = TileCache(tmp_path)
+    a = put(cache, b"a")
+    cache.activate("lab", 1, [a])
+    with pytest.raises(StoreError, match=r"not whole: 1 of 2"):
+        cache.activate("lab", 2, [a, "0" * 64])
+    assert TileCache(tmp_path).active("lab").version == 1
+
+
+def test_a_disk_that_refuses_leaves_the_old_version_active(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache = TileCache(tmp_path)
+    a, b = put(cache, b"a"), put(cache, b"b")
+    cache.activate("lab", 1, [a])
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("locclient.maps.tile_cache.os.fsync", full)
+    with pytest.raises(StoreError, match="No space left"):
+        cache.activate("lab", 2, [b])
+    assert cache.active("lab").version == 1
+    assert TileCache(tmp_path).active("lab").version == 1
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+@pytest.mark.parametrize(
+    "text", [b"", b"{}", b'{"version":0,"blobs":["a"]}', b'{"version":1,"blobs":["../../x"]}', b"\xff"]
+)
+def test_a_damaged_record_is_told_and_forgotten(tmp_path: Path, text: bytes) -> None:
+    cache = TileCache(tmp_path)
+    cache.activate("lab", 1, [put(cache, b"a")])
+    (tmp_path / "sites/lab/active").write_bytes(text)
+    again = TileCache(tmp_path)
+    assert again.active("lab") is None
+    assert "damaged" in again.take_faults()[0]
+
+
+class Dying:
+    """Lets so many calls through, then ends the process, as far as the callers can see."""
+
+    def __init__(self, calls: int) -> None:
+        self.left = calls
+
+    def wrap(self, real: Callable[..., object]) -> Callable[..., object]:
+        def call(*arguments: object, **options: object) -> object:
+            self.left -= 1
+            if self.left < 0:
+                raise KeyboardInterrupt
+            return real(*arguments, **options)
+
+        return call
+
+
+def test_a_death_at_any_moment_leaves_a_whole_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every call to the file system in turn is the last one; a half-written name is never there."""
+    for calls in range(60):
+        folder = tmp_path / str(calls)
+        cache = TileCache(folder)
+        cache.activate("lab", 1, [put(cache, b"old")])
+        dying, finished = Dying(calls), False
+        with monkeypatch.context() as patch:
+            for owner, name in ((os, "fsync"), (os, "open"), (Path, "open"), (Path, "replace"), (Path, "mkdir")):
+                patch.setattr(owner, name, dying.wrap(getattr(owner, name)))
+            try:
+                cache.activate("lab", 2, [put(cache, b"new"), put(cache, b"more")])
+                finished = True
+            except KeyboardInterrupt:
+                pass
+        again = TileCache(folder)
+        record = again.active("lab")
+        assert record.version in {1, 2}
+        assert all(again.get(sha256) for sha256 in record.blobs)
+        assert again.take_faults() == []
+        if finished:
+            assert record.version == 2
+            assert calls > 10
+            return
+    pytest.fail("never finished")

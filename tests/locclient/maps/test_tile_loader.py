@@ -1,0 +1,100 @@
+"""Tiles around the robot are in memory, the others on the disk; bad ones are left out with their reasons."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import FleetmapError
+from fleetmap.mapformat import blob_path
+from fleetmap.messages import WantedVersion
+from locclient.localization.estimate import Status
+from locclient.maps.map_client import StoreFolderLink
+from locclient.maps.tile_cache import StoreFolder
+from locclient.maps.tile_loader import MapRoom
+from locclient.maps.tile_selection import Place, Whereabouts, WindowSettings
+from mapserver.store import MapStore
+from support.fleet.estimates import estimate
+from support.storage.map_samples import draft_details, random_tile
+from support.worlds.robot_world import vocabulary
+
+SETTINGS = WindowSettings(reach_m=20.0, ahead_s=8.0, spare_m=10.0)
+
+
+@pytest.fixture(scope="module")
+def row(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, MapStore]]:
+    """A site of ten tiles in a row along x."""
+    folder = tmp_path_factory.mktemp("row") / "store"
+    rng = np.random.default_rng(0)
+    with MapStore.open(folder, create=True) as store:
+        tiles = [random_tile(rng, cell=(x, 0)) for x in range(10)]
+        store.save_draft("row", tiles=tiles, vocabulary=vocabulary(), details=draft_details(path_m=160.0), archive=b"a")
+        store.publish("row")
+        yield folder, store
+
+
+def at(x_m: float) -> np.ndarray:
+    return np.array([x_m, 8.0, 1.0])
+
+
+def test_memory_follows_the_robot(row: tuple[Path, MapStore]) -> None:
+    link = StoreFolderLink(StoreFolder(row[0]), "row")
+    room, wanted = MapRoom(link, SETTINGS), link.wanted()
+    everywhere = room.load(wanted, Place())
+    assert everywhere is not None
+    assert sorted(everywhere.tiles) == [(x, 0) for x in range(10)]
+    near = room.load(wanted, Place(at(8.0)))
+    assert near is not None
+    assert sorted(near.tiles) == [(0, 0), (1, 0), (2, 0)]  # those held within reach and a spare stay
+    assert room.load(wanted, Place(at(8.5))) is None, "nothing changed"
+    ahead = room.load(wanted, Place(at(30.0), np.array([4.0, 0, 0])))
+    assert ahead is not None
+    assert sorted(ahead.tiles) == [(x, 0) for x in range(6)]
+    room.keep_only([])
+    assert room.load(wanted, Place(at(8.0))) is not None, "forgotten and read again"
+
+
+def test_a_lost_robot_holds_the_tiles_that_it_can_have_come_to(row: tuple[Path, MapStore]) -> None:
+    """Not those where it says that it is: it would drive out of the map, and never find another place."""
+    whereabouts, room = Whereabouts(SETTINGS), MapRoom(StoreFolderLink(StoreFolder(row[0]), "row"), SETTINGS)
+    wanted = StoreFolderLink(StoreFolder(row[0]), "row").wanted()
+    assert whereabouts.handle(estimate(0.0, Status.AMBIGUOUS, known=False)).position_map_m is None, "anywhere"
+    assert whereabouts.handle(estimate(1.0, x_m=40.0)).doubt_m == 0
+    held = []
+    for seconds in (1, 10, 40):
+        place = whereabouts.handle(estimate(1.0 + seconds, Status.LOST, x_m=40.0 + 900.0 * seconds))
+        np.testing.assert_array_equal(place.position_map_m, [40.0, 0.0, 0.0])
+        assert SETTINGS.most_mps * seconds <= place.doubt_m <= SETTINGS.most_mps * seconds + 10
+        loaded = room.load(wanted, place)
+        assert loaded is not None
+        held.append(sorted(x for x, _ in loaded.tiles))
+    assert held == [list(range(5)), list(range(6)), list(range(10))]
+    found = whereabouts.handle(estimate(42.0, Status.DEGRADED, x_m=140.0))
+    assert (float(found.position_map_m[0]), found.doubt_m) == (140.0, 0.0)  # type: ignore[index]
+
+
+def test_bad_tiles_are_left_out(row: tuple[Path, MapStore], tmp_path: Path) -> None:
+    folder, store = row
+    manifest = store.manifest("row", 1)
+    victim = folder / blob_path(manifest.tiles[4].sha256)
+    good = victim.read_bytes()
+    link = StoreFolderLink(StoreFolder(folder), "row")
+    room, wanted = MapRoom(link, SETTINGS), link.wanted()
+    victim.chmod(0o644)
+    victim.write_bytes(good[:-7])
+    try:
+        loaded = room.load(wanted, Place())
+        assert loaded is not None
+        assert len(loaded.tiles) == 9
+        assert list(room.refused(wanted)) == [(4, 0)]
+        assert room.load(wanted, Place()) is None, "not read again and again"
+    finally:
+        victim.write_bytes(good)
+    room.forget_refusals(wanted)
+    mended = room.load(wanted, Place())
+    assert mended is not None
+    assert len(mended.tiles) == 10
+    foreign = WantedVersion(site="else", version=1, manifest_sha256=wanted.manifest_sha256)
+    with pytest.raises(FleetmapError, match="manifest is of row version 1"):
+        MapRoom(StoreFolderLink(StoreFolder(folder), "else"), SETTINGS).load(foreign, Place())

@@ -1,0 +1,131 @@
+"""`locclient replay`: wrong orders end with 2, bad input with 3, each with what to do next, and before any work."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import UsageError
+from locclient import cli
+from locclient.replay.prior_option import parse_prior
+from mapserver.store import MapStore
+from support.recordings.recording_samples import make_sample, write_euroc
+from support.storage.map_samples import save_sample_draft
+
+Said = pytest.CaptureFixture[str]
+
+
+def status(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """What the process would end with."""
+    monkeypatch.setattr(sys, "argv", ["locclient", *(str(a) for a in arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_euroc(tmp_path_factory.mktemp("recordings") / "walk", make_sample(3))
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("store") / "store"
+    with MapStore.open(folder, create=True) as maps:
+        save_sample_draft(maps)
+        maps.publish("lab")
+        save_sample_draft(maps, site="draft-only")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--store", "STORE"], "--site"),
+        (["--site", "lab"], "--server"),
+        (["--site", "lab", "--store", "STORE", "--server", "tcp/127.0.0.1:1"], "either"),
+        (["--site", "La b", "--store", "STORE"], "La b"),
+        (["--site", "lab", "--store", "STORE", "--frames", "1:2:x"], "1:2:x"),
+        (["--site", "lab", "--store", "STORE", "--frames", "70:"], "70"),
+        (["--site", "lab", "--store", "STORE", "--prior", "1,2,3"], "X,Y,YAW,SIGMA_M"),
+        (["--site", "lab", "--store", "STORE", "--prior", "1,2,3,x"], "1,2,3,x"),
+        (["--site", "lab", "--store", "STORE", "--prior", "1,2,3,0"], "positive"),
+        (["--site", "lab", "--server", "nonsense"], "nonsense"),
+        (["--site", "lab", "--store", "STORE", "--colour"], "--colour"),
+    ],
+)
+def test_wrong_orders_end_with_2(
+    monkeypatch: pytest.MonkeyPatch, walk: Path, store: Path, capsys: Said, arguments: list[str], said: str
+) -> None:
+    given = [str(store) if argument == "STORE" else argument for argument in arguments]
+    assert status(monkeypatch, "replay", walk, *given) == 2
+    told = capsys.readouterr()
+    assert said in told.err
+    assert "Traceback" not in told.err + told.out
+
+
+def test_bad_input_ends_with_3(
+    monkeypatch: pytest.MonkeyPatch, walk: Path, store: Path, tmp_path: Path, capsys: Said
+) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "zero.mcap").write_bytes(b"")
+    (tmp_path / "calibration.yaml").write_text("cam0: 7\n")
+    for arguments, said in (
+        ([tmp_path / "missing", "--site", "lab", "--store", store], "does not exist"),
+        ([tmp_path / "empty", "--site", "lab", "--store", store], "empty"),
+        ([tmp_path / "zero.mcap", "--site", "lab", "--store", store], "zero.mcap"),
+        ([walk, "--site", "lab", "--store", tmp_path / "nostore"], "nostore"),
+        ([walk, "--site", "draft-only", "--store", store], "draft-only"),
+        ([walk, "--site", "elsewhere", "--store", store], "elsewhere"),
+        ([walk, "--site", "lab", "--store", store, "--calibration", tmp_path / "calibration.yaml"], "calibration.yaml"),
+        (
+            [walk, "--site", "lab", "--server", "tcp/127.0.0.1:1", "--cache", tmp_path / "cache"],
+            "is the server running",
+        ),
+    ):
+        assert status(monkeypatch, "replay", *arguments) == 3, arguments
+        told = capsys.readouterr()
+        assert said in told.err, told.err
+        assert "Traceback" not in told.err + told.out
+
+
+def test_the_file_gives_defaults_and_knows_its_keys(
+    monkeypatch: pytest.MonkeyPatch, walk: Path, store: Path, tmp_path: Path, capsys: Said
+) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text(f'[replay]\nsite = "elsewhere"\nstore = "{store}"\n')
+    assert status(monkeypatch, "replay", walk, "--config", file) == 3
+    assert "elsewhere" in capsys.readouterr().err
+    assert status(monkeypatch, "replay", walk, "--config", file, "--site", "other") == 3
+    assert "other" in capsys.readouterr().err
+    file.write_text('[replay]\nsight = "lab"\n')
+    assert status(monkeypatch, "replay", walk, "--config", file) == 2
+    assert "sight" in capsys.readouterr().err
+
+
+def test_a_prior_is_a_place_of_the_base_with_a_doubt() -> None:
+    prior = parse_prior("1.5,-2,1.5707963267948966,0.4")
+    np.testing.assert_allclose(prior.map_from_base[:3, 3], [1.5, -2.0, 0.0])
+    np.testing.assert_allclose(prior.map_from_base[:3, :3] @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(prior.cov_rot_trans[3:5, 3:5], 0.16 * np.eye(2))
+    assert np.isinf(np.diag(prior.cov_rot_trans)[[0, 1, 2, 5]]).all()
+    assert parse_prior(None) is None
+
+
+@pytest.mark.parametrize("text", ["nan,0,0,1", "0,inf,0,1", "0,0,nan,1", "0,0,0,nan", "0,0,0,inf", "0,0,0,-1", ""])
+def test_numbers_that_are_no_place_are_refused(text: str) -> None:
+    with pytest.raises(UsageError):
+        parse_prior(text)
+
+
+@pytest.mark.parametrize("option", ["--report", "--trajectory", "--picture"])
+def test_files_that_cannot_be_written_are_told_before_the_work(
+    monkeypatch: pytest.MonkeyPatch, walk: Path, store: Path, tmp_path: Path, capsys: Said, option: str
+) -> None:
+    to_store = ("--site", "lab", "--store", store)
+    assert status(monkeypatch, "replay", walk, *to_store, option, tmp_path / "missing/file.png") == 2
+    assert option in capsys.readouterr().err
+    if option == "--picture":
+        assert status(monkeypatch, "replay", walk, *to_store, option, tmp_path / "picture.txt") == 2
+        assert option in capsys.readouterr().err

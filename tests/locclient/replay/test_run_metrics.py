@@ -1,0 +1,196 @@
+"""What a run was worth, against sequences small enough to judge by hand."""
+
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array
+from locclient.localization.estimate import Status
+from locclient.replay import run_metrics
+from locclient.replay.run_metrics import METRICS, FrameRecord
+
+T, D, A, L, I = Status.TRACKING, Status.DEGRADED, Status.AMBIGUOUS, Status.LOST, Status.INITIALISING  # noqa: E741
+
+
+def frame(
+    t_s: float, status: Status = T, *, fix: bool = True, error_m: float | None = 0.0, error_deg: float = 0.0,
+    sigma_m: float | None = 0.05, cpu_s: float = 0.01, wall_s: float = 0.02, stage_s: dict[str, float] | None = None,
+) -> FrameRecord:  # fmt: skip
+    error = None if error_m is None else error_m * np.array([0.6, -0.8, 0.0])
+    covariance = None if sigma_m is None else np.diag([1e-4] * 3 + [sigma_m**2] * 3)
+    stages = {} if stage_s is None else stage_s
+    angle = None if error_m is None else float(np.radians(error_deg))
+    return FrameRecord(round(t_s * 1e9), status, fix, covariance, error, angle, cpu_s, wall_s, stages)
+
+
+def sequence(*stretches: tuple[float, dict[str, object]], step_s: float = 0.1) -> list[FrameRecord]:
+    """Frames at 10 Hz, so many seconds of each kind; what is not said is good tracking."""
+    frames: list[FrameRecord] = []
+    for seconds, kind in stretches:
+        for _ in range(round(seconds / step_s)):
+            frames.append(frame(len(frames) * step_s, **kind))  # type: ignore[arg-type]
+    return frames
+
+
+GOOD: dict[str, object] = {}
+WRONG: dict[str, object] = {"error_m": 0.31, "sigma_m": 0.5}  # honest about its doubt, and still wrong
+LOST: dict[str, object] = {"status": L, "fix": False, "error_m": None, "sigma_m": None}
+
+
+def counts(frames: Iterable[FrameRecord]) -> tuple[object, object]:
+    """(silent, position) failures."""
+    listed = list(frames)
+    return METRICS["silent_failures"](listed), METRICS["position_failures"](listed)
+
+
+def test_dense_frames_are_localised_by_status() -> None:
+    frames = [frame(0.0, I), frame(0.1, T, fix=False), frame(0.2, D), frame(0.3, A), frame(0.4, L)]
+    assert run_metrics.localised(frames) == [False, True, False, False, False]
+
+
+def test_sparse_frames_are_localised_by_their_own_fix() -> None:
+    frames = [frame(0.0, I), frame(1.5, L, fix=False), frame(3.0, D), frame(4.5, T, fix=False)]
+    assert run_metrics.localised(frames) == [True, False, True, True]
+    assert run_metrics.localised([frame(0.0, I), frame(1.0, I)]) == [False, False]  # not more than a second apart
+    assert run_metrics.localised([frame(0.0, I)]) == [False]
+
+
+def test_the_share_counts_from_the_first_fix() -> None:
+    frames = [frame(0.1 * k, I, fix=False) for k in range(4)]
+    frames += [frame(0.4, I), frame(0.5, T), frame(0.6, D, fix=False), frame(0.7, T)]
+    assert METRICS["localised_share"](frames) == pytest.approx(2 / 4)
+    assert METRICS["first_fix_s"](frames) == pytest.approx(0.4)
+    assert METRICS["localised_share"](frames[:4]) is None
+    assert METRICS["first_fix_s"](frames[:4]) is None
+
+
+def test_errors_are_those_of_localised_frames_with_a_truth() -> None:
+    errors = [0.1, 0.2, 0.3, 0.4, 0.5]
+    frames = [frame(0.1 * k, error_m=e, error_deg=10 * e) for k, e in enumerate(errors)]
+    frames += [frame(0.5, D, error_m=9.0, error_deg=90.0), frame(0.6, T, error_m=None)]
+    # linear interpolation between the sorted values: rank 0.95 * 4 = 3.8, 0.99 * 4 = 3.96
+    assert METRICS["error_m"](frames) == pytest.approx({"median": 0.3, "p95": 0.48, "p99": 0.496, "max": 0.5})
+    assert METRICS["error_deg"](frames) == pytest.approx({"median": 3.0, "p99": 4.96})
+    assert METRICS["error_m"](frames[5:]) is None
+    assert METRICS["error_deg"](frames[5:]) is None
+
+
+def test_times_leave_out_the_warm_up() -> None:
+    slow = [frame(0.1 * k, cpu_s=9.0, wall_s=9.0, stage_s={"map": 9.0}) for k in range(20)]
+    rest = [frame(2.0 + 0.1 * k, cpu_s=0.001 * k, wall_s=0.002 * k, stage_s={"map": 0.01}) for k in range(1, 4)]
+    rest[0].stage_s["decode"] = 0.003
+    assert METRICS["frame_ms"](slow + rest) == pytest.approx({"mean": 2.0, "p50": 2.0, "p99": 2.98, "max": 3.0})
+    assert METRICS["frame_wall_ms"](slow + rest) == pytest.approx({"mean": 4.0, "p50": 4.0, "p99": 5.96, "max": 6.0})
+    assert METRICS["stage_ms"](slow + rest) == pytest.approx({"decode": 1.0, "map": 10.0})
+    assert METRICS["frame_ms"](slow) is None
+
+
+def test_status_shares() -> None:
+    shares = METRICS["status_share"]([frame(0, T), frame(1, T), frame(2, L), frame(3, A)])
+    assert shares == {"INITIALISING": 0.0, "TRACKING": 0.5, "DEGRADED": 0.0, "AMBIGUOUS": 0.25, "LOST": 0.25}
+
+
+def test_nothing_recorded_is_nothing_claimed() -> None:
+    for name, metric in METRICS.items():
+        if name != "silent_failures":
+            assert metric([]) in (None, 0, {}), name
+
+
+def test_good_tracking_has_no_failures() -> None:
+    assert counts(sequence((20, GOOD))) == (0, 0)
+
+
+@pytest.mark.parametrize(("seconds", "failures"), [(0.9, 0), (1.0, 0), (1.1, 1), (4.0, 1)])
+def test_wrong_tracking_is_silent_after_a_second(seconds: float, failures: int) -> None:
+    """A stretch lasts to the first good frame: eleven frames at 10 Hz last 1.1 s."""
+    assert counts(sequence((2, GOOD), (seconds, WRONG), (8, GOOD))) == (failures, failures)
+
+
+@pytest.mark.parametrize(
+    ("kind", "failures"),
+    [
+        ({"error_m": 0.29, "sigma_m": 0.5}, 0),
+        ({"error_m": 0.0, "error_deg": 5.1, "sigma_m": 0.5}, 1),
+        ({"error_m": 0.0, "error_deg": 4.9, "sigma_m": 0.5}, 0),
+        ({"error_m": 5.0, "sigma_m": 5.0, "status": D}, 0),
+        ({"error_m": 5.0, "sigma_m": 5.0, "status": I}, 0),
+        ({"error_m": None}, 0),
+    ],
+)
+def test_only_wrong_tracking_is_silent(kind: dict[str, object], failures: int) -> None:
+    assert counts(sequence((2, GOOD), (3, kind), (2, GOOD)))[0] == failures
+
+
+def test_without_any_truth_silence_is_unknown() -> None:
+    frames = sequence((3, {"error_m": None}))
+    assert counts(frames) == (None, 0)
+
+
+def test_a_failure_ends_after_five_good_seconds() -> None:
+    near = sequence((1, GOOD), (2, WRONG), (4, GOOD), (2, WRONG), (1, GOOD))
+    far = sequence((1, GOOD), (2, WRONG), (6, GOOD), (2, WRONG), (1, GOOD))
+    assert counts(near) == (1, 1)
+    assert counts(far) == (2, 2)
+
+
+@pytest.mark.parametrize(
+    ("kind", "seconds", "failures"),
+    [
+        (LOST, 2.0, 0),
+        (LOST, 2.2, 1),
+        (LOST | {"status": A}, 2.2, 1),
+        ({"status": D, "fix": False, "sigma_m": 0.12}, 2.2, 1),  # 95 % within 2.796 sigmas: 0.336 m
+        ({"status": D, "fix": False, "sigma_m": 0.10}, 5.0, 0),  # 0.280 m
+        (LOST | {"status": I}, 5.0, 0),
+    ],
+)
+def test_blindness_is_a_failure_after_two_seconds(kind: dict[str, object], seconds: float, failures: int) -> None:
+    assert counts(sequence((1, GOOD), (seconds, kind), (2, GOOD))) == (0, failures)
+
+
+def test_blindness_counts_from_the_first_fix_only() -> None:
+    assert counts(sequence((9, LOST), (2, GOOD)))[1] == 0
+
+
+def test_overconfidence_is_a_failure_though_not_silent() -> None:
+    """0.20 m off; the 99.9 % bound of three dimensions is 4.033 sigmas."""
+    inside: dict[str, object] = {"error_m": 0.2, "sigma_m": 0.0501}
+    outside: dict[str, object] = {"error_m": 0.2, "sigma_m": 0.049}
+    assert counts(sequence((1, GOOD), (3, inside), (1, GOOD))) == (0, 0)
+    assert counts(sequence((1, GOOD), (3, outside), (1, GOOD))) == (0, 1)
+    assert counts(sequence((1, GOOD), (0.9, outside), (1, GOOD))) == (0, 0)
+
+
+def test_different_failures_at_once_count_once() -> None:
+    both: dict[str, object] = {"error_m": 0.5, "sigma_m": 0.01}
+    assert counts(sequence((1, GOOD), (3, both), (8, GOOD))) == (1, 1)
+    assert counts(sequence((1, GOOD), (3, LOST), (3, WRONG), (8, GOOD))) == (1, 1)
+    assert counts(sequence((1, GOOD), (3, LOST), (8, GOOD), (3, WRONG))) == (1, 2)
+
+
+def test_between_sparse_frames_nothing_better_is_known() -> None:
+    """2.5 s apart: one lost frame is 2.5 s without a place, one wrong fix 2.5 s in the wrong place."""
+    kinds: list[dict[str, object]] = [{"status": L}, {"status": L}, LOST, {"status": L}, {"status": L}]
+    frames = [frame(2.5 * k, **kind) for k, kind in enumerate(kinds)]  # type: ignore[arg-type]
+    assert METRICS["localised_share"](frames) == pytest.approx(0.8)
+    assert counts(frames) == (0, 1)
+    kinds[2] = {"status": L, "error_m": 0.4, "sigma_m": 0.5}
+    assert counts(frame(2.5 * k, **kind) for k, kind in enumerate(kinds)) == (1, 1)  # type: ignore[arg-type]
+
+
+def test_the_radius_holds_95_percent() -> None:
+    """Against samples of the distribution, and infinite where nothing is known."""
+    samples: Array = np.random.default_rng(3).normal(0, 0.05, (20_000, 3))
+    inside = np.linalg.norm(samples, axis=1) < frame(0, sigma_m=0.05).radius_95_m
+    assert inside.mean() == pytest.approx(0.95, abs=0.005)
+    assert frame(0, sigma_m=None).radius_95_m == np.inf
+
+
+def test_a_failure_ends_only_after_five_seconds_of_good_tracking() -> None:
+    """Lost, then six seconds of half-trust, then lost again is one failure; with six good seconds between, two."""
+    half: dict[str, object] = {"status": D, "fix": False, "sigma_m": 0.05}
+    one = sequence((2, GOOD), (3, LOST), (6, half), (3, LOST), (6, GOOD))
+    two = sequence((2, GOOD), (3, LOST), (6, GOOD), (3, LOST), (6, GOOD))
+    assert counts(one)[1] == 1
+    assert counts(two)[1] == 2

@@ -1,0 +1,92 @@
+"""The report of a failure: numbers, small pictures, and what the map expected beside what was seen."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fleetmap.geometry import se3
+from fleetmap.messages import MAX_MESSAGE_BYTES, MAX_THUMBNAIL_BYTES, encode_message
+from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.samples import CameraFrame
+from locclient.daemon.failure_files import write_failure
+from locclient.daemon.jit_warmup import warm_up
+from locclient.robot.match_view import match_view, small_jpeg
+from mapserver.store import MapStore
+from support.recordings.recording_samples import calibration
+from support.worlds import robot_world
+
+
+def frame(index: int) -> RectifiedFrame:
+    sample = robot_world.cycle()
+    return robot_world.rectifier().rectify(CameraFrame(5, sample.left[index], sample.right[index]))
+
+
+def green(picture: np.ndarray) -> int:
+    return int(((picture[..., 1] > 180) & (picture[..., 0] < 100) & (picture[..., 2] < 100)).sum())
+
+
+def test_the_match_view_tells_the_right_place_from_a_wrong_one() -> None:
+    rig, left = robot_world.rectifier(), frame(30).left
+    right_place = robot_world.truth(30) @ rig.body_from_cam
+    wrong_place = se3(np.eye(3), np.array([1.0, 0.0, 0.0])) @ right_place
+    views = [
+        match_view(left, rig.camera, place, robot_world.tiles(), robot_world.SETTINGS, "test")
+        for place in (right_place, wrong_place)
+    ]
+    assert views[0].shape == (rig.camera.height_px + 30, 2 * rig.camera.width_px, 3)
+    assert green(views[0]) > 2 * green(views[1])
+    nowhere = match_view(np.zeros_like(left), rig.camera, right_place, [], robot_world.SETTINGS, "dark")
+    assert green(nowhere) == 0
+
+
+def test_pictures_are_small() -> None:
+    noise = np.asarray(np.random.default_rng(0).integers(0, 255, (480, 1280, 3)), np.uint8)
+    for limit in (MAX_THUMBNAIL_BYTES, 4000, 900):
+        data = small_jpeg(noise, 800, limit)
+        assert len(data) <= limit
+        assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED).shape[1] <= 800
+
+
+def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
+    """Expected: blind, dark, DEGRADED or LOST, the tile it was last in, pictures of before and of the moment."""
+    from locclient.robot.failure_report import failure_report
+
+    robot = robot_world.new_robot()
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        robot_world.save(store)
+        robot.use(robot_world.loaded(store))
+    told = []
+    for moment in robot_world.moments(130, dark=range(60, 130)):
+        outcome = robot.handle(moment)
+        if outcome is not None and outcome.failure is not None:
+            told.append(outcome.failure)
+    assert len(told) == 1
+    report = failure_report(
+        told[0], site="room", robot="r1", report_id="ab" * 16, wall_ns=7, base_from_body=np.eye(4),
+        camera=robot_world.rectifier().camera, settings=robot_world.SETTINGS,
+    )  # fmt: skip
+    assert (report.kind, report.cause, report.version) == ("blind", "dark", 1)
+    assert report.status in {"DEGRADED", "LOST"}
+    assert report.tile in {(-1, 0), (0, 0)}
+    assert report.exposure == 0.0
+    assert report.inliers is not None
+    assert [picture.kind for picture in report.thumbnails] == ["frame", "frame", "frame", "matches"]
+    assert len(encode_message(report)) < MAX_MESSAGE_BYTES / 4
+    written = json.loads(write_failure(tmp_path / "failures", report).read_text())
+    assert written["cause"] == "dark"
+    assert all((tmp_path / "failures" / name).stat().st_size > 100 for name in written["thumbnails"])
+
+
+def test_warming_up_runs_the_whole_way() -> None:
+    assert warm_up(calibration(), robot_world.rectifier(), robot_world.SETTINGS) >= 3
+
+
+@pytest.mark.parametrize("has_imu", [False])
+def test_warming_up_needs_no_imu(has_imu: bool) -> None:
+    from fleetmap.sensors.rectification import Rectifier
+
+    rig = calibration(has_imu=has_imu)
+    assert warm_up(rig, Rectifier(rig), robot_world.SETTINGS) >= 3

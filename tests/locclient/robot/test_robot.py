@@ -1,0 +1,88 @@
+"""Versions on trial while a robot drives: it keeps its place whatever a new version turns out to be."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from locclient.localization.estimate import Status
+from locclient.robot.robot import Change, Robot
+from mapserver.store import MapStore
+from support.worlds import robot_world
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[MapStore]:
+    with MapStore.open(tmp_path / "store", create=True) as maps:
+        robot_world.save(maps)
+        yield maps
+
+
+def drive(robot: Robot, numbers: range, moments: list) -> list[float]:  # type: ignore[type-arg]
+    """Errors in metres of the tracked frames; all others are infinite."""
+    errors = []
+    for number in numbers:
+        estimate = robot.handle(moments[number]).estimate
+        off = np.inf
+        if estimate.status is Status.TRACKING:
+            off = float(np.linalg.norm(estimate.map_from_body[:3, 3] - robot_world.truth(number)[:3, 3]))
+        errors.append(off)
+    return errors
+
+
+def test_the_first_version_is_taken_and_the_robot_finds_itself(store: MapStore) -> None:
+    robot, moments = robot_world.new_robot(), list(robot_world.moments(70))
+    assert robot.handle(moments[0]).estimate.map_version is None
+    robot.use(robot_world.loaded(store))
+    errors = drive(robot, range(1, 70), moments)
+    assert [change.change for change in robot.take_changes()] == [Change.ADOPTED]
+    assert max(errors[45:]) < 0.05
+    assert robot.take_changes() == []
+
+
+def test_a_good_version_is_adopted_after_its_fixes(store: MapStore) -> None:
+    robot, moments = robot_world.new_robot(), list(robot_world.moments(100))
+    robot.use(robot_world.loaded(store))
+    drive(robot, range(70), moments)
+    robot.take_changes()
+    robot_world.save(store)
+    second = robot_world.loaded(store)
+    robot.use(second)
+    assert [held.version for held in robot.held] == [1, 2]
+    assert max(drive(robot, range(70, 100), moments)) < 0.05
+    changes = robot.take_changes()
+    assert [(change.change, change.wanted.version) for change in changes] == [(Change.ADOPTED, 2)]
+    assert [held.version for held in robot.held] == [2]
+
+
+def test_a_version_that_slipped_is_refused_and_the_place_kept(store: MapStore) -> None:
+    """Status: never wrong; after the trial TRACKING in the old version. Flag: refused, with both versions named."""
+    robot, moments = robot_world.new_robot(), list(robot_world.moments(130))
+    robot.use(robot_world.loaded(store))
+    drive(robot, range(70), moments)
+    robot.take_changes()
+    slipped = robot_world.moved(np.array([2.0, 0.0, 0.0]))
+    robot_world.save(store)
+    robot.use(robot_world.loaded(store, of=slipped))
+    errors = drive(robot, range(70, 130), moments)
+    changes = robot.take_changes()
+    assert [(change.change, change.wanted.version) for change in changes] == [(Change.REFUSED, 2)]
+    assert "of version 2 0 fixes and 2 that contradict it" in changes[0].reason
+    assert "version 1 gives fixes" in changes[0].reason
+    assert robot.running is not None
+    assert robot.running.version == 1
+    assert max(errors) < 0.1
+
+
+def test_darkness_is_no_verdict_about_a_version(store: MapStore) -> None:
+    robot = robot_world.new_robot()
+    moments = list(robot_world.moments(120, dark=range(71, 120)))
+    robot.use(robot_world.loaded(store))
+    drive(robot, range(70), moments)
+    robot.take_changes()
+    robot_world.save(store)
+    robot.use(robot_world.loaded(store))
+    drive(robot, range(70, 120), moments)
+    assert [change.change for change in robot.take_changes()] == [Change.POSTPONED]
+    assert [held.version for held in robot.held] == [1]

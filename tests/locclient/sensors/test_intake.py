@@ -1,0 +1,97 @@
+"""Frames may drop and are counted, inertial samples never do, and a frame waits for its own."""
+
+import threading
+
+import numpy as np
+
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
+from locclient.sensors.intake import Intake
+
+MS = 1_000_000
+
+
+def frame(stamp_ms: int) -> CameraFrame:
+    return CameraFrame(stamp_ms * MS, np.zeros((2, 2), np.uint8))
+
+
+def imu(*stamps_ms: int, gyro: float = 0.0) -> ImuSamples:
+    count = len(stamps_ms)
+    return ImuSamples(MS * np.array(stamps_ms, np.int64), np.full((count, 3), gyro), np.ones((count, 3)))
+
+
+def intake(frames: int = 2, wait_s: float = 0.0, offset_s: float = 0.0) -> Intake:
+    return Intake(frames=frames, imu_minus_cam_s=offset_s, has_imu=True, imu_wait_s=wait_s)
+
+
+def test_the_oldest_frames_drop_and_no_inertial_sample_does() -> None:
+    queue = intake()
+    for stamp_ms in range(0, 100, 10):
+        queue.put_imu(imu(*range(stamp_ms, stamp_ms + 10)))
+        queue.put_frame(frame(stamp_ms))
+    first, second = queue.take(0), queue.take(0)
+    assert (first.frame.stamp_ns, second.frame.stamp_ns) == (80 * MS, 90 * MS)
+    assert (queue.counts.frames, queue.counts.frames_dropped) == (10, 8)
+    stamps = np.concatenate([first.imu.stamps_ns, second.imu.stamps_ns])
+    np.testing.assert_array_equal(stamps, MS * np.arange(100))
+    assert queue.take(0).frame is None
+
+
+def test_what_cannot_be_is_refused_and_counted() -> None:
+    queue = intake(frames=5)
+    queue.put_frame(frame(10))
+    queue.put_frame(frame(10))
+    queue.put_frame(frame(5))
+    queue.put_imu(imu(1, 2, 2, 3))
+    queue.put_imu(imu(1))
+    queue.put_imu(imu(4, gyro=float("nan")))
+    queue.put_imu(imu(5, gyro=1e9))
+    assert queue.counts.frames_disordered == 2
+    assert (queue.counts.imu_samples, queue.counts.imu_refused) == (3, 4)
+    np.testing.assert_array_equal(queue.take(0).imu.stamps_ns, MS * np.array([1, 2, 3]))
+
+
+def test_a_frame_waits_for_its_inertial_samples_but_not_for_ever() -> None:
+    queue = intake(wait_s=5.0, offset_s=0.02)
+    queue.put_frame(frame(100))
+    late = threading.Timer(0.05, lambda: queue.put_imu(imu(90, 119, 121)))
+    late.start()
+    moment = queue.take(1.0)
+    late.join()
+    np.testing.assert_array_equal(moment.imu.stamps_ns, MS * np.array([90, 119, 121]))
+    assert queue.counts.imu_late == 0
+    hasty = intake(wait_s=0.01)
+    hasty.put_frame(frame(100))
+    assert hasty.take(1.0).frame is not None
+    assert hasty.counts.imu_late == 1
+
+
+def test_what_comes_before_a_frame_goes_with_it() -> None:
+    queue = intake()
+    for stamp_ms in (10, 30):
+        queue.put_wheel(WheelSample(stamp_ms * MS, np.zeros(3), 0.0, 0.1, 0.1))
+        queue.put_prior(PositionPrior(stamp_ms * MS, np.eye(4), np.eye(6)))
+    queue.put_frame(frame(20))
+    queue.put_frame(frame(40))
+    for stamp_ms in (10, 30):
+        moment = queue.take(0)
+        assert [sample.stamp_ns for sample in moment.wheel] == [stamp_ms * MS]
+        assert [prior.stamp_ns for prior in moment.priors] == [stamp_ms * MS]
+
+
+def test_without_frames_memory_stays_bounded() -> None:
+    queue = intake()
+    for second in range(0, 200, 10):
+        queue.put_imu(imu(*range(1000 * second, 1000 * second + 10_000, 10)))
+    assert queue.counts.imu_stale > 13_000
+    queue.put_frame(frame(200_000))
+    assert len(queue.take(0).imu) <= 6001
+
+
+def test_the_end_is_told_once_all_is_taken() -> None:
+    queue = intake()
+    queue.put_frame(frame(1))
+    queue.finish()
+    assert not queue.exhausted
+    assert queue.take(10.0).frame is not None
+    assert queue.exhausted
+    assert queue.take(10.0).frame is None

@@ -1,0 +1,43 @@
+"""Pictures that were set aside come back as they were, however many there are."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import StoreError
+from fleetmap.features.patch_align import half_pyramid
+from fleetmap.sensors.rectification import RectifiedFrame
+from mapserver.build.image_spill import PictureFile
+from mapserver.survey.keyframes.keyframes import Pictures
+
+
+def pictures(number: int) -> Pictures:
+    rng = np.random.default_rng(number)
+    left, right = (rng.integers(0, 256, (24, 32), dtype=np.uint8) for _ in range(2))
+    depth = rng.uniform(1, 9, (24, 32)).astype(np.float32) if number % 3 == 0 else None
+    frame = RectifiedFrame(number, left, None if number % 3 == 0 else right, depth)
+    return Pictures(frame, half_pyramid(left))
+
+
+def test_pictures_come_back_to_the_bit(tmp_path: Path) -> None:
+    """More of them than are held in memory, asked for in another order."""
+    with PictureFile(tmp_path) as shelf:
+        numbers = [shelf.put(pictures(n)) for n in range(120)]
+        for n in [*range(119, -1, -7), 0, 1, 119]:
+            back, wanted = shelf.get(numbers[n]), pictures(n)
+            assert back.frame.stamp_ns == n
+            for own, theirs in zip(back.pyramid, wanted.pyramid, strict=True):
+                np.testing.assert_array_equal(own, theirs)
+            for name in ("right", "disparity_px"):
+                own, theirs = getattr(back.frame, name), getattr(wanted.frame, name)
+                assert (own is None) == (theirs is None)
+                if theirs is not None:
+                    np.testing.assert_array_equal(own, theirs)
+                    assert own.flags.writeable
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_takes_no_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="nowhere"):
+        PictureFile(tmp_path / "nowhere")

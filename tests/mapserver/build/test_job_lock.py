@@ -1,0 +1,58 @@
+"""A job whose process was killed does not stand as running for ever, and one that runs is left alone."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from mapserver.build.job_lock import INTERRUPTED, end_interrupted
+from mapserver.build.job_record import noted_job
+from mapserver.store import MapStore
+from support.storage.map_samples import save_sample_draft
+
+MINUTES_NS = 600 * 10**9
+
+
+def begun_elsewhere(folder: Path) -> int:
+    """Another process that has noted a job and works on it."""
+    told, tell = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with MapStore.open(folder) as maps, noted_job(maps, "lab", "build"):
+            os.write(tell, b"x")
+            signal.pause()
+        os._exit(0)
+    os.read(told, 1)
+    return child
+
+
+def test_a_killed_job_is_ended_and_a_running_one_is_not(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as maps:
+        save_sample_draft(maps)
+    child = begun_elsewhere(tmp_path)
+    later_ns = time.time_ns() + MINUTES_NS
+    with MapStore.open(tmp_path) as maps:
+        assert end_interrupted(maps, later_ns) == []
+        assert [job.state for job in maps.jobs()] == ["running"]
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        assert end_interrupted(maps, time.time_ns()) == []  # it may not hold its lock yet
+        assert end_interrupted(maps, later_ns) == [1]
+        (job,) = maps.jobs()
+        assert (job.state, job.report) == ("failed", {INTERRUPTED: True})
+        assert "was interrupted" in job.message
+        assert job.finished is not None
+        assert end_interrupted(maps, later_ns) == []
+    assert list(tmp_path.glob("job-*.lock")) == []
+
+
+def test_the_next_job_ends_it_too(tmp_path: Path) -> None:
+    """Without a server, which looks every few seconds."""
+    with MapStore.open(tmp_path, create=True, clock_ns=lambda: time.time_ns() - MINUTES_NS) as maps:
+        save_sample_draft(maps)
+        maps.begin_job("lab", "build")
+    with MapStore.open(tmp_path) as maps:
+        with noted_job(maps, "lab", "build"):
+            assert [job.state for job in maps.jobs()] == ["running", "failed"]
+        assert [job.state for job in maps.jobs()] == ["done", "failed"]
+    assert list(tmp_path.glob("job-*.lock")) == []

@@ -1,0 +1,113 @@
+"""Whoever does the work of a survey, the map is the same to the byte."""
+
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+
+import pytest
+
+from fleetmap.bow import decode_vocabulary
+from fleetmap.bow.shipped_vocabulary import default_vocabulary_bytes
+from fleetmap.errors import UsageError
+from fleetmap.mapformat import encode_tile
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import CameraFrame, ImuSamples
+from mapserver.build import worker as workers
+from mapserver.build.worker import Threads, open_worker, read_ahead
+from mapserver.store.archive import encode_archive
+from mapserver.survey.executor import ALONE, Worker, in_batches
+from mapserver.survey.loops.zones import Zones
+from mapserver.survey.pipeline import survey
+from mapserver.survey.settings import SurveySettings
+from mapserver.tiles.tiling import tiles_from_survey
+from support.recordings.recording_samples import calibration, make_sample
+
+
+def surveyed_by(worker: Worker) -> tuple[bytes, ...]:
+    """Archive and tiles of a small survey."""
+    sample, rig = make_sample(24), calibration()
+    frames = [CameraFrame(int(s), a, b) for s, a, b in zip(sample.stamps_ns, sample.left, sample.right, strict=True)]
+    imu = ImuSamples(sample.imu_stamps_ns, sample.gyro_radps, sample.accel_mps2)
+    done = survey(
+        iter(frames), len(frames), imu, rig, Rectifier(rig), decode_vocabulary(default_vocabulary_bytes()), SurveySettings(),
+        Zones(), lambda *_: None, worker=worker,
+    )  # fmt: skip
+    return (encode_archive(done.map), *(encode_tile(tile) for tile in tiles_from_survey(done.map)))
+
+
+@lru_cache(maxsize=1)
+def alone() -> tuple[bytes, ...]:
+    return surveyed_by(ALONE)
+
+
+def test_threads_make_the_same_map() -> None:
+    with open_worker(3, None) as worker:
+        assert isinstance(worker, Threads)
+        assert surveyed_by(worker) == alone()
+
+
+def test_processes_of_a_cluster_make_the_same_map() -> None:
+    with open_worker(2, "local") as worker:
+        assert surveyed_by(worker) == alone()
+
+
+def test_a_scheduler_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_CONNECT_WITHIN_S", "1s")
+    for address in ("tcp://127.0.0.1:9", "nonsense"):
+        with pytest.raises(UsageError, match="does not answer"), open_worker(1, address):
+            pass
+
+
+def test_results_come_in_order_and_work_does_not_run_far_ahead() -> None:
+    begun: list[int] = []
+
+    def slow(shared: int, batch: int) -> int:
+        begun.append(batch)
+        time.sleep(0.002 * (batch % 3))
+        return shared + batch
+
+    with ThreadPoolExecutor(2) as pool:
+        found = Threads(pool, 2).map(slow, 100, range(30))
+        first = next(found)
+        assert len(begun) <= 6
+        assert [first, *found] == [100 + n for n in range(30)]
+
+
+def test_an_error_in_a_thread_comes_where_its_result_would() -> None:
+    def fails(_: None, batch: int) -> int:
+        if batch == 2:
+            raise ValueError("two")
+        return batch
+
+    with ThreadPoolExecutor(2) as pool:
+        found = Threads(pool, 2).map(fails, None, range(5))
+        assert [next(found), next(found)] == [0, 1]
+        with pytest.raises(ValueError, match="two"):
+            next(found)
+
+
+def test_reading_ahead_keeps_order_and_errors() -> None:
+    used: list[int] = []
+
+    def numbers() -> Iterator[int]:
+        for number in range(8):
+            used.append(threading.get_ident())
+            yield number
+        raise ValueError("the end is damaged")
+
+    found = []
+    with pytest.raises(ValueError, match="damaged"):
+        for number in read_ahead(numbers()):
+            found.append(number)  # noqa: PERF402
+    assert found == list(range(8))
+    assert threading.get_ident() not in used
+    early = read_ahead(iter(range(100)))
+    assert next(early) == 0
+    early.close()  # type: ignore[attr-defined]
+
+
+def test_batches_keep_everything() -> None:
+    assert in_batches([1, 2, 3, 4, 5], 2) == [[1, 2], [3, 4], [5]]
+    assert in_batches([], 2) == []

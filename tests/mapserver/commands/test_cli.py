@@ -1,0 +1,198 @@
+"""The command line as a whole: exit statuses, configuration file, speed of --help."""
+
+import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from fleetmap.errors import UsageError
+from fleetmap.geometry import se3_exp
+from fleetmap.recordings.tum import write_tum
+from fleetmap.sensors.samples import SensorSet, Trajectory
+from mapserver import cli
+from mapserver.commands.fleet import fleet_app
+from mapserver.config import MapserverConfig, command_defaults, read_config
+from mapserver.quality.figures import Evidence, TileDirections
+from mapserver.store import MapStore
+from support.storage.map_samples import draft_details, random_tile, save_sample_draft
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+HEAVY = ("numpy", "numba", "cv2", "scipy", "gtsam", "matplotlib", "zenoh", "fastapi", "rich.progress", "msgspec")
+
+
+def status(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """What the process would end with."""
+    monkeypatch.setattr(sys, "argv", ["mapserver", *(str(a) for a in arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+@pytest.mark.parametrize("package", ["mapserver", "locclient"])
+def test_the_command_line_imports_nothing_heavy(package: str) -> None:
+    """What --help takes is what these imports take."""
+    code = f"import sys, {package}.cli; print([m for m in {HEAVY!r} if m in sys.modules])"
+    paths = [str(REPOSITORY / part) for part in ("shared", "mapserver", "locclient")]
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.path[:0] = {paths!r}\n{code}"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_exit_statuses(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with MapStore.open(tmp_path / "store", create=True) as maps:
+        save_sample_draft(maps)
+        maps.save_draft("empty", tiles=[], vocabulary=b"w", details=draft_details())
+    to_store = ("--store", tmp_path / "store")
+    assert status(monkeypatch, "versions", "--site", "lab", *to_store) == 0
+    assert status(monkeypatch, "--help") == 0
+    assert status(monkeypatch, "build", "--site", "lab") == 2
+    assert status(monkeypatch, "no-such-command") == 2
+    assert status(monkeypatch, "versions", "--site", "unknown", *to_store) == 2
+    capsys.readouterr()
+    assert status(monkeypatch, "build", tmp_path / "missing", "--site", "lab", *to_store) == 3
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith(f"error: {tmp_path / 'missing'} does not exist")
+    assert "Traceback" not in told.err
+    assert status(monkeypatch, "publish", "--site", "empty", *to_store) == 4
+    assert status(monkeypatch, "publish", "--site", "lab", *to_store) == 0
+
+
+def test_publishing_says_which_way_nobody_drove(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    with MapStore.open(tmp_path / "store", create=True) as maps:
+        tiles = [random_tile(np.random.default_rng(0), cell=(3, -1))]
+        seen = Evidence(directions=[TileDirections((3, -1), {"E": 12}, {"W": 12})])
+        maps.save_draft(
+            "lab", tiles=tiles, vocabulary=b"words", details=draft_details(), archive=b"archive", evidence=seen
+        )
+    assert status(monkeypatch, "publish", "--site", "lab", "--store", tmp_path / "store") == 0
+    assert "tile 3,-1: 12 places face E and none near them W" in capsys.readouterr().out
+
+
+def test_interruption_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "app", interrupted)
+    assert status(monkeypatch, "build") == 130
+    monkeypatch.undo()
+    monkeypatch.setattr("mapserver.store.MapStore.open", lambda *_, **__: interrupted())
+    assert status(monkeypatch, "versions", "--site", "lab", "--store", "s") == 130
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_every_option_has_its_key_in_the_file() -> None:
+    """And every section and key belongs to a command, to a command of a group, or to settings of their own."""
+    commands = {command.__name__: command for command in cli.COMMANDS}
+    sections = {field.name: field.default for field in msgspec.structs.fields(MapserverConfig)}
+    assert set(sections) == {*commands, "fleet", "survey", "gate", "ingest", "canary", "resurvey"}
+    grouped = {command.callback.__name__: command.callback for command in fleet_app.registered_commands}
+    assert set(sections["fleet"].__struct_fields__) == set(grouped)
+    commands |= {f"fleet.{name}": command for name, command in grouped.items()}
+    sections |= {f"fleet.{name}": getattr(sections["fleet"], name) for name in grouped}
+    for name, command in commands.items():
+        options = set()
+        for parameter in inspect.signature(command).parameters.values():
+            kinds = [type(m).__name__ for m in getattr(parameter.annotation, "__metadata__", ())]
+            if "OptionInfo" in kinds and parameter.name != "config":
+                options.add(parameter.name)
+        keys = set(sections[name].__struct_fields__)
+        missing = options - keys
+        assert not missing, f"{name}: {missing} cannot stand in the file"
+        if name not in ("versions", "inspect", "diff", "verify"):  # these share a section type
+            assert keys == options
+
+
+def test_the_file_gives_defaults_and_the_command_line_wins(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with MapStore.open(tmp_path / "store", create=True) as maps:
+        save_sample_draft(maps, site="lab")
+        save_sample_draft(maps, site="hall")
+        save_sample_draft(maps, site="hall")
+    file = tmp_path / "site.toml"
+    file.write_text(f'[versions]\nsite = "lab"\nstore = "{tmp_path / "store"}"\njson = true\n')
+    for arguments, count in (
+        (("--config", file, "versions"), 1),
+        (("--config", file, "versions", "--site", "hall"), 2),
+    ):
+        assert status(monkeypatch, *arguments) == 0
+        assert len(json.loads(capsys.readouterr().out)) == count
+
+
+def test_build_takes_its_settings_from_the_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = []
+    monkeypatch.setattr(
+        "mapserver.build.build.run_build", lambda order, settings: seen.append((order, settings)) or "done"
+    )
+    monkeypatch.setattr("mapserver.build.sensor_subset.sensor_set_of", lambda path, calibration: SensorSet.STEREO)
+    file = tmp_path / "site.toml"
+    file.write_text(
+        f'[build]\nsite = "lab"\nstore = "{tmp_path}"\nframes = "::3"\nframe_from_ground_truth = true\n'
+        "[survey]\nseed = 7\n[survey.keyframes]\nmin_overlap = 0.5\n"
+    )
+    assert status(monkeypatch, "build", "r", "--config", file) == 0
+    assert status(monkeypatch, "--config", file, "build", "r", "--frames", "::2") == 0
+    (order, settings), (second, _) = seen
+    assert (order.site, order.store, order.frames, order.frame_from_ground_truth) == ("lab", tmp_path, "::3", True)
+    assert (settings.seed, settings.keyframes.min_overlap, settings.keyframes.max_interval_s) == (7, 0.5, 2.0)
+    assert (second.frames, second.site) == ("::2", "lab")
+    assert capsys.readouterr().out == "done\ndone\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[build]\nsight = 'lab'", "sight"),
+        ("[survey.loops]\ntop = 'many'", "survey.loops.top"),
+        ("[biuld]", "biuld"),
+        ("[build", "site.toml"),
+    ],
+)
+def test_a_wrong_file_is_a_usage_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
+) -> None:
+    file = tmp_path / "site.toml"
+    file.write_text(text)
+    with pytest.raises(UsageError, match=said):
+        read_config(file)
+    assert status(monkeypatch, "build", "r", "--site", "lab", "--store", "s", "--config", file) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_no_file_sets_nothing() -> None:
+    assert all(not options for options in command_defaults(read_config(None)).values())
+
+
+def test_evaluate_prints_the_errors(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An estimate in another frame, one position of ten off by 0.1 m: errors follow by hand."""
+    rng = np.random.default_rng(5)
+    stamps = np.arange(10, dtype=np.int64) * 50_000_000
+    true = np.array([se3_exp(np.concatenate([rng.normal(0, 0.3, 3), rng.uniform(-5, 5, 3)])) for _ in stamps])
+    shift = se3_exp(np.array([0, 0, 0, 3.0, 4.0, 0]))
+    write_tum(tmp_path / "truth.tum", Trajectory(stamps, true))
+    write_tum(tmp_path / "estimate.tum", Trajectory(stamps, shift @ true))
+    both = ("evaluate", tmp_path / "estimate.tum", "--ground-truth", tmp_path / "truth.tum")
+    assert status(monkeypatch, *both, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["ate_rmse_m"] < 1e-6
+    assert found["unaligned_median_m"] == pytest.approx(5.0, abs=1e-6)
+    assert (found["stamps"], found["matched"], found["evaluated_share"]) == (10, 10, 1.0)
+    assert status(monkeypatch, *both) == 0
+    assert "ate_rmse_m" in capsys.readouterr().out
+    assert status(monkeypatch, "evaluate", tmp_path / "no.tum", "--ground-truth", tmp_path / "truth.tum") == 3

@@ -1,0 +1,174 @@
+"""The commands, and `serve` as a process with real HTTP and real zenoh on loopback."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from fleetmap.bus import ZenohBus
+from fleetmap.errors import GateRefusedError, StoreError, UnreachableError, UsageError
+from fleetmap.messages import RobotHealth, WantedVersion
+from locclient.maps.map_client import MapLink
+from locclient.maps.tile_cache import TileCache
+from mapserver import cli
+from mapserver.commands.releases.inspect import inspect
+from mapserver.commands.releases.publish import publish
+from mapserver.commands.releases.versions import versions
+from mapserver.commands.serve import serve
+from mapserver.store import MapStore
+from support.storage.map_samples import draft_details, random_tile, save_sample_draft
+
+PROGRAM = "import sys, typer; from mapserver.commands.serve import serve; typer.run(serve)"
+
+
+@contextmanager
+def serving(store: Path, endpoint: str = "tcp/127.0.0.1:0") -> Iterator[tuple[subprocess.Popen[str], str, str]]:
+    """A running server and its HTTP and zenoh addresses."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    arguments = ["--store", str(store), "--http", "127.0.0.1:0", "--zenoh", endpoint]
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, *arguments], env=environment, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        addresses = dict(process.stdout.readline().strip().split(": ", 1) for _ in range(2))
+        assert process.stdout.readline() == "ready\n"
+        yield process, addresses["http"], addresses["zenoh"]
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait(timeout=30)
+        process.stdout.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_robot_gets_its_map_and_is_seen(tmp_path: Path, number: signal.Signals) -> None:
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        save_sample_draft(store)
+        store.publish("lab")
+    with serving(tmp_path / "store") as (process, http, zenoh), ZenohBus.connect(zenoh) as bus:
+        link = MapLink(bus, TileCache(tmp_path / "cache"), "lab", "r1")
+        heard: list[WantedVersion] = []
+        link.on_wanted(heard.append)
+        manifest = link.manifest(link.wanted())
+        fetched = link.tiles(manifest)
+        assert (len(fetched.tiles), fetched.refused) == (2, {})
+        link.ack(manifest.version, stamp_ns=1)
+        link.publish_health(RobotHealth(site="lab", robot="r1", stamp_ns=2, version=1, status="TRACKING"))
+        deadline = time.monotonic() + 10
+        robots: list[dict[str, object]] = []
+        while time.monotonic() < deadline and not (robots and robots[0]["last_health"]):
+            robots = httpx.get(f"{http}/v1/robots").json()["robots"]
+            time.sleep(0.02)
+        assert [(robot["robot"], robot["version"]) for robot in robots] == [("r1", 1)]
+        # Another process publishes while the server runs.
+        with MapStore.open(tmp_path / "store") as store:
+            save_sample_draft(store, seed=5)
+            store.publish("lab")
+        while time.monotonic() < deadline and not any(wanted.version == 2 for wanted in heard):
+            time.sleep(0.02)
+        assert any(wanted.version == 2 for wanted in heard)
+        assert link.manifest(heard[-1]).version == 2
+        process.send_signal(number)
+        assert process.wait(timeout=20) == 0
+
+
+def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        tiles = [random_tile(rng, landmarks=5000, cell=(x, 0)) for x in range(6)]
+        store.save_draft("lab", tiles=tiles, vocabulary=b"words", details=draft_details())
+        store.publish("lab")
+    with ExitStack() as servers:
+        process, _, zenoh = servers.enter_context(serving(tmp_path / "store"))
+        bus = servers.enter_context(ZenohBus.connect(zenoh))
+        through, asked, failed = bus.get, [], []
+
+        def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+            asked.append(key)
+            if len(asked) == 6:
+                process.kill()
+                process.wait()
+            if len(failed) == 2 and len(asked) < 100:
+                asked.extend(["back"] * 100)
+                servers.enter_context(serving(tmp_path / "store", zenoh))
+            try:
+                return through(key, payload, timeout_s=timeout_s)
+            except UnreachableError:
+                failed.append(key)
+                raise
+
+        bus.get = get
+        cache = TileCache(tmp_path / "cache")
+        link = MapLink(bus, cache, "lab", "r1", timeout_s=0.5, patience_s=60)
+        assert link.ready().wanted.version == 1
+        assert len(failed) >= 2
+        assert cache.active("lab").version == 1
+        # Nothing that had come was fetched again.
+        assert link.received_bytes == sum(len(cache.get(sha256)) for sha256 in cache.active("lab").blobs)
+
+
+def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:
+    context = typer.Context(typer.main.get_command(cli.app))
+    with pytest.raises(UsageError, match="--http 'nonsense'"):
+        serve(context, tmp_path, "nonsense", "tcp/127.0.0.1:0")
+    with pytest.raises(UsageError, match="endpoint"):
+        serve(context, tmp_path, "127.0.0.1:0", "nonsense")
+    with pytest.raises(StoreError, match="no map store"):
+        serve(context, tmp_path, "127.0.0.1:0", "tcp/127.0.0.1:0")
+    with pytest.raises(UsageError, match="cannot listen"):
+        serve(context, tmp_path, "192.0.2.1:80", "tcp/127.0.0.1:0")
+    (tmp_path / "token").write_text("short")
+    for file, words in ((tmp_path / "token", "at least 16"), (tmp_path / "nothing", "cannot be read")):
+        with pytest.raises(UsageError, match=words):
+            serve(context, tmp_path, "127.0.0.1:0", "tcp/127.0.0.1:0", file)
+
+
+def run(command: object, *arguments: str) -> str:
+    app = typer.Typer()
+    app.command()(command)
+    result = CliRunner().invoke(app, list(arguments))
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_publish_versions_and_inspect(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        save_sample_draft(store)
+    where = ("--site", "lab", "--store", str(tmp_path))
+    assert "version 1 is current (2 tiles, 80 landmarks" in run(publish, *where)
+    (row,) = json.loads(run(versions, *where, "--json"))
+    assert (row["version"], row["state"], row["landmarks"]) == (1, "current", 80)
+    assert "current" in run(versions, *where)
+    shown = json.loads(run(inspect, *where, "--json"))
+    assert shown["manifest"]["report"] == {"path_m": 12.5}
+    assert shown["bytes_per_m"] == pytest.approx(shown["map_bytes"] / 12.5)
+    text = run(inspect, *where)
+    assert "bytes per metre" in text
+    assert "2 tiles of 16 m" in text
+    assert "walk" in text
+    with pytest.raises(UsageError, match="no draft"):
+        run(publish, *where)
+    with pytest.raises(UsageError, match="no version 5"):
+        run(inspect, *where, "--version", "5")
+
+
+def test_an_empty_draft_ends_with_the_gates_status(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        store.save_draft("lab", tiles=[], vocabulary=b"v", details=draft_details())
+    with pytest.raises(GateRefusedError) as refusal:
+        run(publish, "--site", "lab", "--store", str(tmp_path))
+    assert refusal.value.exit_status == 4
+    assert json.loads(run(inspect, "--site", "lab", "--store", str(tmp_path), "--json"))["bytes_per_m"] is None

@@ -1,0 +1,77 @@
+"""The commands that change and check a store, from the command line."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from fleetmap.mapformat import blob_path
+from mapserver import cli
+from mapserver.store import MapStore
+from support.storage.map_samples import save_sample_draft
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    def run(*arguments: object, status: int = 0) -> str:
+        monkeypatch.setattr(sys, "argv", ["mapserver", *(str(a) for a in arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        told = capsys.readouterr()
+        assert int(end.value.code or 0) == status, told.err
+        return told.out + told.err
+
+    return run
+
+
+def test_a_life_of_versions(run, tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        for seed in range(3):
+            save_sample_draft(store, seed=seed)
+    in_store = ("--store", tmp_path / "store")
+    where = ("--site", "lab", *in_store)
+    for version in (1, 2):
+        assert "held_out_frames" in run("publish", *where, "--version", version)
+    assert "version 1 is current again" in run("rollback", *where, "--actor", "ada", "--reason", "lost robots")
+    assert "version 2 is current" in run("promote", *where, 2)
+    assert "error: version 3 of site lab is a draft" in run("promote", *where, 3, status=2)
+    shown = json.loads(run("inspect", *where, "--version", 1, "--json"))
+    assert [(event["kind"], event["actor"]) for event in shown["history"]][-1] == ("rolled_back", "ada")
+    assert "gate: accepted" in run("inspect", *where, "--version", 1)
+    changed = json.loads(run("diff", *where, 1, 2, "--json"))
+    assert (changed["tiles_changed"], changed["quality"]["path_m"]) == (2, {"before": 12.5, "after": 12.5})
+    assert "fetches" in run("diff", *where, 1, 2)
+    assert "version 2 is in" in run("export", *where, tmp_path / "lab.fmex")
+    assert "(draft)" in run("import", tmp_path / "lab.fmex", "--store", tmp_path / "other")
+    assert "0 files would be removed" in run("gc", *in_store, "--dry-run")
+    assert json.loads(run("gc", *in_store, "--keep-drafts", 0, "--keep-days", 0, "--json"))["removed"] == [["lab", 3]]
+    assert "clean" in run("verify", *in_store)
+
+
+def test_verify_ends_with_a_status_of_its_own(run, tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        save_sample_draft(store)
+        tile = store.manifest("lab", 1).tiles[0].sha256
+    (tmp_path / blob_path(tile)).write_bytes(b"other")
+    assert f"{tile} is damaged" in run("verify", "--store", tmp_path, status=3)
+    assert len(json.loads(run("verify", "--store", tmp_path, "--json", status=3))["faults"]) == 1
+
+
+def test_a_reason_is_asked_for(run, tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        save_sample_draft(store)
+    assert "--reason" in run("publish", "--site", "lab", "--store", tmp_path, "--force", status=2)
+
+
+def test_the_gate_takes_its_limits_from_the_file(run, tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        save_sample_draft(store, seed=1)
+        store.publish("lab")
+        save_sample_draft(store, seed=2)
+    strict = tmp_path / "strict.toml"
+    strict.write_text("[gate]\nmin_landmarks_share = 1.5\n")
+    where = ("--site", "lab", "--store", tmp_path / "store")
+    assert "landmarks_share 1.00 of version 1 is below 1.5" in run("publish", *where, "--config", strict, status=4)
+    assert "refused" in run("inspect", *where, "--version", 2)
+    assert "version 2 is current" in run("publish", *where)

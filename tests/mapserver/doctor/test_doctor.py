@@ -1,0 +1,246 @@
+"""The doctor finds each fault that is put into a recording, and nothing in a good one."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from fleetmap.geometry import so3_exp
+from fleetmap.recordings import Recording, open_recording
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, Loss, Stamps
+from mapserver.commands.doctor import doctor
+from mapserver.doctor import Finding, Verdict, examine
+from mapserver.doctor.gyro_images import CameraTurns, fit_gyro
+from mapserver.doctor.inertial import gravity_magnitude
+from mapserver.doctor.sharpness import sharpness
+from mapserver.doctor.timing import camera_gaps, camera_imu_overlap, camera_rate, imu_gaps, imu_rate, stamp_order
+from support.recordings.realdata import real_data
+from support.recordings.recording_samples import make_sample, write_euroc
+
+SAMPLE = make_sample(26)
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return open_recording(write_euroc(tmp_path_factory.mktemp("doctor") / "r", SAMPLE))
+
+
+class ChangedFrames:
+    """The frames of a recording, each changed on the way."""
+
+    def __init__(self, recording: Recording, change: Callable[[CameraFrame], CameraFrame]) -> None:
+        self.frames, self.change = recording.frames, change
+        self.stored, self.hash_into, self.close = (
+            recording.frames.stored,
+            recording.frames.hash_into,
+            recording.frames.close,
+        )
+
+    def frame(self, index: int) -> CameraFrame:
+        return self.change(self.frames.frame(index))
+
+
+def found(recording: Recording) -> dict[str, Finding]:
+    return {finding.name: finding for finding in examine(recording).findings}
+
+
+def with_imu(recording: Recording, change: Callable[[ImuSamples], ImuSamples]) -> Recording:
+    return replace(recording, imu=change(recording.imu))
+
+
+def swapped(frame: CameraFrame) -> CameraFrame:
+    assert frame.right is not None
+    return replace(frame, left=frame.right, right=frame.left)
+
+
+def right_lower_by_3_px(frame: CameraFrame) -> CameraFrame:
+    assert frame.right is not None
+    return replace(frame, right=np.roll(frame.right, 3, axis=0))
+
+
+def test_a_good_recording_is_all_ok(good: Recording) -> None:
+    findings = examine(good).findings
+    assert {f.name: f.verdict for f in findings if f.verdict is not Verdict.OK} == {
+        "stereo against motion": Verdict.NOT_JUDGED  # the sample turns on the spot
+    }
+    assert len({f.name for f in findings}) == len(findings) == 15
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("left and right", swapped, "swapped"),
+        ("epipolar error", right_lower_by_3_px, "calibrate the cameras again"),
+        ("sharpness", lambda f: replace(f, left=np.full_like(f.left, 90)), "look at the lens"),
+    ],
+)
+def test_faults_in_the_images(
+    good: Recording, name: str, change: Callable[[CameraFrame], CameraFrame], says: str
+) -> None:
+    finding = found(replace(good, frames=ChangedFrames(good, change)))[name]
+    assert finding.verdict is Verdict.FAIL
+    assert says in finding.sentence
+
+
+def test_epipolar_error_is_measured_in_pixels(good: Recording) -> None:
+    finding = found(replace(good, frames=ChangedFrames(good, right_lower_by_3_px)))["epipolar error"]
+    assert finding.value == pytest.approx(3.0, abs=0.1)
+
+
+@pytest.mark.parametrize("late_s", [-0.040, 0.030])
+def test_late_imu_stamps_are_measured(good: Recording, late_s: float) -> None:
+    shift_ns = round(late_s * 1e9)
+    spoilt = with_imu(good, lambda imu: replace(imu, stamps_ns=imu.stamps_ns + shift_ns))
+    finding = found(spoilt)["camera-imu time offset"]
+    assert finding.verdict is Verdict.FAIL
+    assert finding.value == pytest.approx(abs(late_s) * 1e3, abs=1.5)
+
+
+def test_a_calibrated_offset_is_not_a_fault(good: Recording) -> None:
+    """imu_minus_cam_s: stamp of the IMU's clock minus stamp of the camera's clock at one moment."""
+    late_s = 0.030
+    spoilt = with_imu(good, lambda imu: replace(imu, stamps_ns=imu.stamps_ns + round(late_s * 1e9)))
+    cameras = tuple(replace(camera, imu_minus_cam_s=late_s) for camera in good.calibration.cameras)
+    calibrated = replace(spoilt, calibration=replace(good.calibration, cameras=cameras))
+    assert found(calibrated)["camera-imu time offset"].verdict is Verdict.OK
+
+
+@pytest.mark.parametrize(
+    ("turn", "says"),
+    [
+        (np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), "x is "),
+        (np.diag([-1.0, -1.0, 1.0]), "x is -x, y is -y"),
+        (np.diag([1.0, 1.0, -1.0]), "mirrored"),
+        (so3_exp(np.array([0.0, 0.35, 0.0])), "20.0 degrees|20.1 degrees|19.9 degrees"),
+    ],
+)
+def test_wrong_axes(good: Recording, turn: np.ndarray, says: str) -> None:
+    finding = found(with_imu(good, lambda imu: replace(imu, gyro_radps=imu.gyro_radps @ turn.T)))["gyro axes"]
+    assert finding.verdict is Verdict.FAIL
+    assert any(part in finding.sentence for part in says.split("|"))
+
+
+def test_gyro_scale_against_the_images(good: Recording) -> None:
+    finding = found(with_imu(good, lambda imu: replace(imu, gyro_radps=1.5 * imu.gyro_radps)))["gyro scale"]
+    assert (finding.verdict, finding.value) == (Verdict.FAIL, pytest.approx(1.5, abs=0.03))
+    degrees = found(with_imu(good, lambda imu: replace(imu, gyro_radps=np.degrees(imu.gyro_radps))))["gyro scale"]
+    assert "degrees per second" in degrees.sentence
+
+
+def test_an_imu_of_another_ride(good: Recording) -> None:
+    rng = np.random.default_rng(5)
+    noise = rng.standard_normal((len(good.imu) // 20 + 2, 3))
+    other = np.repeat(noise, 20, axis=0)[: len(good.imu)]
+    finding = found(with_imu(good, lambda imu: replace(imu, gyro_radps=other)))["gyro axes"]
+    assert finding.verdict is Verdict.FAIL
+
+
+def test_sparse_frames_are_not_judged(good: Recording) -> None:
+    sparse = replace(good, frame_stamps_ns=good.frame_stamps_ns[0] + 2_000_000_000 * np.arange(len(good)))
+    findings = found(sparse)
+    for name in ("camera rate", "camera gaps", "camera-imu time offset", "gyro axes"):
+        assert findings[name].verdict is Verdict.NOT_JUDGED
+    assert "frames are 2.00 s apart" in findings["camera rate"].sentence
+
+
+def test_unreadable_frames_are_a_finding(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path / "r", make_sample(3))
+    image = folder / "mav0/cam1/data/image1.png"
+    image.write_bytes(image.read_bytes()[:500])
+    finding = found(open_recording(folder))["images"]
+    assert finding.verdict is Verdict.FAIL
+    assert "image1.png" in finding.sentence
+
+
+def stamps(step_s: float, count: int = 200) -> Stamps:
+    return (np.arange(count) * step_s * 1e9).astype(np.int64)
+
+
+def test_timing() -> None:
+    assert camera_rate(stamps(0.05)).value == pytest.approx(20)
+    assert camera_rate(stamps(0.3)).verdict is Verdict.WARN
+    assert imu_rate(stamps(0.02)).verdict is Verdict.WARN
+    gap = np.delete(stamps(0.05), slice(50, 80))
+    assert camera_gaps(stamps(0.05)).verdict is Verdict.OK
+    assert camera_gaps(gap).verdict is Verdict.WARN
+    assert camera_gaps(gap).value == pytest.approx(31 * 0.05)
+    assert "2.5 s after the start" in camera_gaps(gap).sentence
+    assert imu_gaps(np.delete(stamps(0.005), slice(50, 100))).verdict is Verdict.FAIL
+    assert stamp_order([Loss("imu: stamps not increasing", "3 of 9")]).verdict is Verdict.FAIL
+    assert camera_imu_overlap(stamps(0.05), stamps(0.005), 0.0).value == pytest.approx(0.9, abs=0.02)
+    assert camera_imu_overlap(stamps(0.05), stamps(0.005, 2000), 0.0).verdict is Verdict.OK
+
+
+@pytest.mark.parametrize(("magnitude", "verdict"), [(9.81, Verdict.OK), (9.4, Verdict.WARN), (12.0, Verdict.FAIL)])
+def test_gravity(magnitude: float, verdict: Verdict) -> None:
+    rng = np.random.default_rng(6)
+    accel = np.array([0.0, 0.0, magnitude]) + 0.05 * rng.standard_normal((1000, 3))
+    accel[300:600] += 4 * rng.standard_normal((300, 3))  # a bumpy stretch does not matter
+    finding = gravity_magnitude(ImuSamples(stamps(0.005, 1000), np.zeros((1000, 3)), accel))
+    assert (finding.verdict, finding.value) == (verdict, pytest.approx(magnitude, abs=0.05))
+
+
+def test_sharpness_knows_blurred_stretches() -> None:
+    assert sharpness([100.0] * 20).verdict is Verdict.OK
+    assert sharpness([100.0] * 13 + [5.0] * 7).verdict is Verdict.WARN
+
+
+def test_a_robot_that_turns_about_one_axis_only() -> None:
+    """Nothing is said about axes that never turned; a wrong sign of the one that did is found."""
+    imu_stamps = stamps(0.005, 1000)
+    times = imu_stamps * 1e-9
+    gyro = np.stack([np.zeros(1000), np.zeros(1000), np.sin(2.2 * times) + 0.4 * np.sin(7 * times)], axis=1)
+    starts, ends = imu_stamps[20:900:10], imu_stamps[30:910:10]
+    rates = np.stack([gyro[20 + 10 * k : 30 + 10 * k].mean(axis=0) for k in range(len(starts))])
+    rates += 1e-4 * np.random.default_rng(8).standard_normal(rates.shape)
+    imu = ImuSamples(imu_stamps, gyro, np.zeros((1000, 3)))
+    fit = fit_gyro(CameraTurns(starts, ends, rates), imu, 0.0)
+    assert fit.axes_seen == 1
+    np.testing.assert_allclose(fit.body_from_gyro, np.eye(3), atol=0.01)
+    wrong = fit_gyro(CameraTurns(starts, ends, -rates), imu, 0.0)
+    assert wrong.body_from_gyro[2, 2] == pytest.approx(-1, abs=0.01)
+    assert wrong.offset_s == pytest.approx(0, abs=0.003)
+
+
+def run(*arguments: str) -> int:
+    app = typer.Typer()
+    app.command()(doctor)
+    return CliRunner().invoke(app, list(arguments)).exit_code
+
+
+def test_the_command_writes_json_and_ends_with_3_on_failure(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path / "r", SAMPLE)
+    assert run(str(folder), "--json", str(tmp_path / "good.json")) == 0
+    report = json.loads((tmp_path / "good.json").read_text())
+    assert (report["verdict"], report["frames"], report["sensor_set"]) == ("ok", 26, "stereo-inertial")
+    assert {f["name"] for f in report["findings"]} >= {"epipolar error", "gyro axes", "gravity magnitude"}
+    for number in (0, 1):
+        (folder / f"mav0/cam{number}/data").rename(folder / f"mav0/cam{number}/was")
+    (folder / "mav0/cam0/was").rename(folder / "mav0/cam1/data")
+    (folder / "mav0/cam1/was").rename(folder / "mav0/cam0/data")
+    assert run(str(folder), "--json", str(tmp_path / "bad.json")) == 3
+    report = json.loads((tmp_path / "bad.json").read_text())
+    assert next(f["name"] for f in report["findings"] if f["verdict"] == "fail") == "left and right"
+
+
+@pytest.mark.parametrize(
+    "name", ["euroc_v101_keyframes", "kitti_stereo_51", "tumvi_room1_fisheye_8", "7scenes_redkitchen_200"]
+)
+def test_no_false_alarm_on_real_recordings(name: str) -> None:
+    findings = examine(open_recording(real_data(name))).findings
+    assert [
+        f for f in findings if f.verdict is Verdict.FAIL or (f.verdict is Verdict.WARN and f.name != "lost data")
+    ] == []
+
+
+def test_the_real_flight_agrees_with_its_calibration() -> None:
+    findings = found(open_recording(real_data("euroc_mh01_start")))
+    assert {f.verdict for f in findings.values()} == {Verdict.OK}
+    assert findings["camera-imu time offset"].value == pytest.approx(0, abs=2)
+    assert findings["gyro scale"].value == pytest.approx(1, abs=0.02)
+    assert findings["gyro axes"].value == pytest.approx(0, abs=1.5)

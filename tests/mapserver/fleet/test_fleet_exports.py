@@ -1,0 +1,214 @@
+"""What leaves the server about the fleet: the page, JSON lines, MCAP, the commands that write them."""
+
+import base64
+import json
+import re
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+
+import jsonschema_rs
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from typer.testing import CliRunner
+
+from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
+from mapserver.cli import app
+from mapserver.fleet.fleet import Fleet
+from mapserver.fleet.shift_page import html_page
+from mapserver.fleet.shift_summary import summarise
+from mapserver.fleet_statistics.canary_test import CanarySettings
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+from mapserver.store import FailureFilter, MapStore
+from support.fleet.made_fleet import NS, Known, MadeRobot, drive
+from support.storage.map_samples import save_sample_draft
+
+
+def run_made_site(folder: Path, *, start_ns: int, seconds: int = 200, cause: str = "dark") -> Known:
+    """A store with what three robots said."""
+    clock = {"ns": start_ns}
+    known = Known()
+    with MapStore.open(folder, create=True, clock_ns=lambda: clock["ns"]) as store:
+        for seed in (1, 2):
+            save_sample_draft(store, site="hall", seed=seed)
+        store.publish("hall", 1)
+        fleet = Fleet(store, clock_ns=lambda: clock["ns"])
+        rng = np.random.default_rng(1)
+        robots = [
+            MadeRobot("hall", f"r{n}", rng, known, rate_per_robot_day=1500.0, suspected_share=0.2, cause=cause)
+            for n in range(3)
+        ]
+        for now_ns, robot, message in drive(robots, seconds, start_ns):
+            clock["ns"] = now_ns
+            if isinstance(message, RobotHealth):
+                fleet.take_health("hall", robot.name, message)
+            elif isinstance(message, PoseMessage):
+                fleet.take_pose("hall", robot.name, message)
+            elif isinstance(message, FailureReport):
+                fleet.take_failure("hall", robot.name, message)
+        fleet.flush()
+        store.start_canary("hall", 2, 0.3)
+    return known
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Known]]:
+    import time
+
+    path = tmp_path_factory.mktemp("site")
+    yield path, run_made_site(path, start_ns=time.time_ns() - 300 * NS, cause="<b>dark & dusty</b>")
+
+
+class _Tags(HTMLParser):
+    """Counts what is open, and what leads outside."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.outside: list[str] = []
+        self.tags: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.outside += [value for name, value in attrs if name in {"src", "href"} and value]
+        if tag not in {"meta", "line", "br"}:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_the_page_stands_alone_and_shows_the_count(folder: tuple[Path, Known]) -> None:
+    import time
+
+    path, known = folder
+    with MapStore.open(path) as store:
+        summary = summarise(store, "hall", 24, time.time_ns(), CanarySettings(), ResurveySettings())
+        page = html_page(summary)
+    assert summary.total.failures.events == known.failures["site", ""] > 0
+    tags = _Tags()
+    tags.feed(page)
+    assert tags.open == [] and tags.outside == []
+    assert not {"script", "link", "img", "b "} & tags.tags
+    assert "http" not in page and "url(" not in page
+    assert "&lt;b&gt;dark &amp; dusty" in page and "<b>dark" not in page
+    assert f"{known.failures['site', '']} in all" in page
+    assert "Version 2 is tried by 30% of the robots" in page
+    assert "prefers-color-scheme: dark" in page
+
+
+def test_an_idle_site_has_a_page_too(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        save_sample_draft(store)
+        page = html_page(summarise(store, "lab", 24, 10**18, CanarySettings(), ResurveySettings()))
+    assert "not known" in page and "None was reported" in page
+
+
+def test_commands(folder: tuple[Path, Known], tmp_path: Path) -> None:
+    path, known = folder
+    run = CliRunner()
+    count = known.reports
+    store = ["--store", str(path)]
+    done = run.invoke(app, ["fleet", "report", str(tmp_path / "shift.html"), "--site", "hall", *store])
+    assert done.exit_code == 0, done.output
+    assert "<!DOCTYPE html>" in (tmp_path / "shift.html").read_text()
+    done = run.invoke(app, ["fleet", "export", str(tmp_path / "failures.jsonl"), "--site", "hall", *store])
+    assert done.output == f"{count} failures\n"
+    done = run.invoke(app, ["fleet", "resurvey", "--site", "hall", *store, "--route", str(tmp_path / "route.csv")])
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "route.csv").read_text().startswith("number,x_map_m")
+    done = run.invoke(app, ["fleet", "export", str(tmp_path / "failures.txt"), *store])
+    assert "--format" in str(done.exception)
+
+
+def test_a_file_sets_options_of_grouped_commands(folder: tuple[Path, Known], tmp_path: Path) -> None:
+    settings = tmp_path / "fleet.toml"
+    settings.write_text(f'[fleet.report]\nsite = "hall"\nstore = "{folder[0]}"\nhours = 5\n')
+    run = CliRunner()
+    for words in (["--config", str(settings), "fleet", "report"], ["fleet", "report", "--config", str(settings)]):
+        done = run.invoke(app, [*words, str(tmp_path / "x.html")])
+        assert done.exit_code == 0, done.output
+        assert "the last 5 h" in (tmp_path / "x.html").read_text()
+
+
+def test_a_canary_from_the_command_line(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        save_sample_draft(store)
+        store.publish("lab")
+        save_sample_draft(store, seed=3)
+    done = CliRunner().invoke(
+        app, ["promote", "2", "--site", "lab", "--store", str(tmp_path), "--canary", "5%", "--reason", "new racks"]
+    )
+    assert "0.05 of the robots try version 2, the others stay on 1" in done.output
+    with MapStore.open(tmp_path) as store:
+        (row,) = store.canaries("lab", running=True)
+        assert (row.version, row.base_version, row.share, row.reason) == (2, 1, 0.05, "new racks")
+    for wrong in ("500%", "some", "0"):
+        done = CliRunner().invoke(app, ["promote", "2", "--site", "lab", "--store", str(tmp_path), "--canary", wrong])
+        assert "between 0 and 1" in str(done.exception)
+
+
+def test_json_lines_hold_every_failure_in_order(folder: tuple[Path, Known], tmp_path: Path) -> None:
+    from mapserver.fleet.exports import write_json_lines
+
+    with MapStore.open(folder[0]) as store:
+        count = write_json_lines(store, FailureFilter(), tmp_path / "out.jsonl")
+        rows = {row.number: row for row in store.fleet.failures(FailureFilter())}
+    lines = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    assert count == len(lines) == len(rows)
+    assert [line["happened_ns"] for line in lines] == sorted(row.happened_ns for row in rows.values())
+    for line in lines:
+        assert line["report"]["id"] == rows[line["number"]].failure_id
+        assert line["pictures"][0]["kind"] == "frame"
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_mcap_holds_what_foxglove_expects(folder: tuple[Path, Known], tmp_path: Path) -> None:
+    from mapserver.fleet.exports import write_mcap
+
+    path = tmp_path / "out.mcap"
+    with MapStore.open(folder[0]) as store:
+        count = write_mcap(store, FailureFilter(site="hall"), path)
+    seen: dict[str, int] = {}
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            value = json.loads(message.data)
+            jsonschema_rs.validate(json.loads(schema.data), value)
+            seen[channel.topic] = seen.get(channel.topic, 0) + 1
+            if "timestamp" in value:
+                assert value["timestamp"]["sec"] * 10**9 + value["timestamp"]["nsec"] == message.log_time
+            if schema.name == "foxglove.CompressedImage":
+                assert base64.b64decode(value["data"], validate=True).startswith(b"\xff\xd8")
+    assert seen == dict.fromkeys(("/failures/log", "/failures/place", "/failures/frame", "/failures/report"), count)
+
+
+def test_the_schemas_have_foxgloves_fields() -> None:
+    """Field by field as the published protobuf schemas of Foxglove have them."""
+    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+    from foxglove_schemas_protobuf.Log_pb2 import Log
+    from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+
+    from mapserver.fleet.export_schemas import SCHEMAS
+
+    for message in (CompressedImage, Log, PoseInFrame):
+        fields = {field.name for field in message.DESCRIPTOR.fields}
+        assert set(SCHEMAS[message.DESCRIPTOR.full_name]["properties"]) == fields
+
+
+def test_the_grafana_dashboard_asks_for_metrics_that_exist(tmp_path: Path) -> None:
+    from mapserver.api.metrics import Metrics
+
+    dashboard = Path(__file__).parents[3] / "deploy" / "grafana-dashboard.json"
+    queries = [target["expr"] for panel in json.loads(dashboard.read_text())["panels"] for target in panel["targets"]]
+    run_made_site(tmp_path, start_ns=10**18, seconds=30)
+    with MapStore.open(tmp_path) as store:
+        text = Metrics(store, Fleet(store)).text().decode()
+    names = set(re.findall(r"^# TYPE (\w+)", text, re.MULTILINE)) | set(re.findall(r"^(\w+)", text, re.MULTILINE))
+    asked = {name for query in queries for name in re.findall(r"\b(?:fleetmap|process)_\w+", query)}
+    assert len(queries) >= 10
+    assert asked - names == set()

@@ -1,0 +1,232 @@
+"""What robots report is counted once, in the right place, and stays what it was: the counts of made-up robots are known."""
+
+import sqlite3
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from fleetmap.errors import LinkError, StoreError
+from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
+from mapserver.fleet.fleet import Fleet
+from mapserver.fleet.ingest import IngestSettings
+from mapserver.fleet_statistics.kpis import HOUR_NS, Tally, measures
+from mapserver.store import FailureFilter, FleetRetention, MapStore
+from support.fleet.made_fleet import NS, Known, MadeRobot, drive
+from support.storage.map_samples import save_sample_draft
+
+START_NS = 490_000 * HOUR_NS + 1700 * NS  # an hour ends in the middle
+
+
+@dataclass
+class Site:
+    store: MapStore
+    fleet: Fleet
+    set_ns: Callable[[int], None]
+    known: Known = field(default_factory=Known)
+
+    def run(self, robots: list[MadeRobot], seconds: int, start_ns: int = START_NS) -> list[FailureReport]:
+        """Everything that they say is taken; the failures among it."""
+        reports = []
+        for now_ns, robot, message in drive(robots, seconds, start_ns):
+            self.set_ns(now_ns)
+            if isinstance(message, RobotHealth):
+                self.fleet.take_health(robot.site, robot.name, message)
+            elif isinstance(message, PoseMessage):
+                self.fleet.take_pose(robot.site, robot.name, message)
+            else:
+                assert self.fleet.take_failure(robot.site, robot.name, message).refused == ""
+                reports.append(message)
+        self.fleet.flush()
+        return reports
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    clock = {"ns": START_NS}
+    with MapStore.open(tmp_path, create=True, clock_ns=lambda: clock["ns"]) as store:
+        save_sample_draft(store)
+        store.publish("lab")
+        fleet = Fleet(store, clock_ns=lambda: clock["ns"])
+        yield Site(store, fleet, lambda ns: clock.update(ns=ns))
+
+
+def made(site: Site, count: int, **options: object) -> list[MadeRobot]:
+    rng = np.random.default_rng(5)
+    return [MadeRobot("lab", f"r{n}", rng, site.known, **options) for n in range(count)]
+
+
+def test_the_store_counts_what_the_robots_know(site: Site) -> None:
+    robots = made(site, 5, rate_per_robot_day=300.0, bad_tile=1, suspected_share=0.3, ahead_s=-7.0)
+    site.run(robots, 600)
+    known = site.known
+    assert known.failures["site", ""] >= 10
+    assert known.suspected["site", ""] >= 5
+    for axis in ("site", "robot", "version", "tile", "cause"):
+        counted = {key: tally for (_, key), tally in site.store.fleet.tallies("lab", axis).items()}
+        failures = {key: t.failures for key, t in counted.items() if t.failures}
+        assert failures == {key: n for (a, key), n in known.failures.items() if a == axis}, axis
+        suspected = {key: t.suspected for key, t in counted.items() if t.suspected}
+        assert suspected == {key: n for (a, key), n in known.suspected.items() if a == axis}, axis
+        if axis != "cause":
+            driven = {key: t.driving_ms / 1e3 for key, t in counted.items() if t.driving_ms}
+            assert driven == {key: s for (a, key), s in known.driving_s.items() if a == axis}, axis
+    total = site.store.fleet.tallies("lab", "site")["lab", ""]
+    assert total.reports == known.health
+    assert total.blind_seen == total.blind_failures == total.failures
+    found = measures(total)
+    assert found.failures.per_robot_day == known.failures["site", ""] / (known.driving_s["site", ""] / 57600)
+    assert found.landmarks_seen_share == pytest.approx(0.7)
+    assert found.first_fix_mean_s == 1.5
+    hours = site.store.fleet.hours("lab", "site")
+    assert sorted(hours) == [490_000]
+    assert len(site.store.fleet.failures(FailureFilter(site="lab"))) == known.reports
+
+
+def test_hours_add_up_to_the_whole(site: Site) -> None:
+    site.run(made(site, 2), 120, START_NS + 1840 * NS)
+    hours = site.store.fleet.hours("lab", "site")
+    assert sorted(hours) == [490_000, 490_001]
+    whole = Tally()
+    for tally in hours.values():
+        whole.add(tally)
+    assert whole == site.store.fleet.tallies("lab", "site")["lab", ""]
+    assert site.store.fleet.tallies("lab", "site", since_hour=490_001)["lab", ""] == hours[490_001]
+
+
+def test_what_comes_again_is_counted_once(site: Site) -> None:
+    reports = site.run(made(site, 2, rate_per_robot_day=2000.0), 120)
+    assert reports
+    before = site.store.fleet.tallies("lab", "robot")
+    for report in reports * 2:
+        assert site.fleet.take_failure("lab", report.robot, report).id == report.id
+    health = RobotHealth(
+        site="lab", robot="r0", stamp_ns=START_NS + 120 * NS, wall_ns=START_NS, version=1, status="LOST"
+    )
+    site.fleet.take_health("lab", "r0", health)
+    site.fleet.flush()
+    assert site.store.fleet.tallies("lab", "robot") == before
+    rows = site.store.fleet.failures(FailureFilter())
+    assert len(rows) == len({(row.robot, row.failure_id) for row in rows}) == len(reports)
+
+
+def test_failures_happen_when_the_servers_clock_says(site: Site) -> None:
+    """A report that waited for an hour in a robot whose clock is wrong by a day belongs to its own hour."""
+    (robot,) = made(site, 1, rate_per_robot_day=5000.0, ahead_s=86400.0)
+    site.run([robot], 30)
+    assert site.fleet.robots("lab")[0].clock_ahead_s == pytest.approx(86400.0)
+    late = next(m for _, _, m in drive([robot], 3000, START_NS + 30 * NS) if isinstance(m, FailureReport))
+    site.set_ns(START_NS + 10_000 * NS)
+    again = Fleet(site.store, clock_ns=lambda: START_NS + 10_000 * NS)  # the server was started again meanwhile
+    again.take_failure("lab", "r0", late)
+    row = site.store.fleet.failures(FailureFilter(), limit=1)[0]
+    assert row.happened_ns == late.stamp_ns
+    assert row.received_ns == START_NS + 10_000 * NS
+
+
+def test_what_cannot_be_is_refused_for_good(site: Site) -> None:
+    (report, *_) = site.run(made(site, 1, rate_per_robot_day=5000.0), 100)
+    wrong = [
+        msgspec.structs.replace(report, robot="r7"),
+        msgspec.structs.replace(report, id="x", wall_ns=1 << 63),
+        msgspec.structs.replace(report, id="x", duration_s=float("nan")),
+        msgspec.structs.replace(report, id="x", site="nowhere"),
+    ]
+    count = len(site.store.fleet.failures(FailureFilter()))
+    for message in wrong:
+        sender = "nowhere" if message.site == "nowhere" else "lab"
+        assert site.fleet.take_failure(sender, "r0", message).refused
+    assert len(site.store.fleet.failures(FailureFilter())) == count
+    with pytest.raises(LinkError, match="check its clock"):
+        site.fleet.take_health(
+            "lab", "r0", RobotHealth(site="lab", robot="r0", stamp_ns=1 << 63, version=1, status="LOST")
+        )
+
+
+def test_names_that_robots_make_up_do_not_make_keys(site: Site) -> None:
+    (report, *_) = site.run(made(site, 1, rate_per_robot_day=5000.0), 100)
+    for number in range(200):
+        site.fleet.take_failure(
+            "lab",
+            "r0",
+            msgspec.structs.replace(report, id=f"n{number}", cause=f"c{number}", version=5 + number, tile=(number, 9)),
+        )
+    for axis, most in (("cause", 66), ("version", 2), ("tile", 3)):
+        assert len(site.store.fleet.tallies("lab", axis)) <= most, axis
+
+
+def test_a_disk_that_refuses_costs_nothing(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    add = site.store.fleet.add
+
+    def refuse(_: object) -> None:
+        raise StoreError("full")
+
+    monkeypatch.setattr(site.store.fleet, "add", refuse)
+    with pytest.raises(StoreError):
+        site.run(made(site, 2), 30)
+    monkeypatch.setattr(site.store.fleet, "add", add)
+    site.run(made(site, 2), 1, START_NS + 30 * NS)
+    total = site.store.fleet.tallies("lab", "site")["lab", ""]
+    assert total.reports == site.known.health
+
+
+def test_traces_are_thinned_but_show_every_change(site: Site) -> None:
+    robots = made(site, 1, rate_per_robot_day=3000.0)
+    site.run(robots, 300)
+    trace = site.store.fleet.trace("lab", "r0")
+    changes = 2 * site.known.failures["robot", "r0"]
+    assert changes >= 6
+    assert 30 <= len(trace) <= 30 + changes
+    assert {row.status for row in trace} == {"TRACKING", "LOST"}
+    assert all(0 <= row.x_map_m <= 32 for row in trace)
+
+
+def test_old_and_many_things_go(site: Site) -> None:
+    reports = site.run(made(site, 2, rate_per_robot_day=3000.0), 200)
+    fleet = site.store.fleet
+    size = sum(len(t.jpeg) for r in reports for t in r.thumbnails)
+    usual = FleetRetention()
+    assert fleet.prune(usual) == 0
+    fleet.prune(replace(usual, picture_bytes=size // 2))
+    kept = [fleet.failure(row.number).pictures for row in fleet.failures(FailureFilter())]
+    assert kept[0] and not kept[-1]  # the newest keep theirs
+    site.run(made(site, 1), 20, START_NS + 10 * HOUR_NS)
+    fleet.prune(replace(usual, trace_rows=3))
+    assert {row.hour for row in fleet.trace("lab", "r0")} == {490_010}
+    site.set_ns(START_NS + 500 * 24 * HOUR_NS)
+    assert fleet.prune(usual) > 0
+    assert fleet.tallies("lab", "site") == {}
+    assert fleet.failures(FailureFilter()) == []
+    assert fleet.trace("lab", "r0") == []
+    assert site.store.verify().faults == []
+
+
+def test_sums_of_a_month_are_small(site: Site, tmp_path: Path) -> None:
+    """30 days of 300 robots below 500 MB: measured on a tenth of the robots for a tenth of the hours, which is a hundredth."""
+    from mapserver.store import FleetBatch
+
+    tally = Tally(*range(10**6, 10**6 + len(Tally.__slots__)))
+    before = _size(tmp_path)
+    for hour in range(72):
+        batch = FleetBatch()
+        for number in range(30):
+            batch.add("lab", "robot", f"robot-{number}", hour, tally)
+        for number in range(60):  # a site of 600 tiles, all of them driven through every hour
+            batch.add("lab", "tile", f"{number % 25},{number // 25}", hour, tally)
+        site.store.fleet.add(batch)
+    assert (_size(tmp_path) - before) * 100 < 500e6
+
+
+def _size(folder: Path) -> int:
+    connection = sqlite3.connect(folder / "store.sqlite3")
+    connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    connection.close()
+    return (folder / "store.sqlite3").stat().st_size
+
+
+def test_settings_reach_the_retention() -> None:
+    settings = IngestSettings(tally_days=3.0, failure_days=4.0, picture_bytes=5, trace_days=6.0, trace_rows=7)
+    assert settings.retention() == FleetRetention(3.0, 4.0, 5, 6.0, 7)

@@ -1,0 +1,65 @@
+"""Intervals against scipy.stats and against chance itself; sums against their parts."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mapserver.fleet_statistics.kpis import TALLY_COLUMNS, Tally, measures, poisson_interval, rate, share
+from mapserver.store.migrations import MIGRATIONS
+
+
+@pytest.mark.parametrize("events", [0, 1, 2, 7, 40, 1000])
+def test_poisson_intervals_are_garwoods(events: int) -> None:
+    low, high = poisson_interval(events)
+    if events == 0:
+        assert (low, high) == (0.0, pytest.approx(-np.log(0.05)))  # the rule of three
+    else:
+        assert low == pytest.approx(stats.chi2.ppf(0.025, 2 * events) / 2)
+        assert high == pytest.approx(stats.chi2.ppf(0.975, 2 * events + 2) / 2)
+
+
+@pytest.mark.parametrize(("hits", "tries"), [(0, 12), (12, 12), (3, 12), (1, 400)])
+def test_shares_have_the_exact_interval(hits: int, tries: int) -> None:
+    found = share(hits, tries)
+    level = 0.90 if hits in {0, tries} else 0.95  # one-sided at the ends
+    exact = stats.binomtest(hits, tries).proportion_ci(level, "exact")
+    assert (found.low, found.high) == (pytest.approx(exact.low), pytest.approx(exact.high))
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+    rng = np.random.default_rng(1)
+    for mean in (0.3, 2.0, 9.0):
+        inside = [low <= mean <= high for low, high in map(poisson_interval, rng.poisson(mean, 2000).tolist())]
+        assert np.mean(inside) >= 0.94
+
+
+def test_a_rate_without_driving_is_not_known() -> None:
+    assert rate(3, 0.0).per_robot_day is None
+    found = rate(0, 150.0)
+    assert (found.per_robot_day, found.high) == (0.0, pytest.approx(0.02, rel=2e-3))  # slam.md's 150 robot-days
+
+
+def test_what_is_not_known_is_none_not_zero() -> None:
+    found = measures(Tally(reports=3, observed_ms=2000))
+    assert found.availability == 0.0
+    assert (found.localised_share, found.first_fix_mean_s, found.frame_drop_share) == (None, None, None)
+    assert (found.docks_wrong.share, found.failures.per_robot_day) == (None, None)
+
+
+def test_silent_failures_are_estimates_apart() -> None:
+    found = measures(
+        Tally(driving_ms=57_600_000, failures=2, suspected=3, docks=10, docks_wrong=1, blind_seen=4, blind_failures=1)
+    )
+    assert (found.failures.events, found.silent_estimated.events) == (2, 4)
+    assert found.docks_wrong.share == 0.1
+    assert found.unreported_blindness == 3
+
+
+def test_every_sum_has_its_column() -> None:
+    text = next(statement for step in MIGRATIONS for statement in step if "CREATE TABLE tallies" in statement)
+    columns = [line.split()[0] for line in text.splitlines()[1:]]
+    assert tuple(columns[2:-1]) == TALLY_COLUMNS
+    kinds = {line.split()[0]: line.split()[1] for line in text.splitlines()[3:-1]}
+    assert all((kinds[f.name] == "REAL") == (f.type in {float, "float"}) for f in fields(Tally))

@@ -1,0 +1,81 @@
+"""What the server does by itself: in turn, again and again, whatever happens to one of them; a bad version goes by itself."""
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from fleetmap.bus import MemoryBus, MemoryHub
+from fleetmap.errors import StoreError
+from fleetmap.messages import FailureReport, RobotHealth
+from mapserver.config import MapserverConfig
+from mapserver.fleet.fleet import Fleet
+from mapserver.fleet.ingest import IngestSettings
+from mapserver.fleet_statistics.canary_test import CanarySettings
+from mapserver.serving.background_tasks import Chore, run_chores, server_chores
+from mapserver.serving.bus_service import TileService
+from mapserver.store import MapStore
+from support.storage.map_samples import save_sample_draft
+
+NS = 1_000_000_000
+
+
+def run_for(chores: list[Chore], seconds: float) -> None:
+    async def run() -> None:
+        task = asyncio.create_task(run_chores(chores))
+        await asyncio.sleep(seconds)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(run())
+
+
+def test_one_that_fails_stops_no_other(caplog: pytest.LogCaptureFixture) -> None:
+    done: list[str] = []
+
+    def refuse() -> None:
+        done.append("refused")
+        raise StoreError("the disk is full")
+
+    def break_down() -> None:
+        done.append("broken")
+        raise ZeroDivisionError
+
+    chores = [Chore("a", 0.01, refuse), Chore("b", 0.01, break_down), Chore("c", 60.0, lambda: done.append("c"))]
+    run_for(chores, 1.0)
+    assert done.count("refused") >= 2 and done.count("broken") >= 2
+    assert done.count("c") == 1
+    assert "a failed: the disk is full" in caplog.text
+    assert "ZeroDivisionError" in caplog.text
+
+
+def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path) -> None:
+    settings = MapserverConfig(
+        ingest=IngestSettings(flush_every_s=0.05, presence_every_s=0.05), canary=CanarySettings(check_every_s=0.05)
+    )
+    with MapStore.open(tmp_path, create=True) as store, MemoryBus(MemoryHub()) as bus:
+        save_sample_draft(store)
+        store.publish("lab")
+        save_sample_draft(store, seed=3)
+        fleet = Fleet(store, settings=settings.ingest)
+        service = TileService(store, fleet, bus, lambda *_: None)
+        store.start_canary("lab", 2, 0.1)
+        for robot, version in (("r1", 2), ("r2", 1), ("r3", 1)):
+            for second in range(40):
+                health = RobotHealth(
+                    site="lab", robot=robot, stamp_ns=second * NS, version=version, status="TRACKING",
+                    metrics={"speed_mps": 1.0},
+                )  # fmt: skip
+                fleet.take_health("lab", robot, health)
+        for number in range(8):
+            report = FailureReport(
+                site="lab", robot="r1", id=f"f{number}", stamp_ns=number * NS, wall_ns=store.canaries()[0].started_ns + NS,
+                duration_s=3.0, kind="blind", status="LOST", cause="changed", version=2,
+            )  # fmt: skip
+            fleet.take_failure("lab", "r1", report)
+        run_for(server_chores(store, fleet, service, settings), 2.0)
+        (canary,) = store.canaries("lab")
+        assert canary.state == "rolled_back", canary
+        assert "8 in" in canary.outcome
+        assert fleet.wanted_version("lab", "r1").version == 1
+        service.close()

@@ -1,0 +1,520 @@
+"""From the store over the bus to the robot and back, on the in-memory bus."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from fleetmap.bus import MemoryBus, MemoryHub
+from fleetmap.errors import LinkError, MapFormatError, UnreachableError, UsageError
+from fleetmap.mapformat import Tile, blob_path, decode_tile
+from fleetmap.messages import (
+    PART_BYTES,
+    FailureAck,
+    FailureReport,
+    PoseMessage,
+    RobotAck,
+    RobotHealth,
+    WantedVersion,
+    blob_key,
+    decode_message,
+    encode_message,
+    manifest_key,
+    part_of,
+    patch_key,
+    robot_key,
+)
+from locclient.maps.map_client import MapLink, StoreFolderLink
+from locclient.maps.tile_cache import StoreFolder, TileCache
+from mapserver.fleet.fleet import Fleet
+from mapserver.serving import bus_service
+from mapserver.serving.bus_service import TileService
+from mapserver.store import FailureFilter, MapStore
+from support.storage.map_samples import draft_details, random_tile, save_sample_draft
+
+TILE_COLUMNS = (
+    "landmark_ids", "points_map", "descriptors", "view_directions_map", "view_half_angle_rad", "max_distance_m", "sigma_m",
+)  # fmt: skip
+
+
+@dataclass
+class World:
+    folder: Path
+    hub: MemoryHub
+    store: MapStore
+    fleet: Fleet
+    service: TileService
+    counts: list[tuple[str, str, int]]
+    robot_bus: MemoryBus
+    cache: TileCache
+    link: MapLink
+    hall: MapLink
+
+    def publish(self, tiles: list[Tile]) -> WantedVersion:
+        """Another version of site hall, which has none at first."""
+        self.store.save_draft("hall", tiles=tiles, vocabulary=b"words" * 50, details=draft_details(path_m=12.5))
+        self.store.publish("hall")
+        return self.hall.wanted()
+
+    def current_tiles(self) -> list[Tile]:
+        """The tiles of the current version as robots decode them."""
+        info = self.store.current("hall")
+        entries = self.store.manifest("hall", info.version).tiles
+        return [decode_tile(self.store.blob(entry.sha256)) for entry in entries]
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    """A server with one published version of site lab, and one robot."""
+    hub = MemoryHub()
+    clock = {"ns": 10**18}
+    counts: list[tuple[str, str, int]] = []
+    with MapStore.open(tmp_path / "store", create=True, clock_ns=lambda: clock["ns"]) as store, MemoryBus(hub) as bus:
+        save_sample_draft(store)
+        store.publish("lab")
+        fleet = Fleet(store, clock_ns=lambda: clock["ns"])
+        service = TileService(store, fleet, bus, lambda *event: counts.append(event))
+        with MemoryBus(hub) as robot_bus:
+            cache = TileCache(tmp_path / "cache")
+            links = (MapLink(robot_bus, cache, site, "r1") for site in ("lab", "hall"))
+            yield World(tmp_path / "store", hub, store, fleet, service, counts, robot_bus, cache, *links)
+        service.close()
+
+
+def test_a_robot_fetches_everything_once(world: World) -> None:
+    wanted = world.link.wanted()
+    assert wanted == WantedVersion(site="lab", version=1, manifest_sha256=world.store.current("lab").manifest_sha256)
+    manifest = world.link.manifest(wanted)
+    assert world.link.vocabulary(manifest) == b"words" * 50
+    fetched = world.link.tiles(manifest)
+    assert sorted(fetched.tiles) == [(0, 0), (1, 0)]
+    assert fetched.refused == {}
+    assert sorted(world.link.tiles(manifest, [(1, 0), (9, 9)]).tiles) == [(1, 0)]
+    assert [what for what, result, _ in world.counts if result == "ok"] == [
+        "wanted",
+        "manifest",
+        "blob",
+        "blob",
+        "blob",
+    ]
+
+
+def test_a_store_folder_gives_the_same(world: World) -> None:
+    folder = StoreFolderLink(StoreFolder(world.folder), "lab")
+    wanted = folder.wanted()
+    assert wanted == world.link.wanted()
+    manifest = folder.manifest(wanted)
+    assert manifest == world.link.manifest(wanted)
+    assert folder.vocabulary(manifest) == world.link.vocabulary(manifest)
+    mine, theirs = folder.tiles(manifest).tiles, world.link.tiles(manifest).tiles
+    assert sorted(mine) == sorted(theirs)
+    np.testing.assert_array_equal(mine[0, 0].points_map, theirs[0, 0].points_map)
+    other = StoreFolderLink(StoreFolder(world.folder), "elsewhere")
+    assert other.wanted().version is None
+    with pytest.raises(LinkError, match="no published version"):
+        other.manifest(other.wanted())
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "missing"])
+def test_a_corrupt_tile_is_refused_and_the_rest_stays(world: World, damage: str) -> None:
+    manifest = world.link.manifest(world.link.wanted())
+    bad = manifest.tiles[0]
+    path = world.folder / blob_path(bad.sha256)
+    data = path.read_bytes()
+    if damage == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(data[:-1] if damage == "cut" else data[:100] + bytes([data[100] ^ 1]) + data[101:])
+    for link in (world.link, StoreFolderLink(StoreFolder(world.folder), "lab")):
+        fetched = link.tiles(manifest)
+        assert sorted(fetched.tiles) == [(1, 0)]
+        assert list(fetched.refused) == [(0, 0)]
+        assert bad.sha256 in fetched.refused[0, 0]
+
+
+def test_a_lying_server_is_refused_by_hash(world: World) -> None:
+    manifest = world.link.manifest(world.link.wanted())
+    world.service.close()
+    with MemoryBus(world.hub) as liar:
+        liar.queryable(blob_key("*", "*"), lambda _, asked: part_of(b"something else", asked))
+        liar.queryable(manifest_key("*", "*"), lambda _, asked: part_of(b"{}", asked))
+        fetched = world.link.tiles(manifest)
+        assert fetched.tiles == {}
+        assert all("damaged" in reason for reason in fetched.refused.values())
+        wanted = WantedVersion(site="lab", version=2, manifest_sha256="0" * 64)
+        with pytest.raises(MapFormatError, match="damaged"):
+            world.link.manifest(wanted)
+    assert all(tile.sha256 not in world.cache for tile in manifest.tiles)
+
+
+def test_a_known_version_is_read_with_the_server_away(world: World) -> None:
+    wanted = world.link.wanted()
+    manifest = world.link.manifest(wanted)
+    world.link.vocabulary(manifest)
+    world.link.tiles(manifest, [(0, 0)])
+    world.hub.reachable = False
+    with pytest.raises(UnreachableError):
+        world.link.wanted()
+    assert world.link.manifest(wanted) == manifest
+    assert world.link.vocabulary(manifest)
+    fetched = world.link.tiles(manifest)
+    assert sorted(fetched.tiles) == [(0, 0)]
+    assert "nobody answered" in fetched.refused[1, 0]
+
+
+def test_silence_is_waited_for_once(world: World) -> None:
+    manifest = world.link.manifest(world.link.wanted())
+    asked: list[str] = []
+
+    def silent(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+        asked.append(key)
+        raise UnreachableError("nobody")
+
+    world.robot_bus.get = silent
+    assert len(world.link.tiles(manifest).refused) == 2
+    assert len(asked) == 1
+
+
+def test_robots_see_published_things_only(world: World) -> None:
+    save_sample_draft(world.store, seed=3)
+    draft = world.store.version("lab", 2)
+    tile = world.store.manifest("lab", 2).tiles[0].sha256
+    archive = world.store.version("lab", 1).archive_sha256
+    for key, words in (
+        (manifest_key("lab", 2), "draft"),
+        (manifest_key("lab", 7), "no version 7"),
+        (manifest_key("lab", "x"), "no version number"),
+        (blob_key("lab", tile), "no published bytes"),
+        (blob_key("lab", archive), "no published bytes"),
+        (blob_key("lab", draft.manifest_sha256), "no published bytes"),
+        (blob_key("lab", ".."), "not a SHA-256"),
+        (robot_key("nowhere", "r1", "wanted"), "no site nowhere"),
+        (robot_key("lab", "R 1", "wanted"), "robot name"),
+    ):
+        with pytest.raises(LinkError, match=words):
+            world.robot_bus.get(key)
+    assert world.counts[-1] == ("wanted", "refused", 0)
+
+
+def test_new_versions_are_announced_to_known_robots(world: World) -> None:
+    heard: list[WantedVersion] = []
+    world.link.on_wanted(heard.append)
+    assert world.link.wanted().version == 1  # asking makes it known
+    assert world.service.announce_changes() == ["lab"]
+    assert [message.version for message in heard] == [1]
+    assert world.service.announce_changes() == []
+    with MapStore.open(world.folder) as other_process:
+        save_sample_draft(other_process, seed=9)
+        other_process.publish("lab")
+    assert world.service.announce_changes() == ["lab"]
+    assert [message.version for message in heard] == [1, 2]
+    assert world.link.manifest(heard[-1]).version == 2
+
+
+def test_reports_reach_the_fleet_and_survive_a_restart(world: World) -> None:
+    world.link.ack(1, stamp_ns=5, refused="tile (0, 0): damaged")
+    world.link.publish_health(
+        RobotHealth(site="lab", robot="r1", stamp_ns=6, version=1, status="TRACKING", metrics={"matches": 80})
+    )
+    world.link.publish_pose(PoseMessage.of(7, np.eye(4), np.eye(6), "TRACKING", 1))
+    (status,) = world.fleet.robots()
+    assert (status.site, status.robot, status.version, status.wanted_version, status.seconds_since) == (
+        "lab",
+        "r1",
+        1,
+        1,
+        0,
+    )
+    assert status.last_ack["refused"] == "tile (0, 0): damaged"
+    assert status.last_health["metrics"] == {"matches": 80}
+    assert status.last_pose["stamp_ns"] == 7
+    world.fleet.flush()
+    (again,) = Fleet(world.store, clock_ns=lambda: 10**18 + 5 * 10**9).robots("lab")
+    assert (again.version, again.seconds_since) == (1, 5)
+    assert again.last_ack == status.last_ack
+    assert Fleet(world.store).robots("other") == []
+
+
+def test_health_is_saved_with_the_next_flush(tmp_path: Path) -> None:
+    now = {"ns": 10**18}
+    with MapStore.open(tmp_path, create=True, clock_ns=lambda: now["ns"]) as store:
+        save_sample_draft(store)
+        fleet = Fleet(store, clock_ns=lambda: now["ns"])
+        saved = []
+        for step in range(30):
+            now["ns"] = 10**18 + step * 100_000_000
+            health = RobotHealth(site="lab", robot="r1", stamp_ns=step, version=None, status="LOST")
+            fleet.take_health("lab", "r1", health)
+            if step % 10 == 0:
+                fleet.flush()
+            saved.append(store.robots()[0].last_report["health"]["stamp_ns"])
+        assert sorted(set(saved)) == [0, 10, 20]
+        assert fleet.robots()[0].last_health["stamp_ns"] == 29
+
+
+def test_presence_is_what_the_bus_shows(world: World) -> None:
+    world.link.ack(1, stamp_ns=5)
+    assert [robot.is_present for robot in world.fleet.robots()] == [None]
+    handle = world.link.announce_presence()
+    world.service.look_for_robots()
+    assert [robot.is_present for robot in world.fleet.robots()] == [True]
+    handle.close()
+    world.service.look_for_robots()
+    assert [robot.is_present for robot in world.fleet.robots()] == [False]
+
+
+def test_a_failure_is_acknowledged_when_it_is_on_the_disk(world: World) -> None:
+    report = FailureReport(
+        site="lab", robot="r1", id="f-1", stamp_ns=5, wall_ns=10**18 - 1, duration_s=2.5, kind="blind", status="LOST",
+        cause="dark", version=1, tile=(0, 0),
+    )  # fmt: skip
+    key = robot_key("lab", "r1", "failures")
+    for _ in range(2):
+        ack = decode_message(world.robot_bus.get(key, encode_message(report)), FailureAck)
+        assert (ack.id, ack.refused) == ("f-1", "")
+        with MapStore.open(world.folder) as other_process:
+            (row,) = other_process.fleet.failures(FailureFilter())
+            assert (row.failure_id, row.tile, row.version) == ("f-1", "0,0", 1)
+    stolen = robot_key("lab", "r2", "failures")
+    assert "speaks for" in decode_message(world.robot_bus.get(stolen, encode_message(report)), FailureAck).refused
+    with pytest.raises(LinkError, match="FailureReport"):
+        world.robot_bus.get(key, b"nonsense")
+    assert world.counts[-1] == ("failure", "refused", 0)
+
+
+def test_patches_are_ready_when_robots_are_told(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+    make = bus_service.make_patch
+    monkeypatch.setattr(bus_service, "make_patch", lambda *pair: (made.append(len(pair[1])), make(*pair))[1])
+    rng = np.random.default_rng(3)
+    tiles = [random_tile(rng, landmarks=400, cell=(x, 0)) for x in range(3)]
+    world.publish(tiles)
+    world.hall.bring(world.hall.wanted())
+    world.service.announce_changes()
+    assert made == []
+    kept = np.arange(len(tiles[1])) > 0
+    fewer = {name: getattr(tiles[1], name)[kept] for name in TILE_COLUMNS}
+    lists = tuple(ids[ids != tiles[1].landmark_ids[0]] for ids in tiles[1].place_landmark_ids)
+    wanted = world.publish([tiles[0], replace(tiles[1], place_landmark_ids=lists, **fewer), tiles[2]])
+    assert world.service.announce_changes() == ["hall"]
+    assert len(made) == 2  # of the manifest and of the tile that changed
+    world.hall.bring(wanted)
+    assert len(made) == 2
+    assert [what for what, result, _ in world.counts if (what, result) == ("patch", "ok")] == ["patch", "patch"]
+
+
+def test_a_report_that_cannot_be_read_is_refused_for_good_and_set_aside(world: World) -> None:
+    """It says its id, so that the robot can let go of it; of another fleetmap it may be."""
+    key = robot_key("lab", "r1", "failures")
+    payload = msgspec.msgpack.encode({"id": "f-7", "site": "lab", "robot": "r1", "kind": 3})
+    ack = decode_message(world.robot_bus.get(key, payload), FailureAck)
+    assert ack.id == "f-7"
+    assert "no FailureReport" in ack.refused
+    assert world.counts[-2:] == [
+        ("failure refused for good", "refused", 0),
+        ("failure", "ok", len(encode_message(ack))),
+    ]
+    (kept,) = (world.folder / "refused").glob("*.msgpack")
+    assert kept.read_bytes() == payload
+    assert ack.refused in kept.with_suffix(".reason.txt").read_text()
+    for number in range(120):
+        world.fleet.take_failure_bytes("lab", "r1", msgspec.msgpack.encode({"id": f"g-{number}"}))
+    assert len(list((world.folder / "refused").iterdir())) <= 200
+    assert world.store.verify().faults == []
+
+
+def test_bad_messages_are_counted_and_change_nothing(world: World, caplog: pytest.LogCaptureFixture) -> None:
+    bus = world.robot_bus
+    bus.publish(robot_key("lab", "r1", "ack"), b"nonsense")
+    stolen = RobotAck(site="lab", robot="r2", stamp_ns=1, version=1)
+    bus.publish(robot_key("lab", "r1", "ack"), encode_message(stolen))
+    bus.publish(
+        robot_key("nowhere", "r1", "health"),
+        encode_message(RobotHealth(site="nowhere", robot="r1", stamp_ns=1, version=None, status="LOST")),
+    )
+    assert [event for event in world.counts if event[1] == "refused"] == [("ack", "refused", 0)] * 2 + [
+        ("health", "refused", 0)
+    ]
+    assert world.fleet.robots() == []
+    assert "speaks for 'r2'" in caplog.text
+
+
+def test_presence_and_names(world: World) -> None:
+    handle = world.link.announce_presence()
+    assert world.robot_bus.alive(robot_key("lab", "*", "alive")) == [robot_key("lab", "r1", "alive")]
+    handle.close()
+    with pytest.raises(UsageError, match="robot name"):
+        MapLink(world.robot_bus, world.cache, "lab", "Robot One")
+
+
+def moved(tile: Tile, rows: slice) -> Tile:
+    points = tile.points_map.copy()
+    points[rows, 2] += 1.0
+    return replace(tile, points_map=points)
+
+
+def large_site(world: World, count: int = 3, landmarks: int = 9000, seed: int = 0) -> list[Tile]:
+    """Tiles that need two parts each."""
+    rng = np.random.default_rng(seed)
+    return [random_tile(rng, landmarks=landmarks, cell=(x, 0)) for x in range(count)]
+
+
+def test_a_version_is_active_when_all_of_it_is_there(world: World) -> None:
+    assert world.cache.active("lab") is None
+    ready = world.link.ready()
+    assert (ready.wanted.version, ready.note) == (1, "")
+    assert world.cache.active("lab").version == 1
+    manifest = world.link.manifest(ready.wanted)
+    world.hub.reachable = False
+    # Another process of the same robot, without a server.
+    again = MapLink(world.robot_bus, TileCache(world.folder.parent / "cache"), "lab", "r1", timeout_s=0.1)
+    later = again.ready()
+    assert later.wanted == ready.wanted
+    assert "version 1 goes on: nobody answered" in later.note
+    assert len(again.tiles(again.manifest(later.wanted)).tiles) == len(manifest.tiles)
+
+
+def test_an_empty_cache_without_a_server_is_told(world: World) -> None:
+    world.hub.reachable = False
+    with pytest.raises(UnreachableError):
+        world.link.ready()
+
+
+def test_a_damaged_version_never_becomes_active(world: World) -> None:
+    world.publish(large_site(world, seed=1))
+    world.hall.ready()
+    world.publish(large_site(world))
+    bad = world.store.manifest("hall", 2).tiles[1]
+    path = world.folder / blob_path(bad.sha256)
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    ready = world.hall.ready()
+    assert ready.wanted.version == 1
+    assert "version 1 goes on" in ready.note
+    assert bad.sha256 in ready.note
+    assert world.cache.active("hall").version == 1
+    # A robot that has nothing yet takes what there is.
+    fresh = MapLink(world.robot_bus, TileCache(world.folder.parent / "fresh"), "hall", "r2")
+    ready = fresh.ready()
+    assert ready.wanted.version == 2
+    assert bad.sha256 in ready.note
+    fetched = fresh.tiles(fresh.manifest(ready.wanted))
+    assert (sorted(fetched.tiles), list(fetched.refused)) == ([(0, 0), (2, 0)], [(1, 0)])
+
+
+def test_a_night_costs_what_changed(world: World) -> None:
+    tiles = large_site(world)
+    world.publish(tiles)
+    world.hall.ready()
+    whole = world.hall.received_bytes
+    assert whole > 900_000
+    tiles = world.current_tiles()
+    world.publish(tiles)  # nothing moved
+    world.hall.ready()
+    unmoved = world.hall.received_bytes - whole
+    assert world.cache.active("hall").version == 2
+    assert unmoved < 0.01 * whole
+    world.publish([moved(tiles[0], slice(0, 450)), *tiles[1:]])
+    world.hall.ready()
+    assert world.cache.active("hall").version == 3
+    assert world.hall.received_bytes - whole - unmoved < 0.01 * whole
+    assert "patch" in [what for what, result, _ in world.counts if result == "ok"]
+    fetched = world.hall.tiles(world.hall.manifest(world.hall.wanted()))
+    np.testing.assert_allclose(fetched.tiles[0, 0].points_map[:450, 2], tiles[0].points_map[:450, 2] + 1.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("lie", [b"", b"nonsense", "another"])
+def test_a_patch_that_does_not_lead_there_costs_the_whole(world: World, lie: bytes | str) -> None:
+    world.publish(large_site(world, 1))
+    world.hall.ready()
+    other = world.current_tiles()[0]
+    world.publish([moved(other, slice(0, 9))])
+    wrong = world.robot_bus.get
+
+    def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+        if "/patches/" not in key:
+            return wrong(key, payload, timeout_s=timeout_s)
+        if lie == "another":
+            base, _, result = key.rpartition("/")[2].partition("-")
+            return wrong(patch_key("hall", result, base), payload)
+        return part_of(lie, payload)
+
+    world.robot_bus.get = get
+    assert world.hall.ready().wanted.version == 2
+    assert world.cache.active("hall").version == 2
+
+
+def test_patches_are_for_published_things_of_one_kind(world: World) -> None:
+    one, two = (tile.sha256 for tile in world.store.manifest("lab", 1).tiles)
+    manifest = world.store.current("lab").manifest_sha256
+    archive = world.store.version("lab", 1).archive_sha256
+    for base, result, words in (
+        (one, manifest, "no published pair"),
+        (one, "0" * 64, "no published pair"),
+        (archive, archive, "no published pair"),
+        (one, two, "not much smaller"),  # another place
+        ("..", one, "not a SHA-256"),
+        (one, "", "not a SHA-256"),
+    ):
+        with pytest.raises(LinkError, match=words):
+            world.robot_bus.get(patch_key("lab", base, result))
+
+
+@pytest.mark.parametrize("died_after", range(1, 8))
+def test_a_fetch_goes_on_where_it_was(world: World, died_after: int) -> None:
+    """The server goes away after any part, the robot gives up, and takes up later: no part comes twice."""
+    wanted = world.publish(large_site(world))
+    asked: list[tuple[str, bytes]] = []
+    through = world.robot_bus.get
+
+    def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+        if len(asked) == died_after:
+            world.hub.reachable = False
+        answer = through(key, payload, timeout_s=timeout_s)
+        asked.append((key, payload))
+        return answer
+
+    world.robot_bus.get = get
+    with pytest.raises(UnreachableError):
+        world.hall.bring(wanted)
+    assert world.cache.active("hall") is None
+    world.hub.reachable = True
+    died_after = -1
+    world.hall.bring(wanted)
+    assert world.cache.active("hall").version == 1
+    assert len(asked) == len(set(asked))
+    assert world.hall.received_bytes == sum(len(world.cache.get(sha256)) for sha256 in world.cache.active("hall").blobs)
+
+
+def test_a_fetch_waits_for_a_server_that_comes_back(world: World) -> None:
+    wanted = world.publish(large_site(world))
+    link = MapLink(world.robot_bus, world.cache, "hall", "r1", timeout_s=0.05, patience_s=20)
+    through, asked = world.robot_bus.get, []
+
+    def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+        asked.append(key)
+        world.hub.reachable = len(asked) not in range(4, 7)  # away for three questions in the middle
+        return through(key, payload, timeout_s=timeout_s)
+
+    world.robot_bus.get = get
+    link.bring(wanted)
+    assert world.cache.active("hall").version == 1
+    assert len(asked) == len(set(asked)) + 3 + 3  # three tiles have a second part under the same key
+
+
+def test_no_message_of_a_large_site_exceeds_a_part(world: World) -> None:
+    wanted = world.publish(large_site(world, 1, landmarks=30_000))
+    sizes: list[int] = []
+    through = world.robot_bus.get
+
+    def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+        answer = through(key, payload, timeout_s=timeout_s)
+        sizes.append(len(answer))
+        return answer
+
+    world.robot_bus.get = get
+    world.hall.bring(wanted)
+    assert max(sizes) <= PART_BYTES + 100
+    assert sum(sizes) > 1 << 20

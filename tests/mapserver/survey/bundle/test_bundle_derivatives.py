@@ -1,0 +1,131 @@
+"""The normal equations of bundle adjustment against numeric derivatives of a second, plain formulation."""
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, se3_exp, se3_inverse
+from mapserver.survey.bundle.bundle_adjustment import (
+    BundleProblem,
+    BundleSettings,
+    MotionPrior,
+    PriorTerm,
+    RelativeTerm,
+    keyframe_covariances,
+)
+from mapserver.survey.bundle.bundle_adjustment import _Bundle as Bundle
+from mapserver.survey.bundle.reduced_system import dense_lower, solve_dense, solve_pcg, solve_sparse
+from support.worlds.bundle_scene import disturbed, make_scene, plain_residuals
+
+NO_ROBUSTNESS = BundleSettings(huber_sigmas=1e9)
+
+
+def _problem(*, inertial: bool) -> BundleProblem:
+    scene = make_scene(keyframes=5, landmarks=40, step_s=0.4, seed=3, noise_px=1.0, inertial=inertial)
+    problem = disturbed(scene.problem, seed=4, rot_rad=0.01, trans_m=0.05, points_m=0.05)
+    rng = np.random.default_rng(7)
+    root = rng.normal(size=(6, 6))
+    map_from_body = problem.map_from_body
+    for i, j in ((1, 4), (3, 0)):
+        off = se3_exp(rng.normal(size=6) * 0.05)
+        problem.relative.append(
+            RelativeTerm(i, j, se3_inverse(map_from_body[i]) @ map_from_body[j] @ off, root @ root.T + np.eye(6))
+        )
+    problem.priors.append(
+        PriorTerm(2, map_from_body[2] @ se3_exp(rng.normal(size=6) * 0.05), root.T @ root + np.eye(6))
+    )
+    if problem.inertial is not None:
+        problem.inertial.velocities_map_mps += rng.normal(size=(5, 3)) * 0.1
+        problem.inertial.gyro_bias_radps += rng.normal(size=(5, 3)) * 0.01
+        problem.inertial.accel_bias_mps2 += rng.normal(size=(5, 3)) * 0.1
+        mean, sigma = rng.normal(size=9) * 0.1, np.array([np.inf] * 3 + [0.01] * 3 + [0.1] * 3)
+        problem.inertial.priors.append(MotionPrior(1, mean, sigma))
+    return problem
+
+
+def _numeric(problem: BundleProblem) -> tuple[Array, Array]:
+    """Gauss-Newton matrix and right-hand side over [(pose, motion) of each keyframe, points]."""
+    count, points = len(problem.map_from_body), len(problem.points_map)
+    size = 6 if problem.inertial is None else 15
+
+    def residuals(step: Array) -> Array:
+        head = step[: count * size].reshape(count, size)
+        motion = head[:, 6:] if size == 15 else np.zeros((count, 9))
+        return plain_residuals(problem, head[:, :6], motion, step[count * size :].reshape(points, 3))
+
+    unknowns = count * size + 3 * points
+    jacobian = np.empty((len(residuals(np.zeros(unknowns))), unknowns))
+    for c in range(unknowns):
+        nudge = 1e-6 * np.eye(unknowns)[c]
+        jacobian[:, c] = (residuals(nudge) - residuals(-nudge)) / 2e-6
+    return jacobian.T @ jacobian, -jacobian.T @ residuals(np.zeros(unknowns))
+
+
+def _eliminated(problem: BundleProblem) -> tuple[Array, Array]:
+    """The numeric system over the moving keyframe unknowns, landmarks eliminated."""
+    matrix, rhs = _numeric(problem)
+    size = 6 if problem.inertial is None else 15
+    head = len(problem.map_from_body) * size
+    free = np.ones(head, np.bool_)
+    for k in np.nonzero(problem.fixed)[0]:
+        free[k * size : k * size + 6] = False
+    held_first = np.nonzero(free)[0]
+    seen = np.isin(np.arange(len(problem.points_map)), problem.obs_landmark)
+    tail = head + np.nonzero(np.repeat(seen, 3))[0]
+    cross, inner = matrix[np.ix_(held_first, tail)], matrix[np.ix_(tail, tail)]
+    return (
+        matrix[np.ix_(held_first, held_first)] - cross @ np.linalg.solve(inner, cross.T),
+        rhs[held_first] - cross @ np.linalg.solve(inner, rhs[tail]),
+    )
+
+
+@pytest.mark.parametrize("inertial", [False, True])
+def test_reduced_system(inertial: bool) -> None:
+    problem = _problem(inertial=inertial)
+    matrix, rhs = _eliminated(problem)
+    bundle = Bundle(problem, NO_ROBUSTNESS)
+    bundle.linearise()
+    system = bundle.reduced(0.0)
+    whole = dense_lower(system)
+    whole = np.triu(whole) + np.triu(whole, 1).T
+    free = system.structure.free.ravel()
+    ours = whole[np.ix_(free, free)]
+    scale = np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
+    np.testing.assert_allclose(ours / scale, matrix / scale, atol=2e-5)
+    np.testing.assert_allclose(system.rhs.ravel()[free], rhs, atol=2e-5 * np.abs(rhs).max())
+
+
+@pytest.mark.parametrize("inertial", [False, True])
+def test_cost_is_half_the_sum_of_squares(inertial: bool) -> None:
+    problem = _problem(inertial=inertial)
+    count = len(problem.map_from_body)
+    plain = plain_residuals(problem, np.zeros((count, 6)), np.zeros((count, 9)), np.zeros((len(problem.points_map), 3)))
+    bundle = Bundle(problem, NO_ROBUSTNESS)
+    assert bundle.cost(bundle.state) == pytest.approx(0.5 * plain @ plain, rel=1e-4)
+
+
+@pytest.mark.parametrize("inertial", [False, True])
+def test_solvers_agree(inertial: bool) -> None:
+    problem = _problem(inertial=inertial)
+    bundle = Bundle(problem, NO_ROBUSTNESS)
+    bundle.linearise()
+    system = bundle.reduced(1e-3)
+    dense, sparse = solve_dense(system), solve_sparse(system)
+    iterated = solve_pcg(system, BundleSettings(pcg_tolerance=1e-12, pcg_max_iterations=1000))
+    assert dense is not None
+    assert sparse is not None
+    assert iterated is not None
+    np.testing.assert_allclose(sparse, dense, atol=1e-8 * np.abs(dense).max())
+    np.testing.assert_allclose(iterated, dense, atol=1e-6 * np.abs(dense).max())
+    assert (dense[~system.structure.free] == 0).all()
+
+
+@pytest.mark.parametrize("inertial", [False, True])
+def test_covariances_are_blocks_of_the_inverse(inertial: bool) -> None:
+    problem = _problem(inertial=inertial)
+    matrix, _ = _eliminated(problem)
+    inverse = np.linalg.inv(matrix)
+    start = (9 if inertial else 0) + (15 if inertial else 6)  # keyframe 0 is held, only its motion is free
+    ours = keyframe_covariances(problem, np.array([0, 2]), huber_sigmas=1e9)
+    np.testing.assert_allclose(ours[0], 0.0)
+    expected = inverse[start : start + 6, start : start + 6]
+    np.testing.assert_allclose(ours[1], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())

@@ -1,0 +1,107 @@
+"""What a survey does not hand on: doubles, landmarks without parallax, keyframes that repeat each other."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from fleetmap.features.orb import Features
+from fleetmap.geometry import Array
+from mapserver.survey.finish.culling import cull, parallax_rad, redundant
+from mapserver.survey.keyframes.keyframes import Keyframe, MemoryShelf
+from mapserver.survey.settings import CullSettings
+from mapserver.survey.tracks.tracks import Landmarks
+from support.worlds.session_scene import CAMERA, survey_state
+
+
+def keyframes(count: int, features: int, seed: int = 0) -> list[Keyframe]:
+    """Keyframes with random descriptors and octave 0, no pictures."""
+    rng = np.random.default_rng(seed)
+    return [
+        Keyframe(
+            k, k,
+            Features(
+                np.zeros((features, 2)), np.zeros(features, np.int8), np.zeros(features, np.float32),
+                rng.integers(0, 256, (features, 32), dtype=np.uint8),
+            ),
+            np.zeros((features, 2)), np.zeros((features, 3)), MemoryShelf(), 0,
+        )
+        for k in range(count)
+    ]  # fmt: skip
+
+
+def seen_by(table: Array, landmarks: int) -> Landmarks:
+    """Observations (landmark, keyframe), sorted."""
+    return Landmarks(
+        np.zeros((landmarks, 3)), table[:, 1].astype(np.int32), table[:, 0].astype(np.int32), np.zeros(len(table), np.int64),
+        np.zeros((len(table), 3)), np.ones((len(table), 2)),
+    )  # fmt: skip
+
+
+def test_keyframes_that_repeat_each_other_do_not_all_go() -> None:
+    """Eight keyframes see the same forty landmarks: each goes while three others see them, so three stay, the ends among them."""
+    table = np.array([(n, k) for n in range(40) for k in range(8)])
+    marks = seen_by(table, 40)
+    gone = redundant(marks, np.zeros(len(table), np.int64), np.ones(40, bool), 8, CullSettings())
+    assert gone.sum() == 5
+    assert not gone[[0, 7]].any()
+
+
+def test_a_keyframe_that_sees_nearer_is_not_repeated_by_others() -> None:
+    """Keyframe 3 sees at octave 0 what the others see at octave 4: from farther, or as larger corners."""
+    table = np.array([(n, k) for n in range(40) for k in range(8)])
+    octaves = np.where(table[:, 1] == 3, 0, 4)
+    gone = redundant(seen_by(table, 40), octaves, np.ones(40, bool), 8, CullSettings())
+    assert not gone[3]
+    assert gone.sum() >= 3
+
+
+def test_what_only_few_see_keeps_its_keyframes() -> None:
+    table = np.array([(n, k) for n in range(40) for k in (n % 8, (n + 1) % 8)])
+    table = table[np.lexsort((table[:, 1], table[:, 0]))]
+    assert not redundant(seen_by(table, 40), np.zeros(len(table), np.int64), np.ones(40, bool), 8, CullSettings()).any()
+
+
+def test_a_double_goes_and_its_neighbours_stay() -> None:
+    """A landmark's observations are split in two, as if a track had broken: one of the two goes, with a like descriptor only."""
+    state = survey_state(1)
+    marks = state.landmarks
+    counts = np.bincount(marks.obs_landmark)
+    split = int(np.argmax(counts))
+    rows = np.flatnonzero(marks.obs_landmark == split)[counts[split] // 2 + 1 :]
+    landmark = marks.obs_landmark.copy()
+    landmark[rows] = len(counts)
+    order = np.argsort(landmark, kind="stable")
+    broken = Landmarks(
+        np.vstack([marks.points_map, marks.points_map[split]]), marks.obs_keyframe[order], landmark[order],
+        marks.obs_feature[order], marks.obs_pixels[order], marks.obs_sigma_px[order],
+    )  # fmt: skip
+    frames = keyframes(12, int(marks.obs_feature.max()) + 1)
+    sigmas = np.full(len(counts) + 1, 0.01)
+    settings = CullSettings(min_parallax_deg=0.0, redundant_share=1.1)
+    _, kept, none = cull(replace(state, landmarks=broken), frames, sigmas, settings)
+    assert none.landmarks_merged == 0  # random descriptors: not the same thing
+    assert kept.all()
+    first = np.flatnonzero(landmark[order] == split)[0]
+    second = np.flatnonzero(landmark[order] == len(counts))[0]
+    theirs = frames[broken.obs_keyframe[second]].features.descriptors
+    theirs[broken.obs_feature[second]] = frames[broken.obs_keyframe[first]].features.descriptors[
+        broken.obs_feature[first]
+    ]
+    left, _, culled = cull(replace(state, landmarks=broken), frames, sigmas, settings)
+    assert culled.landmarks_merged == 1
+    assert len(left.points_map) == len(counts)
+
+
+def test_parallax_is_the_widest_angle_or_the_baselines() -> None:
+    state = survey_state(2)
+    angles = parallax_rad(state)
+    map_from_cam = state.map_from_body @ state.body_from_cam
+    for n in range(0, len(state.landmarks.points_map), 17):
+        own = state.landmarks.obs_landmark == n
+        rays = map_from_cam[state.landmarks.obs_keyframe[own], :3, 3] - state.landmarks.points_map[n]
+        rays /= np.linalg.norm(rays, axis=1)[:, None]
+        widest = np.arccos(np.clip(rays @ rays[0], -1, 1)).max()
+        nearest = np.linalg.norm(
+            map_from_cam[state.landmarks.obs_keyframe[own], :3, 3] - state.landmarks.points_map[n], axis=1
+        ).min()
+        assert np.isclose(angles[n], max(widest, CAMERA.baseline_m / nearest), atol=1e-9)

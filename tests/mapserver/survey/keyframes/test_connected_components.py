@@ -1,0 +1,136 @@
+"""A survey that went blind: what is joined, what is left out, and what is said about it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import SurveyError
+from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.samples import ImuSamples
+from mapserver.survey.bundle.bundle_adjustment import RelativeTerm
+from mapserver.survey.bundle.bundle_rounds import Motion, SurveyState
+from mapserver.survey.keyframes.connected_components import SigmaBetween, beside, find_parts, only_kept, seen_by
+from mapserver.survey.loops.loops import Loops
+from mapserver.survey.odometry_pass import FirstGuess
+from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from mapserver.survey.tracks.tracks import Landmarks
+
+PER_KEYFRAME = 40
+
+
+def survey(seen: list[range], loops: list[tuple[int, int]] | None = None) -> SurveyState:
+    """Keyframes at 1 Hz; every keyframe sees a range of landmarks, loops share 20 more."""
+    pairs = [(k, n) for k, numbers in enumerate(seen) for n in numbers]
+    count = max((n for _, n in pairs), default=-1) + 1
+    for a, b in loops or []:
+        pairs += [(k, count + n) for k in (a, b) for n in range(20)]
+        count += 20
+    pairs.sort(key=lambda pair: (pair[1], pair[0]))
+    keyframe, landmark = np.array(pairs, np.int32).reshape(-1, 2).T
+    places = np.tile(np.eye(4), (len(seen), 1, 1))
+    places[:, 0, 3] = np.arange(len(seen))
+    points = np.column_stack([np.arange(count), np.zeros(count), np.zeros(count)]).astype(float)
+    each = np.column_stack([np.arange(len(seen))] * 3).astype(float)
+    marks = Landmarks(
+        points, keyframe, landmark, np.arange(len(pairs)), np.zeros((len(pairs), 3)), np.ones((len(pairs), 2))
+    )
+    return SurveyState(
+        np.arange(len(seen), dtype=np.int64) * 1_000_000_000, places, np.eye(4),
+        StereoCamera(200.0, 160.0, 120.0, 0.1, 320, 240),
+        Motion(
+            False, ImuSamples.empty(), None, 0.0, each, each, each,
+            [RelativeTerm(k, k + 1, np.eye(4), np.eye(6)) for k in range(len(seen) - 1)],
+        ),
+        marks,
+    )  # fmt: skip
+
+
+def guessed(state: SurveyState) -> FirstGuess:
+    """Its odometry: every other frame is a keyframe."""
+    keyframes = [SimpleNamespace(frame_index=2 * k) for k in range(len(state.stamps_ns))]
+    return FirstGuess([], np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), np.zeros(0), keyframes, inertial=False)
+
+
+def chain(first: int, keyframes: int) -> list[range]:
+    """Neighbours share half of what they see."""
+    return [range(first + k * PER_KEYFRAME // 2, first + (k + 2) * PER_KEYFRAME // 2) for k in range(keyframes)]
+
+
+def sigmas(grows_m: list[float]) -> SigmaBetween:
+    """Odometry that adds so much, root of summed squares, from each keyframe to the next."""
+    variances = np.concatenate([[0.0], np.cumsum(np.square(grows_m))])
+    covariances = np.zeros((len(variances), 6, 6))
+    covariances[:, 3, 3] = variances
+    return SigmaBetween(covariances)
+
+
+BLIND = [range(0), range(0)]
+
+
+def test_an_unbroken_survey_is_one_part_and_stays_as_it_is() -> None:
+    whole = survey(chain(0, 6))
+    parts = find_parts(seen_by(whole), sigmas([9.0] * 5), 0.1)
+    assert [(p.kept, p.keyframes) for p in parts.parts] == [(True, 6)]
+    assert not parts.stray
+    assert only_kept(whole, guessed(whole), Loops(), parts.kept)[0] is whole
+
+
+def test_what_lies_beyond_a_long_darkness_is_left_out_and_named() -> None:
+    dark = survey(chain(0, 4) + BLIND + chain(1000, 6))
+    parts = find_parts(seen_by(dark), sigmas([0.01] * 3 + [5.0] * 3 + [0.01] * 5), 0.1)
+    assert [(p.start_s, p.end_s, p.kept) for p in parts.parts] == [(0.0, 3.0, False), (6.0, 11.0, True)]
+    assert [(p.start_s, p.end_s, p.kept) for p in parts.stray] == [(4.0, 5.0, False)]
+    assert "left out: 4 keyframes from 0.0 to 3.0 s" in parts.parts[0].remark()
+    edges = [PoseEdge(0, 3, np.eye(4), np.eye(6), is_loop=True), PoseEdge(6, 9, np.eye(4), np.eye(6), is_loop=True)]
+    kept, guess, loops = only_kept(dark, guessed(dark), Loops(edges=edges), parts.kept)
+    assert len(kept.stamps_ns) == len(kept.map_from_body) == len(kept.motion.velocities_mps) == 6
+    assert kept.stamps_ns[0] == 6_000_000_000
+    np.testing.assert_array_equal(kept.motion.gyro_bias_radps[:, 0], np.arange(6, 12))
+    assert [(r.i, r.j) for r in kept.motion.relative] == [(k, k + 1) for k in range(5)]
+    assert [(e.i, e.j) for e in loops.edges] == [(0, 3)]
+    assert [k.frame_index for k in guess.keyframes] == list(range(12, 24, 2))
+    assert kept.landmarks.points_map[:, 0].min() >= 1000
+    assert (np.bincount(kept.landmarks.obs_landmark) >= 2).all()
+    assert set(kept.landmarks.obs_keyframe.tolist()) == set(range(6))
+    np.testing.assert_array_equal(beside(23, np.arange(0, 23, 2), parts.kept), np.arange(23) >= 12)
+
+
+def test_a_blink_is_bridged_by_odometry_and_takes_the_blind_along() -> None:
+    blink = survey(chain(0, 4) + BLIND + chain(1000, 6))
+    parts = find_parts(seen_by(blink), sigmas([0.01] * 3 + [0.05] * 3 + [0.01] * 5), 0.1)
+    assert [(p.kept, p.keyframes) for p in parts.parts] == [(True, 12)]
+    assert not parts.stray
+
+
+def test_what_leads_nowhere_is_taken_only_as_far_as_it_is_sure() -> None:
+    """0.04 m is within the joining sigma of 0.1 m, three times that is not."""
+    dark = survey(chain(0, 8) + BLIND + chain(1000, 4))
+    parts = find_parts(seen_by(dark), sigmas([0.01] * 7 + [0.02, 0.05, 5.0] + [0.01] * 3), 0.1)
+    assert [(p.end_s, p.keyframes, p.kept) for p in parts.parts] == [(8.0, 9, True), (13.0, 4, False)]
+    assert [(p.start_s, p.keyframes) for p in parts.stray] == [(9.0, 1)]
+
+
+def test_the_largest_part_is_the_one_with_most_that_see() -> None:
+    dark = survey(chain(0, 4) + BLIND * 3 + chain(1000, 3))
+    parts = find_parts(seen_by(dark), sigmas([0.01] * 3 + [5.0] + [0.001] * 8), 0.1)
+    assert [(p.keyframes, p.kept) for p in parts.parts] == [(4, True), (9, False)]
+
+
+def test_a_bridge_is_as_long_as_the_darkness_not_as_its_steps() -> None:
+    """Each step alone would be sure enough."""
+    dark = survey(chain(0, 4) + BLIND * 5 + chain(1000, 6))
+    parts = find_parts(seen_by(dark), sigmas([0.01] * 3 + [0.05] * 11 + [0.01] * 5), 0.1)
+    assert [p.kept for p in parts.parts] == [False, True]
+
+
+def test_a_loop_joins_what_darkness_parted() -> None:
+    dark = survey(chain(0, 4) + BLIND + chain(1000, 6), loops=[(1, 9)])
+    parts = find_parts(seen_by(dark), sigmas([0.01] * 3 + [5.0] * 3 + [0.01] * 5), 0.1)
+    assert [(p.kept, p.keyframes) for p in parts.parts] == [(True, 10)]
+    assert [p.keyframes for p in parts.stray] == [2]
+
+
+def test_nothing_that_hangs_together_is_refused() -> None:
+    with pytest.raises(SurveyError, match="none of 3 keyframes"):
+        find_parts(seen_by(survey([range(0, 40), range(100, 140), range(200, 240)])), sigmas([1.0, 1.0]), 0.1)

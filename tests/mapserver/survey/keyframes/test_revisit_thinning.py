@@ -1,0 +1,212 @@
+"""Visits beyond enough take no part in the adjustment, and are placed as well as if they had."""
+
+from dataclasses import replace
+from itertools import groupby
+
+import numpy as np
+import pytest
+
+from fleetmap.features.orb import Features
+from fleetmap.geometry import se3_exp
+from mapserver.survey.bundle.bundle_adjustment import BundleSettings, optimize
+from mapserver.survey.bundle.bundle_rounds import adjust
+from mapserver.survey.keyframes.keyframes import Keyframe, MemoryShelf
+from mapserver.survey.keyframes.revisit_thinning import adjust_visits, spare_keyframes, without_spare
+from mapserver.survey.settings import CullSettings, LoopSettings, SurveySettings
+from mapserver.survey.tracks.tracks import Landmarks, Tracks
+from support.worlds.bundle_scene import make_scene
+from support.worlds.corridor_scene import Scene, scene
+
+FEATURES = 60
+
+
+def keyframes(octaves: list[int]) -> list[Keyframe]:
+    """One for each octave, which all its features have; no pictures."""
+    return [
+        Keyframe(
+            k, k,
+            Features(
+                np.zeros((FEATURES, 2)), np.full(FEATURES, octave, np.int8), np.zeros(FEATURES, np.float32),
+                np.zeros((FEATURES, 32), np.uint8),
+            ),
+            np.zeros((FEATURES, 2)), np.zeros((FEATURES, 3)), MemoryShelf(), 0,
+        )
+        for k, octave in enumerate(octaves)
+    ]  # fmt: skip
+
+
+def tracks_seen_by(who: list[list[int]]) -> Tracks:
+    """Tracks of these keyframes; each keyframe's features are numbered as its tracks come."""
+    flat = np.array([k for members in who for k in members], np.int64)
+    counts = np.zeros(flat.max() + 1, np.int64)
+    features = np.empty_like(flat)
+    for n, k in enumerate(flat):
+        features[n] = counts[k]
+        counts[k] += 1
+    return Tracks(flat, features, np.cumsum([0, *(len(members) for members in who)])[:-1])
+
+
+def drive(laps: int, places: int, per_place: int = 20) -> Tracks:
+    """Laps past some places; what stands at a place is seen from it and from the next two."""
+    return tracks_seen_by(
+        [
+            sorted(lap * places + (place + ahead) % places for lap in range(laps) for ahead in range(3))
+            for place in range(places)
+            for _ in range(per_place)
+        ]
+    )
+
+
+def test_of_many_laps_the_first_ones_are_left() -> None:
+    spare = spare_keyframes(drive(6, 30), keyframes([0] * 180), SurveySettings())
+    np.testing.assert_array_equal(np.flatnonzero(spare), np.arange(90, 180))
+    more = SurveySettings(cull=CullSettings(repeated_visits=4))
+    np.testing.assert_array_equal(
+        np.flatnonzero(spare_keyframes(drive(6, 30), keyframes([0] * 180), more)), np.arange(120, 180)
+    )
+
+
+@pytest.mark.parametrize("laps", [1, 2, 3])
+def test_a_drive_that_comes_back_twice_at_most_keeps_all(laps: int) -> None:
+    assert not spare_keyframes(drive(laps, 30), keyframes([0] * 30 * laps), SurveySettings()).any()
+
+
+def test_a_keyframe_that_sees_more_than_the_others_is_not_spare() -> None:
+    """The last lap looks from nearer (an octave that is finer by two), or at things that it alone sees twice."""
+    nearer = keyframes([3] * 120 + [1] * 30)
+    assert not spare_keyframes(drive(5, 30), nearer, SurveySettings())[120:].any()
+    old = drive(5, 30, per_place=10)
+    own = [[120 + k, 121 + k] for k in range(0, 28, 2) for _ in range(15)]
+    members = [g.tolist() for g in np.split(old.keyframes, old.starts[1:])]
+    spare = spare_keyframes(tracks_seen_by([*members, *own]), keyframes([0] * 150), SurveySettings())
+    assert not spare[120:148].any()
+    assert spare[148:].all()  # these two see nothing of their own
+
+
+def test_blind_keyframes_among_spare_ones_are_spare_too() -> None:
+    """In the fourth lap 95 to 97 see nothing, and nobody else does where no keyframe is spare: in the first lap they stay."""
+    whole = drive(4, 30)
+    members = [g.tolist() for g in np.split(whole.keyframes, whole.starts[1:])]
+    dark = {3, 4, 5, 95, 96, 97}
+    spare = spare_keyframes(
+        tracks_seen_by([seen for m in members if (seen := [k for k in m if k not in dark])]), keyframes([0] * 120),
+        SurveySettings(),
+    )  # fmt: skip
+    assert spare[95:98].all()
+    assert not spare[:90].any()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_spare_keyframes_are_those_of_a_plain_twin(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = 60
+    who = [sorted(rng.choice(count, int(rng.integers(2, 30)), replace=False).tolist()) for _ in range(50)]
+    octaves = rng.integers(0, 4, count).tolist()
+    settings = SurveySettings(
+        loops=LoopSettings(min_gap_keyframes=int(rng.integers(2, 9)), alone_inliers=4),
+        cull=CullSettings(repeated_share=0.6, repeated_visits=int(rng.integers(1, 4))),
+    )
+    found = spare_keyframes(tracks_seen_by(who), keyframes(octaves), settings)
+    np.testing.assert_array_equal(found, spare_by_hand(who, octaves, settings))
+    assert found.any()
+    assert not found.all()
+
+
+def spare_by_hand(who: list[list[int]], octaves: list[int], settings: SurveySettings) -> np.ndarray:
+    gap, gone = settings.loops.min_gap_keyframes, np.zeros(len(octaves), bool)
+    for k in range(len(octaves) - 1, 0, -1):
+        own, repeated = [members for members in who if k in members], 0
+        for members in own:
+            others = [m for m in members if not gone[m] and abs(m - k) > gap and octaves[m] <= octaves[k] + 1]
+            breaks = np.cumsum(np.diff(others, prepend=others[0]) > gap) if others else []
+            repeated += len(list(groupby(breaks))) >= settings.cull.repeated_visits
+        gone[k] = repeated >= max(settings.cull.repeated_share * len(own), settings.loops.alone_inliers)
+    while True:
+        left = [[m for m in members if not gone[m]] for members in who]
+        tied = [sum(k in members and len(members) > 1 for members in left) for k in range(len(gone))]
+        alone = [
+            k
+            for k in range(1, len(gone))
+            if not gone[k] and gone[k - 1 : k + 2].any() and tied[k] < settings.loops.alone_inliers
+        ]
+        if not alone:
+            return gone
+        gone[alone] = True
+
+
+def test_held_points_stay_and_keyframes_find_their_places_among_them() -> None:
+    truth = make_scene(keyframes=6, landmarks=150, step_s=0.4, seed=1).problem
+    moved = truth.map_from_body.copy()
+    for k in range(1, 6):
+        moved[k] = moved[k] @ se3_exp(np.array([0.01, -0.02, 0.01, 0.05, -0.03, 0.02]) * k / 5)
+    problem = replace(truth, map_from_body=moved, points_held=True)
+    for dense in (1500, 0):
+        result = optimize(
+            problem, BundleSettings(max_iterations=30, relative_cost_tolerance=1e-12, dense_unknowns=dense)
+        )
+        np.testing.assert_array_equal(result.points_map, truth.points_map)
+        np.testing.assert_allclose(result.map_from_body, truth.map_from_body, atol=1e-8)
+
+
+def laps_of(given: Scene, laps: int, seed: int) -> tuple[Scene, np.ndarray]:
+    """The same drive again and again, observed anew; which keyframes (K,) are of later laps than the third."""
+    rng, state, count = np.random.default_rng(seed), given.state, len(given.map_from_body)
+    marks = state.landmarks
+    observed = np.tile(marks.obs_landmark, laps)
+    order = np.argsort(observed, kind="stable")
+    noise = rng.normal(0, 0.2, (len(observed), 3))
+    noise[: len(marks.obs_landmark)] = 0.0
+    keyframe = np.concatenate([marks.obs_keyframe + lap * count for lap in range(laps)]).astype(np.int32)
+    landmarks = Landmarks(
+        marks.points_map, keyframe[order], observed[order], np.arange(len(observed))[order],
+        (np.tile(marks.obs_pixels, (laps, 1)) + noise)[order], np.tile(marks.obs_sigma_px, (laps, 1))[order],
+    )  # fmt: skip
+    guessed, nothing = np.tile(state.map_from_body, (laps, 1, 1)), np.zeros((laps * count, 3))
+    motion = replace(
+        state.motion, velocities_mps=nothing, gyro_bias_radps=nothing.copy(), accel_bias_mps2=nothing.copy()
+    )
+    whole = replace(
+        state, stamps_ns=np.arange(laps * count, dtype=np.int64) * 100_000_000, map_from_body=guessed, motion=motion,
+        landmarks=landmarks,
+    )  # fmt: skip
+    spare = np.arange(laps * count) >= 3 * count
+    return Scene(
+        whole, np.tile(given.map_from_body, (laps, 1, 1)), given.points_map, np.tile(given.is_outlier, laps)
+    ), spare
+
+
+def test_spare_keyframes_are_placed_as_well_as_if_they_had_been_adjusted() -> None:
+    given, spare = laps_of(scene(12, 3, drift=0.01, outliers=0.03), 5, 4)
+    every, _ = laps_of(scene(12, 3, drift=0.01, outliers=0.03), 5, 4)
+    adjust(every.state, SurveySettings(), final=True)
+    adjust_visits(given.state, SurveySettings(), spare, rounds=3)
+    errors = [
+        np.linalg.norm(s.state.map_from_body[:, :3, 3] - s.map_from_body[:, :3, 3], axis=1) for s in (given, every)
+    ]
+    assert errors[0][spare].max() < 0.01
+    assert np.median(errors[0][spare]) < 1.5 * np.median(errors[1][spare])
+    marks = given.state.landmarks
+    assert (np.diff(marks.obs_landmark) >= 0).all()
+    assert 0.9 < spare[marks.obs_keyframe].mean() / spare.mean() < 1.1
+    wild = given.is_outlier[marks.obs_feature]  # features are numbered by row
+    assert wild.mean() < 0.002
+    assert given.is_outlier.mean() > 0.02
+
+
+def test_what_is_not_spare_is_adjusted_as_if_the_rest_were_not_there() -> None:
+    given, spare = laps_of(scene(12, 5, drift=0.01), 4, 6)
+    alone = without_spare(given.state, spare)
+    adjust(alone, SurveySettings(), final=True)
+    adjust_visits(given.state, SurveySettings(), spare, rounds=3)
+    np.testing.assert_array_equal(given.state.map_from_body[~spare], alone.map_from_body)
+    np.testing.assert_array_equal(given.state.landmarks.points_map, alone.landmarks.points_map)
+
+
+def test_the_imu_does_not_carry_over_what_is_left_out() -> None:
+    """Keyframes a tenth of a second apart: over one that is spare it does, over fifty it does not."""
+    given, _ = laps_of(scene(12, 7, drift=0.01), 8, 8)
+    spare = np.zeros(96, bool)
+    spare[[5, *range(20, 70)]] = True
+    goes_on = without_spare(given.state, spare).motion.goes_on
+    assert goes_on is not None
+    np.testing.assert_array_equal(np.flatnonzero(~goes_on), [19])  # the first keyframe after the gap

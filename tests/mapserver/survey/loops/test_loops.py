@@ -1,0 +1,229 @@
+"""Loops are believed only where the robot can be: a world in which two places look exactly the same.
+
+Keyframes 0-3 see a wall, 4-9 other things, 10-13 what 0-3 saw, pixel for pixel: a return, or the same aisle again.
+"""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from msgspec import structs
+
+from fleetmap.bow import Vocabulary, train_vocabulary
+from fleetmap.geometry import Array, se3_exp, se3_inverse
+from fleetmap.sensors.rectification import Rectifier
+from mapserver.survey.keyframes.keyframes import Keyframe, make_keyframe
+from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, Verdict
+from mapserver.survey.loops.zones import Zones
+from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
+from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from mapserver.survey.settings import LoopSettings, SurveySettings
+from support.recordings.recording_samples import calibration
+from support.worlds.box_room import out_and_back, stereo_pair
+
+SETTINGS = SurveySettings(loops=LoopSettings(min_gap_keyframes=6))
+WALL, AGAIN = range(4), range(10, 14)
+
+
+@lru_cache(maxsize=1)
+def seen() -> tuple[list[Keyframe], Array, Rectifier, Vocabulary]:
+    """Ten rendered keyframes, where each was, the rig and a vocabulary."""
+    rectifier = Rectifier(calibration())
+    wall = [out_and_back(6.0)(t) for t in (2.0, 2.2, 2.4, 2.6)]
+    other = [out_and_back(6.0, yaw_rad=-1.2)(t) for t in (2.0, 2.2, 2.4, 2.6, 2.8, 3.0)]
+    places = np.array([*wall, *other])
+    keyframes = [
+        make_keyframe(rectifier.rectify(stereo_pair(there, k * 10**9)), k, rectifier.camera, SETTINGS)
+        for k, there in enumerate(places)
+    ]
+    descriptors = np.concatenate([k.features.descriptors for k in keyframes])
+    images = np.repeat(np.arange(len(keyframes)), [len(k.features) for k in keyframes])
+    return keyframes, places, rectifier, train_vocabulary(descriptors, 8, 3, np.random.default_rng(2), images)
+
+
+def closed(
+    believed_shift_m: Array, sigma_m: float, *, zones: Zones | None = None, settings: SurveySettings = SETTINGS
+) -> tuple[Loops, Array]:
+    """Loops of the chain and its places; the second look at the wall is believed to be so far from the first.
+
+    sigma_m: of the whole way from keyframe 0 to the last one.
+    """
+    keyframes, places, rectifier, vocabulary = seen()
+    whole = [*keyframes, *(replace(keyframes[k], frame_index=10 + k) for k in WALL)]
+    map_from_body = np.array([*places, *places[WALL]])
+    map_from_body[10:, :3, 3] += believed_shift_m
+    steps = len(whole) - 1
+    covariance = np.diag([1e-8] * 3 + [sigma_m**2 / steps] * 3)
+    chain = [
+        PoseEdge(k, k + 1, se3_inverse(map_from_body[k]) @ map_from_body[k + 1], covariance, is_loop=False)
+        for k in range(steps)
+    ]
+    vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in whole]
+    closer = LoopCloser(
+        whole, vectors, vocabulary.word_count, rectifier.camera, rectifier.body_from_cam, map_from_body,
+        GraphMarginals(map_from_body, chain), {(k, k + 1) for k in range(steps)}, settings, zones or Zones(),
+    )  # fmt: skip
+    for k in range(len(whole)):
+        closer.close(k)
+    return closer.loops, map_from_body
+
+
+def replace_loops(settings: SurveySettings, **changes: float) -> SurveySettings:
+    return structs.replace(settings, loops=structs.replace(settings.loops, **changes))
+
+
+def wall_records(loops: Loops) -> list[LoopRecord]:
+    every = [replace(r, j=j, also=()) for r in loops.records for j in (r.j, *r.also)]
+    return [r for r in every if r.i in AGAIN and r.j in WALL]
+
+
+def test_a_true_return_is_accepted_with_the_motion_that_was() -> None:
+    """0.3 m of drift, a sigma of 0.3 m: same pictures, so the true motion between copies is none at all."""
+    loops, _ = closed(np.array([0.2, -0.2, 0.1]), 0.3)
+    _, places, _, _ = seen()
+    accepted = {(e.i, e.j): e for e in loops.edges}
+    for k in WALL:
+        edge = accepted[10 + k, k]
+        np.testing.assert_allclose(edge.i_from_j, np.eye(4), atol=0.003)
+        assert edge.is_loop
+        assert np.linalg.eigvalsh(edge.cov_rot_trans)[0] > 0
+    for (i, j), edge in accepted.items():
+        truth = se3_inverse(places[i - 10]) @ places[j]
+        assert np.linalg.norm((se3_inverse(truth) @ edge.i_from_j)[:3, 3]) < 0.03
+    assert set(accepted) <= {(i, j) for i in AGAIN for j in WALL}
+
+
+@pytest.mark.parametrize(
+    ("shift", "sigma_m", "why"),
+    [
+        ([0, 5.0, 0], 0.1, "too far apart"),  # farther than one can see: not even looked at
+        ([0, 1.5, 0], 0.1, "from where the robot cannot be"),  # looked at, fits perfectly, and is still impossible
+        ([12.0, 0, 0], 1.0, "too far apart"),
+    ],
+)
+def test_a_place_that_looks_the_same_elsewhere_is_gated_out(shift: list[float], sigma_m: float, why: str) -> None:
+    loops, _ = closed(np.array(shift), sigma_m)
+    assert loops.edges == []
+    records = wall_records(loops)
+    assert len(records) >= 4
+    assert {r.verdict for r in records if r.i - r.j == 10} == {Verdict.GATED_OUT}
+    assert all(why in r.reason for r in records if r.i - r.j == 10)
+
+
+def test_the_gate_opens_as_far_as_the_robot_may_have_drifted() -> None:
+    """The same 1.5 m, when the way between is known to 0.8 m only."""
+    loops, _ = closed(np.array([0, 1.5, 0]), 0.8)
+    assert {(10 + k, k) for k in WALL} <= {(e.i, e.j) for e in loops.edges}
+
+
+@pytest.mark.parametrize(("sigma_m", "verdict"), [(0.8, Verdict.AMBIGUOUS), (0.1, Verdict.ACCEPTED)])
+def test_where_people_say_that_the_site_repeats_a_first_alias_is_not_believed(sigma_m: float, verdict: Verdict) -> None:
+    """Nothing in the survey looks like the wall but the wall itself; the next aisle, 1.5 m aside, may not have been seen yet."""
+    settings = replace_loops(SETTINGS, repeats_every_m=1.5)
+    shift = np.array([0, 1.5 if sigma_m > 0.5 else 0.1, 0])
+    loops, _ = closed(shift, sigma_m, settings=settings)
+    assert {r.verdict for r in wall_records(loops) if r.i - r.j == 10} == {verdict}
+    assert bool(loops.edges) is (verdict is Verdict.ACCEPTED)
+
+
+def test_zones_exclude_what_position_alone_would_admit() -> None:
+    _, places, _, _ = seen()
+    middle = places[0][1, 3] + 0.75
+    low = np.array([[-50, -50], [50, -50], [50, middle], [-50, middle]])
+    high = np.array([[-50, middle], [50, middle], [50, 50], [-50, 50]])
+    loops, _ = closed(np.array([0, 1.5, 0]), 0.8, zones=Zones({"low": low, "high": high}))
+    assert loops.edges == []
+    assert {r.reason for r in wall_records(loops)} == {"in different zones"}
+
+
+def test_two_places_that_exclude_each_other_are_ambiguous() -> None:
+    """Two aisles 1.6 m apart, known well against each other; then a third look, from a way known to metres."""
+    keyframes, places, rectifier, vocabulary = seen()
+    shift = np.array([0, 1.6, 0])
+    moved = places[:4].copy()
+    moved[:, :3, 3] += shift
+    between = places[:4].copy()
+    between[:, :3, 3] += 0.5 * shift
+    path = np.array([*places[:4], *places[4:10], *moved, *places[4:10], *between])
+    order = [*range(10), *range(4), *range(4, 10), *range(4)]
+    whole = [replace(keyframes[k], frame_index=n) for n, k in enumerate(order)]
+    sigmas = [0.005] * 13 + [0.5] * 10
+    chain = [
+        PoseEdge(k, k + 1, se3_inverse(path[k]) @ path[k + 1], np.diag([1e-8] * 3 + [s**2] * 3), is_loop=False)
+        for k, s in enumerate(sigmas)
+    ]
+    vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in whole]
+    closer = LoopCloser(
+        whole, vectors, vocabulary.word_count, rectifier.camera, rectifier.body_from_cam, path,
+        GraphMarginals(path, chain), {(k, k + 1) for k in range(len(chain))}, SETTINGS, Zones(),
+    )  # fmt: skip
+    for k in range(21):
+        closer.close(k)
+    records = [r for r in closer.loops.records if r.i == 20 and r.j in (0, 10)]
+    assert {r.j for r in records} == {0, 10}
+    assert {r.verdict for r in records} == {Verdict.AMBIGUOUS}
+    assert all("exclude each other" in r.reason for r in records)
+    assert not [e for e in closer.loops.edges if e.i == 20]
+    counts = closer.loops.counts()
+    assert counts["rejected"] >= len(records)
+
+
+@pytest.mark.parametrize(("sigma_m", "verdict"), [(1.4, Verdict.AMBIGUOUS), (0.5, Verdict.ACCEPTED)])
+def test_where_the_site_repeats_a_first_visit_is_not_taken_for_a_return(sigma_m: float, verdict: Verdict) -> None:
+    """Two aisles 8 m apart, both seen; a third look, 2 m beside the first by odometry, may be of one 8 m to the other side.
+
+    Only where the way there is known too well for that it is the first aisle.
+    """
+    keyframes, places, rectifier, vocabulary = seen()
+    aside = np.array([0, 8.0, 0])
+    path = np.array([*places, *places, *places[:4]])
+    path[10:14, :3, 3] += aside
+    path[20:, :3, 3] -= 0.25 * aside
+    whole = [replace(keyframes[n % 10], frame_index=n) for n in range(24)]
+    sigmas = [0.005] * 19 + [sigma_m] + [0.005] * 3
+    chain = [
+        PoseEdge(k, k + 1, se3_inverse(path[k]) @ path[k + 1], np.diag([1e-8] * 3 + [s**2] * 3), is_loop=False)
+        for k, s in enumerate(sigmas)
+    ]
+    vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in whole]
+    closer = LoopCloser(
+        whole, vectors, vocabulary.word_count, rectifier.camera, rectifier.body_from_cam, path,
+        GraphMarginals(path, chain), {(k, k + 1) for k in range(len(chain))}, SETTINGS, Zones(),
+    )  # fmt: skip
+    for k in range(21):
+        closer.close(k)
+    (record,) = (r for r in closer.loops.records if (r.i, r.j) == (20, 0))
+    assert record.verdict is verdict
+    assert bool([e for e in closer.loops.edges if e.i == 20]) is (verdict is Verdict.ACCEPTED)
+
+
+def test_candidates_refused_together_are_all_counted() -> None:
+    together = LoopRecord(20, 1, 0.5, Verdict.GATED_OUT, "because", also=(2, 3))
+    assert Loops([together]).counts() == {"candidates": 3, "gated_out": 3, "rejected": 0, "accepted": 0}
+
+
+def edge(i: int, j: int) -> PoseEdge:
+    return PoseEdge(i, j, se3_exp(np.zeros(6)), np.eye(6), is_loop=True)
+
+
+def record(i: int, j: int, verdict: Verdict) -> LoopRecord:
+    return LoopRecord(i, j, 0.5, verdict, "because", 40)
+
+
+def test_counts_add_up() -> None:
+    verdicts = [Verdict.ACCEPTED] * 3 + [Verdict.GATED_OUT] * 2 + [Verdict.REJECTED] + [Verdict.AMBIGUOUS] * 4
+    loops = Loops([record(20 + k, k, verdict) for k, verdict in enumerate(verdicts)])
+    assert loops.counts() == {"candidates": 10, "gated_out": 2, "rejected": 5, "accepted": 3}
+    assert Loops().counts() == {"candidates": 0, "gated_out": 0, "rejected": 0, "accepted": 0}
+
+
+def test_what_the_pose_graph_disbelieves_is_rejected_after_all() -> None:
+    records = [record(20, 1, Verdict.ACCEPTED), record(20, 2, Verdict.GATED_OUT), record(21, 1, Verdict.ACCEPTED)]
+    loops = Loops(records, [edge(20, 1), edge(21, 1)])
+    loops.disbelieve(np.array([0.49, 0.51]))
+    assert [(e.i, e.j) for e in loops.edges] == [(21, 1)]
+    assert [r.verdict for r in loops.records] == [Verdict.REJECTED, Verdict.GATED_OUT, Verdict.ACCEPTED]
+    assert "contradicts" in loops.records[0].reason
+    assert loops.records[0].inliers == 40
+    assert loops.counts()["accepted"] == len(loops.edges) == 1

@@ -1,0 +1,68 @@
+"""Landmarks through surveys: what moved is told from noise, what is missed fades as its own history says."""
+
+import numpy as np
+import pytest
+
+from mapserver.survey.merge.landmark_persistence import Looks, faded, missed_since, shifts
+from mapserver.survey.settings import SessionSettings, SurveySettings
+from mapserver.survey.survey_map import History
+from support.worlds.session_scene import session_scene
+
+
+def history(expected: int, seen: int, missed: int, count: int) -> History:
+    """The same past for all landmarks of six keyframes."""
+    numbers = (np.full(count, n, np.uint32) for n in (expected, seen, missed))
+    return History(np.arange(6, dtype=np.uint32), np.ones(6, bool), *numbers, 6, count)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_noise_moves_nothing_and_what_moved_is_found(seed: int) -> None:
+    """Every tenth landmark stands 8 cm aside: those that are seen often enough are found there, hardly any other is."""
+    scene = session_scene(seed, landmarks=900)
+    points = scene.base.points_map.copy()
+    still = shifts(scene.base, scene.map_from_cam, scene.sightings(points, seed), SurveySettings())
+    assert len(still.rows) > 100
+    assert still.significant.mean() < 0.01
+    moved = np.arange(len(points)) % 10 == 0
+    points[moved] += [0.05, 0.05, 0.04]
+    found = shifts(scene.base, scene.map_from_cam, scene.sightings(points, seed), SurveySettings())
+    is_moved = moved[found.rows]
+    assert found.significant[is_moved].mean() > 0.8
+    assert found.significant[~is_moved].mean() < 0.01
+    off_m = np.linalg.norm(found.points_map - points[found.rows], axis=1)[is_moved & found.significant]
+    assert np.median(off_m) < 0.03
+
+
+def test_a_landmark_fades_when_its_misses_are_too_unlikely() -> None:
+    """Of a landmark that was seen in every second look, n misses happen with probability (1 - 0.7 * 0.5)^n."""
+    count = 300
+    scene = session_scene(1, landmarks=count, history=history(1000, 500, 0, count))
+    n = len(scene.base.points_map)
+    limit = int(np.ceil(np.log(0.001) / np.log(1 - 0.7 * 0.5)))
+    settings = SurveySettings(sessions=SessionSettings(fade_probability=0.001, look_weight=0.7))
+    for misses, gone in ((1, False), (limit - 1, False), (limit + 1, True)):
+        looks = Looks(np.full(n, misses), np.zeros(n, np.int64))
+        assert (faded(scene.base, looks, settings) == gone).all(), misses
+
+
+def test_one_sighting_brings_a_landmark_back() -> None:
+    count = 300
+    scene = session_scene(1, landmarks=count, history=history(40, 20, 14, count))
+    n = len(scene.base.points_map)
+    seen = Looks(np.full(n, 10), np.r_[np.ones(n // 2, np.int64), np.zeros(n - n // 2, np.int64)])
+    missed = missed_since(scene.base, seen)
+    assert (missed[: n // 2] == 0).all()
+    assert (missed[n // 2 :] == 24).all()
+    gone = faded(scene.base, seen, SurveySettings())
+    assert not gone[: n // 2].any()
+    assert gone[n // 2 :].all()
+
+
+def test_a_landmark_that_is_hardly_ever_seen_may_be_missed_longer() -> None:
+    count = 300
+    often = session_scene(1, landmarks=count, history=history(100, 60, 0, count))
+    rarely = session_scene(1, landmarks=count, history=history(100, 6, 0, count))
+    n = len(often.base.points_map)
+    looks = Looks(np.full(n, 16), np.zeros(n, np.int64))
+    assert faded(often.base, looks, SurveySettings()).all()
+    assert not faded(rarely.base, looks, SurveySettings()).any()

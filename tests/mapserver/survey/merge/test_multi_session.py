@@ -1,0 +1,68 @@
+"""Parts of joining: stamps of several recordings on one clock, and keyframes that are enough for what they show."""
+
+import numpy as np
+
+from fleetmap.geometry import se3, se3_inverse
+from fleetmap.sensors.samples import Trajectory
+from mapserver.survey.merge.base_map import BaseMap, as_recorded
+from mapserver.survey.merge.merge import fewer_keyframes
+from mapserver.survey.merge.multi_session import chained
+from mapserver.survey.tracks.tracks import Landmarks
+from support.worlds.session_scene import session_scene
+
+SECOND_NS = 1_000_000_000
+
+
+def trajectory(start_s: float, frames: int) -> Trajectory:
+    stamps = (np.arange(frames) * SECOND_NS // 10 + int(start_s * SECOND_NS)).astype(np.int64)
+    return Trajectory(stamps, np.tile(np.eye(4), (frames, 1, 1)))
+
+
+def test_recordings_in_order_keep_their_stamps() -> None:
+    first, second = trajectory(10, 5), trajectory(100, 7)
+    both = chained([first, second], [first, second])
+    np.testing.assert_array_equal(both.stamps_ns, np.r_[first.stamps_ns, second.stamps_ns])
+    assert len(both) == 12
+
+
+def test_recordings_that_overlap_follow_each_other_and_their_truth_with_them() -> None:
+    first, second = trajectory(10, 50), trajectory(8, 40)
+    truths = [trajectory(9, 400), trajectory(7, 300)]
+    estimate = chained([first, second], [first, second])
+    assert (np.diff(estimate.stamps_ns) > 0).all()
+    moved_ns = estimate.stamps_ns[50] - second.stamps_ns[0]
+    truth = chained(truths, [first, second])
+    assert truth.stamps_ns[400] - truths[1].stamps_ns[0] == moved_ns
+
+
+def test_each_landmark_keeps_enough_keyframes_and_no_more_are_taken() -> None:
+    """Ten keyframes see all of thirty landmarks: three of them are enough; a landmark that only one sees keeps that one."""
+    seen = [(n, k) for n in range(30) for k in range(10)] + [(30, 10)]
+    table = np.array(seen)
+    marks = Landmarks(
+        np.zeros((31, 3)), table[:, 1].astype(np.int32), table[:, 0].astype(np.int32), np.arange(len(seen)),
+        np.zeros((len(seen), 3)), np.ones((len(seen), 2)),
+    )  # fmt: skip
+    fewer = fewer_keyframes(marks, 3)
+    assert np.bincount(fewer.obs_landmark).tolist() == [3] * 30 + [1]
+    assert len(np.unique(fewer.obs_keyframe)) == 4
+
+
+def test_observations_of_another_baseline_come_back_as_they_were() -> None:
+    scene = session_scene(4)
+    wide = scene.base.camera.__class__(400.0, 320.0, 240.0, 0.3, 640, 480)
+    base = BaseMap(scene.base.map, wide, scene.base.map.body_from_cam)
+    row = np.flatnonzero(np.isfinite(scene.base.map.obs_pixels[:, 2]))[0]
+    k, n = base.map.obs_keyframe[row], base.map.obs_landmark[row]
+    point_cam = se3_inverse(base.map_from_cam[k]) @ np.append(base.points_map[n], 1.0)
+    assert np.abs(base.obs_pixels[row] - wide.pixel_from_point(point_cam[None, :3])[0]).max() < 6.0  # noise, times 2.5
+    pixels, sigmas = as_recorded(base, base.obs_pixels, base.obs_sigma_px)
+    np.testing.assert_allclose(pixels, base.map.obs_pixels)
+    np.testing.assert_allclose(sigmas, base.map.obs_sigma_px)
+
+
+def test_a_rig_with_its_body_elsewhere_has_its_cameras_in_the_same_places() -> None:
+    scene = session_scene(4)
+    other = scene.base.map.body_from_cam @ se3(np.eye(3), np.array([0.3, 0.1, -0.2]))
+    base = BaseMap(scene.base.map, scene.base.camera, other)
+    np.testing.assert_allclose(base.map_from_body @ other, scene.base.map_from_cam, atol=1e-12)

@@ -1,0 +1,137 @@
+"""Pose graphs: benchmark problems against gtsam's own reader and solver, wrong loops, bad input."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from fleetmap.errors import SurveyError
+from fleetmap.geometry import Array, se3_exp
+from mapserver.survey.pose_graph.g2o import parse_g2o
+from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
+from support.recordings.realdata import real_data
+from support.worlds.pose_graph_scene import Drive, make_drive
+
+
+def _revisit_error_m(drive: Drive, map_from_body: Array) -> float:
+    """Root mean square error of where a keyframe is seen from the same place of the lap before, over all of them."""
+    seen, true = (
+        np.array([np.linalg.inv(frame_from_body[k - 40]) @ frame_from_body[k] for k in range(40, 80)])[:, :3, 3]
+        for frame_from_body in (map_from_body, drive.truth)
+    )
+    return float(np.sqrt(np.mean(np.sum((seen - true) ** 2, axis=1))))
+
+
+@pytest.mark.parametrize("name", ["sphere2500", "parking-garage"])
+def test_benchmark_problems_end_where_gtsam_ends(name: str) -> None:
+    file = real_data("pose_graphs") / f"{name}.g2o"
+    map_from_body, edges = parse_g2o(file.read_text())
+    graph, values = gtsam.readG2o(str(file), True)
+    anchor = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), anchor))
+    optimum = gtsam.GaussNewtonOptimizer(graph, values).optimize()
+    result = optimize_pose_graph(map_from_body, edges, robust=False)
+    assert result.cost_before == pytest.approx(graph.error(values), rel=1e-6)
+    assert result.cost_after == pytest.approx(graph.error(optimum), rel=1e-4)
+    theirs = np.array([optimum.atPose3(k).matrix() for k in range(len(map_from_body))])
+    np.testing.assert_allclose(result.map_from_body[:, :3, 3], theirs[:, :3, 3], atol=0.02)
+    np.testing.assert_array_equal(result.map_from_body[0], map_from_body[0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_loops_straighten_the_drive_and_wrong_ones_are_disbelieved(seed: int) -> None:
+    drive = make_drive(np.random.default_rng(seed), loops=15, wrong=5)
+    result = optimize_pose_graph(drive.start, drive.edges)
+    np.testing.assert_array_equal(result.loop_weights < 0.5, drive.wrong)
+    clean = [edge for edge, bad in zip(drive.edges, [*[False] * 79, *drive.wrong], strict=True) if not bad]
+    alone = optimize_pose_graph(drive.start, clean, robust=False)
+    np.testing.assert_allclose(result.map_from_body, alone.map_from_body, atol=1e-4)
+    assert result.cost_after == pytest.approx(alone.cost_after, rel=1e-4)
+    assert result.cost_after < result.cost_before
+    error_m = _revisit_error_m(drive, result.map_from_body)
+    assert error_m < 0.35 * _revisit_error_m(drive, drive.start)
+    deceived = optimize_pose_graph(drive.start, drive.edges, robust=False)
+    assert _revisit_error_m(drive, deceived.map_from_body) > 5 * error_m
+
+
+def test_without_loops_nothing_moves() -> None:
+    drive = make_drive(np.random.default_rng(5), loops=0)
+    result = optimize_pose_graph(drive.start, drive.edges)
+    assert len(result.loop_weights) == 0
+    np.testing.assert_allclose(result.map_from_body, drive.start, atol=1e-9)
+
+
+def test_the_fixed_keyframe_stays() -> None:
+    drive = make_drive(np.random.default_rng(6))
+    first, other = (optimize_pose_graph(drive.start, drive.edges, fixed=k) for k in (0, 33))
+    np.testing.assert_array_equal(other.map_from_body[33], drive.start[33])
+    between = np.linalg.inv(first.map_from_body[33]) @ first.map_from_body[60]
+    np.testing.assert_allclose(np.linalg.inv(other.map_from_body[33]) @ other.map_from_body[60], between, atol=1e-4)
+
+
+def test_covariances_are_of_the_axes_of_i() -> None:
+    """Two edges disagree about where j is along the y axis of i; the surer one wins, by the ratio of variances."""
+    i_from_j = se3_exp(np.array([0.0, 0.0, 1.2, 4.0, 1.0, 0.0]))
+    loose_in_y = np.diag([1e-8] * 3 + [1e-8, 1e-2, 1e-8])
+    shifted = i_from_j.copy()
+    shifted[1, 3] += 0.3
+    edges = [PoseEdge(0, 1, i_from_j, loose_in_y, False), PoseEdge(0, 1, shifted, 0.5 * loose_in_y, False)]
+    result = optimize_pose_graph(np.array([np.eye(4), i_from_j]), edges)
+    np.testing.assert_allclose(result.map_from_body[1][:3, 3] - i_from_j[:3, 3], [0.0, 0.2, 0.0], atol=1e-3)
+
+
+def test_adjoint_carries_perturbations() -> None:
+    rng = np.random.default_rng(7)
+    a_from_b = se3_exp(rng.normal(size=6))
+    perturbation = 1e-3 * rng.normal(size=6)
+    left, right = se3_exp(adjoint(a_from_b) @ perturbation) @ a_from_b, a_from_b @ se3_exp(perturbation)
+    np.testing.assert_allclose(left, right, atol=1e-12)
+
+
+def test_bad_graphs_are_refused_with_their_edge() -> None:
+    drive = make_drive(np.random.default_rng(8), loops=2)
+    edge = drive.edges[5]
+    nan = np.full((4, 4), np.nan)
+    for spoiled, words in (
+        (replace(edge, j=200), "edge 5-200"),
+        (replace(edge, j=5), "edge 5-5"),
+        (replace(edge, i_from_j=nan), "edge 5-6"),
+        (replace(edge, cov_rot_trans=np.zeros((6, 6))), "edge 5-6"),
+        (replace(edge, cov_rot_trans=np.diag([np.inf] * 6)), "edge 5-6"),
+    ):
+        with pytest.raises(SurveyError, match=words):
+            optimize_pose_graph(drive.start, [*drive.edges[:5], spoiled, *drive.edges[6:]])
+    with pytest.raises(SurveyError, match=r"keyframes \[41, 42"):
+        optimize_pose_graph(drive.start, drive.edges[:40])
+
+
+_VERTEX = "VERTEX_SE3:QUAT {} 1 2 3 0 0 0 1"
+_EDGE = "EDGE_SE3:QUAT {} {} 1 0 0 0 0 0 1 " + " ".join(["1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 4 0 0 4 0 4"])
+
+
+def test_g2o_ids_need_not_be_dense() -> None:
+    lines = [_VERTEX.format(7), _VERTEX.format(3), "", "FIX 3", _EDGE.format(3, 7)]
+    map_from_body, edges = parse_g2o("\n".join(lines))
+    assert map_from_body.shape == (2, 4, 4)
+    assert (edges[0].i, edges[0].j, edges[0].is_loop) == (0, 1, False)
+    with pytest.raises(SurveyError, match=r"vertices \[9\]"):
+        parse_g2o("\n".join([*lines, _EDGE.format(3, 9)]))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "VERTEX_SE2 0 0 0 0",
+        "VERTEX_SE3:QUAT 3 1 2 3 0 0 0 1",
+        "VERTEX_SE3:QUAT 1 1 2 3 0 0 0",
+        "VERTEX_SE3:QUAT x 1 2 3 0 0 0 1",
+        "VERTEX_SE3:QUAT 4 1 2 nan 0 0 0 1",
+        "VERTEX_SE3:QUAT 4 1 2 3 0 0 0 0",
+        "EDGE_SE3:QUAT 0 1 2",
+        "VERTEX_SE3:QUAT",
+    ],
+)
+def test_bad_g2o_lines_are_named(line: str) -> None:
+    with pytest.raises(SurveyError, match="line 2"):
+        parse_g2o(_VERTEX.format(3) + "\n" + line)

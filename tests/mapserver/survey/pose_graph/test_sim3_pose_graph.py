@@ -1,0 +1,144 @@
+"""The graph of similarities: derivatives, scale drift taken up by a loop, wrong loops, and how loops measure the scale."""
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import SurveyError
+from fleetmap.geometry import Array, align_points, se3, se3_exp, se3_inverse, so3_exp, transform_points
+from mapserver.survey.loops.sim3_loops import gate_covariances, measured_log_scale, rigid, solve_scaled
+from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from mapserver.survey.pose_graph.sim3_pose_graph import Similarities, SimilarityEdge, optimize_similarities, residuals
+
+COUNT = 120
+CHAIN_COV = np.diag([0.002**2] * 3 + [0.008**2] * 3)
+LOOP_COV = np.diag([0.003**2] * 3 + [0.01**2] * 3)
+WALK = 0.01
+
+
+def circle() -> Array:
+    """map_from_body (K, 4, 4): one lap of 80 m that ends where it began."""
+    angle = 2 * np.pi * np.arange(COUNT) / (COUNT - 1)
+    return np.array(
+        [
+            se3(
+                so3_exp(np.array([0.0, 0.0, a + np.pi / 2])),
+                np.array([12.7 * np.cos(a), 12.7 * np.sin(a), 0.2 * np.sin(2 * a)]),
+            )
+            for a in angle
+        ]
+    )
+
+
+def drifted(truth: Array, drift: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """The chain (K, 4, 4) as one camera would have it, whose lengths grow by `drift` from start to end; and its scale (K,)."""
+    scale = np.exp(np.log1p(drift) * np.arange(COUNT) / (COUNT - 1))
+    places = [truth[0]]
+    for k in range(COUNT - 1):
+        step = se3_inverse(truth[k]) @ truth[k + 1]
+        step[:3, 3] *= scale[k]
+        places.append(places[-1] @ step @ se3_exp(rng.multivariate_normal(np.zeros(6), 0.1 * CHAIN_COV)))
+    return np.array(places), scale
+
+
+def chain_of(places: Array) -> list[PoseEdge]:
+    return [
+        PoseEdge(k, k + 1, se3_inverse(places[k]) @ places[k + 1], CHAIN_COV, is_loop=False)
+        for k in range(len(places) - 1)
+    ]
+
+
+def scale_errors(found: Array, truth: Array) -> tuple[float, float]:
+    """After one similarity: largest error in metres, and how far the scale of tenths of the way still wanders."""
+    placed, scale = align_points(truth[:, :3, 3], found[:, :3, 3], with_scale=True)
+    errors = np.linalg.norm(transform_points(placed, scale * found[:, :3, 3]) - truth[:, :3, 3], axis=1)
+    steps = [np.linalg.norm(np.diff(m[:, :3, 3], axis=0), axis=1) for m in (found, truth)]
+    parts = [s[: 10 * (len(s) // 10)].reshape(10, -1).sum(axis=1) for s in steps]
+    ratio = scale * parts[0] / parts[1]
+    return float(errors.max()), float(np.abs(ratio - 1).max())
+
+
+def test_derivatives_are_numeric_ones() -> None:
+    rng = np.random.default_rng(0)
+    states = Similarities(
+        np.array([so3_exp(rng.normal(size=3)) for _ in range(2)]), rng.normal(size=(2, 3)), np.array([0.7, 1.4])
+    )
+    near = se3(states.rotations[0].T @ states.rotations[1] @ so3_exp(np.array([0.2, -0.1, 0.3])), rng.normal(size=3))
+    edge = SimilarityEdge(0, 1, near, 1.7, np.eye(7), is_loop=True)
+    _, by_i, by_j = (values[0] for values in residuals([edge], states))
+    for k, unit in enumerate(1e-6 * np.eye(7)):
+        for which, analytic in ((0, by_i), (1, by_j)):
+            steps = np.zeros((2, 7))
+            steps[which] = unit
+            numeric = (residuals([edge], states.moved(steps))[0] - residuals([edge], states.moved(-steps))[0])[0] / 2e-6
+            assert analytic[:, k] == pytest.approx(numeric, abs=1e-6)
+
+
+def test_five_percent_of_scale_drift_go_with_one_loop() -> None:
+    rng = np.random.default_rng(1)
+    truth = circle()
+    start, scale = drifted(truth, 0.05, rng)
+    before_m, before = scale_errors(start, truth)
+    last_from_first = se3_inverse(truth[-1]) @ truth[0]  # measured in lengths of the first
+    loop = PoseEdge(
+        COUNT - 1, 0, se3_exp(rng.multivariate_normal(np.zeros(6), LOOP_COV)) @ last_from_first, LOOP_COV, is_loop=True
+    )
+    measured = {(COUNT - 1, 0): (float(np.log(scale[-1] / scale[0])) + 0.002 * rng.normal(), 0.003)}
+    result = solve_scaled(start, chain_of(start), [loop], measured, WALK)
+    after_m, after = scale_errors(rigid(result), truth)
+    assert before > 0.02
+    assert result.loop_weights.tolist() == [1.0]
+    assert after < 0.005
+    assert after_m < 0.25 * before_m
+    # a rigid graph bends the lap instead: what similarities are for
+    rigid_scales = {(COUNT - 1, 0): (0.0, 1e-4)}
+    bent = solve_scaled(start, chain_of(start), [loop], rigid_scales, 1e-5)
+    assert scale_errors(rigid(bent), truth)[1] > 2 * after
+
+
+def test_a_wrong_loop_is_disbelieved() -> None:
+    rng = np.random.default_rng(2)
+    truth = circle()
+    start, scale = drifted(truth, 0.05, rng)
+    pairs = [(COUNT - 1, 0), (COUNT - 2, 1), (COUNT - 3, 2), (70, 20)]
+    loops = [PoseEdge(i, j, se3_inverse(truth[i]) @ truth[j], LOOP_COV, is_loop=True) for i, j in pairs[:3]]
+    loops.append(PoseEdge(70, 20, np.eye(4), LOOP_COV, is_loop=True))
+    measured = {(i, j): (float(np.log(scale[i] / scale[j])), 0.005) for i, j in pairs}
+    # what the loop measures has lengths of the old keyframe
+    for n, (_, j) in enumerate(pairs[:3]):
+        loops[n].i_from_j[:3, 3] *= scale[j]
+    result = solve_scaled(start, chain_of(start), loops, measured, WALK)
+    assert result.loop_weights.tolist() == [1.0, 1.0, 1.0, 0.0]
+    assert scale_errors(rigid(result), truth)[1] < 0.005
+
+
+def test_a_keyframe_without_an_edge_is_named() -> None:
+    places = Similarities.rigid(circle()[:4])
+    edges = [SimilarityEdge(0, 1, np.eye(4), 1.0, np.eye(7), is_loop=False)]
+    with pytest.raises(SurveyError, match=r"\[2, 3\]"):
+        optimize_similarities(places, edges)
+
+
+def test_points_of_both_keyframes_measure_the_scale() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-3, -2, 4], [3, 2, 9], (60, 3))
+    j_from_i = se3(so3_exp(np.array([0.0, 0.2, 0.0])), np.array([0.4, 0.0, -0.3]))
+    there = 1.08 * transform_points(j_from_i, points) * (1 + 0.01 * rng.normal(size=(60, 1)))
+    there[:15] = rng.uniform(-5, 5, (15, 3))
+    there[15:20] = np.nan
+    log_scale, sigma = measured_log_scale(points, there, j_from_i)
+    assert log_scale == pytest.approx(np.log(1.08), abs=3 * sigma)
+    assert sigma < 0.02
+    assert measured_log_scale(points[:5], there[20:25], j_from_i) == (0.0, 1.0)
+
+
+def test_the_gate_widens_with_the_way() -> None:
+    """The end's spread after a random walk of the scale, against the sum of the widened edges: never less."""
+    truth = circle()
+    chain = chain_of(truth)
+    widened = gate_covariances(chain, WALK)
+    total = sum(e.cov_rot_trans[3, 3] - c.cov_rot_trans[3, 3] for e, c in zip(widened, chain, strict=True))
+    rng = np.random.default_rng(4)
+    steps = np.diff(truth[:, :3, 3], axis=0)
+    half = COUNT // 2
+    ends = [(np.exp(np.cumsum(WALK * rng.normal(size=half)))[:, None] * steps[:half]).sum(axis=0) for _ in range(400)]
+    assert np.sqrt(total) > np.std(ends, axis=0).max()

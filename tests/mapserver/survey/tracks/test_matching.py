@@ -1,0 +1,120 @@
+"""Which keyframes are matched with which, and how far a match may be from what odometry says."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, se3, se3_exp, so3_exp
+from fleetmap.sensors.rectification import Rectifier
+from mapserver.survey.keyframes.keyframes import Keyframe, make_keyframe
+from mapserver.survey.settings import PairSettings, SurveySettings
+from mapserver.survey.tracks.matching import PairFinder, drift_allowance_m, fixed_allowance_m, median_depth_m
+from mapserver.survey.tracks.pairs import view_overlap
+from support.recordings.recording_samples import calibration
+from support.worlds.box_room import out_and_back, stereo_pair
+
+SETTINGS = SurveySettings(pairs=PairSettings(previous=2, covisible=3))
+
+
+@lru_cache(maxsize=1)
+def seen() -> tuple[list[Keyframe], Array, Rectifier]:
+    """Ten keyframes along the wall and back, and where each truly was."""
+    rectifier = Rectifier(calibration())
+    places = np.array([out_and_back(6.0)(t) for t in np.linspace(1.0, 5.0, 10)])
+    keyframes = [
+        make_keyframe(rectifier.rectify(stereo_pair(there, k)), k, rectifier.camera, SETTINGS)
+        for k, there in enumerate(places)
+    ]
+    return keyframes, places, rectifier
+
+
+def finder() -> PairFinder:
+    keyframes, _, rectifier = seen()
+    return PairFinder(keyframes, rectifier.camera, rectifier.body_from_cam, SETTINGS)
+
+
+def test_candidates_are_the_last_few_and_those_that_see_the_same() -> None:
+    _, places, _ = seen()
+    found = finder().candidates(places, previous=2)
+    assert len(set(found)) == len(found)
+    assert all(i < j for i, j in found)
+    for j in range(1, 10):
+        of_j = {i for i, k in found if k == j}
+        assert set(range(max(0, j - 2), j)) <= of_j
+        assert len(of_j) <= 2 + 3
+    assert (0, 9) in found  # back where it began
+
+
+def test_before_loops_are_closed_only_near_ones_are_candidates() -> None:
+    _, places, _ = seen()
+    found = finder().candidates(places, previous=2, only_near=4)
+    assert max(j - i for i, j in found) <= 4
+    assert {(j - 1, j) for j in range(1, 10)} <= set(found)
+
+
+def test_places_that_look_away_are_no_candidates() -> None:
+    """The second half of the ride is turned round: nothing of the first can be seen from there."""
+    _, places, _ = seen()
+    turned = places.copy()
+    turned[5:, :3, :3] = so3_exp(np.array([0, 0, np.pi])) @ places[5:, :3, :3]
+    found = finder().candidates(turned, previous=1)
+    assert {(i, j) for i, j in found if i < 5 <= j} == {(4, 5)}
+
+
+def matches(predicted_places: Array, allowed_m: float, sigma_rad: float | None = 0.02) -> set[tuple[int, int]]:
+    candidates = [(3, 4), (4, 5), (0, 9)]
+    found = finder().match(
+        candidates, predicted_places, lambda i, j: allowed_m, rotation_sigma_rad=sigma_rad, is_known=False,
+        progress=lambda n: None,
+    )  # fmt: skip
+    return {(m.i, m.j) for m in found}
+
+
+def test_matches_that_agree_with_the_prediction_are_kept() -> None:
+    _, places, _ = seen()
+    assert matches(places, 0.05) == {(3, 4), (4, 5), (0, 9)}
+    assert matches(places, 0.05, None) == {(3, 4), (4, 5), (0, 9)}
+
+
+def test_matches_that_contradict_the_prediction_are_dropped() -> None:
+    """Keyframe 9 is believed 0.4 m away from where it was; then turned by 15 degrees."""
+    _, places, _ = seen()
+    off = places.copy()
+    off[9, :3, 3] += [0.4, 0, 0]
+    assert matches(off, 0.3) == {(3, 4), (4, 5)}
+    assert matches(off, 0.5) == {(3, 4), (4, 5), (0, 9)}
+    turned = places.copy()
+    turned[9] = turned[9] @ se3_exp(np.array([0, 0, np.radians(15), 0, 0, 0]))
+    assert matches(turned, 9.0, None) == {(3, 4), (4, 5)}
+
+
+def test_drift_is_allowed_as_odometry_is_unsure() -> None:
+    """By hand: three sigmas of the gained variance and of a floor of 5 cm and 3 % of the way."""
+    positions = np.array([[0, 0, 0], [3.0, 4.0, 0], [3.0, 4.0, 0]])
+    covariances = np.zeros((3, 6, 6))
+    covariances[1, 3:, 3:] = np.diag([0.01, 0.02, 0.03])
+    covariances[2, 3:, 3:] = np.diag([0.005, 0.01, 0.015])  # gained less than nothing: no credit for it
+    covariances[:, :3, :3] = 5.0 * np.eye(3)  # of rotation, which is not asked here
+    allowed_m = drift_allowance_m(covariances, positions)
+    assert allowed_m(0, 1) == pytest.approx(3 * np.sqrt(0.06 + 0.2**2))
+    assert allowed_m(1, 2) == pytest.approx(3 * 0.05)
+    assert allowed_m(0, 0) == pytest.approx(3 * 0.05)
+
+
+def test_after_adjustment_little_is_allowed() -> None:
+    places = np.array([np.eye(4), se3(np.eye(3), np.array([0, 3.0, 4.0]))])
+    allowed_m = fixed_allowance_m(places)
+    assert allowed_m(0, 0) == pytest.approx(0.15)
+    assert allowed_m(0, 1) == pytest.approx(0.40)
+
+
+def test_depth_and_overlap_against_the_room() -> None:
+    """The wall is 2.2-2.6 m ahead; the same view overlaps itself wholly, one from behind not at all."""
+    keyframes, _, rectifier = seen()
+    assert 1.8 < median_depth_m(keyframes[0]) < 3.0
+    assert view_overlap(keyframes[0], rectifier.camera, np.eye(4)) > 0.99
+    behind = se3(so3_exp(np.array([0, np.pi, 0])), np.zeros(3))
+    assert view_overlap(keyframes[0], rectifier.camera, behind) == 0.0
+    aside = se3(so3_exp(np.array([0, np.radians(38.6), 0])), np.zeros(3))  # half of the picture's angle
+    assert 0.2 < view_overlap(keyframes[0], rectifier.camera, aside) < 0.6

@@ -1,0 +1,180 @@
+"""Landmarks from pairs: joined as a brute-force twin joins them, observed to a fraction of a pixel."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.sensors.rectification import Rectifier
+from mapserver.survey.keyframes.keyframes import Keyframe, make_keyframe
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.tracks.pairs import PairMatch, match_pair
+from mapserver.survey.tracks.tracks import Landmarks, Tracks, build_landmarks, join_tracks, landmarks_of
+from support.recordings.recording_samples import calibration
+from support.worlds.box_room import out_and_back, points_seen, stereo_pair
+
+Node = tuple[int, int]
+
+
+def pair(i: int, j: int, features: list[tuple[int, int]]) -> PairMatch:
+    return PairMatch(i, j, np.array(features, np.int32).reshape(-1, 2), np.eye(4), np.eye(6))
+
+
+def joined_by_hand(pairs: list[PairMatch]) -> list[list[Node]]:
+    """Sets that are searched from end to end; strongest pairs first, what would bring a keyframe in twice is left."""
+    groups: list[set[Node]] = []
+    for match in sorted(pairs, key=lambda p: (-len(p.features), p.i, p.j)):
+        for a, b in match.features:
+            nodes = (match.i, int(a)), (match.j, int(b))
+            first, second = (next((g for g in groups if node in g), {node}) for node in nodes)
+            groups += [g for g in (first, second) if g not in groups]
+            keyframes = [k for k, _ in first] + [k for k, _ in second]
+            if first is not second and len(set(keyframes)) == len(keyframes):
+                groups = [g for g in groups if g not in (first, second)] + [first | second]
+    return sorted(sorted(g) for g in groups if len(g) > 1)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_tracks_are_those_of_the_brute_force_twin(seed: int) -> None:
+    """Random matches among few features, so that conflicts abound."""
+    rng = np.random.default_rng(seed)
+    pairs = []
+    for i in range(6):
+        for j in range(i + 1, 6):
+            count = int(rng.integers(0, 7))
+            chosen = (rng.choice(8, count, replace=False) for _ in range(2))
+            pairs.append(pair(i, j, list(zip(*chosen, strict=True))))
+    found = join_tracks([], pairs)
+    assert sorted(sorted(group) for group in found) == joined_by_hand(pairs)
+    for group in found:
+        assert len({k for k, _ in group}) == len(group) > 1
+    nodes = [node for group in found for node in group]
+    assert len(set(nodes)) == len(nodes)
+
+
+def test_a_chain_of_matches_is_one_track_and_a_contradiction_is_left_out() -> None:
+    """0:1-1:5-2:7 hang together; the weaker pair 0-2 says 0:9-2:7, which would bring keyframe 0 in twice."""
+    strong = [pair(0, 1, [(1, 5), (2, 6)]), pair(1, 2, [(5, 7), (6, 8)])]
+    found = join_tracks([], [pair(0, 2, [(9, 7)]), *strong])
+    assert sorted(found) == [[(0, 1), (1, 5), (2, 7)], [(0, 2), (1, 6), (2, 8)]]
+    assert join_tracks([], []) == []
+
+
+def test_the_order_of_pairs_does_not_matter() -> None:
+    rng = np.random.default_rng(3)
+    pairs = [
+        pair(i, i + d, list(zip(rng.permutation(20)[:9], rng.permutation(20)[:9], strict=True)))
+        for i in range(5)
+        for d in (1, 2)
+    ]
+    expected = join_tracks([], pairs)
+    for _ in range(3):
+        assert join_tracks([], [pairs[k] for k in rng.permutation(len(pairs))]) == expected
+
+
+def test_observations_go_and_landmarks_that_are_seen_too_rarely_with_them() -> None:
+    landmark = np.array([0, 0, 0, 1, 1, 2, 2], np.int32)
+    marks = Landmarks(
+        np.arange(9.0).reshape(3, 3), np.array([0, 1, 2, 0, 1, 1, 2], np.int32), landmark, np.arange(7),
+        np.arange(21.0).reshape(7, 3), np.ones((7, 2)),
+    )  # fmt: skip
+    left = marks.keep_observations(np.array([1, 1, 0, 1, 0, 1, 1], bool), 2)
+    np.testing.assert_array_equal(left.points_map, marks.points_map[[0, 2]])
+    np.testing.assert_array_equal(left.obs_landmark, [0, 0, 1, 1])
+    np.testing.assert_array_equal(left.obs_feature, [0, 1, 5, 6])
+    np.testing.assert_array_equal(left.obs_keyframe, [0, 1, 1, 2])
+
+
+@lru_cache(maxsize=1)
+def views() -> tuple[list[Keyframe], Array, Rectifier, Landmarks]:
+    """Keyframes of the room from four true places, and the landmarks that they share."""
+    settings = SurveySettings()
+    rectifier = Rectifier(calibration())
+    map_from_body = np.array([out_and_back(6.0)(t) for t in (2.0, 2.3, 2.6, 2.9)])
+    keyframes = [
+        make_keyframe(rectifier.rectify(stereo_pair(there, k)), k, rectifier.camera, settings)
+        for k, there in enumerate(map_from_body)
+    ]
+    pairs = []
+    for i in range(4):
+        for j in range(i + 1, 4):
+            predicted = (
+                se3_inverse(map_from_body[j] @ rectifier.body_from_cam) @ map_from_body[i] @ rectifier.body_from_cam
+            )
+            match = match_pair(i, j, keyframes, rectifier.camera, predicted, 0.02, settings.pairs)
+            assert match is not None
+            pairs.append(match)
+    marks = build_landmarks(keyframes, pairs, map_from_body, rectifier.body_from_cam, rectifier.camera, settings)
+    return keyframes, map_from_body, rectifier, marks
+
+
+def true_pixels() -> tuple[Array, Array]:
+    """(M, 3) where each observation of a landmark should be, given its reference's pixel; (M,) which are references."""
+    _, map_from_body, rectifier, marks = views()
+    map_from_cam = map_from_body @ rectifier.body_from_cam
+    is_reference = np.r_[True, np.diff(marks.obs_landmark) > 0]
+    row = np.flatnonzero(is_reference)[marks.obs_landmark]
+    expected = np.empty((len(row), 3))
+    for k in range(4):
+        for source in range(4):
+            rows = np.flatnonzero((marks.obs_keyframe == k) & (marks.obs_keyframe[row] == source))
+            points = points_seen(map_from_cam[source], marks.obs_pixels[row[rows], :2])
+            expected[rows] = rectifier.camera.pixel_from_point(transform_points(se3_inverse(map_from_cam[k]), points))
+    return expected, is_reference
+
+
+def test_observations_are_good_to_a_fraction_of_a_pixel() -> None:
+    """Against the room's geometry; ORB's own coordinates, which are whole pixels of an octave, are far behind."""
+    keyframes, _, _, marks = views()
+    assert len(marks.points_map) > 300
+    expected, is_reference = true_pixels()
+    matched = ~is_reference
+    refined = np.linalg.norm(marks.obs_pixels[matched, :2] - expected[matched, :2], axis=1)
+    features = zip(marks.obs_keyframe[matched], marks.obs_feature[matched], strict=True)
+    whole = np.array([keyframes[k].features.pixels[f] for k, f in features])
+    unrefined = np.linalg.norm(whole - expected[matched, :2], axis=1)
+    assert np.median(refined) < 0.15
+    assert np.median(refined) < 0.3 * np.median(unrefined)
+    assert (refined < 1.0).mean() > 0.95
+
+
+def test_disparities_are_good_to_a_fraction_of_a_pixel_and_not_biased() -> None:
+    _, _, _, marks = views()
+    expected, _ = true_pixels()
+    known = np.isfinite(marks.obs_pixels[:, 2])
+    assert known.mean() > 0.9
+    own = (marks.obs_pixels[:, 0] - marks.obs_pixels[:, 2])[known]
+    error = own - (expected[:, 0] - expected[:, 2])[known]
+    assert np.median(np.abs(error)) < 0.1
+    assert abs(np.median(error)) < 0.02
+
+
+def test_sigmas_tell_refined_observations_from_others() -> None:
+    """Normalised by their own sigmas, errors are those of a believable noise: neither far too small nor too large."""
+    _, _, _, marks = views()
+    expected, is_reference = true_pixels()
+    normal = ((marks.obs_pixels[:, :2] - expected[:, :2]) / marks.obs_sigma_px[:, :1])[~is_reference]
+    assert np.median(np.abs(normal)) < 0.7
+    assert (np.abs(normal) < 4).mean() > 0.97
+    assert (marks.obs_sigma_px > 0).all()
+
+
+def test_spare_keyframes_observe_and_define_nothing() -> None:
+    """Keyframes 0 and 3 are spare: references are in 1 and 2, both of which see every landmark, and 0 and 3 are seen to see them."""
+    keyframes, map_from_body, rectifier, marks = views()
+    order = np.lexsort((marks.obs_keyframe, marks.obs_landmark))
+    starts = np.flatnonzero(np.diff(marks.obs_landmark, prepend=-1))
+    tracks = Tracks(marks.obs_keyframe[order].astype(np.int64), marks.obs_feature[order], starts)
+    spare = np.array([True, False, False, True])
+    left = landmarks_of(
+        keyframes, tracks, spare, map_from_body, rectifier.body_from_cam, rectifier.camera, SurveySettings()
+    )
+    first = np.flatnonzero(np.diff(left.obs_landmark, prepend=-1))
+    assert not spare[left.obs_keyframe[first]].any()
+    members = np.bincount(marks.obs_landmark[~spare[marks.obs_keyframe]], minlength=len(marks.points_map))
+    assert 100 < len(left.points_map) <= (members > 1).sum() < len(marks.points_map)
+    assert (np.bincount(left.obs_landmark[~spare[left.obs_keyframe]]) == 2).all()
+    assert np.bincount(left.obs_keyframe, minlength=4)[[0, 3]].min() > 50
+    nearest = np.linalg.norm(left.points_map[:, None] - marks.points_map, axis=2).min(axis=1)
+    assert np.median(nearest) < 0.02

@@ -1,0 +1,222 @@
+"""The budget: kept where it must be, the choice against a plain greedy loop, and what it is chosen by."""
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from fleetmap.geometry import se3_exp
+from fleetmap.mapformat import encode_tile
+from mapserver.survey.settings import BudgetSettings
+from mapserver.survey.survey_map import SurveyMap
+from mapserver.tiles import landmark_budget_kernels as kernels
+from mapserver.tiles.distinctive_landmarks import distinct_landmarks
+from mapserver.tiles.landmark_budget import choose_landmarks, covered_path_m
+from mapserver.tiles.tiling import tiles_from_survey
+from support.storage.map_samples import random_survey
+
+
+def exactly(count: int, tile_landmarks: int = 1 << 30) -> BudgetSettings:
+    """What the views need, whatever it looks like: random descriptors have no twin."""
+    return BudgetSettings(
+        landmarks_per_m=0.0, min_landmarks=count, tile_landmarks=tile_landmarks, view_distinct_landmarks=0
+    )
+
+
+def plain_greedy(
+    bins: list[list[int]], weights: np.ndarray, cells: np.ndarray, room: list[int], limit: int, needs: list[int]
+) -> set[int]:
+    """The best one next, all values computed anew each time. Four bins are a view."""
+    needs = list(needs)
+    counts: dict[int, int] = {}
+    chosen: list[int] = []
+    room = list(room)
+    while len(chosen) < limit:
+        gains = {
+            n: weights[n] * sum(1.0 / (1.0 + counts.get(b, 0)) for b in bins[n] if needs[b // 4] > 0)
+            for n in range(len(bins))
+            if n not in chosen and room[cells[n]] > 0
+        }
+        if not gains or max(gains.values()) == 0:
+            break
+        best = max(gains, key=lambda n: (gains[n], -n))
+        chosen.append(best)
+        room[cells[best]] -= 1
+        for b in bins[best]:
+            counts[b] = counts.get(b, 0) + 1
+            needs[b // 4] -= 1
+    return set(chosen)
+
+
+@pytest.mark.parametrize("needs", [[99, 99, 99], [9, 2, 30], [1, 0, 3]])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_lazy_choice_is_the_plain_one(seed: int, needs: list[int]) -> None:
+    rng = np.random.default_rng(seed)
+    bins = [rng.integers(0, 12, rng.integers(1, 6)).tolist() for _ in range(40)]
+    weights = rng.choice([0.5, 1.0, 1.5], 40)  # many ties
+    cells, room = rng.integers(0, 3, 40), np.array([5, 30, 4])
+    expected = plain_greedy(bins, weights, cells, room.tolist(), 20, needs)
+    starts = np.concatenate([[0], np.cumsum([len(b) for b in bins])]).astype(np.int64)
+    chosen = np.zeros(40, bool)
+    taken = kernels.choose(
+        np.arange(40), starts, np.concatenate(bins).astype(np.int64), weights, cells.astype(np.int64),
+        room.astype(np.int64), 20, np.zeros(12, np.int64), chosen, np.array(needs), 4,
+    )  # fmt: skip
+    assert taken == len(expected)
+    assert set(np.flatnonzero(chosen)) == expected
+
+
+def seen_per_view(survey: SurveyMap, chosen: np.ndarray) -> np.ndarray:
+    return np.bincount(survey.obs_keyframe[chosen[survey.obs_landmark]], minlength=len(survey.map_from_body))
+
+
+def test_every_view_keeps_its_share() -> None:
+    survey = random_survey(np.random.default_rng(1), keyframes=20, landmarks=800)
+    chosen = choose_landmarks(survey, exactly(100), 16.0)
+    assert chosen.sum() == 100
+    counts = seen_per_view(survey, chosen)
+    assert counts.min() > 0.7 * counts.mean()
+
+
+def test_tiles_hold_what_was_chosen() -> None:
+    survey = random_survey(np.random.default_rng(1), keyframes=20, landmarks=800)
+    chosen = choose_landmarks(survey, exactly(100), 16.0)
+    tiles = tiles_from_survey(survey, 16.0, chosen=chosen)
+    ids = set(survey.landmark_ids[chosen].tolist())
+    assert {int(i) for tile in tiles for i in tile.landmark_ids} == ids
+    listed = {int(i) for tile in tiles for place in tile.place_landmark_ids for i in place}
+    assert listed == ids
+    assert sum(len(tile.place_ids) for tile in tiles) == 20
+
+
+def with_a_lonely_view(own: np.ndarray) -> SurveyMap:
+    """Keyframe 9 of ten sees some of 400 landmarks that nobody else sees, and nothing else."""
+    survey = random_survey(np.random.default_rng(2), keyframes=10, landmarks=400)
+    other = ~np.isin(survey.obs_landmark, own) & (survey.obs_keyframe != 9)
+    count = len(own)
+    return replace(
+        survey,
+        obs_keyframe=np.append(survey.obs_keyframe[other], np.full(count, 9)).astype(np.int32),
+        obs_landmark=np.append(survey.obs_landmark[other], own).astype(np.int32),
+        obs_pixels=np.concatenate([survey.obs_pixels[other], survey.obs_pixels[:count]]),
+        obs_octave=np.append(survey.obs_octave[other], np.zeros(count, np.int8)),
+        obs_sigma_px=np.append(survey.obs_sigma_px[other], np.ones(count)),
+    )
+
+
+def test_a_lonely_view_is_served_before_crowded_ones_get_more() -> None:
+    own = np.arange(375, 400)
+    survey = with_a_lonely_view(own)
+    chosen = choose_landmarks(survey, exactly(120), 16.0)
+    # All others are seen several times: by how often they are seen alone, none of these would be kept.
+    assert np.bincount(survey.obs_landmark)[np.isin(np.arange(400), own)].max() == 1
+    assert seen_per_view(survey, chosen)[9] >= 5
+
+
+def test_a_view_at_the_end_of_a_drive_keeps_what_it_needs() -> None:
+    """Its own landmarks are seen from nowhere else, so that any other one helps many views at once."""
+    survey = with_a_lonely_view(np.arange(300, 400))
+    served = choose_landmarks(survey, msgspec.structs.replace(exactly(160), view_landmarks=40), 16.0)
+    unserved = choose_landmarks(survey, msgspec.structs.replace(exactly(160), view_landmarks=0), 16.0)
+    assert served.sum() == unserved.sum() == 160
+    assert seen_per_view(survey, served)[9] >= 40 > seen_per_view(survey, unserved)[9]
+    assert seen_per_view(survey, served).min() >= 40
+
+
+def test_every_view_gets_what_tells_it_from_its_twins_first() -> None:
+    """A tenth of the landmarks look like no other; by their worth hardly any would be chosen, for they are seen once."""
+    rng = np.random.default_rng(9)
+    survey = random_survey(rng, keyframes=20, landmarks=800)
+    pairs = np.repeat(rng.integers(0, 256, (360, 32), dtype=np.uint8), 2, axis=0)
+    points = survey.points_map.copy()
+    points[1:720:2] = points[:720:2] + np.array([30.0, 0.0, 0.05])
+    survey = replace(survey, descriptors=np.concatenate([pairs, survey.descriptors[720:]]), points_map=points)
+    is_alone = distinct_landmarks(survey.points_map, survey.descriptors)
+    np.testing.assert_array_equal(np.flatnonzero(is_alone), np.arange(720, 800))
+    once = np.isin(survey.obs_landmark, np.arange(720)) | (np.diff(survey.obs_landmark, prepend=-1) != 0)
+    survey = replace(
+        survey, obs_keyframe=survey.obs_keyframe[once], obs_landmark=survey.obs_landmark[once],
+        obs_pixels=survey.obs_pixels[once], obs_octave=survey.obs_octave[once], obs_sigma_px=survey.obs_sigma_px[once],
+    )  # fmt: skip
+    wanted = seen_per_view(survey, is_alone)
+    told = choose_landmarks(survey, msgspec.structs.replace(exactly(200), view_distinct_landmarks=60), 16.0)
+    untold = choose_landmarks(survey, exactly(200), 16.0)
+    assert told.sum() == untold.sum() == 200
+    np.testing.assert_array_equal(seen_per_view(survey, told & is_alone), wanted)
+    assert (seen_per_view(survey, untold & is_alone) < wanted).mean() > 0.5
+    some = choose_landmarks(survey, msgspec.structs.replace(exactly(200), view_distinct_landmarks=1), 16.0)
+    assert (some & is_alone).sum() < is_alone.sum()
+
+
+def test_the_path_sets_the_budget_and_breaks_do_not_count() -> None:
+    survey = random_survey(np.random.default_rng(3), keyframes=50, landmarks=500)
+    whole_m = np.linalg.norm(np.diff((survey.map_from_body @ survey.body_from_cam)[:, :3, 3], axis=0), axis=1).sum()
+    assert covered_path_m(survey) == pytest.approx(whole_m)
+    settings = BudgetSettings(landmarks_per_m=2.0, min_landmarks=10)
+    assert choose_landmarks(survey, settings, 16.0).sum() == int(2.0 * whole_m)
+    broken = survey.map_from_body.copy()
+    broken[25:, 0, 3] += 1000.0
+    assert whole_m - 5 < covered_path_m(replace(survey, map_from_body=broken)) < whole_m
+
+
+def test_the_same_way_again_adds_no_budget_and_the_way_back_does() -> None:
+    survey = random_survey(np.random.default_rng(3), keyframes=50)
+    once_m = covered_path_m(survey)
+    twice = np.concatenate([survey.map_from_body, survey.map_from_body + 0.1 * np.eye(4)[:, 3] * [[1], [1], [0], [0]]])
+    assert covered_path_m(replace(survey, map_from_body=twice)) == pytest.approx(once_m, abs=5.0)
+    turned = survey.map_from_body[::-1] @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    tilt = se3_exp(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))  # the camera looks along x, and back
+    there_and_back = np.concatenate([survey.map_from_body, turned]) @ tilt
+    assert covered_path_m(replace(survey, map_from_body=there_and_back, body_from_cam=np.eye(4))) > 1.8 * once_m
+
+
+def test_what_is_published_is_kept_first() -> None:
+    survey = random_survey(np.random.default_rng(4), keyframes=20, landmarks=600)
+    ids = survey.landmark_ids
+    worst = ids[~choose_landmarks(survey, exactly(500), 16.0)][:60]
+    again = choose_landmarks(survey, exactly(100), 16.0, published=worst)
+    seen = ids[np.unique(survey.obs_landmark)]
+    assert set(ids[again]) >= set(worst) & set(seen)
+    assert again.sum() == 100
+    # Nothing else changed, so nothing changes.
+    once_more = choose_landmarks(survey, exactly(100), 16.0, published=ids[again])
+    np.testing.assert_array_equal(once_more, again)
+
+
+def test_tiles_stay_below_their_limit() -> None:
+    survey = random_survey(np.random.default_rng(5), keyframes=10, landmarks=900)
+    chosen = choose_landmarks(survey, exactly(800, tile_landmarks=70), 16.0)
+    assert max(len(tile) for tile in tiles_from_survey(survey, 16.0, chosen=chosen)) == 70
+
+
+def test_a_full_tile_of_the_default_budget_fits_in_256_kb() -> None:
+    """Random descriptors and places that see 300 landmarks each: harder to compress than any real tile."""
+    rng = np.random.default_rng(6)
+    settings = BudgetSettings()
+    survey = random_survey(rng, keyframes=60, landmarks=settings.tile_landmarks + 500)
+    map_from_body = survey.map_from_body.copy()
+    map_from_body[:, :2, 3] = rng.uniform(1, 15, (60, 2))
+    survey = replace(
+        survey,
+        points_map=rng.uniform([0, 0, 0], [16, 16, 8], (len(survey.points_map), 3)),
+        landmark_ids=np.sort(rng.choice(1 << 20, len(survey.landmark_ids), replace=False)).astype(np.uint32),
+        map_from_body=map_from_body,
+    )
+    chosen = choose_landmarks(survey, exactly(10_000, settings.tile_landmarks), 16.0)
+    largest = max(tiles_from_survey(survey, 16.0, chosen=chosen), key=len)
+    assert len(largest) == settings.tile_landmarks
+    assert len(encode_tile(largest)) <= 256_000
+
+
+def test_nothing_comes_of_nothing() -> None:
+    survey = random_survey(np.random.default_rng(7))
+    nobody = replace(
+        survey,
+        obs_keyframe=survey.obs_keyframe[:0],
+        obs_landmark=survey.obs_landmark[:0],
+        obs_pixels=survey.obs_pixels[:0],
+        obs_octave=survey.obs_octave[:0],
+        obs_sigma_px=survey.obs_sigma_px[:0],
+    )
+    assert not choose_landmarks(nobody, BudgetSettings(), 16.0).any()

@@ -1,0 +1,36 @@
+"""The project's documents, cut into sections and tables for the tests that compare them with the code."""
+
+import re
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+_HEADING = re.compile(r"^#{1,6} .*$", re.MULTILINE)
+
+
+def text(path: str) -> str:
+    """A document, by its path in the repository."""
+    return (REPOSITORY / path).read_text("utf-8")
+
+
+def section(path: str, words: str) -> str:
+    """What stands under the only heading that holds `words`, up to the next heading; empty where there is none."""
+    document = text(path)
+    headings = list(_HEADING.finditer(document))
+    found = [n for n, heading in enumerate(headings) if words in heading[0]]
+    assert len(found) <= 1, f"{path} has {len(found)} headings with {words}"
+    if not found:
+        return ""
+    number = found[0]
+    end = headings[number + 1].start() if number + 1 < len(headings) else len(document)
+    return document[headings[number].end() : end]
+
+
+def rows(part: str) -> list[list[str]]:
+    """The cells of all rows of the tables in `part` whose first cell begins with a word in backticks."""
+    lines = (line for line in part.splitlines() if line.startswith("| `"))
+    return [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines]
+
+
+def code_words(cell: str) -> list[str]:
+    """The words in backticks."""
+    return re.findall(r"`([^`]+)`", cell)

@@ -1,0 +1,15 @@
+"""Where the real recordings are, for tests that need them."""
+
+from pathlib import Path
+
+import pytest
+
+DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
+
+
+def real_data(name: str) -> Path:
+    """The folder of one real recording; skips the test, loudly, where it is missing."""
+    folder = DATA / name
+    if not folder.exists():
+        pytest.skip(f"REAL DATA MISSING: {folder} is not there, this test proves nothing without it")
+    return folder

@@ -1,0 +1,95 @@
+"""Made-up tiles, surveys and drafts for tests of the map's way from the survey to the robot."""
+
+import numpy as np
+
+from fleetmap.geometry import se3_exp
+from fleetmap.mapformat import CameraEntry, RecordingEntry, Tile
+from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.samples import Trajectory
+from mapserver.store import DraftDetails, MapStore
+from mapserver.survey.survey_map import SurveyMap
+
+
+def random_tile(
+    rng: np.random.Generator,
+    *,
+    landmarks: int = 40,
+    places: int = 3,
+    cell: tuple[int, int] = (3, -2),
+    size_m: float = 16.0,
+) -> Tile:
+    """A tile that keeps all rules of Tile; everything else in it is random."""
+    corner = np.array(cell) * size_m
+    ids = np.sort(rng.choice(10 * landmarks + 10, landmarks, replace=False)).astype(np.uint32)
+    directions = rng.normal(size=(landmarks, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    flat = rng.uniform(corner, corner + size_m, (landmarks, 2))
+    return Tile(
+        tile_x=cell[0],
+        tile_y=cell[1],
+        size_m=size_m,
+        landmark_ids=ids,
+        points_map=np.concatenate([flat, rng.normal(0, 5, (landmarks, 1))], axis=1),
+        descriptors=rng.integers(0, 256, (landmarks, 32), dtype=np.uint8),
+        view_directions_map=directions.astype(np.float32),
+        view_half_angle_rad=rng.uniform(0, np.pi, landmarks).astype(np.float32),
+        max_distance_m=rng.uniform(0.2, 60, landmarks).astype(np.float32),
+        sigma_m=rng.uniform(0.001, 0.2, landmarks).astype(np.float32),
+        place_ids=np.sort(rng.choice(1000, places, replace=False)).astype(np.uint32),
+        map_from_cam=np.array([se3_exp(rng.normal(0, 2, 6)) for _ in range(places)]).reshape(places, 4, 4),
+        place_landmark_ids=tuple(
+            np.sort(rng.choice(ids, min(landmarks, 1 + int(rng.integers(20))), replace=False)) for _ in range(places)
+        ),
+    )
+
+
+def random_survey(rng: np.random.Generator, *, keyframes: int = 6, landmarks: int = 80) -> SurveyMap:
+    """A survey of random points seen from a straight walk along x."""
+    map_from_body = np.tile(np.eye(4), (keyframes, 1, 1))
+    map_from_body[:, 0, 3] = np.linspace(-20, 25, keyframes)
+    map_from_body[:, 1, 3] = rng.uniform(-1, 1, keyframes)
+    seen = rng.random((keyframes, landmarks)) < 0.5
+    seen[:, 5] = False  # nobody sees this one
+    obs_keyframe, obs_landmark = np.nonzero(seen)
+    count = len(obs_keyframe)
+    stamps = np.arange(keyframes, dtype=np.int64) * 100_000_000
+    return SurveyMap(
+        camera=StereoCamera(400.0, 320.0, 240.0, 0.1, 640, 480),
+        body_from_cam=se3_exp(np.array([0.3, -0.2, 0.1, 0.05, -0.02, 0.1])),
+        keyframe_stamps_ns=stamps,
+        map_from_body=map_from_body,
+        landmark_ids=rng.permutation(max(1000, landmarks))[:landmarks].astype(np.uint32),
+        points_map=rng.uniform([-25, -10, -1], [30, 10, 4], (landmarks, 3)),
+        descriptors=rng.integers(0, 256, (landmarks, 32), dtype=np.uint8),
+        point_sigma_m=rng.uniform(0.002, 0.1, landmarks),
+        obs_keyframe=obs_keyframe.astype(np.int32),
+        obs_landmark=obs_landmark.astype(np.int32),
+        obs_pixels=rng.uniform(0, 480, (count, 3)),
+        obs_octave=rng.integers(0, 8, count).astype(np.int8),
+        obs_sigma_px=rng.uniform(0.2, 2, (count, 2)),
+        trajectory=Trajectory(stamps, map_from_body),
+        trajectory_estimated=np.ones(keyframes, bool),
+        patches=rng.integers(0, 256, (landmarks, 11, 11), dtype=np.uint8),
+    )
+
+
+def draft_details(**report: object) -> DraftDetails:
+    """What a build says about a draft."""
+    return DraftDetails(
+        created="2026-01-02T03:04:05Z",
+        tile_size_m=16.0,
+        camera=CameraEntry(focal_px=450.0, width_px=752, height_px=480, baseline_m=0.11),
+        recordings=(RecordingEntry(name="walk", sha256="ab" * 32, frames=10),),
+        configuration={"keyframes": {"overlap": 0.6}},
+        libraries={"numpy": "2.4"},
+        report=dict(report),
+    )
+
+
+def save_sample_draft(store: MapStore, *, site: str = "lab", seed: int = 0, vocabulary: bytes = b"words" * 50) -> int:
+    """A draft of two tiles."""
+    rng = np.random.default_rng(seed)
+    tiles = [random_tile(rng, cell=(1, 0)), random_tile(rng, cell=(0, 0))]
+    return store.save_draft(
+        site, tiles=tiles, vocabulary=vocabulary, details=draft_details(path_m=12.5), archive=b"archive"
+    )

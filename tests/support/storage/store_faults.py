@@ -1,0 +1,347 @@
+"""What a store looks like after its process was killed, its disk failed, or the power went, at any file-system call.
+
+`python tests/support/storage/store_faults.py [--every N] [--modes kill,tear,...]` prints what was tried and what was wrong, as JSON.
+Each try is a forked process on a copy of a small store, and afterwards: the store opens, `verify` is clean, the versions are in the
+states before
+or after the operation (after it, if it said so), the log is a continuation, the operation can be done again, and `gc` leaves no stray
+file.
+"""
+
+import argparse
+import json
+import os
+import pickle
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+sys.path[:0] = [str(REPOSITORY / part) for part in ("shared", "mapserver", "locclient", "tests")]
+
+import numpy as np  # noqa: E402
+
+from fleetmap.errors import FleetmapError  # noqa: E402
+from fleetmap.mapformat import current_path  # noqa: E402
+from mapserver.store import Actor, MapStore, Retention  # noqa: E402
+from support.storage.faulty_disk import Disk, install  # noqa: E402
+from support.storage.lost_writes import POLICIES, DiskImage  # noqa: E402
+from support.storage.map_samples import draft_details, random_tile  # noqa: E402
+
+GOLDEN = REPOSITORY / "tests" / "golden"
+ADA = Actor("ada", "a fault")
+MODES = ("kill", "tear", "ENOSPC", "EIO", "ENOSPC from then on", "EIO from then on", "power cut")
+TRACED = {"strace kill": "signal=KILL", "strace ENOSPC": "error=ENOSPC", "strace EIO": "error=EIO"}
+TRACED_CALLS = (
+    "openat",
+    "write",
+    "pwrite64",
+    "fsync",
+    "fdatasync",
+    "rename",
+    "unlink",
+    "mkdir",
+    "ftruncate",
+    "pread64",
+)
+CHILD_WITHIN_S = 30
+Act = Callable[[MapStore], object]
+State = tuple[tuple[str, int, str, str], ...]
+"""Site, number, state and manifest's address of every version."""
+
+
+def clock_ns() -> int:
+    """The same moment in every run."""
+    return 1_800_000_000_000_000_000
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """An operation on the store in folder `start`."""
+
+    name: str
+    start: Path
+    act: Act
+    before: State
+    after: State
+    events: tuple[int, ...]
+
+
+def save(store: MapStore, seed: int) -> None:
+    """A draft of two small tiles, one of which all drafts share."""
+    tiles = [random_tile(np.random.default_rng(s), landmarks=6, places=1, cell=(s, 0)) for s in (0, seed)]
+    store.save_draft("lab", tiles=tiles, vocabulary=b"words" * 50, details=draft_details(), archive=b"archive" * seed)
+
+
+def scenarios(folder: Path) -> list[Scenario]:
+    """All operations, each with the store that it begins with."""
+    start, old, export = folder / "start", folder / "old", folder / "lab-8.fmex"
+    with MapStore.open(start, create=True, clock_ns=clock_ns) as store:
+        for seed in (1, 2, 3):
+            save(store, seed)
+            store.publish("lab", force=True, actor=ADA)
+        save(store, 4)
+        save(store, 5)
+        store._blobs.put(b"what a killed build left")
+        (start / "blobs" / "00").mkdir(exist_ok=True)
+        (start / "blobs" / "00" / ".left.tmp").write_bytes(b"half")
+    shutil.copytree(start, folder / "elsewhere")
+    with MapStore.open(folder / "elsewhere", clock_ns=clock_ns) as store:
+        for seed in (6, 7, 8):
+            save(store, seed)
+        store.export_version("lab", 8, export)
+    old.mkdir()
+    shutil.copy(GOLDEN / "store-1.sqlite3", old / "store.sqlite3")
+    shutil.copytree(GOLDEN / "store-blobs", old / "blobs")
+    nothing_kept = Retention(keep_versions=0, keep_drafts=0, keep_days=0)
+    acts: tuple[tuple[str, Path, Act], ...] = (
+        ("publish", start, lambda store: store.publish("lab", 5, force=True, actor=ADA)),
+        ("promote", start, lambda store: store.promote("lab", 1, actor=ADA)),
+        ("rollback", start, lambda store: store.rollback("lab", actor=ADA)),
+        ("gc", start, lambda store: store.collect_garbage(nothing_kept, actor=ADA)),
+        ("import", start, lambda store: store.import_version(export, actor=ADA)),
+        ("save a draft", start, lambda store: save(store, 9)),
+        ("open an old format", old, lambda store: store.sites()),
+    )
+    return [_scenario(folder, *act) for act in acts]
+
+
+def _scenario(folder: Path, name: str, start: Path, act: Act) -> Scenario:
+    clean = folder / "clean"
+    before, events = _states_of_old(start) if "old" in name else _states(start)
+    copy(start, clean)
+    with MapStore.open(clean, clock_ns=clock_ns) as store:
+        act(store)
+    after, _ = _states(clean)
+    return Scenario(name, start, act, before, after, events)
+
+
+def _states_of_old(start: Path) -> tuple[State, tuple[int, ...]]:
+    copy(start, start.with_name("migrated"))
+    return _states(start.with_name("migrated"))
+
+
+def _states(folder: Path) -> tuple[State, tuple[int, ...]]:
+    with MapStore.open(folder, clock_ns=clock_ns) as store:
+        return _states_in(store), tuple(event.id for info in store.sites() for event in store.events(info.site))
+
+
+def _states_in(store: MapStore) -> State:
+    infos = (info for site in store.sites() for info in store.versions(site.site))
+    return tuple((info.site, info.version, info.state, info.manifest_sha256) for info in infos)
+
+
+def copy(source: Path, target: Path) -> None:
+    """`target` becomes what `source` is."""
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(source, target)
+
+
+def in_child(folder: Path, act: Act, disk: Disk) -> tuple[int, Disk]:
+    """The exit status of the operation on a failing disk (0 done, 3 refused, 9 killed), and the disk afterwards."""
+    told = folder.with_suffix(".told")
+    told.unlink(missing_ok=True)
+    child = os.fork()
+    if child == 0:
+        _be_child(folder, act, disk, told)
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status), pickle.loads(told.read_bytes()) if told.exists() else disk
+
+
+def in_traced_child(folder: Path, act: Act, *options: str) -> int:
+    """The same on a sound disk, under `strace` with these options: the kernel's own calls, SQLite's among them."""
+    child = os.fork()
+    if child == 0:
+        os.kill(os.getpid(), signal.SIGSTOP)
+        _be_child(folder, act, None, None)
+    os.waitpid(child, os.WUNTRACED)
+    command = ["strace", "-f", "-p", str(child), *options]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as tracer:
+        assert tracer.stderr is not None
+        attached = tracer.stderr.readline()
+        assert "attached" in attached, attached
+        os.kill(child, signal.SIGCONT)
+        _, status = os.waitpid(child, 0)
+        tracer.stderr.read()
+    code = os.waitstatus_to_exitcode(status)
+    return -code if code < 0 else code
+
+
+def _be_child(folder: Path, act: Act, disk: Disk | None, told: Path | None) -> None:
+    status = 4
+    try:
+        signal.alarm(CHILD_WITHIN_S)
+        if disk is not None:
+            install(disk)
+        with MapStore.open(folder, clock_ns=clock_ns) as store:
+            act(store)
+        status = 0
+    except FleetmapError:
+        status = 3
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        if told is not None:
+            told.write_bytes(pickle.dumps(disk))
+        os._exit(status)
+
+
+def faults_after(folder: Path, scenario: Scenario, is_done: bool) -> list[str]:
+    """What is wrong with the store in `folder` after a fault in the scenario's operation; repairs and repeats it."""
+    try:
+        with MapStore.open(folder, clock_ns=clock_ns) as store:
+            found = list(store.verify().faults)
+            state = _states_in(store)
+            if state not in ((scenario.after,) if is_done else (scenario.before, scenario.after)):
+                found.append(f"versions are {state}")
+            events = tuple(event.id for info in store.sites() for event in store.events(info.site))
+            if events[: len(scenario.events)] != scenario.events:
+                found.append(f"the log was {scenario.events}, is {events}")
+            current = store.current("lab")
+            if current is None or (folder / current_path("lab")).read_text().strip() != current.manifest_sha256:
+                found.append("the current version cannot be found")
+            if state == scenario.before != scenario.after:
+                scenario.act(store)
+                if _states_in(store) != scenario.after:
+                    found.append("the operation does something else the second time")
+            store.collect_garbage()
+            last = store.verify()
+            if last.faults or last.orphans or last.leftovers:
+                found.append(f"after a repetition and gc: {last}")
+    except Exception as error:
+        return [f"{type(error).__name__}: {error}"]
+    return found
+
+
+def strikes(scenario: Scenario, folder: Path, mode: str, every: int) -> Iterator[tuple[int, list[str]]]:
+    """Number and faults of every try in which something was struck."""
+    how, is_lasting = mode.removesuffix(" from then on"), mode.endswith("from then on")
+    number = hash_of(scenario.name, mode) % every
+    while True:
+        copy(scenario.start, folder)
+        status, disk = in_child(folder, scenario.act, Disk(f"{folder}/", number, how, is_lasting))
+        if status != 9 and disk.count <= number:
+            return
+        if status == 9 or disk.struck:
+            faults = faults_after(folder, scenario, status == 0)
+            if status not in (0, 3, 9):
+                faults.append(f"the process ended with {status}")
+            yield number, faults
+        number += every
+
+
+def power_cuts(scenario: Scenario, folder: Path, every: int) -> Iterator[tuple[int, list[str]]]:
+    """The same with everything lost that was not synced, in several ways, after every call."""
+    copy(scenario.start, folder)
+    image = DiskImage(folder)
+    status, disk = in_child(folder, scenario.act, Disk(f"{folder}/"))
+    assert status == 0, f"{scenario.name} fails on a sound disk"
+    rng = random.Random(hash_of(scenario.name, "power cut"))
+    for number, call in enumerate([*disk.journal, None]):
+        for turn, policy in enumerate(POLICIES):
+            if (number + turn) % every == 0 or call is None:
+                image.write(folder, policy, rng)
+                found = faults_after(folder, scenario, call is None)
+                yield number, [f"{policy}: {fault}" for fault in found]
+        if call is not None:
+            image.apply(call)
+
+
+def traced(scenario: Scenario, folder: Path, mode: str, every: int) -> Iterator[tuple[int, list[str]]]:
+    """The same by `strace`, at every `every`-th of each kind of system call."""
+    copy(scenario.start, folder)
+    calls = folder.with_suffix(".calls")
+    status = in_traced_child(folder, scenario.act, "-o", str(calls), "-e", f"trace={','.join(TRACED_CALLS)}")
+    assert status == 0, f"{scenario.name} fails on a sound disk"
+    names = re.findall(r"^\d* *(\w+)\(", calls.read_text("utf-8", "replace"), re.MULTILINE)
+    for name in TRACED_CALLS:
+        for number in range(1, names.count(name) + 1, every):
+            copy(scenario.start, folder)
+            fault = f"inject={name}:{TRACED[mode]}:when={number}"
+            status = in_traced_child(folder, scenario.act, "-o", os.devnull, "-e", f"trace={name}", "-e", fault)
+            faults = faults_after(folder, scenario, status == 0)
+            if status not in (0, 3, 9):
+                faults.append(f"the process ended with {status}")
+            yield number, [f"{name}: {fault}" for fault in faults]
+
+
+def _tries(scenario: Scenario, folder: Path, mode: str, every: int) -> Iterator[tuple[int, list[str]]]:
+    if mode == "power cut":
+        return power_cuts(scenario, folder, every)
+    if mode in TRACED:
+        return traced(scenario, folder, mode, every)
+    return strikes(scenario, folder, mode, every)
+
+
+def hash_of(*words: str) -> int:
+    """A number that is the same on every run."""
+    return sum(ord(sign) * (i + 1) for i, sign in enumerate("/".join(words)))
+
+
+def run(
+    modes: list[str], every: int, names: list[str] | None = None, within_s: float = float("inf")
+) -> dict[str, object]:
+    """What was tried: counts by scenario and mode, and what was wrong; `is_complete` unless time was short.
+
+    Scenarios and modes take turns, so that none is left out where time is short.
+    """
+    memory = Path("/dev/shm")
+    started_s = time.monotonic()
+    tries: dict[str, dict[str, int]] = {}
+    wrong: list[dict[str, object]] = []
+    with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as made:
+        work = Path(made)
+        chosen = [scenario for scenario in scenarios(work) if names is None or scenario.name in names]
+        waiting = deque(
+            (scenario, mode, _tries(scenario, work / f"store-{n}-{m}", mode, every))
+            for n, scenario in enumerate(chosen)
+            for m, mode in enumerate(modes)
+        )
+        for scenario, mode, _ in waiting:
+            tries.setdefault(scenario.name, {})[mode] = 0
+        while waiting and time.monotonic() - started_s <= within_s:
+            scenario, mode, found = waiting.popleft()
+            tried = next(found, None)
+            if tried is None:
+                continue
+            number, faults = tried
+            tries[scenario.name][mode] += 1
+            if faults:
+                wrong.append({"scenario": scenario.name, "mode": mode, "call": number, "faults": faults})
+            waiting.append((scenario, mode, found))
+    seconds = time.monotonic() - started_s
+    total = sum(sum(counts.values()) for counts in tries.values())
+    return {
+        "points": total,
+        "is_complete": not waiting,
+        "seconds": round(seconds, 1),
+        "tries": tries,
+        "wrong": wrong,
+    }
+
+
+def main() -> int:
+    """The command; ends with 1 where something was wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--every", type=int, default=1, help="only every N-th call")
+    parser.add_argument("--modes", default=",".join(MODES))
+    parser.add_argument("--scenarios", default=None)
+    parser.add_argument("--within-s", type=float, default=float("inf"), help="stop and print after so many seconds")
+    arguments = parser.parse_args()
+    names = None if arguments.scenarios is None else arguments.scenarios.split(",")
+    found = run(arguments.modes.split(","), arguments.every, names, arguments.within_s)
+    print(json.dumps(found, indent=1))
+    return int(bool(found["wrong"]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

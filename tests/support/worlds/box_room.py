@@ -1,0 +1,122 @@
+"""Rides through a textured box of a room: pairs, IMU and truth that agree; nothing here uses the code under test.
+
+A ride is a function from seconds to map_from_body; it stands still before 0 and after its end.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array, se3, so3_exp, so3_log
+from fleetmap.sensors.samples import CameraFrame
+from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, START_NS, WIDTH, Sample
+
+ROOM_M = np.array([[-4.0, -3.0, -1.5], [4.0, 3.0, 1.5]])
+GRAVITY_MPS2 = 9.81
+_TEXEL_M = 0.01
+Ride = Callable[[float], Array]
+
+
+def out_and_back(
+    duration_s: float,
+    *,
+    reach_m: float = 2.4,
+    start_m: tuple[float, float, float] = (-1.2, 0.6, 0.0),
+    yaw_rad: float = np.pi / 2,
+) -> Ride:
+    """Along x and back to the start while looking at the wall at y = 3 (yaw pi/2), swaying a little about all axes."""
+
+    def map_from_body(t_s: float) -> Array:
+        share = min(max(t_s / duration_s, 0.0), 1.0)
+        phase = 2 * np.pi * share**3 * (10 - 15 * share + 6 * share**2)  # no jerk at either end
+        moved = np.array([reach_m * (1 - np.cos(phase)) / 2, 0.15 * np.sin(phase), 0.1 * np.sin(2 * phase)])
+        sway = np.array([0.06 * np.sin(2 * phase), 0.05 * np.sin(phase), yaw_rad + 0.25 * np.sin(phase)])
+        return se3(so3_exp(np.array([0, 0, sway[2]])) @ so3_exp(np.array([sway[0], sway[1], 0])), moved + start_m)
+
+    return map_from_body
+
+
+def ride_sample(ride: Ride, frames: int, frame_s: float, *, seed: int = 0, begin_s: float = 0.0) -> Sample:
+    """What the rig of recording_samples records from `begin_s` on: pairs, and an IMU at 200 Hz from 1 s before."""
+    shift = se3(np.eye(3), np.array([BASELINE_M, 0, 0]))
+    times = begin_s + frame_s * np.arange(frames)
+    stamps = START_NS + np.rint(times * 1e9).astype(np.int64)
+    truth = [ride(float(t)) for t in times]
+    left = [_render(map_from_body @ BODY_FROM_CAM0) for map_from_body in truth]
+    right = [_render(map_from_body @ BODY_FROM_CAM0 @ shift) for map_from_body in truth]
+    imu_times = np.arange(times[0] - 1.0, times[-1] + 0.1, 0.005)
+    rng = np.random.default_rng(seed)
+    gyro, accel = (np.array(values) for values in zip(*(_imu(ride, float(t)) for t in imu_times), strict=True))
+    gyro += rng.normal([0.003, -0.002, 0.001], 2e-3, gyro.shape)
+    accel += rng.normal([0.02, -0.01, 0.03], 2e-2, accel.shape)
+    imu_stamps = START_NS + np.rint(imu_times * 1e9).astype(np.int64)
+    return Sample(stamps, left, right, imu_stamps, gyro, accel, truth)
+
+
+def _imu(ride: Ride, t_s: float, h_s: float = 1e-3) -> tuple[Array, Array]:
+    """Angular rate and specific force in body axes, by central differences."""
+    before, now, after = ride(t_s - h_s), ride(t_s), ride(t_s + h_s)
+    rate = so3_log(before[:3, :3].T @ after[:3, :3]) / (2 * h_s)
+    acceleration = (before[:3, 3] - 2 * now[:3, 3] + after[:3, 3]) / h_s**2
+    return rate, now[:3, :3].T @ (acceleration + np.array([0, 0, GRAVITY_MPS2]))
+
+
+def _render(map_from_cam: Array) -> NDArray[np.uint8]:
+    """One grey image: for each pixel the face of the room that its ray leaves by."""
+    rays = _rays() @ map_from_cam[:3, :3].T
+    origin = map_from_cam[:3, 3]
+    image = np.zeros((HEIGHT, WIDTH), np.uint8)
+    with np.errstate(divide="ignore"):
+        reach = np.where(rays > 0, ROOM_M[1] - origin, ROOM_M[0] - origin) / rays
+    axis = np.argmin(reach, axis=2)
+    hits = origin + rays * np.min(reach, axis=2)[..., None]
+    for face in range(6):
+        side, on = face % 2, face // 2
+        inside = (axis == on) & ((rays[..., on] > 0) == bool(side))
+        if inside.any():
+            first, second = (k for k in range(3) if k != on)
+            at = ((hits[..., [first, second]] - ROOM_M[0, [first, second]]) / _TEXEL_M).astype(np.float32)
+            seen = cv2.remap(_texture(face), at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)  # type: ignore[call-overload]
+            image[inside] = seen[inside]
+    return image
+
+
+@lru_cache(maxsize=1)
+def _rays() -> Array:
+    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    return np.stack([(u - (WIDTH / 2 - 0.5)) / FOCAL, (v - (HEIGHT / 2 - 0.5)) / FOCAL, np.ones_like(u, float)], -1)
+
+
+@lru_cache(maxsize=6)
+def _texture(face: int) -> NDArray[np.uint8]:
+    """800 x 800 texels of soft noise under hard-edged patches, different on each face."""
+    rng = np.random.default_rng(100 + face)
+    noise = sum(
+        (cv2.resize(rng.random((n, n)), (800, 800), interpolation=cv2.INTER_CUBIC) for n in (10, 40, 110)),
+        np.zeros((800, 800)),
+    )
+    canvas = 60 + 40 * noise
+    for _ in range(500):
+        x, y, w, h = (int(v) for v in (*rng.integers(0, 800, 2), *rng.integers(6, 45, 2)))
+        canvas[y : y + h, x : x + w] = rng.uniform(20, 235)
+    return np.asarray(np.clip(cv2.GaussianBlur(canvas, (0, 0), 1.2), 0, 255), np.uint8)
+
+
+def points_seen(map_from_cam: Array, pixels: Array) -> Array:
+    """(N, 3) where the room's surface is hit by the rays of pixels (N, 2)."""
+    rays_cam = np.column_stack([(pixels - [WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5]) / FOCAL, np.ones(len(pixels))])
+    rays = rays_cam @ map_from_cam[:3, :3].T
+    origin = map_from_cam[:3, 3]
+    with np.errstate(divide="ignore"):
+        reach = np.where(rays > 0, ROOM_M[1] - origin, ROOM_M[0] - origin) / rays
+    return origin + rays * reach.min(axis=1)[:, None]
+
+
+def stereo_pair(map_from_body: Array, stamp_ns: int) -> CameraFrame:
+    """What the rig sees from one place."""
+    map_from_cam = map_from_body @ BODY_FROM_CAM0
+    shift = se3(np.eye(3), np.array([BASELINE_M, 0, 0]))
+    return CameraFrame(stamp_ns, _render(map_from_cam), _render(map_from_cam @ shift))

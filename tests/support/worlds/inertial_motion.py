@@ -1,0 +1,58 @@
+"""A smooth motion whose place, velocity, rate and specific force are known in closed form, for tests."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.sensors.samples import ImuSamples
+
+GRAVITY = np.array([0.0, 0.0, -9.81])
+AMPLITUDE_M, RATE_RADPS, PHASE = np.array([1.5, 1.0, 0.3]), np.array([0.9, 1.3, 1.7]), np.array([0.3, 1.1, 2.0])
+ROLL, PITCH = (0.15, 1.1), (0.12, 0.8)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """State at one moment."""
+
+    map_from_body: Array
+    velocity_map_mps: Array
+    gyro_radps: Array
+    accel_mps2: Array
+
+
+def analytic_motion(time_s: float) -> Motion:
+    """Lissajous translation; yaw, pitch, roll as sums of sines, rotation Rz(yaw) Ry(pitch) Rx(roll)."""
+    angle = RATE_RADPS * time_s + PHASE
+    position = AMPLITUDE_M * np.sin(angle)
+    velocity = AMPLITUDE_M * RATE_RADPS * np.cos(angle)
+    acceleration = -AMPLITUDE_M * RATE_RADPS**2 * np.sin(angle)
+    yaw, yaw_rate = 0.5 * time_s + 0.2 * np.sin(time_s), 0.5 + 0.2 * np.cos(time_s)
+    pitch, pitch_rate = PITCH[0] * np.sin(PITCH[1] * time_s), PITCH[0] * PITCH[1] * np.cos(PITCH[1] * time_s)
+    roll, roll_rate = ROLL[0] * np.sin(ROLL[1] * time_s), ROLL[0] * ROLL[1] * np.cos(ROLL[1] * time_s)
+    turn_roll, turn_pitch = so3_exp(np.array([roll, 0, 0])), so3_exp(np.array([0, pitch, 0]))
+    rotation = so3_exp(np.array([0, 0, yaw])) @ turn_pitch @ turn_roll
+    in_pitched = turn_pitch.T @ np.array([0, 0, yaw_rate]) + np.array([0, pitch_rate, 0])
+    gyro = turn_roll.T @ in_pitched + np.array([roll_rate, 0, 0])
+    return Motion(se3(rotation, position), velocity, gyro, rotation.T @ (acceleration - GRAVITY))
+
+
+@lru_cache(maxsize=100_000)
+def _felt(stamp_ns: int) -> tuple[Array, Array]:
+    state = analytic_motion(stamp_ns * 1e-9)
+    return state.gyro_radps, state.accel_mps2
+
+
+def sample_motion(
+    *, rate_hz: float, duration_s: float, gyro_bias: Array | None = None, accel_bias: Array | None = None
+) -> ImuSamples:
+    """Noise-free samples from time 0 to `duration_s`, both included."""
+    stamps = np.round(np.arange(round(duration_s * rate_hz) + 1) * 1e9 / rate_hz).astype(np.int64)
+    gyro, accel = np.array([_felt(int(s)) for s in stamps]).transpose(1, 0, 2)
+    return ImuSamples(
+        stamps,
+        gyro + (0 if gyro_bias is None else gyro_bias),
+        accel + (0 if accel_bias is None else accel_bias),
+    )

@@ -1,0 +1,173 @@
+"""A robot that drives to and fro in a painted room for as long as wanted, and maps of that room in its truth. Made once."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
+
+import msgspec
+import numpy as np
+
+from fleetmap.bow import decode_vocabulary, encode_vocabulary, train_vocabulary
+from fleetmap.features import orb
+from fleetmap.geometry import Array
+from fleetmap.mapformat import CameraEntry, Tile
+from fleetmap.messages import WantedVersion
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples
+from locclient.localization.settings import LocalizerSettings
+from locclient.robot.robot import LoadedMap, Robot
+from locclient.robot.version_trial import TrialSettings
+from locclient.sensors.intake import Moment
+from mapserver.store import MapStore
+from support.recordings.recording_samples import FOCAL, HEIGHT, WIDTH, Sample, calibration
+from support.storage.map_samples import draft_details
+from support.worlds.box_room import out_and_back, points_seen, ride_sample
+
+RIDE_S, STAND_S, FRAME_S = 6.0, 1.0, 0.1
+CYCLE_NS = round((STAND_S + RIDE_S) * 1e9)
+TILE_M = 16.0
+SITE = "room"
+SETTINGS = LocalizerSettings()
+TRIAL = TrialSettings(confirming_fixes=3, patience_s=2.0)
+
+
+@lru_cache(maxsize=1)
+def cycle() -> Sample:
+    """Standing for a second, then out and back; the next cycle begins where this one ends."""
+    return ride_sample(out_and_back(RIDE_S), round((STAND_S + RIDE_S) / FRAME_S), FRAME_S, begin_s=-STAND_S)
+
+
+@lru_cache(maxsize=1)
+def rectifier() -> Rectifier:
+    return Rectifier(calibration())
+
+
+def moments(frames: int, *, dark: range = range(0)) -> Iterator[Moment]:
+    """Frames with the IMU before each; those in `dark` are black."""
+    sample = cycle()
+    first_ns = int(sample.stamps_ns[0])
+    inside = (sample.imu_stamps_ns >= first_ns) & (sample.imu_stamps_ns < first_ns + CYCLE_NS)
+    stamps, gyro, accel = sample.imu_stamps_ns[inside], sample.gyro_radps[inside], sample.accel_mps2[inside]
+    fed_ns = first_ns
+    for number in range(frames):
+        turn, index = divmod(number, len(sample.stamps_ns))
+        stamp_ns = int(sample.stamps_ns[index]) + turn * CYCLE_NS
+        until_ns = stamp_ns + 10_000_000
+        parts = []
+        for shift_ns in (turn * CYCLE_NS, (turn + 1) * CYCLE_NS):
+            chosen = (stamps + shift_ns >= fed_ns) & (stamps + shift_ns < until_ns)
+            parts.append((stamps[chosen] + shift_ns, gyro[chosen], accel[chosen]))
+        imu = ImuSamples(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+        fed_ns = until_ns
+        rng = np.random.default_rng(number)  # a sensor's noise: a camera that repeats itself to the bit counts as stuck
+        left, right = (_noisy(picture, rng) for picture in (sample.left[index], sample.right[index]))
+        if number in dark:
+            left, right = np.zeros_like(left), np.zeros_like(right)
+        yield Moment(CameraFrame(stamp_ns, left, right), imu, [], [])
+
+
+def _noisy(picture: Image, rng: np.random.Generator) -> Image:
+    """With a grey value more or less in every other pixel."""
+    noise = rng.integers(-1, 2, picture.shape, dtype=np.int16)
+    return np.clip(picture + noise, 0, 255).astype(np.uint8)
+
+
+def truth(number: int) -> Array:
+    """map_from_body at frame `number`."""
+    return cycle().world_from_body[number % len(cycle().world_from_body)]
+
+
+@lru_cache(maxsize=1)
+def tiles() -> tuple[Tile, ...]:
+    """The room's map: features of some frames, where their rays meet the walls."""
+    camera, sample = rectifier().camera, cycle()
+    parts = []
+    for index in range(0, len(sample.stamps_ns), 6):
+        frame = rectifier().rectify(CameraFrame(int(sample.stamps_ns[index]), sample.left[index], sample.right[index]))
+        features = orb.detect(frame.left, SETTINGS.orb)
+        map_from_cam = sample.world_from_body[index] @ rectifier().body_from_cam
+        rays = (features.pixels - [camera.cx_px, camera.cy_px]) / camera.focal_px
+        points = points_seen(map_from_cam, rays * FOCAL + [WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5])
+        parts.append((map_from_cam, features, points))
+    return tuple(_tile(cell, parts) for cell in ((-1, -1), (-1, 0), (0, -1), (0, 0)))
+
+
+def _tile(cell: tuple[int, int], parts: list[tuple[Array, orb.Features, Array]]) -> Tile:
+    columns: dict[str, list[Array]] = {name: [] for name in ("ids", "points", "descriptors", "towards", "reach")}
+    places, seen_at, begin = [], [], 0
+    for number, (map_from_cam, features, points) in enumerate(parts):
+        ids = np.arange(begin, begin + len(points), dtype=np.uint32)
+        begin += len(points)
+        inside = (np.floor(points[:, :2] / TILE_M) == cell).all(axis=1)
+        towards = map_from_cam[:3, 3] - points
+        distance = np.linalg.norm(towards, axis=1)
+        for name, values in (
+            ("ids", ids),
+            ("points", points),
+            ("descriptors", features.descriptors),
+            ("towards", towards / distance[:, None]),
+            ("reach", distance * orb.SCALE_FACTOR ** features.octaves.astype(float)),
+        ):
+            columns[name].append(values[inside])
+        if (np.floor(map_from_cam[:2, 3] / TILE_M) == cell).all():
+            places.append((number, map_from_cam))
+            seen_at.append(ids)
+    joined = {name: np.concatenate(values) for name, values in columns.items()}
+    count = len(joined["ids"])
+    return Tile(
+        tile_x=cell[0], tile_y=cell[1], size_m=TILE_M, landmark_ids=joined["ids"], points_map=joined["points"],
+        descriptors=joined["descriptors"], view_directions_map=joined["towards"].astype(np.float32),
+        view_half_angle_rad=np.full(count, 0.3, np.float32), max_distance_m=joined["reach"].astype(np.float32),
+        sigma_m=np.full(count, 0.01, np.float32), place_ids=np.array([n for n, _ in places], np.uint32),
+        map_from_cam=np.array([m for _, m in places]).reshape(-1, 4, 4), place_landmark_ids=tuple(seen_at),
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=1)
+def vocabulary() -> bytes:
+    descriptors = np.concatenate([tile.descriptors for tile in tiles()])
+    return encode_vocabulary(train_vocabulary(descriptors, 8, 3, np.random.default_rng(0)))
+
+
+def save(store: MapStore, *, site: str = SITE, of: tuple[Tile, ...] | None = None) -> int:
+    """A version of the room, made current."""
+    camera = rectifier().camera
+    entry = CameraEntry(
+        focal_px=camera.focal_px, width_px=camera.width_px, height_px=camera.height_px, baseline_m=camera.baseline_m
+    )
+    details = msgspec.structs.replace(draft_details(path_m=10.0), tile_size_m=TILE_M, camera=entry)
+    number = store.save_draft(
+        site, tiles=list(tiles() if of is None else of), vocabulary=vocabulary(), details=details, archive=b"archive"
+    )
+    store.publish(site)
+    return number
+
+
+def wanted(store: MapStore, site: str = SITE) -> WantedVersion:
+    current = store.current(site)
+    return WantedVersion(site=site, version=current.version, manifest_sha256=current.manifest_sha256)
+
+
+def loaded(store: MapStore, of: tuple[Tile, ...] | None = None) -> LoadedMap:
+    """The current version, in memory, with these tiles."""
+    version = wanted(store)
+    held = {(tile.tile_x, tile.tile_y): tile for tile in (tiles() if of is None else of)}
+    return LoadedMap(version, store.manifest(SITE, version.version), decode_vocabulary(vocabulary()), held)
+
+
+def moved(offset_m: Array) -> tuple[Tile, ...]:
+    """The same map somewhere else: what a version would be whose frame has slipped."""
+    return tuple(
+        replace(tile, points_map=tile.points_map + offset_m, map_from_cam=_shifted(tile.map_from_cam, offset_m))
+        for tile in tiles()
+    )
+
+
+def _shifted(map_from_cam: Array, offset_m: Array) -> Array:
+    out = map_from_cam.copy()
+    out[:, :3, 3] += offset_m
+    return out
+
+
+def new_robot(trial: TrialSettings = TRIAL) -> Robot:
+    return Robot(calibration(), rectifier(), SETTINGS, trial)

@@ -1,0 +1,87 @@
+"""A made-up map with known truth, and what keyframes of a later survey see of it. No pictures."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.sensors.samples import ImuSamples, Trajectory
+from mapserver.survey.bundle.bundle_rounds import Motion, SurveyState
+from mapserver.survey.merge.base_map import BaseMap
+from mapserver.survey.merge.guided_matching import Sighting
+from mapserver.survey.survey_map import History, SurveyMap
+from mapserver.survey.tracks.tracks import Landmarks
+from support.worlds.bundle_scene import BODY_FROM_CAM, CAMERA, make_scene
+
+SIGMA_PX = 0.4
+
+
+@dataclass(frozen=True)
+class SessionScene:
+    """The map as BaseMap, the true places of a later survey's cameras (K, 4, 4), and which landmarks each sees."""
+
+    base: BaseMap
+    map_from_cam: Array
+    visible: list[NDArray[np.int64]]
+
+    def sightings(self, points_map: Array, seed: int) -> list[Sighting | None]:
+        """What the later survey sees of landmarks that stand at points_map (N, 3) by now, with noise."""
+        rng = np.random.default_rng(seed)
+        found: list[Sighting | None] = []
+        for place, rows in zip(self.map_from_cam, self.visible, strict=True):
+            pixels = CAMERA.pixel_from_point(transform_points(se3_inverse(place), points_map[rows]))
+            noise = rng.normal(0, SIGMA_PX, pixels.shape)
+            noise[:, 2] = noise[:, 0] - noise[:, 2]
+            found.append(Sighting(rows, np.arange(len(rows)), pixels + noise, np.full((len(rows), 2), SIGMA_PX)))
+        return found
+
+
+def session_scene(seed: int, *, landmarks: int = 300, history: History | None = None) -> SessionScene:
+    """Keyframes 0 and 2, 4... of a ride made the map, those between them are the later survey."""
+    problem = make_scene(keyframes=12, landmarks=landmarks, step_s=0.3, seed=seed, noise_px=0.5, mono_share=0.0).problem
+    old = np.isin(problem.obs_keyframe, np.arange(0, 12, 2))
+    order = np.lexsort((problem.obs_keyframe[old], problem.obs_landmark[old]))
+    keyframe, landmark = problem.obs_keyframe[old][order] // 2, problem.obs_landmark[old][order]
+    count = len(problem.points_map)
+    survey_map = SurveyMap(
+        camera=CAMERA,
+        body_from_cam=BODY_FROM_CAM,
+        keyframe_stamps_ns=np.arange(6, dtype=np.int64),
+        map_from_body=problem.map_from_body[::2],
+        landmark_ids=np.arange(count, dtype=np.uint32),
+        points_map=problem.points_map,
+        descriptors=np.zeros((count, 32), np.uint8),
+        point_sigma_m=np.full(count, 0.01),
+        obs_keyframe=keyframe.astype(np.int32),
+        obs_landmark=landmark.astype(np.int32),
+        obs_pixels=problem.obs_pixels[old][order],
+        obs_octave=np.zeros(len(order), np.int8),
+        obs_sigma_px=problem.obs_sigma_px[old][order],
+        trajectory=Trajectory(np.arange(6, dtype=np.int64), problem.map_from_body[::2]),
+        trajectory_estimated=np.ones(6, bool),
+        patches=np.zeros((count, 21, 21), np.uint8),
+        history=history,
+    )
+    in_map = np.unique(landmark)
+    visible = [
+        np.intersect1d(problem.obs_landmark[problem.obs_keyframe == k], in_map).astype(np.int64)
+        for k in range(1, 12, 2)
+    ]
+    return SessionScene(
+        BaseMap(survey_map, CAMERA, BODY_FROM_CAM), problem.map_from_body[1::2] @ BODY_FROM_CAM, visible
+    )
+
+
+def survey_state(seed: int) -> SurveyState:
+    """A survey of twelve keyframes at its truth, all landmarks seen at least twice, no motion."""
+    problem = make_scene(keyframes=12, landmarks=200, step_s=0.3, seed=seed, mono_share=0.0).problem
+    order = np.lexsort((problem.obs_keyframe, problem.obs_landmark))
+    seen, number = np.unique(problem.obs_landmark[order], return_inverse=True)
+    marks = Landmarks(
+        problem.points_map[seen], problem.obs_keyframe[order].astype(np.int32), number.astype(np.int32), np.arange(len(order)),
+        problem.obs_pixels[order], problem.obs_sigma_px[order],
+    )  # fmt: skip
+    none = np.zeros((12, 3))
+    motion = Motion(False, ImuSamples.empty(), None, 0.0, none, none.copy(), none.copy(), [])
+    return SurveyState(np.arange(12, dtype=np.int64), problem.map_from_body, BODY_FROM_CAM, CAMERA, motion, marks)
