@@ -7,9 +7,9 @@ fleetmap/{site}/robots/{robot}/pose      published by the robot: PoseMessage
 fleetmap/{site}/robots/{robot}/estimate  published by the robot for every frame: EstimateMessage
 fleetmap/{site}/robots/{robot}/failures  asked by the robot, FailureReport: FailureAck, once the server has it on its disk
 fleetmap/{site}/robots/{robot}/alive     liveliness token of the robot
-fleetmap/{site}/manifests/{version}      asked by the robot, PartQuestion: Part of a manifest
-fleetmap/{site}/blobs/{sha256}           asked by the robot, PartQuestion: Part of a tile, vocabulary or manifest
-fleetmap/{site}/patches/{base}-{sha256}  asked by the robot, PartQuestion: Part of what makes a tile or manifest out of `base`
+fleetmap/{site}/manifests/{version}      asked by the robot, ChunkRequest: Part of a manifest
+fleetmap/{site}/blobs/{sha256}           asked by the robot, ChunkRequest: Part of a tile, vocabulary or manifest
+fleetmap/{site}/patches/{base}-{sha256}  asked by the robot, ChunkRequest: Part of what makes a tile or manifest out of `base`
 """
 
 from typing import Annotated, Any, Self, TypeVar
@@ -32,7 +32,7 @@ Metrics = Annotated[dict[Name, float | int | str | bool | None], msgspec.Meta(ma
 Flags = Annotated[tuple[Name, ...], msgspec.Meta(max_length=64)]
 
 
-class PartQuestion(msgspec.Struct, frozen=True, kw_only=True):
+class ChunkRequest(msgspec.Struct, frozen=True, kw_only=True):
     """Asks for at most max_bytes from offset on; an empty payload asks for the first part."""
 
     offset: Annotated[int, msgspec.Meta(ge=0, le=1 << 40)] = 0
@@ -231,7 +231,7 @@ Message = (
     | RobotAck
     | RobotHealth
     | PoseMessage
-    | PartQuestion
+    | ChunkRequest
     | Part
     | EstimateMessage
     | FailureReport
@@ -243,7 +243,7 @@ M = TypeVar(
     RobotAck,
     RobotHealth,
     PoseMessage,
-    PartQuestion,
+    ChunkRequest,
     Part,
     EstimateMessage,
     FailureReport,
@@ -269,8 +269,8 @@ def decode_message(data: bytes, message_type: type[M]) -> M:
 
 
 def part_of(data: bytes, question: bytes) -> bytes:
-    """The encoded Part of `data` that an encoded PartQuestion asks for; raises LinkError as `decode_message`."""
-    asked = decode_message(question, PartQuestion) if question else PartQuestion()
+    """The encoded Part of `data` that an encoded ChunkRequest asks for; raises LinkError as `decode_message`."""
+    asked = decode_message(question, ChunkRequest) if question else ChunkRequest()
     part = data[asked.offset : asked.offset + asked.max_bytes]
     return encode_message(Part(total_bytes=len(data), offset=asked.offset, data=part))
 

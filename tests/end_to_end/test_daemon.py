@@ -15,11 +15,11 @@ import pytest
 
 from fleetmap.bus import MemoryBus, MemoryHub, ZenohBus
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
-from locclient.daemon.outbox import Spool
-from locclient.maps.map_client import MapLink
+from locclient.daemon.outbox import Outbox
+from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver.fleet.fleet import Fleet
-from mapserver.serving.bus_service import TileService
+from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from support.recordings.recording_samples import Sample, write_euroc
 from support.worlds import robot_world
@@ -82,8 +82,8 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
         manager.setblocking(False)
         robot_world.save(store)
         with MemoryBus(hub) as bus, MemoryBus(hub) as robot_bus:
-            service = TileService(store, Fleet(store), bus, lambda *_: None)
-            link = MapLink(robot_bus, TileCache(tmp_path / "cache"), "room", "r1")
+            service = BusService(store, Fleet(store), bus, lambda *_: None)
+            link = MapClient(robot_bus, TileCache(tmp_path / "cache"), "room", "r1")
             link.bring(link.wanted())
             service.close()
 
@@ -95,7 +95,7 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
             wait_for(lambda: any((tmp_path / "failures").glob("*.json")), process)
             process.send_signal(signal.SIGKILL)
             process.wait()
-        waiting = Spool(spool, max_bytes=10**8).waiting(10)
+        waiting = Outbox(spool, max_bytes=10**8).waiting(10)
         assert len(waiting) == 1
         report = decode_message(waiting[0].payload, FailureReport)
         assert (report.kind, report.cause, report.version) == ("blind", "dark", 1)
@@ -109,7 +109,7 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
 
         fleet = Fleet(store)
         with ZenohBus.listen(endpoint) as bus:
-            service = TileService(store, fleet, bus, lambda *_: None)
+            service = BusService(store, fleet, bus, lambda *_: None)
             bus.queryable(robot_key("*", "*", "failures"), take)
             light_walk = write_walk(tmp_path / "light", 70, range(0))
             config = configuration(tmp_path, light_walk, endpoint, speed=0.5)
@@ -121,4 +121,4 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
             service.close()
         assert fleet.robots("room")[0].version == 1
     assert table == [report.id]
-    assert Spool(spool, max_bytes=10**8).counts()["delivered"] == 1
+    assert Outbox(spool, max_bytes=10**8).counts()["delivered"] == 1

@@ -15,10 +15,10 @@ def check(
     from locclient.config import LocclientConfig
 
     settings = load_toml(config, LocclientConfig)
-    from locclient.daemon.preflight import FAIL, self_check
+    from locclient.daemon.preflight import FAIL, run_preflight
 
     failed = False
-    for finding in self_check(settings, seconds):
+    for finding in run_preflight(settings, seconds):
         typer.echo(f"{finding.level:<5} {finding.what}: {finding.text}")
         failed |= finding.level == FAIL
     if failed:

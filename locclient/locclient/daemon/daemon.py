@@ -14,16 +14,16 @@ from fleetmap.mapformat import check_name
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
 from locclient.config import LocclientConfig
-from locclient.daemon.jit_warmup import settled_memory, warm_up
-from locclient.daemon.outbox import Spool
+from locclient.daemon.jit_warmup import gc_frozen, warm_up
+from locclient.daemon.outbox import Outbox
 from locclient.daemon.publishers import Output, open_output
 from locclient.daemon.run_settings import RunSection
 from locclient.daemon.runtime import Parts
-from locclient.daemon.server_sync import ServerTalk
+from locclient.daemon.server_sync import ServerSync
 from locclient.maps.connection import default_cache_folder
-from locclient.maps.map_client import CachedMap, MapLink, MapSource, StoreFolderLink
+from locclient.maps.map_client import CachedMap, LocalMapSource, MapClient, MapSource
 from locclient.maps.tile_cache import StoreFolder, TileCache
-from locclient.maps.tile_loader import MapRoom
+from locclient.maps.tile_loader import TileLoader
 from locclient.replay.prior_option import parse_prior
 from locclient.robot.robot import Robot
 from locclient.sensors.intake import Intake
@@ -68,12 +68,12 @@ def daemon_parts(config: LocclientConfig) -> Iterator[Parts]:
         if bus is not None:
             stack.callback(bus.close)
         output = _output(config, bus, site, name, stack)
-        spool = Spool(spool_path(config.run, site, name), max_bytes=config.run.spool_bytes)
+        spool = Outbox(spool_path(config.run, site, name), max_bytes=config.run.spool_bytes)
         if spool.set_aside is not None:
             _log.warning("the spool was damaged; it lies in %s now, and a new one was begun", spool.set_aside)
         begun_s = time.monotonic()
         warm_up(calibration, rectifier, config.localizer)
-        stack.enter_context(settled_memory())
+        stack.enter_context(gc_frozen())
         _log.info("warm after %.1f s", time.monotonic() - begun_s)
         link, maps, first = _maps(config.run, bus, site, name)
         robot = Robot(calibration, rectifier, config.localizer, config.run.trial, time.thread_time)
@@ -83,9 +83,9 @@ def daemon_parts(config: LocclientConfig) -> Iterator[Parts]:
             frames=config.run.frame_queue, imu_minus_cam_s=rectifier.imu_minus_cam_s, has_imu=calibration.imu is not None,
             imu_wait_s=config.run.imu_wait_s,
         )  # fmt: skip
-        talk = None if link is None else ServerTalk(link, spool, retry_s=config.run.trial.retry_s)
+        talk = None if link is None else ServerSync(link, spool, retry_s=config.run.trial.retry_s)
         yield Parts(
-            site=site, robot_name=name, source=source, intake=intake, robot=robot, room=MapRoom(maps, config.run.window),
+            site=site, robot_name=name, source=source, intake=intake, robot=robot, room=TileLoader(maps, config.run.window),
             spool=spool, camera=rectifier.camera, settings=config.localizer, output=output, link=link, talk=talk, first=first,
             failures_folder=None if config.run.failures is None else Path(config.run.failures),
         )  # fmt: skip
@@ -107,10 +107,10 @@ def _output(config: LocclientConfig, bus: Bus | None, site: str, name: str, stac
 
 def _maps(
     run: RunSection, bus: Bus | None, site: str, name: str
-) -> tuple[MapLink | None, MapSource, WantedVersion | None]:
+) -> tuple[MapClient | None, MapSource, WantedVersion | None]:
     """The link to a server, what maps are read from, and the version to begin with; from the disk alone, without waiting."""
     if bus is None:
-        folder = StoreFolderLink(StoreFolder(Path(run.store or "")), site)
+        folder = LocalMapSource(StoreFolder(Path(run.store or "")), site)
         wanted = folder.wanted()
         if wanted.version is None:
             raise LinkError(
@@ -118,6 +118,6 @@ def _maps(
             )
         return None, folder, wanted
     cache = Path(run.cache) if run.cache is not None else default_cache_folder()
-    link = MapLink(bus, TileCache(cache, max_bytes=run.cache_bytes), site, name, patience_s=_PATIENCE_S)
+    link = MapClient(bus, TileCache(cache, max_bytes=run.cache_bytes), site, name, patience_s=_PATIENCE_S)
     # Its own view of the same folder, because a cache is not for two threads; it only reads.
     return link, CachedMap(TileCache(cache, max_bytes=run.cache_bytes), site), link.active()

@@ -55,7 +55,7 @@ def warm_up(calibration: RigCalibration, rectifier: Rectifier, settings: Localiz
 
 
 @contextmanager
-def settled_memory() -> Iterator[None]:
+def gc_frozen() -> Iterator[None]:
     """While it lasts, the garbage collector leaves alone what lives now: libraries hold some hundred thousand objects that nobody
     drops, and now and then a frame would have to wait until all of them were looked at."""
     gc.collect()

@@ -18,14 +18,14 @@ _BUSY_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class SpooledReport:
+class QueuedReport:
     """One report as it waits: payload is the encoded message."""
 
     id: str
     payload: bytes
 
 
-class Spool:
+class Outbox:
     """Reports in the order of their making; the oldest are dropped, and counted, where `max_bytes` is exceeded.
 
     What `put` returned for survives the death of the process and of the power. A file that is damaged is set aside under another
@@ -51,17 +51,17 @@ class Spool:
                 f"the spool {path} cannot be used ({error}); choose another file with [run] spool"
             ) from error
 
-    def put(self, report: SpooledReport) -> None:
+    def put(self, report: QueuedReport) -> None:
         """Keeps a report; one with an id that waits already is not kept twice. Raises StoreError where the disk refuses."""
         with self._transaction() as database:
             database.execute("INSERT OR IGNORE INTO report (id, payload) VALUES (?, ?)", (report.id, report.payload))
             self._make_room(database)
 
-    def waiting(self, limit: int = 1) -> list[SpooledReport]:
+    def waiting(self, limit: int = 1) -> list[QueuedReport]:
         """The oldest reports."""
         with self._transaction() as database:
             rows = database.execute("SELECT id, payload FROM report ORDER BY number LIMIT ?", (limit,)).fetchall()
-        return [SpooledReport(*row) for row in rows]
+        return [QueuedReport(*row) for row in rows]
 
     def done(self, report_id: str) -> None:
         """Lets go of a report that arrived."""

@@ -14,9 +14,9 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from locclient.config import LocclientConfig
 from locclient.daemon.daemon import check_run, spool_path
-from locclient.daemon.outbox import Spool
+from locclient.daemon.outbox import Outbox
 from locclient.maps.connection import default_cache_folder
-from locclient.maps.map_client import MapLink, StoreFolderLink
+from locclient.maps.map_client import LocalMapSource, MapClient
 from locclient.maps.tile_cache import StoreFolder, TileCache
 from locclient.sensors.intake import Intake
 from locclient.sensors.source import Source, open_source
@@ -40,7 +40,7 @@ class Finding:
     text: str
 
 
-def self_check(config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
+def run_preflight(config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
     """One finding after another; never raises for what is wrong with the robot. listen_s: how long to hear its sensors."""
     try:
         check_run(config)
@@ -155,7 +155,7 @@ def _clock(now_ns: int, synchronised: bool) -> Finding:
 
 def _spool(config: LocclientConfig) -> Iterator[Finding]:
     path = spool_path(config.run, str(config.run.site), str(config.run.robot))
-    spool = Spool(path, max_bytes=config.run.spool_bytes)
+    spool = Outbox(path, max_bytes=config.run.spool_bytes)
     counts = spool.counts()
     said = f"{path}: {counts['waiting']} reports wait, {counts['delivered']} delivered, {counts['dropped']} dropped"
     if spool.set_aside is not None:
@@ -167,7 +167,7 @@ def _spool(config: LocclientConfig) -> Iterator[Finding]:
 
 
 def _store(config: LocclientConfig) -> Iterator[Finding]:
-    link = StoreFolderLink(StoreFolder(Path(str(config.run.store))), str(config.run.site))
+    link = LocalMapSource(StoreFolder(Path(str(config.run.store))), str(config.run.site))
     wanted = link.wanted()
     fetched = link.tiles(link.manifest(wanted))
     yield _tiles("store", wanted.version, len(fetched.tiles), fetched.refused)
@@ -182,7 +182,7 @@ def _cache_and_server(config: LocclientConfig) -> Iterator[Finding]:
         yield Finding(WARN, "disk", f"{free_bytes / 1e6:.0f} MB free beside {folder}; make room for new versions")
     bus = ZenohBus.connect(str(run.server))
     try:
-        link = MapLink(bus, cache, str(run.site), str(run.robot), timeout_s=_ANSWER_S)
+        link = MapClient(bus, cache, str(run.site), str(run.robot), timeout_s=_ANSWER_S)
         active = link.active()
         if active is None:
             yield Finding(

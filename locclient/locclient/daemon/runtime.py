@@ -13,14 +13,14 @@ from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.messages import PoseMessage, WantedVersion, encode_message
 from fleetmap.sensors.rectification import StereoCamera
 from locclient.daemon.failure_files import write_failure
-from locclient.daemon.outbox import Spool, SpooledReport
+from locclient.daemon.outbox import Outbox, QueuedReport
 from locclient.daemon.publishers import Output
-from locclient.daemon.server_sync import ServerTalk
+from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.systemd_notify import ServiceManager
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.map_client import MapLink
-from locclient.maps.tile_loader import MapRoom
-from locclient.maps.tile_selection import Cell, Place, Whereabouts
+from locclient.maps.map_client import MapClient
+from locclient.maps.tile_loader import TileLoader
+from locclient.maps.tile_selection import Cell, Place, PositionBound
 from locclient.robot.failure_report import failure_report
 from locclient.robot.health_report import Figure, HealthFigures
 from locclient.robot.robot import FailureContext, LoadedMap, Outcome, Robot
@@ -44,13 +44,13 @@ class Parts:
     source: Source
     intake: Intake
     robot: Robot
-    room: MapRoom
-    spool: Spool
+    room: TileLoader
+    spool: Outbox
     camera: StereoCamera
     settings: LocalizerSettings
     output: Output | None
-    link: MapLink | None
-    talk: ServerTalk | None
+    link: MapClient | None
+    talk: ServerSync | None
     first: WantedVersion | None
     failures_folder: Path | None = None
 
@@ -75,7 +75,7 @@ class Runtime:
         self._sensors_stop = threading.Event()
         self._shared = _Shared()
         self._figures = HealthFigures()
-        self._whereabouts = Whereabouts(parts.room.settings)
+        self._whereabouts = PositionBound(parts.room.settings)
         self._last_frame_s: float | None = None
         self._health_s, self._pose_ns = 0.0, -(2**62)
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
@@ -269,7 +269,7 @@ class Runtime:
                 base_from_body=parts.robot.base_from_body, camera=parts.camera, settings=parts.settings,
             )  # fmt: skip
             try:
-                parts.spool.put(SpooledReport(report.id, encode_message(report)))
+                parts.spool.put(QueuedReport(report.id, encode_message(report)))
                 if parts.failures_folder is not None:
                     write_failure(parts.failures_folder, report)
             except FleetmapError as error:

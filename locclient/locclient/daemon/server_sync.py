@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError
 from fleetmap.messages import FailureReport, RobotHealth, WantedVersion, decode_message
-from locclient.daemon.outbox import Spool, SpooledReport
-from locclient.maps.map_client import MapLink
+from locclient.daemon.outbox import Outbox, QueuedReport
+from locclient.maps.map_client import MapClient
 from locclient.robot.robot import Change, VersionChange
 
 _ASK_EVERY_S = 60.0
@@ -17,7 +17,7 @@ _DELIVER_AT_ONCE = 20
 _log = logging.getLogger(__name__)
 
 
-class ServerTalk:
+class ServerSync:
     """One `step` after another: asks for the wanted version and fetches it, delivers failures, acknowledges, reports health.
 
     The main thread leaves what is to be said in `health` and `changes` and finds fetched versions in `fetched`. A server that is
@@ -25,7 +25,7 @@ class ServerTalk:
     """
 
     def __init__(
-        self, link: MapLink, spool: Spool, *, retry_s: float, clock_s: Callable[[], float] = time.monotonic,
+        self, link: MapClient, spool: Outbox, *, retry_s: float, clock_s: Callable[[], float] = time.monotonic,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:  # fmt: skip
         """retry_s: when a version that was put off is offered again."""
@@ -178,7 +178,7 @@ class ServerTalk:
                 self._spool.done(report.id)
 
 
-def _is_whole(report: SpooledReport) -> bool:
+def _is_whole(report: QueuedReport) -> bool:
     """Whether what lies in the spool is still the report that was put there; says so where it is not."""
     try:
         told = decode_message(report.payload, FailureReport).id

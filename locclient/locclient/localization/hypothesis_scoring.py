@@ -6,15 +6,15 @@ from itertools import combinations
 import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.relocalization.relocalizer import Fix, Slices
+from fleetmap.relocalization.relocalizer import Fix, TimeSliced
 from locclient.localization.alias_disambiguation import evidence, mark_shared
-from locclient.localization.pose_hypothesis import Anchor, difference
+from locclient.localization.pose_hypothesis import PoseHypothesis, difference
 from locclient.localization.settings import TrackSettings
 
 _PAIRS_AT_ONCE = 4  # comparisons in a slice of a look
 
 
-def begin_look(candidates: Sequence[Anchor], settings: TrackSettings, *, is_elsewhere: bool) -> None:
+def begin_look(candidates: Sequence[PoseHypothesis], settings: TrackSettings, *, is_elsewhere: bool) -> None:
     """One more look at the map, in which none of them has been spoken for yet; is_elsewhere: from another spot than the last."""
     for candidate in candidates:
         candidate.misses += 1
@@ -24,7 +24,11 @@ def begin_look(candidates: Sequence[Anchor], settings: TrackSettings, *, is_else
 
 
 def vote(
-    candidates: list[Anchor], fresh: Anchor, fix: Fix, odom_from_body: Array | None, settings: TrackSettings
+    candidates: list[PoseHypothesis],
+    fresh: PoseHypothesis,
+    fix: Fix,
+    odom_from_body: Array | None,
+    settings: TrackSettings,
 ) -> None:
     """The place of a fix, carried to the present: a vote for the candidate that is there, which takes it over, or a new candidate.
 
@@ -34,27 +38,29 @@ def vote(
         if _is_same_place(fresh, candidate, settings):
             if candidate.misses:  # at most one vote a frame
                 candidate.support, candidate.misses = candidate.support + 1, 0
-                candidate.speak(fix.inliers, fix.hit_share)
+                candidate.speak(fix.inliers, fix.landmark_recall)
                 _count(candidate, fresh, fix, odom_from_body, settings)
             candidate.moved_to(fresh)
             return
     fresh.fade(0.0)
-    fresh.speak(fix.inliers, fix.hit_share)
+    fresh.speak(fix.inliers, fix.landmark_recall)
     _count(fresh, fresh, fix, odom_from_body, settings)
     candidates.append(fresh)
 
 
-def still_held(candidates: Sequence[Anchor], settings: TrackSettings) -> list[Anchor]:
+def still_held(candidates: Sequence[PoseHypothesis], settings: TrackSettings) -> list[PoseHypothesis]:
     """Those that some recent look spoke for."""
     return [c for c in candidates if c.misses < settings.max_misses]
 
 
-def ranked(candidates: Sequence[Anchor]) -> list[Anchor]:
+def ranked(candidates: Sequence[PoseHypothesis]) -> list[PoseHypothesis]:
     """The one that most speaks for first."""
     return sorted(candidates, key=lambda c: -c.evidence)
 
 
-def rivals(candidates: Sequence[Anchor], settings: TrackSettings, best: Anchor | None = None) -> list[Anchor]:
+def rivals(
+    candidates: Sequence[PoseHypothesis], settings: TrackSettings, best: PoseHypothesis | None = None
+) -> list[PoseHypothesis]:
     """Candidates besides the best for which nearly as much speaks, look by look since they were thought of: as many inliers,
     or as many of the landmarks that should be seen there. A place where the map is thin is no less likely than its twin."""
     if not candidates:
@@ -74,7 +80,7 @@ def rivals(candidates: Sequence[Anchor], settings: TrackSettings, best: Anchor |
     ]
 
 
-def told_apart(candidates: Sequence[Anchor], settings: TrackSettings) -> Slices[Anchor | None]:
+def disambiguated(candidates: Sequence[PoseHypothesis], settings: TrackSettings) -> TimeSliced[PoseHypothesis | None]:
     """The one that what stands there tells from every other that totals would name its rival; None while nothing does. In slices.
 
     It need not be the one that totals rank first: a sign is little beside all that the places share. Only where the right one must be
@@ -90,7 +96,7 @@ def told_apart(candidates: Sequence[Anchor], settings: TrackSettings) -> Slices[
         mark_shared(places[i].tally, places[j].tally, shared[i], shared[j])
     known = {id(c): (c.tally, flags) for c, flags in zip(places, shared, strict=True)}
 
-    def lead(one: Anchor, other: Anchor) -> float:
+    def lead(one: PoseHypothesis, other: PoseHypothesis) -> float:
         (tally, flags), (other_tally, other_flags) = known[id(one)], known[id(other)]
         return evidence(tally, other_tally, flags, other_flags)
 
@@ -106,26 +112,28 @@ def told_apart(candidates: Sequence[Anchor], settings: TrackSettings) -> Slices[
     return best
 
 
-def is_proven(candidate: Anchor, settings: TrackSettings) -> bool:
+def is_proven(candidate: PoseHypothesis, settings: TrackSettings) -> bool:
     """By fixes and way enough."""
     return candidate.support >= settings.confirming_fixes and candidate.travelled_m >= settings.confirming_distance_m
 
 
-def is_unmistakable(fix: Fix, settings: TrackSettings) -> bool:
+def is_unambiguous(fix: Fix, settings: TrackSettings) -> bool:
     """Whether a fix, alone of all places that were tried, is so strong that no other place of this map can be meant."""
     return (
         fix.inliers >= settings.strong_inliers
         and fix.share >= settings.strong_share
-        and fix.twin_share < settings.strong_twin_share
+        and fix.alias_ratio < settings.strong_twin_share
     )
 
 
-def _count(candidate: Anchor, fresh: Anchor, fix: Fix, odom_from_body: Array | None, settings: TrackSettings) -> None:
+def _count(
+    candidate: PoseHypothesis, fresh: PoseHypothesis, fix: Fix, odom_from_body: Array | None, settings: TrackSettings
+) -> None:
     if settings.is_whole_site_mapped and fix.witnessed is not None and odom_from_body is not None:
         candidate.tally.look(odom_from_body @ se3_inverse(fresh.now_map_from_body), fix.witnessed)
 
 
-def _is_same_place(fresh: Anchor, candidate: Anchor, settings: TrackSettings) -> bool:
+def _is_same_place(fresh: PoseHypothesis, candidate: PoseHypothesis, settings: TrackSettings) -> bool:
     error, covariance = difference(fresh.now_map_from_body, candidate.now_map_from_body), candidate.now_cov
     far_m = settings.hypothesis_distance_m + 3 * np.sqrt(np.trace(covariance[3:, 3:]))
     far_rad = np.radians(settings.hypothesis_angle_deg) + 3 * np.sqrt(np.trace(covariance[:3, :3]))

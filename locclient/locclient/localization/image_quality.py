@@ -30,7 +30,7 @@ class Cause(StrEnum):
     UNMATCHED = "nothing in the map agrees"
 
 
-class SightSettings(Section, frozen=True):
+class ImageQualitySettings(Section, frozen=True):
     """When a picture counts as bad."""
 
     dark_contrast: float = 4.0
@@ -40,10 +40,10 @@ class SightSettings(Section, frozen=True):
     occluded_depth_share: float = 0.4
 
 
-class SightJudge:
+class ImageQualityMonitor:
     """Judges frames in their order."""
 
-    def __init__(self, settings: SightSettings) -> None:
+    def __init__(self, settings: ImageQualitySettings) -> None:
         self._settings = settings
         self._last: list[Image | None] = [None, None]
         self._frozen = [False, False]

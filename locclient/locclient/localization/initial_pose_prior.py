@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry import Odometry, OdometryEstimate
 from fleetmap.sensors.samples import PositionPrior
-from locclient.localization.pose_hypothesis import Anchor, led_back, moved
+from locclient.localization.pose_hypothesis import PoseHypothesis, led_back, moved
 from locclient.localization.settings import TrackSettings
 
 _OWN_M = 0.05  # by which any prior is doubted: it speaks of a moment between two frames
@@ -15,7 +15,7 @@ _BOUND, _BOUND_SIGMAS = 13.816, 3.7  # 0.999 of two dimensions
 _PLACE_REACH_M = 3.0  # from a place that shows the same as the robot sees
 
 
-class HeldPrior:
+class InitialPosePrior:
     """A prior, and the robot's way since its moment.
 
     place: where the robot is by both, a place of its own as long as the map knows none; None for priors that leave a direction open.
@@ -24,8 +24,8 @@ class HeldPrior:
     def __init__(self, prior: PositionPrior, base_from_body: Array) -> None:
         self._prior, self._base_from_body = prior, base_from_body
         self._way_m = 0.0
-        self._since: Anchor | None = None  # the first frame after it, as the identity
-        self.place: Anchor | None = None
+        self._since: PoseHypothesis | None = None  # the first frame after it, as the identity
+        self.place: PoseHypothesis | None = None
 
     def follow(self, tracker: Odometry, odometry: OdometryEstimate, step: Array, settings: TrackSettings) -> None:
         """To the present frame, by `step` (4, 4) from the last one. The place, an anchor like others, is carried with those."""
@@ -33,13 +33,13 @@ class HeldPrior:
         if self._since is not None:
             self._since.carry(tracker, odometry, step, settings)
             return
-        self._since = Anchor.at(odometry, np.eye(4), np.zeros((6, 6)))
+        self._since = PoseHypothesis.at(odometry, np.eye(4), np.zeros((6, 6)))
         if np.isfinite(self._prior.cov_rot_trans).all():
             map_from_body = self._prior.map_from_base @ self._base_from_body
             lever_m = map_from_body[:3, 3] - self._prior.map_from_base[:3, 3]
-            self.place = Anchor.at(odometry, map_from_body, moved(self._prior.cov_rot_trans, lever_m))
+            self.place = PoseHypothesis.at(odometry, map_from_body, moved(self._prior.cov_rot_trans, lever_m))
 
-    def allows(self, place: Anchor) -> bool:
+    def allows(self, place: PoseHypothesis) -> bool:
         """Whether the robot's way leads back from a place of the present to within the 0.999 bound of the prior's position."""
         if self._since is None:
             return True

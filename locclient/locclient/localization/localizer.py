@@ -10,16 +10,16 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.map_view import MapView
-from fleetmap.relocalization.relocalizer import Fix, Relocalizer, Seen, Slices
+from fleetmap.relocalization.relocalizer import Fix, Relocalizer, Seen, TimeSliced
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.localization.estimate import Estimate, Hypothesis, Status
 from locclient.localization.hypothesis_scoring import still_held
-from locclient.localization.hypothesis_set import Confirmation, Heard
-from locclient.localization.image_quality import Cause, SightJudge
-from locclient.localization.initial_pose_prior import HeldPrior
-from locclient.localization.pose_hypothesis import Anchor, applied, difference, moved
+from locclient.localization.hypothesis_set import Heard, HypothesisSet
+from locclient.localization.image_quality import Cause, ImageQualityMonitor
+from locclient.localization.initial_pose_prior import InitialPosePrior
+from locclient.localization.pose_hypothesis import PoseHypothesis, applied, difference, moved
 from locclient.localization.settings import LocalizerSettings
 
 _RADIUS_95 = 2.796  # of a three-dimensional normal distribution, in sigmas
@@ -61,16 +61,16 @@ class Localizer:
         self._tiles: dict[tuple[int, int], Tile] = {}
         self._vocabulary: Vocabulary | None = None
         self._survey_focal_px = 0.0
-        self._prior: HeldPrior | None = None
-        self._anchor: Anchor | None = None  # the confirmed place
-        self._confirmation = Confirmation(settings.track)  # of a place, while there is none
+        self._prior: InitialPosePrior | None = None
+        self._anchor: PoseHypothesis | None = None  # the confirmed place
+        self._confirmation = HypothesisSet(settings.track)  # of a place, while there is none
         self._last_odom: Array | None = None
         self._last_ns: int | None = None
         self._begun_ns: int | None = None  # of the last look
-        self._work: Slices[_Outcome] | None = None  # the look that goes on
-        self._moment: Anchor | None = None  # the frame of that look, as the identity
+        self._work: TimeSliced[_Outcome] | None = None  # the look that goes on
+        self._moment: PoseHypothesis | None = None  # the frame of that look, as the identity
         self._failed_looks = 0
-        self._judge = SightJudge(settings.sight)
+        self._judge = ImageQualityMonitor(settings.sight)
         self._cause = Cause.NONE
         self._ever_tracked = False
 
@@ -85,7 +85,7 @@ class Localizer:
     def handle_prior(self, prior: PositionPrior) -> None:
         """A coarse place at this moment; used for the search until a fix has been confirmed, widened by some of the way since. One
         whose covariance is finite is a place of its own as long as the map knows none: DEGRADED, by odometry from there."""
-        self._prior = HeldPrior(prior, self._base_from_body)
+        self._prior = InitialPosePrior(prior, self._base_from_body)
 
     def handle_version(
         self, version: int, tiles: Iterable[Tile], vocabulary: Vocabulary, survey_focal_px: float
@@ -149,12 +149,12 @@ class Localizer:
         if self._prior is not None:
             self._prior.follow(self._odometry, odometry, step, self._settings.track)
 
-    def _anchors(self) -> list[Anchor]:
+    def _anchors(self) -> list[PoseHypothesis]:
         known = [self._anchor, *self._anchor.strangers] if self._anchor else []
         told = self._told()
         return [*known, *self._confirmation.anchors(), *([told] if told else [])]
 
-    def _told(self) -> Anchor | None:
+    def _told(self) -> PoseHypothesis | None:
         """The place of a prior that is known in all directions."""
         return self._prior.place if self._prior is not None else None
 
@@ -179,7 +179,7 @@ class Localizer:
                 return _Outcome(), None
             at_once = self._is_sparse(frame.stamp_ns) or odometry.after_gap
             self._begun_ns = frame.stamp_ns
-            self._moment = Anchor.at(odometry, np.eye(4), np.zeros((6, 6)))
+            self._moment = PoseHypothesis.at(odometry, np.eye(4), np.zeros((6, 6)))
             for anchor in self._anchors():
                 anchor.mark()
             self._work = self._look(frame, self._relocalizer)
@@ -203,7 +203,7 @@ class Localizer:
             return True
         return (stamp_ns - self._last_ns) * 1e-9 > _SPREAD_SHARE * self._settings.track.fix_interval_s
 
-    def _look(self, frame: RectifiedFrame, relocalizer: Relocalizer) -> Slices[_Outcome]:
+    def _look(self, frame: RectifiedFrame, relocalizer: Relocalizer) -> TimeSliced[_Outcome]:
         seen = yield from relocalizer.look(frame)
         if self._anchor is None:
             fixes = yield from self._search(seen, relocalizer)
@@ -221,7 +221,7 @@ class Localizer:
             return _Outcome(None, "nothing in the map agrees with this frame")
         return self._correct(fixes, map_from_body, covariance, is_near=near is not None)
 
-    def _search(self, seen: Seen, relocalizer: Relocalizer) -> Slices[list[Fix]]:
+    def _search(self, seen: Seen, relocalizer: Relocalizer) -> TimeSliced[list[Fix]]:
         """Fixes anywhere, around the candidates first; inside the prior where there is one."""
         fixes: list[Fix] = []
         candidates = self._confirmation.places
@@ -246,13 +246,13 @@ class Localizer:
         Racks repeat: some landmarks of any agree with some of any other."""
         settings, strong = self._settings.fix, self._settings.track.strong_inliers
         return fix.inliers >= strong or (
-            fix.inliers >= settings.min_inliers and fix.hit_share >= settings.min_hit_share
+            fix.inliers >= settings.min_inliers and fix.landmark_recall >= settings.min_hit_share
         )
 
     def _in_prior(self, fix: Fix) -> bool:
         if self._prior is None or self._moment is None:
             return True
-        return self._prior.allows(Anchor.behind(self._moment, *self._at_body(fix)))
+        return self._prior.allows(PoseHypothesis.behind(self._moment, *self._at_body(fix)))
 
     # --- tracking --------------------------------------------------------------------------------------------------------
 
@@ -277,7 +277,7 @@ class Localizer:
         gain = np.linalg.solve(covariance + measured_cov, covariance).T
         rest = np.eye(6) - gain
         updated = rest @ covariance @ rest.T + gain @ measured_cov @ gain.T
-        anchor = Anchor.behind(self._moment, applied(gain @ error, map_from_body), updated)
+        anchor = PoseHypothesis.behind(self._moment, applied(gain @ error, map_from_body), updated)
         anchor.support = self._anchor.support + 1
         self._anchor = anchor
         return _Outcome(fix, "", innovation, off_m)
@@ -301,7 +301,7 @@ class Localizer:
 
     # --- confirmation ----------------------------------------------------------------------------------------------------
 
-    def _weigh(self, fixes: list[Fix]) -> Slices[_Outcome]:
+    def _weigh(self, fixes: list[Fix]) -> TimeSliced[_Outcome]:
         """Every fix speaks for a candidate or begins one; confirmed is the one that is left, or told from all others, with enough
         behind it, or with a tight prior."""
         known = self._confirmation
@@ -331,7 +331,7 @@ class Localizer:
         """The fixes of the look that goes on, with their places at the present."""
         moment = self._moment
         assert moment is not None
-        return [(fix, Anchor.behind(moment, *self._at_body(fix))) for fix in fixes]
+        return [(fix, PoseHypothesis.behind(moment, *self._at_body(fix))) for fix in fixes]
 
     def _odom(self) -> Array:
         """The present odom_from_body."""
@@ -367,7 +367,7 @@ class Localizer:
             return said
         return self._as_told(said, told)
 
-    def _as_told(self, said: Estimate, told: Anchor) -> Estimate:
+    def _as_told(self, said: Estimate, told: PoseHypothesis) -> Estimate:
         """Nothing in the map agrees: the prior and the way since, as far as that goes."""
         now, covariance = told.now_map_from_body, self._published(told.now_cov)
         radius_m = _RADIUS_95 * float(np.sqrt(np.linalg.eigvalsh(told.now_cov[3:, 3:])[-1]))
@@ -375,7 +375,7 @@ class Localizer:
         cause = self._cause or Cause.UNMATCHED
         return replace(said, status=status, map_from_body=now, cov_rot_trans=covariance, cause=cause)
 
-    def _worth(self, anchor: Anchor, odometry: OdometryEstimate) -> tuple[Status, Cause]:
+    def _worth(self, anchor: PoseHypothesis, odometry: OdometryEstimate) -> tuple[Status, Cause]:
         """Status of a confirmed place, and what is in the way of a better one."""
         settings = self._settings.track
         radius = _RADIUS_95 * float(np.sqrt(np.linalg.eigvalsh(anchor.now_cov[3:, 3:])[-1]))

@@ -15,7 +15,7 @@ _BY_SIGHT = (0.005, 0.02, 0.1)  # of a motion that no IMU vouches for: a few wro
 
 
 @dataclass
-class Anchor:
+class PoseHypothesis:
     """Where the body was in `map` at one frame of the odometry, and everything that speaks for it.
 
     map_from_body and cov_rot_trans: at that frame. now_map_from_body, now_cov: the same carried to the present. then_map_from_body,
@@ -38,16 +38,16 @@ class Anchor:
     looks: float = 0.0
     misses: int = 0
     travelled_m: float = 0.0
-    strangers: list["Anchor"] = field(default_factory=list)
+    strangers: list["PoseHypothesis"] = field(default_factory=list)
     tally: Tally = field(default_factory=Tally)
 
     @classmethod
-    def at(cls, odometry: OdometryEstimate, map_from_body: Array, cov_rot_trans: Array) -> "Anchor":
+    def at(cls, odometry: OdometryEstimate, map_from_body: Array, cov_rot_trans: Array) -> "PoseHypothesis":
         """At the present frame."""
         return cls(odometry.frame_index, odometry.stamp_ns, map_from_body, cov_rot_trans, map_from_body, cov_rot_trans)
 
     @classmethod
-    def behind(cls, moment: "Anchor", map_from_body: Array, cov_rot_trans: Array) -> "Anchor":
+    def behind(cls, moment: "PoseHypothesis", map_from_body: Array, cov_rot_trans: Array) -> "PoseHypothesis":
         """A place of the frame at which `moment` began as the identity, carried to the present as that was."""
         return cls(
             moment.frame_index, moment.stamp_ns,
@@ -70,16 +70,16 @@ class Anchor:
         self.evidence, self.hit_evidence = kept_share * self.evidence, kept_share * self.hit_evidence
         self.looks = kept_share * self.looks + 1.0
 
-    def speak(self, inliers: int, hit_share: float) -> None:
+    def speak(self, inliers: int, landmark_recall: float) -> None:
         """A fix of this look was there."""
         self.evidence += inliers
-        self.hit_evidence += hit_share
+        self.hit_evidence += landmark_recall
 
     def mark(self) -> None:
         """Remembers the present for the look that begins now."""
         self.then_map_from_body, self.then_cov = self.now_map_from_body, self.now_cov
 
-    def moved_to(self, other: "Anchor") -> None:
+    def moved_to(self, other: "PoseHypothesis") -> None:
         """Takes over where another one is."""
         self.frame_index, self.stamp_ns = other.frame_index, other.stamp_ns
         self.map_from_body, self.cov_rot_trans = other.map_from_body, other.cov_rot_trans

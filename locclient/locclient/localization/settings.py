@@ -5,7 +5,7 @@ from fleetmap.features.orb import OrbSettings
 from fleetmap.features.stereo import StereoSettings
 from fleetmap.odometry import OdometrySettings
 from fleetmap.relocalization.settings import FixSettings, RelocalizerSettings
-from locclient.localization.image_quality import SightSettings
+from locclient.localization.image_quality import ImageQualitySettings
 
 
 class TrackSettings(Section, frozen=True):
@@ -50,7 +50,7 @@ class LocalizerSettings(Section, frozen=True):
     orb: OrbSettings = OrbSettings(count=1000)
     fix: FixSettings = FixSettings()
     track: TrackSettings = TrackSettings()
-    sight: SightSettings = SightSettings()
+    sight: ImageQualitySettings = ImageQualitySettings()
 
     @property
     def relocalizer(self) -> RelocalizerSettings:

@@ -5,13 +5,13 @@ from collections.abc import Callable
 
 from fleetmap.bus import Bus
 from fleetmap.errors import LinkError, UnreachableError
-from fleetmap.messages import Part, PartQuestion, decode_message, encode_message
+from fleetmap.messages import ChunkRequest, Part, decode_message, encode_message
 
 _RETRY_S = 0.2
 _MAX_BEGUN = 8
 
 
-class PartReader:
+class ChunkReader:
     """Reads what a server sends in parts. What was begun is kept until it is whole, over errors and calls."""
 
     def __init__(
@@ -42,7 +42,7 @@ class PartReader:
             raise
 
     def _part(self, key: str, offset: int, max_bytes: int) -> Part:
-        part = self._patiently(key, encode_message(PartQuestion(offset=offset)))
+        part = self._patiently(key, encode_message(ChunkRequest(offset=offset)))
         self.received_bytes += len(part.data)
         if part.total_bytes > max_bytes:
             raise LinkError(f"{key} has {part.total_bytes} bytes where at most {max_bytes} are expected")

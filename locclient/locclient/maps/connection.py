@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fleetmap.bus import ZenohBus
-from locclient.maps.map_client import MapLink, StoreFolderLink
+from locclient.maps.map_client import LocalMapSource, MapClient
 from locclient.maps.tile_cache import StoreFolder, TileCache
 from locclient.replay.replay import RobotLink
 
@@ -19,13 +19,13 @@ def connected(options: dict[str, Any]) -> Iterator[RobotLink]:
     """A link for the options `server` or `store`, `site`, `robot`, `cache`, `cache_bytes`; closed afterwards."""
     site, robot = options["site"], options["robot"]
     if options["store"] is not None:
-        yield RobotLink(StoreFolderLink(StoreFolder(Path(options["store"])), site), None, site, robot)
+        yield RobotLink(LocalMapSource(StoreFolder(Path(options["store"])), site), None, site, robot)
         return
     folder = Path(options["cache"]) if options["cache"] is not None else default_cache_folder()
     bus = ZenohBus.connect(options["server"])
     try:
         cache = TileCache(folder, max_bytes=options["cache_bytes"])
-        link = MapLink(bus, cache, site, robot, patience_s=_PATIENCE_S)
+        link = MapClient(bus, cache, site, robot, patience_s=_PATIENCE_S)
         link.announce_presence()
         yield RobotLink(link, link, site, robot)
     finally:

@@ -33,7 +33,7 @@ from fleetmap.messages import (
     patch_key,
     robot_key,
 )
-from locclient.maps.chunked_download import PartReader
+from locclient.maps.chunked_download import ChunkReader
 from locclient.maps.tile_cache import ActiveVersion, StoreFolder, TileCache
 
 
@@ -69,7 +69,7 @@ class MapSource(Protocol):
         """Tiles of that version: all, or those of `cells` that it has."""
 
 
-class MapLink:
+class MapClient:
     """A robot's link to the server, through a cache.
 
     Bytes that are in the cache are not asked for again, so a known version can be read with the server away. Of what a robot
@@ -85,7 +85,7 @@ class MapLink:
         self._site = check_name(site, "site")
         self._robot = check_name(robot, "robot")
         self._timeout_s = timeout_s
-        self._parts = PartReader(bus, timeout_s=timeout_s, patience_s=patience_s)
+        self._parts = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
 
     @property
     def received_bytes(self) -> int:
@@ -261,7 +261,7 @@ class MapLink:
 
 
 class CachedMap:
-    """The same reading out of the cache alone, without waiting for anybody; for another thread than that of the MapLink.
+    """The same reading out of the cache alone, without waiting for anybody; for another thread than that of the MapClient.
 
     Give it a TileCache of its own: it only reads, so that the two do not disturb each other.
     """
@@ -288,7 +288,7 @@ class CachedMap:
         return shipped_vocabulary(sha256) or self._blob(sha256)
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
-        """Tiles of the version, as `MapLink.tiles`."""
+        """Tiles of the version, as `MapClient.tiles`."""
         return _collect(manifest, cells, lambda entry: self._blob(entry.sha256))
 
     def _blob(self, sha256: str) -> bytes:
@@ -298,7 +298,7 @@ class CachedMap:
         return data
 
 
-class StoreFolderLink:
+class LocalMapSource:
     """The same reading out of a store's folder, for a robot without a server."""
 
     def __init__(self, folder: StoreFolder, site: str) -> None:
@@ -319,7 +319,7 @@ class StoreFolderLink:
         return WantedVersion(site=self._site, version=version, manifest_sha256=sha256)
 
     def manifest(self, wanted: WantedVersion) -> Manifest:
-        """The wanted version's manifest; errors as of `MapLink.manifest`, StoreError where bytes are missing."""
+        """The wanted version's manifest; errors as of `MapClient.manifest`, StoreError where bytes are missing."""
         return _checked(decode_manifest(self._folder.blob(_address(wanted)[1])), wanted)
 
     def vocabulary(self, manifest: Manifest) -> bytes:
@@ -327,7 +327,7 @@ class StoreFolderLink:
         return self._folder.blob(manifest.vocabulary.sha256)
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
-        """Tiles of the version, as `MapLink.tiles`."""
+        """Tiles of the version, as `MapClient.tiles`."""
         return _collect(manifest, cells, lambda entry: self._folder.blob(entry.sha256))
 
 

@@ -20,7 +20,7 @@ class _Version:
     cells: frozenset[Cell] | None = None
 
 
-class MapRoom:
+class TileLoader:
     """Reads from one MapSource. A tile that cannot be read is left out, and its reason kept; the others stay usable."""
 
     def __init__(self, source: MapSource, settings: WindowSettings) -> None:

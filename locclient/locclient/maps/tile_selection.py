@@ -31,7 +31,7 @@ class Place:
     doubt_m: float = 0.0
 
 
-class Whereabouts:
+class PositionBound:
     """Follows a robot's estimates: while it is lost, it is within what it, or who carries it, can have come since it was not.
 
     A lost robot's own estimate leads out of the tiles that it holds, and without them it finds no other place. All tiles of a

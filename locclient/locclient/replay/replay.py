@@ -15,14 +15,14 @@ from fleetmap.mapformat import Manifest
 from fleetmap.messages import PoseMessage, RobotHealth
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import PositionPrior, SensorSet, Trajectory
-from locclient.daemon.jit_warmup import settled_memory
+from locclient.daemon.jit_warmup import gc_frozen
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.map_client import FetchedTiles, MapLink, MapSource
+from locclient.maps.map_client import FetchedTiles, MapClient, MapSource
 from locclient.replay.replay_sources import ReplaySource
 from locclient.replay.run_metrics import METRICS, FrameRecord, localised
-from locclient.robot.dock_check import DockWatch
+from locclient.robot.dock_check import DockCheck
 from locclient.robot.health_report import FixFigures
 
 _HEALTH_EVERY_S, _POSE_EVERY_S = 1.0, 0.5
@@ -34,7 +34,7 @@ class RobotLink:
     """How a replay talks to a server; `map_link` is None when it reads a store's folder."""
 
     source: MapSource
-    map_link: MapLink | None
+    map_link: MapClient | None
     site: str
     robot: str
 
@@ -72,7 +72,7 @@ class ReplayResult:
         return Trajectory(stamps, np.array([e.map_from_body for e in kept]).reshape(-1, 4, 4))
 
 
-@settled_memory()
+@gc_frozen()
 def replay(
     source: ReplaySource, link: RobotLink, settings: LocalizerSettings, prior: PositionPrior | None, *, realtime: bool,
     progress: Callable[[int], None],
@@ -104,7 +104,7 @@ def replay(
     if prior is not None:
         localizer.handle_prior(prior)
     result = ReplayResult([], [], [], manifest, tiles, [ready.note] if ready.note else [])
-    reporter, docks = _Reporter(link, result), DockWatch(source.calibration.base_from_body)
+    reporter, docks = _Reporter(link, result), DockCheck(source.calibration.base_from_body)
     begun_s, first_ns = time.monotonic(), None
     for number, imu in enumerate(source.imu_before_each()):
         decode_s = time.process_time()
@@ -207,7 +207,7 @@ class _Reporter:
     def _due(self, now_ns: int, last_ns: int, every_s: float) -> bool:
         return now_ns - last_ns >= every_s * 1e9
 
-    def _send(self, act: Callable[[MapLink], None]) -> None:
+    def _send(self, act: Callable[[MapClient], None]) -> None:
         if self._link.map_link is None or self._broken:
             return
         try:

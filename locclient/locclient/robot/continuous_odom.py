@@ -16,7 +16,7 @@ class Placed:
     map_from_odom: Array | None
 
 
-class OdomFrame:
+class ContinuousOdom:
     """Follows estimates one after another.
 
     The odometry redefines its own frame when it finds gravity, or begins anew. Before the first place that is taken over, because

@@ -13,7 +13,7 @@ _LEFT_M = 1.0  # way after which the next word of a dock is another arrival
 _STALE_M = 0.05  # way between a dock's word and the frame beyond which the two cannot be compared
 
 
-class DockWatch:
+class DockCheck:
     """Compares what docks say with estimates that were TRACKING before they said it; once for each arrival."""
 
     def __init__(self, base_from_body: Array) -> None:

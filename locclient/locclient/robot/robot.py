@@ -17,8 +17,8 @@ from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.tile_selection import Cell
-from locclient.robot.continuous_odom import OdomFrame, Placed
-from locclient.robot.dock_check import DockWatch
+from locclient.robot.continuous_odom import ContinuousOdom, Placed
+from locclient.robot.dock_check import DockCheck
 from locclient.robot.failure_monitor import Failure, FailureMonitor, Picture, PictureJudge
 from locclient.robot.version_trial import TrialSettings, Verdict, VersionTrial
 from locclient.sensors.intake import Moment
@@ -73,7 +73,7 @@ class FailureContext:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one frame brought. cpu_s: from encoded images to estimate. dock_error_m: as `DockWatch` says, None without an arrival."""
+    """What one frame brought. cpu_s: from encoded images to estimate. dock_error_m: as `DockCheck` says, None without an arrival."""
 
     estimate: Estimate
     placed: Placed
@@ -113,9 +113,9 @@ class Robot:
         )
         self._trial_settings = trial
         self._versions = _Versions()
-        self._odom = OdomFrame(calibration.base_from_body)
+        self._odom = ContinuousOdom(calibration.base_from_body)
         self._judge, self.monitor = PictureJudge(), FailureMonitor()
-        self._docks = DockWatch(calibration.base_from_body)
+        self._docks = DockCheck(calibration.base_from_body)
         self._pictures: deque[tuple[int, Image]] = deque(maxlen=_THUMBNAILS)
         self._last: tuple[RectifiedFrame, Estimate] | None = None
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording
 from mapserver.doctor import Finding, Verdict, examine
-from mapserver.survey.executor import ALONE, Worker
+from mapserver.survey.executor import SERIAL, Executor
 
 # Wrong units, axes, cameras or partners: a survey would not fail on them but be wrong. Gaps, blur and damage are its daily bread.
 DECISIVE = (
@@ -36,7 +36,7 @@ class CheckedRecording:
 
 
 def checked(
-    recording: Recording, on_frame: Callable[[], None] = lambda: None, worker: Worker = ALONE
+    recording: Recording, on_frame: Callable[[], None] = lambda: None, worker: Executor = SERIAL
 ) -> CheckedRecording:
     """The recording with what was found in it. RecordingError where a check that decides failed."""
     examination = examine(recording, on_frame, sampled=SAMPLED_FRAMES, turn_frames=TURN_FRAMES, worker=worker)

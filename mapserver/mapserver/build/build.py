@@ -22,8 +22,8 @@ from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver.build.draft_evidence import Before, examine_draft, replayed_probes
-from mapserver.build.image_spill import PictureFile
-from mapserver.build.job_record import Job, noted_job
+from mapserver.build.image_spill import ImageSpill
+from mapserver.build.job_record import Job, recorded_job
 from mapserver.build.progress import ProgressView, StageTimes
 from mapserver.build.report import Accuracy, BuildReport, accuracy, full_report, make_report, sessions_report
 from mapserver.build.survey_recordings import Admission, Surveyed, admit_recordings, survey_all, survey_recording
@@ -50,7 +50,7 @@ _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fle
 
 
 @dataclass(frozen=True, slots=True)
-class BuildOrder:
+class BuildRequest:
     """What `mapserver build` was asked for; frames is an A:B:C slice of each recording, absent files are not written.
 
     replay: earlier recordings of the current version, of which frames are looked for in the draft. threads, scheduler: who does
@@ -103,13 +103,13 @@ class Draft:
     left_out: dict[str, str]
 
 
-def run_build(order: BuildOrder, settings: SurveySettings) -> str:
+def run_build(order: BuildRequest, settings: SurveySettings) -> str:
     """Does it; the sentence says what there is now. Raises FleetmapErrors, before the survey where possible."""
     return build_draft(order, settings, noted=True).sentence
 
 
 def build_draft(
-    order: BuildOrder, settings: SurveySettings, unusable: dict[Path, str] | None = None, *, noted: bool = False
+    order: BuildRequest, settings: SurveySettings, unusable: dict[Path, str] | None = None, *, noted: bool = False
 ) -> Draft:
     """As `run_build`; noted: as a job of the store.
 
@@ -127,7 +127,7 @@ def build_draft(
         )  # fmt: skip
     with (
         MapStore.open(order.store, create=True) as maps,
-        noted_job(maps, order.site, "build") if noted else nullcontext(Job()) as job,
+        recorded_job(maps, order.site, "build") if noted else nullcontext(Job()) as job,
     ):
         parent = _parent(order, maps)
         base = None if parent is None else parent.survey
@@ -140,7 +140,7 @@ def build_draft(
         return draft
 
 
-def _parent(order: BuildOrder, maps: MapStore) -> Before | None:
+def _parent(order: BuildRequest, maps: MapStore) -> Before | None:
     """The site's current version, to build on; None for a site without one."""
     current = maps.current(order.site) if order.site in {info.site for info in maps.sites()} else None
     if current is None:
@@ -159,12 +159,12 @@ def _parent(order: BuildOrder, maps: MapStore) -> Before | None:
 
 
 def _survey(
-    order: BuildOrder, admitted: dict[Path, Admission], zones: Zones, base: SurveyMap | None, chosen: ChosenVocabulary,
+    order: BuildRequest, admitted: dict[Path, Admission], zones: Zones, base: SurveyMap | None, chosen: ChosenVocabulary,
     settings: SurveySettings, console: Console, times: StageTimes, started_s: float, unusable: dict[Path, str] | None,
 ) -> _Built:  # fmt: skip
     with (
         ProgressView(console) as view,
-        PictureFile(order.store) as shelf,
+        ImageSpill(order.store) as shelf,
         open_worker(order.threads, order.scheduler) as worker,
     ):
 
@@ -209,7 +209,7 @@ def _survey(
     return _Built(surveyed, joined, found, chosen, zones, times, started_s)
 
 
-def _say_left_out(order: BuildOrder, surveyed: list[Surveyed], joined: Joined, console: Console) -> None:
+def _say_left_out(order: BuildRequest, surveyed: list[Surveyed], joined: Joined, console: Console) -> None:
     """Names the recordings that could not be joined; raises SurveyError where none could."""
     left = [(s, o) for s, o in zip(surveyed, joined.outcomes, strict=True) if not o.joined]
     for recording, outcome in left:
@@ -229,7 +229,7 @@ def _truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
     return chained(known, joined.trajectories) if len(known) == len(truths) else None
 
 
-def _keep(order: BuildOrder, built: _Built, parent: Before | None, settings: SurveySettings, maps: MapStore) -> Draft:
+def _keep(order: BuildRequest, built: _Built, parent: Before | None, settings: SurveySettings, maps: MapStore) -> Draft:
     survey_map = built.joined.map
     for_robots = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M, _wanted_ids(parent, survey_map))
     tiles = tiles_from_survey(survey_map, chosen=for_robots)
@@ -282,7 +282,7 @@ def _keep(order: BuildOrder, built: _Built, parent: Before | None, settings: Sur
 
 
 def _examined(
-    order: BuildOrder, built: _Built, tiles: list[Tile], before: Before | None, settings: SurveySettings
+    order: BuildRequest, built: _Built, tiles: list[Tile], before: Before | None, settings: SurveySettings
 ) -> Evidence:
     replayed = [] if before is None else replayed_probes(
         order.replay, before, order.frames, order.calibration, order.use, built.joined.map.camera, settings
@@ -311,7 +311,9 @@ def _wanted_ids(parent: Before | None, survey_map: SurveyMap) -> NDArray[np.uint
     return np.unique(np.concatenate([new, *(tile.landmark_ids for tile in parent.tiles)])).astype(np.uint32)
 
 
-def _configuration(order: BuildOrder, parent: Before | None, zones: Zones, settings: SurveySettings) -> dict[str, Any]:
+def _configuration(
+    order: BuildRequest, parent: Before | None, zones: Zones, settings: SurveySettings
+) -> dict[str, Any]:
     """What the map depends on besides the recordings; no paths, which mean nothing elsewhere."""
     kept = parent is not None and bool(parent.manifest.configuration.get("frame_from_ground_truth"))
     return {
@@ -345,7 +347,7 @@ def _peak_rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
-def _write_files(order: BuildOrder, built: _Built, parent: Before | None, report: BuildReport, version: int) -> None:
+def _write_files(order: BuildRequest, built: _Built, parent: Before | None, report: BuildReport, version: int) -> None:
     if order.trajectory is not None:
         write_tum(order.trajectory, built.joined.map.trajectory)
     if order.picture is not None:

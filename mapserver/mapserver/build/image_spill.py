@@ -24,8 +24,8 @@ class _Place:
     arrays: tuple[tuple[int, np.dtype[Any], tuple[int, ...]] | None, ...]  # left, right, disparity: offset, type, shape
 
 
-class PictureFile:
-    """A PictureShelf over an unnamed file in `folder`, which the system removes with the process."""
+class ImageSpill:
+    """A ImageStore over an unnamed file in `folder`, which the system removes with the process."""
 
     def __init__(self, folder: Path) -> None:
         try:
@@ -44,7 +44,7 @@ class PictureFile:
         self._file.close()
 
     def put(self, pictures: Pictures) -> int:
-        """See PictureShelf."""
+        """See ImageStore."""
         frame, number = pictures.frame, len(self._places)
         parts = (frame.left, frame.right, frame.disparity_px)
         try:
@@ -57,7 +57,7 @@ class PictureFile:
         return number
 
     def get(self, number: int) -> Pictures:
-        """See PictureShelf."""
+        """See ImageStore."""
         if number not in self._held:
             place = self._places[number]
             left, right, disparity = (None if part is None else self._read(*part) for part in place.arrays)

@@ -19,7 +19,7 @@ class Job:
 
 
 @contextmanager
-def noted_job(maps: MapStore, site: str, kind: str) -> Iterator[Job]:
+def recorded_job(maps: MapStore, site: str, kind: str) -> Iterator[Job]:
     """Notes a job as running, then as done, or as failed with the error that ended it.
 
     One that is killed stands as running until the server, or the next job, finds that nobody holds its lock.

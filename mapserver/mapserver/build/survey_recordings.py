@@ -14,16 +14,16 @@ from fleetmap.geometry import Array
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
-from fleetmap.sensors.samples import Loss, PositionPrior, SensorSet, Trajectory
+from fleetmap.sensors.samples import DataIssue, PositionPrior, SensorSet, Trajectory
 from mapserver.build.admission import checked, with_clock
 from mapserver.build.draft_evidence import HeldOut, held_out_of
 from mapserver.build.report import check_truth
 from mapserver.build.sensor_subset import reduced
 from mapserver.build.worker import read_ahead
-from mapserver.survey.executor import ALONE, Worker
-from mapserver.survey.finish.dock_alignment import anchored_by_priors, map_from_survey
+from mapserver.survey.executor import SERIAL, Executor
+from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey
 from mapserver.survey.finish.map_transform import scaled, scaled_state
-from mapserver.survey.keyframes.keyframes import PictureShelf
+from mapserver.survey.keyframes.keyframes import ImageStore
 from mapserver.survey.loops.zones import Zones
 from mapserver.survey.pipeline import Progress, Survey, survey
 from mapserver.survey.settings import SurveySettings
@@ -38,7 +38,7 @@ class Surveyed:
     entry: RecordingEntry
     format: str
     sensor_set: SensorSet
-    losses: tuple[Loss, ...]
+    losses: tuple[DataIssue, ...]
     truth: Trajectory | None
     survey: Survey
     placed: Array | None
@@ -60,7 +60,7 @@ class Admission:
 
 def admit_recordings(
     paths: Sequence[Path], frames: str, calibration: Path | None, use: SensorSet | None, console: Console, *,
-    needs_truth: bool, unusable: dict[Path, str] | None = None, worker: Worker = ALONE,
+    needs_truth: bool, unusable: dict[Path, str] | None = None, worker: Executor = SERIAL,
 ) -> dict[Path, Admission]:  # fmt: skip
     """Examines all of them, and refuses before the work what could not end well.
 
@@ -86,7 +86,7 @@ def _admission(
     use: SensorSet | None,
     console: Console,
     needs_truth: bool,
-    worker: Worker,
+    worker: Executor,
 ) -> Admission:
     with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
         recording = reduced(opened, use)
@@ -106,8 +106,8 @@ def _check(recording: Recording, indices: NDArray[np.int64], needs_truth: bool) 
 
 def survey_recording(
     path: Path, admission: Admission, frames: str, calibration: Path | None, use: SensorSet | None, pinhole: StereoCamera | None,
-    vocabulary: Vocabulary, settings: SurveySettings, zones: Zones, progress: Progress, shelf: PictureShelf,
-    worker: Worker = ALONE,
+    vocabulary: Vocabulary, settings: SurveySettings, zones: Zones, progress: Progress, shelf: ImageStore,
+    worker: Executor = SERIAL,
 ) -> Surveyed:  # fmt: skip
     """Surveys one recording by the sensors of `use` (or all it has), as if `pinhole` (or what suits it) had seen it."""
     with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
@@ -138,7 +138,7 @@ def _placed(done: Survey, priors: Sequence[PositionPrior], base_from_body: Array
     """The survey, in metres where its priors give a scale that was unknown, and map_from_survey (4, 4) by them, None without any."""
     if done.map.scale_known:
         return done, map_from_survey(done.map, priors, base_from_body)
-    anchoring = anchored_by_priors(done.map, priors, base_from_body)
+    anchoring = aligned_by_priors(done.map, priors, base_from_body)
     if anchoring is None:
         return done, None
     in_metres = replace(done, map=scaled(done.map, anchoring.scale), state=scaled_state(done.state, anchoring.scale))

@@ -7,7 +7,7 @@ from fleetmap.bow import Vocabulary, decode_vocabulary, vocabulary_hash
 from fleetmap.bow.shipped_vocabulary import DEFAULT_VOCABULARY_SHA256, default_vocabulary
 from fleetmap.errors import MapFormatError, UsageError
 from mapserver.store import MapStore
-from mapserver.survey.loops.vocabulary_evaluation import VocabularyTrial, try_own_vocabulary
+from mapserver.survey.loops.vocabulary_evaluation import VocabularyEvaluation, try_own_vocabulary
 from mapserver.survey.pipeline import Survey
 from mapserver.survey.settings import SurveySettings
 
@@ -18,7 +18,7 @@ class ChosenVocabulary:
 
     vocabulary: Vocabulary
     source: str
-    trial: VocabularyTrial | None = None
+    trial: VocabularyEvaluation | None = None
 
     def sha256(self) -> str:
         """What maps name it by."""

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import cv2
 
 from fleetmap.errors import UsageError
-from mapserver.survey.executor import ALONE, Batch, Result, Shared, Worker
+from mapserver.survey.executor import SERIAL, Batch, Executor, Result, Shared
 
 Item = TypeVar("Item")
 EMBEDDED = "local"
@@ -25,7 +25,7 @@ _CONNECT_WITHIN_S = "20s"
 
 
 class Threads:
-    """A Worker of threads; results are computed ahead of who asks for them."""
+    """An executor of threads; results are computed ahead of who asks for them."""
 
     def __init__(self, pool: ThreadPoolExecutor, count: int) -> None:
         self._pool, self._ahead = pool, _AHEAD * count
@@ -33,12 +33,12 @@ class Threads:
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
     ) -> Iterator[Result]:
-        """See Worker."""
+        """See Executor."""
         return _in_order(lambda batch: self._pool.submit(function, shared, batch), Future.result, batches, self._ahead)
 
 
 class Cluster:
-    """A Worker of the processes behind a dask client.
+    """An executor of the processes behind a dask client.
 
     Everything travels as pickles of ours: arrays that dask unpacks itself cannot be written to, and numba would compile every
     kernel a second time for such.
@@ -52,7 +52,7 @@ class Cluster:
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
     ) -> Iterator[Result]:
-        """See Worker."""
+        """See Executor."""
         if self._shared[0] is not shared:
             packed = (secrets.token_hex(8), pickle.dumps(shared, protocol=5))
             self._shared = (shared, self._client.scatter([packed], broadcast=True, hash=False)[0])
@@ -91,7 +91,7 @@ def _in_order(
 
 
 @contextmanager
-def open_worker(threads: int | None, scheduler: str | None) -> Iterator[Worker]:
+def open_worker(threads: int | None, scheduler: str | None) -> Iterator[Executor]:
     """Threads (as many as there are cores, without a number), or the cluster of a scheduler; `local` makes one of processes here.
 
     Raises UsageError where the scheduler does not answer.
@@ -101,7 +101,7 @@ def open_worker(threads: int | None, scheduler: str | None) -> Iterator[Worker]:
         with _client(scheduler, count) as client:
             yield Cluster(client)
     elif count == 1:
-        yield ALONE
+        yield SERIAL
     else:
         with ThreadPoolExecutor(count, thread_name_prefix="survey") as pool, _opencv_alone():
             yield Threads(pool, count)

@@ -53,12 +53,12 @@ def build(
     from fleetmap.mapformat import check_name
 
     check_name(site, "site")
-    from mapserver.build.build import BuildOrder, run_build
+    from mapserver.build.build import BuildRequest, run_build
     from mapserver.build.sensor_subset import named_sensor_set, sensor_set_of
     from mapserver.config import read_config, survey_settings
 
     sensors = None if use is None else named_sensor_set(use)
-    order = BuildOrder(
+    order = BuildRequest(
         tuple(recordings),
         site,
         store,

@@ -49,11 +49,11 @@ def nightly(
 
     from fleetmap.recordings import FrameSelection
     from mapserver.config import read_config
-    from mapserver.nightly import NightOrder, run_night
+    from mapserver.nightly import NightRequest, run_night
 
     FrameSelection.parse(frames)
     settings = read_config(config_path(context))
-    order = NightOrder(site, inbox, store, time.time_ns(), settle_s, frames, calibration, zones, threads, scheduler)
+    order = NightRequest(site, inbox, store, time.time_ns(), settle_s, frames, calibration, zones, threads, scheduler)
     try:
         sentence = run_night(order, settings.survey, settings.gate, Console(stderr=True))
     except BusyError:

@@ -66,21 +66,21 @@ def _run(
     from mapserver.api.metrics import Metrics
     from mapserver.dashboard.install import install_dashboard
     from mapserver.fleet.fleet import Fleet
-    from mapserver.serving.background_tasks import run_chores, server_chores
-    from mapserver.serving.bus_service import TileService
+    from mapserver.serving.background_tasks import run_background_tasks, server_tasks
+    from mapserver.serving.bus_service import BusService
 
     # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     fleet = Fleet(maps, settings=settings.ingest)
     metrics = Metrics(maps, fleet)
-    service = TileService(maps, fleet, bus, metrics.count_bus)
+    service = BusService(maps, fleet, bus, metrics.count_bus)
 
     @asynccontextmanager
     async def lifespan(_: "FastAPI") -> AsyncIterator[None]:
         import asyncio
 
-        chores = asyncio.create_task(run_chores(server_chores(maps, fleet, service, settings)))
+        chores = asyncio.create_task(run_background_tasks(server_tasks(maps, fleet, service, settings)))
         host, port = listener.getsockname()[:2]
         typer.echo(f"http: http://{f'[{host}]' if ':' in host else host}:{port}")
         typer.echo(f"zenoh: {bus.endpoint}")

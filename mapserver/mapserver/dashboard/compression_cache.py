@@ -29,7 +29,7 @@ class _Answer:
             self.is_whole = not message.get("more_body", False)
 
 
-class KeptFiles(GZipMiddleware):
+class CompressionCache(GZipMiddleware):
     """GZipMiddleware that keeps the answers for the page library's files in memory."""
 
     def __init__(self, app: ASGIApp) -> None:

@@ -10,7 +10,7 @@ from nicegui import ui
 from fleetmap.errors import FleetmapError
 from mapserver.api.writers import Writers
 from mapserver.dashboard import failure_page, fleet_page, map_page, survey_page
-from mapserver.dashboard.compression_cache import KeptFiles
+from mapserver.dashboard.compression_cache import CompressionCache
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.layout import Rooms
@@ -54,7 +54,7 @@ def install_dashboard(
         reconnect_timeout=10.0,
         binding_refresh_interval=None,
         show_welcome_message=False,
-        gzip_middleware_factory=KeptFiles,
+        gzip_middleware_factory=CompressionCache,
     )
 
 

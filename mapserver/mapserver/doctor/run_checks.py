@@ -17,7 +17,7 @@ from mapserver.doctor.findings import Finding, Verdict
 from mapserver.doctor.gyro_images import CameraTurns, gyro_check
 from mapserver.doctor.sharpness import laplacian_variance, sharpness
 from mapserver.doctor.stereo import StereoMatches, epipolar_error, match_pair, swapped_cameras
-from mapserver.survey.executor import ALONE, Worker
+from mapserver.survey.executor import SERIAL, Executor
 
 SAMPLED_FRAMES = 40
 TURN_FRAMES = 200
@@ -59,7 +59,7 @@ def examine(
     *,
     sampled: int = SAMPLED_FRAMES,
     turn_frames: int = TURN_FRAMES,
-    worker: Worker = ALONE,
+    worker: Executor = SERIAL,
 ) -> Examination:
     """Everything the checks say about a recording.
 
@@ -97,7 +97,7 @@ class _Seen:
     variances: list[float]
 
 
-def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, worker: Worker) -> _Seen:
+def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, worker: Executor) -> _Seen:
     seen = _Seen([], [], [])
     moments = _moments(recording, frames, rectifier, count)
     for variance, pair, zero in worker.map(_look, rectifier.camera, moments):
@@ -135,7 +135,7 @@ def _look(camera: StereoCamera, moment: _Moment) -> tuple[float, StereoMatches |
 
 
 def _camera_turns(
-    recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, worker: Worker
+    recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, worker: Executor
 ) -> CameraTurns:
     starts, ends, rates = [], [], []
     pairs = _consecutive(recording, frames, rectifier, count)

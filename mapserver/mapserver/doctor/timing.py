@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fleetmap.sensors.samples import Loss, Stamps
+from fleetmap.sensors.samples import DataIssue, Stamps
 from mapserver.doctor.findings import Finding, Verdict, judge, not_judged
 
 SPARSE_S = 0.35  # frames further apart than this are keyframes, not a video
@@ -47,7 +47,7 @@ def imu_gaps(imu_stamps_ns: Stamps) -> Finding:
     return _gaps("imu gaps", imu_stamps_ns, max(3.5 * median_period_s(imu_stamps_ns), 0.02), 0.2, "inertial samples")
 
 
-def stamp_order(losses: Sequence[Loss]) -> Finding:
+def stamp_order(losses: Sequence[DataIssue]) -> Finding:
     """Whether stamps that do not increase were left out when the recording was opened."""
     found = [loss for loss in losses if "stamps not increasing" in loss.what]
     limit = "none may be out of order"
@@ -58,7 +58,7 @@ def stamp_order(losses: Sequence[Loss]) -> Finding:
     return Finding("stamp order", Verdict.FAIL, float(len(found)), limit, sentence)
 
 
-def other_losses(losses: Sequence[Loss]) -> list[Finding]:
+def other_losses(losses: Sequence[DataIssue]) -> list[Finding]:
     """One warning for everything else that could not be read."""
     return [
         Finding(

@@ -20,8 +20,8 @@ from fleetmap.messages import (
     report_dict,
 )
 from mapserver.fleet.ingest import Ingest, IngestSettings
-from mapserver.fleet.rejected_reports import RefusedReports, refused
-from mapserver.fleet.version_assignment import SitePlan, read_plan
+from mapserver.fleet.rejected_reports import RejectedReports, refused
+from mapserver.fleet.version_assignment import VersionAssignment, read_plan
 from mapserver.fleet_statistics.clock_skew import ClockSkew
 from mapserver.store import MapStore
 
@@ -77,7 +77,7 @@ class Fleet:
         self._clock_ns = clock_ns
         self._lock = threading.Lock()
         self._ingest = Ingest(store, settings)
-        self._refused = RefusedReports(store.folder / "refused")
+        self._refused = RejectedReports(store.folder / "refused")
         self._robots: dict[tuple[str, str], _Robot] = {}
         for info in store.robots():
             skew = ClockSkew(info.last_report.get("clock_ahead_s"))
@@ -189,7 +189,7 @@ class Fleet:
         now_ns = self._clock_ns()
         with self._lock:
             chosen = [(key, robot) for key, robot in sorted(self._robots.items()) if site in {None, key[0]}]
-        plans: dict[str, SitePlan] = {}
+        plans: dict[str, VersionAssignment] = {}
         for key, _ in chosen:
             if key[0] not in plans:
                 plans[key[0]] = read_plan(self._store, key[0])
@@ -209,7 +209,7 @@ class Fleet:
         return entry
 
 
-def _status(key: tuple[str, str], robot: _Robot, plan: SitePlan, now_ns: int) -> RobotStatus:
+def _status(key: tuple[str, str], robot: _Robot, plan: VersionAssignment, now_ns: int) -> RobotStatus:
     return RobotStatus(
         site=key[0],
         robot=key[1],

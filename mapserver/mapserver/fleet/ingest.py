@@ -12,7 +12,7 @@ from fleetmap.config import Section
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
 from mapserver.fleet_statistics.clock_skew import server_time_ns
-from mapserver.fleet_statistics.health_stream import RobotWatch
+from mapserver.fleet_statistics.health_stream import HealthStream
 from mapserver.fleet_statistics.kpis import Tally, hour_of
 from mapserver.store import CanaryRow, FleetBatch, FleetRetention, MapStore, TallyKey, TraceRow, tile_key
 
@@ -47,7 +47,7 @@ class IngestSettings(Section, frozen=True):
 
 @dataclass(slots=True)
 class _Stream:
-    watch: RobotWatch = field(default_factory=RobotWatch)
+    watch: HealthStream = field(default_factory=HealthStream)
     trace_ns: int = -(1 << 62)
     status: str = ""
 

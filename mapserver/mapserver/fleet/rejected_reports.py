@@ -27,7 +27,7 @@ def refused(payload: bytes, reason: str) -> FailureAck:
     return FailureAck(id=known.id, refused=reason[:2000])
 
 
-class RefusedReports:
+class RejectedReports:
     """A folder of the last of them, the bytes of each beside its reason. A disk that refuses costs only these."""
 
     def __init__(self, folder: Path) -> None:

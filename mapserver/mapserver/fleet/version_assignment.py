@@ -8,7 +8,7 @@ from mapserver.store import CanaryRow, MapStore
 
 
 @dataclass(frozen=True, slots=True)
-class SitePlan:
+class VersionAssignment:
     """The current version, and the one that some robots try before the others; None where there is none."""
 
     current: WantedVersion
@@ -25,7 +25,7 @@ class SitePlan:
         return self.tried if self.tried is not None and self.is_canary(robot) else self.current
 
 
-def read_plan(store: MapStore, site: str) -> SitePlan:
+def read_plan(store: MapStore, site: str) -> VersionAssignment:
     """The plan of a site as it is now; raises UsageError for an unknown one."""
     info = store.current(site)
     current = WantedVersion(
@@ -35,6 +35,8 @@ def read_plan(store: MapStore, site: str) -> SitePlan:
     )
     running = store.canaries(site, running=True)
     if not running:
-        return SitePlan(current, None, None)
+        return VersionAssignment(current, None, None)
     address = store.version(site, running[0].version).manifest_sha256
-    return SitePlan(current, running[0], WantedVersion(site=site, version=running[0].version, manifest_sha256=address))
+    return VersionAssignment(
+        current, running[0], WantedVersion(site=site, version=running[0].version, manifest_sha256=address)
+    )

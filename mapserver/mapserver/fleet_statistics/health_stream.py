@@ -14,7 +14,7 @@ _MAX_COUNT = 1 << 40
 _MAX_FIGURE = 1e15
 
 
-class RobotWatch:
+class HealthStream:
     """Follows one robot: runs, driving, first fixes, blindness. Reports must come in the order of their stamps."""
 
     def __init__(self) -> None:

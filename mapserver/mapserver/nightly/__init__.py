@@ -1,5 +1,5 @@
 """What a site's map does every night: take what came in, check it, build on the current version, and publish if the gate agrees."""
 
-from mapserver.nightly.night import NightOrder, last_report, run_night
+from mapserver.nightly.night import NightRequest, last_report, run_night
 
-__all__ = ["NightOrder", "last_report", "run_night"]
+__all__ = ["NightRequest", "last_report", "run_night"]

@@ -14,7 +14,7 @@ from typing import Any
 from rich.console import Console
 
 from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, SurveyError
-from mapserver.build.build import BuildOrder, build_draft
+from mapserver.build.build import BuildRequest, build_draft
 from mapserver.build.job_lock import INTERRUPTED, end_interrupted, held
 from mapserver.nightly import inbox as boxes
 from mapserver.nightly.lock import only_one
@@ -27,7 +27,7 @@ JOB = "nightly"
 
 
 @dataclass(frozen=True, slots=True)
-class NightOrder:
+class NightRequest:
     """What `mapserver nightly` was asked for. now_ns: the moment by which recordings have been quiet for `settle_s`, or not."""
 
     site: str
@@ -67,7 +67,7 @@ class Night:
         }
 
 
-def run_night(order: NightOrder, survey: SurveySettings, gate: GateSettings, console: Console) -> str:
+def run_night(order: NightRequest, survey: SurveySettings, gate: GateSettings, console: Console) -> str:
     """Does it; the sentence says how it ended.
 
     Raises BusyError where another night of the site runs, GateRefusedError for a refused draft, and other FleetmapErrors; the job
@@ -124,7 +124,7 @@ class _Conductor:
     """The steps of a night."""
 
     def __init__(
-        self, order: NightOrder, survey: SurveySettings, gate: GateSettings, console: Console, maps: MapStore, night: Night
+        self, order: NightRequest, survey: SurveySettings, gate: GateSettings, console: Console, maps: MapStore, night: Night
     ) -> None:  # fmt: skip
         self._order, self._survey, self._gate = order, survey, gate
         self._console, self._maps, self._night = console, maps, night
@@ -190,7 +190,7 @@ class _Conductor:
         order = self._order
         by_hash = {recorded.sha256: recorded for recorded in recordings}
         unusable: dict[Path, str] = {}
-        build = BuildOrder(
+        build = BuildRequest(
             tuple(r.path for r in recordings), order.site, order.store, order.frames, order.calibration, order.zones,
             replay=tuple(self._replayed()), actor=Actor(JOB, _reason(self._night.job)),
             threads=order.threads, scheduler=order.scheduler,

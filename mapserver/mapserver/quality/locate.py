@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from fleetmap.features.matching import match_by_projection, match_mutual
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.pnp.pnp import Resection, ransac_resection, refine_resection
+from fleetmap.pnp.pnp import PnpResult, ransac_pnp, refine_pnp
 from mapserver.quality.probes import Look
 from mapserver.quality.tile_map import TileMap
 from mapserver.survey.settings import SurveySettings
@@ -57,12 +57,12 @@ def locate(tile_map: TileMap, look: Look, prior_map_from_cam: Array, settings: S
 
 @dataclass(frozen=True, slots=True)
 class _Match:
-    resection: Resection
+    resection: PnpResult
     measured: Array
     residual_px: float
 
 
-def _first(tile_map: TileMap, look: Look, prior: Array, settings: SurveySettings) -> Resection | None:
+def _first(tile_map: TileMap, look: Look, prior: Array, settings: SurveySettings) -> PnpResult | None:
     rows = tile_map.neighbourhood(prior, PRIOR_RADIUS_M)
     pairs = match_mutual(
         tile_map.descriptors[rows], look.descriptors, settings.pairs.max_distance, settings.pairs.ratio
@@ -70,7 +70,7 @@ def _first(tile_map: TileMap, look: Look, prior: Array, settings: SurveySettings
     least = settings.sessions.min_inliers // 2
     points_map, measured = tile_map.points_map[rows[pairs[:, 0]]], look.pixels[pairs[:, 1]]
     sigmas_px = np.full((len(pairs), 2), settings.pairs.match_sigma_px)
-    return ransac_resection(
+    return ransac_pnp(
         look.camera, points_map, measured, sigmas_px, threshold_px=_RANSAC_PX, min_inliers=least, seed=settings.seed
     )
 
@@ -91,7 +91,7 @@ def _again(
     points_map = tile_map.points_map[rows[hit]]
     scale = SCALE_FACTOR ** np.minimum(look.octaves[found[hit]], 4).astype(np.float64)
     sigmas_px = settings.pairs.match_sigma_px * np.column_stack([scale, np.maximum(scale, 1.0)])
-    solved = refine_resection(look.camera, points_map, measured, sigmas_px, cam_from_map)
+    solved = refine_pnp(look.camera, points_map, measured, sigmas_px, cam_from_map)
     if solved is None or not solved.inliers.any():
         return None
     seen = points_map[solved.inliers] @ solved.cam_from_source[:3, :3].T + solved.cam_from_source[:3, 3]

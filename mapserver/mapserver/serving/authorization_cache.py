@@ -8,7 +8,7 @@ _KEEP_S = 5.0
 _MAX_KEPT = 20_000
 
 
-class RecentKinds:
+class AuthorizationCache:
     """For several threads. A whole fleet asks for the parts of the same things: the store is asked once in some seconds.
 
     Only what may be fetched is remembered, so that a version is served as soon as it is published; what `gc` took away is

@@ -11,7 +11,7 @@ from mapserver.build.job_lock import end_interrupted
 from mapserver.config import MapserverConfig
 from mapserver.fleet.canary_controller import review
 from mapserver.fleet.fleet import Fleet
-from mapserver.serving.bus_service import TileService
+from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 
 _ANNOUNCE_EVERY_S = 1.0
@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
-class Chore:
+class BackgroundTask:
     """Something to do again and again."""
 
     name: str
@@ -30,16 +30,18 @@ class Chore:
     due_s: float = 0.0
 
 
-def server_chores(store: MapStore, fleet: Fleet, service: TileService, settings: MapserverConfig) -> list[Chore]:
+def server_tasks(store: MapStore, fleet: Fleet, service: BusService, settings: MapserverConfig) -> list[BackgroundTask]:
     """All chores of a server."""
     ingest = settings.ingest
     return [
-        Chore("announcing versions", _ANNOUNCE_EVERY_S, service.announce_changes),
-        Chore("keeping reports", ingest.flush_every_s, fleet.flush),
-        Chore("looking for robots", ingest.presence_every_s, service.look_for_robots),
-        Chore("removing old reports", ingest.prune_every_s, fleet.prune),
-        Chore("looking for jobs that were killed", _JOBS_EVERY_S, lambda: end_interrupted(store, time.time_ns())),
-        Chore(
+        BackgroundTask("announcing versions", _ANNOUNCE_EVERY_S, service.announce_changes),
+        BackgroundTask("keeping reports", ingest.flush_every_s, fleet.flush),
+        BackgroundTask("looking for robots", ingest.presence_every_s, service.look_for_robots),
+        BackgroundTask("removing old reports", ingest.prune_every_s, fleet.prune),
+        BackgroundTask(
+            "looking for jobs that were killed", _JOBS_EVERY_S, lambda: end_interrupted(store, time.time_ns())
+        ),
+        BackgroundTask(
             "looking at canaries",
             settings.canary.check_every_s,
             lambda: review(store, settings.canary, time.time_ns()),
@@ -47,7 +49,7 @@ def server_chores(store: MapStore, fleet: Fleet, service: TileService, settings:
     ]
 
 
-async def run_chores(chores: list[Chore]) -> None:
+async def run_background_tasks(chores: list[BackgroundTask]) -> None:
     """Does them in turn, in a thread, until it is cancelled. One that fails is tried again at its next time."""
     while True:
         for chore in chores:

@@ -24,8 +24,8 @@ from fleetmap.messages import (
     split_key,
 )
 from mapserver.fleet.fleet import Fleet
-from mapserver.serving.authorization_cache import RecentKinds
-from mapserver.serving.byte_cache import RecentBytes
+from mapserver.serving.authorization_cache import AuthorizationCache
+from mapserver.serving.byte_cache import ByteCache
 from mapserver.store import MapStore
 
 Count = Callable[[str, str, int], None]
@@ -39,7 +39,7 @@ _PATCHED_KINDS = {"tile", "manifest"}
 _PREPARE_S = 10.0  # in all: longer would keep robots and other chores waiting
 
 
-class TileService:
+class BusService:
     """Serves a store on a bus from its making to `close`. Reads what other processes publish meanwhile.
 
     Bytes go out in parts; what was sent last is kept in memory, because robots ask for the same things at the same time.
@@ -51,10 +51,10 @@ class TileService:
         self._bus = bus
         self._count = count
         self._announced: dict[tuple[str, str], str | None] = {}
-        self._recent = RecentBytes(_RECENT_BYTES)
-        self._patches = RecentBytes(_RECENT_PATCHES_BYTES)
+        self._recent = ByteCache(_RECENT_BYTES)
+        self._patches = ByteCache(_RECENT_PATCHES_BYTES)
         self._patching = threading.Lock()
-        self._kinds = RecentKinds(store.served_kind)
+        self._kinds = AuthorizationCache(store.served_kind)
         self._handles: list[Handle] = [
             bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
             bus.queryable(robot_key("*", "*", "failures"), self._counted("failure", self._failure)),

@@ -7,7 +7,7 @@ from collections.abc import Callable
 _ENTRY_BYTES = 200  # what an entry takes beside its bytes, so that empty ones are bounded too
 
 
-class RecentBytes:
+class ByteCache:
     """For several threads. Holds at most `max_bytes`; the least recently used go first."""
 
     def __init__(self, max_bytes: int) -> None:

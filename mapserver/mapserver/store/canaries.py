@@ -5,10 +5,10 @@ import sqlite3
 from fleetmap.errors import StateError
 from mapserver.store.fleet_rows import CanaryRow
 from mapserver.store.rows import Actor, VersionInfo
-from mapserver.store.transactions import Ledger
+from mapserver.store.transactions import Transactions
 
 
-def canaries(ledger: Ledger, site: str | None, *, running: bool) -> list[CanaryRow]:
+def canaries(ledger: Transactions, site: str | None, *, running: bool) -> list[CanaryRow]:
     """Canaries (of a site), the last one first."""
     rows = ledger.query(
         """SELECT * FROM canaries WHERE (?1 IS NULL OR site = ?1) AND (?2 = 0 OR state = 'running') ORDER BY id DESC""",
@@ -18,7 +18,7 @@ def canaries(ledger: Ledger, site: str | None, *, running: bool) -> list[CanaryR
 
 
 def start_canary(
-    ledger: Ledger, version: VersionInfo, base_version: int, share: float, threshold: float, actor: Actor
+    ledger: Transactions, version: VersionInfo, base_version: int, share: float, threshold: float, actor: Actor
 ) -> None:
     """Begins; StateError where another process began one meanwhile, or made another version current."""
     with ledger.write() as connection:
@@ -45,7 +45,7 @@ def start_canary(
         ledger.log(connection, version.site, "canary_started", detail, version=version.version, actor=actor)
 
 
-def take_back_canary(ledger: Ledger, canary: CanaryRow, outcome: str, actor: Actor) -> None:
+def take_back_canary(ledger: Transactions, canary: CanaryRow, outcome: str, actor: Actor) -> None:
     """Ends it and retires its version. StateError where it does not run any more."""
     with ledger.write() as connection:
         check_running(connection, canary)
@@ -67,7 +67,7 @@ def check_running(connection: sqlite3.Connection, canary: CanaryRow) -> None:
         raise StateError(f"version {canary.version} of site {canary.site} is not tried any more; look at `versions`")
 
 
-def close_canary(ledger: Ledger, connection: sqlite3.Connection, site: str, version: int, actor: Actor) -> None:
+def close_canary(ledger: Transactions, connection: sqlite3.Connection, site: str, version: int, actor: Actor) -> None:
     """Ends what runs at a site where `version` becomes current, within that transaction: its comparison is over."""
     running = _running(connection, site)
     if running is None:
@@ -88,7 +88,7 @@ def _running(connection: sqlite3.Connection, site: str) -> tuple[int, int] | Non
     return row
 
 
-def _end(ledger: Ledger, connection: sqlite3.Connection, number: int, state: str, outcome: str) -> None:
+def _end(ledger: Transactions, connection: sqlite3.Connection, number: int, state: str, outcome: str) -> None:
     connection.execute(
         "UPDATE canaries SET state = ?, ended_ns = ?, outcome = ? WHERE id = ?",
         (state, ledger.now_ns(), outcome, number),

@@ -19,7 +19,7 @@ from mapserver.store.fleet_rows import (
     PictureRow,
     TraceRow,
 )
-from mapserver.store.transactions import Ledger
+from mapserver.store.transactions import Transactions
 
 TallyKey = tuple[str, str, str, int]
 """Site, axis, key, hour."""
@@ -48,7 +48,7 @@ class FleetBatch:
 class FleetRecords:
     """The part of an open store that knows how the fleet does."""
 
-    def __init__(self, ledger: Ledger) -> None:
+    def __init__(self, ledger: Transactions) -> None:
         self._ledger = ledger
         self._key_ids: dict[tuple[str, str, str], int] = {}
 

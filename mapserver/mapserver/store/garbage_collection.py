@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.lifecycle import ROLLBACK_TARGET
 from mapserver.store.rows import Actor, VersionInfo
-from mapserver.store.transactions import Ledger
+from mapserver.store.transactions import Transactions
 
 _DAY_NS = 86_400_000_000_000
 
@@ -35,7 +35,7 @@ class Garbage:
     freed_bytes: int = 0
 
 
-def collect(ledger: Ledger, blobs: BlobFolder, retention: Retention, *, dry_run: bool, actor: Actor) -> Garbage:
+def collect(ledger: Transactions, blobs: BlobFolder, retention: Retention, *, dry_run: bool, actor: Actor) -> Garbage:
     """Removes versions first, which must be on the disk before the first file goes. The caller holds the lock alone.
 
     Never touched: current versions, those that some robots try, what a rollback would go to, what a robot runs, the vocabularies of sites.
@@ -58,7 +58,7 @@ def collect(ledger: Ledger, blobs: BlobFolder, retention: Retention, *, dry_run:
     return garbage
 
 
-def _plan(ledger: Ledger, retention: Retention, garbage: Garbage) -> None:
+def _plan(ledger: Transactions, retention: Retention, garbage: Garbage) -> None:
     now_ns = ledger.now_ns()
     old_ns = now_ns - int(retention.keep_days * _DAY_NS)
     for row in ledger.query("SELECT site FROM sites ORDER BY site"):
@@ -79,7 +79,7 @@ def _plan(ledger: Ledger, retention: Retention, garbage: Garbage) -> None:
         garbage.removed += sorted((site, v.version) for v in gone if v.version not in needed)
 
 
-def _protected(ledger: Ledger, site: str, seen_since_ns: int) -> set[int]:
+def _protected(ledger: Transactions, site: str, seen_since_ns: int) -> set[int]:
     current = ledger.query("SELECT version FROM versions WHERE site = ? AND state = 'current'", (site,))
     robots = ledger.query(
         "SELECT DISTINCT version FROM robots WHERE site = ? AND version IS NOT NULL AND last_seen_ns >= ?",
@@ -90,7 +90,7 @@ def _protected(ledger: Ledger, site: str, seen_since_ns: int) -> set[int]:
     return {row["version"] for row in (*current, *robots, *tried, *before)}
 
 
-def _write_down(ledger: Ledger, connection: sqlite3.Connection, garbage: Garbage, actor: Actor) -> None:
+def _write_down(ledger: Transactions, connection: sqlite3.Connection, garbage: Garbage, actor: Actor) -> None:
     for site, version in garbage.retired:
         connection.execute(
             "UPDATE versions SET state = 'retired', retired_ns = ? WHERE site = ? AND version = ?",
@@ -103,7 +103,7 @@ def _write_down(ledger: Ledger, connection: sqlite3.Connection, garbage: Garbage
         ledger.log(connection, site, "removed", f"version {version}", version=version, actor=actor)
 
 
-def _mentioned(ledger: Ledger, leaving: set[tuple[str, int]]) -> set[str]:
+def _mentioned(ledger: Transactions, leaving: set[tuple[str, int]]) -> set[str]:
     rows = ledger.query("SELECT site, version, sha256 FROM version_blobs")
     kept = {row["sha256"] for row in rows if (row["site"], row["version"]) not in leaving}
     vocabularies = ledger.query("SELECT vocabulary_sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL")

@@ -13,7 +13,7 @@ from mapserver.quality.gate import Verdict
 from mapserver.store.canaries import check_running, close_canary
 from mapserver.store.fleet_rows import CanaryRow
 from mapserver.store.rows import Actor, VersionInfo
-from mapserver.store.transactions import Ledger
+from mapserver.store.transactions import Transactions
 
 # The row of what was current before what is current now.
 ROLLBACK_TARGET = """
@@ -22,7 +22,7 @@ ROLLBACK_TARGET = """
     ORDER BY id DESC LIMIT 1"""
 
 
-def record_verdict(ledger: Ledger, draft: VersionInfo, verdict: Verdict, *, forced: bool, actor: Actor) -> None:
+def record_verdict(ledger: Transactions, draft: VersionInfo, verdict: Verdict, *, forced: bool, actor: Actor) -> None:
     """Keeps what the gate said; a refusal also stands in the log."""
     reasons = [*verdict.hard_reasons, *verdict.reasons]
     with ledger.write() as connection:
@@ -56,7 +56,7 @@ def refusal(draft: VersionInfo, verdict: Verdict) -> GateRefusedError:
     return GateRefusedError(f"draft {draft.version} of {draft.site} is refused: {reasons}; {way_out}")
 
 
-def admit(ledger: Ledger, draft: VersionInfo, actor: Actor) -> None:
+def admit(ledger: Transactions, draft: VersionInfo, actor: Actor) -> None:
     """Makes a draft a published version that is not current, for robots that try it first."""
     with ledger.write() as connection:
         done = connection.execute(
@@ -69,7 +69,7 @@ def admit(ledger: Ledger, draft: VersionInfo, actor: Actor) -> None:
         ledger.log(connection, draft.site, "admitted", detail, version=draft.version, actor=actor)
 
 
-def publish(ledger: Ledger, draft: VersionInfo, judged_against: int | None, actor: Actor) -> None:
+def publish(ledger: Transactions, draft: VersionInfo, judged_against: int | None, actor: Actor) -> None:
     """Makes a draft current that was compared with version `judged_against`; StateError where someone was faster."""
     with ledger.write() as connection:
         left = _leave_current(connection, draft.site, "published")
@@ -95,7 +95,7 @@ def publish(ledger: Ledger, draft: VersionInfo, judged_against: int | None, acto
         ledger.log(connection, draft.site, "published", detail, version=draft.version, actor=actor)
 
 
-def promote(ledger: Ledger, wanted: VersionInfo, actor: Actor, canary: CanaryRow | None = None) -> None:
+def promote(ledger: Transactions, wanted: VersionInfo, actor: Actor, canary: CanaryRow | None = None) -> None:
     """Makes a published or retired version current; raises StateError for a draft, nothing happens to the current.
 
     canary: only while this one runs; StateError where it does not.
@@ -118,7 +118,7 @@ def promote(ledger: Ledger, wanted: VersionInfo, actor: Actor, canary: CanaryRow
         ledger.log(connection, wanted.site, "promoted", detail, version=wanted.version, actor=actor)
 
 
-def roll_back(ledger: Ledger, site: str, actor: Actor) -> int:
+def roll_back(ledger: Transactions, site: str, actor: Actor) -> int:
     """Makes the version current that was so before, retires the one that is, and returns the number.
 
     Raises StateError where none was current before.
@@ -139,7 +139,7 @@ def roll_back(ledger: Ledger, site: str, actor: Actor) -> int:
 
 
 def insert_version(
-    ledger: Ledger,
+    ledger: Transactions,
     connection: sqlite3.Connection,
     manifest: Manifest,
     manifest_sha256: str,
@@ -195,7 +195,7 @@ def _make_current(connection: sqlite3.Connection, site: str, version: int) -> No
         raise StateError(f"version {version} of site {site} is not published any more; look at `mapserver versions`")
 
 
-def _enter_current(ledger: Ledger, connection: sqlite3.Connection, site: str, version: int) -> None:
+def _enter_current(ledger: Transactions, connection: sqlite3.Connection, site: str, version: int) -> None:
     connection.execute(
         "INSERT INTO currents (site, version, since_ns) VALUES (?, ?, ?)", (site, version, ledger.now_ns())
     )

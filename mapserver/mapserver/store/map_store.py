@@ -39,7 +39,7 @@ from mapserver.store.export_import import ExportReader, open_export, write_expor
 from mapserver.store.files import locked, make_folder, read_file, sync_folder, write_atomically
 from mapserver.store.fleet_rows import CanaryRow
 from mapserver.store.garbage_collection import Garbage, Retention, collect
-from mapserver.store.queries import StoreRecords
+from mapserver.store.queries import StoreQueries
 from mapserver.store.rows import NOBODY, Actor, DraftDetails, VersionInfo
 from mapserver.store.verification import Findings, verify
 from mapserver.store.version_diff import Difference, difference
@@ -49,7 +49,7 @@ _USUAL_RETENTION = Retention()
 _RECENT_NS = 2 * 86_400_000_000_000  # robots silent for longer do not count as somebody to try a version
 
 
-class MapStore(StoreRecords):
+class MapStore(StoreQueries):
     """One open store. Methods may be called from any thread; every process opens its own."""
 
     def __init__(self, root: Path, clock_ns: Callable[[], int]) -> None:

@@ -17,20 +17,20 @@ from mapserver.store.fleet_records import FleetRecords
 from mapserver.store.fleet_rows import CanaryRow
 from mapserver.store.lifecycle import ROLLBACK_TARGET
 from mapserver.store.rows import NOBODY, Actor, Event, JobInfo, RobotInfo, SiteInfo, VerdictRow, VersionInfo
-from mapserver.store.transactions import Ledger
+from mapserver.store.transactions import Transactions
 
 JOB_STATES = ("running", "done", "failed")
 _SERVED_KINDS = ("manifest", "tile", "vocabulary")
 
 
-class StoreRecords:
+class StoreQueries:
     """The part of an open store that changes no version."""
 
     def __init__(self, root: Path, clock_ns: Callable[[], int]) -> None:
         self._root = root
         self._clock_ns = clock_ns
         self._blobs = BlobFolder(root)
-        self._ledger = Ledger(root / "store.sqlite3", clock_ns)
+        self._ledger = Transactions(root / "store.sqlite3", clock_ns)
         self.fleet = FleetRecords(self._ledger)
 
     @property

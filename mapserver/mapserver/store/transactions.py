@@ -12,7 +12,7 @@ from mapserver.store.database import open_database, open_reader, transaction
 from mapserver.store.rows import Actor
 
 
-class Ledger:
+class Transactions:
     """Methods may be called from any thread.
 
     One connection writes and another one reads, each under a lock of its own: reading does not wait while a write is forced to the

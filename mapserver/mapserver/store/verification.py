@@ -7,7 +7,7 @@ from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import Manifest, current_path, decode_manifest
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.rows import VersionInfo
-from mapserver.store.transactions import Ledger
+from mapserver.store.transactions import Transactions
 
 
 @dataclass(slots=True)
@@ -26,7 +26,7 @@ class Findings:
     faults: list[str] = field(default_factory=list)
 
 
-def verify(root: Path, ledger: Ledger, blobs: BlobFolder) -> Findings:
+def verify(root: Path, ledger: Transactions, blobs: BlobFolder) -> Findings:
     """Reads everything in the store. Raises StoreError only where the database cannot be read at all."""
     found = Findings()
     found.faults += [f"database: {row['integrity_check']}" for row in _unless_ok(ledger)]
@@ -44,11 +44,11 @@ def verify(root: Path, ledger: Ledger, blobs: BlobFolder) -> Findings:
 _FOREIGN = "PRAGMA foreign_key_check"
 
 
-def _unless_ok(ledger: Ledger) -> list[dict[str, str]]:
+def _unless_ok(ledger: Transactions) -> list[dict[str, str]]:
     return [row for row in ledger.query("PRAGMA integrity_check") if row["integrity_check"] != "ok"]
 
 
-def _check_blobs(ledger: Ledger, blobs: BlobFolder, found: Findings) -> set[str]:
+def _check_blobs(ledger: Transactions, blobs: BlobFolder, found: Findings) -> set[str]:
     """The addresses whose bytes are whole."""
     mentioned = {row["sha256"] for row in ledger.query("SELECT DISTINCT sha256 FROM version_blobs")}
     mentioned |= {
@@ -66,7 +66,9 @@ def _check_blobs(ledger: Ledger, blobs: BlobFolder, found: Findings) -> set[str]
     return (mentioned & present) - damaged
 
 
-def _check_version(ledger: Ledger, blobs: BlobFolder, info: VersionInfo, sound: set[str], found: Findings) -> None:
+def _check_version(
+    ledger: Transactions, blobs: BlobFolder, info: VersionInfo, sound: set[str], found: Findings
+) -> None:
     name = f"version {info.version} of {info.site}"
     if info.manifest_sha256 not in sound:
         return  # told with the blobs, unless nothing mentions it
@@ -106,7 +108,13 @@ def _figures_of(manifest: Manifest) -> tuple[object, ...]:
 
 
 def _check_site(
-    root: Path, ledger: Ledger, site: str, last_version: int, vocabulary: str | None, sound: set[str], found: Findings
+    root: Path,
+    ledger: Transactions,
+    site: str,
+    last_version: int,
+    vocabulary: str | None,
+    sound: set[str],
+    found: Findings,
 ) -> None:
     versions = {v["version"]: v for v in ledger.query("SELECT * FROM versions WHERE site = ?", (site,))}
     if versions and max(versions) > last_version:

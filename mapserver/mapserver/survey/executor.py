@@ -8,7 +8,7 @@ Result = TypeVar("Result")
 Shared = TypeVar("Shared")
 
 
-class Worker(Protocol):
+class Executor(Protocol):
     """Does batches, in any order and anywhere; function and arguments can be pickled."""
 
     def map(
@@ -17,17 +17,17 @@ class Worker(Protocol):
         """function(shared, batch) of every batch, in their order. `shared` travels once, however many calls it takes part in."""
 
 
-class Alone:
+class SerialExecutor:
     """Does everything itself, one batch after the other, each when its result is asked for."""
 
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
     ) -> Iterator[Result]:
-        """See Worker."""
+        """See Executor."""
         return (function(shared, batch) for batch in batches)
 
 
-ALONE = Alone()
+SERIAL = SerialExecutor()
 
 
 def in_batches(items: Sequence[Any], size: int) -> list[Any]:

@@ -11,12 +11,12 @@ from fleetmap.odometry import OdometryEstimate, OdometryStatus, make_odometry
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, WheelSample, wheel_between
-from mapserver.survey.executor import ALONE, Worker
+from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.keyframes.keyframes import (
     FrameSummary,
+    ImageStore,
     Keyframe,
     KeyframePolicy,
-    PictureShelf,
     make_keyframes,
     sharpness,
 )
@@ -27,7 +27,7 @@ _GIVEN_UP_RAD, _GIVEN_UP_M = 0.1, 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class FirstGuess:
+class OdometryPass:
     """Odometry of F frames and K keyframes.
 
     odom_from_body (F, 4, 4), covariances (F, 6, 6) in odom axes, rotation first; tracked (F,) false where nothing tied the frame
@@ -47,9 +47,9 @@ class FirstGuess:
 
 def run_odometry(
     frames: Iterable[CameraFrame | RectifiedFrame], imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
-    settings: SurveySettings, progress: Callable[[int], None], shelf: PictureShelf | None = None,
-    wheel: Sequence[WheelSample] = (), worker: Worker = ALONE,
-) -> FirstGuess:  # fmt: skip
+    settings: SurveySettings, progress: Callable[[int], None], shelf: ImageStore | None = None,
+    wheel: Sequence[WheelSample] = (), worker: Executor = SERIAL,
+) -> OdometryPass:  # fmt: skip
     """Feeds frames (in order), the IMU and the wheels up to each into the odometry.
 
     frames: as they were recorded, or rectified by who reads them ahead. progress is called with each frame's number. While the
@@ -83,7 +83,7 @@ def run_odometry(
 
     keyframes = list(make_keyframes(chosen(), rectifier.camera, settings, shelf, worker))
     inertial = bool(estimates) and calibration.imu is not None and estimates[-1].inertial
-    guess = FirstGuess(
+    guess = OdometryPass(
         estimates,
         np.array(odom_from_body),
         carried_on(estimates),
@@ -139,7 +139,7 @@ def _summary(frame: RectifiedFrame, estimate: OdometryEstimate) -> FrameSummary:
     )
 
 
-def connected_part(guess: FirstGuess, body_from_cam: Array) -> FirstGuess:
+def connected_part(guess: OdometryPass, body_from_cam: Array) -> OdometryPass:
     """One camera's longest run of frames in one frame and scale; without gravity it is turned upright as cameras are.
 
     With an IMU what follows its start hangs together through gaps in the pictures, without one every gap begins another scale.

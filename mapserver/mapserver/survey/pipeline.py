@@ -12,18 +12,25 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, WheelSample
 from mapserver.survey.bundle.bundle_rounds import Motion, SurveyState, adjust, adjust_windows
-from mapserver.survey.bundle.odometry_factors import chain_edges, odometry_terms, terms_in_the_dark
-from mapserver.survey.bundle.stereo_yaw_check import NO_TURN, PairTurn, estimate_turn, without_turn
-from mapserver.survey.executor import ALONE, Worker
+from mapserver.survey.bundle.odometry_factors import blackout_factors, chain_edges, odometry_terms
+from mapserver.survey.bundle.stereo_yaw_check import NO_TURN, StereoYaw, estimate_stereo_yaw, without_stereo_yaw
+from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.finish.culling import Culled
 from mapserver.survey.finish.map_assembly import summarise
-from mapserver.survey.keyframes.connected_components import Part, SigmaBetween, beside, find_parts, only_kept, seen_by
-from mapserver.survey.keyframes.keyframes import PictureShelf
-from mapserver.survey.keyframes.revisit_thinning import adjust_visits, spare_keyframes, without_spare
+from mapserver.survey.keyframes.connected_components import (
+    Part,
+    SigmaBetween,
+    beside,
+    find_components,
+    only_kept,
+    seen_by,
+)
+from mapserver.survey.keyframes.keyframes import ImageStore
+from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.loops.loops import LoopCloser, Loops
-from mapserver.survey.loops.sim3_loops import ScaledLoopCloser, gate_covariances, rigid, solve_scaled
+from mapserver.survey.loops.sim3_loops import Sim3LoopCloser, gate_covariances, rigid, solve_scaled
 from mapserver.survey.loops.zones import Zones
-from mapserver.survey.odometry_pass import FirstGuess, run_odometry
+from mapserver.survey.odometry_pass import OdometryPass, run_odometry
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import optimize_pose_graph
 from mapserver.survey.settings import SurveySettings
@@ -47,17 +54,17 @@ class Survey:
     map: SurveyMap
     vocabulary: Vocabulary
     loops: Loops
-    first_guess: FirstGuess
+    first_guess: OdometryPass
     state: SurveyState
     culled: Culled
-    pair_turn: PairTurn
+    pair_turn: StereoYaw
     parts: list[Part]
 
 
 def survey(
     frames: Iterable[CameraFrame | RectifiedFrame], frame_count: int, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
     vocabulary: Vocabulary, settings: SurveySettings, zones: Zones, progress: Progress,
-    shelf: PictureShelf | None = None, wheel: Sequence[WheelSample] = (), worker: Worker = ALONE,
+    shelf: ImageStore | None = None, wheel: Sequence[WheelSample] = (), worker: Executor = SERIAL,
 ) -> Survey:  # fmt: skip
     """Maps one recording, its keyframes' pictures on `shelf`. Raises SurveyError where it holds too little to map."""
     guess = run_odometry(
@@ -68,8 +75,8 @@ def survey(
 
 
 def survey_from(
-    guess: FirstGuess, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, vocabulary: Vocabulary,
-    settings: SurveySettings, zones: Zones, progress: Progress, worker: Worker = ALONE,
+    guess: OdometryPass, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, vocabulary: Vocabulary,
+    settings: SurveySettings, zones: Zones, progress: Progress, worker: Executor = SERIAL,
 ) -> Survey:  # fmt: skip
     """All stages after the first guess."""
     if len(guess.keyframes) < _MIN_KEYFRAMES:
@@ -87,7 +94,7 @@ def survey_from(
         keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings, worker
     )
     if guess.inertial:
-        state.motion = replace(state.motion, relative=terms_in_the_dark(guess, state))
+        state.motion = replace(state.motion, relative=blackout_factors(guess, state))
     if len(state.landmarks.points_map) < _MIN_LANDMARKS:
         raise SurveyError(
             f"{len(keyframes)} keyframes share only {len(state.landmarks.points_map)} landmarks; look at the recording with "
@@ -104,7 +111,7 @@ def survey_from(
     guess, turn = _adjust_globally(guess, state, finder, depths, settings, progress, worker)
     progress("global adjustment", 2, 2)
     frames_of = np.array([k.frame_index for k in guess.keyframes], np.int64)
-    parts = find_parts(seen_by(state), SigmaBetween(guess.covariances[frames_of]), settings.join_sigma_m)
+    parts = find_components(seen_by(state), SigmaBetween(guess.covariances[frames_of]), settings.join_sigma_m)
     state, guess, loops = only_kept(state, guess, loops, parts.kept)
     survey_map, culled = summarise(state, guess, settings)
     between = beside(len(survey_map.trajectory), frames_of, parts.kept)
@@ -113,9 +120,9 @@ def survey_from(
 
 
 def _adjust_globally(
-    guess: FirstGuess, state: SurveyState, finder: PairFinder, depths: ViewDepths | None, settings: SurveySettings,
-    progress: Progress, worker: Worker,
-) -> tuple[FirstGuess, PairTurn]:  # fmt: skip
+    guess: OdometryPass, state: SurveyState, finder: PairFinder, depths: ViewDepths | None, settings: SurveySettings,
+    progress: Progress, worker: Executor,
+) -> tuple[OdometryPass, StereoYaw]:  # fmt: skip
     """Matches all views where the loops put them and adjusts them together, twice: the first result shows how the pair is turned."""
     turn, spare = NO_TURN, np.zeros(len(guess.keyframes), bool)
     for round_number in range(2):
@@ -126,7 +133,7 @@ def _adjust_globally(
         keyframes = guess.keyframes
         if round_number == 0 or depths is not None:
             tracks = tracks_of(_match_all(state, finder, settings, progress))
-            spare = spare_keyframes(tracks, keyframes, settings)
+            spare = redundant_keyframes(tracks, keyframes, settings)
             state.landmarks = landmarks_of(
                 keyframes, tracks, spare, state.map_from_body, state.body_from_cam, state.camera, settings, worker
             )
@@ -135,14 +142,14 @@ def _adjust_globally(
             state.landmarks = observed_again(
                 state.landmarks, keyframes, state.map_from_body, state.body_from_cam, state.camera, settings, worker
             )
-        state.landmarks = without_turn(state.landmarks, state.camera, turn.correction_px)
+        state.landmarks = without_stereo_yaw(state.landmarks, state.camera, turn.correction_px)
         adjust_visits(state, settings, spare, rounds=3 if round_number == 0 or depths is not None else 2)
         if round_number == 0:
-            turn = estimate_turn(without_spare(state, spare), settings)
+            turn = estimate_stereo_yaw(without_redundant(state, spare), settings)
     return guess, turn
 
 
-def _with_depths(guess: FirstGuess, state: SurveyState, depths: ViewDepths | None) -> FirstGuess:
+def _with_depths(guess: OdometryPass, state: SurveyState, depths: ViewDepths | None) -> OdometryPass:
     """One camera's keyframes with depths by where they are now; the same guess for rigs that measure depth."""
     if depths is None:
         return guess
@@ -150,7 +157,7 @@ def _with_depths(guess: FirstGuess, state: SurveyState, depths: ViewDepths | Non
 
 
 def _first_state(
-    guess: FirstGuess, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings
+    guess: OdometryPass, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings
 ) -> SurveyState:
     """Keyframes where odometry put them, no landmarks yet."""
     numbers = [k.frame_index for k in guess.keyframes]
@@ -170,7 +177,7 @@ def _first_state(
 
 
 def _match_neighbours(
-    guess: FirstGuess, state: SurveyState, finder: PairFinder, settings: SurveySettings, progress: Progress
+    guess: OdometryPass, state: SurveyState, finder: PairFinder, settings: SurveySettings, progress: Progress
 ) -> list[PairMatch]:
     candidates = finder.candidates(
         state.map_from_body,
@@ -194,14 +201,14 @@ def _match_all(state: SurveyState, finder: PairFinder, settings: SurveySettings,
 
 
 def _close_loops(
-    guess: FirstGuess, state: SurveyState, matched: set[tuple[int, int]], vocabulary: Vocabulary, settings: SurveySettings,
-    zones: Zones, progress: Progress, worker: Worker,
+    guess: OdometryPass, state: SurveyState, matched: set[tuple[int, int]], vocabulary: Vocabulary, settings: SurveySettings,
+    zones: Zones, progress: Progress, worker: Executor,
 ) -> Loops:  # fmt: skip
     """Finds loops, and moves the keyframes to where the pose graph with them says."""
     keyframes = guess.keyframes
     chain, walk = chain_edges(guess, state), settings.monocular.scale_walk
     vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in keyframes]
-    kind, known = (LoopCloser, chain) if guess.scale_known else (ScaledLoopCloser, gate_covariances(chain, walk))
+    kind, known = (LoopCloser, chain) if guess.scale_known else (Sim3LoopCloser, gate_covariances(chain, walk))
     closer = kind(
         keyframes, vectors, vocabulary.word_count, state.camera, state.body_from_cam, state.map_from_body,
         GraphMarginals(state.map_from_body, known), matched, settings, zones, worker,
@@ -209,7 +216,7 @@ def _close_loops(
     for i in range(len(keyframes)):
         closer.close(i)
         progress("loops", i + 1, len(keyframes))
-    if closer.loops.edges and isinstance(closer, ScaledLoopCloser):
+    if closer.loops.edges and isinstance(closer, Sim3LoopCloser):
         scaled = solve_scaled(state.map_from_body, chain, closer.loops.edges, closer.scales, walk)
         closer.loops.disbelieve(scaled.loop_weights)
         _move(state, rigid(scaled))

@@ -14,7 +14,7 @@ _REACH = 6  # among those that agree in two bytes
 _MOST_COMPARED = 10_000  # what repeats not once among so many is as good as alone
 
 
-def distinct_landmarks(points_map: Array, descriptors: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def distinctive_landmarks(points_map: Array, descriptors: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """(N,) which landmarks (N, 3) with descriptors (N, 32) have no twin: none equally high and further off that looks the same.
 
     Twins mostly agree in some two bytes, and are found side by side where all are sorted by those; the few without are then compared

@@ -14,7 +14,7 @@ from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles import landmark_budget_kernels as kernels
-from mapserver.tiles.distinctive_landmarks import distinct_landmarks
+from mapserver.tiles.distinctive_landmarks import distinctive_landmarks
 
 _COLUMNS, _ROWS, _DEPTHS = 4, 3, 2
 _NO_LIMIT = 1 << 40
@@ -42,7 +42,7 @@ def choose_landmarks(
     chosen = np.zeros(len(survey.landmark_ids), bool)
     seen = np.diff(starts) > 0
     first = seen & np.isin(survey.landmark_ids, [] if published is None else published)
-    distinct = distinct_landmarks(survey.points_map, survey.descriptors)
+    distinct = distinctive_landmarks(survey.points_map, survey.descriptors)
     per_view = _ROWS * _COLUMNS * _DEPTHS
     taken = np.zeros(len(survey.map_from_body), np.int64)
     for mask in (first, seen & ~first):

@@ -44,7 +44,7 @@ def follow(
     return places, found
 
 
-def leads_back(
+def forward_backward_check(
     before: Pyramid, now: Pyramid, pixels: Array, places: Array, found: NDArray[np.bool_], *, window_px: int, within_px: float
 ) -> NDArray[np.bool_]:  # fmt: skip
     """Which (N,) of the found places (N, 2) lead back to the pixels (N, 2) that they were found from, as nearly as is asked."""

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from fleetmap.features.stereo import StereoSettings
 from fleetmap.geometry import Array, interpolate_se3, se3_adjoint, se3_inverse, skew
-from fleetmap.odometry.checks.divergence_monitor import Doubts
+from fleetmap.odometry.checks.divergence_monitor import DivergenceMonitor
 from fleetmap.odometry.checks.imu_faults import joined, longest_gap_ns, without_spikes
-from fleetmap.odometry.checks.zero_velocity import StillPictures, middle
+from fleetmap.odometry.checks.zero_velocity import ZeroVelocityDetector, middle
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter.msckf import InvariantFilter, NavState
-from fleetmap.odometry.init.filter_initialization import Start, is_steady, start_in_motion, start_steady
+from fleetmap.odometry.init.filter_initialization import Start, dynamic_initialization, is_steady, static_initialization
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
 from fleetmap.odometry.tracking.tracker import Tracked, Tracker
 from fleetmap.odometry.tracking.tracks import Observations
@@ -44,8 +44,8 @@ class Odometry:
         settings: OdometrySettings,
         stereo_settings: StereoSettings | None = None,
     ) -> None:
-        self._doubts = Doubts(settings.filter.time_offset_sigma_s)
-        self._still = StillPictures(settings.filter.still_window_s, settings.filter.still_flow_px)
+        self._doubts = DivergenceMonitor(settings.filter.time_offset_sigma_s)
+        self._still = ZeroVelocityDetector(settings.filter.still_window_s, settings.filter.still_flow_px)
         self._base_from_body = calibration.base_from_body
         self._wheel: list[WheelSample] = []
         self._real_noise = calibration.imu
@@ -98,7 +98,7 @@ class Odometry:
             self._displace(tracked)
         else:
             self._doubt(tracked)
-            self._feel_standing(tracked)
+            self._apply_zero_velocity(tracked)
             self._feel_wheels()
         self._filter.add_clone(self._frame_index, rate)
         self._clone_stamps[self._frame_index] = self._state_ns
@@ -151,7 +151,7 @@ class Odometry:
     def _begin(self, stamp_ns: int) -> None:
         start = None
         if self._noise is not None:
-            start = start_steady(self._imu, stamp_ns, self._settings.start, self._settings.filter)
+            start = static_initialization(self._imu, stamp_ns, self._settings.start, self._settings.filter)
         if start is not None:
             self._install(start)
             return
@@ -181,7 +181,7 @@ class Odometry:
         seen = self._filter.state.odom_from_body
         s = self._settings.start
         since = self._imu.between(self._not_before_ns, stamp_ns + 1)
-        start = start_steady(since, stamp_ns, s, self._settings.filter)
+        start = static_initialization(since, stamp_ns, s, self._settings.filter)
         if start is None:
             if tracked.lost:
                 self._vision.clear()
@@ -195,7 +195,7 @@ class Odometry:
             ):
                 return None
             vision = Trajectory(stamps, np.array([m for _, m in recent]))
-            start = start_in_motion(vision, self._imu, self._noise, s, self._settings.filter)
+            start = dynamic_initialization(vision, self._imu, self._noise, s, self._settings.filter)
             if start is None:
                 return None
         self._install(start)
@@ -255,7 +255,9 @@ class Odometry:
         duration_s = max(target_ns - self._state_ns, 0) * 1e-9
         between_s = (self._clone_stamps[held[1]] - self._clone_stamps[held[0]]) * 1e-9
         motion = interpolate_se3(np.eye(4), se3_inverse(earlier) @ last, duration_s / max(between_s, 1e-3))
-        self._filter.displace(motion, settings.free_rotation_sigma_rad, settings.free_translation_sigma_m, duration_s)
+        self._filter.predict_random_walk(
+            motion, settings.free_rotation_sigma_rad, settings.free_translation_sigma_m, duration_s
+        )
         self._filter.doubt_velocity(settings.initial_velocity_sigma_mps)
         self._state_ns = max(target_ns, self._state_ns)
 
@@ -290,7 +292,7 @@ class Odometry:
             )
         body_from_next = self._body_from_cam @ se3_inverse(self._last_motion) @ self._cam_from_body
         duration_s = (self._state_ns - self._clone_stamps[self._frame_index - 1]) * 1e-9
-        self._filter.displace(
+        self._filter.predict_random_walk(
             body_from_next, s.free_rotation_sigma_rad, s.free_translation_sigma_m, duration_s, self._loosely(tracked)
         )
 
@@ -322,9 +324,9 @@ class Odometry:
         assert self._filter is not None
         seen = self._seen_body(tracked)
         if seen is not None:
-            self._filter.open_up(seen[0], seen[1], (self._state_ns - self._clone_stamps[seen[0]]) * 1e-9)
+            self._filter.inflate(seen[0], seen[1], (self._state_ns - self._clone_stamps[seen[0]]) * 1e-9)
 
-    def _feel_standing(self, tracked: Tracked) -> None:
+    def _apply_zero_velocity(self, tracked: Tracked) -> None:
         """Zero velocity and turn where for a while neither pictures nor IMU moved."""
         assert self._filter is not None
         assert self._real_noise is not None
@@ -337,7 +339,7 @@ class Odometry:
             return
         duration_s = (now_ns - still[1]) * 1e-9
         sigma_radps = self._real_noise.gyro_noise_radps_rthz / np.sqrt(duration_s)
-        self._filter.stand_still(since.gyro_radps.mean(axis=0), float(sigma_radps), _GATE_6)
+        self._filter.zero_velocity_update(since.gyro_radps.mean(axis=0), float(sigma_radps), _GATE_6)
 
     def _feel_wheels(self) -> None:
         assert self._filter is not None

@@ -15,7 +15,7 @@ GATE_SQUARED = 11.345  # 0.99 of chi-square with 3 degrees of freedom: u, v, dis
 
 
 @dataclass(frozen=True, slots=True)
-class Resection:
+class PnpResult:
     """A solved camera.
 
     cam_from_source (4, 4); cov_rot_trans (6, 6) of a left perturbation in camera axes; inliers (N,); squared normalised
@@ -28,10 +28,10 @@ class Resection:
     squared: Array
 
 
-def refine_resection(
+def refine_pnp(
     camera: StereoCamera, points_source: Array, pixels: Array, sigmas_px: Array, cam_from_source: Array,
     prior_information: Array | None = None, iterations: int = 10,
-) -> Resection | None:  # fmt: skip
+) -> PnpResult | None:  # fmt: skip
     """Robust least squares from a start; None where the points do not determine the camera.
 
     points_source (N, 3); pixels (N, 3) u_left v u_right (NaN none); sigmas_px (N, 2) of u and v, of the disparity.
@@ -72,12 +72,12 @@ def refine_resection(
             rotation, translation, points, measured, weights, intrinsics, _WIDTH, np.empty((6, 6)), np.empty(6), squared
         )
         inliers = squared < GATE_SQUARED
-    return Resection(
+    return PnpResult(
         se3(rotation, translation), np.asarray(np.linalg.inv(hessian + prior + 1e-9 * np.eye(6))), inliers, squared
     )
 
 
-def ransac_resection(
+def ransac_pnp(
     camera: StereoCamera,
     points_source: Array,
     pixels: Array,
@@ -87,8 +87,8 @@ def ransac_resection(
     min_inliers: int,
     seed: int,
     iterations: int = 800,
-) -> Resection | None:
-    """As `refine_resection` without a start: three-point RANSAC first, of so many iterations at most.
+) -> PnpResult | None:
+    """As `refine_pnp` without a start: three-point RANSAC first, of so many iterations at most.
 
     None below min_inliers. Sources are named in the kernels.
     """
@@ -106,18 +106,18 @@ def ransac_resection(
     start = se3(rotation, translation)
     off = np.linalg.norm(camera.pixel_from_point(transform_points(start, points))[:, :2] - measured, axis=1)
     index = np.flatnonzero(off < threshold_px)
-    first = refine_resection(camera, points_source[index], pixels[index], sigmas_px[index], start)
+    first = refine_pnp(camera, points_source[index], pixels[index], sigmas_px[index], start)
     if first is None:
         return None
-    result = refine_resection(camera, points_source, pixels, sigmas_px, first.cam_from_source)
+    result = refine_pnp(camera, points_source, pixels, sigmas_px, first.cam_from_source)
     return result if result is not None and int(result.inliers.sum()) >= min_inliers else None
 
 
-def resection_with_rotation(
+def pnp_with_rotation(
     camera: StereoCamera, points_source: Array, pixels: Array, sigmas_px: Array, cam_from_source_rotation: Array, *,
     threshold_px: float, min_inliers: int, rotation_sigma_rad: float,
-) -> Resection | None:  # fmt: skip
-    """As `ransac_resection` where the rotation is nearly known (from the IMU).
+) -> PnpResult | None:  # fmt: skip
+    """As `ransac_pnp` where the rotation is nearly known (from the IMU).
 
     One correspondence proposes the translation. Needs depth in both views. Finds the place among far more wrong matches
     than three points can; none below min_inliers.
@@ -138,8 +138,8 @@ def resection_with_rotation(
     start = se3(cam_from_source_rotation, translation)
     turned = points_source @ start[:3, :3].T + translation
     near = np.linalg.norm(camera.pixel_from_point(turned)[:, :2] - pixels[:, :2], axis=1) < threshold_px
-    first = refine_resection(camera, points_source[near], pixels[near], sigmas_px[near], start, prior)
+    first = refine_pnp(camera, points_source[near], pixels[near], sigmas_px[near], start, prior)
     if first is None:
         return None
-    result = refine_resection(camera, points_source, pixels, sigmas_px, first.cam_from_source, prior)
+    result = refine_pnp(camera, points_source, pixels, sigmas_px, first.cam_from_source, prior)
     return result if result is not None and int(result.inliers.sum()) >= min_inliers else None

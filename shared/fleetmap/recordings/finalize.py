@@ -10,7 +10,7 @@ from fleetmap.recordings.calibration_files import CalibrationFile, load_calibrat
 from fleetmap.recordings.imu_units import check_imu_units
 from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import ImuSamples, Loss, PositionPrior, SensorSet, Stamps, Trajectory, WheelSample
+from fleetmap.sensors.samples import DataIssue, ImuSamples, PositionPrior, SensorSet, Stamps, Trajectory, WheelSample
 
 
 @dataclass
@@ -29,7 +29,7 @@ class Parts:
     wheel: tuple[WheelSample, ...] = ()
     priors: tuple[PositionPrior, ...] = ()
     ground_truth: Trajectory | None = None
-    losses: list[Loss] = field(default_factory=list)
+    losses: list[DataIssue] = field(default_factory=list)
 
 
 def calibration_of_options(options: OpenOptions) -> CalibrationFile | None:
@@ -56,7 +56,7 @@ def assemble(parts: Parts) -> Recording:
     if len(parts.calibration.cameras) > wanted and not parts.has_depth:
         described = len(parts.calibration.cameras)
         parts.losses.append(
-            Loss("cameras missing", f"the calibration describes {described}, there are images of {wanted}")
+            DataIssue("cameras missing", f"the calibration describes {described}, there are images of {wanted}")
         )
     imu = _usable_imu(parts)
     check_imu_units(imu, str(parts.path))
@@ -82,7 +82,7 @@ def _usable_imu(parts: Parts) -> ImuSamples:
     if len(parts.imu) == 0 or parts.calibration.imu is not None:
         return parts.imu
     parts.losses.append(
-        Loss(
+        DataIssue(
             "imu not used",
             f"{len(parts.imu)} samples, but no calibration says how the IMU is mounted; pass one with --calibration "
             f"FILE",
@@ -105,5 +105,5 @@ def _sensor_set(parts: Parts, imu: ImuSamples) -> SensorSet:
     return SensorSet.MONO_INERTIAL if len(imu) else SensorSet.MONO
 
 
-def _in_words(losses: list[Loss]) -> str:
+def _in_words(losses: list[DataIssue]) -> str:
     return "; ".join(f"{loss.what}: {loss.detail}" for loss in losses)

@@ -11,8 +11,8 @@ from fleetmap.recordings.images import StoredFrame
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import (
     CameraFrame,
+    DataIssue,
     ImuSamples,
-    Loss,
     PositionPrior,
     SensorSet,
     Stamps,
@@ -81,7 +81,7 @@ class Recording:
     wheel: tuple[WheelSample, ...] = ()
     priors: tuple[PositionPrior, ...] = ()
     ground_truth: Trajectory | None = None
-    losses: tuple[Loss, ...] = ()
+    losses: tuple[DataIssue, ...] = ()
 
     def __len__(self) -> int:
         return len(self.frame_stamps_ns)

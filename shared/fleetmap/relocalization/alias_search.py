@@ -26,7 +26,7 @@ _LEAST_VOTES = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Twin:
+class AliasCandidate:
     """A camera that would see the same: map_from_cam (4, 4), about a cell exact; how many features speak for it, as a share of
     those that speak for the place that was found; and features (P,) with landmarks (P,), rows of the map, that do."""
 
@@ -36,10 +36,10 @@ class Twin:
     landmarks: NDArray[np.int64]
 
 
-def find_twins(
+def find_aliases(
     descriptors: NDArray[np.uint8], points_map: Array, map_descriptors: NDArray[np.uint8], map_points_map: Array,
     map_from_cam: Array, least_share: float, most: int,
-) -> Generator[None, None, list[Twin]]:  # fmt: skip
+) -> Generator[None, None, list[AliasCandidate]]:  # fmt: skip
     """Twins of a camera's place, best first, for which at least a share of the votes of the place itself is given; in slices.
 
     descriptors (F, 32), points_map (F, 3): of what was recognized there, and where the map says that it is.
@@ -64,7 +64,7 @@ def find_twins(
 def _peaks(
     pairs: NDArray[np.int32], points_map: Array, used: NDArray[np.int64], map_points_map: Array, map_from_cam: Array,
     least_share: float, most: int,
-) -> list[Twin]:  # fmt: skip
+) -> list[AliasCandidate]:  # fmt: skip
     place = map_from_cam[:2, 3]
     low, high = map_points_map[:, :2].min(axis=0) - 12.0, map_points_map[:, :2].max(axis=0) + 12.0
     shape = tuple(int(n) for n in np.ceil((high - low) / _CELL_M))
@@ -88,7 +88,7 @@ def _peaks(
     own = max(int(there[column - 1 : column + 1, row - 1 : row + 1].max()), 1)
     order = np.flatnonzero(~is_own & (votes >= least_share * own))
     order = order[np.argsort(-votes[order], kind="stable")]
-    found: list[Twin] = []
+    found: list[AliasCandidate] = []
     taken: list[tuple[int, Array]] = []
     for k in order.tolist():
         quarter, centre = int(quarters[k]), centres[k]
@@ -106,10 +106,10 @@ def _peaks(
 def _twin(
     pairs: NDArray[np.int32], offsets_m: Array, turn: Array, centre: Array, share: float, used: NDArray[np.int64],
     map_points_map: Array, map_from_cam: Array,
-) -> Twin:  # fmt: skip
+) -> AliasCandidate:  # fmt: skip
     cameras = map_points_map[pairs[:, 1], :2] - offsets_m[pairs[:, 0]]
     speaks = (np.abs(cameras - centre) < _CELL_M).all(axis=1)
     twin = map_from_cam.copy()
     twin[:2, 3] = np.median(cameras[speaks], axis=0)
     twin[:2, :3] = turn @ map_from_cam[:2, :3]
-    return Twin(twin, float(share), used[pairs[speaks, 0]], pairs[speaks, 1].astype(np.int64))
+    return AliasCandidate(twin, float(share), used[pairs[speaks, 0]], pairs[speaks, 1].astype(np.int64))

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from fleetmap.features import orb, stereo
 from fleetmap.features.matching import match_by_projection, match_mutual
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.pnp.pnp import Resection, ransac_resection, refine_resection, resection_with_rotation
-from fleetmap.relocalization.alias_search import Twin, find_twins
+from fleetmap.pnp.pnp import PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
+from fleetmap.relocalization.alias_search import AliasCandidate, find_aliases
 from fleetmap.relocalization.map_view import Expected, MapView, Rows
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
@@ -23,19 +23,20 @@ _FIRST_DOUBT = 3.0  # of the sigmas, while the place that matches were looked fo
 _SAME_PLACE_M, _SAME_PLACE_COSINE = 1.2, 0.8  # less than half a bay: no other place looks so much the same so near
 
 T = TypeVar("T")
-Slices = Generator[None, None, T]  # work that may be interrupted wherever it yields
+TimeSliced = Generator[None, None, T]  # work that may be interrupted wherever it yields
 
 
 @dataclass(frozen=True, slots=True)
 class Fix:
     """A verified place of one frame.
 
-    map_from_cam (4, 4); cov_rot_trans (6, 6) in map axes, rotation first; inliers and cells of the image that hold them; share
-    of the inliers among what was matched at the end. hit_share: of the landmarks that the survey saw from next to there, how many
-    are among the inliers; 1 where nobody looked. twin_share: how much of
-    what speaks for this place speaks for another one too, 1 where nobody looked. expected: how many landmarks the hit_share is of, and
-    seen those that were found, 0 where nobody looked. matches (P, 2): features and landmarks, rows of
-    the view, of the inliers. witnessed: what the hit_share is of, None where the survey did not pass.
+    map_from_cam (4, 4); cov_rot_trans (6, 6) in map axes, rotation first; inliers and the cells of the image that hold them;
+    share of the inliers among what was matched at the end. matches (P, 2): features and landmarks, rows of the view, of the inliers.
+
+    landmark_recall: share of the landmarks seen by the survey from next to there that are inliers; 1 where none is expected.
+    expected, seen: how many landmarks that is a share of, and how many were found; 0 where none is expected.
+    alias_ratio: support of the best other place relative to this one; 1 where no other place was searched for.
+    witnessed: the landmarks behind landmark_recall, None where the survey did not pass.
     """
 
     map_from_cam: Array
@@ -43,8 +44,8 @@ class Fix:
     inliers: int
     cells: int
     share: float = 1.0
-    hit_share: float = 1.0
-    twin_share: float = 1.0
+    landmark_recall: float = 1.0
+    alias_ratio: float = 1.0
     expected: int = 0
     seen: int = 0
     matches: NDArray[np.int64] | None = field(default=None, repr=False, compare=False)
@@ -72,7 +73,7 @@ class Relocalizer:
         self._camera = camera
         self._settings = settings
 
-    def look(self, frame: RectifiedFrame) -> Slices[Seen]:
+    def look(self, frame: RectifiedFrame) -> TimeSliced[Seen]:
         """What one frame shows, in slices: see `finished`."""
         features = yield from orb.detect_in_slices(frame.left, self._settings.orb)
         pixels = np.column_stack([features.pixels, np.full(len(features), np.nan)])
@@ -99,7 +100,7 @@ class Relocalizer:
     def anywhere(
         self, seen: Seen, allowed: NDArray[np.bool_] | None = None, map_from_cam_rotation: Array | None = None,
         found: Sequence[Fix] = (),
-    ) -> Slices[list[Fix]]:  # fmt: skip
+    ) -> TimeSliced[list[Fix]]:  # fmt: skip
         """Fixes of all places that look like this one and verify, best first, duplicates removed; a slice for each place.
 
         allowed (K,): places that may be considered. map_from_cam_rotation: the orientation, where it is known. found: fixes of
@@ -132,17 +133,17 @@ class Relocalizer:
             fixes = yield from self._with_twins(seen, fixes)
         return sorted(fixes, key=lambda f: -f.inliers)
 
-    def _with_twins(self, seen: Seen, fixes: list[Fix]) -> Slices[list[Fix]]:
+    def _with_twins(self, seen: Seen, fixes: list[Fix]) -> TimeSliced[list[Fix]]:
         """The fixes, and those at the twins of the best one."""
         settings, best = self._settings.fix, fixes[0]
         if best.matches is None:
             return fixes
         features, rows = best.matches.T
-        twins = yield from find_twins(
+        twins = yield from find_aliases(
             seen.features.descriptors[features], self.view.points_map[rows], self.view.descriptors, self.view.points_map,
             best.map_from_cam, settings.twin_votes_share, settings.most_twins,
         )  # fmt: skip
-        fixes = [replace(best, twin_share=max((twin.share for twin in twins), default=0.0)), *fixes[1:]]
+        fixes = [replace(best, alias_ratio=max((twin.share for twin in twins), default=0.0)), *fixes[1:]]
         for twin in twins:
             if any(_stands_at(fix.map_from_cam, twin.map_from_cam) for fix in fixes):
                 continue
@@ -152,10 +153,10 @@ class Relocalizer:
                 fixes.append(fix)
         return fixes
 
-    def _at_twin(self, seen: Seen, twin: Twin, features: NDArray[np.int64]) -> Fix | None:
+    def _at_twin(self, seen: Seen, twin: AliasCandidate, features: NDArray[np.int64]) -> Fix | None:
         settings = self._settings.fix
         index = features[twin.features]
-        found = resection_with_rotation(
+        found = pnp_with_rotation(
             self._camera, self.view.points_map[twin.landmarks], self._measured(seen, index),
             self._sigmas(seen, index, twin.landmarks, None), twin.map_from_cam[:3, :3].T,
             threshold_px=2 * settings.ransac_px + settings.rotation_sigma_rad * self._camera.focal_px,
@@ -177,14 +178,14 @@ class Relocalizer:
         points, pixels = self.view.points_map[rows[pairs[:, 0]]], self._measured(seen, pairs[:, 1])
         sigmas = self._sigmas(seen, pairs[:, 1], rows[pairs[:, 0]], None)
         wide_px = 2 * settings.ransac_px + settings.rotation_sigma_rad * self._camera.focal_px
-        found: Resection | None = None
+        found: PnpResult | None = None
         if rotation is not None:
-            found = resection_with_rotation(
+            found = pnp_with_rotation(
                 self._camera, points, pixels, sigmas, rotation.T, threshold_px=wide_px,
                 min_inliers=settings.min_inliers // 2, rotation_sigma_rad=settings.rotation_sigma_rad,
             )  # fmt: skip
         if found is None:
-            found = ransac_resection(
+            found = ransac_pnp(
                 self._camera, points, pixels, sigmas, threshold_px=settings.ransac_px, min_inliers=settings.min_inliers // 2,
                 seed=self._settings.seed,
             )  # fmt: skip
@@ -195,7 +196,7 @@ class Relocalizer:
     def _by_projection(self, seen: Seen, map_from_cam: Array, radius_px: float) -> Fix | None:
         """Guided matching of all visible landmarks around a place, twice: wide, then narrow around the first answer."""
         settings = self._settings.fix
-        found: Resection | None = None
+        found: PnpResult | None = None
         matches: NDArray[np.int64] = np.zeros((0, 2), np.int64)
         for radius, doubt in ((radius_px, _FIRST_DOUBT), (min(radius_px, settings.guided_radius_px) * 0.6, 1.0)):
             rows, pixels, octaves = self.view.visible(
@@ -215,7 +216,7 @@ class Relocalizer:
             points = self.view.points_map[rows[kept]]
             sigmas = doubt * self._sigmas(seen, hit[kept], rows[kept], map_from_cam)
             measured = self._measured(seen, hit[kept], pixels[kept, 0] - pixels[kept, 2])
-            found = refine_resection(self._camera, points, measured, sigmas, se3_inverse(map_from_cam))
+            found = refine_pnp(self._camera, points, measured, sigmas, se3_inverse(map_from_cam))
             if found is None or found.inliers.sum() < settings.min_inliers:
                 return None
             map_from_cam = se3_inverse(found.cam_from_source)
@@ -223,7 +224,7 @@ class Relocalizer:
         assert found is not None
         return self._verified(seen, found, matches)
 
-    def _verified(self, seen: Seen, found: Resection, matches: NDArray[np.int64]) -> Fix | None:
+    def _verified(self, seen: Seen, found: PnpResult, matches: NDArray[np.int64]) -> Fix | None:
         settings, features = self._settings.fix, matches[:, 0]
         pixels = seen.pixels[features]
         column = np.clip(pixels[:, 0] / self._camera.width_px * 8, 0, 7).astype(int)
@@ -282,7 +283,7 @@ class Relocalizer:
         )
 
 
-def finished(work: Slices[T]) -> T:
+def finished(work: TimeSliced[T]) -> T:
     """The result of work in slices, all of them at once."""
     while True:
         try:

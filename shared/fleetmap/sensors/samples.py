@@ -122,7 +122,7 @@ class Trajectory:
 
 
 @dataclass(frozen=True, slots=True)
-class Loss:
+class DataIssue:
     """Something that a recording should hold and does not: what, and how much in words."""
 
     what: str

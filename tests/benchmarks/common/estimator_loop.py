@@ -17,7 +17,7 @@ from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracking.tracker import MotionSince, Tracked, Tracker
 from fleetmap.relocalization.map_view import MapView
-from fleetmap.relocalization.relocalizer import Relocalizer, Seen, Slices
+from fleetmap.relocalization.relocalizer import Relocalizer, Seen, TimeSliced
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import PositionPrior, wheel_between
@@ -207,7 +207,7 @@ class SessionRelocalizer(Relocalizer):
         self._session = session
         self._index_of = {stamp: index for index, stamp in enumerate(session.stamps_ns)}
 
-    def look(self, frame: RectifiedFrame) -> Slices[Seen]:
+    def look(self, frame: RectifiedFrame) -> TimeSliced[Seen]:
         """As the relocalizer's."""
         yield
         return seen(self._session, self._index_of[frame.stamp_ns])

@@ -33,7 +33,7 @@ from locclient.robot.health_report import FixFigures
 from mapserver.fleet.canary_controller import review
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.canary_test import CanarySettings, number_of
-from mapserver.serving.bus_service import TileService
+from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from support.storage.map_samples import draft_details
 
@@ -106,7 +106,7 @@ def bench(robots: int, share: float) -> dict[str, Any]:
 
     with tempfile.TemporaryDirectory() as name, publish(Path(name), clock) as store, MemoryBus(MemoryHub()) as bus:
         fleet = Fleet(store, clock_ns=lambda: clock["ns"])
-        service = TileService(store, fleet, bus, lambda *_: None)
+        service = BusService(store, fleet, bus, lambda *_: None)
         bus.subscribe(robot_key(SITE, "*", "wanted"), hear)
         for robot in names:
             fleet.take_question(SITE, robot)

@@ -2,9 +2,9 @@
 
     PYTHONPATH=tests python tests/benchmarks/fleet/bench_service.py [--clients 300] [--site-mb 50] [--outage-s 60] [--out FILE.json]
 
-Robots are threads of a few processes, each with its own zenoh session, and run the robot's own `PartReader`. Every byte of every
+Robots are threads of a few processes, each with its own zenoh session, and run the robot's own `ChunkReader`. Every byte of every
 robot is hashed. Patches are applied, and their results verified, once per process: on real robots that is work of 300 machines.
-Meanwhile operators ask the HTTP list endpoints. Then one robot fetches through `MapLink` and a cache on the disk while the server
+Meanwhile operators ask the HTTP list endpoints. Then one robot fetches through `MapClient` and a cache on the disk while the server
 is killed in the middle and started again after `--outage-s`.
 """
 
@@ -31,7 +31,7 @@ from benchmarks.fleet.service_clients import SITE
 from fleetmap.bus import ZenohBus
 from fleetmap.mapformat import Tile
 from fleetmap.messages import robot_key
-from locclient.maps.map_client import MapLink
+from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver.store import MapStore
 from support.storage.map_samples import draft_details, random_tile
@@ -281,7 +281,7 @@ def measure_outage(folder: Path, cache_folder: Path, outage_s: float) -> dict[st
     """A robot's fetch over a server that is killed in the middle and comes back."""
     with serving(folder) as (process, _, endpoint), ZenohBus.connect(endpoint) as bus:
         cache = TileCache(cache_folder)
-        link = MapLink(bus, cache, SITE, "patient", timeout_s=2.0, patience_s=outage_s + 60)
+        link = MapClient(bus, cache, SITE, "patient", timeout_s=2.0, patience_s=outage_s + 60)
         wanted = link.wanted()
         finished: list[float] = []
         thread = threading.Thread(target=lambda: (link.bring(wanted), finished.append(time.monotonic())))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from fleetmap.bus import ZenohBus
 from fleetmap.mapformat import Manifest, apply_patch, decode_manifest, sha256_hex, verified
 from fleetmap.messages import WantedVersion, blob_key, decode_message, manifest_key, patch_key, robot_key
-from locclient.maps.chunked_download import PartReader
+from locclient.maps.chunked_download import ChunkReader
 
 SITE = "bench"
 _TIMEOUT_S, _PATIENCE_S = 20.0, 120.0
@@ -39,7 +39,7 @@ class Robot:
     def __init__(self, endpoint: str, name: str, shared: Shared) -> None:
         self._bus = ZenohBus.connect(endpoint)
         self._name, self._shared = name, shared
-        self._parts = PartReader(self._bus, timeout_s=_TIMEOUT_S, patience_s=_PATIENCE_S)
+        self._parts = ChunkReader(self._bus, timeout_s=_TIMEOUT_S, patience_s=_PATIENCE_S)
         self._manifest: Manifest | None = None
         self._address = ""
         self.phases: list[dict[str, float]] = []

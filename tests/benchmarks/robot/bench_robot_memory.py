@@ -36,10 +36,10 @@ from benchmarks.common.recorded_runs import (
 from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.sensors.rectification import Rectifier
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.map_client import StoreFolderLink
+from locclient.maps.map_client import LocalMapSource
 from locclient.maps.tile_cache import StoreFolder
-from locclient.maps.tile_loader import MapRoom
-from locclient.maps.tile_selection import Place, Whereabouts, WindowSettings
+from locclient.maps.tile_loader import TileLoader
+from locclient.maps.tile_selection import Place, PositionBound, WindowSettings
 from locclient.replay.replay_sources import ReplaySource
 from locclient.robot.health_report import HealthFigures
 from locclient.robot.robot import Robot
@@ -67,7 +67,7 @@ def large_site(work: Path, megabytes: float) -> Path:
     folder = work / f"large-{megabytes:g}"
     if (folder / "built").exists():
         return folder
-    source = StoreFolderLink(StoreFolder(surveyed(work)), SITE)
+    source = LocalMapSource(StoreFolder(surveyed(work)), SITE)
     manifest = source.manifest(source.ready().wanted)
     own = list(source.tiles(manifest).tiles.values())
     rounds = int(np.ceil(megabytes * 1e6 / sum(len(encode_tile(tile)) for tile in own)))
@@ -108,10 +108,10 @@ def long_enough(recording: Recording, minutes: float) -> Recording:
 def drive(store: Path, recording: Path, minutes: float) -> dict[str, Any]:
     """The robot's life, and its memory minute by minute."""
     cv2.setNumThreads(1)
-    link = StoreFolderLink(StoreFolder(store), SITE)
+    link = LocalMapSource(StoreFolder(store), SITE)
     wanted = link.ready().wanted
     site_mb = sum(entry.bytes for entry in link.manifest(wanted).tiles) / 1e6
-    figures, room, whereabouts = HealthFigures(), MapRoom(link, WindowSettings()), Whereabouts(WindowSettings())
+    figures, room, whereabouts = HealthFigures(), TileLoader(link, WindowSettings()), PositionBound(WindowSettings())
     memory, tiles_held, begun_s = [], [], time.process_time()
     with open_recording(recording) as opened:
         source = ReplaySource.of(long_enough(opened, minutes), FrameSelection.parse(":"), reverse=False)

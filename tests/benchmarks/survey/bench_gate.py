@@ -30,7 +30,7 @@ from fleetsim.motion.routes import Route
 from fleetsim.recorder import Order, Session, prepare
 from fleetsim.scenarios import SCENARIOS, Run, Scenario, find_scenario
 from fleetsim.scene.layout import Layout
-from mapserver.survey.keyframes.keyframes import Keyframe, MemoryShelf
+from mapserver.survey.keyframes.keyframes import Keyframe, MemoryImageStore
 from mapserver.survey.loops.loops import LoopCloser, Verdict
 from mapserver.survey.loops.zones import Zones
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
@@ -121,7 +121,7 @@ def keyframe(session: EstimatorSession, number: int, frame: int) -> Keyframe:
     )
     return Keyframe(
         number, shown.stamp_ns, features, np.column_stack([disparity, np.full(len(disparity), 0.2)]),
-        session.camera.point_from_pixel(features.pixels, disparity), MemoryShelf(), 0,
+        session.camera.point_from_pixel(features.pixels, disparity), MemoryImageStore(), 0,
     )  # fmt: skip
 
 

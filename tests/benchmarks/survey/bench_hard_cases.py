@@ -21,7 +21,7 @@ import numpy as np
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings.export_mcap import copy_to_mcap
-from mapserver.build.build import BuildOrder, run_build
+from mapserver.build.build import BuildRequest, run_build
 from mapserver.config import MapserverConfig
 from support.recordings.spoiled_recording import (
     swapped,
@@ -75,7 +75,7 @@ def outcome(case: str, recording: Recording, frames: str) -> Outcome:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         copy_to_mcap(recording, folder / "case.mcap")
-        order = BuildOrder((folder / "case.mcap",), "hall", folder / "store", frames, report=folder / "r.json")
+        order = BuildRequest((folder / "case.mcap",), "hall", folder / "store", frames, report=folder / "r.json")
         try:
             run_build(order, MapserverConfig().survey)
         except FleetmapError as error:

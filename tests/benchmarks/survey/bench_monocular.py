@@ -29,7 +29,7 @@ from mapserver.config import survey_settings
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey.keyframes.keyframes import make_keyframe
 from mapserver.survey.loops.zones import Zones
-from mapserver.survey.odometry_pass import FirstGuess
+from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.pipeline import Survey, survey, survey_from
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_map import SurveyMap
@@ -154,7 +154,7 @@ def drifting(path: Path, drift: float, seed: int = 0) -> Row:
 
 def drifting_guess(
     recording: Recording, rectifier: Rectifier, settings: SurveySettings, drift: float, rng: np.random.Generator
-) -> FirstGuess:
+) -> OdometryPass:
     """What one camera's odometry might say: every fifth frame a keyframe, noise of 0.5 % of each step, and the drift."""
     truth = recording.ground_truth
     assert truth is not None
@@ -181,7 +181,7 @@ def drifting_guess(
         make_keyframe(rectifier.rectify(recording.read_frame(numbers[n])), n, rectifier.camera, settings)
         for n in range(0, len(numbers), _EVERY)
     ]
-    return FirstGuess(
+    return OdometryPass(
         estimates, np.array(placed), np.array(spread), np.ones(len(numbers), bool), keyframes, False, False
     )
 

@@ -29,12 +29,12 @@ from fleetsim.commands import record_order
 from fleetsim.recorder import Order
 from fleetsim.scenarios import SCENARIOS, Scenario, find_scenario
 from fleetsim.scene.stock import Slot, last_restock_day
-from locclient.maps.map_client import MapLink
+from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver.config import MapserverConfig
 from mapserver.fleet.fleet import Fleet
-from mapserver.nightly import NightOrder, last_report, run_night
-from mapserver.serving.bus_service import TileService
+from mapserver.nightly import NightRequest, last_report, run_night
+from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 
 SITE = "hall"
@@ -90,8 +90,8 @@ def fetched(folder: Path, cache: Path) -> dict[str, int]:
     told: list[tuple[str, str, int]] = []
     hub = MemoryHub()
     with MapStore.open(folder) as store, MemoryBus(hub) as bus, MemoryBus(hub) as robot:
-        service = TileService(store, Fleet(store), bus, lambda *event: told.append(event))
-        link = MapLink(robot, TileCache(cache), SITE, "r1")
+        service = BusService(store, Fleet(store), bus, lambda *event: told.append(event))
+        link = MapClient(robot, TileCache(cache), SITE, "r1")
         wanted = link.wanted()
         manifest = link.fetch(wanted)
         link.activate(manifest, wanted)
@@ -120,7 +120,7 @@ def measure(work: Path, scenario: str, frames: str, rate: float) -> list[dict[st
                 kept.with_suffix(".part").rename(kept)
             (inbox / f"{night.run}.mcap").symlink_to(kept)
             begun_s = time.monotonic()
-            order = NightOrder(SITE, inbox, store, time.time_ns(), 0.0, frames)
+            order = NightRequest(SITE, inbox, store, time.time_ns(), 0.0, frames)
             run_night(order, settings.survey, settings.gate, Console(stderr=True))
             seconds = time.monotonic() - begun_s
             full, delta = fetched(store, folder / f"new-{night.run}"), fetched(store, folder / "cache")

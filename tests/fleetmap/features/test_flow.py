@@ -82,11 +82,11 @@ def test_what_went_wrong_does_not_lead_back() -> None:
     places, found = flow.follow(*pyramids, pixels, pixels, window_px=15, levels=1)
     wrong = np.arange(len(pixels)) % 3 == 0
     places[wrong] += (0.0, 2.0)
-    held = flow.leads_back(*pyramids, pixels, places, found, window_px=15, within_px=0.5)
+    held = flow.forward_backward_check(*pyramids, pixels, places, found, window_px=15, within_px=0.5)
     assert found.all()
     np.testing.assert_array_equal(held, ~wrong)
     nothing = np.zeros(len(pixels), bool)
-    assert not flow.leads_back(*pyramids, pixels, places, nothing, window_px=15, within_px=0.5).any()
+    assert not flow.forward_backward_check(*pyramids, pixels, places, nothing, window_px=15, within_px=0.5).any()
 
 
 def test_a_pyramid_is_made_once() -> None:

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from fleetmap.features.matching import packed
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.relocalization import alias_search_kernels
-from fleetmap.relocalization.alias_search import Twin, find_twins
+from fleetmap.relocalization.alias_search import AliasCandidate, find_aliases
 from fleetmap.relocalization.relocalizer import finished
 
 PITCH_M, AISLES = 5.0, 7
@@ -36,9 +36,9 @@ class Hall:
         ahead = (goods[:, 0] > 7) & (goods[:, 0] < 12)
         self.seen_map, self.seen = goods[ahead] + (0, 2 * PITCH_M, 0), spoiled(rng, looks[ahead], 0.05)
 
-    def twins(self, least_share: float = 0.2) -> list[Twin]:
+    def twins(self, least_share: float = 0.2) -> list[AliasCandidate]:
         return finished(
-            find_twins(self.seen, self.seen_map, self.descriptors, self.points_map, self.camera, least_share, 64)
+            find_aliases(self.seen, self.seen_map, self.descriptors, self.points_map, self.camera, least_share, 64)
         )
 
 
@@ -80,7 +80,7 @@ def test_what_lies_beside_a_camera_is_no_twin_of_itself() -> None:
     far = rng.uniform((-15, -15, 0), (15, 15, 0.2), (400, 3))
     held = np.concatenate([spoiled(rng, looks, 0.05), rng.integers(0, 256, (400, 32), np.uint8)])
     down = se3(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 1.0]))
-    assert finished(find_twins(looks, points, held, np.concatenate([points, far]), down, 0.2, 64)) == []
+    assert finished(find_aliases(looks, points, held, np.concatenate([points, far]), down, 0.2, 64)) == []
 
 
 def test_alike_is_what_its_definition_says() -> None:

@@ -3,7 +3,7 @@
 import gc
 import weakref
 
-from locclient.daemon.jit_warmup import settled_memory
+from locclient.daemon.jit_warmup import gc_frozen
 
 
 class Ring:
@@ -16,7 +16,7 @@ class Ring:
 def test_what_lived_before_is_left_alone_and_what_comes_later_is_not() -> None:
     before = Ring()
     of_before = weakref.ref(before)
-    with settled_memory():
+    with gc_frozen():
         del before
         of_later = weakref.ref(Ring())
         gc.collect()

@@ -7,19 +7,19 @@ from pathlib import Path
 import pytest
 
 from fleetmap.errors import StoreError
-from locclient.daemon.outbox import Spool, SpooledReport
+from locclient.daemon.outbox import Outbox, QueuedReport
 
 
-def report(name: str, size: int = 10) -> SpooledReport:
-    return SpooledReport(name, name.encode() * size)
+def report(name: str, size: int = 10) -> QueuedReport:
+    return QueuedReport(name, name.encode() * size)
 
 
 def test_what_waits_survives_a_restart_in_order(tmp_path: Path) -> None:
-    spool = Spool(tmp_path / "new" / "spool.sqlite3", max_bytes=10_000)
+    spool = Outbox(tmp_path / "new" / "spool.sqlite3", max_bytes=10_000)
     for name in ("a", "b", "c"):
         spool.put(report(name))
     spool.put(report("a", size=20))
-    again = Spool(tmp_path / "new" / "spool.sqlite3", max_bytes=10_000)
+    again = Outbox(tmp_path / "new" / "spool.sqlite3", max_bytes=10_000)
     assert again.waiting(10) == [report("a"), report("b"), report("c")]
     again.done("a")
     again.done("a")
@@ -29,7 +29,7 @@ def test_what_waits_survives_a_restart_in_order(tmp_path: Path) -> None:
 
 
 def test_the_oldest_are_dropped_and_counted(tmp_path: Path) -> None:
-    spool = Spool(tmp_path / "spool", max_bytes=250)
+    spool = Outbox(tmp_path / "spool", max_bytes=250)
     for name in "abcde":
         spool.put(report(name, size=100))
     assert [kept.id for kept in spool.waiting(10)] == ["d", "e"]
@@ -40,10 +40,10 @@ def test_the_oldest_are_dropped_and_counted(tmp_path: Path) -> None:
 
 def test_a_killed_process_loses_nothing_that_was_put(tmp_path: Path) -> None:
     script = (
-        "import os, signal, sys; from pathlib import Path; from locclient.daemon.outbox import Spool, SpooledReport\n"
-        "spool = Spool(Path(sys.argv[1]), max_bytes=10**6)\n"
+        "import os, signal, sys; from pathlib import Path; from locclient.daemon.outbox import Outbox, QueuedReport\n"
+        "spool = Outbox(Path(sys.argv[1]), max_bytes=10**6)\n"
         "for n in range(1000):\n"
-        "    spool.put(SpooledReport(str(n), b'x' * 5000)); print(n, flush=True)\n"
+        "    spool.put(QueuedReport(str(n), b'x' * 5000)); print(n, flush=True)\n"
         "    if n == 20: os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     done = subprocess.run(
@@ -52,13 +52,13 @@ def test_a_killed_process_loses_nothing_that_was_put(tmp_path: Path) -> None:
     )  # fmt: skip
     said = done.stdout.split()
     assert said[-1] == "20", done.stderr
-    assert [kept.id for kept in Spool(tmp_path / "spool", max_bytes=10**6).waiting(100)] == said
+    assert [kept.id for kept in Outbox(tmp_path / "spool", max_bytes=10**6).waiting(100)] == said
 
 
 @pytest.mark.parametrize("content", [b"no database at all" * 300, b"SQLite format 3\0" + b"\xff" * 8000])
 def test_a_damaged_file_is_set_aside(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "spool").write_bytes(content)
-    spool = Spool(tmp_path / "spool", max_bytes=1000)
+    spool = Outbox(tmp_path / "spool", max_bytes=1000)
     assert spool.set_aside == tmp_path / "spool.damaged"
     assert spool.set_aside.read_bytes() == content
     spool.put(report("a"))
@@ -68,8 +68,8 @@ def test_a_damaged_file_is_set_aside(tmp_path: Path, content: bytes) -> None:
 def test_a_place_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="spool"):
-        Spool(tmp_path / "file" / "spool", max_bytes=1000)
-    spool = Spool(tmp_path / "spool", max_bytes=1000)
+        Outbox(tmp_path / "file" / "spool", max_bytes=1000)
+    spool = Outbox(tmp_path / "spool", max_bytes=1000)
     (tmp_path / "spool").unlink()
     (tmp_path / "spool").mkdir()
     with pytest.raises(StoreError, match="refused"):

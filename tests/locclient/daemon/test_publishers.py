@@ -14,7 +14,7 @@ from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior, 
 from locclient.daemon.publishers import OutputSection, open_output
 from locclient.localization.estimate import Status
 from locclient.localization.image_quality import Cause
-from locclient.robot.continuous_odom import OdomFrame
+from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
 
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([0.2, 0.0, 0.5]))
@@ -25,7 +25,7 @@ def published(section: OutputSection, *estimates: object) -> dict[str, list[byte
     hub, heard = MemoryHub(), {}  # type: ignore[var-annotated]
     with MemoryBus(hub) as bus, MemoryBus(hub) as other:
         other.subscribe("**", lambda key, payload: heard.setdefault(key, []).append(payload))
-        output, odom = open_output(bus, "hall", "r1", section), OdomFrame(BASE_FROM_BODY)
+        output, odom = open_output(bus, "hall", "r1", section), ContinuousOdom(BASE_FROM_BODY)
         for one in estimates:
             output.publish(one, odom.handle(one), BASE_FROM_BODY)  # type: ignore[arg-type]
     return heard
@@ -74,7 +74,7 @@ def test_what_cannot_be_told_is_refused_at_once(section: dict[str, str], said: s
 
 def test_odom_is_continuous_once_a_place_was_named() -> None:
     change = se3(so3_exp(np.array([0.0, 0.0, 0.4])), np.array([3.0, 1.0, 0.0]))
-    frame = OdomFrame(np.eye(4))
+    frame = ContinuousOdom(np.eye(4))
     early = frame.handle(estimate(0.0, known=False, change=change))
     np.testing.assert_array_equal(early.odom_from_base, estimate(0.0).odometry.odom_from_body)
     before = frame.handle(estimate(1.0, x_m=1.0))

@@ -12,20 +12,20 @@ import pytest
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import RecordingError
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
-from locclient.daemon.outbox import Spool
+from locclient.daemon.outbox import Outbox
 from locclient.daemon.runtime import Parts, Runtime
-from locclient.daemon.server_sync import ServerTalk
+from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.systemd_notify import ServiceManager
 from locclient.localization.estimate import Estimate
-from locclient.maps.map_client import CachedMap, MapLink, StoreFolderLink
+from locclient.maps.map_client import CachedMap, LocalMapSource, MapClient
 from locclient.maps.tile_cache import StoreFolder, TileCache
-from locclient.maps.tile_loader import MapRoom
+from locclient.maps.tile_loader import TileLoader
 from locclient.maps.tile_selection import Place, WindowSettings
 from locclient.robot.continuous_odom import Placed
 from locclient.robot.robot import Robot
 from locclient.sensors.intake import Intake, Moment
 from mapserver.fleet.fleet import Fleet
-from mapserver.serving.bus_service import TileService
+from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
@@ -77,14 +77,14 @@ class World:
 
     def parts(self, source: ScriptedSource, robot: Robot, listener: Listener) -> Parts:
         cache = self.folder / "cache"
-        link = MapLink(self.bus, TileCache(cache), "room", "r1")
-        spool = Spool(self.folder / "spool", max_bytes=10**7)
+        link = MapClient(self.bus, TileCache(cache), "room", "r1")
+        spool = Outbox(self.folder / "spool", max_bytes=10**7)
         intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=True, imu_wait_s=1.0)
         return Parts(
             site="room", robot_name="r1", source=source, intake=intake, robot=robot,
-            room=MapRoom(CachedMap(TileCache(cache), "room"), WindowSettings()), spool=spool,
+            room=TileLoader(CachedMap(TileCache(cache), "room"), WindowSettings()), spool=spool,
             camera=robot_world.rectifier().camera, settings=robot_world.SETTINGS, output=listener, link=link,
-            talk=ServerTalk(link, spool, retry_s=600.0), first=link.active(),
+            talk=ServerSync(link, spool, retry_s=600.0), first=link.active(),
         )  # fmt: skip
 
 
@@ -103,7 +103,7 @@ def world(tmp_path: Path) -> Iterator[World]:
         bus.queryable(
             robot_key("*", "*", "failures"), take
         )  # before the service's own table: what arrives is looked at here
-        service = TileService(store, fleet, bus, lambda *_: None)
+        service = BusService(store, fleet, bus, lambda *_: None)
         yield made
         service.close()
 
@@ -111,8 +111,8 @@ def world(tmp_path: Path) -> Iterator[World]:
 def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world: World) -> None:
     """Without a network from frame 30 to 120, dark from 60 to 100: the estimates are to the bit those of a robot alone."""
     moments = list(robot_world.moments(130, dark=range(60, 100)))
-    folder = StoreFolderLink(StoreFolder(world.folder / "store"), "room")
-    whole = MapRoom(folder, WindowSettings()).load(folder.wanted(), Place())
+    folder = LocalMapSource(StoreFolder(world.folder / "store"), "room")
+    whole = TileLoader(folder, WindowSettings()).load(folder.wanted(), Place())
     assert whole is not None
     alone = robot_world.new_robot()
     alone.use(whole)
@@ -136,7 +136,7 @@ def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world:
     waiting = [report.id for report in parts.spool.waiting(10)]
     world.hub.reachable = True
     assert parts.talk is not None
-    last = ServerTalk(parts.link, parts.spool, retry_s=600.0)  # the next start delivers what was not yet
+    last = ServerSync(parts.link, parts.spool, retry_s=600.0)  # the next start delivers what was not yet
     last.step()
     assert len(world.table) == len(set(world.table)) == 1
     assert waiting in ([], world.table)

@@ -18,13 +18,13 @@ from fleetmap.messages import (
     encode_message,
     robot_key,
 )
-from locclient.daemon.outbox import Spool, SpooledReport
-from locclient.daemon.server_sync import ServerTalk
-from locclient.maps.map_client import MapLink
+from locclient.daemon.outbox import Outbox, QueuedReport
+from locclient.daemon.server_sync import ServerSync
+from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from locclient.robot.robot import Change, VersionChange
 from mapserver.fleet.fleet import Fleet
-from mapserver.serving.bus_service import TileService
+from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from support.storage.map_samples import save_sample_draft
 
@@ -37,9 +37,9 @@ class World:
     store: MapStore
     folder: Path
     fleet: Fleet
-    talk: ServerTalk
-    link: MapLink
-    spool: Spool
+    talk: ServerSync
+    link: MapClient
+    spool: Outbox
     clock: dict[str, float]
     table: list[str] = field(default_factory=list)
     lose_answers: bool = False
@@ -83,10 +83,10 @@ def world(tmp_path: Path) -> Iterator[World]:
             return made_late[0].take_failure(key, payload)
 
         bus.queryable(robot_key("*", "*", "failures"), take)
-        service = TileService(store, fleet, bus, lambda *_: None)
-        link = MapLink(robot_bus, TileCache(tmp_path / "cache"), "lab", "r1")
-        spool = Spool(tmp_path / "spool", max_bytes=10**6)
-        talk = ServerTalk(link, spool, retry_s=600.0, clock_s=lambda: clock["s"])
+        service = BusService(store, fleet, bus, lambda *_: None)
+        link = MapClient(robot_bus, TileCache(tmp_path / "cache"), "lab", "r1")
+        spool = Outbox(tmp_path / "spool", max_bytes=10**6)
+        talk = ServerSync(link, spool, retry_s=600.0, clock_s=lambda: clock["s"])
         made = World(hub, store, tmp_path / "store", fleet, talk, link, spool, clock)
         made_late.append(made)
         yield made
@@ -94,11 +94,11 @@ def world(tmp_path: Path) -> Iterator[World]:
         service.close()
 
 
-def report(name: str) -> SpooledReport:
+def report(name: str) -> QueuedReport:
     message = FailureReport(
         site="lab", robot="r1", id=name, stamp_ns=1, wall_ns=1, duration_s=2.0, kind="blind", status="LOST", cause="dark", version=1
     )  # fmt: skip
-    return SpooledReport(name, encode_message(message))
+    return QueuedReport(name, encode_message(message))
 
 
 def adopt(world: World) -> WantedVersion:
@@ -226,7 +226,7 @@ def test_ten_minutes_without_a_network_cost_no_report_and_double_none(world: Wor
     assert world.spool.counts()["waiting"] == 10
     # The program dies, and begins anew with what its disk holds.
     world.talk.close()
-    world.talk = ServerTalk(world.link, world.spool, retry_s=600.0, clock_s=lambda: world.clock["s"])
+    world.talk = ServerSync(world.link, world.spool, retry_s=600.0, clock_s=lambda: world.clock["s"])
     world.hub.reachable, world.lose_answers = True, True
     world.step()
     world.hub.reachable, world.lose_answers = True, False
@@ -256,7 +256,7 @@ def test_a_report_that_the_server_refuses_does_not_hold_up_the_others(world: Wor
 def test_a_report_that_the_disk_has_damaged_is_dropped_and_counted(world: World, payload: bytes) -> None:
     """It is told neither once nor for ever, and those before and behind it arrive."""
     world.spool.put(report("before"))
-    world.spool.put(SpooledReport("damaged", payload))
+    world.spool.put(QueuedReport("damaged", payload))
     world.spool.put(report("behind"))
     world.step()
     assert world.table == ["before", "behind"]

@@ -8,7 +8,7 @@ import pytest
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import Image
 from locclient.localization import image_quality_kernels
-from locclient.localization.image_quality import Cause, SightJudge, SightSettings
+from locclient.localization.image_quality import Cause, ImageQualityMonitor, ImageQualitySettings
 
 Spoil = Callable[[Image, np.random.Generator], Image]
 
@@ -29,9 +29,9 @@ def frame(number: int, left: Image | None = None, right: Image | None = None) ->
     )
 
 
-def judged() -> SightJudge:
+def judged() -> ImageQualityMonitor:
     """After ten good frames, none of which it found fault with."""
-    judge = SightJudge(SightSettings())
+    judge = ImageQualityMonitor(ImageQualitySettings())
     assert {judge.judge(frame(number)) for number in range(10)} == {Cause.NONE}
     return judge
 

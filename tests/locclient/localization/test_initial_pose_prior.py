@@ -8,8 +8,8 @@ import pytest
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.samples import PositionPrior
-from locclient.localization.initial_pose_prior import HeldPrior
-from locclient.localization.pose_hypothesis import Anchor
+from locclient.localization.initial_pose_prior import InitialPosePrior
+from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, 1.5])), np.array([0.4, 0.0, 0.2]))
@@ -39,7 +39,7 @@ class Ride:
         map_from_base[1, 3] += off_m
         unknown = 0.01**2 if whole else np.inf
         covariance = np.diag([unknown] * 3 + [sigma_m**2, sigma_m**2, unknown])
-        self.prior = HeldPrior(PositionPrior(0, map_from_base, covariance), BASE_FROM_BODY)
+        self.prior = InitialPosePrior(PositionPrior(0, map_from_base, covariance), BASE_FROM_BODY)
         self.odometry: Any = Steady()
         self.prior.follow(self.odometry, self._estimate(), np.eye(4), SETTINGS)
 
@@ -55,11 +55,11 @@ class Ride:
             self.map_from_body = self.map_from_body @ STEP
             self.prior.follow(self.odometry, self._estimate(), STEP, SETTINGS)
 
-    def place(self, x_m: float = 0.0, y_m: float = 0.0, turned_rad: float = 0.0) -> Anchor:
+    def place(self, x_m: float = 0.0, y_m: float = 0.0, turned_rad: float = 0.0) -> PoseHypothesis:
         beside = self.map_from_body.copy()
         beside[:3, :3] = so3_exp(np.array([0.0, 0.0, turned_rad])) @ beside[:3, :3]
         beside[:2, 3] += x_m, y_m
-        return Anchor.at(self._estimate(), beside, np.diag([0.002**2] * 3 + [0.01**2] * 3))
+        return PoseHypothesis.at(self._estimate(), beside, np.diag([0.002**2] * 3 + [0.01**2] * 3))
 
 
 @pytest.mark.parametrize("steps", [0, 3, 9])

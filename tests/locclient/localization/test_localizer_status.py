@@ -266,7 +266,7 @@ def test_one_strong_fix_alone_is_believed(robot: Robot) -> None:
 
 
 def test_a_strong_fix_where_the_map_has_a_twin_must_be_confirmed(robot: Robot) -> None:
-    robot.inliers, robot.relocalizer.twin_share = 100, 0.55
+    robot.inliers, robot.relocalizer.alias_ratio = 100, 0.55
     assert [e.status for e in robot.ride(3, 0.6)] == [Status.INITIALISING] * 2 + [Status.TRACKING]
 
 

@@ -4,24 +4,24 @@ import pytest
 
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import LinkError, UnreachableError
-from fleetmap.messages import PART_BYTES, Part, PartQuestion, decode_message, encode_message, part_of
-from locclient.maps.chunked_download import PartReader
+from fleetmap.messages import PART_BYTES, ChunkRequest, Part, decode_message, encode_message, part_of
+from locclient.maps.chunked_download import ChunkReader
 
 DATA = bytes(range(256)) * 3000  # three parts
 
 
-def answered(*parts: Part) -> PartReader:
+def answered(*parts: Part) -> ChunkReader:
     """A reader of a server that answers these, whatever is asked."""
     hub, left = MemoryHub(), list(parts)
     MemoryBus(hub).queryable("x", lambda *_: encode_message(left.pop(0)))
-    return PartReader(MemoryBus(hub), timeout_s=0.01, patience_s=0)
+    return ChunkReader(MemoryBus(hub), timeout_s=0.01, patience_s=0)
 
 
 def test_parts_become_the_whole() -> None:
     hub = MemoryHub()
     MemoryBus(hub).queryable("x", lambda _, asked: part_of(DATA, asked))
     MemoryBus(hub).queryable("empty", lambda _, asked: part_of(b"", asked))
-    reader = PartReader(MemoryBus(hub), timeout_s=0.01, patience_s=0)
+    reader = ChunkReader(MemoryBus(hub), timeout_s=0.01, patience_s=0)
     assert reader.read("x", max_bytes=len(DATA)) == DATA
     assert reader.received_bytes == len(DATA)
     assert reader.read("empty", max_bytes=0) == b""
@@ -32,7 +32,7 @@ def test_parts_become_the_whole() -> None:
 def test_an_empty_question_asks_for_the_first_part() -> None:
     part = decode_message(part_of(DATA, b""), Part)
     assert (part.total_bytes, part.offset, part.data) == (len(DATA), 0, DATA[:PART_BYTES])
-    beyond = decode_message(part_of(DATA, encode_message(PartQuestion(offset=10**9))), Part)
+    beyond = decode_message(part_of(DATA, encode_message(ChunkRequest(offset=10**9))), Part)
     assert (beyond.total_bytes, beyond.data) == (len(DATA), b"")
     for nonsense in (b"x", b"\x80\x80", encode_message(Part(total_bytes=1, offset=0, data=b""))[:-1]):
         with pytest.raises(LinkError):
@@ -66,5 +66,5 @@ def test_patience_ends() -> None:
 
     bus.get = get
     with pytest.raises(UnreachableError):
-        PartReader(bus, timeout_s=5.0, patience_s=9.0, clock_s=lambda: now[0]).read("x", max_bytes=1)
+        ChunkReader(bus, timeout_s=5.0, patience_s=9.0, clock_s=lambda: now[0]).read("x", max_bytes=1)
     assert len(asked) == 2

@@ -10,10 +10,10 @@ from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import blob_path
 from fleetmap.messages import WantedVersion
 from locclient.localization.estimate import Status
-from locclient.maps.map_client import StoreFolderLink
+from locclient.maps.map_client import LocalMapSource
 from locclient.maps.tile_cache import StoreFolder
-from locclient.maps.tile_loader import MapRoom
-from locclient.maps.tile_selection import Place, Whereabouts, WindowSettings
+from locclient.maps.tile_loader import TileLoader
+from locclient.maps.tile_selection import Place, PositionBound, WindowSettings
 from mapserver.store import MapStore
 from support.fleet.estimates import estimate
 from support.storage.map_samples import draft_details, random_tile
@@ -39,8 +39,8 @@ def at(x_m: float) -> np.ndarray:
 
 
 def test_memory_follows_the_robot(row: tuple[Path, MapStore]) -> None:
-    link = StoreFolderLink(StoreFolder(row[0]), "row")
-    room, wanted = MapRoom(link, SETTINGS), link.wanted()
+    link = LocalMapSource(StoreFolder(row[0]), "row")
+    room, wanted = TileLoader(link, SETTINGS), link.wanted()
     everywhere = room.load(wanted, Place())
     assert everywhere is not None
     assert sorted(everywhere.tiles) == [(x, 0) for x in range(10)]
@@ -57,8 +57,8 @@ def test_memory_follows_the_robot(row: tuple[Path, MapStore]) -> None:
 
 def test_a_lost_robot_holds_the_tiles_that_it_can_have_come_to(row: tuple[Path, MapStore]) -> None:
     """Not those where it says that it is: it would drive out of the map, and never find another place."""
-    whereabouts, room = Whereabouts(SETTINGS), MapRoom(StoreFolderLink(StoreFolder(row[0]), "row"), SETTINGS)
-    wanted = StoreFolderLink(StoreFolder(row[0]), "row").wanted()
+    whereabouts, room = PositionBound(SETTINGS), TileLoader(LocalMapSource(StoreFolder(row[0]), "row"), SETTINGS)
+    wanted = LocalMapSource(StoreFolder(row[0]), "row").wanted()
     assert whereabouts.handle(estimate(0.0, Status.AMBIGUOUS, known=False)).position_map_m is None, "anywhere"
     assert whereabouts.handle(estimate(1.0, x_m=40.0)).doubt_m == 0
     held = []
@@ -79,8 +79,8 @@ def test_bad_tiles_are_left_out(row: tuple[Path, MapStore], tmp_path: Path) -> N
     manifest = store.manifest("row", 1)
     victim = folder / blob_path(manifest.tiles[4].sha256)
     good = victim.read_bytes()
-    link = StoreFolderLink(StoreFolder(folder), "row")
-    room, wanted = MapRoom(link, SETTINGS), link.wanted()
+    link = LocalMapSource(StoreFolder(folder), "row")
+    room, wanted = TileLoader(link, SETTINGS), link.wanted()
     victim.chmod(0o644)
     victim.write_bytes(good[:-7])
     try:
@@ -97,4 +97,4 @@ def test_bad_tiles_are_left_out(row: tuple[Path, MapStore], tmp_path: Path) -> N
     assert len(mended.tiles) == 10
     foreign = WantedVersion(site="else", version=1, manifest_sha256=wanted.manifest_sha256)
     with pytest.raises(FleetmapError, match="manifest is of row version 1"):
-        MapRoom(StoreFolderLink(StoreFolder(folder), "else"), SETTINGS).load(foreign, Place())
+        TileLoader(LocalMapSource(StoreFolder(folder), "else"), SETTINGS).load(foreign, Place())

@@ -8,7 +8,7 @@ import pytest
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.estimate import Estimate, Status
-from locclient.robot.dock_check import DockWatch
+from locclient.robot.dock_check import DockCheck
 from support.fleet.estimates import estimate
 
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([0.3, 0.0, 1.0]))
@@ -25,7 +25,7 @@ def at(stamp_s: float, x_m: float, status: Status = Status.TRACKING, speed_mps: 
     return replace(said, odometry=replace(said.odometry, velocity_odom_mps=np.array([speed_mps, 0.0, 0.0])))
 
 
-def arrived(watch: DockWatch, stamp_s: float, x_m: float, *docks: PositionPrior) -> float | None:
+def arrived(watch: DockCheck, stamp_s: float, x_m: float, *docks: PositionPrior) -> float | None:
     """What two frames at a place bring, the second with what docks say."""
     watch.handle([], at(stamp_s - 0.1, x_m))
     return watch.handle(docks, at(stamp_s, x_m))
@@ -33,14 +33,14 @@ def arrived(watch: DockWatch, stamp_s: float, x_m: float, *docks: PositionPrior)
 
 def test_the_error_is_that_of_the_base() -> None:
     """The body stands at x = 2 and the base beside it, as the calibration says."""
-    watch = DockWatch(BASE_FROM_BODY)
+    watch = DockCheck(BASE_FROM_BODY)
     # map_from_base = map_from_body @ inverse(base_from_body): the base's origin is 0.3 m along the body's y.
     assert arrived(watch, 1.0, 2.0, dock(1.0, 2.0, 0.3)) == pytest.approx(0.0, abs=1e-9)
-    assert arrived(DockWatch(BASE_FROM_BODY), 1.0, 2.0, dock(1.0, 2.3, 0.7)) == pytest.approx(0.5)
+    assert arrived(DockCheck(BASE_FROM_BODY), 1.0, 2.0, dock(1.0, 2.3, 0.7)) == pytest.approx(0.5)
 
 
 def test_an_arrival_counts_once_and_the_next_one_again() -> None:
-    watch = DockWatch(np.eye(4))
+    watch = DockCheck(np.eye(4))
     assert arrived(watch, 1.0, 0.0, dock(1.0, 0.1)) == pytest.approx(0.1)
     assert arrived(watch, 2.0, 0.0, dock(2.0, 0.1)) is None
     assert arrived(watch, 3.0, 0.5, dock(3.0, 0.6)) is None, "it has hardly moved"
@@ -49,7 +49,7 @@ def test_an_arrival_counts_once_and_the_next_one_again() -> None:
 
 
 def test_zones_and_operators_are_no_docks() -> None:
-    watch = DockWatch(np.eye(4))
+    watch = DockCheck(np.eye(4))
     assert arrived(watch, 1.0, 0.0, dock(1.0, 0.6, sigma_m=1.0)) is None
     unknown = replace(dock(1.1, 0.6), cov_rot_trans=np.full((6, 6), np.inf))
     assert arrived(watch, 1.1, 0.0, unknown) is None
@@ -59,20 +59,20 @@ def test_zones_and_operators_are_no_docks() -> None:
 @pytest.mark.parametrize("before", [Status.LOST, Status.DEGRADED, Status.AMBIGUOUS, Status.INITIALISING])
 def test_who_had_claimed_nothing_was_not_wrong(before: Status) -> None:
     """A robot that is told its place by the dock agrees with it afterwards."""
-    watch = DockWatch(np.eye(4))
+    watch = DockCheck(np.eye(4))
     watch.handle([], at(0.9, 0.0, before))
     assert watch.handle([dock(1.0, 0.5)], at(1.0, 0.0)) is None
 
 
 def test_a_word_that_is_old_is_not_compared_while_the_robot_drives() -> None:
     for speed_mps, expected in ((0.0, pytest.approx(0.1)), (1.0, None)):
-        watch = DockWatch(np.eye(4))
+        watch = DockCheck(np.eye(4))
         watch.handle([], at(0.9, 0.0, speed_mps=speed_mps))
         assert watch.handle([dock(0.9, 0.1)], at(1.0, 0.0, speed_mps=speed_mps)) == expected
 
 
 def test_odometry_that_begins_anew_is_no_way() -> None:
-    watch, change = DockWatch(np.eye(4)), se3(np.eye(3), np.array([50.0, 0.0, 0.0]))
+    watch, change = DockCheck(np.eye(4)), se3(np.eye(3), np.array([50.0, 0.0, 0.0]))
     assert arrived(watch, 1.0, 0.0, dock(1.0, 0.1)) == pytest.approx(0.1)
     said = at(1.1, 0.0)
     redefined = replace(said.odometry, odom_from_body=_moved(change, said), new_odom_from_old_odom=change)

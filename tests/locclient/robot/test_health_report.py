@@ -15,7 +15,7 @@ from locclient.localization.estimate import Estimate, Status
 from locclient.maps.map_client import FetchedTiles
 from locclient.replay.replay import ReplayResult, RobotLink, _record, _Reporter
 from locclient.robot.health_report import FixFigures, HealthFigures
-from mapserver.fleet_statistics.health_stream import RobotWatch
+from mapserver.fleet_statistics.health_stream import HealthStream
 from mapserver.store import MapStore
 from support.fleet.estimates import estimate
 from support.recordings.recording_samples import calibration
@@ -109,7 +109,7 @@ def test_a_replay_tells_the_server_what_it_counts_with(store: MapStore) -> None:
     link, manifest = _Link(), store.manifest(robot_world.SITE, 1)
     result = ReplayResult([], [], [], manifest, FetchedTiles({}, {}))
     to: Any = link
-    reporter, watch, sums = _Reporter(RobotLink(to, to, robot_world.SITE, "r1"), result), RobotWatch(), []
+    reporter, watch, sums = _Reporter(RobotLink(to, to, robot_world.SITE, "r1"), result), HealthStream(), []
     for number in range(50):
         said = look(0.1 * number, 4.0, 0.4 if number == 35 else 0.02, 50, 40)
         result.frames.append(_record(said, None, 0.01, 0.01, {}))

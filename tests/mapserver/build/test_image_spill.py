@@ -8,7 +8,7 @@ import pytest
 from fleetmap.errors import StoreError
 from fleetmap.features.patch_align import half_pyramid
 from fleetmap.sensors.rectification import RectifiedFrame
-from mapserver.build.image_spill import PictureFile
+from mapserver.build.image_spill import ImageSpill
 from mapserver.survey.keyframes.keyframes import Pictures
 
 
@@ -22,7 +22,7 @@ def pictures(number: int) -> Pictures:
 
 def test_pictures_come_back_to_the_bit(tmp_path: Path) -> None:
     """More of them than are held in memory, asked for in another order."""
-    with PictureFile(tmp_path) as shelf:
+    with ImageSpill(tmp_path) as shelf:
         numbers = [shelf.put(pictures(n)) for n in range(120)]
         for n in [*range(119, -1, -7), 0, 1, 119]:
             back, wanted = shelf.get(numbers[n]), pictures(n)
@@ -40,4 +40,4 @@ def test_pictures_come_back_to_the_bit(tmp_path: Path) -> None:
 
 def test_a_folder_that_takes_no_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="nowhere"):
-        PictureFile(tmp_path / "nowhere")
+        ImageSpill(tmp_path / "nowhere")

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from mapserver.build.job_lock import INTERRUPTED, end_interrupted
-from mapserver.build.job_record import noted_job
+from mapserver.build.job_record import recorded_job
 from mapserver.store import MapStore
 from support.storage.map_samples import save_sample_draft
 
@@ -18,7 +18,7 @@ def begun_elsewhere(folder: Path) -> int:
     told, tell = os.pipe()
     child = os.fork()
     if child == 0:
-        with MapStore.open(folder) as maps, noted_job(maps, "lab", "build"):
+        with MapStore.open(folder) as maps, recorded_job(maps, "lab", "build"):
             os.write(tell, b"x")
             signal.pause()
         os._exit(0)
@@ -52,7 +52,7 @@ def test_the_next_job_ends_it_too(tmp_path: Path) -> None:
         save_sample_draft(maps)
         maps.begin_job("lab", "build")
     with MapStore.open(tmp_path) as maps:
-        with noted_job(maps, "lab", "build"):
+        with recorded_job(maps, "lab", "build"):
             assert [job.state for job in maps.jobs()] == ["running", "failed"]
         assert [job.state for job in maps.jobs()] == ["done", "failed"]
     assert list(tmp_path.glob("job-*.lock")) == []

@@ -17,7 +17,7 @@ from fleetmap.sensors.samples import CameraFrame, ImuSamples
 from mapserver.build import worker as workers
 from mapserver.build.worker import Threads, open_worker, read_ahead
 from mapserver.store.archive import encode_archive
-from mapserver.survey.executor import ALONE, Worker, in_batches
+from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.loops.zones import Zones
 from mapserver.survey.pipeline import survey
 from mapserver.survey.settings import SurveySettings
@@ -25,7 +25,7 @@ from mapserver.tiles.tiling import tiles_from_survey
 from support.recordings.recording_samples import calibration, make_sample
 
 
-def surveyed_by(worker: Worker) -> tuple[bytes, ...]:
+def surveyed_by(worker: Executor) -> tuple[bytes, ...]:
     """Archive and tiles of a small survey."""
     sample, rig = make_sample(24), calibration()
     frames = [CameraFrame(int(s), a, b) for s, a, b in zip(sample.stamps_ns, sample.left, sample.right, strict=True)]
@@ -39,7 +39,7 @@ def surveyed_by(worker: Worker) -> tuple[bytes, ...]:
 
 @lru_cache(maxsize=1)
 def alone() -> tuple[bytes, ...]:
-    return surveyed_by(ALONE)
+    return surveyed_by(SERIAL)
 
 
 def test_threads_make_the_same_map() -> None:

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from fleetmap.bus import ZenohBus
 from fleetmap.errors import GateRefusedError, StoreError, UnreachableError, UsageError
 from fleetmap.messages import RobotHealth, WantedVersion
-from locclient.maps.map_client import MapLink
+from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver import cli
 from mapserver.commands.releases.inspect import inspect
@@ -57,7 +57,7 @@ def test_a_robot_gets_its_map_and_is_seen(tmp_path: Path, number: signal.Signals
         save_sample_draft(store)
         store.publish("lab")
     with serving(tmp_path / "store") as (process, http, zenoh), ZenohBus.connect(zenoh) as bus:
-        link = MapLink(bus, TileCache(tmp_path / "cache"), "lab", "r1")
+        link = MapClient(bus, TileCache(tmp_path / "cache"), "lab", "r1")
         heard: list[WantedVersion] = []
         link.on_wanted(heard.append)
         manifest = link.manifest(link.wanted())
@@ -110,7 +110,7 @@ def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path
 
         bus.get = get
         cache = TileCache(tmp_path / "cache")
-        link = MapLink(bus, cache, "lab", "r1", timeout_s=0.5, patience_s=60)
+        link = MapClient(bus, cache, "lab", "r1", timeout_s=0.5, patience_s=60)
         assert link.ready().wanted.version == 1
         assert len(failed) >= 2
         assert cache.active("lab").version == 1

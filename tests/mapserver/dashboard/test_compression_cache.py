@@ -10,7 +10,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.testclient import TestClient
 
-from mapserver.dashboard.compression_cache import KeptFiles
+from mapserver.dashboard.compression_cache import CompressionCache
 
 TEXT = "quasar " * 1000
 asked: Counter[str] = Counter()
@@ -27,7 +27,7 @@ def _answer(request: Request) -> Response:
 def client() -> TestClient:
     asked.clear()
     inner = Starlette(routes=[Route("/{path:path}", _answer)])
-    return TestClient(KeptFiles(inner))
+    return TestClient(CompressionCache(inner))
 
 
 def test_a_file_is_asked_for_once_and_is_the_same_for_all(client: TestClient) -> None:

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from fleetmap.errors import StateError, UsageError
 from fleetmap.mapformat import Manifest
-from mapserver.build.job_record import noted_job
+from mapserver.build.job_record import recorded_job
 from mapserver.dashboard import drawing
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData, trend_words
@@ -239,12 +239,12 @@ def test_health_of_a_site(store: MapStore) -> None:
 
 
 def test_a_job_is_noted_from_begin_to_end(store: MapStore) -> None:
-    with noted_job(store, SITE, "build") as job:
+    with recorded_job(store, SITE, "build") as job:
         assert store.jobs(SITE)[0].state == "running"
         job.message, job.report = "draft 4", build_report()
     done = store.jobs(SITE)[0]
     assert (done.state, done.message, done.report["version"]) == ("done", "draft 4", 3)
-    with pytest.raises(UsageError), noted_job(store, SITE, "build"):
+    with pytest.raises(UsageError), recorded_job(store, SITE, "build"):
         raise UsageError("cameras are swapped")
     failed = store.jobs(SITE)[0]
     assert (failed.state, failed.message) == ("failed", "cameras are swapped")

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from fleetmap.geometry import so3_exp
 from fleetmap.recordings import Recording, open_recording
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, Loss, Stamps
+from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, Stamps
 from mapserver.commands.doctor import doctor
 from mapserver.doctor import Finding, Verdict, examine
 from mapserver.doctor.gyro_images import CameraTurns, fit_gyro
@@ -171,7 +171,7 @@ def test_timing() -> None:
     assert camera_gaps(gap).value == pytest.approx(31 * 0.05)
     assert "2.5 s after the start" in camera_gaps(gap).sentence
     assert imu_gaps(np.delete(stamps(0.005), slice(50, 100))).verdict is Verdict.FAIL
-    assert stamp_order([Loss("imu: stamps not increasing", "3 of 9")]).verdict is Verdict.FAIL
+    assert stamp_order([DataIssue("imu: stamps not increasing", "3 of 9")]).verdict is Verdict.FAIL
     assert camera_imu_overlap(stamps(0.05), stamps(0.005), 0.0).value == pytest.approx(0.9, abs=0.02)
     assert camera_imu_overlap(stamps(0.05), stamps(0.005, 2000), 0.0).verdict is Verdict.OK
 

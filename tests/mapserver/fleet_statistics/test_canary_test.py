@@ -11,7 +11,7 @@ from scipy import integrate, stats
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import GateRefusedError, StateError, UsageError
 from fleetmap.messages import FailureReport, PoseMessage, RobotHealth, WantedVersion, decode_message, robot_key
-from locclient.maps.map_client import MapLink
+from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver.fleet.canary_controller import find, review
 from mapserver.fleet.fleet import Fleet
@@ -24,7 +24,7 @@ from mapserver.fleet_statistics.canary_test import (
     within_margin,
 )
 from mapserver.fleet_statistics.kpis import Tally, rate
-from mapserver.serving.bus_service import TileService
+from mapserver.serving.bus_service import BusService
 from mapserver.store import Actor, MapStore, Retention
 from support.fleet.made_fleet import NS, Known, MadeRobot, drive
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
@@ -107,7 +107,7 @@ class World:
 
     store: MapStore
     fleet: Fleet
-    service: TileService
+    service: BusService
     bus: MemoryBus
     clock: dict[str, int]
     robots: list[MadeRobot]
@@ -147,7 +147,7 @@ def world(tmp_path: Path) -> Iterator[World]:
         store.publish("lab")
         save_sample_draft(store, seed=7)
         fleet = Fleet(store, clock_ns=lambda: clock["ns"])
-        service = TileService(store, fleet, bus, lambda *_: None)
+        service = BusService(store, fleet, bus, lambda *_: None)
         rng = np.random.default_rng(2)
         robots = [MadeRobot("lab", f"r{n}", rng, Known(), rate_per_robot_day=2.0) for n in range(40)]
         world = World(store, fleet, service, bus, clock, robots)
@@ -206,7 +206,7 @@ def test_a_robot_fetches_what_it_is_told(world: World, tmp_path: Path) -> None:
     inside = next(r.name for r in world.robots if number_of("lab", 2, r.name) < canary.threshold)
     outside = next(r.name for r in world.robots if number_of("lab", 2, r.name) >= canary.threshold)
     for name, version in ((inside, 2), (outside, 1)):
-        ready = MapLink(world.bus, TileCache(tmp_path / name), "lab", name).ready()
+        ready = MapClient(world.bus, TileCache(tmp_path / name), "lab", name).ready()
         assert (ready.wanted.version, ready.note) == (version, "")
 
 

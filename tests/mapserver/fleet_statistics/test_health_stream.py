@@ -6,7 +6,7 @@ import pytest
 
 from fleetmap.messages import PoseMessage, RobotHealth
 from mapserver.fleet_statistics.clock_skew import ClockSkew, server_time_ns
-from mapserver.fleet_statistics.health_stream import RobotWatch
+from mapserver.fleet_statistics.health_stream import HealthStream
 from mapserver.fleet_statistics.kpis import Tally
 
 NS = 1_000_000_000
@@ -18,8 +18,8 @@ def health(second: float, status: str = "TRACKING", *, wall_ns: int | None = Non
     )
 
 
-def total(reports: list[RobotHealth], watch: RobotWatch | None = None) -> Tally:
-    watch, found = watch or RobotWatch(), Tally()
+def total(reports: list[RobotHealth], watch: HealthStream | None = None) -> Tally:
+    watch, found = watch or HealthStream(), Tally()
     for report in reports:
         tally = watch.take_health(report)
         if tally is not None:
@@ -79,7 +79,7 @@ def test_driving_by_speed_else_by_poses_else_not_at_all() -> None:
     assert total([health(n, speed_mps=1.0) for n in range(5)]).driving_ms == 4000
     assert total([health(n, speed_mps=0.0) for n in range(5)]).driving_ms == 0
     assert total([health(n) for n in range(5)]).driving_ms == 0
-    watch, found = RobotWatch(), Tally()
+    watch, found = HealthStream(), Tally()
     for n in range(5):
         watch.take_pose(
             PoseMessage(
@@ -100,7 +100,7 @@ def test_counters_are_differences_and_a_run_begins_anew() -> None:
 
 
 def test_repeated_and_replayed_reports() -> None:
-    watch = RobotWatch()
+    watch = HealthStream()
     assert total([health(5, wall_ns=5 * NS), health(5, wall_ns=5 * NS), health(4, wall_ns=4 * NS)], watch).reports == 1
     assert watch.duplicates == 2
     assert total([health(3, wall_ns=60 * NS)], watch).reports == 1  # the same recording, played again

@@ -26,9 +26,9 @@ from fleetmap.errors import (
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import open_recording
 from mapserver import cli
-from mapserver.build.build import BuildOrder, Draft
+from mapserver.build.build import BuildRequest, Draft
 from mapserver.build.survey_recordings import admit_recordings
-from mapserver.nightly import NightOrder, last_report, night, run_night
+from mapserver.nightly import NightRequest, last_report, night, run_night
 from mapserver.nightly.inbox import arrivals
 from mapserver.quality.gate import GateSettings
 from mapserver.store import MapStore
@@ -48,7 +48,7 @@ def record(inbox: Path, name: str, number: int) -> Path:
     return write_euroc(inbox / name, sample)
 
 
-def built(order: BuildOrder, _: SurveySettings, unusable: dict[Path, str], *, landmarks: int = 60) -> Draft:
+def built(order: BuildRequest, _: SurveySettings, unusable: dict[Path, str], *, landmarks: int = 60) -> Draft:
     """A draft with what a build would say; recordings named "lost" find no place, those named "dark" cannot be surveyed."""
     entries, left_out = [], {}
     for path in order.recordings:
@@ -87,7 +87,7 @@ def hall(tmp_path: Path) -> Path:
 
 def spend(folder: Path) -> str:
     """One night, some time after everything came in."""
-    order = NightOrder("hall", folder / "inbox", folder / "store", time.time_ns() + LATER_NS)
+    order = NightRequest("hall", folder / "inbox", folder / "store", time.time_ns() + LATER_NS)
     return run_night(order, SurveySettings(), GateSettings(), Console(file=io.StringIO()))
 
 

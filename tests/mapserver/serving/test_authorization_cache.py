@@ -1,6 +1,6 @@
 """What may be fetched is remembered for some seconds, what may not is asked for each time."""
 
-from mapserver.serving.authorization_cache import RecentKinds
+from mapserver.serving.authorization_cache import AuthorizationCache
 
 
 def test_the_store_is_asked_once_in_some_seconds() -> None:
@@ -10,7 +10,7 @@ def test_the_store_is_asked_once_in_some_seconds() -> None:
         asked.append(sha256)
         return published.get((sha256, site))
 
-    kinds = RecentKinds(ask, lambda: now["s"])
+    kinds = AuthorizationCache(ask, lambda: now["s"])
     assert [kinds.get("tile", "hall") for _ in range(3)] == ["tile"] * 3
     assert asked == ["tile"]
     assert kinds.get("tile", "lab") is None

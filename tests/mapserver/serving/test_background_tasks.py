@@ -12,17 +12,17 @@ from mapserver.config import MapserverConfig
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet_statistics.canary_test import CanarySettings
-from mapserver.serving.background_tasks import Chore, run_chores, server_chores
-from mapserver.serving.bus_service import TileService
+from mapserver.serving.background_tasks import BackgroundTask, run_background_tasks, server_tasks
+from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from support.storage.map_samples import save_sample_draft
 
 NS = 1_000_000_000
 
 
-def run_for(chores: list[Chore], seconds: float) -> None:
+def run_for(chores: list[BackgroundTask], seconds: float) -> None:
     async def run() -> None:
-        task = asyncio.create_task(run_chores(chores))
+        task = asyncio.create_task(run_background_tasks(chores))
         await asyncio.sleep(seconds)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
@@ -41,7 +41,11 @@ def test_one_that_fails_stops_no_other(caplog: pytest.LogCaptureFixture) -> None
         done.append("broken")
         raise ZeroDivisionError
 
-    chores = [Chore("a", 0.01, refuse), Chore("b", 0.01, break_down), Chore("c", 60.0, lambda: done.append("c"))]
+    chores = [
+        BackgroundTask("a", 0.01, refuse),
+        BackgroundTask("b", 0.01, break_down),
+        BackgroundTask("c", 60.0, lambda: done.append("c")),
+    ]
     run_for(chores, 1.0)
     assert done.count("refused") >= 2 and done.count("broken") >= 2
     assert done.count("c") == 1
@@ -58,7 +62,7 @@ def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path) -> None:
         store.publish("lab")
         save_sample_draft(store, seed=3)
         fleet = Fleet(store, settings=settings.ingest)
-        service = TileService(store, fleet, bus, lambda *_: None)
+        service = BusService(store, fleet, bus, lambda *_: None)
         store.start_canary("lab", 2, 0.1)
         for robot, version in (("r1", 2), ("r2", 1), ("r3", 1)):
             for second in range(40):
@@ -73,7 +77,7 @@ def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path) -> None:
                 duration_s=3.0, kind="blind", status="LOST", cause="changed", version=2,
             )  # fmt: skip
             fleet.take_failure("lab", "r1", report)
-        run_for(server_chores(store, fleet, service, settings), 2.0)
+        run_for(server_tasks(store, fleet, service, settings), 2.0)
         (canary,) = store.canaries("lab")
         assert canary.state == "rolled_back", canary
         assert "8 in" in canary.outcome

@@ -27,11 +27,11 @@ from fleetmap.messages import (
     patch_key,
     robot_key,
 )
-from locclient.maps.map_client import MapLink, StoreFolderLink
+from locclient.maps.map_client import LocalMapSource, MapClient
 from locclient.maps.tile_cache import StoreFolder, TileCache
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving import bus_service
-from mapserver.serving.bus_service import TileService
+from mapserver.serving.bus_service import BusService
 from mapserver.store import FailureFilter, MapStore
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
@@ -46,12 +46,12 @@ class World:
     hub: MemoryHub
     store: MapStore
     fleet: Fleet
-    service: TileService
+    service: BusService
     counts: list[tuple[str, str, int]]
     robot_bus: MemoryBus
     cache: TileCache
-    link: MapLink
-    hall: MapLink
+    link: MapClient
+    hall: MapClient
 
     def publish(self, tiles: list[Tile]) -> WantedVersion:
         """Another version of site hall, which has none at first."""
@@ -76,10 +76,10 @@ def world(tmp_path: Path) -> Iterator[World]:
         save_sample_draft(store)
         store.publish("lab")
         fleet = Fleet(store, clock_ns=lambda: clock["ns"])
-        service = TileService(store, fleet, bus, lambda *event: counts.append(event))
+        service = BusService(store, fleet, bus, lambda *event: counts.append(event))
         with MemoryBus(hub) as robot_bus:
             cache = TileCache(tmp_path / "cache")
-            links = (MapLink(robot_bus, cache, site, "r1") for site in ("lab", "hall"))
+            links = (MapClient(robot_bus, cache, site, "r1") for site in ("lab", "hall"))
             yield World(tmp_path / "store", hub, store, fleet, service, counts, robot_bus, cache, *links)
         service.close()
 
@@ -103,7 +103,7 @@ def test_a_robot_fetches_everything_once(world: World) -> None:
 
 
 def test_a_store_folder_gives_the_same(world: World) -> None:
-    folder = StoreFolderLink(StoreFolder(world.folder), "lab")
+    folder = LocalMapSource(StoreFolder(world.folder), "lab")
     wanted = folder.wanted()
     assert wanted == world.link.wanted()
     manifest = folder.manifest(wanted)
@@ -112,7 +112,7 @@ def test_a_store_folder_gives_the_same(world: World) -> None:
     mine, theirs = folder.tiles(manifest).tiles, world.link.tiles(manifest).tiles
     assert sorted(mine) == sorted(theirs)
     np.testing.assert_array_equal(mine[0, 0].points_map, theirs[0, 0].points_map)
-    other = StoreFolderLink(StoreFolder(world.folder), "elsewhere")
+    other = LocalMapSource(StoreFolder(world.folder), "elsewhere")
     assert other.wanted().version is None
     with pytest.raises(LinkError, match="no published version"):
         other.manifest(other.wanted())
@@ -128,7 +128,7 @@ def test_a_corrupt_tile_is_refused_and_the_rest_stays(world: World, damage: str)
         path.unlink()
     else:
         path.write_bytes(data[:-1] if damage == "cut" else data[:100] + bytes([data[100] ^ 1]) + data[101:])
-    for link in (world.link, StoreFolderLink(StoreFolder(world.folder), "lab")):
+    for link in (world.link, LocalMapSource(StoreFolder(world.folder), "lab")):
         fetched = link.tiles(manifest)
         assert sorted(fetched.tiles) == [(1, 0)]
         assert list(fetched.refused) == [(0, 0)]
@@ -347,7 +347,7 @@ def test_presence_and_names(world: World) -> None:
     assert world.robot_bus.alive(robot_key("lab", "*", "alive")) == [robot_key("lab", "r1", "alive")]
     handle.close()
     with pytest.raises(UsageError, match="robot name"):
-        MapLink(world.robot_bus, world.cache, "lab", "Robot One")
+        MapClient(world.robot_bus, world.cache, "lab", "Robot One")
 
 
 def moved(tile: Tile, rows: slice) -> Tile:
@@ -370,7 +370,7 @@ def test_a_version_is_active_when_all_of_it_is_there(world: World) -> None:
     manifest = world.link.manifest(ready.wanted)
     world.hub.reachable = False
     # Another process of the same robot, without a server.
-    again = MapLink(world.robot_bus, TileCache(world.folder.parent / "cache"), "lab", "r1", timeout_s=0.1)
+    again = MapClient(world.robot_bus, TileCache(world.folder.parent / "cache"), "lab", "r1", timeout_s=0.1)
     later = again.ready()
     assert later.wanted == ready.wanted
     assert "version 1 goes on: nobody answered" in later.note
@@ -396,7 +396,7 @@ def test_a_damaged_version_never_becomes_active(world: World) -> None:
     assert bad.sha256 in ready.note
     assert world.cache.active("hall").version == 1
     # A robot that has nothing yet takes what there is.
-    fresh = MapLink(world.robot_bus, TileCache(world.folder.parent / "fresh"), "hall", "r2")
+    fresh = MapClient(world.robot_bus, TileCache(world.folder.parent / "fresh"), "hall", "r2")
     ready = fresh.ready()
     assert ready.wanted.version == 2
     assert bad.sha256 in ready.note
@@ -490,7 +490,7 @@ def test_a_fetch_goes_on_where_it_was(world: World, died_after: int) -> None:
 
 def test_a_fetch_waits_for_a_server_that_comes_back(world: World) -> None:
     wanted = world.publish(large_site(world))
-    link = MapLink(world.robot_bus, world.cache, "hall", "r1", timeout_s=0.05, patience_s=20)
+    link = MapClient(world.robot_bus, world.cache, "hall", "r1", timeout_s=0.05, patience_s=20)
     through, asked = world.robot_bus.get, []
 
     def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:

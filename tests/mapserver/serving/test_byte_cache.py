@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from mapserver.serving.byte_cache import RecentBytes
+from mapserver.serving.byte_cache import ByteCache
 
 
 def test_the_least_recently_used_go_first() -> None:
@@ -16,7 +16,7 @@ def test_the_least_recently_used_go_first() -> None:
         made.append(key)
         return key.encode() * 100
 
-    held = RecentBytes(1000)
+    held = ByteCache(1000)
     for key in "abcab":
         assert held.get(key, lambda key=key: make(key)) == key.encode() * 100
     assert made == ["a", "b", "c"]
@@ -28,7 +28,7 @@ def test_the_least_recently_used_go_first() -> None:
 
 
 def test_what_is_larger_than_the_limit_and_what_fails_is_not_kept() -> None:
-    held = RecentBytes(1000)
+    held = ByteCache(1000)
     assert len(held.get("x", lambda: bytes(2000))) == 2000
     with pytest.raises(ZeroDivisionError):
         held.get("y", lambda: bytes(1 // 0))
@@ -40,7 +40,7 @@ def test_what_is_larger_than_the_limit_and_what_fails_is_not_kept() -> None:
 
 def test_what_many_ask_for_at_once_is_made_once() -> None:
     """Also where making it fails at first: the next one tries."""
-    held, begun, made = RecentBytes(1000), threading.Event(), []
+    held, begun, made = ByteCache(1000), threading.Event(), []
 
     def make() -> bytes:
         made.append(threading.get_ident())

@@ -7,20 +7,20 @@ from pathlib import Path
 import pytest
 
 from fleetmap.errors import StoreError
-from mapserver.store.transactions import Ledger
+from mapserver.store.transactions import Transactions
 
 COUNT = "SELECT count(*) AS n FROM events"
 _LINE = "INSERT INTO events (stamp_ns, site, kind, detail) VALUES (1, 'hall', 'note', 'x')"
 
 
 @pytest.fixture
-def ledger(tmp_path: Path) -> Iterator[Ledger]:
-    opened = Ledger(tmp_path / "store.sqlite3", lambda: 1)
+def ledger(tmp_path: Path) -> Iterator[Transactions]:
+    opened = Transactions(tmp_path / "store.sqlite3", lambda: 1)
     yield opened
     opened.close()
 
 
-def _read_elsewhere(ledger: Ledger) -> int:
+def _read_elsewhere(ledger: Transactions) -> int:
     found: list[int] = []
     thread = threading.Thread(target=lambda: found.append(ledger.query(COUNT)[0]["n"]), daemon=True)
     thread.start()
@@ -29,7 +29,7 @@ def _read_elsewhere(ledger: Ledger) -> int:
     return found[0]
 
 
-def test_others_read_on_while_a_transaction_is_open(ledger: Ledger) -> None:
+def test_others_read_on_while_a_transaction_is_open(ledger: Transactions) -> None:
     with ledger.write() as connection:
         connection.execute(_LINE)
         assert ledger.query(COUNT)[0]["n"] == 1, "its own thread sees what it wrote"
@@ -37,21 +37,21 @@ def test_others_read_on_while_a_transaction_is_open(ledger: Ledger) -> None:
     assert _read_elsewhere(ledger) == ledger.query(COUNT)[0]["n"] == 1
 
 
-def test_what_is_taken_back_was_never_there(ledger: Ledger) -> None:
+def test_what_is_taken_back_was_never_there(ledger: Transactions) -> None:
     with pytest.raises(RuntimeError), ledger.write() as connection:
         connection.execute(_LINE)
         raise RuntimeError
     assert ledger.query(COUNT)[0]["n"] == 0
 
 
-def test_reading_cannot_write(ledger: Ledger) -> None:
+def test_reading_cannot_write(ledger: Transactions) -> None:
     with pytest.raises(StoreError, match="cannot be read"):
         ledger.query(_LINE)
 
 
 def test_closing_leaves_one_file(tmp_path: Path) -> None:
     """The write-ahead log is folded in by the last connection; a copy of the file is then the whole database."""
-    opened = Ledger(tmp_path / "store.sqlite3", lambda: 1)
+    opened = Transactions(tmp_path / "store.sqlite3", lambda: 1)
     with opened.write() as connection:
         connection.execute(_LINE)
     opened.query(COUNT)

@@ -5,7 +5,7 @@ import pytest
 
 from fleetmap.geometry import Array
 from mapserver.tiles import distinctive_landmarks as module
-from mapserver.tiles.distinctive_landmarks import distinct_landmarks
+from mapserver.tiles.distinctive_landmarks import distinctive_landmarks
 
 
 def racks(rng: np.random.Generator, aisles: int, count: int, noise: float) -> tuple[Array, np.ndarray]:
@@ -35,7 +35,7 @@ def test_as_all_pairs_say(noise: float) -> None:
     # The same thing mapped twice is one thing, and what stands on another shelf is no twin.
     points[-1], descriptors[-1] = points[-2] + [0.5, 0.0, 0.0], descriptors[-2]
     points[-3], descriptors[-3] = points[-4] + [5.0, 0.0, 0.4], descriptors[-4]
-    found = distinct_landmarks(points, descriptors)
+    found = distinctive_landmarks(points, descriptors)
     np.testing.assert_array_equal(found, by_all_pairs(points, descriptors))
     assert found[-30:].all()
     assert found[:180].mean() < 0.3
@@ -45,8 +45,8 @@ def test_a_part_of_the_others_finds_what_repeats_often(monkeypatch: pytest.Monke
     points, descriptors = racks(np.random.default_rng(3), 30, 40, 0.05)
     monkeypatch.setattr(module, "_REACH", 0)
     monkeypatch.setattr(module, "_MOST_COMPARED", 20)
-    assert distinct_landmarks(points, descriptors).mean() < 0.05
+    assert distinctive_landmarks(points, descriptors).mean() < 0.05
 
 
 def test_an_empty_survey_has_none() -> None:
-    assert distinct_landmarks(np.zeros((0, 3)), np.zeros((0, 32), np.uint8)).shape == (0,)
+    assert distinctive_landmarks(np.zeros((0, 3)), np.zeros((0, 32), np.uint8)).shape == (0,)

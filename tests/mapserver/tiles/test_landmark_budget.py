@@ -11,7 +11,7 @@ from fleetmap.mapformat import encode_tile
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles import landmark_budget_kernels as kernels
-from mapserver.tiles.distinctive_landmarks import distinct_landmarks
+from mapserver.tiles.distinctive_landmarks import distinctive_landmarks
 from mapserver.tiles.landmark_budget import choose_landmarks, covered_path_m
 from mapserver.tiles.tiling import tiles_from_survey
 from support.storage.map_samples import random_survey
@@ -132,7 +132,7 @@ def test_every_view_gets_what_tells_it_from_its_twins_first() -> None:
     points = survey.points_map.copy()
     points[1:720:2] = points[:720:2] + np.array([30.0, 0.0, 0.05])
     survey = replace(survey, descriptors=np.concatenate([pairs, survey.descriptors[720:]]), points_map=points)
-    is_alone = distinct_landmarks(survey.points_map, survey.descriptors)
+    is_alone = distinctive_landmarks(survey.points_map, survey.descriptors)
     np.testing.assert_array_equal(np.flatnonzero(is_alone), np.arange(720, 800))
     once = np.isin(survey.obs_landmark, np.arange(720)) | (np.diff(survey.obs_landmark, prepend=-1) != 0)
     survey = replace(

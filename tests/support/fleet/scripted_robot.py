@@ -68,7 +68,7 @@ class ScriptedRelocalizer:
     """Offers the fixes of the present frame: near the prediction the one that lies there, anywhere all of them."""
 
     fixes: list[Fix] = field(default_factory=list)
-    twin_share: float = 0.1
+    alias_ratio: float = 0.1
 
     @property
     def view(self) -> Any:
@@ -137,7 +137,7 @@ class Robot:
             np.diag([0.002**2] * 3 + [0.01**2] * 3),
             self.inliers,
             20,
-            twin_share=self.relocalizer.twin_share,
+            alias_ratio=self.relocalizer.alias_ratio,
         )
 
     def error_m(self, estimate: Estimate) -> float:

@@ -8,11 +8,11 @@ from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.bundle.bundle_adjustment import RelativeTerm
 from mapserver.survey.bundle.bundle_rounds import SurveyState
 from mapserver.survey.keyframes.connected_components import MIN_SEEN
-from mapserver.survey.odometry_pass import FirstGuess
+from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 
 
-def odometry_terms(guess: FirstGuess, map_from_body: Array) -> list[RelativeTerm]:
+def odometry_terms(guess: OdometryPass, map_from_body: Array) -> list[RelativeTerm]:
     """Without an IMU, neighbours are held by odometry: weakly, so that it decides only where landmarks do not.
 
     For one camera this also holds the scale, which its landmarks leave open.
@@ -27,7 +27,7 @@ def odometry_terms(guess: FirstGuess, map_from_body: Array) -> list[RelativeTerm
     return terms
 
 
-def terms_in_the_dark(guess: FirstGuess, state: SurveyState) -> list[RelativeTerm]:
+def blackout_factors(guess: OdometryPass, state: SurveyState) -> list[RelativeTerm]:
     """Odometry from and to keyframes that see next to nothing.
 
     It knows from the wheels what the inertial terms do not; without wheels it knows nothing that those do not say better, and where
@@ -47,7 +47,7 @@ def terms_in_the_dark(guess: FirstGuess, state: SurveyState) -> list[RelativeTer
     return terms
 
 
-def chain_edges(guess: FirstGuess, state: SurveyState) -> list[PoseEdge]:
+def chain_edges(guess: OdometryPass, state: SurveyState) -> list[PoseEdge]:
     """Each keyframe from the one before, where the adjustment put it, as surely as odometry knows."""
     edges = []
     numbers = [k.frame_index for k in guess.keyframes]
@@ -57,7 +57,7 @@ def chain_edges(guess: FirstGuess, state: SurveyState) -> list[PoseEdge]:
     return edges
 
 
-def _edge_covariance(guess: FirstGuess, a: int, b: int) -> Array:
+def _edge_covariance(guess: OdometryPass, a: int, b: int) -> Array:
     """(6, 6) of i_from_j between frames a and b, axes of a: what the odometry's uncertainty gained, with a floor."""
     rotation = guess.odom_from_body[a, :3, :3].T
     gained = guess.covariances[b] - guess.covariances[a]

@@ -23,7 +23,7 @@ _MIN_DISPARITIES = 200
 
 
 @dataclass(frozen=True, slots=True)
-class PairTurn:
+class StereoYaw:
     """What disparities are too large by in the middle of the picture, how surely, and whether the survey corrects it."""
 
     shift_px: float
@@ -36,7 +36,7 @@ class PairTurn:
         return self.shift_px if self.corrected else 0.0
 
 
-NO_TURN = PairTurn(0.0, float("inf"), corrected=False)
+NO_TURN = StereoYaw(0.0, float("inf"), corrected=False)
 
 
 def disparity_shift(camera: StereoCamera, pixels: Array) -> Array:
@@ -44,7 +44,7 @@ def disparity_shift(camera: StereoCamera, pixels: Array) -> Array:
     return np.asarray(1.0 + ((pixels[:, 0] - camera.cx_px) / camera.focal_px) ** 2)
 
 
-def without_turn(landmarks: Landmarks, camera: StereoCamera, correction_px: float) -> Landmarks:
+def without_stereo_yaw(landmarks: Landmarks, camera: StereoCamera, correction_px: float) -> Landmarks:
     """The landmarks with all observed disparities made smaller by the shift."""
     if correction_px == 0.0:
         return landmarks
@@ -53,7 +53,7 @@ def without_turn(landmarks: Landmarks, camera: StereoCamera, correction_px: floa
     return replace(landmarks, obs_pixels=pixels)
 
 
-def estimate_turn(state: SurveyState, settings: SurveySettings) -> PairTurn:
+def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings) -> StereoYaw:
     """The turn that the adjusted survey speaks for; corrected where it is far from zero, in sigmas.
 
     sigma_px is the adjustment's own, and with it `noise.turn_floor_px`: what matching alone pretends. NO_TURN where too few
@@ -76,13 +76,13 @@ def estimate_turn(state: SurveyState, settings: SurveySettings) -> PairTurn:
             break
     shift += step
     sigma = float(np.hypot(1.0 / np.sqrt(curvature), settings.noise.turn_floor_px))
-    return PairTurn(float(shift), sigma, corrected=abs(shift) > settings.noise.turn_sigmas * sigma)
+    return StereoYaw(float(shift), sigma, corrected=abs(shift) > settings.noise.turn_sigmas * sigma)
 
 
 def _slope(state: SurveyState, shift_px: float, settings: SurveySettings) -> float:
     """Derivative of the adjusted cost by the shift, everything else at its optimum for this shift."""
     camera = state.camera
-    moved = replace(state, landmarks=without_turn(state.landmarks, camera, shift_px))
+    moved = replace(state, landmarks=without_stereo_yaw(state.landmarks, camera, shift_px))
     result = optimize(bundle_problem(moved, settings, None), settings.final_bundle)
     marks = moved.landmarks
     ahead = se3_inverse(result.map_from_body @ state.body_from_cam)[marks.obs_keyframe, 2]

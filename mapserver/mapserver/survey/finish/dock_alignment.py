@@ -59,7 +59,7 @@ def _row(turn: Array, shift: Array, survey_from_base: Array, prior: PositionPrio
 
 
 @dataclass(frozen=True, slots=True)
-class Anchoring:
+class DockAlignment:
     """map_from_survey (4, 4) without the scale, metres per unit of the survey, and the standard deviation of that as a share of it."""
 
     map_from_survey: Array
@@ -67,9 +67,9 @@ class Anchoring:
     scale_sigma_share: float
 
 
-def anchored_by_priors(
+def aligned_by_priors(
     survey_map: SurveyMap, priors: Sequence[PositionPrior], base_from_body: Array
-) -> Anchoring | None:
+) -> DockAlignment | None:
     """Where a survey of unknown scale lies and how large it is, by priors that know their place and their directions.
 
     None with fewer than two such priors, or where they leave the scale less sure than 1 %. Source: Gauss-Newton on seven unknowns.
@@ -110,4 +110,4 @@ def anchored_by_priors(
             scale * float(np.exp(step[6])),
         )
     sigma = float(np.sqrt(np.linalg.inv(hessian)[6, 6]))
-    return Anchoring(se3(turn, shift), scale, sigma) if sigma <= _MAX_SCALE_SIGMA_SHARE else None
+    return DockAlignment(se3(turn, shift), scale, sigma) if sigma <= _MAX_SCALE_SIGMA_SHARE else None

@@ -15,7 +15,7 @@ from mapserver.survey.finish.culling import Culled, cull
 from mapserver.survey.finish.map_assembly_kernels import medoids
 from mapserver.survey.finish.trajectory import frame_trajectory
 from mapserver.survey.keyframes.keyframes import Keyframe
-from mapserver.survey.odometry_pass import FirstGuess
+from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.survey.tracks.tracks import Landmarks, of_features
@@ -25,7 +25,7 @@ _MIN_TIED = 8
 _CHUNK = 5000  # landmarks
 
 
-def summarise(state: SurveyState, guess: FirstGuess, settings: SurveySettings) -> tuple[SurveyMap, Culled]:
+def summarise(state: SurveyState, guess: OdometryPass, settings: SurveySettings) -> tuple[SurveyMap, Culled]:
     """The SurveyMap of an adjusted survey, in the survey's own frame, and what was left out of it."""
     every_sigma = point_sigmas_m(state)
     marks, kept, culled = cull(state, guess.keyframes, every_sigma, settings.cull)
@@ -123,7 +123,7 @@ def cut_patches(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8
     return out
 
 
-def _estimated(state: SurveyState, guess: FirstGuess) -> NDArray[np.bool_]:
+def _estimated(state: SurveyState, guess: OdometryPass) -> NDArray[np.bool_]:
     """(F,) frames that something measured ties to the map: landmarks, unbroken odometry, or the IMU through a gap."""
     tied = guess.tracked.astype(bool).copy()
     counts = np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns))

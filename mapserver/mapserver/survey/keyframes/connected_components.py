@@ -13,7 +13,7 @@ from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
 from mapserver.survey.bundle.bundle_rounds import SurveyState, state_of
 from mapserver.survey.loops.loops import Loops
-from mapserver.survey.odometry_pass import FirstGuess
+from mapserver.survey.odometry_pass import OdometryPass
 
 _MIN_SHARED = 15  # landmarks, as many as a loop needs matches
 MIN_SEEN = 8  # landmarks without which a keyframe counts as blind
@@ -83,7 +83,7 @@ class Parts:
         return np.asarray(self.labels == next(n for n, part in enumerate(self.parts) if part.kept))
 
 
-def find_parts(survey_map: "Sightings", odometry_sigmas_m: "SigmaBetween", join_sigma_m: float) -> Parts:
+def find_components(survey_map: "Sightings", odometry_sigmas_m: "SigmaBetween", join_sigma_m: float) -> Parts:
     """The parts of a finished survey; SurveyError where nothing hangs together.
 
     Keyframes belong together where they share landmarks, directly or through others, and where the one that saw something last
@@ -128,8 +128,8 @@ def seen_by(state: SurveyState) -> "Covisibility":
 
 
 def only_kept(
-    state: SurveyState, guess: FirstGuess, loops: Loops, kept: NDArray[np.bool_]
-) -> tuple[SurveyState, FirstGuess, Loops]:
+    state: SurveyState, guess: OdometryPass, loops: Loops, kept: NDArray[np.bool_]
+) -> tuple[SurveyState, OdometryPass, Loops]:
     """The survey of the kept keyframes (K,) alone; the records of loops keep the old numbers."""
     if kept.all():
         return state, guess, loops

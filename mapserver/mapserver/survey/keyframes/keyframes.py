@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fleetmap.features import orb, patch_align, stereo
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
-from mapserver.survey.executor import ALONE, Worker
+from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.settings import KeyframeSettings, SurveySettings
 
 _BATCH = 2  # frames for one call: a twentieth of a second each
@@ -27,7 +27,7 @@ class Pictures:
     pyramid: patch_align.Pyramid
 
 
-class PictureShelf(Protocol):
+class ImageStore(Protocol):
     """Where the pictures of keyframes wait until they are looked at again: a long survey's do not fit in memory."""
 
     def put(self, pictures: Pictures) -> int:
@@ -37,19 +37,19 @@ class PictureShelf(Protocol):
         """The pictures as they were put."""
 
 
-class MemoryShelf:
+class MemoryImageStore:
     """Keeps all pictures as they are."""
 
     def __init__(self) -> None:
         self._pictures: list[Pictures] = []
 
     def put(self, pictures: Pictures) -> int:
-        """See PictureShelf."""
+        """See ImageStore."""
         self._pictures.append(pictures)
         return len(self._pictures) - 1
 
     def get(self, number: int) -> Pictures:
-        """See PictureShelf."""
+        """See ImageStore."""
         return self._pictures[number]
 
 
@@ -65,7 +65,7 @@ class Keyframe:
     features: orb.Features
     disparities: Array
     points_cam: Array
-    shelf: PictureShelf
+    shelf: ImageStore
     shelf_number: int
     from_views: bool = False
 
@@ -86,18 +86,18 @@ class Keyframe:
 
 
 def make_keyframe(
-    frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings, shelf: PictureShelf | None = None
+    frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings, shelf: ImageStore | None = None
 ) -> Keyframe:  # fmt: skip
     """Detects, describes and stereo-matches one frame; its pictures go to `shelf`, into memory without one."""
-    return next(make_keyframes([(frame_index, frame)], camera, settings, shelf, ALONE))
+    return next(make_keyframes([(frame_index, frame)], camera, settings, shelf, SERIAL))
 
 
 def make_keyframes(
-    frames: Iterable[tuple[int, RectifiedFrame]], camera: StereoCamera, settings: SurveySettings, shelf: PictureShelf | None,
-    worker: Worker,
+    frames: Iterable[tuple[int, RectifiedFrame]], camera: StereoCamera, settings: SurveySettings, shelf: ImageStore | None,
+    worker: Executor,
 ) -> Iterator[Keyframe]:  # fmt: skip
     """The same of several frames, each with its number; a worker is at some of them while the next ones are still awaited."""
-    kept = MemoryShelf() if shelf is None else shelf
+    kept = MemoryImageStore() if shelf is None else shelf
     waiting: deque[tuple[int, RectifiedFrame]] = deque()
 
     def batches() -> Iterator[list[RectifiedFrame]]:
@@ -128,7 +128,7 @@ def _extract(
 
 def with_pictures(keyframe: Keyframe, *, whole: bool) -> Keyframe:
     """The same keyframe with its pictures in memory; unless `whole`, only the left one's pyramid."""
-    pictures, shelf = keyframe.shelf.get(keyframe.shelf_number), MemoryShelf()
+    pictures, shelf = keyframe.shelf.get(keyframe.shelf_number), MemoryImageStore()
     if not whole:
         frame = RectifiedFrame(keyframe.stamp_ns, pictures.pyramid[0], None, None)
         pictures = Pictures(frame, pictures.pyramid)
@@ -137,7 +137,7 @@ def with_pictures(keyframe: Keyframe, *, whole: bool) -> Keyframe:
 
 def without_pictures(keyframe: Keyframe) -> Keyframe:
     """The same keyframe with nothing on its shelf: what travels where only features are compared."""
-    return replace(keyframe, shelf=MemoryShelf(), shelf_number=0)
+    return replace(keyframe, shelf=MemoryImageStore(), shelf_number=0)
 
 
 @dataclass(frozen=True, slots=True)

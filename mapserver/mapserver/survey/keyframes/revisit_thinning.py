@@ -19,7 +19,7 @@ from mapserver.survey.tracks.tracks import Landmarks, Tracks
 _LONGEST_GAP_S = 3.0  # over which the IMU carries from one keyframe to the next where those between take no part
 
 
-def spare_keyframes(tracks: Tracks, keyframes: list[Keyframe], settings: SurveySettings) -> NDArray[np.bool_]:
+def redundant_keyframes(tracks: Tracks, keyframes: list[Keyframe], settings: SurveySettings) -> NDArray[np.bool_]:
     """(K,) keyframes without which `repeated_visits` other visits still see `repeated_share` of their tracks, as finely.
 
     A visit ends where no keyframe has seen a track for longer than a loop takes at least. The last keyframes go first, so that
@@ -55,7 +55,7 @@ def _left_alone(
     return np.asarray(~spare & beside & (np.bincount(keyframes[shared], minlength=len(spare)) < least))
 
 
-def without_spare(state: SurveyState, spare: NDArray[np.bool_]) -> SurveyState:
+def without_redundant(state: SurveyState, spare: NDArray[np.bool_]) -> SurveyState:
     """The state of all other keyframes; where spare ones leave long gaps, the IMU does not carry over."""
     if not spare.any():
         return state
@@ -70,7 +70,7 @@ def adjust_visits(state: SurveyState, settings: SurveySettings, spare: NDArray[n
     if not spare.any():
         adjust(state, settings, rounds=rounds, final=True)
         return
-    part = without_spare(state, spare)
+    part = without_redundant(state, spare)
     adjust(part, settings, rounds=rounds, final=True)
     used, motion = ~spare, state.motion
     state.map_from_body[used] = part.map_from_body

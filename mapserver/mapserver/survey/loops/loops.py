@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fleetmap.bow import BowVector, PlaceIndex
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
-from mapserver.survey.executor import ALONE, Worker
+from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.keyframes.keyframes import Keyframe, without_pictures
 from mapserver.survey.loops.zones import Zones
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
@@ -93,7 +93,7 @@ class LoopCloser:
     def __init__(
         self, keyframes: list[Keyframe], vectors: list[BowVector], word_count: int, camera: StereoCamera, body_from_cam: Array,
         map_from_body: Array, marginals: GraphMarginals, matched: set[tuple[int, int]], settings: SurveySettings, zones: Zones,
-        worker: Worker = ALONE,
+        worker: Executor = SERIAL,
     ) -> None:  # fmt: skip
         self._keyframes, self._vectors, self._camera = keyframes, vectors, camera
         self._body_from_cam, self._map_from_body = body_from_cam, map_from_body  # moved by every accepted loop

@@ -18,7 +18,7 @@ _CORRELATION = 3.0  # depths of one keyframe share the errors of its neighbours
 _UNKNOWN_SIGMA = 1.0
 
 
-class ScaledLoopCloser(LoopCloser):
+class Sim3LoopCloser(LoopCloser):
     """A LoopCloser that also keeps by how much each loop's two keyframes differ in scale; (log scale, sigma) by (new, old)."""
 
     scales: dict[tuple[int, int], tuple[float, float]]

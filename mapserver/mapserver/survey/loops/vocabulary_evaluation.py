@@ -18,7 +18,7 @@ Descriptors = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
-class VocabularyTrial:
+class VocabularyEvaluation:
     """Revisits looked up with both vocabularies: how often the most similar place was right, and what follows.
 
     Own words are better only where chance alone would hardly say so (sign test over the revisits on which the two differ).
@@ -37,7 +37,7 @@ def try_own_vocabulary(
     settings: VocabularySettings,
     gap: int,
     seed: int,
-) -> tuple[VocabularyTrial, Vocabulary | None]:
+) -> tuple[VocabularyEvaluation, Vocabulary | None]:
     """The trial, and the site's own vocabulary, of all keyframes, where it is better.
 
     descriptors: those of each keyframe (K). A revisit is a keyframe that shares landmarks with one at least `gap` before it; own
@@ -45,14 +45,14 @@ def try_own_vocabulary(
     """
     right = _revisits(survey_map, gap)
     if len(right) < MIN_REVISITS:
-        return VocabularyTrial(len(right), 0, 0, own_is_better=False), None
+        return VocabularyEvaluation(len(right), 0, 0, own_is_better=False), None
     others = [k for k in range(len(descriptors)) if k not in right]
     own = train_on(descriptors, others, settings, seed)
     found = [_found(vocabulary, descriptors, right, gap) for vocabulary in (given, own)]
     only_own = sum(mine and not theirs for theirs, mine in zip(*found, strict=True))
     only_given = sum(theirs and not mine for theirs, mine in zip(*found, strict=True))
     is_better = sign_test(only_own, only_own + only_given) < _CHANCE
-    trial = VocabularyTrial(len(right), sum(found[0]), sum(found[1]), is_better)
+    trial = VocabularyEvaluation(len(right), sum(found[0]), sum(found[1]), is_better)
     return trial, train_on(descriptors, range(len(descriptors)), settings, seed) if is_better else None
 
 

@@ -10,7 +10,7 @@ from fleetmap.features.matching import match_by_projection
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.features.patch_align_kernels import align_patches
 from fleetmap.geometry import Array, se3_inverse, transform_points
-from fleetmap.pnp.pnp import Resection, refine_resection
+from fleetmap.pnp.pnp import PnpResult, refine_pnp
 from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.merge.base_map import BaseMap, Rows
 from mapserver.survey.settings import SurveySettings
@@ -32,7 +32,7 @@ class Sighting:
 
 def locate(
     base: BaseMap, keyframe: Keyframe, map_from_cam: Array, radius_px: float, settings: SurveySettings
-) -> tuple[Rows, Rows, Resection] | None:
+) -> tuple[Rows, Rows, PnpResult] | None:
     """Where a keyframe near `map_from_cam` is, by landmarks (P,) seen as features (P,); None where too few agree."""
     s = settings.sessions
     rows, features = _match(base, keyframe, map_from_cam, radius_px, settings)
@@ -42,7 +42,7 @@ def locate(
     measured = np.column_stack([pixels, pixels[:, 0] - keyframe.disparities[features, 0]])
     scale = SCALE_FACTOR ** np.minimum(keyframe.features.octaves[features], 4).astype(np.float64)
     rough = settings.pairs.match_sigma_px * scale
-    solved = refine_resection(
+    solved = refine_pnp(
         base.camera, base.points_map[rows], measured, np.column_stack([rough, np.maximum(rough, 1.0)]), se3_inverse(map_from_cam)
     )  # fmt: skip
     if solved is None or solved.inliers.sum() < s.min_inliers or solved.inliers.mean() < 0.35:

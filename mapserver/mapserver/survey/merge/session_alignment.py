@@ -8,7 +8,7 @@ import numpy as np
 from fleetmap.bow import PlaceIndex, Vocabulary
 from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
-from fleetmap.pnp.pnp import Resection, ransac_resection
+from fleetmap.pnp.pnp import PnpResult, ransac_pnp
 from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import locate
@@ -78,7 +78,7 @@ def _fixes_of(
     return found
 
 
-def _fix_at(base: BaseMap, keyframe: Keyframe, place: int, settings: SurveySettings) -> Resection | None:
+def _fix_at(base: BaseMap, keyframe: Keyframe, place: int, settings: SurveySettings) -> PnpResult | None:
     rows = base.neighbourhood(place)
     pairs = match_mutual(
         base.descriptors[rows], keyframe.features.descriptors, settings.pairs.max_distance, settings.pairs.ratio
@@ -88,7 +88,7 @@ def _fix_at(base: BaseMap, keyframe: Keyframe, place: int, settings: SurveySetti
     pixels = keyframe.features.pixels[pairs[:, 1]]
     measured = np.column_stack([pixels, pixels[:, 0] - keyframe.disparities[pairs[:, 1], 0]])
     sigmas = np.full((len(pairs), 2), settings.pairs.match_sigma_px)
-    found = ransac_resection(
+    found = ransac_pnp(
         base.camera, base.points_map[rows[pairs[:, 0]]], measured, sigmas, threshold_px=_RANSAC_PX,
         min_inliers=settings.sessions.min_inliers // 2, seed=settings.seed,
     )  # fmt: skip

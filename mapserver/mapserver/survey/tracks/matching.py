@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
-from mapserver.survey.executor import ALONE, Worker, in_batches
+from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.keyframes.keyframes import Keyframe, without_pictures
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.tracks.pairs import PairMatch, match_pair, view_overlap
@@ -23,7 +23,7 @@ class PairFinder:
 
     def __init__(
         self, keyframes: list[Keyframe], camera: StereoCamera, body_from_cam: Array, settings: SurveySettings,
-        worker: Worker = ALONE,
+        worker: Executor = SERIAL,
     ) -> None:  # fmt: skip
         self._keyframes, self._camera, self._body_from_cam, self._settings = keyframes, camera, body_from_cam, settings
         self._worker = worker

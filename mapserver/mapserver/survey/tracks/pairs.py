@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fleetmap.features.matching import match_by_projection, match_mutual
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.pnp.pnp import Resection, ransac_resection, refine_resection, resection_with_rotation
+from fleetmap.pnp.pnp import PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.settings import PairSettings
@@ -65,18 +65,18 @@ def _from_descriptors(
     j_from_i: Array | None,
     rotation_sigma_rad: float | None,
     settings: PairSettings,
-) -> Resection | None:
+) -> PnpResult | None:
     known = np.flatnonzero(np.isfinite(a.disparities[:, 0]))
     pairs = match_mutual(a.features.descriptors[known], b.features.descriptors, settings.max_distance, settings.ratio)
     index_a, index_b = known[pairs[:, 0]], pairs[:, 1]
     points, measured, sigmas = a.points_cam[index_a], _measured(b, index_b), _sigmas(b, index_b, settings)
     if j_from_i is not None and rotation_sigma_rad is not None and not b.from_views:
         threshold = max(settings.search_px, 1.5 * rotation_sigma_rad * camera.focal_px)
-        return resection_with_rotation(
+        return pnp_with_rotation(
             camera, points, measured, sigmas, j_from_i[:3, :3], threshold_px=threshold, min_inliers=settings.min_inliers,
             rotation_sigma_rad=rotation_sigma_rad,
         )  # fmt: skip
-    found = ransac_resection(
+    found = ransac_pnp(
         camera, points, measured, sigmas, threshold_px=4.0, min_inliers=settings.min_inliers, seed=len(pairs)
     )
     # without a known rotation a few matches agree with something by chance: ask for a share of them too
@@ -114,25 +114,25 @@ def _lens(camera: StereoCamera) -> Array:
 
 def _from_projection(
     a: Keyframe, b: Keyframe, camera: StereoCamera, b_from_a: Array, settings: PairSettings, radius_px: float
-) -> Resection | None:
+) -> PnpResult | None:
     pairs = _project_match(a, b, camera, b_from_a, settings, radius_px)
     if len(pairs) < settings.min_inliers:
         return None
-    found = refine_resection(
+    found = refine_pnp(
         camera, a.points_cam[pairs[:, 0]], _measured(b, pairs[:, 1]), _sigmas(b, pairs[:, 1], settings), b_from_a
     )
     return found if found is not None and found.inliers.sum() >= max(settings.min_inliers, 0.4 * len(pairs)) else None
 
 
 def _complete(
-    i: int, j: int, a: Keyframe, b: Keyframe, camera: StereoCamera, found: Resection, settings: PairSettings
+    i: int, j: int, a: Keyframe, b: Keyframe, camera: StereoCamera, found: PnpResult, settings: PairSettings
 ) -> PairMatch | None:
     """All matches that fit the motion, looked for in both directions, and the motion from all of them."""
     for _ in range(2):
         forward = _project_match(a, b, camera, found.cam_from_source, settings, settings.guided_radius_px)
         if len(forward) < settings.min_inliers:
             return None
-        again = refine_resection(
+        again = refine_pnp(
             camera,
             a.points_cam[forward[:, 0]],
             _measured(b, forward[:, 1]),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fleetmap.features import stereo
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.sensors.rectification import StereoCamera
-from mapserver.survey.executor import ALONE, Worker, in_batches
+from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.keyframes.keyframes import Keyframe, Pictures, with_pictures
 from mapserver.survey.settings import NoiseSettings, SurveySettings
 from mapserver.survey.tracks.pairs import PairMatch
@@ -94,7 +94,7 @@ def tracks_of(pairs: list[PairMatch]) -> Tracks:
 
 def build_landmarks(
     keyframes: list[Keyframe], pairs: list[PairMatch], map_from_body: Array, body_from_cam: Array, camera: StereoCamera,
-    settings: SurveySettings, worker: Worker = ALONE,
+    settings: SurveySettings, worker: Executor = SERIAL,
 ) -> Landmarks:  # fmt: skip
     """Tracks of the pairs with a stereo point to start from, each observation's coordinate refined against the reference patch."""
     none = np.zeros(len(keyframes), bool)
@@ -103,7 +103,7 @@ def build_landmarks(
 
 def landmarks_of(
     keyframes: list[Keyframe], tracks: Tracks, spare: NDArray[np.bool_], map_from_body: Array, body_from_cam: Array,
-    camera: StereoCamera, settings: SurveySettings, worker: Worker = ALONE,
+    camera: StereoCamera, settings: SurveySettings, worker: Executor = SERIAL,
 ) -> Landmarks:  # fmt: skip
     """The same from tracks. Those that fewer than two keyframes see which are not spare (K,) give no landmark."""
     map_from_cam = map_from_body @ body_from_cam
@@ -121,7 +121,7 @@ def landmarks_of(
 
 def observed_again(
     marks: Landmarks, keyframes: list[Keyframe], map_from_body: Array, body_from_cam: Array, camera: StereoCamera,
-    settings: SurveySettings, worker: Worker = ALONE,
+    settings: SurveySettings, worker: Executor = SERIAL,
 ) -> Landmarks:  # fmt: skip
     """The same landmarks with their coordinates refined anew: from better places patches are warped better."""
     table = np.column_stack([marks.obs_keyframe, marks.obs_landmark, marks.obs_feature]).astype(np.int64)
@@ -171,7 +171,7 @@ def _observe(
     map_from_cam: Array,
     camera: StereoCamera,
     settings: SurveySettings,
-    worker: Worker,
+    worker: Executor,
 ) -> tuple[Array, Array]:
     """Pixels (M, 3) and sigmas (M, 2) of observations (keyframe, landmark, feature), references first in each landmark."""
     is_reference = _is_first(table)

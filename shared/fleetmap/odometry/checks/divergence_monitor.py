@@ -10,7 +10,7 @@ _MOST_OFFSET_SIGMAS = 3.0  # between the clocks, beyond which it is not the cloc
 _STRAYED_M, _MOST_STRAYED = 0.5, 3  # from what the pictures show of one step, and for so many frames in a row
 
 
-class Doubts:
+class DivergenceMonitor:
     """Counts what speaks against the IMU and against the filter. Motions are cam_from_previous (4, 4), None where unknown."""
 
     def __init__(self, offset_sigma_s: float) -> None:

@@ -9,7 +9,7 @@ from fleetmap.odometry.tracking import tracker_kernels
 _MIN_POINTS = 10
 
 
-class StillPictures:
+class ZeroVelocityDetector:
     """Compares each picture with the one of a window ago."""
 
     def __init__(self, window_s: float, limit_px: float) -> None:
@@ -24,7 +24,7 @@ class StillPictures:
         self._looks = [look for look in self._looks if look[0] >= now_ns - 2 * self._window_ns]
         self._looks.append((now_ns, ids, pixels))
         old = [look for look in self._looks if look[0] <= now_ns - self._window_ns]
-        if not old or not is_picture_still(old[-1][1], old[-1][2], ids, pixels, self._limit_px):
+        if not old or not is_image_still(old[-1][1], old[-1][2], ids, pixels, self._limit_px):
             return None
         return old[-1][0], self._looks[-2][0]
 
@@ -33,7 +33,7 @@ class StillPictures:
         self._looks.clear()
 
 
-def is_picture_still(
+def is_image_still(
     old_ids: NDArray[np.int64], old_pixels: Array, ids: NDArray[np.int64], pixels: Array, limit_px: float
 ) -> bool:
     """Whether most of at least ten points seen in both pictures, pixels (N, 3), have stayed within the limit; ids ascend."""

@@ -45,7 +45,7 @@ class NavState:
 class InvariantFilter:
     """Keeps the current state and a window of past body transforms (clones) with their joint covariance.
 
-    Without an IMU the state moves by `displace` instead of `propagate`; velocity and biases are then idle.
+    Without an IMU the state moves by `predict_random_walk` instead of `propagate`; velocity and biases are then idle.
 
     Two covariances are kept. `covariance` is what measurements are weighed and gated by: noise that is white, the same
     for all pixels, and wide, which is robust to what no model tells. `budget` is what the same corrections leave of all
@@ -111,7 +111,7 @@ class InvariantFilter:
         self._forget_pair(max(end_ns - start_ns, 0) * 1e-9)
         return gyro[-1] - self.state.gyro_bias_radps if len(gyro) else np.zeros(3)
 
-    def displace(
+    def predict_random_walk(
         self, body_from_next: Array, rotation_sigma_rad: float, translation_sigma_m: float, duration_s: float = 0.0,
         known: Array | None = None,
     ) -> None:  # fmt: skip
@@ -255,7 +255,7 @@ class InvariantFilter:
         self.budget = _symmetric(self.budget - taken - taken.T)
         return normalised
 
-    def stand_still(self, gyro_mean_radps: Array, gyro_sigma_radps: float, gate: float) -> float:
+    def zero_velocity_update(self, gyro_mean_radps: Array, gyro_sigma_radps: float, gate: float) -> float:
         """The body neither moves nor turns: velocity zero, the gyro shows its bias alone.
 
         gyro_mean_radps (3,) over the time since the last frame, known to gyro_sigma_radps. Gated as `correct_with`.
@@ -291,7 +291,7 @@ class InvariantFilter:
             jacobian, residual, weighed, gate=gate, real_noise=np.diag(sigmas**2), by_allowed=allowed
         )
 
-    def open_up(self, clone_id: int, seen_odom_from_body: Array, gap_s: float) -> bool:
+    def inflate(self, clone_id: int, seen_odom_from_body: Array, gap_s: float) -> bool:
         """Widens position and velocity where vision contradicts the prediction since `clone_id` beyond its covariance.
 
         After seconds without pictures an IMU's error can exceed what its noise figures admit; a filter that then

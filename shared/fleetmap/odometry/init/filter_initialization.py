@@ -28,7 +28,7 @@ class Start:
     odom_from_old: Array
 
 
-def start_steady(
+def static_initialization(
     imu: ImuSamples, until_ns: int, settings: StartSettings, filter_settings: FilterSettings
 ) -> Start | None:
     """The state at the end of the latest steady window before `until_ns`; None where the IMU was never steady."""
@@ -86,7 +86,7 @@ def _steady_state(window: ImuSamples, stamp_ns: int, settings: FilterSettings) -
     return Start(state, covariance, stamp_ns, np.eye(4))
 
 
-def start_in_motion(
+def dynamic_initialization(
     vision: Trajectory, imu: ImuSamples, noise: ImuNoise, settings: StartSettings, filter_settings: FilterSettings
 ) -> Start | None:
     """Aligns visual odometry (metric, body transforms in any frame) with the IMU.

@@ -17,7 +17,7 @@ _POSITION_SIGMA_M, _VELOCITY_SIGMA_MPS = 0.006, 0.04
 
 
 @dataclass(frozen=True, slots=True)
-class ScaledStart:
+class MonoInertialStart:
     """A start, the metres in one unit of vision, and the standard deviation of that as a share of it."""
 
     start: Start
@@ -25,10 +25,10 @@ class ScaledStart:
     scale_sigma_share: float
 
 
-def start_with_scale(
+def mono_inertial_initialization(
     vision: Trajectory, imu: ImuSamples, noise: ImuNoise, body_from_cam: Array, settings: MonocularSettings,
     start_settings: StartSettings, filter_settings: FilterSettings,
-) -> ScaledStart | None:  # fmt: skip
+) -> MonoInertialStart | None:  # fmt: skip
     """Aligns a camera's way up to scale with the IMU's.
 
     vision holds vision_from_cam at IMU stamps. None where the motion does not show the scale to within the settings' share, or
@@ -65,7 +65,7 @@ def start_with_scale(
         return None
     turned[:, :3, 3] = scale * way.cameras + way.levers
     start = _motion_state(bodies, direction, solution[-3:], gyro_bias, accel_bias, basis, covariance, filter_settings)
-    return ScaledStart(start, scale, sigma / scale)
+    return MonoInertialStart(start, scale, sigma / scale)
 
 
 @dataclass(frozen=True)

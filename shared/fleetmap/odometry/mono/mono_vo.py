@@ -9,7 +9,7 @@ from fleetmap.geometry import Array, se3, se3_inverse, transform_points
 from fleetmap.odometry.mono.mono_ba_kernels import adjust_window
 from fleetmap.odometry.mono.two_view import rays_from_pixels, two_view_motion
 from fleetmap.odometry.settings import MonocularSettings
-from fleetmap.pnp.pnp import ransac_resection, refine_resection
+from fleetmap.pnp.pnp import ransac_pnp, refine_pnp
 from fleetmap.sensors.rectification import StereoCamera
 
 Ids = NDArray[np.int64]
@@ -224,9 +224,9 @@ class VisualOdometry:
         points = np.array([self._world.points[i] for i in ids[rows].tolist()])
         measured = np.column_stack([pixels[rows], np.full(len(rows), np.nan)])
         sigmas = np.full((len(rows), 2), s.sigma_px)
-        found = refine_resection(self._camera, points, measured, sigmas, se3_inverse(guess))
+        found = refine_pnp(self._camera, points, measured, sigmas, se3_inverse(guess))
         if found is None or found.inliers.sum() < max(s.min_points, 0.6 * len(rows)):
-            again = ransac_resection(
+            again = ransac_pnp(
                 self._camera,
                 points,
                 measured,

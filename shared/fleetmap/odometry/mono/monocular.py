@@ -10,8 +10,8 @@ from fleetmap.features.stereo import StereoSettings
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter import msckf_kernels
-from fleetmap.odometry.init.filter_initialization import Start, start_steady
-from fleetmap.odometry.init.mono_inertial_init import start_with_scale
+from fleetmap.odometry.init.filter_initialization import Start, static_initialization
+from fleetmap.odometry.init.mono_inertial_init import mono_inertial_initialization
 from fleetmap.odometry.mono.mono_vo import Sight, VisualOdometry
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.settings import OdometrySettings, TrackerSettings
@@ -185,7 +185,7 @@ class MonocularOdometry(Odometry):
         """By rest, if picture and IMU agree on it, else by motion; with the metres in one unit of vision, which rest leaves open."""
         assert self._noise is not None
         if self._still_since_ns is not None and (stamp_ns - self._still_since_ns) * 1e-9 > _STILL_S:
-            resting = start_steady(self._imu, stamp_ns, self._settings.start, self._settings.filter)
+            resting = static_initialization(self._imu, stamp_ns, self._settings.start, self._settings.filter)
             if resting is not None and stamp_ns - resting.stamp_ns < int(0.1e9):
                 covariance = resting.covariance
                 covariance[3:6, 3:6] = _STILL_SIGMA_MPS**2 * np.eye(3)
@@ -200,7 +200,7 @@ class MonocularOdometry(Odometry):
         if len(chosen) < s.metric_samples:
             return None
         vision = Trajectory(np.array([c[1] for c in chosen], np.int64), np.array([c[2] for c in chosen]))
-        found = start_with_scale(
+        found = mono_inertial_initialization(
             vision, self._imu, self._noise, self._body_from_cam, s, self._settings.start, self._settings.filter
         )
         return None if found is None else (found.start, found.metres_per_unit)

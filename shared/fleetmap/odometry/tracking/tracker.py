@@ -12,7 +12,7 @@ from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, transform_points
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracking import tracker_kernels
-from fleetmap.pnp.pnp import Resection, ransac_resection, refine_resection, resection_with_rotation
+from fleetmap.pnp.pnp import PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 
 _LEVELS_WHEN_SURE, _HELD_WHEN_SURE = 1, 0.6
@@ -139,7 +139,7 @@ class Tracker:
         tracker_kernels.predict(points_cam, pixels, np.ascontiguousarray(cam_from_previous), self._lens, predicted)
         return predicted
 
-    def _follow(self, frame: RectifiedFrame, cam_from_previous: Array, sure: bool) -> tuple[Resection | None, float]:
+    def _follow(self, frame: RectifiedFrame, cam_from_previous: Array, sure: bool) -> tuple[PnpResult | None, float]:
         """sure: the motion is a prediction, not a guess."""
         if not len(self._points.ids):
             return None, 0.0
@@ -183,9 +183,11 @@ class Tracker:
         new, found = flow.follow(before, now, old, predicted, window_px=s.window_px, levels=levels)
         height, width = frame.left.shape
         found &= (new[:, 0] > 6) & (new[:, 1] > 6) & (new[:, 0] < width - 7) & (new[:, 1] < height - 7)
-        return new, flow.leads_back(before, now, old, new, found, window_px=s.window_px, within_px=s.back_check_px)
+        return new, flow.forward_backward_check(
+            before, now, old, new, found, window_px=s.window_px, within_px=s.back_check_px
+        )
 
-    def _motion(self, points_cam: Array, flowed: Array, kept: NDArray[np.bool_], guess: Array) -> Resection | None:
+    def _motion(self, points_cam: Array, flowed: Array, kept: NDArray[np.bool_], guess: Array) -> PnpResult | None:
         """cam_from_previous from points with depth.
 
         Least squares from the guess, RANSAC where most points disagree with it.
@@ -196,10 +198,10 @@ class Tracker:
             return None
         measured = np.column_stack([flowed[usable], np.full(count, np.nan)])
         sigmas = np.full((count, 2), 1.0)
-        result = refine_resection(self._camera, points_cam[usable], measured, sigmas, guess)
+        result = refine_pnp(self._camera, points_cam[usable], measured, sigmas, guess)
         if result is not None and result.inliers.sum() > 0.6 * count:
             return result
-        again = ransac_resection(
+        again = ransac_pnp(
             self._camera, points_cam[usable], measured, sigmas, threshold_px=self._settings.ransac_px,
             min_inliers=self._settings.min_inliers, seed=count, iterations=_FLOW_ITERATIONS,
         )  # fmt: skip
@@ -284,18 +286,18 @@ class Tracker:
 
     def _wide_motion(
         self, points_cam: Array, measured: Array, guess: Array, rotation_sigma_rad: float | None
-    ) -> Resection | None:
+    ) -> PnpResult | None:
         """cam_from_previous from raw descriptor matches: with a known rotation first, without any guess else."""
         sigmas = np.full((len(points_cam), 2), 1.5)
         least = self._settings.min_inliers
         if rotation_sigma_rad is not None:
-            found = resection_with_rotation(
+            found = pnp_with_rotation(
                 self._camera, points_cam, measured, sigmas, guess[:3, :3], threshold_px=4 * self._settings.ransac_px,
                 min_inliers=self._settings.min_inliers_known_rotation, rotation_sigma_rad=rotation_sigma_rad,
             )  # fmt: skip
             if found is not None:
                 return found
-        found = ransac_resection(
+        found = ransac_pnp(
             self._camera,
             points_cam,
             measured,

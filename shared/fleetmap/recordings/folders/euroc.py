@@ -25,7 +25,7 @@ from fleetmap.recordings.folders.table_files import (
 )
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import ImuSamples, Loss, Trajectory
+from fleetmap.sensors.samples import DataIssue, ImuSamples, Trajectory
 
 # The second kind is TUM-VI's, whose motion-capture poses are those of the IMU
 _GROUND_TRUTHS = ("mav0/state_groundtruth_estimate0/data.csv", "dso/gt_imu.csv", "mav0/mocap0/data.csv")
@@ -40,7 +40,7 @@ def recognises(path: Path) -> bool:
 def open_euroc(path: Path, options: OpenOptions) -> Recording:
     """The recording in a EuRoC folder. The body is the IMU where imu0/sensor.yaml exists, else EuRoC's body frame."""
     root = path.resolve().parent if path.name == "mav0" else path
-    losses: list[Loss] = []
+    losses: list[DataIssue] = []
     read_files: list[Path] = []
     cameras = _cameras(root, losses, read_files)
     calibration, body_from_imu = _calibration(root, len(cameras), options, read_files)
@@ -61,7 +61,7 @@ def open_euroc(path: Path, options: OpenOptions) -> Recording:
     )
 
 
-def _cameras(root: Path, losses: list[Loss], read_files: list[Path]) -> list[ImageFolder]:
+def _cameras(root: Path, losses: list[DataIssue], read_files: list[Path]) -> list[ImageFolder]:
     if not (root / "mav0/cam0").is_dir():
         found = sorted(p.name for p in (root / "mav0").iterdir() if p.is_dir())
         raise RecordingError(
@@ -74,7 +74,7 @@ def _cameras(root: Path, losses: list[Loss], read_files: list[Path]) -> list[Ima
     ]
 
 
-def _camera(folder: Path, name: str, losses: list[Loss], read_files: list[Path]) -> ImageFolder:
+def _camera(folder: Path, name: str, losses: list[DataIssue], read_files: list[Path]) -> ImageFolder:
     stamps_ns, names = read_name_table(folder / "data.csv")
     if not names:
         raise RecordingError(f"{folder / 'data.csv'} names no image; copy the recording again")
@@ -111,7 +111,7 @@ def _calibration(root: Path, count: int, options: OpenOptions, read_files: list[
     )
 
 
-def _imu(root: Path, losses: list[Loss], read_files: list[Path]) -> ImuSamples:
+def _imu(root: Path, losses: list[DataIssue], read_files: list[Path]) -> ImuSamples:
     file = root / "mav0/imu0/data.csv"
     if not file.is_file():
         return ImuSamples.empty()
@@ -120,7 +120,9 @@ def _imu(root: Path, losses: list[Loss], read_files: list[Path]) -> ImuSamples:
     return clean_imu(stamps_ns, rows[:, :3], rows[:, 3:], losses)
 
 
-def _ground_truth(root: Path, body_from_imu: Array, losses: list[Loss], read_files: list[Path]) -> Trajectory | None:
+def _ground_truth(
+    root: Path, body_from_imu: Array, losses: list[DataIssue], read_files: list[Path]
+) -> Trajectory | None:
     for name in _GROUND_TRUTHS:
         file = root / name
         if not file.is_file():

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.folders.table_files import pair_stamps
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_frame
-from fleetmap.sensors.samples import CameraFrame, Loss, Stamps
+from fleetmap.sensors.samples import CameraFrame, DataIssue, Stamps
 
 _BLOCK_BYTES = 1 << 20
 
@@ -29,7 +29,7 @@ class ImageFolder:
         return ImageFolder(self.stamps_ns[indices], tuple(self.paths[int(i)] for i in indices))
 
 
-def existing_images(folder: ImageFolder, what: str, losses: list[Loss]) -> ImageFolder:
+def existing_images(folder: ImageFolder, what: str, losses: list[DataIssue]) -> ImageFolder:
     """The images that exist and hold bytes; the others are counted in `losses`. RecordingError where none is left."""
     sizes = {
         entry.path: entry.stat().st_size for parent in {p.parent for p in folder.paths} for entry in _entries(parent)
@@ -38,11 +38,15 @@ def existing_images(folder: ImageFolder, what: str, losses: list[Loss]) -> Image
     empty = [path for path in folder.paths if sizes.get(str(path)) == 0]
     if missing:
         losses.append(
-            Loss(f"{what}: images missing", f"{len(missing)} of {len(folder.paths)}, the first is {missing[0].name}")
+            DataIssue(
+                f"{what}: images missing", f"{len(missing)} of {len(folder.paths)}, the first is {missing[0].name}"
+            )
         )
     if empty:
         losses.append(
-            Loss(f"{what}: images without a byte", f"{len(empty)} of {len(folder.paths)}, the first is {empty[0].name}")
+            DataIssue(
+                f"{what}: images without a byte", f"{len(empty)} of {len(folder.paths)}, the first is {empty[0].name}"
+            )
         )
     kept = np.array([i for i, path in enumerate(folder.paths) if sizes.get(str(path), 0) > 0], np.int64)
     if len(kept) == 0:
@@ -53,7 +57,7 @@ def existing_images(folder: ImageFolder, what: str, losses: list[Loss]) -> Image
     return folder.chosen(kept)
 
 
-def paired_cameras(cameras: Sequence[ImageFolder], losses: list[Loss]) -> tuple[ImageFolder, ImageFolder | None]:
+def paired_cameras(cameras: Sequence[ImageFolder], losses: list[DataIssue]) -> tuple[ImageFolder, ImageFolder | None]:
     """Left and right images of the same moments; those alone are counted in `losses`.
 
     The right is None for one camera.
@@ -64,7 +68,7 @@ def paired_cameras(cameras: Sequence[ImageFolder], losses: list[Loss]) -> tuple[
     alone = sum(len(camera.paths) - len(lefts) for camera in cameras)
     if alone:
         counts = " and ".join(str(len(camera.paths)) for camera in cameras)
-        losses.append(Loss("images without their partner", f"{alone} of {counts}; {len(lefts)} pairs remain"))
+        losses.append(DataIssue("images without their partner", f"{alone} of {counts}; {len(lefts)} pairs remain"))
     return cameras[0].chosen(lefts), cameras[1].chosen(rights)
 
 

@@ -12,7 +12,7 @@ from fleetmap.recordings.folders.table_files import forward_only, natural_key
 from fleetmap.recordings.images import StoredImage, decode_grey
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration, check_camera
-from fleetmap.sensors.samples import Loss, Stamps, Trajectory
+from fleetmap.sensors.samples import DataIssue, Stamps, Trajectory
 
 # Folder names and the rows of calib.txt that describe them
 _PAIRS = (("image_l", "image_r", 0, 1), ("image_0", "image_1", 0, 1), ("image_2", "image_3", 2, 3))
@@ -26,7 +26,7 @@ def recognises(path: Path) -> bool:
 
 def open_kitti(path: Path, options: OpenOptions) -> Recording:
     """The recording in a KITTI folder. The body is the camera that poses.txt is about (KITTI's rectified camera 0)."""
-    losses: list[Loss] = []
+    losses: list[DataIssue] = []
     left_name, right_name, left_row, right_row = next(
         pair for pair in _PAIRS if (path / pair[0]).is_dir() or (path / pair[1]).is_dir()
     )
@@ -41,7 +41,7 @@ def open_kitti(path: Path, options: OpenOptions) -> Recording:
     both, lefts, rights = np.intersect1d(left.stamps_ns, right.stamps_ns, return_indices=True)
     alone = len(left.paths) + len(right.paths) - 2 * len(both)
     if alone:
-        losses.append(Loss("images without their partner", f"{alone}; {len(both)} pairs remain"))
+        losses.append(DataIssue("images without their partner", f"{alone}; {len(both)} pairs remain"))
     left, right = left.chosen(lefts), right.chosen(rights)
     given = calibration_of_options(options)
     if given is not None and options.calibration_file is not None:
@@ -80,7 +80,7 @@ def _stamp(number: int, stamps_of_number: Stamps | None, path: Path) -> int:
     return int(stamps_of_number[number])
 
 
-def _images(folder: Path, stamps_of_number: Stamps | None, losses: list[Loss]) -> ImageFolder:
+def _images(folder: Path, stamps_of_number: Stamps | None, losses: list[DataIssue]) -> ImageFolder:
     paths = sorted((p for p in folder.iterdir() if p.is_file() and p.stem.isdigit()), key=lambda p: natural_key(p.name))
     if not paths:
         raise RecordingError(f"{folder} holds no numbered image such as 000000.png; copy the recording again")
@@ -126,7 +126,7 @@ def _projections(file: Path) -> dict[int, Array]:
 
 
 def _ground_truth(
-    path: Path, stamps_of_number: Stamps | None, read_files: list[Path], losses: list[Loss]
+    path: Path, stamps_of_number: Stamps | None, read_files: list[Path], losses: list[DataIssue]
 ) -> Trajectory | None:
     file = path / "poses.txt"
     if not file.is_file():
@@ -135,7 +135,7 @@ def _ground_truth(
     rows = _table(file, (12, 16))
     if stamps_of_number is not None and len(stamps_of_number) != len(rows):
         losses.append(
-            Loss("ground truth not used", f"poses.txt has {len(rows)} rows, times.txt {len(stamps_of_number)}")
+            DataIssue("ground truth not used", f"poses.txt has {len(rows)} rows, times.txt {len(stamps_of_number)}")
         )
         return None
     stamps_ns = np.arange(len(rows)) * _PERIOD_NS if stamps_of_number is None else stamps_of_number

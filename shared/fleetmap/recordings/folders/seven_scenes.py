@@ -24,7 +24,7 @@ from fleetmap.recordings.folders.table_files import forward_only
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_depth, decode_frame, decode_grey
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
-from fleetmap.sensors.samples import CameraFrame, Loss, Stamps, Trajectory
+from fleetmap.sensors.samples import CameraFrame, DataIssue, Stamps, Trajectory
 
 _COLOUR_FOCAL_PX, _DEPTH_FOCAL_PX = 525.0, 585.0
 # Of a Kinect. On the red kitchen depth's edges lie on colour's edges best with 28 mm and these focal lengths.
@@ -42,12 +42,12 @@ def recognises(path: Path) -> bool:
 
 def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
     """The recording in a 7-Scenes folder. The body is the colour camera; depth comes registered to colour."""
-    losses: list[Loss] = []
+    losses: list[DataIssue] = []
     colour, depth = _files(path, "color", losses), _files(path, "depth", losses)
     stamps_ns, colours, depths = np.intersect1d(colour.stamps_ns, depth.stamps_ns, return_indices=True)
     alone = len(colour.paths) + len(depth.paths) - 2 * len(stamps_ns)
     if alone:
-        losses.append(Loss("images without their partner", f"{alone}; {len(stamps_ns)} pairs remain"))
+        losses.append(DataIssue("images without their partner", f"{alone}; {len(stamps_ns)} pairs remain"))
     if len(stamps_ns) == 0:
         raise RecordingError(f"{path}: no colour image has its depth image; copy the recording again")
     colour, depth = colour.chosen(colours), depth.chosen(depths)
@@ -151,7 +151,7 @@ class RegisteredFrames:
         self._files.close()
 
 
-def _files(path: Path, kind: str, losses: list[Loss]) -> ImageFolder:
+def _files(path: Path, kind: str, losses: list[DataIssue]) -> ImageFolder:
     found = sorted((_number(file), file) for file in path.glob(f"frame-*.{kind}.*"))
     if not found:
         raise RecordingError(f"{path} holds no frame-NNNNNN.{kind} file; copy the recording again")
@@ -187,7 +187,7 @@ def _centred(shape: Sequence[int], focal_px: float) -> CameraCalibration:
 
 
 def _ground_truth(
-    colour: ImageFolder, depth_from_body: Array, read_files: list[Path], losses: list[Loss]
+    colour: ImageFolder, depth_from_body: Array, read_files: list[Path], losses: list[DataIssue]
 ) -> Trajectory | None:
     stamps: list[int] = []
     frame_from_bodies: list[Array] = []
@@ -204,7 +204,7 @@ def _ground_truth(
         stamps.append(stamp_ns)
         frame_from_bodies.append(matrix @ depth_from_body)
     if bad:
-        losses.append(Loss("ground truth: no rigid transform", f"{bad} of {bad + len(stamps)} files left out"))
+        losses.append(DataIssue("ground truth: no rigid transform", f"{bad} of {bad + len(stamps)} files left out"))
     return Trajectory(_stamps(stamps), np.stack(frame_from_bodies)) if stamps else None
 
 

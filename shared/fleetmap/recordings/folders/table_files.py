@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import AnyArray, Array, rotation_from_quat_wxyz, se3
-from fleetmap.sensors.samples import ImuSamples, Loss, Stamps, Trajectory
+from fleetmap.sensors.samples import DataIssue, ImuSamples, Stamps, Trajectory
 
 _ABSURD = 1e5  # no inertial sensor measures this in any unit; flipped bits do
 PAIR_TOLERANCE_NS = 5_000_000  # two cameras of one rig: more than this apart is not one moment
 
 
-def read_stamped_rows(path: Path, columns: int, losses: list[Loss]) -> tuple[Stamps, Array]:
+def read_stamped_rows(path: Path, columns: int, losses: list[DataIssue]) -> tuple[Stamps, Array]:
     """Stamps (N,) in ns and values (N, columns) of a text table.
 
     A line holds an integer and then numbers, parted by commas or blanks; # begins a comment.
@@ -55,7 +55,7 @@ def read_name_table(path: Path) -> tuple[Stamps, list[str]]:
     return np.array(stamps, np.int64), names
 
 
-def forward_only(stamps_ns: Stamps, what: str, losses: list[Loss]) -> NDArray[np.bool_]:
+def forward_only(stamps_ns: Stamps, what: str, losses: list[DataIssue]) -> NDArray[np.bool_]:
     """(N,) which stamps to keep so that they increase strictly and as few as possible are left out.
 
     Those are counted in `losses`.
@@ -71,7 +71,7 @@ def forward_only(stamps_ns: Stamps, what: str, losses: list[Loss]) -> NDArray[np
     kept = _longest_increasing(stamps_ns)
     dropped, first = int((~kept).sum()), int(backwards[0])
     losses.append(
-        Loss(
+        DataIssue(
             f"{what}: stamps not increasing",
             f"{dropped} of {len(kept)} left out; the first is {stamps_ns[first + 1]} after {stamps_ns[first]}",
         )
@@ -102,11 +102,13 @@ def _longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
     return kept
 
 
-def clean_imu(stamps_ns: Stamps, gyro_radps: Array, accel_mps2: Array, losses: list[Loss]) -> ImuSamples:
+def clean_imu(stamps_ns: Stamps, gyro_radps: Array, accel_mps2: Array, losses: list[DataIssue]) -> ImuSamples:
     """The samples whose values are possible and move forward in time; what was left out is counted in `losses`."""
     possible = np.asarray((np.abs(np.hstack([gyro_radps, accel_mps2])) < _ABSURD).all(axis=1))
     if not possible.all():
-        losses.append(Loss("imu: impossible values", f"{int((~possible).sum())} of {len(possible)} samples left out"))
+        losses.append(
+            DataIssue("imu: impossible values", f"{int((~possible).sum())} of {len(possible)} samples left out")
+        )
     stamps_ns, gyro_radps, accel_mps2 = stamps_ns[possible], gyro_radps[possible], accel_mps2[possible]
     kept = forward_only(stamps_ns, "imu", losses)
     return ImuSamples(
@@ -117,7 +119,7 @@ def clean_imu(stamps_ns: Stamps, gyro_radps: Array, accel_mps2: Array, losses: l
 
 
 def trajectory_of_rows(
-    stamps_ns: Stamps, position_quat_wxyz: Array, losses: list[Loss], what: str
+    stamps_ns: Stamps, position_quat_wxyz: Array, losses: list[DataIssue], what: str
 ) -> Trajectory | None:
     """Trajectory of rows x y z qw qx qy qz (N, 7); rows without a unit quaternion are left out and counted.
 
@@ -127,7 +129,9 @@ def trajectory_of_rows(
     good = np.isfinite(position_quat_wxyz).all(axis=1) & (np.abs(norms - 1) < 0.01)
     if not good.all():
         losses.append(
-            Loss(f"{what}: no rotation", f"{int((~good).sum())} of {len(good)} rows without a unit quaternion left out")
+            DataIssue(
+                f"{what}: no rotation", f"{int((~good).sum())} of {len(good)} rows without a unit quaternion left out"
+            )
         )
     stamps_ns, rows = stamps_ns[good], position_quat_wxyz[good]
     kept = forward_only(stamps_ns, what, losses)
@@ -174,7 +178,9 @@ def _read_text(path: Path) -> str:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); the recording is incomplete") from error
 
 
-def _read_rows_singly(path: Path, text: str, columns: int, dtype: "np.dtype[np.void]", losses: list[Loss]) -> AnyArray:
+def _read_rows_singly(
+    path: Path, text: str, columns: int, dtype: "np.dtype[np.void]", losses: list[DataIssue]
+) -> AnyArray:
     rows, bad = [], 0
     for line in text.splitlines():
         words = line.partition("#")[0].split()
@@ -189,6 +195,8 @@ def _read_rows_singly(path: Path, text: str, columns: int, dtype: "np.dtype[np.v
         else:
             bad += 1
     losses.append(
-        Loss(f"{path.name}: unreadable lines", f"{bad} of {bad + len(rows)} lines are no stamp and {columns} numbers")
+        DataIssue(
+            f"{path.name}: unreadable lines", f"{bad} of {bad + len(rows)} lines are no stamp and {columns} numbers"
+        )
     )
     return np.array(rows, dtype) if rows else np.zeros(0, dtype)

@@ -16,7 +16,7 @@ from fleetmap.recordings.folders.table_files import (
     trajectory_of_rows,
 )
 from fleetmap.recordings.recording import OpenOptions, Recording
-from fleetmap.sensors.samples import ImuSamples, Loss, Trajectory
+from fleetmap.sensors.samples import DataIssue, ImuSamples, Trajectory
 
 _CAMERAS = ("cam0", "cam1")
 
@@ -28,7 +28,7 @@ def recognises(path: Path) -> bool:
 
 def open_tumvi(path: Path, options: OpenOptions) -> Recording:
     """The recording in a TUM-VI folder. The body is the IMU, as in Kalibr's camchain."""
-    losses: list[Loss] = []
+    losses: list[DataIssue] = []
     read_files: list[Path] = []
     if not (path / "cam0/images").is_dir():
         raise RecordingError(f"{path / 'cam0/images'} is missing, cam1 is there; copy the recording again")
@@ -55,7 +55,7 @@ def open_tumvi(path: Path, options: OpenOptions) -> Recording:
     )
 
 
-def _images(folder: Path, name: str, losses: list[Loss], read_files: list[Path]) -> ImageFolder:
+def _images(folder: Path, name: str, losses: list[DataIssue], read_files: list[Path]) -> ImageFolder:
     """The images by times.txt (`name seconds exposure`), or by their names in ns where there is no such file."""
     files = {p.stem: p for p in (folder / "images").iterdir() if p.is_file()}
     times = folder / "times.txt"
@@ -71,7 +71,9 @@ def _images(folder: Path, name: str, losses: list[Loss], read_files: list[Path])
             f"{folder / 'images'} holds none of the {len(stamp_of)} images listed; copy the recording again"
         )
     if len(listed) < len(stamp_of):
-        losses.append(Loss(f"{name}: images missing", f"{len(stamp_of) - len(listed)} of {len(stamp_of)} in times.txt"))
+        losses.append(
+            DataIssue(f"{name}: images missing", f"{len(stamp_of) - len(listed)} of {len(stamp_of)} in times.txt")
+        )
     stamps_ns = np.array([stamp_of[stem] for stem in listed], np.int64)
     images = ImageFolder(stamps_ns, tuple(files[stem] for stem in listed))
     return existing_images(images.chosen(np.flatnonzero(forward_only(stamps_ns, name, losses))), name, losses)
@@ -85,7 +87,7 @@ def _stamp_ns(seconds: str, where: Path) -> int:
     return int(whole) * 1_000_000_000 + int(part[:9].ljust(9, "0"))
 
 
-def _imu(file: Path, losses: list[Loss], read_files: list[Path]) -> ImuSamples:
+def _imu(file: Path, losses: list[DataIssue], read_files: list[Path]) -> ImuSamples:
     if not file.is_file():
         return ImuSamples.empty()
     read_files.append(file)
@@ -93,7 +95,7 @@ def _imu(file: Path, losses: list[Loss], read_files: list[Path]) -> ImuSamples:
     return clean_imu(stamps_ns, rows[:, :3], rows[:, 3:], losses)
 
 
-def _ground_truth(file: Path, losses: list[Loss], read_files: list[Path]) -> Trajectory | None:
+def _ground_truth(file: Path, losses: list[DataIssue], read_files: list[Path]) -> Trajectory | None:
     if not file.is_file():
         return None
     read_files.append(file)

@@ -29,7 +29,7 @@ from fleetmap.recordings.mcap.topics import IMAGE_TYPES, KNOWN_TYPES, TopicParts
 from fleetmap.recordings.mcap.writer import CALIBRATION_ATTACHMENT
 from fleetmap.recordings.recording import OpenOptions, Recording, Topics
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, Loss, Stamps, Trajectory
+from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, Stamps, Trajectory
 
 DEPTH_TOLERANCE_NS = 20_000_000  # depth and colour of consumer sensors are not triggered together
 V = TypeVar("V")
@@ -246,22 +246,22 @@ def _streams(streams: dict[int, _Stream], chosen: TopicParts, part: str) -> list
     return [streams[channel_id] for channel_id in chosen.channels.get(part, ())]
 
 
-def _images(streams: Sequence[_Stream], what: str, losses: list[Loss]) -> _Images:
+def _images(streams: Sequence[_Stream], what: str, losses: list[DataIssue]) -> _Images:
     stamps_ns = np.array([stamp for stream in streams for stamp in stream.stamps_ns], np.int64)
     places = tuple((stream, location) for stream in streams for location in stream.locations)
     return _Images(stamps_ns, places).chosen(np.flatnonzero(forward_only(stamps_ns, what, losses)))
 
 
-def _paired(first: _Images, second: _Images, tolerance_ns: int, losses: list[Loss]) -> tuple[_Images, _Images]:
+def _paired(first: _Images, second: _Images, tolerance_ns: int, losses: list[DataIssue]) -> tuple[_Images, _Images]:
     firsts, seconds = pair_stamps(first.stamps_ns, second.stamps_ns, tolerance_ns)
     alone = len(first.places) + len(second.places) - 2 * len(firsts)
     if alone:
         counts = f"{alone} of {len(first.places)} and {len(second.places)}"
-        losses.append(Loss("images without their partner", f"{counts}; {len(firsts)} pairs remain"))
+        losses.append(DataIssue("images without their partner", f"{counts}; {len(firsts)} pairs remain"))
     return first.chosen(firsts), second.chosen(seconds)
 
 
-def _imu(streams: Sequence[_Stream], losses: list[Loss]) -> tuple[ImuSamples, str | None]:
+def _imu(streams: Sequence[_Stream], losses: list[DataIssue]) -> tuple[ImuSamples, str | None]:
     parts: list[tuple[Stamps, NDArray[np.float64], NDArray[np.float64], str]] = []
     for stream in streams:
         codec = stream.codec
@@ -275,7 +275,7 @@ def _imu(streams: Sequence[_Stream], losses: list[Loss]) -> tuple[ImuSamples, st
     return clean_imu(stamps_ns.astype(np.int64), gyro, accel, losses), parts[0][3]
 
 
-def _ground_truth(streams: Sequence[_Stream], losses: list[Loss]) -> Trajectory | None:
+def _ground_truth(streams: Sequence[_Stream], losses: list[DataIssue]) -> Trajectory | None:
     rows = [value for stream in streams for value in stream.values(stream.codec.pose)]
     if not rows:
         return None
@@ -309,16 +309,18 @@ def _calibration(
     return calibration_of_messages(infos, are_rectified, links, imu_frame, str(scan.path))
 
 
-def _forward(values: Sequence[V], stamps_ns: Iterable[int], what: str, losses: list[Loss]) -> list[V]:
+def _forward(values: Sequence[V], stamps_ns: Iterable[int], what: str, losses: list[DataIssue]) -> list[V]:
     kept = forward_only(np.array(list(stamps_ns), np.int64), what, losses)
     return [value for value, keep in zip(values, kept, strict=True) if keep]
 
 
-def _damaged(stream: _Stream) -> Loss:
-    return Loss(f"{stream.channel.topic}: damaged messages", f"{stream.damaged} left out, {len(stream)} were found")
+def _damaged(stream: _Stream) -> DataIssue:
+    return DataIssue(
+        f"{stream.channel.topic}: damaged messages", f"{stream.damaged} left out, {len(stream)} were found"
+    )
 
 
-def _in_words(losses: Iterable[Loss]) -> str:
+def _in_words(losses: Iterable[DataIssue]) -> str:
     return "; ".join(f"{loss.what}: {loss.detail}" for loss in losses)
 
 

@@ -1,6 +1,6 @@
 """Walks through an MCAP file as far as it is whole, with or without its index, chunked or not.
 
-Written for files that recorders left behind at a power loss: what does not fit is a Loss, and where the file still has
+Written for files that recorders left behind at a power loss: what does not fit is a DataIssue, and where the file still has
 its index the walk goes on at the next chunk. Source of the layout: the MCAP specification (mcap.dev/spec).
 """
 
@@ -14,7 +14,7 @@ from typing import BinaryIO
 import zstandard
 
 from fleetmap.errors import RecordingError
-from fleetmap.sensors.samples import Loss
+from fleetmap.sensors.samples import DataIssue
 
 MAGIC = b"\x89MCAP0\r\n"
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 8
@@ -60,7 +60,7 @@ Message = tuple[Channel, int, Location, memoryview]
 class Damage:
     """What could not be read, counted while walking."""
 
-    losses: list[Loss] = field(default_factory=list)
+    losses: list[DataIssue] = field(default_factory=list)
     bad_chunks: int = 0
     bad_chunk_bytes: int = 0
     first_bad_chunk_at: int = -1
@@ -71,14 +71,14 @@ class Damage:
         self.bad_chunks += 1
         self.bad_chunk_bytes += size
 
-    def all(self) -> list[Loss]:
+    def all(self) -> list[DataIssue]:
         """Everything in words."""
         if not self.bad_chunks:
             return self.losses
         detail = (
             f"{self.bad_chunks} with {self.bad_chunk_bytes} bytes left out, the first at byte {self.first_bad_chunk_at}"
         )
-        return [*self.losses, Loss("damaged chunks (checksum or compression)", detail)]
+        return [*self.losses, DataIssue("damaged chunks (checksum or compression)", detail)]
 
 
 class McapScan:
@@ -248,7 +248,7 @@ class McapScan:
 
     def _lose(self, what: str, detail: str) -> None:
         if len(self.damage.losses) < 20:
-            self.damage.losses.append(Loss(what, detail))
+            self.damage.losses.append(DataIssue(what, detail))
 
 
 def decompress(compression: str, packed: memoryview, uncompressed_size: int) -> bytes:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.mcap.scan import Channel
 from fleetmap.recordings.recording import Topics
-from fleetmap.sensors.samples import Loss
+from fleetmap.sensors.samples import DataIssue
 
 IMAGE_TYPES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")
 _TYPES = {
@@ -34,7 +34,7 @@ class TopicParts:
     """Channel ids by the part that they play; several where one topic was recorded on several channels."""
 
     channels: Mapping[str, tuple[int, ...]]
-    losses: tuple[Loss, ...]
+    losses: tuple[DataIssue, ...]
 
 
 def type_name(channel: Channel) -> str:
@@ -52,7 +52,7 @@ def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str) -> To
     for channel in channels:
         by_topic.setdefault(channel.topic, []).append(channel)
     chosen: dict[str, str] = {}
-    losses: list[Loss] = []
+    losses: list[DataIssue] = []
     for part, types in _TYPES.items():
         name = getattr(wanted, part)
         found = next((t for t in (name, f"{name}/compressed") if type_name_of(by_topic, t) in types), None)
@@ -75,12 +75,14 @@ def type_name_of(by_topic: Mapping[str, list[Channel]], topic: str) -> str:
     return type_name(by_topic[topic][0]) if topic in by_topic else ""
 
 
-def _choose_alone(part: str, by_topic: Mapping[str, list[Channel]], chosen: dict[str, str], losses: list[Loss]) -> None:
+def _choose_alone(
+    part: str, by_topic: Mapping[str, list[Channel]], chosen: dict[str, str], losses: list[DataIssue]
+) -> None:
     candidates = [topic for topic in by_topic if type_name_of(by_topic, topic) in _TYPES[part]]
     if len(candidates) == 1:
         chosen[part] = candidates[0]
     elif candidates:
-        losses.append(Loss(f"{part} not chosen", f"{', '.join(sorted(candidates))} could be it; name one of them"))
+        losses.append(DataIssue(f"{part} not chosen", f"{', '.join(sorted(candidates))} could be it; name one of them"))
 
 
 def _choose_images(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str], where: str) -> None:

@@ -3,8 +3,8 @@
 import numpy as np
 
 from fleetmap.geometry import se3, so3_exp
-from fleetmap.odometry.checks.divergence_monitor import Doubts
-from fleetmap.odometry.checks.zero_velocity import StillPictures
+from fleetmap.odometry.checks.divergence_monitor import DivergenceMonitor
+from fleetmap.odometry.checks.zero_velocity import ZeroVelocityDetector
 
 STILL = np.eye(4)
 
@@ -18,7 +18,7 @@ def stepped(metres: float) -> np.ndarray:
 
 
 def test_an_imu_is_given_up_when_it_contradicts_more_often_than_it_agrees() -> None:
-    doubts = Doubts(0.02)
+    doubts = DivergenceMonitor(0.02)
     assert not any(doubts.is_wrong_imu(STILL, turned(0.05)) for _ in range(7))
     assert not any(doubts.is_wrong_imu(STILL, turned(0.01)) for _ in range(5))
     assert not doubts.is_wrong_imu(None, turned(0.05))
@@ -27,7 +27,7 @@ def test_an_imu_is_given_up_when_it_contradicts_more_often_than_it_agrees() -> N
 
 
 def test_a_start_is_wrong_where_it_strays_three_times_in_a_row_or_the_clocks_are_impossible() -> None:
-    doubts = Doubts(0.02)
+    doubts = DivergenceMonitor(0.02)
     strays = [doubts.is_wrong_start(0.0, STILL, stepped(m)) for m in (0.7, 0.7, 0.1, 0.7, 0.7, 0.7)]
     assert strays == [False] * 5 + [True]
     doubts.begin_again()
@@ -37,7 +37,7 @@ def test_a_start_is_wrong_where_it_strays_three_times_in_a_row_or_the_clocks_are
 
 
 def test_pictures_stand_still_only_after_a_whole_window_of_it() -> None:
-    pictures, ids = StillPictures(0.3, 0.5), np.arange(30)
+    pictures, ids = ZeroVelocityDetector(0.3, 0.5), np.arange(30)
     pixels = np.random.default_rng(1).uniform(0, 300, (30, 3))
     found = [pictures.since(k * 100_000_000, ids, pixels + 0.01 * k) for k in range(6)]
     assert found[:3] == [None] * 3

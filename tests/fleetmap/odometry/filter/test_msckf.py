@@ -41,7 +41,7 @@ def clones_at(
             step = se3_inverse(analytic_motion(times_s[k - 1]).map_from_body) @ analytic_motion(time_s).map_from_body
             if last_body_from_guess is not None and k == len(times_s) - 1:
                 step = step @ last_body_from_guess
-            estimate.displace(step, 0.3, 1.5)
+            estimate.predict_random_walk(step, 0.3, 1.5)
         estimate.add_clone(k, np.zeros(3))
         seen[k] = observe(seen_by, time_s, rng)
     return estimate, seen
@@ -143,7 +143,7 @@ def test_wrong_matches_are_refused() -> None:
     for k, time_s in enumerate([0.0, 0.15, 0.3]):
         if k:
             before = analytic_motion(time_s - 0.15).map_from_body
-            estimate.displace(se3_inverse(before) @ analytic_motion(time_s).map_from_body, 0.005, 0.02)
+            estimate.predict_random_walk(se3_inverse(before) @ analytic_motion(time_s).map_from_body, 0.005, 0.02)
         estimate.add_clone(k, np.zeros(3))
         seen[k] = observe(points, time_s, rng)
     tracks = tracks_of(seen, np.arange(len(points)))
@@ -205,7 +205,7 @@ def test_displacement_noise_is_relative_to_the_body() -> None:
     step = se3_exp(np.array([0.1, 0.0, 0.2, 0.3, 0.1, 0.0]))
     estimate = InvariantFilter(state, np.zeros((15, 15)), SETTINGS, CAMERA, BODY_FROM_CAM)
     start = estimate.state.odom_from_body
-    estimate.displace(step, 0.01, 0.02)
+    estimate.predict_random_walk(step, 0.01, 0.02)
     errors = []
     for _ in range(3000):
         noise = np.concatenate([0.01 * rng.normal(size=3), 0.02 * rng.normal(size=3)])
@@ -221,11 +221,11 @@ def test_vision_that_contradicts_widens_and_vision_that_agrees_does_not() -> Non
     newest = estimate.clone_ids[-1]
     before = estimate.covariance.copy()
     here = estimate.state.odom_from_body
-    assert not estimate.open_up(newest, here, 1.0)
+    assert not estimate.inflate(newest, here, 1.0)
     np.testing.assert_array_equal(estimate.covariance, before)
     away = here.copy()
     away[:3, 3] += [0.0, 2.0, 0.0]
-    assert estimate.open_up(newest, away, 1.0)
+    assert estimate.inflate(newest, away, 1.0)
     assert (np.diag(estimate.covariance)[6:9] > np.diag(before)[6:9] + 3.9).all()
     assert (np.diag(estimate.covariance)[3:6] > np.diag(before)[3:6] + 3.9).all()
 
@@ -291,6 +291,6 @@ def test_wheels_and_standing_measure_what_they_say() -> None:
     np.testing.assert_array_equal(estimate.covariance, before)
     standing = NavState(velocity_mps=np.array([0.02, -0.01, 0.03]))
     estimate = InvariantFilter(standing, np.diag(START_SIGMAS**2), SETTINGS, CAMERA, BODY_FROM_CAM)
-    assert estimate.stand_still(np.array([0.004, 0.0, -0.003]), 1e-5, gate=22.0) < 22.0
+    assert estimate.zero_velocity_update(np.array([0.004, 0.0, -0.003]), 1e-5, gate=22.0) < 22.0
     assert np.linalg.norm(estimate.state.velocity_mps) < 1e-3
     np.testing.assert_allclose(estimate.state.gyro_bias_radps, [0.004, 0.0, -0.003], atol=1e-5)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import se3, se3_exp, se3_inverse, so3_exp
-from mapserver.survey.bundle.odometry_factors import terms_in_the_dark
+from mapserver.survey.bundle.odometry_factors import blackout_factors
 from mapserver.survey.keyframes.connected_components import SigmaBetween
-from mapserver.survey.odometry_pass import FirstGuess, carried_on
+from mapserver.survey.odometry_pass import OdometryPass, carried_on
 from support.worlds.corridor_scene import scene
 
 
@@ -25,12 +25,12 @@ def test_only_what_touches_the_dark_hangs_on_odometry_as_odometry_measured_it() 
     truth = state.map_from_body.copy()
     odom_from_body = se3_exp(np.array([0.3, 0.1, -0.2, 4.0, 2.0, 1.0])) @ truth
     keyframes = [SimpleNamespace(frame_index=k) for k in range(8)]
-    guess = FirstGuess(
+    guess = OdometryPass(
         [], odom_from_body, np.arange(8)[:, None, None] * 1e-4 * np.eye(6), np.ones(8, bool), keyframes, inertial=True,
         has_wheels=True,
     )  # fmt: skip
     state.map_from_body[3:5, 0, 3] += 7.0  # where an adjustment may have put them says nothing
-    terms = terms_in_the_dark(guess, state)
+    terms = blackout_factors(guess, state)
     assert [(t.i, t.j) for t in terms] == [(2, 3), (3, 4), (4, 5)]
     for term in terms:
         np.testing.assert_allclose(term.i_from_j, se3_inverse(truth[term.i]) @ truth[term.j], atol=1e-9)
@@ -38,7 +38,7 @@ def test_only_what_touches_the_dark_hangs_on_odometry_as_odometry_measured_it() 
         assert (sigmas_m > 0.01).all()
         assert (sigmas_m < 0.05).all()
     # Without wheels the odometry of sparse pictures knows less than it says, and nothing that the IMU does not.
-    assert not terms_in_the_dark(replace(guess, has_wheels=False), state)
+    assert not blackout_factors(replace(guess, has_wheels=False), state)
 
 
 def test_beginning_anew_does_not_join_what_nothing_joins() -> None:

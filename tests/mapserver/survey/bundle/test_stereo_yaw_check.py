@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapserver.survey.bundle.bundle_rounds import SurveyState, adjust
-from mapserver.survey.bundle.stereo_yaw_check import NO_TURN, disparity_shift, estimate_turn, without_turn
+from mapserver.survey.bundle.stereo_yaw_check import NO_TURN, disparity_shift, estimate_stereo_yaw, without_stereo_yaw
 from mapserver.survey.settings import SurveySettings
 from support.worlds.corridor_scene import CAMERA, scene
 
@@ -16,14 +16,14 @@ SETTINGS = SurveySettings()
 def adjusted(seed: int, turn_px: float) -> SurveyState:
     """A made-up survey with disparities that are too large by turn_px, adjusted as they are."""
     state = scene(24, seed, drift=0.01).state
-    state.landmarks = without_turn(state.landmarks, CAMERA, -turn_px)
+    state.landmarks = without_stereo_yaw(state.landmarks, CAMERA, -turn_px)
     adjust(state, SETTINGS, final=True)
     return state
 
 
 @pytest.mark.parametrize("turn_px", [-0.3, 0.2])
 def test_the_shift_is_found_with_its_sign(turn_px: float) -> None:
-    found = estimate_turn(adjusted(1, turn_px), SETTINGS)
+    found = estimate_stereo_yaw(adjusted(1, turn_px), SETTINGS)
     assert found.corrected
     assert found.shift_px == pytest.approx(turn_px, abs=0.05)
     assert abs(found.shift_px - turn_px) < 3 * found.sigma_px
@@ -31,7 +31,7 @@ def test_the_shift_is_found_with_its_sign(turn_px: float) -> None:
 
 @pytest.mark.parametrize("seed", [2, 3, 4])
 def test_an_exact_calibration_is_believed(seed: int) -> None:
-    found = estimate_turn(adjusted(seed, 0.0), SETTINGS)
+    found = estimate_stereo_yaw(adjusted(seed, 0.0), SETTINGS)
     assert abs(found.shift_px) < 3 * found.sigma_px
     assert not found.corrected
     assert found.correction_px == 0.0
@@ -42,8 +42,8 @@ def test_taking_the_shift_out_gives_the_survey_its_scale_back() -> None:
     state, truth = adjusted(5, 0.3), scene(24, 5, drift=0.01).map_from_body
     length_m = float(np.linalg.norm(truth[-1, :3, 3] - truth[0, :3, 3]))
     before = float(np.linalg.norm(state.map_from_body[-1, :3, 3])) / length_m
-    found = estimate_turn(state, SETTINGS)
-    state.landmarks = without_turn(state.landmarks, CAMERA, found.correction_px)
+    found = estimate_stereo_yaw(state, SETTINGS)
+    state.landmarks = without_stereo_yaw(state.landmarks, CAMERA, found.correction_px)
     adjust(state, SETTINGS, final=True)
     after = float(np.linalg.norm(state.map_from_body[-1, :3, 3])) / length_m
     assert abs(before - 1.0) > 0.01
@@ -60,7 +60,9 @@ def test_the_shift_grows_towards_the_rim_as_a_turn_makes_it() -> None:
 
 def test_depth_cameras_and_single_cameras_have_no_pair() -> None:
     state = adjusted(6, 0.0)
-    assert estimate_turn(replace(state, is_depth_camera=True), SETTINGS) == NO_TURN
+    assert estimate_stereo_yaw(replace(state, is_depth_camera=True), SETTINGS) == NO_TURN
     blind = state.landmarks.obs_pixels.copy()
     blind[:, 2] = np.nan
-    assert estimate_turn(replace(state, landmarks=replace(state.landmarks, obs_pixels=blind)), SETTINGS) == NO_TURN
+    assert (
+        estimate_stereo_yaw(replace(state, landmarks=replace(state.landmarks, obs_pixels=blind)), SETTINGS) == NO_TURN
+    )

@@ -8,9 +8,9 @@ import pytest
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, transform_points
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.samples import PositionPrior, Trajectory
-from mapserver.survey.finish.dock_alignment import anchored_by_priors
+from mapserver.survey.finish.dock_alignment import aligned_by_priors
 from mapserver.survey.finish.map_transform import moved, scaled
-from mapserver.survey.odometry_pass import FirstGuess, connected_part
+from mapserver.survey.odometry_pass import OdometryPass, connected_part
 from mapserver.survey.survey_map import SurveyMap
 from support.storage.map_samples import random_survey
 
@@ -45,7 +45,7 @@ def test_two_docks_give_the_metres() -> None:
     survey, truth = unscaled()
     rng = np.random.default_rng(0)
     docks = [dock(int(survey.trajectory.stamps_ns[k]), truth[k], 0.01, rng) for k in (0, 5)]
-    found = anchored_by_priors(survey, docks, BASE_FROM_BODY)
+    found = aligned_by_priors(survey, docks, BASE_FROM_BODY)
     assert found is not None
     assert found.scale == pytest.approx(TRUE_SCALE, rel=4 * found.scale_sigma_share)
     assert found.scale_sigma_share < 0.005
@@ -63,7 +63,7 @@ def test_docks_that_leave_the_scale_open_change_nothing() -> None:
     one = [dock(int(survey.trajectory.stamps_ns[2]), truth[2], 0.01, rng)]
     same = [dock(int(survey.trajectory.stamps_ns[2]), truth[2], 0.01, rng)] * 2
     for docks in (vague, one, same, []):
-        assert anchored_by_priors(survey, docks, BASE_FROM_BODY) is None
+        assert aligned_by_priors(survey, docks, BASE_FROM_BODY) is None
 
 
 def test_a_scaled_map_is_seen_by_its_cameras_as_before() -> None:
@@ -85,11 +85,11 @@ def estimate(k: int, status: OdometryStatus, *, scale_known: bool) -> OdometryEs
     )  # fmt: skip
 
 
-def guess_of(marks: str, *, scale_known: bool) -> FirstGuess:
+def guess_of(marks: str, *, scale_known: bool) -> OdometryPass:
     """i initialising, t tracking, d degraded, T tracking in metres, D degraded in metres."""
     kinds = {"i": OdometryStatus.INITIALISING, "t": OdometryStatus.TRACKING, "d": OdometryStatus.DEGRADED}
     estimates = [estimate(k, kinds[m.lower()], scale_known=m.isupper()) for k, m in enumerate(marks)]
-    return FirstGuess(
+    return OdometryPass(
         estimates, np.array([e.odom_from_body for e in estimates]), np.array([e.cov_rot_trans for e in estimates]),
         np.array([e.status is not OdometryStatus.DEGRADED for e in estimates]), [], scale_known, scale_known,
     )  # fmt: skip

@@ -7,7 +7,7 @@ import numpy as np
 from fleetmap.features.orb import Features
 from fleetmap.geometry import Array
 from mapserver.survey.finish.culling import cull, parallax_rad, redundant
-from mapserver.survey.keyframes.keyframes import Keyframe, MemoryShelf
+from mapserver.survey.keyframes.keyframes import Keyframe, MemoryImageStore
 from mapserver.survey.settings import CullSettings
 from mapserver.survey.tracks.tracks import Landmarks
 from support.worlds.session_scene import CAMERA, survey_state
@@ -23,7 +23,7 @@ def keyframes(count: int, features: int, seed: int = 0) -> list[Keyframe]:
                 np.zeros((features, 2)), np.zeros(features, np.int8), np.zeros(features, np.float32),
                 rng.integers(0, 256, (features, 32), dtype=np.uint8),
             ),
-            np.zeros((features, 2)), np.zeros((features, 3)), MemoryShelf(), 0,
+            np.zeros((features, 2)), np.zeros((features, 3)), MemoryImageStore(), 0,
         )
         for k in range(count)
     ]  # fmt: skip

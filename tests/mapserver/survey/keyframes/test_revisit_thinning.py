@@ -10,8 +10,8 @@ from fleetmap.features.orb import Features
 from fleetmap.geometry import se3_exp
 from mapserver.survey.bundle.bundle_adjustment import BundleSettings, optimize
 from mapserver.survey.bundle.bundle_rounds import adjust
-from mapserver.survey.keyframes.keyframes import Keyframe, MemoryShelf
-from mapserver.survey.keyframes.revisit_thinning import adjust_visits, spare_keyframes, without_spare
+from mapserver.survey.keyframes.keyframes import Keyframe, MemoryImageStore
+from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.settings import CullSettings, LoopSettings, SurveySettings
 from mapserver.survey.tracks.tracks import Landmarks, Tracks
 from support.worlds.bundle_scene import make_scene
@@ -29,7 +29,7 @@ def keyframes(octaves: list[int]) -> list[Keyframe]:
                 np.zeros((FEATURES, 2)), np.full(FEATURES, octave, np.int8), np.zeros(FEATURES, np.float32),
                 np.zeros((FEATURES, 32), np.uint8),
             ),
-            np.zeros((FEATURES, 2)), np.zeros((FEATURES, 3)), MemoryShelf(), 0,
+            np.zeros((FEATURES, 2)), np.zeros((FEATURES, 3)), MemoryImageStore(), 0,
         )
         for k, octave in enumerate(octaves)
     ]  # fmt: skip
@@ -58,27 +58,27 @@ def drive(laps: int, places: int, per_place: int = 20) -> Tracks:
 
 
 def test_of_many_laps_the_first_ones_are_left() -> None:
-    spare = spare_keyframes(drive(6, 30), keyframes([0] * 180), SurveySettings())
+    spare = redundant_keyframes(drive(6, 30), keyframes([0] * 180), SurveySettings())
     np.testing.assert_array_equal(np.flatnonzero(spare), np.arange(90, 180))
     more = SurveySettings(cull=CullSettings(repeated_visits=4))
     np.testing.assert_array_equal(
-        np.flatnonzero(spare_keyframes(drive(6, 30), keyframes([0] * 180), more)), np.arange(120, 180)
+        np.flatnonzero(redundant_keyframes(drive(6, 30), keyframes([0] * 180), more)), np.arange(120, 180)
     )
 
 
 @pytest.mark.parametrize("laps", [1, 2, 3])
 def test_a_drive_that_comes_back_twice_at_most_keeps_all(laps: int) -> None:
-    assert not spare_keyframes(drive(laps, 30), keyframes([0] * 30 * laps), SurveySettings()).any()
+    assert not redundant_keyframes(drive(laps, 30), keyframes([0] * 30 * laps), SurveySettings()).any()
 
 
 def test_a_keyframe_that_sees_more_than_the_others_is_not_spare() -> None:
     """The last lap looks from nearer (an octave that is finer by two), or at things that it alone sees twice."""
     nearer = keyframes([3] * 120 + [1] * 30)
-    assert not spare_keyframes(drive(5, 30), nearer, SurveySettings())[120:].any()
+    assert not redundant_keyframes(drive(5, 30), nearer, SurveySettings())[120:].any()
     old = drive(5, 30, per_place=10)
     own = [[120 + k, 121 + k] for k in range(0, 28, 2) for _ in range(15)]
     members = [g.tolist() for g in np.split(old.keyframes, old.starts[1:])]
-    spare = spare_keyframes(tracks_seen_by([*members, *own]), keyframes([0] * 150), SurveySettings())
+    spare = redundant_keyframes(tracks_seen_by([*members, *own]), keyframes([0] * 150), SurveySettings())
     assert not spare[120:148].any()
     assert spare[148:].all()  # these two see nothing of their own
 
@@ -88,7 +88,7 @@ def test_blind_keyframes_among_spare_ones_are_spare_too() -> None:
     whole = drive(4, 30)
     members = [g.tolist() for g in np.split(whole.keyframes, whole.starts[1:])]
     dark = {3, 4, 5, 95, 96, 97}
-    spare = spare_keyframes(
+    spare = redundant_keyframes(
         tracks_seen_by([seen for m in members if (seen := [k for k in m if k not in dark])]), keyframes([0] * 120),
         SurveySettings(),
     )  # fmt: skip
@@ -106,7 +106,7 @@ def test_spare_keyframes_are_those_of_a_plain_twin(seed: int) -> None:
         loops=LoopSettings(min_gap_keyframes=int(rng.integers(2, 9)), alone_inliers=4),
         cull=CullSettings(repeated_share=0.6, repeated_visits=int(rng.integers(1, 4))),
     )
-    found = spare_keyframes(tracks_seen_by(who), keyframes(octaves), settings)
+    found = redundant_keyframes(tracks_seen_by(who), keyframes(octaves), settings)
     np.testing.assert_array_equal(found, spare_by_hand(who, octaves, settings))
     assert found.any()
     assert not found.all()
@@ -195,7 +195,7 @@ def test_spare_keyframes_are_placed_as_well_as_if_they_had_been_adjusted() -> No
 
 def test_what_is_not_spare_is_adjusted_as_if_the_rest_were_not_there() -> None:
     given, spare = laps_of(scene(12, 5, drift=0.01), 4, 6)
-    alone = without_spare(given.state, spare)
+    alone = without_redundant(given.state, spare)
     adjust(alone, SurveySettings(), final=True)
     adjust_visits(given.state, SurveySettings(), spare, rounds=3)
     np.testing.assert_array_equal(given.state.map_from_body[~spare], alone.map_from_body)
@@ -207,6 +207,6 @@ def test_the_imu_does_not_carry_over_what_is_left_out() -> None:
     given, _ = laps_of(scene(12, 7, drift=0.01), 8, 8)
     spare = np.zeros(96, bool)
     spare[[5, *range(20, 70)]] = True
-    goes_on = without_spare(given.state, spare).motion.goes_on
+    goes_on = without_redundant(given.state, spare).motion.goes_on
     assert goes_on is not None
     np.testing.assert_array_equal(np.flatnonzero(~goes_on), [19])  # the first keyframe after the gap
