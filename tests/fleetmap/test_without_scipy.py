@@ -20,8 +20,8 @@ sys.meta_path.insert(0, Refuse())
 import numpy as np
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.odometry import Odometry, OdometrySettings
-from inertial_motion import sample_motion
-from textured_room import BODY_FROM_CAM, CAMERA, rig, stereo_frame
+from support.worlds.inertial_motion import sample_motion
+from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, rig, stereo_frame
 
 odometry = Odometry(rig(ImuNoise()), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
 samples, fed_ns = sample_motion(rate_hz=200.0, duration_s=3.0), 0
