@@ -12,6 +12,7 @@ fleetmap/{site}/blobs/{sha256}           asked by the robot, ChunkRequest: Part 
 fleetmap/{site}/patches/{base}-{sha256}  asked by the robot, ChunkRequest: Part of what makes a tile or manifest out of `base`
 """
 
+from enum import StrEnum
 from typing import Annotated, Any, Self, TypeVar
 
 import msgspec
@@ -30,6 +31,46 @@ Text = Annotated[str, msgspec.Meta(max_length=2000)]
 Version = Annotated[int, msgspec.Meta(ge=1, le=(1 << 31))]
 Metrics = Annotated[dict[Name, float | int | str | bool | None], msgspec.Meta(max_length=256)]
 Flags = Annotated[tuple[Name, ...], msgspec.Meta(max_length=64)]
+
+
+class Status(StrEnum):
+    """Status of a robot's estimate.
+
+    Messages carry statuses, causes and kinds as text, not as these types: another version of fleetmap may send others, which the
+    receiver keeps and shows as they are.
+    """
+
+    INITIALISING = "INITIALISING"
+    TRACKING = "TRACKING"
+    DEGRADED = "DEGRADED"
+    AMBIGUOUS = "AMBIGUOUS"
+    LOST = "LOST"
+
+
+class Cause(StrEnum):
+    """Reason why an estimate is worth less than TRACKING, or of a failure; docs/service.md explains each."""
+
+    NONE = ""
+    DARK = "dark"
+    GLARE = "glare"
+    FROZEN = "frozen"
+    BLURRED = "blurred"
+    OCCLUDED = "occluded"
+    ODOMETRY = "odometry lost"
+    UNMATCHED = "nothing in the map agrees"
+    NO_FRAMES = "no_frames"
+    NO_MAP = "no_map"
+    AMBIGUOUS = "ambiguous"
+    NO_MATCH = "no_match"
+    FIX_REFUSED = "fix_refused"
+    MOVED = "moved"
+
+
+class FailureKind(StrEnum):
+    """`blind`: no position that may be relied upon. `suspected`: tracking, but fixes contradict it."""
+
+    BLIND = "blind"
+    SUSPECTED = "suspected"
 
 
 class ChunkRequest(msgspec.Struct, frozen=True, kw_only=True):

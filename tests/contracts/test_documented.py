@@ -13,8 +13,7 @@ import pytest
 import typer
 
 from fleetmap import messages
-from locclient.localization.estimate import Status
-from locclient.localization.image_quality import Cause
+from fleetmap.messages import Cause, Status
 from locclient.replay.run_metrics import METRICS
 from locclient.robot import failure_monitor
 from mapserver.build.report import BuildReport

@@ -11,6 +11,7 @@ from fleetmap.geometry import se3_exp
 from fleetmap.messages import (
     MAX_MESSAGE_BYTES,
     MAX_THUMBNAIL_BYTES,
+    Cause,
     EstimateMessage,
     FailureAck,
     FailureReport,
@@ -19,12 +20,14 @@ from fleetmap.messages import (
     PoseMessage,
     RobotAck,
     RobotHealth,
+    Status,
     Thumbnail,
     WantedVersion,
     blob_key,
     decode_message,
     encode_message,
     manifest_key,
+    report_dict,
     robot_key,
     split_key,
 )
@@ -118,3 +121,13 @@ def test_keys_can_be_taken_apart() -> None:
     for key in ("", "fleetmap/lab", "other/lab/blobs/ab", "fleetmap/lab/robots/r1/ack/x"):
         with pytest.raises(LinkError):
             split_key(key)
+
+
+def test_enums_are_text_on_the_wire() -> None:
+    """The bytes are those of plain text, and what a newer robot says that this version does not know arrives as it is."""
+    health = RobotHealth(site="hall", robot="r", stamp_ns=1, version=None, status=Status.LOST, flags=(Cause.DARK,))
+    plain = RobotHealth(site="hall", robot="r", stamp_ns=1, version=None, status="LOST", flags=("dark",))
+    assert encode_message(health) == encode_message(plain)
+    assert report_dict(health) == report_dict(plain)
+    newer = RobotHealth(site="hall", robot="r", stamp_ns=1, version=None, status="HOVERING")
+    assert decode_message(encode_message(newer), RobotHealth).status == "HOVERING"

@@ -1,22 +1,11 @@
 """What a robot says of its place, frame by frame."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 from fleetmap.geometry import Array
+from fleetmap.messages import Cause, Status
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.relocalizer import Fix
-from locclient.localization.image_quality import Cause
-
-
-class Status(StrEnum):
-    """What an estimate is worth."""
-
-    INITIALISING = "INITIALISING"
-    TRACKING = "TRACKING"
-    DEGRADED = "DEGRADED"
-    AMBIGUOUS = "AMBIGUOUS"
-    LOST = "LOST"
 
 
 @dataclass(frozen=True, slots=True)

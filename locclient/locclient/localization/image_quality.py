@@ -2,32 +2,19 @@
 
 from collections import deque
 from dataclasses import dataclass
-from enum import StrEnum
 from math import sqrt
 from statistics import median
 
 import numpy as np
 
 from fleetmap.config import Section
+from fleetmap.messages import Cause
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import Image
 from locclient.localization import image_quality_kernels
 
 _EVERY_PX = 8  # rows and columns that are looked at
 _BRIGHT = 250
-
-
-class Cause(StrEnum):
-    """Why an estimate is worth less than TRACKING, in a word; NONE while nothing is wrong."""
-
-    NONE = ""
-    DARK = "dark"
-    GLARE = "glare"
-    FROZEN = "frozen"
-    BLURRED = "blurred"
-    OCCLUDED = "occluded"
-    ODOMETRY = "odometry lost"
-    UNMATCHED = "nothing in the map agrees"
 
 
 class ImageQualitySettings(Section, frozen=True):

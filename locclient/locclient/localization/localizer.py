@@ -8,16 +8,17 @@ import numpy as np
 from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
+from fleetmap.messages import Cause, Status
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer, Seen, TimeSliced
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
-from locclient.localization.estimate import Estimate, Hypothesis, Status
+from locclient.localization.estimate import Estimate, Hypothesis
 from locclient.localization.hypothesis_scoring import still_held
 from locclient.localization.hypothesis_set import Heard, HypothesisSet
-from locclient.localization.image_quality import Cause, ImageQualityMonitor
+from locclient.localization.image_quality import ImageQualityMonitor
 from locclient.localization.initial_pose_prior import InitialPosePrior
 from locclient.localization.pose_hypothesis import PoseHypothesis, applied, difference, moved
 from locclient.localization.settings import LocalizerSettings

@@ -7,7 +7,8 @@ import numpy as np
 from fleetmap.config import Section
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Manifest
-from locclient.localization.estimate import Estimate, Status
+from fleetmap.messages import Status
+from locclient.localization.estimate import Estimate
 
 Cell = tuple[int, int]
 _DOUBT_STEP_M = 10.0  # so that tiles are not read anew with every frame

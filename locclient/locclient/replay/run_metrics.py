@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap.geometry import Array
-from locclient.localization.estimate import Status
+from fleetmap.messages import Status
 
 SPARSE_S = 1.0  # frames farther apart than this are localised by a fix of their own
 WARM_UP_FRAMES = 20

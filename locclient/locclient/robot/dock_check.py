@@ -5,8 +5,9 @@ from collections.abc import Iterable
 import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.messages import Status
 from fleetmap.sensors.samples import PositionPrior
-from locclient.localization.estimate import Estimate, Status
+from locclient.localization.estimate import Estimate
 
 _EXACT_M = 0.1  # sigma up to which a coarse place is a dock's: three of them are what counts as a failure
 _LEFT_M = 1.0  # way after which the next word of a dock is another arrival

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 
 from fleetmap.geometry import Array
-from fleetmap.messages import FixNote
+from fleetmap.messages import Cause, FailureKind, FixNote, Status
 from fleetmap.sensors.samples import Image
-from locclient.localization.estimate import Estimate, Status
+from locclient.localization.estimate import Estimate
 from locclient.replay.run_metrics import BLIND_S, GOOD_S, RADIUS_LIMIT_M, SILENT_S
 
 _RADIUS_95 = 2.796
@@ -30,13 +30,13 @@ class Picture:
     is_frozen: bool
 
     @property
-    def fault(self) -> str:
-        """dark, frozen, blurred, or nothing."""
+    def fault(self) -> Cause:
+        """DARK, FROZEN, BLURRED, or NONE."""
         if self.exposure < _DARK:
-            return "dark"
+            return Cause.DARK
         if self.is_frozen:
-            return "frozen"
-        return "blurred" if self.sharpness < _BLURRED_SHARE else ""
+            return Cause.FROZEN
+        return Cause.BLURRED if self.sharpness < _BLURRED_SHARE else Cause.NONE
 
 
 class PictureJudge:
@@ -64,8 +64,8 @@ class PictureJudge:
 class Failure:
     """A failure as it is told once. stamp_ns: of its first frame; estimate, picture: when it was told, picture None without one."""
 
-    kind: str
-    cause: str
+    kind: FailureKind
+    cause: Cause
     stamp_ns: int
     duration_s: float
     estimate: Estimate
@@ -83,7 +83,7 @@ class FailureMonitor:
 
     def __init__(self) -> None:
         self._fixes: deque[FixNote] = deque(maxlen=_FIX_NOTES)
-        self._causes: Counter[str] = Counter()
+        self._causes: Counter[Cause] = Counter()
         self._had_fix = False
         self._blind_ns: int | None = None
         self._doubted_ns: int | None = None
@@ -110,11 +110,11 @@ class FailureMonitor:
         if self._running:
             return None
         if self._blind_ns is not None and (now_ns - self._blind_ns) * 1e-9 > BLIND_S:
-            return self._told("blind", self._causes.most_common(1)[0][0], self._blind_ns, now_ns, picture)
+            return self._told(FailureKind.BLIND, self._causes.most_common(1)[0][0], self._blind_ns, now_ns, picture)
         if self._doubted_ns is not None and (now_ns - self._doubted_ns) * 1e-9 > SILENT_S:
-            return self._told("suspected", "fix_refused", self._doubted_ns, now_ns, picture)
+            return self._told(FailureKind.SUSPECTED, Cause.FIX_REFUSED, self._doubted_ns, now_ns, picture)
         if estimate.moved_m is not None and estimate.moved_m > MOVED_LIMIT_M:
-            return self._told("suspected", "moved", now_ns, now_ns, picture)
+            return self._told(FailureKind.SUSPECTED, Cause.MOVED, now_ns, now_ns, picture)
         return None
 
     def handle_silence(self, for_s: float) -> Failure | None:
@@ -123,7 +123,7 @@ class FailureMonitor:
             return None
         began_ns = self._last.stamp_ns
         self._good_ns = None
-        return self._told("blind", "no_frames", began_ns, began_ns + int(for_s * 1e9), None)
+        return self._told(FailureKind.BLIND, Cause.NO_FRAMES, began_ns, began_ns + int(for_s * 1e9), None)
 
     def _note(self, estimate: Estimate) -> None:
         if estimate.fix is None and not estimate.refused:
@@ -160,7 +160,7 @@ class FailureMonitor:
         elif (now_ns - self._good_ns) * 1e-9 >= GOOD_S:
             self._running = False
 
-    def _told(self, kind: str, cause: str, began_ns: int, now_ns: int, picture: Picture | None) -> Failure:
+    def _told(self, kind: FailureKind, cause: Cause, began_ns: int, now_ns: int, picture: Picture | None) -> Failure:
         assert self._last is not None
         self._running = True
         return Failure(kind, cause, began_ns, (now_ns - began_ns) * 1e-9, self._last, picture, tuple(self._fixes))
@@ -180,12 +180,12 @@ def radius_95_m(cov_rot_trans: Array | None) -> float:
     return _RADIUS_95 * float(np.sqrt(np.linalg.eigvalsh(cov_rot_trans[3:, 3:])[-1]))
 
 
-def cause_of(estimate: Estimate, picture: Picture) -> str:
+def cause_of(estimate: Estimate, picture: Picture) -> Cause:
     """In a word, why a frame has no place: what is wrong with the picture goes first, then what the map said."""
     if picture.fault:
         return picture.fault
     if estimate.map_version is None:
-        return "no_map"
+        return Cause.NO_MAP
     if estimate.status is Status.AMBIGUOUS:
-        return "ambiguous"
-    return "no_match" if estimate.innovation is None else "fix_refused"
+        return Cause.AMBIGUOUS
+    return Cause.NO_MATCH if estimate.innovation is None else Cause.FIX_REFUSED

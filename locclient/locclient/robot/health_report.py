@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fleetmap.messages import RobotHealth
-from locclient.localization.estimate import Estimate, Status
+from fleetmap.messages import RobotHealth, Status
+from locclient.localization.estimate import Estimate
 from locclient.robot.failure_monitor import is_blind, radius_95_m
 from locclient.robot.robot import Outcome
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from fleetmap.config import Section
 from fleetmap.geometry import Array, se3_inverse
-from locclient.localization.estimate import Estimate, Status
+from fleetmap.messages import Status
+from locclient.localization.estimate import Estimate
 
 _DRIFT_SHARE = 0.02  # of the way, several times what the odometry errs by
 

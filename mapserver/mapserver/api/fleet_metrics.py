@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from fleetmap.messages import Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.kpis import Tally
 from mapserver.store import MapStore
 
-STATUSES = ("INITIALISING", "TRACKING", "DEGRADED", "AMBIGUOUS", "LOST")
 _SILENT_AFTER_S = 60.0
 
 _SITE_SUMS: tuple[tuple[str, str, Callable[[Tally], float]], ...] = (
@@ -94,11 +94,11 @@ class FleetCollector(Collector):
             present.add_metric([info.site], sum(robot.is_present is True for robot in own))
             skew.add_metric([info.site], max((abs(robot.clock_ahead_s or 0.0) for robot in own), default=0.0))
             counts = Counter(_status(robot) for robot in own if robot.seconds_since <= _SILENT_AFTER_S)
-            for status in (*STATUSES, "other"):
+            for status in (*Status, "other"):
                 statuses.add_metric([info.site, status], counts[status])
         yield from (present, statuses, skew)
 
 
 def _status(robot: RobotStatus) -> str:
     told = (robot.last_health or {}).get("status")
-    return told if told in STATUSES else "other"
+    return told if told in tuple(Status) else "other"

@@ -5,7 +5,7 @@ from markupsafe import Markup
 from nicegui import ui
 
 from fleetmap.errors import FleetmapError
-from fleetmap.messages import FailureReport
+from fleetmap.messages import FailureKind, FailureReport
 from mapserver.dashboard import drawing
 from mapserver.dashboard.drawing import Mark
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN, Choices
@@ -134,11 +134,11 @@ def _marks(where: Where, plan: Plan, shown: list[FailureRow]) -> Markup:
 
 
 def _tone(row: FailureRow) -> str:
-    return "warn" if row.kind == "suspected" else "bad"
+    return "warn" if row.kind == FailureKind.SUSPECTED else "bad"
 
 
 def _kind(row: FailureRow) -> Markup:
-    return badge(_tone(row), "suspected" if row.kind == "suspected" else row.kind)
+    return badge(_tone(row), "suspected" if row.kind == FailureKind.SUSPECTED else row.kind)
 
 
 def _rows(where: Where, wanted: FailureFilter, found: list[FailureRow]) -> Markup:
@@ -177,7 +177,7 @@ def _context(where: Where, detail: FailureDetail) -> Markup:
     def figure(value: float | None, unit: str = "") -> str | None:
         return None if value is None else f"{value:.3g}{unit}"
 
-    suspected = row.kind == "suspected"
+    suspected = row.kind == FailureKind.SUSPECTED
     return Markup("<div><h2>What happened</h2>{}{}</div>").format(
         notice(
             "warn",

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from fleetmap.messages import Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
 
 SILENT_S = 10.0  # robots report every second
@@ -11,12 +12,12 @@ _GONE_S = 3.0
 _KEPT_S = 0.9
 
 # What a status means to people, and its tone. Robots may send others, which are shown as they are.
-STATUSES = {
-    "TRACKING": ("localised", "good"),
-    "DEGRADED": ("unsure", "warn"),
-    "INITIALISING": ("starting", "warn"),
-    "AMBIGUOUS": ("several places fit", "bad"),
-    "LOST": ("lost", "bad"),
+STATUSES: dict[str, tuple[str, str]] = {
+    Status.TRACKING: ("localised", "good"),
+    Status.DEGRADED: ("unsure", "warn"),
+    Status.INITIALISING: ("starting", "warn"),
+    Status.AMBIGUOUS: ("several places fit", "bad"),
+    Status.LOST: ("lost", "bad"),
 }
 SILENT = ("silent", "quiet")
 

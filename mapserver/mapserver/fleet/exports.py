@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 from mcap.writer import CompressionType, Writer
 
 from fleetmap.errors import StoreError
-from fleetmap.messages import report_dict
+from fleetmap.messages import FailureKind, report_dict
 from mapserver.fleet.export_schemas import SCHEMAS
 from mapserver.fleet.fleet import finite
 from mapserver.store import FailureDetail, FailureFilter, MapStore
@@ -83,7 +83,7 @@ def _messages(store: MapStore, found: FailureDetail) -> Iterator[tuple[str, dict
     row, placed = found.failure, found.report.map_from_base
     stamp = {"sec": max(0, row.happened_ns) // 10**9, "nsec": max(0, row.happened_ns) % 10**9}
     words = f"{row.kind}: {row.cause}, {row.duration_s:.1f} s, version {row.version}, tile {row.tile}"
-    level = _LOG_WARNING if row.kind == "suspected" else _LOG_ERROR
+    level = _LOG_WARNING if row.kind == FailureKind.SUSPECTED else _LOG_ERROR
     yield (
         "/failures/log",
         {"timestamp": stamp, "level": level, "message": words, "name": row.robot, "file": row.site, "line": row.number},

@@ -10,7 +10,7 @@ import msgspec
 
 from fleetmap.config import Section
 from fleetmap.errors import FleetmapError
-from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
+from fleetmap.messages import FailureKind, FailureReport, PoseMessage, RobotHealth
 from mapserver.fleet_statistics.clock_skew import server_time_ns
 from mapserver.fleet_statistics.health_stream import HealthStream
 from mapserver.fleet_statistics.kpis import Tally, hour_of
@@ -123,8 +123,8 @@ class Ingest:
         grid = self._grid(report.site, report.version)
         canary = self._canary(report.site, now_ns)
         arm = _arm(canary, report.version) if canary is not None and happened_ns >= canary.started_ns else None
-        tally = Tally(suspected=1) if report.kind == "suspected" else Tally(failures=1)
-        tally.blind_failures = int(report.kind == "blind")
+        tally = Tally(suspected=1) if report.kind == FailureKind.SUSPECTED else Tally(failures=1)
+        tally.blind_failures = int(report.kind == FailureKind.BLIND)
         keys = _keys(report.robot, _version_key(report.version, grid), arm)
         keys.append(("cause", self._cause(report.site, report.cause)))
         if grid is not None and report.tile is not None:

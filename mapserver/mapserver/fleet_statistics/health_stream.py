@@ -2,7 +2,7 @@
 
 import math
 
-from fleetmap.messages import PoseMessage, RobotHealth
+from fleetmap.messages import PoseMessage, RobotHealth, Status
 from mapserver.fleet_statistics.kpis import Tally
 
 MAX_GAP_S = 5.0  # a robot that is silent for longer was not observed meanwhile
@@ -95,11 +95,15 @@ class HealthStream:
 
     def _count_status(self, tally: Tally, health: RobotHealth, figures: dict[str, float], dt_ms: int) -> None:
         is_stale = self._is_stale(health, dt_ms)
-        is_tracking = health.status == "TRACKING" and not is_stale
+        is_tracking = health.status == Status.TRACKING and not is_stale
         is_close = figures.get("radius_95_m", math.inf) <= RADIUS_LIMIT_M and not is_stale
-        is_blind = is_stale or health.status in {"LOST", "AMBIGUOUS"} or (health.status == "DEGRADED" and not is_close)
+        is_blind = (
+            is_stale
+            or health.status in {Status.LOST, Status.AMBIGUOUS}
+            or (health.status == Status.DEGRADED and not is_close)
+        )
         self._has_fix = self._has_fix or is_tracking or "first_fix_s" in figures
-        tally.usable_ms = dt_ms if is_tracking or (health.status == "DEGRADED" and is_close) else 0
+        tally.usable_ms = dt_ms if is_tracking or (health.status == Status.DEGRADED and is_close) else 0
         if self._has_fix:
             tally.after_fix_ms = dt_ms
             tally.localised_ms = dt_ms if is_tracking else 0

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 from benchmarks.common import estimator_loop
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
+from fleetmap.messages import Status
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import PositionPrior, Trajectory
 from fleetsim.estimator.landmarks import LandmarkField
 from fleetsim.estimator.simulated_run import EstimatorSession, Found, Ids, Sighting
 from fleetsim.recorder import Order, prepare
-from locclient.localization.estimate import Estimate, Status
+from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings, TrackSettings
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap

@@ -6,6 +6,7 @@ beginning is one of those that are promised, nothing fails silently, and the rob
 """
 
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+from fleetmap.messages import Status
 
 # isort: split
 from dataclasses import asdict, dataclass
@@ -14,7 +15,6 @@ import numpy as np
 
 from benchmarks.common.recorded_runs import parsed, played, recorded, surveyed, write_results
 from fleetsim.scenarios import find_scenario
-from locclient.localization.estimate import Status
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from locclient.replay.replay import ReplayResult

@@ -8,12 +8,10 @@ import pytest
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, se3_inverse, so3_exp
-from fleetmap.messages import EstimateMessage, decode_message
+from fleetmap.messages import Cause, EstimateMessage, Status, decode_message
 from fleetmap.recordings.ros2.keys import ros_key
 from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior, decode_text
 from locclient.daemon.publishers import OutputSection, open_output
-from locclient.localization.estimate import Status
-from locclient.localization.image_quality import Cause
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
 

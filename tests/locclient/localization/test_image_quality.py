@@ -5,10 +5,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from fleetmap.messages import Cause
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import Image
 from locclient.localization import image_quality_kernels
-from locclient.localization.image_quality import Cause, ImageQualityMonitor, ImageQualitySettings
+from locclient.localization.image_quality import ImageQualityMonitor, ImageQualitySettings
 
 Spoil = Callable[[Image, np.random.Generator], Image]
 

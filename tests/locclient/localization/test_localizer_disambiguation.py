@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array
+from fleetmap.messages import Status
 from fleetmap.relocalization.map_view import Expected
 from fleetmap.relocalization.relocalizer import Fix
-from locclient.localization.estimate import Status
 from support.fleet.scripted_robot import MAP_FROM_ODOM, Robot, off
 
 TWIN = off(0.0, 5.0)

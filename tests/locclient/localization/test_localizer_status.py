@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.messages import Cause, Status
 from fleetmap.sensors.samples import PositionPrior
-from locclient.localization.estimate import Status
-from locclient.localization.image_quality import Cause
 from locclient.localization.settings import TrackSettings
 from support.fleet.scripted_robot import FRAME_NS, NO_FIX, TRUE, Robot, off
 

@@ -8,8 +8,7 @@ import pytest
 
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import blob_path
-from fleetmap.messages import WantedVersion
-from locclient.localization.estimate import Status
+from fleetmap.messages import Status, WantedVersion
 from locclient.maps.map_client import LocalMapSource
 from locclient.maps.tile_cache import StoreFolder
 from locclient.maps.tile_loader import TileLoader

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array
-from locclient.localization.estimate import Status
+from fleetmap.messages import Status
 from locclient.replay import run_metrics
 from locclient.replay.run_metrics import METRICS, FrameRecord
 

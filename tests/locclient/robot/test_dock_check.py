@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.messages import Status
 from fleetmap.sensors.samples import PositionPrior
-from locclient.localization.estimate import Estimate, Status
+from locclient.localization.estimate import Estimate
 from locclient.robot.dock_check import DockCheck
 from support.fleet.estimates import estimate
 

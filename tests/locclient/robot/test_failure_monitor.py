@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from locclient.localization.estimate import Status
+from fleetmap.messages import Status
 from locclient.robot.failure_monitor import Failure, FailureMonitor, Picture, PictureJudge
 from support.fleet.estimates import estimate
 

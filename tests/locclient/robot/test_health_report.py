@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import se3_inverse
-from fleetmap.messages import HEALTH_FIGURES, RobotHealth
+from fleetmap.messages import HEALTH_FIGURES, RobotHealth, Status
 from fleetmap.sensors.samples import PositionPrior
-from locclient.localization.estimate import Estimate, Status
+from locclient.localization.estimate import Estimate
 from locclient.maps.map_client import FetchedTiles
 from locclient.replay.replay import ReplayResult, RobotLink, _record, _Reporter
 from locclient.robot.health_report import FixFigures, HealthFigures

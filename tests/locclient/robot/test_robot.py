@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from locclient.localization.estimate import Status
+from fleetmap.messages import Status
 from locclient.robot.robot import Change, Robot
 from mapserver.store import MapStore
 from support.worlds import robot_world

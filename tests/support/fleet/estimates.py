@@ -3,9 +3,10 @@
 import numpy as np
 
 from fleetmap.geometry import Array, se3
+from fleetmap.messages import Status
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.relocalizer import Fix
-from locclient.localization.estimate import Estimate, Hypothesis, Status
+from locclient.localization.estimate import Estimate, Hypothesis
 
 
 def estimate(
