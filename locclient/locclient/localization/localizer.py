@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleetmap.bow import Vocabulary
+from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.messages import Cause, Status
@@ -23,7 +24,6 @@ from locclient.localization.initial_pose_prior import InitialPosePrior
 from locclient.localization.pose_hypothesis import PoseHypothesis, applied, difference, moved
 from locclient.localization.settings import LocalizerSettings
 
-_RADIUS_95 = 2.796  # of a three-dimensional normal distribution, in sigmas
 _SPREAD_SHARE = 0.45  # of the time between two looks: frames that come less often are not made to share one
 _CANDIDATES_AT_ONCE = 3  # in one slice of a search
 _OWN_FIX_M = 0.3  # from the place that it speaks for
@@ -371,7 +371,7 @@ class Localizer:
     def _as_told(self, said: Estimate, told: PoseHypothesis) -> Estimate:
         """Nothing in the map agrees: the prior and the way since, as far as that goes."""
         now, covariance = told.now_map_from_body, self._published(told.now_cov)
-        radius_m = _RADIUS_95 * float(np.sqrt(np.linalg.eigvalsh(told.now_cov[3:, 3:])[-1]))
+        radius_m = radius_95_m(told.now_cov)
         status = said.status if radius_m > self._settings.track.lost_radius_m else Status.DEGRADED
         cause = self._cause or Cause.UNMATCHED
         return replace(said, status=status, map_from_body=now, cov_rot_trans=covariance, cause=cause)
@@ -379,7 +379,7 @@ class Localizer:
     def _worth(self, anchor: PoseHypothesis, odometry: OdometryEstimate) -> tuple[Status, Cause]:
         """Status of a confirmed place, and what is in the way of a better one."""
         settings = self._settings.track
-        radius = _RADIUS_95 * float(np.sqrt(np.linalg.eigvalsh(anchor.now_cov[3:, 3:])[-1]))
+        radius = radius_95_m(anchor.now_cov)
         age_s = (odometry.stamp_ns - anchor.stamp_ns) * 1e-9
         is_lost = odometry.status is OdometryStatus.DEGRADED
         cause = self._cause or (Cause.ODOMETRY if is_lost else Cause.UNMATCHED if self._failed_looks else Cause.NONE)

@@ -4,9 +4,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.failure_definition import ERROR_LIMIT_M
 from fleetmap.geometry import Array
 from locclient.replay.replay import ReplayResult
-from locclient.replay.run_metrics import ERROR_LIMIT_M, localised
+from locclient.replay.run_metrics import localised
 
 Canvas = NDArray[np.uint8]
 _SIZE = (900, 1500)

@@ -5,16 +5,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleetmap.failure_definition import (
+    BLIND_S,
+    GOOD_S,
+    SILENT_S,
+    is_blind,
+    is_outside_bound,
+    is_wrong,
+    radius_95_m,
+)
 from fleetmap.geometry import Array
 from fleetmap.messages import Status
 
 SPARSE_S = 1.0  # frames farther apart than this are localised by a fix of their own
 WARM_UP_FRAMES = 20
-ERROR_LIMIT_M, ERROR_LIMIT_DEG = 0.30, 5.0
-SILENT_S, BLIND_S, GOOD_S = 1.0, 2.0, 5.0
-RADIUS_LIMIT_M = 0.30
-CHI2_3_0999 = 16.266
-_RADIUS_95 = 2.796
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +43,6 @@ class FrameRecord:
     def error_m(self) -> float | None:
         """Distance between estimate and truth."""
         return None if self.error_map_m is None else float(np.linalg.norm(self.error_map_m))
-
-    @property
-    def radius_95_m(self) -> float:
-        """Radius that holds the position with 95 %; infinite without an estimate."""
-        if self.cov_rot_trans is None:
-            return float("inf")
-        return _RADIUS_95 * float(np.sqrt(np.linalg.eigvalsh(self.cov_rot_trans[3:, 3:])[-1]))
 
 
 Frames = Sequence[FrameRecord]
@@ -142,25 +139,19 @@ def position_failures(frames: Frames) -> int:
 
 
 def _is_silent(frame: FrameRecord, is_localised: bool) -> bool:
-    wrong = frame.error_m is not None and (
-        frame.error_m > ERROR_LIMIT_M or (frame.error_rad is not None and np.degrees(frame.error_rad) > ERROR_LIMIT_DEG)
-    )
+    wrong = frame.error_m is not None and is_wrong(frame.error_m, frame.error_rad)
     return (frame.status is Status.TRACKING or is_localised) and wrong
 
 
 def _is_blind(frame: FrameRecord, is_localised: bool) -> bool:
-    if is_localised:
-        return False
-    if frame.status is Status.DEGRADED:
-        return frame.radius_95_m > RADIUS_LIMIT_M
-    return frame.status in (Status.LOST, Status.AMBIGUOUS)
+    return not is_localised and is_blind(frame.status, radius_95_m(frame.cov_rot_trans))
 
 
 def is_outside_its_bound(frame: FrameRecord) -> bool:
     """Whether the truth lies outside the 99.9 % bound of the position that the frame claims."""
     if frame.error_map_m is None or frame.cov_rot_trans is None:
         return False
-    return float(frame.error_map_m @ np.linalg.solve(frame.cov_rot_trans[3:, 3:], frame.error_map_m)) > CHI2_3_0999
+    return is_outside_bound(frame.error_map_m, frame.cov_rot_trans)
 
 
 def _is_overconfident(frame: FrameRecord, is_localised: bool) -> bool:

@@ -6,18 +6,15 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fleetmap.geometry import Array
+from fleetmap.failure_definition import BLIND_S, GOOD_S, SILENT_S, is_blind, is_wrong, radius_95_m
 from fleetmap.messages import Cause, FailureKind, FixNote, Status
 from fleetmap.sensors.samples import Image
 from locclient.localization.estimate import Estimate
-from locclient.replay.run_metrics import BLIND_S, GOOD_S, RADIUS_LIMIT_M, SILENT_S
 
-_RADIUS_95 = 2.796
 _FIX_NOTES = 20
 _DARK, _BLURRED_SHARE = 0.06, 0.25
 _TYPICAL_FRAMES = 200
 _MAX_REFUSED_CHARS = 500
-MOVED_LIMIT_M = 0.30
 CONTRADICTING_LOOKS = 3  # one refused fix is chance, several in a row are a doubt
 
 
@@ -103,7 +100,10 @@ class FailureMonitor:
         self._note(estimate)
         self._had_fix |= estimate.fix is not None
         now_ns = estimate.stamp_ns
-        blind, doubted = self._had_fix and is_blind(estimate), self._doubts >= CONTRADICTING_LOOKS
+        blind, doubted = (
+            self._had_fix and is_blind(estimate.status, radius_95_m(estimate.cov_rot_trans)),
+            self._doubts >= CONTRADICTING_LOOKS,
+        )
         self._follow(now_ns, blind, doubted)
         if blind:
             self._causes[cause_of(estimate, picture)] += 1
@@ -113,7 +113,7 @@ class FailureMonitor:
             return self._told(FailureKind.BLIND, self._causes.most_common(1)[0][0], self._blind_ns, now_ns, picture)
         if self._doubted_ns is not None and (now_ns - self._doubted_ns) * 1e-9 > SILENT_S:
             return self._told(FailureKind.SUSPECTED, Cause.FIX_REFUSED, self._doubted_ns, now_ns, picture)
-        if estimate.moved_m is not None and estimate.moved_m > MOVED_LIMIT_M:
+        if estimate.moved_m is not None and is_wrong(estimate.moved_m):
             return self._told(FailureKind.SUSPECTED, Cause.MOVED, now_ns, now_ns, picture)
         return None
 
@@ -164,20 +164,6 @@ class FailureMonitor:
         assert self._last is not None
         self._running = True
         return Failure(kind, cause, began_ns, (now_ns - began_ns) * 1e-9, self._last, picture, tuple(self._fixes))
-
-
-def is_blind(estimate: Estimate) -> bool:
-    """Whether there is no place that may be relied upon: lost, ambiguous, or degraded beyond RADIUS_LIMIT_M."""
-    if estimate.status in {Status.TRACKING, Status.INITIALISING}:
-        return False
-    return estimate.status is not Status.DEGRADED or radius_95_m(estimate.cov_rot_trans) > RADIUS_LIMIT_M
-
-
-def radius_95_m(cov_rot_trans: Array | None) -> float:
-    """Radius that holds the position with 95 %; infinite without an estimate."""
-    if cov_rot_trans is None:
-        return float("inf")
-    return _RADIUS_95 * float(np.sqrt(np.linalg.eigvalsh(cov_rot_trans[3:, 3:])[-1]))
 
 
 def cause_of(estimate: Estimate, picture: Picture) -> Cause:

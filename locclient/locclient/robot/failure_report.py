@@ -2,11 +2,11 @@
 
 import math
 
+from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.messages import MAX_THUMBNAIL_BYTES, FailureReport, Placement, Thumbnail
 from fleetmap.sensors.rectification import StereoCamera
 from locclient.localization.settings import LocalizerSettings
-from locclient.robot.failure_monitor import radius_95_m
 from locclient.robot.match_view import match_view, small_jpeg
 from locclient.robot.robot import FailureContext
 

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from fleetmap.failure_definition import is_blind, radius_95_m
 from fleetmap.messages import RobotHealth, Status
 from locclient.localization.estimate import Estimate
-from locclient.robot.failure_monitor import is_blind, radius_95_m
 from locclient.robot.robot import Outcome
 
 _RECENT = 300
@@ -97,7 +97,10 @@ class HealthFigures:
         status = Status.INITIALISING.value if last is None else last.estimate.status.value
         flags = [
             name
-            for name, raised in (("no_frames", silent), ("blind", last is not None and is_blind(last.estimate)))
+            for name, raised in (
+                ("no_frames", silent),
+                ("blind", last is not None and is_blind(status, radius_95_m(last.estimate.cov_rot_trans))),
+            )
             if raised
         ]
         if last is not None and last.picture.fault:

@@ -2,14 +2,12 @@
 
 import math
 
+from fleetmap.failure_definition import BLIND_S, CHI2_6_0999, GOOD_S, is_blind, is_usable, is_wrong
 from fleetmap.messages import PoseMessage, RobotHealth, Status
 from mapserver.fleet_statistics.kpis import Tally
 
 MAX_GAP_S = 5.0  # a robot that is silent for longer was not observed meanwhile
 DRIVING_MPS = 0.05
-BLIND_S, GOOD_S, RADIUS_LIMIT_M = 2.0, 5.0, 0.30  # as docs/reports.md defines failures
-WRONG_M = 0.30
-CHI2_6_0999 = 22.458  # 99.9 % of a squared Mahalanobis distance of 6 degrees of freedom
 _MAX_COUNT = 1 << 40
 _MAX_FIGURE = 1e15
 
@@ -96,21 +94,17 @@ class HealthStream:
     def _count_status(self, tally: Tally, health: RobotHealth, figures: dict[str, float], dt_ms: int) -> None:
         is_stale = self._is_stale(health, dt_ms)
         is_tracking = health.status == Status.TRACKING and not is_stale
-        is_close = figures.get("radius_95_m", math.inf) <= RADIUS_LIMIT_M and not is_stale
-        is_blind = (
-            is_stale
-            or health.status in {Status.LOST, Status.AMBIGUOUS}
-            or (health.status == Status.DEGRADED and not is_close)
-        )
+        radius_m = figures.get("radius_95_m", math.inf)
         self._has_fix = self._has_fix or is_tracking or "first_fix_s" in figures
-        tally.usable_ms = dt_ms if is_tracking or (health.status == Status.DEGRADED and is_close) else 0
+        tally.usable_ms = dt_ms if not is_stale and is_usable(health.status, radius_m) else 0
         if self._has_fix:
             tally.after_fix_ms = dt_ms
             tally.localised_ms = dt_ms if is_tracking else 0
             self._watched_ns += dt_ms * 1_000_000
-            tally.blind_seen = self._blindness(self._watched_ns, dt_ms, is_blind, is_tracking)
+            is_blind_now = is_stale or is_blind(health.status, radius_m)
+            tally.blind_seen = self._blindness(self._watched_ns, dt_ms, is_blind_now, is_tracking)
 
-    def _blindness(self, watched_ns: int, dt_ms: int, is_blind: bool, is_tracking: bool) -> int:
+    def _blindness(self, watched_ns: int, dt_ms: int, is_blind_now: bool, is_tracking: bool) -> int:
         """1 where a stretch of blindness became a failure with this report.
 
         A stretch lasts until the next report that is better, and a failure until 5 s of good tracking.
@@ -118,7 +112,7 @@ class HealthStream:
         if dt_ms == 0:
             self._blind_since_ns = self._good_since_ns = None  # nobody knows what was in between
         began = self._blind_since_ns is not None and watched_ns - self._blind_since_ns > BLIND_S * 1e9
-        if not is_blind:
+        if not is_blind_now:
             self._blind_since_ns = None
         elif self._blind_since_ns is None:
             self._blind_since_ns = watched_ns
@@ -141,14 +135,14 @@ class HealthStream:
             tally.innovations, tally.innovation_sum = 1, innovation
             tally.innovation_m_sum = figures.get("fix_innovation_m", 0.0)
             tally.exceeded = int(innovation > CHI2_6_0999)
-        if self._has_fix and figures.get("fix_innovation_m", 0.0) > WRONG_M:
+        if self._has_fix and is_wrong(figures.get("fix_innovation_m", 0.0)):
             # The estimate was wrong before, or is now. Jumps without 5 s between them are one; one within a failure belongs to it.
             is_new = self._jump_ns is None or stamp_ns - self._jump_ns >= GOOD_S * 1e9
             tally.jumps = int(is_new and not self._in_failure)
             self._jump_ns = stamp_ns
         dock_m = figures.get("dock_error_m")
         if dock_m is not None:
-            tally.docks, tally.docks_wrong = 1, int(dock_m > WRONG_M)
+            tally.docks, tally.docks_wrong = 1, int(is_wrong(dock_m))
 
     def _count_work(self, tally: Tally, figures: dict[str, float]) -> None:
         if "frame_ms_mean" in figures:

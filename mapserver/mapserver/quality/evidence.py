@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
+from fleetmap.failure_definition import ERROR_LIMIT_DEG, ERROR_LIMIT_M
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.sensors.samples import Stamps
 from mapserver.quality.figures import Aliasing, Compared, Evidence, Looks, Motion
@@ -15,7 +16,6 @@ from mapserver.quality.probes import Probe
 from mapserver.quality.tile_map import Lookalikes, TileMap
 from mapserver.survey.settings import SurveySettings
 
-WRONG_M, WRONG_RAD = 0.30, np.radians(5.0)  # what counts as a failure of a robot's position
 _ELSEWHERE_M = 2 * PRIOR_RADIUS_M + 2.0  # a neighbourhood that shares no place with the true one's
 _STRETCH_M, _APART_M = 3.0, 1.0
 _BREAK_M, _BREAK_SHARE = 0.15, 0.05
@@ -67,7 +67,7 @@ def _looks(probes: Sequence[Probe], fixes: Sequence[Fix | None]) -> Looks:
         return Looks(len(probes), 0.0, 0.0, None, None, None, None)
     errors_m = np.array([np.linalg.norm(off[:3, 3]) for _, off in found])
     turns_rad = np.array([rotation_angle_rad(off[:3, :3]) for _, off in found])
-    wrong = (errors_m > WRONG_M) | (turns_rad > WRONG_RAD)
+    wrong = (errors_m > ERROR_LIMIT_M) | (turns_rad > np.radians(ERROR_LIMIT_DEG))
     return Looks(
         len(probes),
         round(len(found) / len(probes), 4),

@@ -6,6 +6,7 @@ beginning is one of those that are promised, nothing fails silently, and the rob
 """
 
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+from fleetmap.failure_definition import ERROR_LIMIT_M
 from fleetmap.messages import Status
 
 # isort: split
@@ -85,7 +86,7 @@ def outcome(fault: str, result: ReplayResult) -> Outcome:
         if t >= end_s
         and frame.status is Status.TRACKING
         and frame.error_m is not None
-        and frame.error_m < run_metrics.ERROR_LIMIT_M
+        and frame.error_m < ERROR_LIMIT_M
     ]
     first = next(k for k, t in enumerate(times_s) if t >= end_s)
     way = [truth[:3, 3] for truth in result.truths[first : good[0] + 1] if truth is not None] if good else []

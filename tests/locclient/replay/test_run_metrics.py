@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
+from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.messages import Status
 from locclient.replay import run_metrics
@@ -182,9 +183,9 @@ def test_between_sparse_frames_nothing_better_is_known() -> None:
 def test_the_radius_holds_95_percent() -> None:
     """Against samples of the distribution, and infinite where nothing is known."""
     samples: Array = np.random.default_rng(3).normal(0, 0.05, (20_000, 3))
-    inside = np.linalg.norm(samples, axis=1) < frame(0, sigma_m=0.05).radius_95_m
+    inside = np.linalg.norm(samples, axis=1) < radius_95_m(frame(0, sigma_m=0.05).cov_rot_trans)
     assert inside.mean() == pytest.approx(0.95, abs=0.005)
-    assert frame(0, sigma_m=None).radius_95_m == np.inf
+    assert radius_95_m(None) == np.inf
 
 
 def test_a_failure_ends_only_after_five_seconds_of_good_tracking() -> None:
