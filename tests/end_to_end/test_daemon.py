@@ -29,11 +29,11 @@ PATIENCE_S = 240.0  # the first start of all compiles every kernel
 
 def write_walk(folder: Path, frames: int, dark: range) -> Path:
     """The robot's ride as a recording."""
-    moments = list(robot_world.moments(frames, dark=dark))
-    imu = [moment.imu for moment in moments]
+    bundles = list(robot_world.bundles(frames, dark=dark))
+    imu = [bundle.imu for bundle in bundles]
     sample = Sample(
-        np.array([moment.frame.stamp_ns for moment in moments]), [moment.frame.left for moment in moments],
-        [moment.frame.right for moment in moments], np.concatenate([part.stamps_ns for part in imu]),
+        np.array([bundle.frame.stamp_ns for bundle in bundles]), [bundle.frame.left for bundle in bundles],
+        [bundle.frame.right for bundle in bundles], np.concatenate([part.stamps_ns for part in imu]),
         np.concatenate([part.gyro_radps for part in imu]), np.concatenate([part.accel_mps2 for part in imu]),
         [robot_world.truth(number) for number in range(frames)],
     )  # fmt: skip

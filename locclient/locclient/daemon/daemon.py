@@ -75,7 +75,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[Parts]:
         warm_up(calibration, rectifier, config.localizer)
         stack.enter_context(gc_frozen())
         _log.info("warm after %.1f s", time.monotonic() - begun_s)
-        link, maps, first = _maps(config.run, bus, site, name)
+        link, maps, first, caches = _maps(config.run, bus, site, name)
         robot = Robot(calibration, rectifier, config.localizer, config.run.trial, time.thread_time)
         if prior is not None:
             robot.localizer.handle_prior(prior)
@@ -88,6 +88,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[Parts]:
             site=site, robot_name=name, source=source, intake=intake, robot=robot, room=TileLoader(maps, config.run.window),
             spool=spool, camera=rectifier.camera, settings=config.localizer, output=output, link=link, talk=talk, first=first,
             failures_folder=None if config.run.failures is None else Path(config.run.failures),
+            caches=caches,
         )  # fmt: skip
 
 
@@ -107,7 +108,7 @@ def _output(config: LocclientConfig, bus: Bus | None, site: str, name: str, stac
 
 def _maps(
     run: RunSection, bus: Bus | None, site: str, name: str
-) -> tuple[MapClient | None, MapSource, WantedVersion | None]:
+) -> tuple[MapClient | None, MapSource, WantedVersion | None, tuple[TileCache, ...]]:
     """The link to a server, what maps are read from, and the version to begin with; from the disk alone, without waiting."""
     if bus is None:
         folder = LocalMapSource(StoreFolder(Path(run.store or "")), site)
@@ -116,8 +117,9 @@ def _maps(
             raise LinkError(
                 f"site {site} has no published version in {run.store}; publish one with `mapserver publish`"
             )
-        return None, folder, wanted
+        return None, folder, wanted, ()
     cache = Path(run.cache) if run.cache is not None else default_cache_folder()
-    link = MapClient(bus, TileCache(cache, max_bytes=run.cache_bytes), site, name, patience_s=_PATIENCE_S)
-    # Its own view of the same folder, because a cache is not for two threads; it only reads.
-    return link, CachedMap(TileCache(cache, max_bytes=run.cache_bytes), site), link.active()
+    # Two views of the same folder, because a cache is not for two threads; the second only reads.
+    caches = tuple(TileCache(cache, max_bytes=run.cache_bytes) for _ in range(2))
+    link = MapClient(bus, caches[0], site, name, patience_s=_PATIENCE_S)
+    return link, CachedMap(caches[1], site), link.active(), caches

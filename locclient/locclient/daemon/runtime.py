@@ -18,12 +18,14 @@ from locclient.daemon.publishers import Output
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.systemd_notify import ServiceManager
 from locclient.localization.settings import LocalizerSettings
+from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_client import MapClient
+from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
 from locclient.maps.tile_selection import Cell, Place, PositionBound
 from locclient.robot.failure_report import failure_report
 from locclient.robot.health_report import Figure, HealthFigures
-from locclient.robot.robot import FailureContext, LoadedMap, Outcome, Robot
+from locclient.robot.robot import FailureContext, Outcome, Robot
 from locclient.sensors.intake import Intake
 from locclient.sensors.source import Source
 
@@ -53,6 +55,7 @@ class Parts:
     talk: ServerSync | None
     first: WantedVersion | None
     failures_folder: Path | None = None
+    caches: tuple[TileCache, ...] = ()
 
 
 @dataclass
@@ -79,6 +82,7 @@ class Runtime:
         self._last_frame_s: float | None = None
         self._health_s, self._pose_ns = 0.0, -(2**62)
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
+        self._cache_faults = 0
         self._fetched_again: set[str] = set()
         self._refused_tiles: dict[str, dict[Cell, str]] = {}
 
@@ -120,12 +124,12 @@ class Runtime:
 
     def _turn(self) -> None:
         robot, shared = self._parts.robot, self._shared
-        moment = self._parts.intake.take(_TAKE_S)
+        bundle = self._parts.intake.take(_TAKE_S)
         while shared.loaded:
             robot.use(shared.loaded.popleft())
         outcome = None
         try:
-            outcome = robot.handle(moment)
+            outcome = robot.handle(bundle)
         except RecordingError as error:
             # A picture that cannot be read costs itself.
             self._parts.intake.count_unreadable()
@@ -188,8 +192,19 @@ class Runtime:
     def _more(self) -> dict[str, Figure]:
         counts: dict[str, Figure] = dict(asdict(self._parts.intake.counts))
         spool = {f"spool_{name}": value for name, value in self._parts.spool.counts().items()}
-        tiles = sum(len(loaded.tiles) for loaded in self._parts.robot.held)
-        return {**counts, **spool, "tiles_held": tiles, "tiles_refused": sum(map(len, self._refused_tiles.values()))}
+        tiles = {
+            "tiles_held": sum(len(loaded.tiles) for loaded in self._parts.robot.held),
+            "tiles_refused": sum(map(len, self._refused_tiles.values())),
+            "cache_faults": self._count_cache_faults(),
+        }
+        return {**counts, **spool, **tiles}
+
+    def _count_cache_faults(self) -> int:
+        for cache in self._parts.caches:
+            for fault in cache.take_faults():
+                _log.warning("tile cache: %s", fault)
+                self._cache_faults += 1
+        return self._cache_faults
 
     # --- the other threads --------------------------------------------------------------------------------------------
 

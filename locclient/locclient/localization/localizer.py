@@ -59,9 +59,6 @@ class Localizer:
         )
         self._relocalizer: Relocalizer | None = None
         self._map_version: int | None = None
-        self._tiles: dict[tuple[int, int], Tile] = {}
-        self._vocabulary: Vocabulary | None = None
-        self._survey_focal_px = 0.0
         self._prior: InitialPosePrior | None = None
         self._anchor: PoseHypothesis | None = None  # the confirmed place
         self._confirmation = HypothesisSet(settings.track)  # of a place, while there is none
@@ -92,27 +89,8 @@ class Localizer:
         self, version: int, tiles: Iterable[Tile], vocabulary: Vocabulary, survey_focal_px: float
     ) -> None:
         """The tiles around, of one version; takes the place of what was held. A look that goes on is given up."""
-        self._tiles = {(tile.tile_x, tile.tile_y): tile for tile in tiles}
-        self._vocabulary, self._survey_focal_px = vocabulary, survey_focal_px
         self._map_version = version
-        self._hold()
-
-    def handle_tile(self, tile: Tile) -> None:
-        """One more tile of the version that is held, or another edition of one."""
-        assert self._vocabulary is not None, "tiles belong to a version: handle_version comes first"
-        self._tiles[(tile.tile_x, tile.tile_y)] = tile
-        self._hold()
-
-    def forget_tiles(self, cells: Iterable[tuple[int, int]]) -> None:
-        """Lets go of tiles, (tile_x, tile_y), that are far away."""
-        for cell in cells:
-            self._tiles.pop(cell, None)
-        if self._vocabulary is not None:
-            self._hold()
-
-    def _hold(self) -> None:
-        assert self._vocabulary is not None
-        view = MapView(self._tiles.values(), self._vocabulary, self._survey_focal_px)
+        view = MapView(tiles, vocabulary, survey_focal_px)
         self._relocalizer = Relocalizer(view, self._camera, self._settings.relocalizer)
         self._work = self._moment = None
 

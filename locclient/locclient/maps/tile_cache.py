@@ -2,6 +2,7 @@
 
 import os
 import secrets
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +13,7 @@ from fleetmap.errors import MapFormatError, StoreError
 from fleetmap.mapformat import blob_path, check_name, check_sha256, current_path, verified
 
 DEFAULT_MAX_BYTES = 2_000_000_000
+_MAX_FAULTS = 100  # that wait to be taken
 
 
 class ActiveVersion(msgspec.Struct, frozen=True):
@@ -35,7 +37,8 @@ class TileCache:
         """Makes the folder; raises StoreError where that is not possible."""
         self._folder = folder
         self._max_bytes = max_bytes
-        self._faults: list[str] = []
+        self._faults: deque[str] = deque(maxlen=_MAX_FAULTS)
+        self._last_fault = ""
         self._on_the_way: dict[str, frozenset[str]] = {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -62,7 +65,7 @@ class TileCache:
             self._sizes.pop(sha256, None)
             return None
         except (OSError, MapFormatError) as error:
-            self._faults.append(f"cached {sha256} cannot be used and was removed: {error}")
+            self._note(f"cached {sha256} cannot be used and was removed: {error}")
             self._remove(sha256)
             return None
         # Dictionaries keep their order: last used is last.
@@ -94,11 +97,11 @@ class TileCache:
         if missing:
             raise StoreError(
                 f"version {version} of {site} is not whole: {len(missing)} of {len(blobs)} pieces are missing, "
-                f"{missing[0]} first; {'; '.join(self._faults[-1:]) or 'fetch them again'}"
+                f"{missing[0]} first; {self._last_fault or 'fetch them again'}"
             )
         record = ActiveVersion(version, tuple(blobs))
         if not self._write(self._active_path(site), msgspec.json.encode(record)):
-            raise StoreError(f"version {version} of {site} cannot be made active: {self._faults[-1]}")
+            raise StoreError(f"version {version} of {site} cannot be made active: {self._last_fault}")
         self._active[site] = record
         self._on_the_way.pop(site, None)
         self._make_room(keep="")
@@ -108,9 +111,12 @@ class TileCache:
         return self._active.get(site)
 
     def take_faults(self) -> list[str]:
-        """What went wrong with the disk since the last call, in words."""
-        faults, self._faults = self._faults, []
-        return faults
+        """What went wrong with the disk since the last call, in words. For any thread."""
+        return [self._faults.popleft() for _ in range(len(self._faults))]
+
+    def _note(self, fault: str) -> None:
+        self._last_fault = fault
+        self._faults.append(fault)
 
     def _scan(self) -> dict[str, int]:
         found = []
@@ -131,7 +137,7 @@ class TileCache:
                     record, blobs=tuple(check_sha256(sha256) for sha256 in record.blobs)
                 )
             except (msgspec.MsgspecError, UnicodeDecodeError, MapFormatError) as error:
-                self._faults.append(f"{path} is damaged ({error}); the version has to be fetched again")
+                self._note(f"{path} is damaged ({error}); the version has to be fetched again")
         return found
 
     def _make_room(self, keep: str) -> None:
@@ -158,7 +164,7 @@ class TileCache:
             temporary.replace(path)
             _sync_folder(path.parent)
         except OSError as error:
-            self._faults.append(f"{path} cannot be written ({error.strerror}); make space for the cache")
+            self._note(f"{path} cannot be written ({error.strerror}); make space for the cache")
             self._try_unlink(temporary)
             return False
         return True
@@ -174,7 +180,7 @@ class TileCache:
         try:
             path.unlink(missing_ok=True)
         except OSError as error:
-            self._faults.append(f"{path} cannot be removed ({error.strerror}); check the rights of the cache")
+            self._note(f"{path} cannot be removed ({error.strerror}); check the rights of the cache")
 
     def _path(self, sha256: str) -> Path:
         return self._folder / blob_path(sha256)

@@ -6,9 +6,9 @@ from fleetmap.bow import Vocabulary, decode_vocabulary
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import Manifest, Tile
 from fleetmap.messages import WantedVersion
+from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_client import MapSource
 from locclient.maps.tile_selection import Cell, Place, WindowSettings, window
-from locclient.robot.robot import LoadedMap
 
 
 @dataclass

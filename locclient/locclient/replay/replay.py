@@ -19,7 +19,8 @@ from locclient.daemon.jit_warmup import gc_frozen
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.map_client import FetchedTiles, MapClient, MapSource
+from locclient.maps.connection import MapConnection
+from locclient.maps.map_client import FetchedTiles, MapClient
 from locclient.replay.replay_sources import ReplaySource
 from locclient.replay.run_metrics import METRICS, FrameRecord, localised
 from locclient.robot.dock_check import DockCheck
@@ -27,16 +28,6 @@ from locclient.robot.health_report import FixFigures
 
 _HEALTH_EVERY_S, _POSE_EVERY_S = 1.0, 0.5
 TRUTH_FLAG = "frame_from_ground_truth"  # key of the configuration: the map lies in the frame of the recordings' truth
-
-
-@dataclass
-class RobotLink:
-    """How a replay talks to a server; `map_link` is None when it reads a store's folder."""
-
-    source: MapSource
-    map_link: MapClient | None
-    site: str
-    robot: str
 
 
 @dataclass(frozen=True)
@@ -74,7 +65,7 @@ class ReplayResult:
 
 @gc_frozen()
 def replay(
-    source: ReplaySource, link: RobotLink, settings: LocalizerSettings, prior: PositionPrior | None, *, realtime: bool,
+    source: ReplaySource, link: MapConnection, settings: LocalizerSettings, prior: PositionPrior | None, *, realtime: bool,
     progress: Callable[[int], None],
 ) -> ReplayResult:  # fmt: skip
     """Plays the source; raises LinkError where no map can be had, RecordingError for frames that cannot be read."""
@@ -158,7 +149,7 @@ def _record(
 class _Reporter:
     """Sends acknowledgement, poses and health, thinned by sensor time; a link that breaks is noted and costs the replay nothing."""
 
-    def __init__(self, link: RobotLink, result: ReplayResult) -> None:
+    def __init__(self, link: MapConnection, result: ReplayResult) -> None:
         self._link, self._result = link, result
         self._fixes = FixFigures()
         self._health_ns = self._pose_ns = -(2**62)
@@ -208,10 +199,10 @@ class _Reporter:
         return now_ns - last_ns >= every_s * 1e9
 
     def _send(self, act: Callable[[MapClient], None]) -> None:
-        if self._link.map_link is None or self._broken:
+        if self._link.client is None or self._broken:
             return
         try:
-            act(self._link.map_link)
+            act(self._link.client)
         except LinkError as error:
             self._broken = True
             self._result.notes.append(f"reports are no longer sent: {error}")

@@ -5,9 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
-from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array
-from fleetmap.mapformat import Manifest, Tile
 from fleetmap.messages import WantedVersion
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.calibration import RigCalibration
@@ -16,31 +14,15 @@ from fleetmap.sensors.samples import Image
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.tile_selection import Cell
+from locclient.maps.loaded_map import LoadedMap
 from locclient.robot.continuous_odom import ContinuousOdom, Placed
 from locclient.robot.dock_check import DockCheck
 from locclient.robot.failure_monitor import Failure, FailureMonitor, Picture, PictureJudge
+from locclient.robot.sensor_bundle import SensorBundle
 from locclient.robot.version_trial import TrialSettings, Verdict, VersionTrial
-from locclient.sensors.intake import Moment
 
 _THUMBNAIL_EVERY_NS = 1_000_000_000
 _THUMBNAILS = 2
-
-
-@dataclass(frozen=True)
-class LoadedMap:
-    """Some tiles of one version, ready for the localizer; is_offer: of a version to begin with or to try, not only other tiles."""
-
-    wanted: WantedVersion
-    manifest: Manifest
-    vocabulary: Vocabulary
-    tiles: dict[Cell, Tile]
-    is_offer: bool = True
-
-    @property
-    def version(self) -> int:
-        """Its number."""
-        return self.manifest.version
 
 
 class Change(StrEnum):
@@ -99,7 +81,7 @@ class _Versions:
 
 
 class Robot:
-    """Feeds moments and maps to the localizer and keeps two versions while one of them is on trial."""
+    """Feeds sensor bundles and maps to the localizer and keeps two versions while one of them is on trial."""
 
     def __init__(
         self, calibration: RigCalibration, rectifier: Rectifier, settings: LocalizerSettings, trial: TrialSettings,
@@ -155,16 +137,16 @@ class Robot:
             versions.candidate, versions.trial, versions.is_doubt = loaded, self._new_trial(), False
         self._show(loaded)
 
-    def handle(self, moment: Moment) -> Outcome | None:
-        """What a moment with a frame brought; None without one. RecordingError for pictures that cannot be read."""
-        self.localizer.handle_imu(moment.imu)
-        self.localizer.handle_wheel(moment.wheel)
-        for prior in moment.priors:
+    def handle(self, bundle: SensorBundle) -> Outcome | None:
+        """What a bundle with a frame brought; None without one. RecordingError for pictures that cannot be read."""
+        self.localizer.handle_imu(bundle.imu)
+        self.localizer.handle_wheel(bundle.wheel)
+        for prior in bundle.priors:
             self.localizer.handle_prior(prior)
-        if moment.frame is None:
+        if bundle.frame is None:
             return None
         begun_s = self._clock_s()
-        raw = decode_frame(moment.frame) if isinstance(moment.frame, StoredFrame) else moment.frame
+        raw = decode_frame(bundle.frame) if isinstance(bundle.frame, StoredFrame) else bundle.frame
         frame = self._rectifier.rectify(raw)
         estimate = self.localizer.handle_stereo(frame)
         picture = self._judge.judge(frame.left)
@@ -174,7 +156,7 @@ class Robot:
         context = None if failure is None else self._context(failure)
         if not self._pictures or estimate.stamp_ns - self._pictures[-1][0] >= _THUMBNAIL_EVERY_NS:
             self._pictures.append((estimate.stamp_ns, frame.left))
-        dock_error_m = self._docks.handle(moment.priors, estimate)
+        dock_error_m = self._docks.handle(bundle.priors, estimate)
         return Outcome(estimate, self._odom.handle(estimate), picture, cpu_s, context, dock_error_m)
 
     def handle_silence(self, for_s: float) -> FailureContext | None:

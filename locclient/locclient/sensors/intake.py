@@ -13,20 +13,11 @@ import numpy as np
 
 from fleetmap.recordings import StoredFrame
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
+from locclient.robot.sensor_bundle import SensorBundle
 
 _IMU_LEAD_NS = 10_000_000  # a frame is handled when the IMU has come a little past it
 _STALE_NS = 60_000_000_000  # integrated over longer than this without a picture, inertial samples say nothing
 _ABSURD = 1e5
-
-
-@dataclass(frozen=True, slots=True)
-class Moment:
-    """A frame, None where none came in time, and everything that goes before it."""
-
-    frame: CameraFrame | StoredFrame | None
-    imu: ImuSamples
-    wheel: list[WheelSample]
-    priors: list[PositionPrior]
 
 
 @dataclass
@@ -139,11 +130,11 @@ class Intake:
         with self._changed:
             return self._changed.wait_for(lambda: len(self._frames) < self._limit, timeout_s)
 
-    def take(self, timeout_s: float) -> Moment:
+    def take(self, timeout_s: float) -> SensorBundle:
         """The oldest frame with all that goes before it, once its inertial samples are there or have been waited for."""
         with self._changed:
             if not self._changed.wait_for(lambda: self._frames or self._finished, timeout_s) or not self._frames:
-                return Moment(None, ImuSamples.empty(), [], [])
+                return SensorBundle()
             if self._has_imu and not self._changed.wait_for(self._imu_is_there, self._imu_wait_s):
                 self.counts.imu_late += 1
             frame = self._frames.popleft()
@@ -154,7 +145,7 @@ class Intake:
             self._wheel = [sample for sample in self._wheel if sample.stamp_ns > body_ns]
             self._priors = [prior for prior in self._priors if prior.stamp_ns > frame.stamp_ns]
             self._changed.notify_all()
-            return Moment(frame, imu, wheel, priors)
+            return SensorBundle(frame, imu, wheel, priors)
 
     def _imu_is_there(self) -> bool:
         """Up to the oldest frame, which may be another one than when the wait began."""

@@ -43,8 +43,8 @@ from locclient.maps.tile_selection import Place, PositionBound, WindowSettings
 from locclient.replay.replay_sources import ReplaySource
 from locclient.robot.health_report import HealthFigures
 from locclient.robot.robot import Robot
+from locclient.robot.sensor_bundle import SensorBundle
 from locclient.robot.version_trial import TrialSettings
-from locclient.sensors.intake import Moment
 
 PROMISES: Promises = {"resident_mb": (320, AT_MOST), "anonymous_mb": (200, AT_MOST), "growth_mb": (5, AT_MOST)}
 _RUNNER = ("--robot", "runner-1", "--day", "1")
@@ -127,8 +127,8 @@ def drive(store: Path, recording: Path, minutes: float) -> dict[str, Any]:
                 if loaded is not None:
                     robot.use(loaded)
                 tiles_held.append(sum(len(held.tiles) for held in robot.held))
-            moment = Moment(source.frame(number), imu, list(source.wheel_before(number)), priors)
-            outcome = robot.handle(moment)
+            bundle = SensorBundle(source.frame(number), imu, list(source.wheel_before(number)), priors)
+            outcome = robot.handle(bundle)
             assert outcome is not None
             figures.handle(outcome)
             estimate = outcome.estimate

@@ -23,7 +23,8 @@ from locclient.maps.tile_loader import TileLoader
 from locclient.maps.tile_selection import Place, WindowSettings
 from locclient.robot.continuous_odom import Placed
 from locclient.robot.robot import Robot
-from locclient.sensors.intake import Intake, Moment
+from locclient.robot.sensor_bundle import SensorBundle
+from locclient.sensors.intake import Intake
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
@@ -33,9 +34,9 @@ from support.worlds import robot_world
 
 @dataclass
 class ScriptedSource:
-    """Puts moments one after another, each once the one before was taken; does something before some of them."""
+    """Puts bundles one after another, each once the one before was taken; does something before some of them."""
 
-    moments: list[Moment]
+    bundles: list[SensorBundle]
     before: dict[int, Callable[[], None]] = field(default_factory=dict)
     ready: Callable[[], bool] = lambda: True
     calibration = calibration()
@@ -44,13 +45,13 @@ class ScriptedSource:
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
         while not self.ready() and not wait(0.01):
             pass
-        for number, moment in enumerate(self.moments):
+        for number, bundle in enumerate(self.bundles):
             while not intake.wait_for_room(0.1) and not wait(0.0):
                 pass
             self.before.get(number, lambda: None)()
-            intake.put_imu(moment.imu)
-            assert moment.frame is not None
-            intake.put_frame(moment.frame)
+            intake.put_imu(bundle.imu)
+            assert bundle.frame is not None
+            intake.put_frame(bundle.frame)
 
     def close(self) -> None:
         pass
@@ -76,15 +77,15 @@ class World:
     table: list[str] = field(default_factory=list)
 
     def parts(self, source: ScriptedSource, robot: Robot, listener: Listener) -> Parts:
-        cache = self.folder / "cache"
-        link = MapClient(self.bus, TileCache(cache), "room", "r1")
+        caches = tuple(TileCache(self.folder / "cache") for _ in range(2))
+        link = MapClient(self.bus, caches[0], "room", "r1")
         spool = Outbox(self.folder / "spool", max_bytes=10**7)
         intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=True, imu_wait_s=1.0)
         return Parts(
             site="room", robot_name="r1", source=source, intake=intake, robot=robot,
-            room=TileLoader(CachedMap(TileCache(cache), "room"), WindowSettings()), spool=spool,
+            room=TileLoader(CachedMap(caches[1], "room"), WindowSettings()), spool=spool,
             camera=robot_world.rectifier().camera, settings=robot_world.SETTINGS, output=listener, link=link,
-            talk=ServerSync(link, spool, retry_s=600.0), first=link.active(),
+            talk=ServerSync(link, spool, retry_s=600.0), first=link.active(), caches=caches,
         )  # fmt: skip
 
 
@@ -110,19 +111,19 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world: World) -> None:
     """Without a network from frame 30 to 120, dark from 60 to 100: the estimates are to the bit those of a robot alone."""
-    moments = list(robot_world.moments(130, dark=range(60, 100)))
+    bundles = list(robot_world.bundles(130, dark=range(60, 100)))
     folder = LocalMapSource(StoreFolder(world.folder / "store"), "room")
     whole = TileLoader(folder, WindowSettings()).load(folder.wanted(), Place())
     assert whole is not None
     alone = robot_world.new_robot()
     alone.use(whole)
-    expected = [outcome.estimate for outcome in map(alone.handle, moments) if outcome is not None]
+    expected = [outcome.estimate for outcome in map(alone.handle, bundles) if outcome is not None]
 
     robot, listener = robot_world.new_robot(), Listener()
     away, back = (lambda: setattr(world.hub, "reachable", False)), (lambda: setattr(world.hub, "reachable", True))
     delivered_while_away: list[int] = []
     steps = {30: away, 119: lambda: delivered_while_away.append(len(world.table)), 120: back}
-    source = ScriptedSource(moments, steps, ready=lambda: robot.running is not None)
+    source = ScriptedSource(bundles, steps, ready=lambda: robot.running is not None)
     parts = world.parts(source, robot, listener)
     runtime = Runtime(parts, ServiceManager(""))
     runtime.run()
@@ -145,7 +146,7 @@ def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world:
 
 def test_a_new_version_is_taken_while_driving(world: World) -> None:
     robot, listener = robot_world.new_robot(), Listener()
-    source = ScriptedSource(list(robot_world.moments(200)), ready=lambda: robot.running is not None)
+    source = ScriptedSource(list(robot_world.bundles(200)), ready=lambda: robot.running is not None)
     parts = world.parts(source, robot, listener)
 
     def publish() -> None:
@@ -175,7 +176,7 @@ def test_what_kills_a_thread_ends_the_daemon(world: World) -> None:
     def die() -> None:
         raise RuntimeError("the driver broke")
 
-    source = ScriptedSource(list(robot_world.moments(3)), {1: die})
+    source = ScriptedSource(list(robot_world.bundles(3)), {1: die})
     with pytest.raises(RuntimeError, match="the driver broke"):
         Runtime(world.parts(source, robot, Listener()), ServiceManager("")).run()
     assert not [thread for thread in threading.enumerate() if thread.name in {"sensors", "disk", "network"}]
@@ -183,15 +184,24 @@ def test_what_kills_a_thread_ends_the_daemon(world: World) -> None:
 
 def test_a_picture_that_cannot_be_read_costs_itself(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     robot, listener = robot_world.new_robot(), Listener()
-    handle, moments = robot.handle, list(robot_world.moments(6))
+    handle, bundles = robot.handle, list(robot_world.bundles(6))
 
-    def sometimes(moment: Moment) -> object:
-        if moment.frame is moments[2].frame:
+    def sometimes(bundle: SensorBundle) -> object:
+        if bundle.frame is bundles[2].frame:
             raise RecordingError("cut off")
-        return handle(moment)
+        return handle(bundle)
 
     monkeypatch.setattr(robot, "handle", sometimes)
-    parts = world.parts(ScriptedSource(moments), robot, listener)
+    parts = world.parts(ScriptedSource(bundles), robot, listener)
     Runtime(parts, ServiceManager("")).run()
     assert len(listener.estimates) == 5
     assert parts.intake.counts.unreadable == 1
+
+
+def test_faults_of_the_tile_cache_reach_the_server(world: World) -> None:
+    record = world.folder / "cache" / "sites" / "room" / "active"
+    record.parent.mkdir(parents=True)
+    record.write_bytes(b"damaged")
+    parts = world.parts(ScriptedSource(list(robot_world.bundles(3))), robot_world.new_robot(), Listener())
+    Runtime(parts, ServiceManager("")).run()
+    assert world.fleet.robots("room")[0].last_health["metrics"]["cache_faults"] == len(parts.caches)

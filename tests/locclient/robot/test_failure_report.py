@@ -51,7 +51,7 @@ def test_pictures_are_small() -> None:
 
 
 def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
-    """Expected: blind, dark, DEGRADED or LOST, the tile it was last in, pictures of before and of the moment."""
+    """Expected: blind, dark, DEGRADED or LOST, the tile it was last in, pictures from before and from that moment."""
     from locclient.robot.failure_report import failure_report
 
     robot = robot_world.new_robot()
@@ -59,8 +59,8 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
         robot_world.save(store)
         robot.use(robot_world.loaded(store))
     told = []
-    for moment in robot_world.moments(130, dark=range(60, 130)):
-        outcome = robot.handle(moment)
+    for bundle in robot_world.bundles(130, dark=range(60, 130)):
+        outcome = robot.handle(bundle)
         if outcome is not None and outcome.failure is not None:
             told.append(outcome.failure)
     assert len(told) == 1

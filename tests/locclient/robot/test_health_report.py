@@ -12,8 +12,9 @@ from fleetmap.geometry import se3_inverse
 from fleetmap.messages import HEALTH_FIGURES, RobotHealth, Status
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.estimate import Estimate
+from locclient.maps.connection import MapConnection
 from locclient.maps.map_client import FetchedTiles
-from locclient.replay.replay import ReplayResult, RobotLink, _record, _Reporter
+from locclient.replay.replay import ReplayResult, _record, _Reporter
 from locclient.robot.health_report import FixFigures, HealthFigures
 from mapserver.fleet_statistics.health_stream import HealthStream
 from mapserver.store import MapStore
@@ -72,15 +73,15 @@ def store(tmp_path: Path) -> Iterator[MapStore]:
 
 def test_a_robot_tells_all_that_the_server_counts_with(store: MapStore) -> None:
     """A drive through the room; at its end a dock stands 0.2 m from where it says."""
-    robot, moments, figures = robot_world.new_robot(), list(robot_world.moments(62)), HealthFigures()
+    robot, bundles, figures = robot_world.new_robot(), list(robot_world.bundles(62)), HealthFigures()
     robot.use(robot_world.loaded(store))
-    for number, moment in enumerate(moments):
+    for number, bundle in enumerate(bundles):
         if number == 60:
             map_from_base = robot_world.truth(number) @ se3_inverse(calibration().base_from_body)
             map_from_base[0, 3] += 0.2
-            said = PositionPrior(moment.frame.stamp_ns, map_from_base, 1e-4 * np.eye(6))
-            moments[number] = replace(moment, priors=[said])
-        outcome = robot.handle(moments[number])
+            said = PositionPrior(bundle.frame.stamp_ns, map_from_base, 1e-4 * np.eye(6))
+            bundles[number] = replace(bundle, priors=[said])
+        outcome = robot.handle(bundles[number])
         assert outcome is not None
         figures.handle(outcome)
     metrics = figures.report("hall", "r1", 5, {}, False).metrics
@@ -109,7 +110,7 @@ def test_a_replay_tells_the_server_what_it_counts_with(store: MapStore) -> None:
     link, manifest = _Link(), store.manifest(robot_world.SITE, 1)
     result = ReplayResult([], [], [], manifest, FetchedTiles({}, {}))
     to: Any = link
-    reporter, watch, sums = _Reporter(RobotLink(to, to, robot_world.SITE, "r1"), result), HealthStream(), []
+    reporter, watch, sums = _Reporter(MapConnection(to, to, robot_world.SITE, "r1"), result), HealthStream(), []
     for number in range(50):
         said = look(0.1 * number, 4.0, 0.4 if number == 35 else 0.02, 50, 40)
         result.frames.append(_record(said, None, 0.01, 0.01, {}))

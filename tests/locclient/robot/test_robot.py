@@ -19,11 +19,11 @@ def store(tmp_path: Path) -> Iterator[MapStore]:
         yield maps
 
 
-def drive(robot: Robot, numbers: range, moments: list) -> list[float]:  # type: ignore[type-arg]
+def drive(robot: Robot, numbers: range, bundles: list) -> list[float]:  # type: ignore[type-arg]
     """Errors in metres of the tracked frames; all others are infinite."""
     errors = []
     for number in numbers:
-        estimate = robot.handle(moments[number]).estimate
+        estimate = robot.handle(bundles[number]).estimate
         off = np.inf
         if estimate.status is Status.TRACKING:
             off = float(np.linalg.norm(estimate.map_from_body[:3, 3] - robot_world.truth(number)[:3, 3]))
@@ -32,25 +32,25 @@ def drive(robot: Robot, numbers: range, moments: list) -> list[float]:  # type: 
 
 
 def test_the_first_version_is_taken_and_the_robot_finds_itself(store: MapStore) -> None:
-    robot, moments = robot_world.new_robot(), list(robot_world.moments(70))
-    assert robot.handle(moments[0]).estimate.map_version is None
+    robot, bundles = robot_world.new_robot(), list(robot_world.bundles(70))
+    assert robot.handle(bundles[0]).estimate.map_version is None
     robot.use(robot_world.loaded(store))
-    errors = drive(robot, range(1, 70), moments)
+    errors = drive(robot, range(1, 70), bundles)
     assert [change.change for change in robot.take_changes()] == [Change.ADOPTED]
     assert max(errors[45:]) < 0.05
     assert robot.take_changes() == []
 
 
 def test_a_good_version_is_adopted_after_its_fixes(store: MapStore) -> None:
-    robot, moments = robot_world.new_robot(), list(robot_world.moments(100))
+    robot, bundles = robot_world.new_robot(), list(robot_world.bundles(100))
     robot.use(robot_world.loaded(store))
-    drive(robot, range(70), moments)
+    drive(robot, range(70), bundles)
     robot.take_changes()
     robot_world.save(store)
     second = robot_world.loaded(store)
     robot.use(second)
     assert [held.version for held in robot.held] == [1, 2]
-    assert max(drive(robot, range(70, 100), moments)) < 0.05
+    assert max(drive(robot, range(70, 100), bundles)) < 0.05
     changes = robot.take_changes()
     assert [(change.change, change.wanted.version) for change in changes] == [(Change.ADOPTED, 2)]
     assert [held.version for held in robot.held] == [2]
@@ -58,14 +58,14 @@ def test_a_good_version_is_adopted_after_its_fixes(store: MapStore) -> None:
 
 def test_a_version_that_slipped_is_refused_and_the_place_kept(store: MapStore) -> None:
     """Status: never wrong; after the trial TRACKING in the old version. Flag: refused, with both versions named."""
-    robot, moments = robot_world.new_robot(), list(robot_world.moments(130))
+    robot, bundles = robot_world.new_robot(), list(robot_world.bundles(130))
     robot.use(robot_world.loaded(store))
-    drive(robot, range(70), moments)
+    drive(robot, range(70), bundles)
     robot.take_changes()
     slipped = robot_world.moved(np.array([2.0, 0.0, 0.0]))
     robot_world.save(store)
     robot.use(robot_world.loaded(store, of=slipped))
-    errors = drive(robot, range(70, 130), moments)
+    errors = drive(robot, range(70, 130), bundles)
     changes = robot.take_changes()
     assert [(change.change, change.wanted.version) for change in changes] == [(Change.REFUSED, 2)]
     assert "of version 2 0 fixes and 2 that contradict it" in changes[0].reason
@@ -77,12 +77,12 @@ def test_a_version_that_slipped_is_refused_and_the_place_kept(store: MapStore) -
 
 def test_darkness_is_no_verdict_about_a_version(store: MapStore) -> None:
     robot = robot_world.new_robot()
-    moments = list(robot_world.moments(120, dark=range(71, 120)))
+    bundles = list(robot_world.bundles(120, dark=range(71, 120)))
     robot.use(robot_world.loaded(store))
-    drive(robot, range(70), moments)
+    drive(robot, range(70), bundles)
     robot.take_changes()
     robot_world.save(store)
     robot.use(robot_world.loaded(store))
-    drive(robot, range(70, 120), moments)
+    drive(robot, range(70, 120), bundles)
     assert [change.change for change in robot.take_changes()] == [Change.POSTPONED]
     assert [held.version for held in robot.held] == [1]

@@ -15,9 +15,10 @@ from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples
 from locclient.localization.settings import LocalizerSettings
-from locclient.robot.robot import LoadedMap, Robot
+from locclient.maps.loaded_map import LoadedMap
+from locclient.robot.robot import Robot
+from locclient.robot.sensor_bundle import SensorBundle
 from locclient.robot.version_trial import TrialSettings
-from locclient.sensors.intake import Moment
 from mapserver.store import MapStore
 from support.recordings.recording_samples import FOCAL, HEIGHT, WIDTH, Sample, calibration
 from support.storage.map_samples import draft_details
@@ -42,7 +43,7 @@ def rectifier() -> Rectifier:
     return Rectifier(calibration())
 
 
-def moments(frames: int, *, dark: range = range(0)) -> Iterator[Moment]:
+def bundles(frames: int, *, dark: range = range(0)) -> Iterator[SensorBundle]:
     """Frames with the IMU before each; those in `dark` are black."""
     sample = cycle()
     first_ns = int(sample.stamps_ns[0])
@@ -63,7 +64,7 @@ def moments(frames: int, *, dark: range = range(0)) -> Iterator[Moment]:
         left, right = (_noisy(picture, rng) for picture in (sample.left[index], sample.right[index]))
         if number in dark:
             left, right = np.zeros_like(left), np.zeros_like(right)
-        yield Moment(CameraFrame(stamp_ns, left, right), imu, [], [])
+        yield SensorBundle(CameraFrame(stamp_ns, left, right), imu)
 
 
 def _noisy(picture: Image, rng: np.random.Generator) -> Image:

@@ -1,0 +1,16 @@
+"""Input of one step of a robot: a frame and the other samples that came up to it. Pure."""
+
+from dataclasses import dataclass, field
+
+from fleetmap.recordings.images import StoredFrame
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
+
+
+@dataclass(frozen=True, slots=True)
+class SensorBundle:
+    """A frame, None where none came in time, and the samples to handle before it."""
+
+    frame: CameraFrame | StoredFrame | None = None
+    imu: ImuSamples = field(default_factory=ImuSamples.empty)
+    wheel: list[WheelSample] = field(default_factory=list)
+    priors: list[PositionPrior] = field(default_factory=list)
