@@ -13,7 +13,7 @@ from fleetmap.bow import Vocabulary
 from fleetmap.features import orb
 from fleetmap.geometry import se3
 from fleetmap.mapformat import Tile
-from fleetmap.relocalization.map_view import Expected
+from fleetmap.relocalization.map_view import CovisibleLandmarks
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, WheelSample
@@ -69,7 +69,7 @@ def gc_frozen() -> Iterator[None]:
 def _tell_apart() -> None:
     """What only an ambiguous place needs."""
     one, other = Tally(), Tally()
-    seen = Expected(np.zeros(1, np.uint32), np.zeros((1, 3)), np.zeros((1, 32), np.uint8), np.ones(1, bool))
+    seen = CovisibleLandmarks(np.zeros(1, np.uint32), np.zeros((1, 3)), np.zeros((1, 32), np.uint8), np.ones(1, bool))
     for tally in (one, other):
         tally.look(np.eye(4), seen)
     shared = [np.zeros(1, bool) for _ in range(2)]

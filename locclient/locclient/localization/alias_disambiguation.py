@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from fleetmap.features.matching import packed
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
-from fleetmap.relocalization.map_view import Expected
+from fleetmap.relocalization.map_view import CovisibleLandmarks
 from locclient.localization import alias_disambiguation_kernels as kernels
 
 Flags = NDArray[np.bool_]
@@ -84,7 +84,7 @@ class Tally:
         self.expected, self.found = self.expected << np.uint64(1), self.found << np.uint64(1)
         self._keep(np.flatnonzero(self.expected))
 
-    def look(self, odom_from_map: Array, seen: Expected) -> None:
+    def look(self, odom_from_map: Array, seen: CovisibleLandmarks) -> None:
         """What the look that began showed from here."""
         self.looks |= 1
         ids, inverse = np.unique(np.concatenate([self.ids, seen.ids]), return_inverse=True)

@@ -121,7 +121,7 @@ def is_unambiguous(fix: Fix, settings: TrackSettings) -> bool:
     """Whether a fix, alone of all places that were tried, is so strong that no other place of this map can be meant."""
     return (
         fix.inliers >= settings.strong_inliers
-        and fix.share >= settings.strong_share
+        and fix.inlier_share >= settings.strong_share
         and fix.alias_ratio < settings.strong_twin_share
     )
 
@@ -129,8 +129,8 @@ def is_unambiguous(fix: Fix, settings: TrackSettings) -> bool:
 def _count(
     candidate: PoseHypothesis, fresh: PoseHypothesis, fix: Fix, odom_from_body: Array | None, settings: TrackSettings
 ) -> None:
-    if settings.is_whole_site_mapped and fix.witnessed is not None and odom_from_body is not None:
-        candidate.tally.look(odom_from_body @ se3_inverse(fresh.now_map_from_body), fix.witnessed)
+    if settings.is_whole_site_mapped and fix.covisible is not None and odom_from_body is not None:
+        candidate.tally.look(odom_from_body @ se3_inverse(fresh.now_map_from_body), fix.covisible)
 
 
 def _is_same_place(fresh: PoseHypothesis, candidate: PoseHypothesis, settings: TrackSettings) -> bool:

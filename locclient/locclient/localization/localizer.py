@@ -11,8 +11,9 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.messages import Cause, Status
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
+from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
-from fleetmap.relocalization.relocalizer import Fix, Relocalizer, Seen, TimeSliced
+from fleetmap.relocalization.relocalizer import Fix, Relocalizer, TimeSliced
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
@@ -183,31 +184,31 @@ class Localizer:
         return (stamp_ns - self._last_ns) * 1e-9 > _SPREAD_SHARE * self._settings.track.fix_interval_s
 
     def _look(self, frame: RectifiedFrame, relocalizer: Relocalizer) -> TimeSliced[_Outcome]:
-        seen = yield from relocalizer.look(frame)
+        query = yield from relocalizer.extract(frame)
         if self._anchor is None:
-            fixes = yield from self._search(seen, relocalizer)
+            fixes = yield from self._search(query, relocalizer)
             return (yield from self._weigh(fixes))
         map_from_body, covariance = self._anchor.then_map_from_body, self._anchor.then_cov
         map_from_cam = map_from_body @ self._body_from_cam
-        near = relocalizer.near(seen, map_from_cam, self._at_camera(map_from_body, covariance))
+        near = relocalizer.near(query, map_from_cam, self._at_camera(map_from_body, covariance))
         fixes = [] if near is None else [near]
         is_sparse = self._is_sparse(frame.stamp_ns)
         if near is None and (is_sparse or self._failed_looks + 1 >= self._settings.track.search_after_failed):
             yield
-            fixes = yield from relocalizer.anywhere(seen, None, map_from_cam[:3, :3])
+            fixes = yield from relocalizer.anywhere(query, None, map_from_cam[:3, :3])
             fixes = [fix for fix in fixes if fix.inliers >= self._settings.fix.min_inliers]
         if not fixes:
             return _Outcome(None, "nothing in the map agrees with this frame")
         return self._correct(fixes, map_from_body, covariance, is_near=near is not None)
 
-    def _search(self, seen: Seen, relocalizer: Relocalizer) -> TimeSliced[list[Fix]]:
+    def _search(self, query: FrameFeatures, relocalizer: Relocalizer) -> TimeSliced[list[Fix]]:
         """Fixes anywhere, around the candidates first; inside the prior where there is one."""
         fixes: list[Fix] = []
         candidates = self._confirmation.places
         for number, candidate in enumerate(candidates):
             map_from_body, covariance = candidate.then_map_from_body, candidate.then_cov
             fix = relocalizer.near(
-                seen, map_from_body @ self._body_from_cam, self._at_camera(map_from_body, covariance)
+                query, map_from_body @ self._body_from_cam, self._at_camera(map_from_body, covariance)
             )
             if fix is not None:
                 fixes.append(fix)
@@ -217,7 +218,7 @@ class Localizer:
         if len(candidates) == 1:
             known = (candidates[0].then_map_from_body @ self._body_from_cam)[:3, :3]
         near = None if self._prior is None else self._prior.is_near(relocalizer.view.map_from_cam[:, :3, 3])
-        fixes = yield from relocalizer.anywhere(seen, near, known, fixes)
+        fixes = yield from relocalizer.anywhere(query, near, known, fixes)
         return [f for f in fixes if self._counts(f) and self._in_prior(f)]
 
     def _counts(self, fix: Fix) -> bool:

@@ -1,13 +1,16 @@
-"""Places of a map that look the same as one that was found. Pure.
+"""Search for aliases: places of a map that look the same as one that was found. Pure.
 
-Words do not tell them: a map within a budget holds other landmarks of every aisle, and what stands in one aisle stands in part in
-all others. What does: the same things in the same order. Each thing that was recognized is looked for in the whole map, and every
-landmark that looks like it speaks for a camera that would see it so. Halls are taken to be built at right angles; a twin that is
-turned by anything else is found by its words or not at all.
+Bags of words do not find them: a map within a budget holds other landmarks of every aisle, and what stands in one aisle stands in
+part in all others. The same things in the same order do. Every landmark of the map that looks like one that was recognized votes for
+a camera that would see it so. Halls are assumed to be built at right angles; an alias that is turned by any other angle is found by
+its words or not at all.
+
+Source: the generalised Hough transform, Ballard 1981.
 """
 
 from collections.abc import Generator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,100 +19,109 @@ from fleetmap.features.matching import packed
 from fleetmap.geometry import Array
 from fleetmap.relocalization import alias_search_kernels
 
-_MOST_FEATURES, _MOST_PAIRS = 96, 400_000
-_MAX_BITS, _HEIGHT_M = 50, 0.3
+_MAX_FEATURES, _MAX_PAIRS = 96, 400_000
 _CELL_M = 0.5
 _OWN_M = 1.2  # around the place itself
-_OWN_THING_M = 0.5  # around what was recognized: it, and what of it was mapped twice
-_AT_ONCE = 3_000_000  # comparisons in a slice: some ten milliseconds
-_LEAST_VOTES = 6
+_OWN_LANDMARK_M = 0.5  # around what was recognized: it, and what of it was mapped twice
+_COMPARISONS_PER_SLICE = 3_000_000  # some ten milliseconds
+_MIN_VOTES = 6
+_BORDER_M = 12.0  # around the map's landmarks, where cameras may stand
+_QUARTER_TURNS = [np.array([[c, -s], [s, c]]) for c, s in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))]
+
+
+class LandmarkSet(NamedTuple):
+    """Landmarks: points_map (N, 3) and descriptors (N, 32)."""
+
+    points_map: Array
+    descriptors: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
 class AliasCandidate:
-    """A camera that would see the same: map_from_cam (4, 4), about a cell exact; how many features speak for it, as a share of
-    those that speak for the place that was found; and features (P,) with landmarks (P,), rows of the map, that do."""
+    """A camera that would see the same: map_from_cam (4, 4), about a cell exact.
+
+    alias_ratio: its votes as a share of those for the place that was found. features (P,) with landmarks (P,), rows of the map: what
+    voted for it.
+    """
 
     map_from_cam: Array
-    share: float
+    alias_ratio: float
     features: NDArray[np.int64]
     landmarks: NDArray[np.int64]
 
 
 def find_aliases(
-    descriptors: NDArray[np.uint8], points_map: Array, map_descriptors: NDArray[np.uint8], map_points_map: Array,
-    map_from_cam: Array, least_share: float, most: int,
-) -> Generator[None, None, list[AliasCandidate]]:  # fmt: skip
-    """Twins of a camera's place, best first, for which at least a share of the votes of the place itself is given; in slices.
+    seen: LandmarkSet, landmarks: LandmarkSet, map_from_cam: Array, min_ratio: float, max_count: int
+) -> Generator[None, None, list[AliasCandidate]]:
+    """Aliases of a camera's place in the map of `landmarks`, best first, with at least a share of its own votes; in slices.
 
-    descriptors (F, 32), points_map (F, 3): of what was recognized there, and where the map says that it is.
+    seen: the descriptors of what was recognized there, and where the map says that it is.
     """
-    used = np.linspace(0, len(points_map) - 1, min(len(points_map), _MOST_FEATURES)).astype(np.int64)
-    features, landmarks = packed(descriptors[used]), packed(map_descriptors)
-    heights_m = np.ascontiguousarray(points_map[used, 2])
-    pairs, count = np.empty((_MOST_PAIRS, 2), np.int32), 0
-    step = max(1, _AT_ONCE // max(len(used), 1))
-    for first in range(0, len(landmarks), step):
+    used = np.linspace(0, len(seen.points_map) - 1, min(len(seen.points_map), _MAX_FEATURES)).astype(np.int64)
+    points_map = seen.points_map[used]
+    features, others = packed(seen.descriptors[used]), packed(landmarks.descriptors)
+    heights_m = np.ascontiguousarray(points_map[:, 2])
+    pairs, count = np.empty((_MAX_PAIRS, 2), np.int32), 0
+    step = max(1, _COMPARISONS_PER_SLICE // max(len(used), 1))
+    for first in range(0, len(others), step):
         if first:
             yield
-        last = min(first + step, len(landmarks))
-        count = alias_search_kernels.alike(
-            features, heights_m, landmarks, map_points_map, first, last, _MAX_BITS, _HEIGHT_M, pairs, count
+        last = min(first + step, len(others))
+        count += alias_search_kernels.alike(
+            features, heights_m, others, landmarks.points_map, first, last, pairs[count:]
         )
     pairs = pairs[:count]
     pairs = np.ascontiguousarray(pairs[np.argsort(pairs[:, 0], kind="stable")])
-    return _peaks(pairs, points_map[used], used, map_points_map, map_from_cam, least_share, most)
+    votes = _Votes(pairs, points_map, landmarks.points_map, map_from_cam)
+    return [votes.candidate(*peak, used) for peak in votes.peaks(min_ratio, max_count)]
 
 
-def _peaks(
-    pairs: NDArray[np.int32], points_map: Array, used: NDArray[np.int64], map_points_map: Array, map_from_cam: Array,
-    least_share: float, most: int,
-) -> list[AliasCandidate]:  # fmt: skip
-    place = map_from_cam[:2, 3]
-    low, high = map_points_map[:, :2].min(axis=0) - 12.0, map_points_map[:, :2].max(axis=0) + 12.0
-    shape = tuple(int(n) for n in np.ceil((high - low) / _CELL_M))
-    # What stands at the place itself speaks for it alone. Near a camera it lies in the same cell from whichever side it is seen.
-    other = np.linalg.norm(map_points_map[pairs[:, 1]] - points_map[pairs[:, 0]], axis=1) > _OWN_THING_M
-    others = np.ascontiguousarray(pairs[other])
-    counts = np.zeros((4, *shape), np.int32)
-    turns = [np.array([[c, -s], [s, c]]) for c, s in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))]
-    offsets = [(points_map[:, :2] - place) @ turn.T for turn in turns]
-    for quarter, offset in enumerate(offsets):
-        alias_search_kernels.vote(
-            others, offset, map_points_map, low, _CELL_M, np.full(shape, -1, np.int32), counts[quarter]
-        )
-    there = np.zeros(shape, np.int32)
-    alias_search_kernels.vote(pairs, offsets[0], map_points_map, low, _CELL_M, np.full(shape, -1, np.int32), there)
-    quarters, columns, rows = np.nonzero(counts >= _LEAST_VOTES)
-    centres = low + _CELL_M * (np.column_stack([columns, rows]) + 1.0)
-    votes = counts[quarters, columns, rows]
-    is_own = (quarters == 0) & (np.linalg.norm(centres - place, axis=1) < _OWN_M)
-    column, row = np.clip(((place - low) / _CELL_M).astype(int), 1, np.array(shape) - 1)
-    own = max(int(there[column - 1 : column + 1, row - 1 : row + 1].max()), 1)
-    order = np.flatnonzero(~is_own & (votes >= least_share * own))
-    order = order[np.argsort(-votes[order], kind="stable")]
-    found: list[AliasCandidate] = []
-    taken: list[tuple[int, Array]] = []
-    for k in order.tolist():
-        quarter, centre = int(quarters[k]), centres[k]
-        if any(quarter == q and np.linalg.norm(centre - other) < _OWN_M for q, other in taken):
-            continue
-        taken.append((quarter, centre))
-        found.append(
-            _twin(others, offsets[quarter], turns[quarter], centre, votes[k] / own, used, map_points_map, map_from_cam)
-        )
-        if len(found) == most:
-            break
-    return found
+class _Votes:
+    """Votes of pairs (P, 2), features at points_map (F, 3) with landmarks (N, 3) that look like them, for cells of (x, y, quarter turn)."""
 
+    def __init__(self, pairs: NDArray[np.int32], points_map: Array, landmarks_map: Array, map_from_cam: Array) -> None:
+        self._map_from_cam, self._landmarks_map = map_from_cam, landmarks_map
+        self._low = landmarks_map[:, :2].min(axis=0) - _BORDER_M
+        high = landmarks_map[:, :2].max(axis=0) + _BORDER_M
+        self._shape = tuple(int(n) for n in np.ceil((high - self._low) / _CELL_M))
+        self._offsets = [(points_map[:, :2] - map_from_cam[:2, 3]) @ turn.T for turn in _QUARTER_TURNS]
+        # Landmarks of the place itself vote for it alone. Near a camera they lie in the same cell from whichever side they are seen.
+        away_m = np.linalg.norm(landmarks_map[pairs[:, 1]] - points_map[pairs[:, 0]], axis=1)
+        self._others = np.ascontiguousarray(pairs[away_m > _OWN_LANDMARK_M])
+        self._counts = np.stack([self._cast(self._others, quarter) for quarter in range(4)])
+        there = self._cast(pairs, 0)
+        column, row = np.clip(((map_from_cam[:2, 3] - self._low) / _CELL_M).astype(int), 1, np.array(self._shape) - 1)
+        self._own = max(int(there[column - 1 : column + 1, row - 1 : row + 1].max()), 1)
 
-def _twin(
-    pairs: NDArray[np.int32], offsets_m: Array, turn: Array, centre: Array, share: float, used: NDArray[np.int64],
-    map_points_map: Array, map_from_cam: Array,
-) -> AliasCandidate:  # fmt: skip
-    cameras = map_points_map[pairs[:, 1], :2] - offsets_m[pairs[:, 0]]
-    speaks = (np.abs(cameras - centre) < _CELL_M).all(axis=1)
-    twin = map_from_cam.copy()
-    twin[:2, 3] = np.median(cameras[speaks], axis=0)
-    twin[:2, :3] = turn @ map_from_cam[:2, :3]
-    return AliasCandidate(twin, float(share), used[pairs[speaks, 0]], pairs[speaks, 1].astype(np.int64))
+    def _cast(self, pairs: NDArray[np.int32], quarter: int) -> NDArray[np.int32]:
+        counts, last = np.zeros(self._shape, np.int32), np.full(self._shape, -1, np.int32)
+        offsets = self._offsets[quarter]
+        alias_search_kernels.vote(pairs, offsets, self._landmarks_map, self._low, _CELL_M, last, counts)
+        return counts
+
+    def peaks(self, min_ratio: float, max_count: int) -> list[tuple[int, Array, float]]:
+        """Quarter turn, (x, y) and share of the own votes of the best cells, none near another one or near the place itself."""
+        quarters, columns, rows = np.nonzero(self._counts >= _MIN_VOTES)
+        centres = self._low + _CELL_M * (np.column_stack([columns, rows]) + 1.0)
+        votes = self._counts[quarters, columns, rows]
+        is_own = (quarters == 0) & (np.linalg.norm(centres - self._map_from_cam[:2, 3], axis=1) < _OWN_M)
+        order = np.flatnonzero(~is_own & (votes >= min_ratio * self._own))
+        found: list[tuple[int, Array, float]] = []
+        for k in order[np.argsort(-votes[order], kind="stable")].tolist():
+            quarter, centre = int(quarters[k]), centres[k]
+            if any(quarter == q and np.linalg.norm(centre - other) < _OWN_M for q, other, _ in found):
+                continue
+            found.append((quarter, centre, float(votes[k] / self._own)))
+            if len(found) == max_count:
+                break
+        return found
+
+    def candidate(self, quarter: int, centre: Array, ratio: float, used: NDArray[np.int64]) -> AliasCandidate:
+        """The camera at a peak, in the median of its votes; used (F,): the numbers of the features among all that were recognized."""
+        pairs = self._others
+        cameras = self._landmarks_map[pairs[:, 1], :2] - self._offsets[quarter][pairs[:, 0]]
+        voted = (np.abs(cameras - centre) < _CELL_M).all(axis=1)
+        place = self._map_from_cam.copy()
+        place[:2, 3] = np.median(cameras[voted], axis=0)
+        place[:2, :3] = _QUARTER_TURNS[quarter] @ self._map_from_cam[:2, :3]
+        return AliasCandidate(place, ratio, used[pairs[voted, 0]], pairs[voted, 1].astype(np.int64))

@@ -1,4 +1,4 @@
-"""Inner loops of the search for twins: what looks alike anywhere in the map, and which places that speaks for."""
+"""Inner loops of the alias search: pairs that look alike anywhere in the map, and the votes that they give to places."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,21 +7,22 @@ from fleetmap.features.matching_kernels import Packed, hamming
 from fleetmap.geometry import Array
 from fleetmap.numerics.kernel import kernel
 
+_MAX_BITS, _HEIGHT_M = 50, 0.3
 Pairs = NDArray[np.int32]
 
 
 @kernel
 def alike(
-    features: Packed, heights_m: Array, landmarks: Packed, points_map: Array, first: int, last: int, max_bits: int,
-    height_m: float, pairs: Pairs, count: int,
-) -> int:  # fmt: skip
-    """Appends to pairs (C, 2) the features (F) and those of the landmarks [first, last) that look the same at the same height.
+    features: Packed, heights_m: Array, landmarks: Packed, points_map: Array, first: int, last: int, pairs: Pairs
+) -> int:
+    """Writes to pairs (C, 2) the features (F) and those of the landmarks [first, last) that look the same at the same height.
 
-    Returns the new count; what has no room is left out.
+    Returns how many; what has no room is left out.
     """
+    count = 0
     for j in range(first, last):
         for i in range(len(features)):
-            if abs(points_map[j, 2] - heights_m[i]) > height_m or hamming(features, i, landmarks, j) > max_bits:
+            if abs(points_map[j, 2] - heights_m[i]) > _HEIGHT_M or hamming(features, i, landmarks, j) > _MAX_BITS:
                 continue
             if count == len(pairs):
                 return count
@@ -34,7 +35,7 @@ def alike(
 def vote(
     pairs: Pairs, offsets_m: Array, points_map: Array, low_m: Array, cell_m: float, last: Pairs, counts: Pairs
 ) -> None:
-    """Fills counts (X, Y): the features that speak for a camera in a square of two cells' side that begins at the cell's corner.
+    """Fills counts (X, Y): the features that vote for a camera in a square of two cells' side that begins at the cell's corner.
 
     offsets_m (F, 2): from the camera to what each feature shows, turned as the camera would be. last (X, Y): of -1. Pairs must
     come with all those of one feature together.

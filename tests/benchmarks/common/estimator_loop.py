@@ -16,8 +16,9 @@ from fleetmap.mapformat import Tile
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracking.tracker import MotionSince, Tracked, Tracker
+from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
-from fleetmap.relocalization.relocalizer import Relocalizer, Seen, TimeSliced
+from fleetmap.relocalization.relocalizer import Relocalizer, TimeSliced
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import PositionPrior, wheel_between
@@ -82,11 +83,13 @@ class EstimatorTracker(Tracker):
         self._points = type(self._points)(ids[rising], pixels[rising])
 
 
-def seen(session: EstimatorSession, frame: int) -> Seen:
-    """What Relocalizer.look would have made of the picture."""
+def seen(session: EstimatorSession, frame: int) -> FrameFeatures:
+    """What Relocalizer.extract would have made of the picture."""
     found = session.features(frame)
     angles = np.zeros(len(found.rows), np.float32)
-    return Seen(orb.Features(found.pixels[:, :2].copy(), found.octaves, angles, found.descriptors), found.pixels)
+    return FrameFeatures(
+        orb.Features(found.pixels[:, :2].copy(), found.octaves, angles, found.descriptors), found.pixels
+    )
 
 
 def blank(session: EstimatorSession, frame: int) -> RectifiedFrame:
@@ -207,7 +210,7 @@ class SessionRelocalizer(Relocalizer):
         self._session = session
         self._index_of = {stamp: index for index, stamp in enumerate(session.stamps_ns)}
 
-    def look(self, frame: RectifiedFrame) -> TimeSliced[Seen]:
+    def extract(self, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
         """As the relocalizer's."""
         yield
         return seen(self._session, self._index_of[frame.stamp_ns])

@@ -27,9 +27,9 @@ def expected(view: MapView, map_from_cam: Array, margin_px: float, angle_rad: fl
     away = map_from_cam[:3, 3] - view.points_map
     distance = np.linalg.norm(away, axis=1)
     pixels = CAMERA.pixel_from_point(transform_points(se3_inverse(map_from_cam), view.points_map))
-    reach = 1.3 * view.max_distances_m * (CAMERA.focal_px / SURVEY_FOCAL_PX)
-    turned = np.arccos(np.clip(np.einsum("ni,ni->n", away / distance[:, None], view.view_directions_map), -1, 1))
-    seen = (distance > 0.2) & (distance < reach) & (turned < view.view_half_angles_rad + angle_rad)
+    reach = 1.3 * view.cones.max_distances_m * (CAMERA.focal_px / SURVEY_FOCAL_PX)
+    turned = np.arccos(np.clip(np.einsum("ni,ni->n", away / distance[:, None], view.cones.directions_map), -1, 1))
+    seen = (distance > 0.2) & (distance < reach) & (turned < view.cones.half_angles_rad + angle_rad)
     seen &= (pixels[:, 0] > -margin_px) & (pixels[:, 0] < CAMERA.width_px + margin_px)
     seen &= (pixels[:, 1] > -margin_px) & (pixels[:, 1] < CAMERA.height_px + margin_px)
     return set(np.flatnonzero(seen).tolist())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, so3_exp
-from fleetmap.relocalization.map_view import Expected
+from fleetmap.relocalization.map_view import CovisibleLandmarks
 from locclient.localization import alias_disambiguation
 from locclient.localization.alias_disambiguation import Spot, Tally, log_found, mark_shared
 
@@ -55,7 +55,7 @@ class Aisles:
                 if moved:
                     stands &= ~((points > BOX[0]) & (points < BOX[1])).all(axis=1)
                 found = self.rng.random(len(ahead)) < np.where(stands[ahead], shares[ahead], 0.04)
-                seen = Expected(ahead.astype(np.uint32), points[ahead], looks_like[ahead], found)
+                seen = CovisibleLandmarks(ahead.astype(np.uint32), points[ahead], looks_like[ahead], found)
                 tally.begin_look()
                 tally.look(odom_from_true, seen)
         return tallies
@@ -203,7 +203,9 @@ def test_a_look_that_only_one_place_stands_for_does_not_count() -> None:
     for _ in range(8):
         one.begin_look()
         other.begin_look()
-        one.look(np.eye(4), Expected(one.ids, one.points_odom, one.descriptors, rng.random(len(one.ids)) < 0.02))
+        one.look(
+            np.eye(4), CovisibleLandmarks(one.ids, one.points_odom, one.descriptors, rng.random(len(one.ids)) < 0.02)
+        )
     assert evidence(one, other) == pytest.approx(before, abs=1e-9)
 
 
@@ -213,7 +215,9 @@ def test_looks_are_counted_one_by_one() -> None:
         tally.begin_look()
         if number % 2 == 0:
             ids = np.array([7, 3] if number < 4 else [9, 3], np.uint32)
-            seen = Expected(ids, np.full((2, 3), float(number)), np.zeros((2, 32), np.uint8), np.array([True, False]))
+            seen = CovisibleLandmarks(
+                ids, np.full((2, 3), float(number)), np.zeros((2, 32), np.uint8), np.array([True, False])
+            )
             tally.look(np.eye(4), seen)
     assert tally.ids.tolist() == [3, 7, 9]
     assert tally.looks == 0b101010
@@ -232,7 +236,7 @@ def test_a_tally_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
         ids = np.arange(number // 10 * 10, number // 10 * 10 + 20, dtype=np.uint32)
         points = np.tile(ids[:, None], (1, 3)).astype(float)
         tally.begin_look()
-        tally.look(np.eye(4), Expected(ids, points, np.zeros((20, 32), np.uint8), np.ones(20, bool)))
+        tally.look(np.eye(4), CovisibleLandmarks(ids, points, np.zeros((20, 32), np.uint8), np.ones(20, bool)))
     assert tally.ids.tolist() == list(range(40, 70))
     np.testing.assert_allclose(tally.points_odom[:, 0], range(40, 70))
     for _ in range(64):

@@ -7,7 +7,7 @@ import pytest
 
 from fleetmap.geometry import Array
 from fleetmap.messages import Status
-from fleetmap.relocalization.map_view import Expected
+from fleetmap.relocalization.map_view import CovisibleLandmarks
 from fleetmap.relocalization.relocalizer import Fix
 from support.fleet.scripted_robot import MAP_FROM_ODOM, Robot, off
 
@@ -35,8 +35,8 @@ class Signs:
     def fix(self, offset: Array) -> Fix:
         aisle = int(np.any(offset != 0.0))
         found = self.rng.random(24) < (0.4 if aisle == self.seen else 0.03)
-        expected = Expected(np.arange(24, dtype=np.uint32), self.points_map[aisle], self.looks[aisle], found)
-        return replace(self._fix(offset), witnessed=expected)
+        expected = CovisibleLandmarks(np.arange(24, dtype=np.uint32), self.points_map[aisle], self.looks[aisle], found)
+        return replace(self._fix(offset), covisible=expected)
 
 
 @pytest.mark.parametrize("own", [0, 1])

@@ -74,7 +74,7 @@ class ScriptedRelocalizer:
     def view(self) -> Any:
         return type("View", (), {"map_from_cam": np.tile(np.eye(4), (4, 1, 1))})
 
-    def look(self, frame: RectifiedFrame) -> Generator[None, None, list[Fix]]:
+    def extract(self, frame: RectifiedFrame) -> Generator[None, None, list[Fix]]:
         seen = self.fixes
         yield
         return seen

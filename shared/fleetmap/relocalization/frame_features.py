@@ -1,0 +1,54 @@
+"""The features of one frame, with the depth of those that match something in a map."""
+
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.features import orb, stereo
+from fleetmap.features.stereo import StereoSettings
+from fleetmap.geometry import Array
+from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+
+
+@dataclass(slots=True)
+class FrameFeatures:
+    """Features of one frame: pixels (N, 3) u_left v u_right, NaN where unknown.
+
+    Depth is measured only for features that match something, while `frame` is held: `is_tried` (N,) says for which it was.
+    """
+
+    features: orb.Features
+    pixels: Array
+    frame: RectifiedFrame | None = None
+    is_tried: NDArray[np.bool_] | None = None
+
+    def measured(
+        self, rows: NDArray[np.int64], camera: StereoCamera, settings: StereoSettings, prior_px: Array | None = None
+    ) -> Array:
+        """Pixels (P, 3) of some features, depth measured now where it was not tried before; prior_px (P,) narrows the search."""
+        if self.frame is not None and self.is_tried is not None:
+            new = np.flatnonzero(~self.is_tried[rows])
+            at = rows[new]
+            prior = None if prior_px is None else prior_px[new]
+            found = stereo.disparities(self.frame, camera, self.features.pixels[at], settings, prior)
+            self.pixels[at, 2] = self.pixels[at, 0] - found[:, 0]
+            self.is_tried[at] = True
+        return self.pixels[rows]
+
+
+def extract_features(frame: RectifiedFrame, settings: orb.OrbSettings) -> Generator[None, None, FrameFeatures]:
+    """The features of one frame, no depth measured yet, in slices."""
+    features = yield from orb.detect_in_slices(frame.left, settings)
+    pixels = np.column_stack([features.pixels, np.full(len(features), np.nan)])
+    return FrameFeatures(features, pixels, frame, np.zeros(len(features), bool))
+
+
+def features_with_depth(
+    frame: RectifiedFrame, camera: StereoCamera, settings: orb.OrbSettings, stereo_settings: StereoSettings
+) -> FrameFeatures:
+    """The features of one frame with the depth of all of them; the frame itself is not kept."""
+    features = orb.detect(frame.left, settings)
+    found = stereo.disparities(frame, camera, features.pixels, stereo_settings)
+    return FrameFeatures(features, np.column_stack([features.pixels, features.pixels[:, 0] - found[:, 0]]))

@@ -1,0 +1,93 @@
+"""Landmarks that a camera should see, their matches among its features, and the places around a place. Pure.
+
+Source: Mur-Artal et al. 2015 (ORB-SLAM), section V.D: a landmark is expected where it projects into the image, within the range of
+distances and close to the directions from which it was seen, at the octave that its distance predicts.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.features.matching import match_by_projection
+from fleetmap.features.orb import SCALE_FACTOR, Features
+from fleetmap.geometry import AnyArray, Array
+from fleetmap.mapformat import Tile
+from fleetmap.relocalization.landmark_visibility_kernels import ViewingCones, visible
+from fleetmap.relocalization.settings import FixSettings
+from fleetmap.sensors.rectification import StereoCamera
+
+Rows = NDArray[np.int64]
+COLUMNS, ROWS = 8, 6  # the parts of an image over which matches must be spread
+
+
+class VisibleLandmarks(NamedTuple):
+    """Landmarks that a camera should see: rows (V,), pixels (V, 3) u_left v u_right, and the octaves (V,) they should appear at."""
+
+    rows: Rows
+    pixels: Array
+    octaves: Array
+
+
+def visible_landmarks(
+    cones: ViewingCones, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float
+) -> VisibleLandmarks:
+    """The landmarks in a camera's image widened by margin_px, seen at most max_view_angle_rad outside their cones."""
+    lens = (camera.focal_px, camera.cx_px, camera.cy_px, camera.focal_px * camera.baseline_m)
+    pinhole = np.array([*lens, camera.width_px, camera.height_px])
+    place = np.ascontiguousarray(map_from_cam)
+    rows, pixels, distances_m = visible(cones, place, pinhole, margin_px, max_view_angle_rad)
+    octaves = np.log(np.maximum(cones.max_distances_m[rows] / distances_m, 0.5)) / np.log(SCALE_FACTOR)
+    return VisibleLandmarks(rows, pixels, octaves)
+
+
+def match_visible(
+    expected: VisibleLandmarks,
+    descriptors: NDArray[np.uint8],
+    windows_px: Array,
+    features: Features,
+    settings: FixSettings,
+) -> Rows:
+    """(V,) the feature that shows each expected landmark with descriptors (V, 32), -1 for none, within windows_px (V,) of its pixel."""
+    octaves = np.column_stack([np.floor(expected.octaves) - 2, np.ceil(expected.octaves) + 2]).astype(np.int64)
+    theirs = (features.pixels, features.octaves, features.descriptors)
+    limits = (settings.guided_distance, settings.guided_ratio)
+    found, _ = match_by_projection(expected.pixels[:, :2], windows_px, descriptors, octaves, *theirs, *limits)
+    return found
+
+
+def cones_of_tiles(tiles: Sequence[Tile]) -> ViewingCones:
+    """The cones of all landmarks of the tiles, one tile after the other."""
+    return ViewingCones(
+        joined([tile.points_map for tile in tiles], (0, 3), np.float64),
+        joined([tile.view_directions_map for tile in tiles], (0, 3), np.float32),
+        joined([tile.view_half_angle_rad for tile in tiles], (0,), np.float32),
+        joined([tile.max_distance_m for tile in tiles], (0,), np.float32),
+    )
+
+
+def places_around(
+    places_map_from_cam: Array, map_from_cam: Array, radius_m: float, min_cosine: float
+) -> NDArray[np.bool_]:
+    """(K,) which places (K, 4, 4) lie within a radius of a camera and look its way, by the cosine between the axes."""
+    apart_m = np.linalg.norm(places_map_from_cam[:, :3, 3] - map_from_cam[:3, 3], axis=1)
+    axes_map, axis_map = places_map_from_cam[:, :3, 2], map_from_cam[:3, 2]
+    return np.asarray((apart_m < radius_m) & (axes_map @ axis_map > min_cosine))
+
+
+def image_cells(pixels: Array, camera: StereoCamera) -> Rows:
+    """(P,) which of COLUMNS x ROWS parts of the image each pixel (P, 2) lies in."""
+    column = np.clip(pixels[:, 0] / camera.width_px * COLUMNS, 0, COLUMNS - 1).astype(np.int64)
+    row = np.clip(pixels[:, 1] / camera.height_px * ROWS, 0, ROWS - 1).astype(np.int64)
+    return np.asarray(column * ROWS + row)
+
+
+def image_coverage(pixels: Array, camera: StereoCamera) -> int:
+    """How many of these parts hold one of the pixels."""
+    return len(np.unique(image_cells(pixels, camera)))
+
+
+def joined(parts: Sequence[AnyArray], empty: tuple[int, ...], dtype: type[np.generic]) -> Any:
+    """The parts one after the other; an array of shape `empty` without any."""
+    return np.concatenate(parts).astype(dtype) if parts else np.zeros(empty, dtype)
