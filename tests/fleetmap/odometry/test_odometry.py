@@ -8,6 +8,7 @@ import pytest
 
 from fleetmap.geometry import Array, se3_inverse, se3_log, so3_exp
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings, OdometryStatus
+from fleetmap.odometry.modes import InertialMode
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracking.tracker import Tracker
 from fleetmap.sensors.calibration import ImuNoise
@@ -234,12 +235,13 @@ def test_a_filter_that_leaves_the_pictures_begins_again(broken: str) -> None:
         odometry.handle_imu(samples.between(fed_ns, frame.stamp_ns + 1))
         fed_ns = frame.stamp_ns + 1
         if k == 40:
-            assert odometry._filter is not None
+            mode = odometry._mode
+            assert isinstance(mode, InertialMode)
             if broken == "clocks":
-                odometry._filter.imu_minus_cam_s = 0.09
+                mode.window.filter.imu_minus_cam_s = 0.09
             else:  # and sure of it
-                odometry._filter.state.velocity_mps += np.array([0.0, 0.0, 14.0])
-                odometry._filter.covariance *= 1e-9
+                mode.window.filter.state.velocity_mps += np.array([0.0, 0.0, 14.0])
+                mode.window.filter.covariance *= 1e-9
         said.append(odometry.handle_stereo(frame))
     assert said[38].inertial
     began = [n for n, estimate in enumerate(said) if estimate.new_odom_from_old_odom is not None and n > 38]

@@ -313,7 +313,7 @@ class InvariantFilter:
             wide[3:6, 3:6] += (size / max(gap_s, 0.1)) ** 2 * np.eye(3)
         return True
 
-    def doubt_velocity(self, sigma_mps: float) -> None:
+    def inflate_velocity(self, sigma_mps: float) -> None:
         """The velocity may have changed by so much."""
         for wide in (self.covariance, self.budget[_ALLOWED:, _ALLOWED:]):
             wide[3:6, 3:6] += sigma_mps**2 * np.eye(3)

@@ -1,0 +1,163 @@
+"""The window of frames that odometry estimates over: the filter, its clones, and the observations that tie them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array, rotation_angle_rad, se3_adjoint, se3_inverse
+from fleetmap.odometry.checks.zero_velocity import middle
+from fleetmap.odometry.filter.msckf import InvariantFilter, NavState
+from fleetmap.odometry.settings import OdometrySettings
+from fleetmap.odometry.tracking.tracker import Tracked
+from fleetmap.odometry.tracking.tracks import Observations
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.rectification import StereoCamera
+
+_UNKNOWN_DEPTH_M = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryRig:
+    """The rectified camera on its body, and what the calibration says of the other sensors.
+
+    body_from_cam, cam_from_body and base_from_body are (4, 4); imu is None for a rig without noise figures.
+    """
+
+    camera: StereoCamera
+    body_from_cam: Array
+    cam_from_body: Array
+    base_from_body: Array
+    imu_minus_cam_s: float
+    imu: ImuNoise | None
+    settings: OdometrySettings
+
+
+class SlidingWindow:
+    """The state at stamp_ns (IMU clock), one clone for each frame that is kept, and the observations not used yet."""
+
+    def __init__(self, rig: OdometryRig, state: NavState, covariance: Array, stamp_ns: int) -> None:
+        """covariance (15, 15) in the filter's error."""
+        self.rig, self.stamp_ns = rig, stamp_ns
+        self.rate_body_radps = np.zeros(3)  # at the state, without bias
+        self.scene_depth_m = _UNKNOWN_DEPTH_M
+        settings = rig.settings.filter
+        true_error_cov = settings.real_start_share**2 * covariance
+        if rig.imu is not None:  # the mean of a steady gyro is far better than what it is weighed by
+            true_error_cov[9:12, :], true_error_cov[:, 9:12] = 0.0, 0.0
+            true_error_cov[range(9, 12), range(9, 12)] = settings.real_gyro_bias_sigma_radps**2
+        self.filter = InvariantFilter(state, covariance, settings, rig.camera, rig.body_from_cam, true_error_cov)
+        self._observations = self._no_observations()
+        self._stamps_ns: dict[int, int] = {}
+        # Frames dropped with the newest: a frame that is kept, and kept_from_dropped.
+        self._merged: dict[int, tuple[int, Array]] = {}
+
+    def restarted(self, state: NavState, covariance: Array, stamp_ns: int) -> "SlidingWindow":
+        """An empty window of the same scene."""
+        window = type(self)(self.rig, state, covariance, stamp_ns)
+        window.scene_depth_m = self.scene_depth_m
+        return window
+
+    # --- what it knows ---
+
+    def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
+        """As `Odometry.motion_since`."""
+        kept_from_frame = np.eye(4)
+        while frame_index in self._merged:
+            frame_index, kept_from_earlier = self._merged[frame_index]
+            kept_from_frame = kept_from_earlier @ kept_from_frame
+        if frame_index not in self.filter.clone_ids:
+            return None
+        kept_from_now, covariance = self.filter.motion_since(frame_index)
+        frame_from_kept = se3_inverse(kept_from_frame)
+        carry = se3_adjoint(frame_from_kept)
+        return frame_from_kept @ kept_from_now, carry @ covariance @ carry.T
+
+    def cam_from_earlier(self, frame_index: int) -> Array | None:
+        """(4, 4) from a frame's camera to the one at the state; None where the frame is not kept."""
+        if frame_index not in self.filter.clone_ids:
+            return None
+        odom_from_earlier = self.filter.odom_from_clone(frame_index)
+        body_from_odom = se3_inverse(self.filter.state.odom_from_body)
+        return np.asarray(self.rig.cam_from_body @ body_from_odom @ odom_from_earlier @ self.rig.body_from_cam)
+
+    def matched_body(self, tracked: Tracked) -> tuple[int, Array] | None:
+        """After a gap: the best matched clone and odom_from_body (4, 4) as vision measured it since then."""
+        best = next((e for e in tracked.earlier if e.frame_index in self.filter.clone_ids), None)
+        if best is None:
+            return None
+        odom_from_earlier = self.filter.odom_from_clone(best.frame_index)
+        odom_from_cam = odom_from_earlier @ self.rig.body_from_cam @ se3_inverse(best.cam_from_earlier)
+        return best.frame_index, np.asarray(odom_from_cam @ self.rig.cam_from_body)
+
+    def seconds_since(self, frame_index: int) -> float:
+        """From a frame that is kept to the state."""
+        return (self.stamp_ns - self._stamps_ns[frame_index]) * 1e-9
+
+    def seconds_between(self, earlier_index: int, later_index: int) -> float:
+        """Between two frames that are kept."""
+        return (self._stamps_ns[later_index] - self._stamps_ns[earlier_index]) * 1e-9
+
+    # --- one frame ---
+
+    def seed(self, frame_index: int, tracked: Tracked) -> None:
+        """Begins an empty window with one frame; the tracks go on from it alone."""
+        self._add_clone(frame_index)
+        self._observations.add(frame_index, tracked.ids, tracked.pixels)
+
+    def update(self, frame_index: int, tracked: Tracked, chunk_frames: int, iterations: int) -> NDArray[np.int8]:
+        """Adds a frame at the state and uses tracks that ended, that are due in their turn, or (after a gap) all.
+
+        Every observation serves exactly once. Returns what `InvariantFilter.update` does.
+        """
+        self._add_clone(frame_index)
+        self._observe(frame_index, tracked)
+        due = (frame_index + tracked.ids) % chunk_frames == 0
+        held = np.array(self.filter.clone_ids)
+        chosen = self._observations.take(tracked.ids, held, due | tracked.by_descriptors, self.rig.camera)
+        seen = self.matched_body(tracked)
+        if seen is None:
+            used = self.filter.update(chosen, iterations)
+        else:
+            scale = self.rig.settings.filter.descriptor_sigma_scale
+            used = self.filter.update(chosen, 4, newest_odom_from_body=seen[1], sigma_scale=scale)
+        self._prune()
+        return used
+
+    def _add_clone(self, frame_index: int) -> None:
+        self.filter.add_clone(frame_index, self.rate_body_radps)
+        self._stamps_ns[frame_index] = self.stamp_ns
+
+    def _no_observations(self) -> Observations:
+        return Observations()
+
+    def _observe(self, frame_index: int, tracked: Tracked) -> None:
+        for earlier in tracked.earlier:
+            self._observations.add(earlier.frame_index, earlier.ids, earlier.pixels)
+        self._observations.add(frame_index, tracked.ids, tracked.pixels)
+        self.scene_depth_m = self._depth_of(tracked.pixels)
+
+    def _depth_of(self, pixels: Array) -> float:
+        disparities = pixels[:, 0] - pixels[:, 2]
+        known = disparities[np.isfinite(disparities)]
+        camera = self.rig.camera
+        return camera.focal_px * camera.baseline_m / middle(known) if len(known) else _UNKNOWN_DEPTH_M
+
+    def _prune(self) -> None:
+        """Drops the second newest clone where the robot hardly moved since the one before, else the oldest."""
+        settings = self.rig.settings.filter
+        self._merged.clear()
+        while len(self.filter.clone_ids) >= settings.clones:
+            ids = self.filter.clone_ids
+            earlier, candidate = self.filter.odom_from_clone(ids[-3]), self.filter.odom_from_clone(ids[-2])
+            motion = se3_inverse(earlier) @ candidate
+            parallax = float(np.linalg.norm(motion[:3, 3])) / self.scene_depth_m
+            is_still = (
+                rotation_angle_rad(motion[:3, :3]) < settings.keyframe_rotation_rad
+                and parallax < settings.keyframe_parallax
+            )
+            gone = ids[-2] if is_still else ids[0]
+            if is_still:
+                self._merged[gone] = ids[-3], motion
+            self.filter.remove_clone(gone)
+            self._stamps_ns.pop(gone, None)

@@ -1,0 +1,351 @@
+"""The modes of the odometry, one class each: vision alone, starting (vision that looks for gravity), and stereo-inertial."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array, interpolate_se3, se3_inverse, skew
+from fleetmap.odometry.checks.divergence_monitor import DivergenceMonitor
+from fleetmap.odometry.checks.imu_faults import longest_gap_ns
+from fleetmap.odometry.checks.zero_velocity import ZeroVelocityDetector
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.filter.msckf import NavState
+from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
+from fleetmap.odometry.init.filter_initialization import Start, dynamic_initialization, is_steady, static_initialization
+from fleetmap.odometry.sensor_buffer import SensorBuffer
+from fleetmap.odometry.tracking.tracker import Tracked
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.samples import Trajectory
+
+_GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of freedom
+_ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
+_IMU_GAP_NS = 50_000_000  # a longer time without samples is bridged as without an IMU
+
+
+@dataclass(frozen=True, slots=True)
+class ImuInputs:
+    """What the use of an IMU needs: its samples, its noise as it is and as it is weighed, and the monitor of its faults."""
+
+    samples: SensorBuffer
+    noise: ImuNoise
+    weighing_noise: ImuNoise
+    monitor: DivergenceMonitor
+
+
+class Step(NamedTuple):
+    """What a mode made of one frame: the mode from now on, what its update used (see `InvariantFilter.update`).
+
+    The last two are as in OdometryEstimate.
+    """
+
+    mode: "Mode"
+    used: NDArray[np.int8]
+    new_odom_from_old_odom: Array | None = None
+    revised: tuple[tuple[int, Array], ...] = ()
+
+
+class Mode(ABC):
+    """A way to follow the body. For each frame `predict`, then `process` with what was tracked by the prediction."""
+
+    inertial = False
+    rotation_sigma_rad: float | None = None  # of `cam_from_earlier`, None where that is only a guess
+
+    @property
+    @abstractmethod
+    def stamp_ns(self) -> int:
+        """Of the state, on the IMU's clock; 0 before the first frame."""
+
+    def begin(self, stamp_ns: int) -> "Mode":
+        """The mode for the first frame, which is at stamp_ns."""
+        return self
+
+    @abstractmethod
+    def predict(self, stamp_ns: int) -> None:
+        """Moves the state to a frame."""
+
+    @abstractmethod
+    def cam_from_earlier(self, frame_index: int) -> Array | None:
+        """(4, 4) predicted for the frame in work; None where the earlier one is forgotten."""
+
+    @abstractmethod
+    def process(self, frame_index: int, tracked: Tracked) -> Step:
+        """Takes what was tracked in the frame that was predicted."""
+
+    @abstractmethod
+    def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
+        """As `Odometry.motion_since`."""
+
+    @abstractmethod
+    def will_forget(self, frame_index: int) -> bool:
+        """As `Odometry.will_forget`."""
+
+    @abstractmethod
+    def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
+        """The estimate at a frame, stamped on the camera's clock; `step` is what `process` returned."""
+
+
+class WindowMode(Mode):
+    """A mode that estimates over a sliding window."""
+
+    waits_for_gravity = False
+
+    def __init__(self, window: SlidingWindow) -> None:
+        self.window = window
+        self._rig = window.rig
+
+    @property
+    def stamp_ns(self) -> int:
+        """See Mode."""
+        return self.window.stamp_ns
+
+    def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
+        """See Mode."""
+        return self.window.motion_since(frame_index)
+
+    def will_forget(self, frame_index: int) -> bool:
+        """See Mode."""
+        return frame_index not in self.window.filter.clone_ids[1:]
+
+    def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
+        """See Mode."""
+        window_filter, used = self.window.filter, step.used
+        state = window_filter.state
+        status = OdometryStatus.INITIALISING if self.waits_for_gravity else OdometryStatus.TRACKING
+        if frame_index > 0 and tracked.lost:
+            status = OdometryStatus.DEGRADED
+        offset_s = self._rig.imu_minus_cam_s + window_filter.imu_minus_cam_s if self.inertial else 0.0
+        return OdometryEstimate(
+            stamp_ns=stamp_ns,
+            frame_index=frame_index,
+            odom_from_body=state.odom_from_body,
+            cov_rot_trans=window_filter.body_covariance(),
+            velocity_odom_mps=state.velocity_mps.copy(),
+            gyro_bias_radps=state.gyro_bias_radps.copy(),
+            accel_bias_mps2=state.accel_bias_mps2.copy(),
+            status=status,
+            track_ids=tracked.ids,
+            scene_depth_m=self.window.scene_depth_m,
+            inlier_share=int((used == 1).sum()) / len(used) if len(used) else tracked.inlier_share,
+            after_gap=tracked.by_descriptors,
+            inertial=self.inertial,
+            new_odom_from_old_odom=step.new_odom_from_old_odom,
+            revised=step.revised,
+            imu_minus_cam_s=offset_s,
+        )
+
+
+class VisualMode(WindowMode):
+    """Vision alone: the state moves by the motion that is measured between frames, gravity is unknown."""
+
+    def __init__(self, window: SlidingWindow, cam_from_previous: Array | None = None) -> None:
+        """cam_from_previous (4, 4): the last motion where one is known."""
+        super().__init__(window)
+        self._cam_from_previous = np.eye(4) if cam_from_previous is None else cam_from_previous
+
+    def predict(self, stamp_ns: int) -> None:
+        """See Mode; where the state will be is known only when the frame was tracked."""
+        self.window.stamp_ns, self.window.rate_body_radps = stamp_ns, np.zeros(3)
+
+    def cam_from_earlier(self, frame_index: int) -> Array | None:
+        """See Mode: the last motion once more."""
+        return self._cam_from_previous if self.window.filter.clone_ids[-1:] == [frame_index] else None
+
+    def process(self, frame_index: int, tracked: Tracked) -> Step:
+        """See Mode."""
+        if self.window.filter.clone_ids:
+            self._predict_random_walk(tracked)
+        used = self.window.update(frame_index, tracked, self._rig.settings.filter.chunk_frames_without_imu, 4)
+        return Step(self, used)
+
+    def _predict_random_walk(self, tracked: Tracked) -> None:
+        rig, settings, window = self._rig, self._rig.settings.filter, self.window
+        if tracked.cam_from_previous is not None:
+            self._cam_from_previous = tracked.cam_from_previous
+        elif (seen := window.matched_body(tracked)) is not None:
+            cam_from_odom = rig.cam_from_body @ se3_inverse(seen[1])
+            self._cam_from_previous = cam_from_odom @ window.filter.state.odom_from_body @ rig.body_from_cam
+        body_from_next = rig.body_from_cam @ se3_inverse(self._cam_from_previous) @ rig.cam_from_body
+        duration_s = window.seconds_since(window.filter.clone_ids[-1])
+        sigmas = settings.free_rotation_sigma_rad, settings.free_translation_sigma_m
+        window.filter.predict_random_walk(body_from_next, *sigmas, duration_s, self._measured_motion_cov(tracked))
+
+    def _measured_motion_cov(self, tracked: Tracked) -> Array | None:
+        """Covariance (6, 6), in the body's axes, that holds the state near the motion from all points of the last two frames.
+
+        An update takes the few tracks that are due or ended. Where they cluster or slip together the state must not
+        follow them further than all the others allow; so loose, it adds no information to speak of.
+        """
+        if tracked.cov_rot_trans is None:
+            return None
+        body_from_cam = np.zeros((6, 6))
+        rotation = self._rig.body_from_cam[:3, :3]
+        body_from_cam[:3, :3] = body_from_cam[3:, 3:] = rotation
+        body_from_cam[3:, :3] = skew(self._rig.body_from_cam[:3, 3]) @ rotation
+        wide = self._rig.settings.filter.seen_motion_scale**2 * tracked.cov_rot_trans
+        return np.asarray(body_from_cam @ wide @ body_from_cam.T)
+
+
+class StartingMode(VisualMode):
+    """Vision alone until gravity is known, by rest or by motion."""
+
+    waits_for_gravity = True
+
+    def __init__(
+        self,
+        window: SlidingWindow,
+        imu: ImuInputs,
+        not_before_ns: int = -(2**62),
+        cam_from_previous: Array | None = None,
+    ) -> None:
+        """not_before_ns: earlier samples led to a static start that was wrong."""
+        super().__init__(window, cam_from_previous)
+        self._imu, self._not_before_ns = imu, not_before_ns
+        self._trajectory: list[tuple[int, Array]] = []
+
+    def begin(self, stamp_ns: int) -> Mode:
+        """See Mode: stereo-inertial at once where the IMU rested before the first frame."""
+        start = self._static_start(stamp_ns)
+        return self if start is None else InertialMode.started(self.window, self._imu, start)
+
+    def process(self, frame_index: int, tracked: Tracked) -> Step:
+        """See Mode; switches to stereo-inertial once gravity is known, which redefines `odom`."""
+        step = super().process(frame_index, tracked)
+        stamp_ns, old_odom_from_body = self.stamp_ns, self.window.filter.state.odom_from_body
+        start = self._static_start(stamp_ns) or self._dynamic_start(stamp_ns, old_odom_from_body, tracked.lost)
+        if start is None:
+            return step
+        mode = InertialMode.started(self.window, self._imu, start)
+        mode.predict(stamp_ns)
+        mode.window.seed(frame_index, tracked)
+        change = np.asarray(mode.window.filter.state.odom_from_body @ se3_inverse(old_odom_from_body))
+        return Step(mode, step.used, change)
+
+    def _static_start(self, stamp_ns: int) -> Start | None:
+        since = self._imu.samples.imu.between(self._not_before_ns, stamp_ns + 1)
+        return static_initialization(since, stamp_ns, self._rig.settings.start, self._rig.settings.filter)
+
+    def _dynamic_start(self, stamp_ns: int, odom_from_body: Array, lost: bool) -> Start | None:
+        settings = self._rig.settings.start
+        if lost:
+            self._trajectory.clear()
+        self._trajectory.append((stamp_ns, odom_from_body))
+        recent = self._trajectory[-settings.moving_frames :]
+        stamps = np.array([stamp for stamp, _ in recent], np.int64)
+        if (
+            len(recent) < 5
+            or stamps[-1] - stamps[0] < settings.moving_duration_s * 0.9e9
+            or np.diff(stamps).max() > settings.moving_gap_s * 1e9
+        ):
+            return None
+        vision = Trajectory(stamps, np.array([odom_from_body for _, odom_from_body in recent]))
+        imu = self._imu
+        return dynamic_initialization(vision, imu.samples.imu, imu.weighing_noise, settings, self._rig.settings.filter)
+
+
+class InertialMode(WindowMode):
+    """Stereo-inertial: the state moves by the IMU, pictures correct it, rest and wheels help."""
+
+    inertial = True
+    rotation_sigma_rad = _ROTATION_SIGMA_RAD
+
+    def __init__(self, window: SlidingWindow, imu: ImuInputs) -> None:
+        super().__init__(window)
+        settings = self._rig.settings.filter
+        self._imu = imu
+        self._zero_velocity = ZeroVelocityDetector(settings.still_window_s, settings.still_flow_px)
+        self._frame_ns = window.stamp_ns
+        self._last_odom_from_body = window.filter.state.odom_from_body  # at the frame before
+
+    @classmethod
+    def started(cls, old: SlidingWindow, imu: ImuInputs, start: Start) -> "InertialMode":
+        """The mode with an empty window in the place of another."""
+        return cls(old.restarted(start.state, start.covariance, start.stamp_ns), imu)
+
+    def predict(self, stamp_ns: int) -> None:
+        """See Mode."""
+        window, imu = self.window, self._imu
+        self._frame_ns = stamp_ns
+        end_ns = stamp_ns + int(window.filter.imu_minus_cam_s * 1e9)
+        if longest_gap_ns(imu.samples.imu, window.stamp_ns, end_ns) > _IMU_GAP_NS and len(window.filter.clone_ids) > 1:
+            self._bridge_gap(end_ns)
+        else:
+            window.rate_body_radps = window.filter.propagate(
+                imu.samples.imu, window.stamp_ns, end_ns, imu.weighing_noise, imu.noise
+            )
+        window.stamp_ns = max(end_ns, window.stamp_ns)
+
+    def cam_from_earlier(self, frame_index: int) -> Array | None:
+        """See Mode."""
+        return self.window.cam_from_earlier(frame_index)
+
+    def process(self, frame_index: int, tracked: Tracked) -> Step:
+        """See Mode; an IMU that contradicts the pictures is given up, a filter that diverged begins again."""
+        window, monitor, seen = self.window, self._imu.monitor, tracked.cam_from_previous
+        if seen is not None and monitor.is_wrong_imu(self.cam_from_earlier(frame_index - 1), seen):
+            return VisualMode(window, seen).process(frame_index, tracked)
+        matched = window.matched_body(tracked)
+        if matched is not None:
+            window.filter.inflate(matched[0], matched[1], window.seconds_since(matched[0]))
+        self._update_zero_velocity(tracked)
+        wheel = self._imu.samples.take_wheel(window.stamp_ns)
+        if wheel is not None:
+            window.filter.roll(*wheel, self._rig.base_from_body, _GATE_4)
+        used = window.update(frame_index, tracked, self._rig.settings.filter.chunk_frames, 1)
+        if monitor.is_wrong_start(window.filter.imu_minus_cam_s, self.cam_from_earlier(frame_index - 1), seen):
+            return Step(self._begin_again(frame_index, tracked), used, np.eye(4))
+        self._last_odom_from_body = window.filter.state.odom_from_body
+        return Step(self, used)
+
+    def _bridge_gap(self, end_ns: int) -> None:
+        """Without samples: as fast as between the last two frames that are held, as uncertain as without an IMU."""
+        window, settings = self.window, self._rig.settings.filter
+        held = window.filter.clone_ids[-2:]
+        earlier, last = (window.filter.odom_from_clone(clone) for clone in held)
+        duration_s = max(end_ns - window.stamp_ns, 0) * 1e-9
+        between_s = window.seconds_between(*held)
+        motion = interpolate_se3(np.eye(4), se3_inverse(earlier) @ last, duration_s / max(between_s, 1e-3))
+        sigmas = settings.free_rotation_sigma_rad, settings.free_translation_sigma_m
+        window.filter.predict_random_walk(motion, *sigmas, duration_s)
+        window.filter.inflate_velocity(settings.initial_velocity_sigma_mps)
+        window.rate_body_radps = np.zeros(3)
+
+    def _update_zero_velocity(self, tracked: Tracked) -> None:
+        """Zero velocity and turn where for a while neither pictures nor IMU moved."""
+        now_ns, samples = self.window.stamp_ns, self._imu.samples.imu
+        still = self._zero_velocity.since(now_ns, tracked.ids, tracked.pixels)
+        if still is None:
+            return
+        window, since = samples.between(still[0], now_ns), samples.between(still[1], now_ns)
+        if len(window) < 20 or not len(since) or not is_steady(window, self._rig.settings.start):
+            return
+        duration_s = (now_ns - still[1]) * 1e-9
+        sigma_radps = self._imu.noise.gyro_noise_radps_rthz / np.sqrt(duration_s)
+        self.window.filter.zero_velocity_update(since.gyro_radps.mean(axis=0), float(sigma_radps), _GATE_6)
+
+    def _begin_again(self, frame_index: int, tracked: Tracked) -> Mode:
+        """Vision alone from where the last frame was, until gravity is known anew.
+
+        What was called `odom` goes on, but nothing of before is known as well as it was said to be.
+        """
+        rig, seen = self._rig, tracked.cam_from_previous
+        motion = np.eye(4) if seen is None else seen
+        odom_from_body = self._last_odom_from_body @ rig.body_from_cam @ se3_inverse(motion) @ rig.cam_from_body
+        state = NavState(rotation=odom_from_body[:3, :3], position_m=odom_from_body[:3, 3])
+        window = self.window.restarted(state, np.diag([1e-10] * 15), self._frame_ns)
+        window.seed(frame_index, tracked)
+        self._imu.monitor.begin_again()
+        return StartingMode(window, self._imu, self._frame_ns, motion)
+
+
+def imu_inputs(rig: OdometryRig, noise: ImuNoise, samples: SensorBuffer) -> ImuInputs:
+    """The inputs of an IMU whose noise is weighed as wider than its data sheet says."""
+    settings = rig.settings.filter
+    weighing = replace(
+        noise,
+        gyro_noise_radps_rthz=noise.gyro_noise_radps_rthz * settings.gyro_noise_scale,
+        accel_noise_mps2_rthz=noise.accel_noise_mps2_rthz * settings.accel_noise_scale,
+    )
+    return ImuInputs(samples, noise, weighing, DivergenceMonitor(settings.time_offset_sigma_s))

@@ -1,0 +1,277 @@
+"""Odometry with one camera: metric once the IMU has shown the scale, up to scale, and labelled so, until then or without an IMU."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.filter import msckf_kernels
+from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
+from fleetmap.odometry.init.filter_initialization import Start, static_initialization
+from fleetmap.odometry.init.mono_inertial_init import mono_inertial_initialization
+from fleetmap.odometry.modes import ImuInputs, InertialMode, Mode, Step
+from fleetmap.odometry.mono.mono_vo import Sight, VisualOdometry
+from fleetmap.odometry.tracking.tracker import Tracked
+from fleetmap.odometry.tracking.tracks import Observations, TrackBatch
+from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.samples import Trajectory
+
+_STILL_S = 0.5
+_STILL_SIGMA_MPS = 0.02
+_FAR_M = 200.0  # points beyond it lie on almost parallel rays and say nothing of the scene's depth
+_UNSCALED_FRAMES = 2400  # that are kept to be placed anew once the IMU has shown the scale
+_SIGHTINGS = 12  # of one track that are kept to place its point
+_NONE_USED = np.zeros(0, np.int8)
+Ids = NDArray[np.int64]
+
+
+class MonocularObservations(Observations):
+    """Observations whose points are looked for from the scene's usual depth, where no disparity tells."""
+
+    def __init__(self, depth_m: Callable[[], float]) -> None:
+        super().__init__()
+        self._depth_m = depth_m
+
+    def take(self, alive: Ids, held: Ids, due: NDArray[np.bool_], camera: StereoCamera) -> TrackBatch:
+        """As Observations'; first guesses of points along the newest ray."""
+        batch = super().take(alive, held, due, camera)
+        last = batch.starts[1:] - 1
+        rays = (batch.pixels[last, :2] - [camera.cx_px, camera.cy_px]) / camera.focal_px
+        points = self._depth_m() * np.column_stack([rays, np.ones(len(last))])
+        return replace(batch, anchors=batch.clone_ids[last], points_cam=points)
+
+
+class MonocularWindow(SlidingWindow):
+    """The window of one camera: depth comes from points that several frames triangulate."""
+
+    _sightings: dict[int, list[tuple[int, Array]]]
+
+    def points_in_camera(self, ids: Ids) -> Array:
+        """(N, 3) tracked points in the newest frame's camera, NaN where they cannot be triangulated; updates the depth."""
+        held = {clone: k for k, clone in enumerate(self.filter.clone_ids)}
+        out = np.full((len(ids), 3), np.nan)
+        if not held:
+            return out
+        camera, settings = self.rig.camera, self.rig.settings
+        lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, 0.0])
+        odom_from_cam = np.array([self.filter.odom_from_clone(c) for c in held]) @ self.rig.body_from_cam
+        rotations = np.ascontiguousarray(odom_from_cam[:, :3, :3])
+        positions = np.ascontiguousarray(odom_from_cam[:, :3, 3])
+        weights = np.array([1.0 / settings.filter.pixel_sigma_px, 1.0])
+        max_cosine = np.cos(np.radians(settings.monocular.point_angle_deg))
+        for n, track_id in enumerate(ids.tolist()):
+            seen = [(held[c], p) for c, p in self._sightings.get(track_id, []) if c in held]
+            if len(seen) < 2:
+                continue
+            views, pixels = np.array([k for k, _ in seen], np.int64), np.array([p for _, p in seen])
+            rays = np.column_stack([(pixels[[0, -1], :2] - lens[1:3]) / lens[0], np.ones(2)])
+            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+            if (rotations[views[0]] @ rays[0]) @ (rotations[views[-1]] @ rays[1]) > max_cosine:
+                continue
+            point = positions[views[-1]] + self.scene_depth_m * rotations[views[-1]] @ rays[1]
+            if msckf_kernels.triangulate(rotations, positions, views, pixels, lens, weights, point):
+                out[n] = point
+        points = transform_points(se3_inverse(odom_from_cam[-1]), out)
+        with np.errstate(invalid="ignore"):
+            known = (points[:, 2] > 0) & (points[:, 2] < _FAR_M)
+        if known.sum() >= settings.monocular.min_points:
+            self.scene_depth_m = float(np.median(points[known, 2]))
+        return points
+
+    def _no_observations(self) -> Observations:
+        self._sightings = {}
+        return MonocularObservations(lambda: self.scene_depth_m)
+
+    def _observe(self, frame_index: int, tracked: Tracked) -> None:
+        depth_m = self.scene_depth_m
+        super()._observe(frame_index, tracked)
+        self.scene_depth_m = depth_m
+        alive = set(tracked.ids.tolist())
+        self._sightings = {i: seen[-_SIGHTINGS:] for i, seen in self._sightings.items() if i in alive}
+        for track_id, pixel in zip(tracked.ids.tolist(), tracked.pixels, strict=True):
+            self._sightings.setdefault(track_id, []).append((frame_index, pixel))
+
+
+class _UnscaledFrame(NamedTuple):
+    """A frame without metres; vision_from_cam (4, 4) is None where vision could not place it."""
+
+    frame_index: int
+    stamp_ns: int
+    vision_from_cam: Array | None
+
+
+class MonocularMode(Mode):
+    """One camera alone, up to scale, until an IMU shows the scale and the direction of gravity."""
+
+    def __init__(self, rig: OdometryRig, imu: ImuInputs | None) -> None:
+        self._rig, self._imu = rig, imu
+        self._stamp_ns = 0
+        self._visual_odometry = VisualOdometry(rig.camera, rig.settings.monocular)
+        self._sight = Sight(None, np.zeros((6, 6)))
+        self._unscaled: list[_UnscaledFrame] = []
+        self._newest_pixels: tuple[Ids, Array] = (np.zeros(0, np.int64), np.zeros((0, 2)))
+        self._still_since_ns: int | None = None
+        self._tried_ns = 0
+
+    @property
+    def stamp_ns(self) -> int:
+        """See Mode."""
+        return self._stamp_ns
+
+    def resume(self, stamp_ns: int, *, with_imu: bool) -> None:
+        """Goes on at a frame after an IMU was given up (for good without `with_imu`); vision begins again without metres."""
+        self._stamp_ns = stamp_ns
+        self._imu = self._imu if with_imu else None
+
+    def points_in_camera(self, ids: Ids) -> Array:
+        """(N, 3) tracked points in the newest frame's camera, NaN where unknown."""
+        return self._visual_odometry.points_in_camera(ids)
+
+    def predict(self, stamp_ns: int) -> None:
+        """See Mode."""
+        self._stamp_ns = stamp_ns
+
+    def cam_from_earlier(self, frame_index: int) -> Array | None:
+        """See Mode: the last motion once more, for the frame before."""
+        return self._visual_odometry.motion_guess()
+
+    def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
+        """See Mode: unknown in metres."""
+        return None
+
+    def will_forget(self, frame_index: int) -> bool:
+        """See Mode."""
+        return True
+
+    def process(self, frame_index: int, tracked: Tracked) -> Step:
+        """See Mode; switches to the filter once the scale is known, and places earlier frames anew then."""
+        self._detect_standstill(tracked)
+        sight = self._sight = self._visual_odometry.add(frame_index, tracked.ids, tracked.pixels[:, :2])
+        if self._imu is not None:
+            self._keep_unscaled(frame_index, sight)
+            found = self._metric_start(self._imu, sight)
+            if found is not None:
+                return self._go_metric(
+                    frame_index, tracked, InertialMode(self._metric_window(*found), self._imu), found[1]
+                )
+        return Step(self, _NONE_USED, revised=tuple((number, self._body(there)) for number, there in sight.revised))
+
+    def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
+        """See Mode; velocity and biases are zero, for they are unknown."""
+        sight = self._sight
+        there = np.eye(4) if sight.vision_from_cam is None else sight.vision_from_cam
+        turn = np.kron(np.eye(2), self._rig.body_from_cam[:3, :3])
+        status = OdometryStatus.TRACKING
+        if sight.vision_from_cam is None:
+            status = OdometryStatus.DEGRADED if sight.lost else OdometryStatus.INITIALISING
+        return OdometryEstimate(
+            stamp_ns=stamp_ns,
+            frame_index=frame_index,
+            odom_from_body=self._body(there),
+            cov_rot_trans=turn @ sight.cov_rot_trans @ turn.T + 1e-12 * np.eye(6),
+            velocity_odom_mps=np.zeros(3),
+            gyro_bias_radps=np.zeros(3),
+            accel_bias_mps2=np.zeros(3),
+            status=status,
+            track_ids=tracked.ids,
+            scene_depth_m=sight.depth,
+            inlier_share=tracked.inlier_share,
+            after_gap=tracked.by_descriptors,
+            inertial=False,
+            new_odom_from_old_odom=None,
+            scale_known=False,
+            revised=step.revised,
+        )
+
+    def _body(self, vision_from_cam: Array) -> Array:
+        return np.asarray(self._rig.body_from_cam @ vision_from_cam @ self._rig.cam_from_body)
+
+    def _keep_unscaled(self, frame_index: int, sight: Sight) -> None:
+        if sight.lost:
+            self._unscaled.clear()
+        revised = dict(sight.revised)
+        kept = [f._replace(vision_from_cam=revised.get(f.frame_index, f.vision_from_cam)) for f in self._unscaled]
+        kept.append(_UnscaledFrame(frame_index, self._stamp_ns, sight.vision_from_cam))
+        self._unscaled = kept[-_UNSCALED_FRAMES:]
+
+    def _detect_standstill(self, tracked: Tracked) -> None:
+        """Keeps since when the picture stands still."""
+        before, old = self._newest_pixels
+        _, a, b = np.intersect1d(before, tracked.ids, return_indices=True)
+        moved_px = np.linalg.norm(old[a] - tracked.pixels[b, :2], axis=1)
+        settings = self._rig.settings
+        still = len(a) >= settings.tracker.min_inliers and np.median(moved_px) < settings.monocular.still_px
+        if not still:
+            self._still_since_ns = None
+        elif self._still_since_ns is None:
+            self._still_since_ns = self._stamp_ns
+        self._newest_pixels = (tracked.ids, tracked.pixels[:, :2].copy())
+
+    def _metric_start(self, imu: ImuInputs, sight: Sight) -> tuple[Start, float | None] | None:
+        """By rest, if picture and IMU agree on it, else by motion; with the metres in one unit of vision, which rest leaves open."""
+        stamp_ns, settings = self._stamp_ns, self._rig.settings
+        if self._still_since_ns is not None and (stamp_ns - self._still_since_ns) * 1e-9 > _STILL_S:
+            resting = static_initialization(imu.samples.imu, stamp_ns, settings.start, settings.filter)
+            if resting is not None and stamp_ns - resting.stamp_ns < int(0.1e9):
+                covariance = resting.covariance
+                covariance[3:6, 3:6] = _STILL_SIGMA_MPS**2 * np.eye(3)
+                return replace(resting, covariance=covariance), None
+        if not self._visual_odometry.started or sight.vision_from_cam is None:
+            return None
+        if stamp_ns - self._tried_ns < settings.monocular.sample_interval_s * 1e9:
+            return None
+        self._tried_ns = stamp_ns
+        vision = self._spaced_trajectory()
+        if len(vision) < settings.monocular.metric_samples:
+            return None
+        found = mono_inertial_initialization(
+            vision, imu.samples.imu, imu.weighing_noise, self._rig.body_from_cam, settings.monocular, settings.start,
+            settings.filter,
+        )  # fmt: skip
+        return None if found is None else (found.start, found.metres_per_unit)
+
+    def _spaced_trajectory(self) -> Trajectory:
+        """vision_from_cam of placed frames far enough apart in time, the newest among them; in order of time."""
+        settings = self._rig.settings
+        stamps: list[int] = []
+        vision_from_cams: list[Array] = []
+        for _, stamp_ns, there in reversed(self._unscaled):
+            if there is None or len(stamps) == settings.monocular.metric_max_samples:
+                break
+            gap_ns = stamps[-1] - stamp_ns if stamps else 0
+            if stamps and gap_ns < settings.monocular.sample_interval_s * 1e9:
+                continue
+            if gap_ns > settings.start.moving_gap_s * 2e9:
+                break
+            stamps.append(stamp_ns)
+            vision_from_cams.append(there)
+        return Trajectory(np.array(stamps[::-1], np.int64), np.array(vision_from_cams[::-1]).reshape(-1, 4, 4))
+
+    def _metric_window(self, start: Start, metres_per_unit: float | None) -> MonocularWindow:
+        window = MonocularWindow(self._rig, start.state, start.covariance, start.stamp_ns)
+        window.scene_depth_m = self._sight.depth * (1.0 if metres_per_unit is None else metres_per_unit)
+        return window
+
+    def _go_metric(self, frame_index: int, tracked: Tracked, mode: InertialMode, metres_per_unit: float | None) -> Step:
+        """Switches to the filter and revises earlier frames: in metres and in the frame that gravity levels.
+
+        After motion these are all since vision began, after rest those since the picture stands still.
+        """
+        mode.predict(self._stamp_ns)
+        mode.window.seed(frame_index, tracked)
+        here, newest = mode.window.filter.state.odom_from_body, self._unscaled[-1].vision_from_cam
+        revised: list[tuple[int, Array]] = []
+        for number, seen_ns, there in self._unscaled[:-1]:
+            if metres_per_unit is None:
+                if self._still_since_ns is not None and seen_ns >= self._still_since_ns:
+                    revised.append((number, here))
+            elif newest is not None and there is not None:
+                newest_from_there = se3_inverse(newest) @ there
+                newest_from_there[:3, 3] *= metres_per_unit
+                revised.append((number, here @ self._body(newest_from_there)))
+        self._unscaled.clear()
+        return Step(mode, _NONE_USED, revised=tuple(revised))
