@@ -236,7 +236,8 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     stamp_ns: when it began, sensor clock; wall_ns: the same moment by the robot's wall clock. duration_s: how long it had lasted
     when it was written down. kind: `blind` (no place that may be relied upon) or `suspected` (tracking, but fixes contradict it: an
     estimate of silent failures, not a count). cause: one word or a few, such as `dark`. tile, map_from_base: by the last
-    estimate. exposure: mean brightness of the left image, 0 to 1; sharpness: variance of its Laplacian, 1 is typical for the robot.
+    estimate. exposure: mean brightness of the left image, 0 to 1; sharpness: variance of the steps
+    between neighbouring pixels of a row, 1 is typical for the robot.
     """
 
     site: Name

@@ -13,16 +13,14 @@ import pytest
 import typer
 
 from fleetmap import messages
-from fleetmap.messages import Cause, Status
+from fleetmap.messages import Cause
 from locclient.replay.run_metrics import METRICS
-from locclient.robot import failure_monitor
 from mapserver.build.report import BuildReport
 from mapserver.fleet_statistics.kpis import Measures
 from mapserver.nightly.night import Night
 from mapserver.quality import figures
 from mapserver.survey.merge.pipeline import Counts
 from support.fleet.contracts_documents import REPOSITORY, code_words, rows, section, text
-from support.fleet.estimates import estimate
 
 COMMANDS = "docs/command_line.md"
 SERVICE = "docs/service.md"
@@ -103,28 +101,6 @@ def test_bus_keys_are_documented() -> None:
 def test_causes_are_documented() -> None:
     causes = {cause.value for cause in Cause if cause is not Cause.NONE}
     assert {code_words(row[0])[0] for row in rows(section(SERVICE, "Causes"))} == causes
-
-
-def test_causes_of_failures_are_documented() -> None:
-    sharp = failure_monitor.Picture(0.5, 1.0, is_frozen=False)
-    pictures = [
-        failure_monitor.Picture(0.0, 1.0, False),
-        failure_monitor.Picture(0.5, 1.0, True),
-        failure_monitor.Picture(0.5, 0.0, False),
-    ]
-    causes = {failure_monitor.cause_of(estimate(1.0), picture) for picture in pictures}
-    for lost in (
-        estimate(1.0, Status.LOST), estimate(1.0, Status.LOST, version=None), estimate(1.0, Status.LOST, innovation=99.0),
-        estimate(1.0, Status.AMBIGUOUS),
-    ):  # fmt: skip
-        causes.add(failure_monitor.cause_of(lost, sharp))
-    monitor = failure_monitor.FailureMonitor()
-    monitor.handle(estimate(1.0, fix=True), sharp)
-    silence = monitor.handle_silence(10.0)
-    assert silence is not None
-    causes.add(silence.cause)
-    assert len(causes) == 8
-    assert causes <= set(code_words(section(SERVICE, "Causes")))
 
 
 def test_build_report_keys_are_documented() -> None:

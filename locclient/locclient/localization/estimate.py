@@ -1,4 +1,4 @@
-"""What a robot says of its place, frame by frame."""
+"""A robot's estimate of its pose, frame by frame."""
 
 from dataclasses import dataclass
 
@@ -6,11 +6,12 @@ from fleetmap.geometry import Array
 from fleetmap.messages import Cause, Status
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.relocalizer import Fix
+from locclient.localization.image_quality import GOOD_IMAGE, ImageQuality
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A place where the robot may be: map_from_body (4, 4) and how many fixes spoke for it."""
+    """A pose that the robot may have, map_from_body (4, 4), and the number of fixes that support it."""
 
     map_from_body: Array
     support: int
@@ -18,16 +19,18 @@ class Hypothesis:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Where the body is.
+    """Pose of the body at one frame, with what led to it.
 
-    map_from_body (4, 4) and cov_rot_trans (6, 6) (map axes, rotation first) are None until there is anything to say. cause: what
-    stands in the way, NONE while TRACKING. fix: the one that was finished with this frame, None without one, taken from the
-    frame of fix_stamp_ns, which may be a few frames old: looking at the map is spread over frames. refused: why a fix was not
-    used. innovation: how far what the map says is from what was predicted, squared by its covariance; innovation_m: in metres, of what
-    was found where the robot should be, or was believed. moved_m: how far a place that was confirmed with this frame is from the one
-    that was said until fixes spoke against it, beyond its covariance, so that one of them was wrong; None else. hypotheses: what speaks for
-    which place while AMBIGUOUS.
-    stage_s: seconds by the clock that was passed in, for odometry and for looking at the map.
+    map_from_body (4, 4), cov_rot_trans (6, 6): map axes, rotation first; None while unknown.
+    cause: what stands in the way of TRACKING; image: quality of the frame's images, with their own cause, also while TRACKING.
+    fix: the one that was finished with this frame, taken from the frame of fix_stamp_ns, which may be a few frames older.
+    refused: why a fix was not used.
+    innovation: squared Mahalanobis distance between fix and prediction; innovation_m: metres, for fixes that were believed or found
+    where the robot should be.
+    moved_m: for a pose confirmed with this frame, its distance from the pose that was claimed until fixes contradicted it, where
+    that is more than its covariance admits: one of the two was wrong.
+    hypotheses: the competing poses while AMBIGUOUS.
+    stage_s: seconds by stage, by the clock that was passed in.
     """
 
     stamp_ns: int
@@ -42,6 +45,7 @@ class Estimate:
     odometry: OdometryEstimate
     stage_s: dict[str, float]
     cause: Cause = Cause.NONE
+    image: ImageQuality = GOOD_IMAGE
     fix_stamp_ns: int | None = None
     innovation_m: float | None = None
     moved_m: float | None = None

@@ -1,4 +1,4 @@
-"""What is wrong with the pictures of a frame, told from them alone. Pure."""
+"""Image quality of a frame: exposure, sharpness, and the fault that they show. Pure."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ _BRIGHT = 250
 
 
 class ImageQualitySettings(Section, frozen=True):
-    """When a picture counts as bad."""
+    """Limits beyond which an image counts as bad."""
 
     dark_contrast: float = 4.0
     glare_share: float = 0.6
@@ -27,8 +27,24 @@ class ImageQualitySettings(Section, frozen=True):
     occluded_depth_share: float = 0.4
 
 
+@dataclass(frozen=True, slots=True)
+class ImageQuality:
+    """Quality of one frame's images.
+
+    cause: their fault, NONE for good ones. Of the left image: exposure, the mean brightness from 0 to 1, and sharpness, the variance of
+    the steps between neighbouring pixels of a row, where 1 is typical for this robot so far.
+    """
+
+    cause: Cause = Cause.NONE
+    exposure: float = 0.5
+    sharpness: float = 1.0
+
+
+GOOD_IMAGE = ImageQuality()
+
+
 class ImageQualityMonitor:
-    """Judges frames in their order."""
+    """Judges frames in their order; both the localizer and the failure monitor use its verdict."""
 
     def __init__(self, settings: ImageQualitySettings) -> None:
         self._settings = settings
@@ -37,55 +53,58 @@ class ImageQualityMonitor:
         self._sharpness: deque[float] = deque(maxlen=settings.typical_frames)
         self._depths_m: deque[float] = deque(maxlen=settings.typical_frames)
 
-    def judge(self, frame: RectifiedFrame) -> Cause:
-        """What is wrong with the pictures of `frame`: too dark, too bright, the last one again (of either camera), or blurred."""
-        looks = [_Look.at(picture) for picture in (frame.left, frame.right) if picture is not None]
-        self._frozen = [self._is_frozen(side, look) for side, look in enumerate(looks)]
-        left = looks[0]
-        if left.contrast < self._settings.dark_contrast:
-            return Cause.DARK if left.mean < 128.0 else Cause.GLARE
-        if left.bright_share > self._settings.glare_share:
-            return Cause.GLARE
-        if any(self._frozen):
-            return Cause.FROZEN
+    def judge(self, frame: RectifiedFrame) -> ImageQuality:
+        """The quality of `frame`; its fault is darkness, glare, a camera (either one) that repeats its last image, or blur."""
+        thinned = [_ThinnedImage.of(image) for image in (frame.left, frame.right) if image is not None]
+        self._frozen = [self._is_frozen(side, image) for side, image in enumerate(thinned)]
         count, total, squares = image_quality_kernels.row_steps(frame.left, _EVERY_PX)
-        sharpness = squares / count - (total / count) ** 2
-        typical = median(self._sharpness) if self._sharpness else sharpness
-        self._sharpness.append(sharpness)
-        return Cause.BLURRED if sharpness < self._settings.blurred_share * typical else Cause.NONE
+        variance = squares / count - (total / count) ** 2
+        typical = median(self._sharpness) if self._sharpness else variance
+        cause = self._exposure_fault(thinned[0])
+        if cause is Cause.NONE and any(self._frozen):
+            cause = Cause.FROZEN
+        if cause is Cause.NONE:
+            self._sharpness.append(variance)
+            cause = Cause.BLURRED if variance < self._settings.blurred_share * typical else Cause.NONE
+        return ImageQuality(cause, thinned[0].mean / 255.0, variance / max(typical, 1e-9))
 
     def without_frozen(self, frame: RectifiedFrame) -> RectifiedFrame:
-        """`frame`, just judged, without what a stuck camera repeats: no right picture, or nothing to see at all."""
+        """`frame`, just judged, without what a stuck camera repeats: no right image, or nothing to see at all."""
         left = np.zeros_like(frame.left) if self._frozen[0] else frame.left
         return RectifiedFrame(frame.stamp_ns, left, None, None)
 
     def judge_depth(self, scene_depth_m: float) -> Cause:
-        """Whether something stands before the cameras: what is seen is much nearer than it used to be."""
+        """OCCLUDED where the scene is much nearer than it used to be: something stands before the cameras."""
         typical_m = median(self._depths_m) if self._depths_m else scene_depth_m
         if scene_depth_m < self._settings.occluded_depth_share * typical_m:
             return Cause.OCCLUDED
         self._depths_m.append(scene_depth_m)
         return Cause.NONE
 
-    def _is_frozen(self, side: int, look: "_Look") -> bool:
+    def _exposure_fault(self, left: "_ThinnedImage") -> Cause:
+        if left.contrast < self._settings.dark_contrast:
+            return Cause.DARK if left.mean < 128.0 else Cause.GLARE
+        return Cause.GLARE if left.bright_share > self._settings.glare_share else Cause.NONE
+
+    def _is_frozen(self, side: int, image: "_ThinnedImage") -> bool:
         """Sensor noise never repeats itself: equal to the last bit is a stuck camera."""
-        last, self._last[side] = self._last[side], look.small
-        return last is not None and look.contrast > 1.0 and np.array_equal(last, look.small)
+        last, self._last[side] = self._last[side], image.pixels
+        return last is not None and image.contrast > 1.0 and np.array_equal(last, image.pixels)
 
 
 @dataclass(frozen=True, slots=True)
-class _Look:
-    """A picture thinned out, with mean and standard deviation of what is left, and the share of it that is as good as white."""
+class _ThinnedImage:
+    """Every eighth pixel of every eighth row, with their mean, standard deviation and share of nearly white ones."""
 
-    small: Image
+    pixels: Image
     mean: float
     contrast: float
     bright_share: float
 
     @classmethod
-    def at(cls, picture: Image) -> "_Look":
-        height, width = picture.shape
-        small = np.empty((-(-height // _EVERY_PX), -(-width // _EVERY_PX)), np.uint8)
-        total, squares, brights = image_quality_kernels.thin(np.ascontiguousarray(picture), _EVERY_PX, _BRIGHT, small)
-        mean = total / small.size
-        return cls(small, mean, sqrt(max(squares / small.size - mean * mean, 0.0)), brights / small.size)
+    def of(cls, image: Image) -> "_ThinnedImage":
+        height, width = image.shape
+        pixels = np.empty((-(-height // _EVERY_PX), -(-width // _EVERY_PX)), np.uint8)
+        total, squares, brights = image_quality_kernels.thin(np.ascontiguousarray(image), _EVERY_PX, _BRIGHT, pixels)
+        mean = total / pixels.size
+        return cls(pixels, mean, sqrt(max(squares / pixels.size - mean * mean, 0.0)), brights / pixels.size)

@@ -1,4 +1,4 @@
-"""Sums over the pixels of a picture that say how bright and how sharp it is; whole numbers, so exact."""
+"""Sums over the pixels of an image that measure brightness and sharpness; integers, so exact."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +9,11 @@ Grey = NDArray[np.uint8]
 
 
 @kernel
-def thin(picture: Grey, every: int, bright: int, small: Grey) -> tuple[int, int, int]:
+def thin(image: Grey, every: int, bright: int, small: Grey) -> tuple[int, int, int]:
     """Fills `small` with each every-th pixel of each every-th row; returns its sum, its squares' and how many are bright."""
     total, squares, brights = 0, 0, 0
     for v in range(small.shape[0]):
-        row, out = picture[v * every], small[v]
+        row, out = image[v * every], small[v]
         for u in range(len(out)):
             value = row[u * every]
             out[u] = value
@@ -24,11 +24,11 @@ def thin(picture: Grey, every: int, bright: int, small: Grey) -> tuple[int, int,
 
 
 @kernel
-def row_steps(picture: Grey, every: int) -> tuple[int, int, int]:
+def row_steps(image: Grey, every: int) -> tuple[int, int, int]:
     """Number, sum and sum of squares of the steps from pixel to pixel along each every-th row."""
     count, total, squares = 0, 0, 0
-    for v in range(0, picture.shape[0], every):
-        row = picture[v]
+    for v in range(0, image.shape[0], every):
+        row = image[v]
         step_sum, square_sum = np.int32(0), np.int32(0)  # of one row: narrow enough for many at once
         for u in range(len(row) - 1):
             step = np.int32(row[u + 1]) - np.int32(row[u])

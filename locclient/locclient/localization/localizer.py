@@ -20,7 +20,7 @@ from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.localization.estimate import Estimate, Hypothesis
 from locclient.localization.hypothesis_scoring import still_held
 from locclient.localization.hypothesis_set import Heard, HypothesisSet
-from locclient.localization.image_quality import ImageQualityMonitor
+from locclient.localization.image_quality import GOOD_IMAGE, ImageQualityMonitor
 from locclient.localization.initial_pose_prior import InitialPosePrior
 from locclient.localization.pose_hypothesis import PoseHypothesis, applied, difference, moved
 from locclient.localization.settings import LocalizerSettings
@@ -69,8 +69,8 @@ class Localizer:
         self._work: TimeSliced[_Outcome] | None = None  # the look that goes on
         self._moment: PoseHypothesis | None = None  # the frame of that look, as the identity
         self._failed_looks = 0
-        self._judge = ImageQualityMonitor(settings.sight)
-        self._cause = Cause.NONE
+        self._image_monitor = ImageQualityMonitor(settings.sight)
+        self._image = GOOD_IMAGE
         self._ever_tracked = False
 
     def handle_imu(self, samples: ImuSamples) -> None:
@@ -98,13 +98,13 @@ class Localizer:
     def handle_stereo(self, frame: RectifiedFrame) -> Estimate:
         """The estimate at `frame`, newer than any before."""
         begun = self._clock()
-        self._cause = self._judge.judge(frame)
-        if self._cause is Cause.FROZEN:
-            frame = self._judge.without_frozen(frame)
+        self._image = self._image_monitor.judge(frame)
+        if self._image.cause is Cause.FROZEN:
+            frame = self._image_monitor.without_frozen(frame)
         judged = self._clock()
         odometry = self._odometry.handle_stereo(frame)
-        if self._cause is Cause.NONE:
-            self._cause = self._judge.judge_depth(odometry.scene_depth_m)
+        if self._image.cause is Cause.NONE:
+            self._image = replace(self._image, cause=self._image_monitor.judge_depth(odometry.scene_depth_m))
         tracked = self._clock()
         self._follow(odometry)
         outcome, looked_ns = self._see_map(frame, odometry)
@@ -323,7 +323,7 @@ class Localizer:
     def _estimate(self, odometry: OdometryEstimate, outcome: _Outcome, looked_ns: int | None) -> Estimate:
         said = Estimate(
             odometry.stamp_ns, Status.INITIALISING, None, None, self._map_version, outcome.fix, outcome.refused,
-            outcome.innovation, (), odometry, self._stage_s, self._cause, looked_ns,
+            outcome.innovation, (), odometry, self._stage_s, self._image.cause, self._image, looked_ns,
             outcome.innovation_m, outcome.moved_m,
         )  # fmt: skip
         if self._anchor is not None:
@@ -352,7 +352,7 @@ class Localizer:
         now, covariance = told.now_map_from_body, self._published(told.now_cov)
         radius_m = radius_95_m(told.now_cov)
         status = said.status if radius_m > self._settings.track.lost_radius_m else Status.DEGRADED
-        cause = self._cause or Cause.UNMATCHED
+        cause = self._image.cause or Cause.UNMATCHED
         return replace(said, status=status, map_from_body=now, cov_rot_trans=covariance, cause=cause)
 
     def _worth(self, anchor: PoseHypothesis, odometry: OdometryEstimate) -> tuple[Status, Cause]:
@@ -361,10 +361,16 @@ class Localizer:
         radius = radius_95_m(anchor.now_cov)
         age_s = (odometry.stamp_ns - anchor.stamp_ns) * 1e-9
         is_lost = odometry.status is OdometryStatus.DEGRADED
-        cause = self._cause or (Cause.ODOMETRY if is_lost else Cause.UNMATCHED if self._failed_looks else Cause.NONE)
+        cause = self._image.cause or (
+            Cause.ODOMETRY if is_lost else Cause.UNMATCHED if self._failed_looks else Cause.NONE
+        )
         if radius > settings.lost_radius_m:
             return Status.LOST, cause
-        if radius > settings.degraded_radius_m or age_s > settings.degraded_after_s or self._cause is Cause.FROZEN:
+        if (
+            radius > settings.degraded_radius_m
+            or age_s > settings.degraded_after_s
+            or self._image.cause is Cause.FROZEN
+        ):
             return Status.DEGRADED, cause
         return Status.TRACKING, Cause.NONE
 

@@ -25,14 +25,14 @@ def failure_report(
     radius = radius_95_m(estimate.cov_rot_trans)
     looks = [note for note in failure.fixes if note.innovation is not None]
     fixes = [note for note in failure.fixes if note.inliers is not None]
-    picture = failure.picture
+    image = failure.image
     return FailureReport(
         site=site, robot=robot, id=report_id, stamp_ns=failure.stamp_ns, wall_ns=wall_ns, duration_s=failure.duration_s,
         kind=failure.kind, status=estimate.status.value, cause=failure.cause, version=estimate.map_version,
         tile=_tile(context, map_from_base), map_from_base=None if map_from_base is None else Placement.of(map_from_base),
         radius_95_m=radius if math.isfinite(radius) else None, innovation=looks[-1].innovation if looks else None,
-        inliers=fixes[-1].inliers if fixes else None, exposure=None if picture is None else picture.exposure,
-        sharpness=None if picture is None else picture.sharpness, fixes=failure.fixes,
+        inliers=fixes[-1].inliers if fixes else None, exposure=None if image is None else image.exposure,
+        sharpness=None if image is None else image.sharpness, fixes=failure.fixes,
         thumbnails=_thumbnails(context, camera, settings),
     )  # fmt: skip
 

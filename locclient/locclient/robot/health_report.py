@@ -103,8 +103,8 @@ class HealthFigures:
             )
             if raised
         ]
-        if last is not None and last.picture.fault:
-            flags.append(last.picture.fault)
+        if last is not None and last.estimate.image.cause:
+            flags.append(last.estimate.image.cause)
         figures: dict[str, Figure] = {
             "localised_share": self._localised / self._frames if self._frames else None,
             "first_fix_s": self._first_fix_s,
@@ -115,7 +115,7 @@ class HealthFigures:
             **self._fixes.take(),
         }
         if last is not None:
-            figures["exposure"], figures["sharpness"] = last.picture.exposure, last.picture.sharpness
+            figures["exposure"], figures["sharpness"] = last.estimate.image.exposure, last.estimate.image.sharpness
         return RobotHealth(
             site=site, robot=robot, stamp_ns=0 if last is None else last.estimate.stamp_ns, wall_ns=wall_ns,
             version=None if last is None else last.estimate.map_version, status=status, flags=tuple(flags),

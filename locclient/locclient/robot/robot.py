@@ -17,7 +17,7 @@ from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap
 from locclient.robot.continuous_odom import ContinuousOdom, Placed
 from locclient.robot.dock_check import DockCheck
-from locclient.robot.failure_monitor import Failure, FailureMonitor, Picture, PictureJudge
+from locclient.robot.failure_monitor import Failure, FailureMonitor
 from locclient.robot.sensor_bundle import SensorBundle
 from locclient.robot.version_trial import TrialSettings, Verdict, VersionTrial
 
@@ -59,7 +59,6 @@ class Outcome:
 
     estimate: Estimate
     placed: Placed
-    picture: Picture
     cpu_s: float
     failure: FailureContext | None
     dock_error_m: float | None = None
@@ -96,7 +95,7 @@ class Robot:
         self._trial_settings = trial
         self._versions = _Versions()
         self._odom = ContinuousOdom(calibration.base_from_body)
-        self._judge, self.monitor = PictureJudge(), FailureMonitor()
+        self.monitor = FailureMonitor()
         self._docks = DockCheck(calibration.base_from_body)
         self._pictures: deque[tuple[int, Image]] = deque(maxlen=_THUMBNAILS)
         self._last: tuple[RectifiedFrame, Estimate] | None = None
@@ -149,15 +148,14 @@ class Robot:
         raw = decode_frame(bundle.frame) if isinstance(bundle.frame, StoredFrame) else bundle.frame
         frame = self._rectifier.rectify(raw)
         estimate = self.localizer.handle_stereo(frame)
-        picture = self._judge.judge(frame.left)
         cpu_s = self._clock_s() - begun_s
         self._try(estimate, frame)
-        failure = self.monitor.handle(estimate, picture)
+        failure = self.monitor.handle(estimate)
         context = None if failure is None else self._context(failure)
         if not self._pictures or estimate.stamp_ns - self._pictures[-1][0] >= _THUMBNAIL_EVERY_NS:
             self._pictures.append((estimate.stamp_ns, frame.left))
         dock_error_m = self._docks.handle(bundle.priors, estimate)
-        return Outcome(estimate, self._odom.handle(estimate), picture, cpu_s, context, dock_error_m)
+        return Outcome(estimate, self._odom.handle(estimate), cpu_s, context, dock_error_m)
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """The failure that a source which sends no frames is."""

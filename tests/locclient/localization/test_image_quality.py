@@ -33,7 +33,7 @@ def frame(number: int, left: Image | None = None, right: Image | None = None) ->
 def judged() -> ImageQualityMonitor:
     """After ten good frames, none of which it found fault with."""
     judge = ImageQualityMonitor(ImageQualitySettings())
-    assert {judge.judge(frame(number)) for number in range(10)} == {Cause.NONE}
+    assert {judge.judge(frame(number)).cause for number in range(10)} == {Cause.NONE}
     return judge
 
 
@@ -47,8 +47,8 @@ SPOILT: dict[Cause, Spoil] = {
 @pytest.mark.parametrize("cause", SPOILT)
 def test_a_fault_is_named(cause: Cause) -> None:
     judge = judged()
-    assert judge.judge(frame(11, SPOILT[cause](picture(22), np.random.default_rng(5)))) is cause
-    assert judge.judge(frame(12)) is Cause.NONE
+    assert judge.judge(frame(11, SPOILT[cause](picture(22), np.random.default_rng(5)))).cause is cause
+    assert judge.judge(frame(12)).cause is Cause.NONE
 
 
 @pytest.mark.parametrize("side", [0, 1])
@@ -56,10 +56,21 @@ def test_a_camera_that_repeats_itself_is_frozen(side: int) -> None:
     judge = judged()
     stuck = picture(18 + side)
     spoilt = frame(11, stuck, None) if side == 0 else frame(11, None, stuck)
-    assert judge.judge(spoilt) is Cause.FROZEN
+    assert judge.judge(spoilt).cause is Cause.FROZEN
     left = judge.without_frozen(spoilt)
     assert left.right is None
     assert left.left.any() == (side == 1)
+
+
+def test_exposure_and_sharpness_are_measured_of_every_frame() -> None:
+    judge = judged()
+    good = judge.judge(frame(11))
+    assert good.exposure == pytest.approx(picture(22).mean() / 255.0, abs=0.01)
+    assert good.sharpness == pytest.approx(1.0, abs=0.1)
+    black = judge.judge(frame(12, np.zeros_like(picture(0))))
+    assert (black.cause, black.exposure, black.sharpness) == (Cause.DARK, 0.0, 0.0)
+    assert judge.judge(frame(13, SPOILT[Cause.BLURRED](picture(26), np.random.default_rng(5)))).sharpness < 0.1
+    assert judge.judge(frame(14)).sharpness == pytest.approx(1.0, abs=0.1), "bad frames do not change what is typical"
 
 
 def test_something_before_the_cameras_is_told_by_its_depth() -> None:

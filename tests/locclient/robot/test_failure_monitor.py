@@ -5,19 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleetmap.messages import Status
-from locclient.robot.failure_monitor import Failure, FailureMonitor, Picture, PictureJudge
+from fleetmap.messages import Cause, Status
+from locclient.localization.image_quality import GOOD_IMAGE, ImageQuality
+from locclient.robot.failure_monitor import Failure, FailureMonitor, failure_cause
 from support.fleet.estimates import estimate
 
-GOOD, DARK = Picture(0.4, 1.0, False), Picture(0.01, 0.0, False)
+GOOD, DARK = GOOD_IMAGE, ImageQuality(Cause.DARK, 0.01, 0.0)
 
 
 def play(
-    monitor: FailureMonitor, begin_s: float, end_s: float, picture: Picture = GOOD, **about: object
+    monitor: FailureMonitor, begin_s: float, end_s: float, image: ImageQuality = GOOD, **about: object
 ) -> list[Failure]:
     told = []
     for stamp_s in np.arange(begin_s, end_s - 1e-9, 0.1):
-        failure = monitor.handle(estimate(float(stamp_s), **about), picture)  # type: ignore[arg-type]
+        failure = monitor.handle(replace(estimate(float(stamp_s), **about), cause=image.cause, image=image))  # type: ignore[arg-type]
         if failure is not None:
             told.append(failure)
     return told
@@ -38,20 +39,20 @@ def test_blindness_is_told_after_two_seconds_and_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("about", "picture", "cause"),
+    ("about", "image", "cause"),
     [
         ({"status": Status.AMBIGUOUS}, GOOD, "ambiguous"),
         ({"status": Status.LOST, "version": None}, GOOD, "no_map"),
         ({"status": Status.LOST, "refused": "nothing agrees"}, GOOD, "no_match"),
         ({"status": Status.LOST, "refused": "far off", "innovation": 99.0}, GOOD, "fix_refused"),
-        ({"status": Status.DEGRADED, "sigma_m": 0.5}, Picture(0.4, 1.0, True), "frozen"),
-        ({"status": Status.DEGRADED, "sigma_m": 0.5}, Picture(0.4, 0.1, False), "blurred"),
+        ({"status": Status.DEGRADED, "sigma_m": 0.5}, ImageQuality(Cause.FROZEN), "frozen"),
+        ({"status": Status.DEGRADED, "sigma_m": 0.5}, ImageQuality(Cause.BLURRED), "blurred"),
     ],
 )
-def test_the_cause_is_named(about: dict[str, object], picture: Picture, cause: str) -> None:
+def test_the_cause_is_named(about: dict[str, object], image: ImageQuality, cause: str) -> None:
     monitor = FailureMonitor()
     play(monitor, 0, 1, fix=True)
-    assert [failure.cause for failure in play(monitor, 1, 4, picture, **about)] == [cause]
+    assert [failure.cause for failure in play(monitor, 1, 4, image, **about)] == [cause]
 
 
 def test_what_is_no_failure_is_not_told() -> None:
@@ -76,15 +77,15 @@ def test_a_place_that_turns_out_to_be_another_is_told_once() -> None:
     monitor = FailureMonitor()
     play(monitor, 0, 3, fix=True)
     near, far = (replace(estimate(t, fix=True), moved_m=m) for t, m in ((3.0, 0.1), (3.2, 0.5)))
-    assert monitor.handle(near, GOOD) is None
-    told = monitor.handle(far, GOOD)
+    assert monitor.handle(near) is None
+    told = monitor.handle(far)
     assert told is not None
     assert (told.kind, told.cause) == ("suspected", "moved")
-    assert monitor.handle(replace(estimate(3.4, fix=True), moved_m=0.6), GOOD) is None
+    assert monitor.handle(replace(estimate(3.4, fix=True), moved_m=0.6)) is None
     assert not play(monitor, 3.6, 9, fix=True)
     assert not monitor.is_running
     assert play(monitor, 9, 12, status=Status.LOST)[0].kind == "blind"
-    assert monitor.handle(replace(estimate(12.1, fix=True), moved_m=7.0), GOOD) is None
+    assert monitor.handle(replace(estimate(12.1, fix=True), moved_m=7.0)) is None
 
 
 def test_silence_is_a_failure_of_its_own() -> None:
@@ -93,17 +94,16 @@ def test_silence_is_a_failure_of_its_own() -> None:
     play(monitor, 0, 3, fix=True)
     failure = monitor.handle_silence(2.5)
     assert failure is not None
-    assert (failure.cause, failure.duration_s, failure.picture) == ("no_frames", 2.5, None)
+    assert (failure.cause, failure.duration_s, failure.image) == ("no_frames", 2.5, None)
     assert monitor.handle_silence(3.0) is None
 
 
-def test_pictures_are_measured() -> None:
-    rng = np.random.default_rng(0)
-    judge = PictureJudge()
-    sharp = [np.asarray(rng.integers(0, 255, (120, 160)), np.uint8) for _ in range(3)]
-    assert [judge.judge(picture).fault for picture in sharp] == ["", "", ""]
-    assert judge.judge(sharp[-1]).fault == "frozen"
-    assert judge.judge(np.zeros((120, 160), np.uint8)).fault == "dark"
-    flat = np.asarray(np.tile(np.linspace(60, 160, 160), (120, 1)), np.uint8)
-    assert judge.judge(flat).fault == "blurred"
-    assert judge.judge(sharp[0]).sharpness == pytest.approx(1.0, abs=0.1)
+@pytest.mark.parametrize("status", [status for status in Status if status is not Status.TRACKING])
+@pytest.mark.parametrize("cause", Cause)
+def test_estimate_and_failure_agree_on_the_cause(status: Status, cause: Cause) -> None:
+    """An estimate's cause is the failure's; `nothing in the map agrees` and no cause at all are told in more detail."""
+    told = failure_cause(replace(estimate(1.0, status), cause=cause, image=ImageQuality(cause)))
+    if cause in {Cause.NONE, Cause.UNMATCHED}:
+        assert told in {Cause.NO_MAP, Cause.AMBIGUOUS, Cause.NO_MATCH, Cause.FIX_REFUSED}
+    else:
+        assert told is cause

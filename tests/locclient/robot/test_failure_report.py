@@ -64,6 +64,7 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
         if outcome is not None and outcome.failure is not None:
             told.append(outcome.failure)
     assert len(told) == 1
+    assert told[0].failure.estimate.cause is told[0].failure.estimate.image.cause is told[0].failure.cause
     report = failure_report(
         told[0], site="room", robot="r1", report_id="ab" * 16, wall_ns=7, base_from_body=np.eye(4),
         camera=robot_world.rectifier().camera, settings=robot_world.SETTINGS,
