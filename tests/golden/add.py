@@ -13,9 +13,10 @@ import numpy as np  # noqa: E402
 
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_tile, encode_tile  # noqa: E402
 from fleetmap.messages import FailureReport, Thumbnail  # noqa: E402
+from mapserver import releases  # noqa: E402
 from mapserver.fleet.fleet import Fleet  # noqa: E402
 from mapserver.quality.figures import Compared, Evidence, Looks, Motion  # noqa: E402
-from mapserver.store import MapStore  # noqa: E402
+from mapserver.store import DraftContent, MapStore  # noqa: E402
 from mapserver.store.archive import ARCHIVE_FORMAT, encode_archive  # noqa: E402
 from mapserver.store.export_import import EXPORT_FORMAT  # noqa: E402
 from mapserver.store.migrations import MIGRATIONS  # noqa: E402
@@ -33,13 +34,13 @@ def write_store(folder: Path) -> None:
             tiles = [random_tile(rng, landmarks=8, places=1, cell=(x, 0)) for x in range(2)]
             details = draft_details(path_m=12.5)
             store.save_draft(
-                "lab", tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive %d" % seed,
-                evidence=EVIDENCE if seed == 3 else None,
+                "lab", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive %d" % seed,
+                evidence=EVIDENCE if seed == 3 else None),
             )  # fmt: skip
             if seed < 3:
-                store.publish("lab")
+                releases.publish(store, "lab")
         store.record_robot_report("lab", "r1", {"status": "TRACKING"}, 1)
-        store.rollback("lab")
+        releases.roll_back(store, "lab")
         store.update_job(store.begin_job("lab", "nightly"), "done", "version 2 is published", {"drafts": 1})
         report = FailureReport(
             site="lab", robot="r1", id="f1", stamp_ns=5, wall_ns=6, duration_s=2.5, kind="blind", status="LOST", cause="dark",

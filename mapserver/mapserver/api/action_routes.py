@@ -7,6 +7,7 @@ from typing import Any
 from fastapi import Depends, FastAPI
 from starlette.exceptions import HTTPException
 
+from mapserver import releases
 from mapserver.api.fleet_views import CanaryAct, CanaryView
 from mapserver.api.parameters import Site, Version
 from mapserver.api.writers import Writers, checked_by
@@ -46,7 +47,7 @@ def install_action_routes(app: FastAPI, store: MapStore, writers: Writers, setti
         `rollback` takes it back, promoting it ends it early; otherwise the server decides by the failures of both sides.
         """
         share = settings.canary.share if act.share is None else act.share
-        begun = store.start_canary(site, version, share, actor=act.who(), gate=settings.gate)
+        begun = releases.start_canary(store, site, version, share, actor=act.who(), gate=settings.gate)
         return _view(store, begun, settings.canary)
 
     @app.get("/v1/sites/{site}/resurvey")

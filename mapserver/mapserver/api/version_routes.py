@@ -2,11 +2,13 @@
 
 from fastapi import Depends, FastAPI
 
+from mapserver import releases
 from mapserver.api.parameters import Site, Version
 from mapserver.api.views import Act, PublishAct, QualityView, VersionView
 from mapserver.api.writers import Writers, checked_by
 from mapserver.quality.gate import GateSettings
-from mapserver.store import Difference, MapStore
+from mapserver.releases import Difference
+from mapserver.store import MapStore
 
 
 def install_version_routes(app: FastAPI, store: MapStore, writers: Writers, gate: GateSettings) -> None:
@@ -23,21 +25,21 @@ def install_version_routes(app: FastAPI, store: MapStore, writers: Writers, gate
     @app.get("/v1/sites/{site}/versions/{before}/diff/{after}")
     def diff(site: Site, before: Version, after: Version) -> Difference:
         """What changed between two versions: tiles, landmarks, bytes to fetch, quality side by side."""
-        return store.difference(site, before, after)
+        return releases.difference(store, site, before, after)
 
     @app.post("/v1/sites/{site}/versions/{version}/publish", dependencies=allowed)
     def publish(site: Site, version: Version, act: PublishAct) -> VersionView:
         """Takes a draft through the gate and makes it current."""
-        store.publish(site, version, actor=act.who(), force=act.force, gate=gate)
+        releases.publish(store, site, version, actor=act.who(), force=act.force, gate=gate)
         return VersionView.of(store.version(site, version))
 
     @app.post("/v1/sites/{site}/versions/{version}/promote", dependencies=allowed)
     def promote(site: Site, version: Version, act: Act) -> VersionView:
         """Makes a version that was published before the current one."""
-        store.promote(site, version, actor=act.who())
+        releases.promote(store, site, version, actor=act.who())
         return VersionView.of(store.version(site, version))
 
     @app.post("/v1/sites/{site}/rollback", dependencies=allowed)
     def rollback(site: Site, act: Act) -> VersionView:
         """Makes the version current that was so before; the current one retires."""
-        return VersionView.of(store.version(site, store.rollback(site, actor=act.who())))
+        return VersionView.of(store.version(site, releases.roll_back(store, site, actor=act.who())))

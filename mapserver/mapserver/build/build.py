@@ -33,7 +33,7 @@ from mapserver.build.zones_file import read_zones
 from mapserver.dashboard.loop_overlay import loop_places
 from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence
-from mapserver.store import NOBODY, Actor, DraftDetails, MapStore
+from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
 from mapserver.survey.finish.map_transform import moved
 from mapserver.survey.loops.loops import Loops
@@ -54,7 +54,7 @@ class BuildRequest:
     """What `mapserver build` was asked for; frames is an A:B:C slice of each recording, absent files are not written.
 
     replay: earlier recordings of the current version, of which frames are looked for in the draft. threads, scheduler: who does
-    the work, see worker.py.
+    the work, see worker.py. job: the number of the job that builds, for its draft.
     """
 
     recordings: tuple[Path, ...]
@@ -73,6 +73,7 @@ class BuildRequest:
     actor: Actor = NOBODY
     threads: int | None = None
     scheduler: str | None = None
+    job: int | None = None
 
 
 @dataclass(frozen=True)
@@ -259,15 +260,10 @@ def _keep(order: BuildRequest, built: _Built, parent: Before | None, settings: S
         # A robot downloads the manifest: what it says about the build is short.
         report={key: value for key, value in msgspec.to_builtins(report).items() if key not in _NOT_FOR_ROBOTS},
     )
-    version = maps.save_draft(
-        order.site,
-        tiles=tiles,
-        vocabulary=vocabulary,
-        details=details,
-        archive=archive,
-        evidence=evidence,
-        actor=order.actor,
+    content = DraftContent(
+        tiles=tiles, vocabulary=vocabulary, details=details, archive=archive, evidence=evidence, job=order.job
     )
+    version = maps.save_draft(order.site, content, actor=order.actor)
     info = maps.version(order.site, version)
     report = msgspec.structs.replace(report, map_bytes=info.map_bytes)
     built.times.begin("writing")

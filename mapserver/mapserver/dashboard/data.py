@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 from fleetmap.errors import StateError, UsageError
 from fleetmap.mapformat import Manifest, decode_tile
+from mapserver import releases
 from mapserver.dashboard.plan import Plan, make_plan
 from mapserver.quality.gate import GateSettings
-from mapserver.store import Actor, CanaryRow, Difference, Event, JobInfo, MapStore, SiteInfo, VerdictRow, VersionInfo
+from mapserver.releases import Difference
+from mapserver.store import Actor, CanaryRow, Event, JobInfo, MapStore, SiteInfo, VerdictRow, VersionInfo
 
 _KEPT_PLANS = 8
 _EVENTS_SHOWN = 50
@@ -73,8 +75,8 @@ class MapData:
         info = next(info for info in self._store.sites() if info.site == site)
         versions = self._store.versions(site)[::-1]
         events = self._store.last_events(site, _EVENTS_SHOWN)
-        trials = self._store.canaries(site, running=True)
-        return SiteHistory(info, versions, events, self._store.rollback_target(site), trials[0] if trials else None)
+        rows = self._store.releases(site)
+        return SiteHistory(info, versions, events, rows.rollback_target, rows.canary)
 
     def current_version(self, site: str) -> int | None:
         """The number of the current version, None before the first."""
@@ -103,7 +105,7 @@ class MapData:
 
     def difference(self, site: str, before: int, after: int) -> Difference:
         """What changed between two versions."""
-        return self._store.difference(site, before, after)
+        return releases.difference(self._store, site, before, after)
 
     def changed_tiles(self, site: str, before: int, after: int) -> dict[tuple[int, int], str]:
         """Cells that are not the same in both: added, removed or changed."""
@@ -128,27 +130,28 @@ class MapData:
 
     def publish(self, site: str, version: int, actor: Actor) -> str:
         """Takes a draft through the gate and makes it current."""
-        self._store.publish(site, version, actor=actor, gate=self._gate)
+        releases.publish(self._store, site, version, actor=actor, gate=self._gate)
         return f"Version {version} is published and current."
 
     def promote(self, site: str, version: int, actor: Actor) -> str:
         """Makes an earlier version current."""
-        self._store.promote(site, version, actor=actor)
+        releases.promote(self._store, site, version, actor=actor)
         return f"Version {version} is current."
 
     def start_trial(self, site: str, version: int, actor: Actor) -> str:
         """Gives a version to some robots first."""
-        self._store.start_canary(site, version, self.trial_share, actor=actor, gate=self._gate)
+        releases.start_canary(self._store, site, version, self.trial_share, actor=actor, gate=self._gate)
         return f"Version {version} is tried by {self.trial_share:.0%} of the robots."
 
     def stop_trial(self, site: str, trial: CanaryRow, actor: Actor) -> str:
         """Takes the version back that some robots try; raises StateError where it is not tried any more."""
         outcome = f"taken back by hand: {actor.reason or 'no reason given'}"
-        self._store.end_canary(trial, promote=False, outcome=outcome, actor=actor)
+        releases.end_canary(self._store, trial, promote=False, outcome=outcome, actor=actor)
         return f"Version {trial.version} of {site} is taken back."
 
     def roll_back(self, site: str, version: int, actor: Actor) -> str:
         """Makes the version current that was so before; raises StateError where that is not `version` any more."""
-        if self._store.rollback_target(site) != version or self._store.canaries(site, running=True):
+        rows = self._store.releases(site)
+        if rows.rollback_target != version or rows.canary is not None:
             raise StateError(f"rolling back does not lead to version {version} any more; load the page again")
-        return f"Version {self._store.rollback(site, actor=actor)} is current."
+        return f"Version {releases.roll_back(self._store, site, actor=actor)} is current."

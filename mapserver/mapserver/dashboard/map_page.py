@@ -14,7 +14,8 @@ from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, Rooms, Where, html, l
 from mapserver.dashboard.markup import badge, choices, facts, joined, link, moment, share, size, table
 from mapserver.dashboard.plan import Plan
 from mapserver.quality.directions import missing_words
-from mapserver.store import CanaryRow, Difference, VersionInfo
+from mapserver.releases import Difference
+from mapserver.store import CanaryRow, VersionInfo
 
 _LOOK_AGAIN_S = 5.0
 _STATE_TONES = {"current": "good", "draft": "warn", "published": "quiet", "retired": "quiet"}

@@ -3,6 +3,7 @@
 import logging
 
 from fleetmap.errors import FleetmapError
+from mapserver import releases
 from mapserver.fleet.ingest import arm_key
 from mapserver.fleet_statistics.canary_test import DAY_NS, CanaryFinding, CanarySettings, judge_canary
 from mapserver.fleet_statistics.kpis import Tally
@@ -29,7 +30,9 @@ def review(store: MapStore, settings: CanarySettings, now_ns: int) -> list[Canar
         if finding.action == "wait":
             continue
         try:
-            store.end_canary(canary, promote=finding.action == "promote", outcome=finding.reason, actor=Actor(ACTOR))
+            releases.end_canary(
+                store, canary, promote=finding.action == "promote", outcome=finding.reason, actor=Actor(ACTOR)
+            )
         except FleetmapError as error:
             _log.error("the canary of site %s, version %d, is not ended: %s", canary.site, canary.version, error)
             continue

@@ -14,6 +14,7 @@ from typing import Any
 from rich.console import Console
 
 from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, SurveyError
+from mapserver import releases
 from mapserver.build.build import BuildRequest, build_draft
 from mapserver.build.job_lock import INTERRUPTED, end_interrupted, held
 from mapserver.nightly import inbox as boxes
@@ -166,11 +167,9 @@ class _Conductor:
         site = self._order.site
         if site not in {known.site for known in self._maps.sites()}:
             return None
-        reasons = {_reason(job) for job in self._night.resumes}
-        saved = [e.version for e in self._maps.events(site) if e.kind == "saved" and e.reason in reasons and e.version]
-        drafts = {info.version: info for info in self._maps.versions(site) if info.state == "draft"}
-        fitting = [drafts[v] for v in saved if v in drafts and drafts[v].parent == _current(self._maps, site)]
-        return fitting[-1] if fitting else None
+        parent, resumed = _current(self._maps, site), set(self._night.resumes)
+        drafts = [info for info in self._maps.versions(site) if info.state == "draft" and info.job in resumed]
+        return next((info for info in reversed(drafts) if info.parent == parent), None)
 
     def _unknown(self, recordings: list[Recorded]) -> list[Recorded]:
         """Those that no version was made of; the others are put away."""
@@ -193,7 +192,7 @@ class _Conductor:
         build = BuildRequest(
             tuple(r.path for r in recordings), order.site, order.store, order.frames, order.calibration, order.zones,
             replay=tuple(self._replayed()), actor=Actor(JOB, _reason(self._night.job)),
-            threads=order.threads, scheduler=order.scheduler,
+            threads=order.threads, scheduler=order.scheduler, job=self._night.job,
         )  # fmt: skip
         try:
             draft = build_draft(build, self._survey, unusable)
@@ -228,7 +227,7 @@ class _Conductor:
         taken = {entry.sha256 for entry in self._maps.manifest(site, version).recordings}
         own = [recorded for recorded in recordings if recorded.sha256 in taken]
         try:
-            self._maps.publish(site, version, actor=Actor(JOB, _reason(self._night.job)), gate=self._gate)
+            releases.publish(self._maps, site, version, actor=Actor(JOB, _reason(self._night.job)), gate=self._gate)
         except GateRefusedError as error:
             for recorded in own:
                 self._put_away(recorded.path, boxes.HELD, recorded.sha256, str(error))

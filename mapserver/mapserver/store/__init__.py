@@ -1,54 +1,62 @@
-"""Where maps are kept: content-addressed files and one SQLite database. SQL lives here alone."""
+"""Maps on the disk: content-addressed files and one SQLite database. SQL lives here alone."""
 
-from mapserver.store.fleet_records import FleetBatch, FleetRecords, TallyKey, tile_key
-from mapserver.store.fleet_rows import (
+from mapserver.store.fleet_queries import FleetBatch, FleetQueries, TallyKey, tile_key
+from mapserver.store.garbage_collection import Garbage, Retention
+from mapserver.store.map_store import MapStore
+from mapserver.store.rows import (
     AXES,
+    NOBODY,
+    Actor,
+    CanaryEnd,
     CanaryRow,
+    DraftContent,
+    DraftDetails,
+    Event,
     FailureDetail,
     FailureFilter,
     FailureRow,
     FleetRetention,
-    PictureRow,
-    TraceRow,
-)
-from mapserver.store.garbage_collection import Garbage, Retention
-from mapserver.store.map_store import MapStore
-from mapserver.store.rows import (
-    NOBODY,
-    Actor,
-    DraftDetails,
-    Event,
     JobInfo,
+    LogEntry,
+    NewCanary,
+    PictureRow,
+    ReleaseChanges,
     RobotInfo,
     SiteInfo,
+    SiteReleases,
+    TraceRow,
     VerdictRow,
     VersionInfo,
 )
-from mapserver.store.verification import Findings
-from mapserver.store.version_diff import Difference
+from mapserver.store.verification import StoreFindings
 
 __all__ = [
     "AXES",
     "NOBODY",
     "Actor",
+    "CanaryEnd",
     "CanaryRow",
-    "Difference",
+    "DraftContent",
     "DraftDetails",
     "Event",
     "FailureDetail",
     "FailureFilter",
     "FailureRow",
-    "Findings",
     "FleetBatch",
-    "FleetRecords",
+    "FleetQueries",
     "FleetRetention",
     "Garbage",
     "JobInfo",
+    "LogEntry",
     "MapStore",
+    "NewCanary",
     "PictureRow",
+    "ReleaseChanges",
     "Retention",
     "RobotInfo",
     "SiteInfo",
+    "SiteReleases",
+    "StoreFindings",
     "TallyKey",
     "TraceRow",
     "VerdictRow",

@@ -4,9 +4,9 @@ import sqlite3
 from dataclasses import dataclass, field
 
 from mapserver.store.blobs import BlobFolder
-from mapserver.store.lifecycle import ROLLBACK_TARGET
-from mapserver.store.rows import Actor, VersionInfo
+from mapserver.store.rows import Actor, LogEntry, SiteReleases
 from mapserver.store.transactions import Transactions
+from mapserver.store.version_rows import set_state, site_releases
 
 _DAY_NS = 86_400_000_000_000
 
@@ -35,19 +35,21 @@ class Garbage:
     freed_bytes: int = 0
 
 
-def collect(ledger: Transactions, blobs: BlobFolder, retention: Retention, *, dry_run: bool, actor: Actor) -> Garbage:
+def collect(
+    transactions: Transactions, blobs: BlobFolder, retention: Retention, *, dry_run: bool, actor: Actor
+) -> Garbage:
     """Removes versions first, which must be on the disk before the first file goes. The caller holds the lock alone.
 
     Never touched: current versions, those that some robots try, what a rollback would go to, what a robot runs, the vocabularies of sites.
     """
     garbage = Garbage()
     if dry_run:
-        _plan(ledger, retention, garbage)
+        _plan(transactions, retention, garbage)
     else:
-        with ledger.write() as connection:
-            _plan(ledger, retention, garbage)
-            _write_down(ledger, connection, garbage, actor)
-    kept = _mentioned(ledger, set(garbage.removed) if dry_run else set())
+        with transactions.write() as connection:
+            _plan(transactions, retention, garbage)
+            _write_down(transactions, connection, garbage, actor)
+    kept = _mentioned(transactions, set(garbage.removed) if dry_run else set())
     for sha256 in sorted(blobs.addresses() - kept):
         path = blobs.path(sha256)
         garbage.freed_bytes += path.stat().st_size if dry_run else blobs.remove_file(path)
@@ -58,13 +60,14 @@ def collect(ledger: Transactions, blobs: BlobFolder, retention: Retention, *, dr
     return garbage
 
 
-def _plan(ledger: Transactions, retention: Retention, garbage: Garbage) -> None:
-    now_ns = ledger.now_ns()
+def _plan(transactions: Transactions, retention: Retention, garbage: Garbage) -> None:
+    now_ns = transactions.now_ns()
     old_ns = now_ns - int(retention.keep_days * _DAY_NS)
-    for row in ledger.query("SELECT site FROM sites ORDER BY site"):
+    for row in transactions.query("SELECT site FROM sites ORDER BY site"):
         site = row["site"]
-        versions = [VersionInfo(**v) for v in ledger.query("SELECT * FROM versions WHERE site = ?", (site,))]
-        needed = _protected(ledger, site, now_ns - int(retention.robot_days * _DAY_NS))
+        releases = site_releases(transactions, site)
+        versions = releases.versions.values()
+        needed = _protected(transactions, releases, now_ns - int(retention.robot_days * _DAY_NS))
         published = sorted(
             (v for v in versions if v.state == "published"),
             key=lambda v: (v.published_ns or 0, v.version),
@@ -79,32 +82,28 @@ def _plan(ledger: Transactions, retention: Retention, garbage: Garbage) -> None:
         garbage.removed += sorted((site, v.version) for v in gone if v.version not in needed)
 
 
-def _protected(ledger: Transactions, site: str, seen_since_ns: int) -> set[int]:
-    current = ledger.query("SELECT version FROM versions WHERE site = ? AND state = 'current'", (site,))
-    robots = ledger.query(
+def _protected(transactions: Transactions, releases: SiteReleases, seen_since_ns: int) -> set[int | None]:
+    robots = transactions.query(
         "SELECT DISTINCT version FROM robots WHERE site = ? AND version IS NOT NULL AND last_seen_ns >= ?",
-        (site, seen_since_ns),
+        (releases.site, seen_since_ns),
     )
-    tried = ledger.query("SELECT version FROM canaries WHERE site = ? AND state = 'running'", (site,))
-    before = ledger.query(ROLLBACK_TARGET.replace(":site", "?1"), (site,))
-    return {row["version"] for row in (*current, *robots, *tried, *before)}
+    current = None if releases.current is None else releases.current.version
+    tried = None if releases.canary is None else releases.canary.version
+    return {current, tried, releases.rollback_target, *(row["version"] for row in robots)}
 
 
-def _write_down(ledger: Transactions, connection: sqlite3.Connection, garbage: Garbage, actor: Actor) -> None:
+def _write_down(transactions: Transactions, connection: sqlite3.Connection, garbage: Garbage, actor: Actor) -> None:
     for site, version in garbage.retired:
-        connection.execute(
-            "UPDATE versions SET state = 'retired', retired_ns = ? WHERE site = ? AND version = ?",
-            (ledger.now_ns(), site, version),
-        )
-        ledger.log(connection, site, "retired", f"version {version}", version=version, actor=actor)
+        set_state(connection, (site, version), "retired", transactions.now_ns())
+        transactions.log(connection, site, LogEntry("retired", f"version {version}", version, actor))
     for site, version in garbage.removed:
         for table in ("currents", "verdicts", "evidence", "version_blobs", "versions"):
             connection.execute(f"DELETE FROM {table} WHERE site = ? AND version = ?", (site, version))
-        ledger.log(connection, site, "removed", f"version {version}", version=version, actor=actor)
+        transactions.log(connection, site, LogEntry("removed", f"version {version}", version, actor))
 
 
-def _mentioned(ledger: Transactions, leaving: set[tuple[str, int]]) -> set[str]:
-    rows = ledger.query("SELECT site, version, sha256 FROM version_blobs")
+def _mentioned(transactions: Transactions, leaving: set[tuple[str, int]]) -> set[str]:
+    rows = transactions.query("SELECT site, version, sha256 FROM version_blobs")
     kept = {row["sha256"] for row in rows if (row["site"], row["version"]) not in leaving}
-    vocabularies = ledger.query("SELECT vocabulary_sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL")
+    vocabularies = transactions.query("SELECT vocabulary_sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL")
     return kept | {row["vocabulary_sha256"] for row in vocabularies}

@@ -188,4 +188,11 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
             outcome TEXT NOT NULL)""",
         "CREATE UNIQUE INDEX one_canary_per_site ON canaries(site) WHERE state = 'running'",
     ),
+    (
+        # The job that saved a version. Before, a night's drafts were known by the reason that the log gives for them.
+        "ALTER TABLE versions ADD COLUMN job INTEGER",
+        """UPDATE versions SET job = (SELECT CAST(substr(reason, length('nightly job ') + 1) AS INTEGER) FROM events e
+            WHERE e.site = versions.site AND e.version = versions.version AND e.kind = 'saved' AND e.actor = 'nightly'
+            AND e.reason LIKE 'nightly job %')""",
+    ),
 )

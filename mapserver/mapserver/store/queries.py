@@ -12,12 +12,22 @@ from fleetmap.errors import UsageError
 from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest
 from mapserver.quality.figures import Evidence
 from mapserver.store.blobs import BlobFolder
-from mapserver.store.canaries import canaries
-from mapserver.store.fleet_records import FleetRecords
-from mapserver.store.fleet_rows import CanaryRow
-from mapserver.store.lifecycle import ROLLBACK_TARGET
-from mapserver.store.rows import NOBODY, Actor, Event, JobInfo, RobotInfo, SiteInfo, VerdictRow, VersionInfo
+from mapserver.store.fleet_queries import FleetQueries
+from mapserver.store.rows import (
+    NOBODY,
+    Actor,
+    CanaryRow,
+    Event,
+    JobInfo,
+    LogEntry,
+    RobotInfo,
+    SiteInfo,
+    SiteReleases,
+    VerdictRow,
+    VersionInfo,
+)
 from mapserver.store.transactions import Transactions
+from mapserver.store.version_rows import canaries, site_releases
 
 JOB_STATES = ("running", "done", "failed")
 _SERVED_KINDS = ("manifest", "tile", "vocabulary")
@@ -30,17 +40,21 @@ class StoreQueries:
         self._root = root
         self._clock_ns = clock_ns
         self._blobs = BlobFolder(root)
-        self._ledger = Transactions(root / "store.sqlite3", clock_ns)
-        self.fleet = FleetRecords(self._ledger)
+        self._transactions = Transactions(root / "store.sqlite3", clock_ns)
+        self.fleet = FleetQueries(self._transactions)
 
     @property
     def folder(self) -> Path:
         """Where the store is."""
         return self._root
 
+    def now_ns(self) -> int:
+        """The store's clock, nanoseconds since 1970."""
+        return self._clock_ns()
+
     def sites(self) -> list[SiteInfo]:
         """All sites by name."""
-        rows = self._ledger.query(
+        rows = self._transactions.query(
             """SELECT s.site,
                       (SELECT version FROM versions v WHERE v.site = s.site AND state = 'current') current_version,
                       (SELECT count(*) FROM versions v WHERE v.site = s.site) versions, s.vocabulary_sha256
@@ -51,7 +65,7 @@ class StoreQueries:
     def versions(self, site: str, *, after: int = 0, limit: int = -1) -> list[VersionInfo]:
         """Versions of a site, oldest first, behind number `after`; raises UsageError for a site that is not known."""
         self._check_site(site)
-        rows = self._ledger.query(
+        rows = self._transactions.query(
             "SELECT * FROM versions WHERE site = ? AND version > ? ORDER BY version LIMIT ?", (site, after, limit)
         )
         return [VersionInfo(**row) for row in rows]
@@ -59,7 +73,7 @@ class StoreQueries:
     def version(self, site: str, version: int) -> VersionInfo:
         """One version; raises UsageError where it does not exist."""
         self._check_site(site)
-        rows = self._ledger.query("SELECT * FROM versions WHERE site = ? AND version = ?", (site, version))
+        rows = self._transactions.query("SELECT * FROM versions WHERE site = ? AND version = ?", (site, version))
         if not rows:
             raise UsageError(f"site {site} has no version {version}; `mapserver versions --site {site}` lists them")
         return VersionInfo(**rows[0])
@@ -69,11 +83,10 @@ class StoreQueries:
         self._check_site(site)
         return self._current_row(site)
 
-    def rollback_target(self, site: str) -> int | None:
-        """The version that rolling back would make current, None where none was so before."""
+    def releases(self, site: str) -> SiteReleases:
+        """What releases of a site are decided by, as it is now; raises UsageError for an unknown site."""
         self._check_site(site)
-        rows = self._ledger.query(ROLLBACK_TARGET.replace(":site", "?1"), (site,))
-        return int(rows[0]["version"]) if rows else None
+        return site_releases(self._transactions, site)
 
     def manifest(self, site: str, version: int) -> Manifest:
         """The manifest of a version; errors as of `version` and `blob`."""
@@ -88,7 +101,7 @@ class StoreQueries:
 
         None for everything else: archives, and what only drafts mention.
         """
-        rows = self._ledger.query(
+        rows = self._transactions.query(
             """SELECT kind FROM version_blobs JOIN versions USING (site, version)
                WHERE sha256 = ?1 AND state <> 'draft' AND (?2 IS NULL OR site = ?2)""",
             (check_sha256(sha256), site),
@@ -104,7 +117,7 @@ class StoreQueries:
     def site_vocabulary(self, site: str) -> bytes | None:
         """The vocabulary that new surveys of a site must use: the published one, else the newest draft's, else None."""
         check_name(site, "site")
-        rows = self._ledger.query(
+        rows = self._transactions.query(
             """SELECT coalesce(s.vocabulary_sha256, v.vocabulary_sha256) sha256
                FROM sites s JOIN versions v USING (site) WHERE s.site = ? ORDER BY v.version DESC LIMIT 1""",
             (site,),
@@ -114,7 +127,7 @@ class StoreQueries:
     def verdicts(self, site: str, version: int) -> list[VerdictRow]:
         """What the gate said about a version, oldest first; raises UsageError where it does not exist."""
         self.version(site, version)
-        rows = self._ledger.query(
+        rows = self._transactions.query(
             """SELECT stamp_ns, accepted, forced, reasons, report FROM verdicts
                WHERE site = ? AND version = ? ORDER BY id""",
             (site, version),
@@ -133,33 +146,35 @@ class StoreQueries:
     def evidence(self, site: str, version: int) -> Evidence | None:
         """What was measured of a version when it was built, None for one that came without; UsageError as `version`."""
         self.version(site, version)
-        rows = self._ledger.query("SELECT figures FROM evidence WHERE site = ? AND version = ?", (site, version))
+        rows = self._transactions.query("SELECT figures FROM evidence WHERE site = ? AND version = ?", (site, version))
         return msgspec.json.decode(rows[0]["figures"], type=Evidence) if rows else None
 
     def events(self, site: str, *, after: int = 0, limit: int = -1) -> list[Event]:
         """A site's history, oldest first, behind event `after`."""
-        rows = self._ledger.query(
+        rows = self._transactions.query(
             "SELECT * FROM events WHERE site = ? AND id > ? ORDER BY id LIMIT ?", (site, after, limit)
         )
         return [Event(**row) for row in rows]
 
     def canaries(self, site: str | None = None, *, running: bool = False) -> list[CanaryRow]:
         """Versions that some robots (of a site) tried first, the last one first; those that run alone with `running`."""
-        return canaries(self._ledger, site, running=running)
+        return canaries(self._transactions, site, running=running)
 
     def last_events(self, site: str, limit: int) -> list[Event]:
         """The last of a site's history, newest first."""
-        rows = self._ledger.query("SELECT * FROM events WHERE site = ? ORDER BY id DESC LIMIT ?", (site, limit))
+        rows = self._transactions.query("SELECT * FROM events WHERE site = ? ORDER BY id DESC LIMIT ?", (site, limit))
         return [Event(**row) for row in rows]
 
     def robots(self, site: str | None = None) -> list[RobotInfo]:
         """What every robot (of a site) said last."""
-        rows = self._ledger.query("SELECT * FROM robots WHERE ?1 IS NULL OR site = ?1 ORDER BY site, robot", (site,))
+        rows = self._transactions.query(
+            "SELECT * FROM robots WHERE ?1 IS NULL OR site = ?1 ORDER BY site, robot", (site,)
+        )
         return [RobotInfo(**{**row, "last_report": json.loads(row["last_report"])}) for row in rows]
 
     def jobs(self, site: str | None = None, *, before: int | None = None, limit: int = -1) -> list[JobInfo]:
         """Jobs (of a site), newest first, older than job `before`."""
-        rows = self._ledger.query(
+        rows = self._transactions.query(
             """SELECT * FROM jobs WHERE (?1 IS NULL OR site = ?1) AND (?2 IS NULL OR id < ?2)
                ORDER BY id DESC LIMIT ?3""",
             (site, before, limit),
@@ -168,12 +183,12 @@ class StoreQueries:
 
     def running_jobs(self) -> list[JobInfo]:
         """Jobs that stand as running, oldest first."""
-        rows = self._ledger.query("SELECT * FROM jobs WHERE state = 'running' ORDER BY id")
+        rows = self._transactions.query("SELECT * FROM jobs WHERE state = 'running' ORDER BY id")
         return [JobInfo(**{**row, "report": json.loads(row["report"])}) for row in rows]
 
     def job(self, number: int) -> JobInfo:
         """One job; raises UsageError where it does not exist."""
-        rows = self._ledger.query("SELECT * FROM jobs WHERE id = ?", (number,))
+        rows = self._transactions.query("SELECT * FROM jobs WHERE id = ?", (number,))
         if not rows:
             raise UsageError(f"there is no job {number}; the list of jobs shows those that are kept")
         return JobInfo(**{**rows[0], "report": json.loads(rows[0]["report"])})
@@ -181,7 +196,7 @@ class StoreQueries:
     def record_robot_report(self, site: str, robot: str, report: dict[str, Any], version: int | None = None) -> None:
         """Keeps what a robot said; `version` is what it runs, None where it did not say."""
         text = msgspec.json.encode(report).decode()
-        with self._ledger.write(durable=False) as connection:
+        with self._transactions.write(durable=False) as connection:
             connection.execute(
                 """INSERT INTO robots (site, robot, version, last_seen_ns, last_report) VALUES (?, ?, ?, ?, ?)
                    ON CONFLICT DO UPDATE SET version = coalesce(excluded.version, version),
@@ -193,12 +208,12 @@ class StoreQueries:
         self, site: str, kind: str, detail: str, *, version: int | None = None, actor: Actor = NOBODY
     ) -> None:
         """Keeps one line of a site's history."""
-        with self._ledger.write() as connection:
-            self._ledger.log(connection, site, kind, detail, version=version, actor=actor)
+        with self._transactions.write() as connection:
+            self._transactions.log(connection, site, LogEntry(kind, detail, version, actor))
 
     def begin_job(self, site: str, kind: str) -> int:
         """The number of a new running job."""
-        with self._ledger.write() as connection:
+        with self._transactions.write() as connection:
             done = connection.execute(
                 "INSERT INTO jobs (site, kind, state, started, message, report) VALUES (?, ?, 'running', ?, '', '{}')",
                 (check_name(site, "site"), kind, self._now()),
@@ -208,7 +223,7 @@ class StoreQueries:
     def update_job(self, job: int, state: str, message: str, report: dict[str, Any]) -> None:
         """Keeps how a job goes on, or ended (state done or failed)."""
         assert state in JOB_STATES
-        with self._ledger.write() as connection:
+        with self._transactions.write() as connection:
             connection.execute(
                 "UPDATE jobs SET state = ?, finished = ?, message = ?, report = ? WHERE id = ?",
                 (state, None if state == "running" else self._now(), message, json.dumps(report), job),
@@ -216,12 +231,12 @@ class StoreQueries:
 
     def _check_site(self, site: str) -> None:
         check_name(site, "site")
-        if not self._ledger.query("SELECT 1 FROM sites WHERE site = ?", (site,)):
+        if not self._transactions.query("SELECT 1 FROM sites WHERE site = ?", (site,)):
             known = ", ".join(info.site for info in self.sites()) or "none"
             raise UsageError(f"the store has no site {site}; it has: {known}")
 
     def _current_row(self, site: str) -> VersionInfo | None:
-        rows = self._ledger.query("SELECT * FROM versions WHERE site = ? AND state = 'current'", (site,))
+        rows = self._transactions.query("SELECT * FROM versions WHERE site = ? AND state = 'current'", (site,))
         return VersionInfo(**rows[0]) if rows else None
 
     def _now(self) -> str:

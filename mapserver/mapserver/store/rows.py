@@ -1,16 +1,19 @@
-"""What the store tells about versions, robots and events."""
+"""Rows of the store: versions, verdicts, canaries, jobs, robots, failures, and what a release changes of them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
-from fleetmap.mapformat import CameraEntry, RecordingEntry
+from fleetmap.mapformat import CameraEntry, RecordingEntry, Tile
+from fleetmap.messages import FailureReport
+from mapserver.quality.figures import Evidence
 
 
 @dataclass(frozen=True, slots=True)
 class VersionInfo:
-    """One version of a site. state: draft, published, current or retired."""
+    """One version of a site. state: draft, published, current or retired; job: the job that saved it, if it is known."""
 
     site: str
     version: int
@@ -28,6 +31,7 @@ class VersionInfo:
     archive_sha256: str | None
     saved_ns: int
     retired_ns: int | None
+    job: int | None = None
 
     @property
     def map_bytes(self) -> int:
@@ -116,3 +120,182 @@ class DraftDetails(msgspec.Struct, frozen=True, kw_only=True):
     configuration: dict[str, Any]
     libraries: dict[str, str]
     report: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DraftContent:
+    """A new draft. archive: the whole survey; evidence: what the gate judges it by; job: the number of the job that made it."""
+
+    tiles: Sequence[Tile]
+    vocabulary: bytes
+    details: DraftDetails
+    archive: bytes | None = None
+    evidence: Evidence | None = None
+    job: int | None = None
+
+
+AXES = ("site", "robot", "version", "tile", "cause", "arm")
+"""What the sums are kept by, each for itself: never robot and tile together, so that they stay small."""
+
+
+@dataclass(frozen=True, slots=True)
+class FailureRow:
+    """One failure. happened_ns: when it began, by the server's clock; tile: "x,y"; kind `suspected`: an estimate."""
+
+    number: int
+    site: str
+    robot: str
+    failure_id: str
+    received_ns: int
+    happened_ns: int
+    duration_s: float
+    kind: str
+    cause: str
+    status: str
+    version: int | None
+    tile: str | None
+    x_map_m: float | None
+    y_map_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class PictureRow:
+    """A picture of a failure: its place among them, kind (`frame`, `matches`) and bytes."""
+
+    place: int
+    kind: str
+    stamp_ns: int
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class FailureDetail:
+    """A failure with its context. report: without pictures; pictures: those that are still kept."""
+
+    failure: FailureRow
+    report: FailureReport
+    pictures: list[PictureRow]
+
+
+@dataclass(frozen=True, slots=True)
+class FailureFilter:
+    """Which failures; None is any. since_ns, until_ns: by `happened_ns`."""
+
+    site: str | None = None
+    robot: str | None = None
+    version: int | None = None
+    tile: str | None = None
+    cause: str | None = None
+    kind: str | None = None
+    since_ns: int | None = None
+    until_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TraceRow:
+    """Where a robot was and what its estimate was worth, thinned; hour: since 1970, by the server's clock."""
+
+    site: str
+    robot: str
+    hour: int
+    stamp_ns: int
+    status: str
+    version: int | None
+    x_map_m: float | None
+    y_map_m: float | None
+    radius_95_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class CanaryRow:
+    """A version that some robots of a site try before the others. state: running, promoted, rolled_back or stopped.
+
+    threshold: robots whose number (`canary.number_of`) is below it take part. outcome: why it ended, empty while it runs.
+    """
+
+    id: int
+    site: str
+    version: int
+    base_version: int
+    share: float
+    threshold: float
+    state: str
+    started_ns: int
+    ended_ns: int | None
+    actor: str
+    reason: str
+    outcome: str
+
+
+@dataclass(frozen=True, slots=True)
+class SiteReleases:
+    """What releases of a site are decided by: its versions by number, and the canary that runs, if any.
+
+    rollback_target: the version that was current before, None where none was; rollback_row: its row in the record of what was
+    current.
+    """
+
+    site: str
+    versions: dict[int, VersionInfo]
+    rollback_target: int | None
+    rollback_row: int | None
+    canary: CanaryRow | None
+
+    @property
+    def current(self) -> VersionInfo | None:
+        """The current version, None before the first publication."""
+        return next((info for info in self.versions.values() if info.state == "current"), None)
+
+
+class LogEntry(NamedTuple):
+    """One line of a site's history that is to be written."""
+
+    kind: str
+    detail: str
+    version: int | None = None
+    actor: Actor = NOBODY
+
+
+class NewCanary(NamedTuple):
+    """A canary that begins."""
+
+    version: int
+    base_version: int
+    share: float
+    threshold: float
+    actor: Actor
+
+
+class CanaryEnd(NamedTuple):
+    """How the canary of this row ends: promoted, rolled_back or stopped, and why."""
+
+    id: int
+    state: str
+    outcome: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReleaseChanges:
+    """Rows that one decision changes, all in one transaction.
+
+    states: versions and their new states, in this order: a site never has two current versions. new_current: is appended to the
+    record of what was current; drop_currents_after: rows of that record behind this one go.
+    """
+
+    states: tuple[tuple[int, str], ...] = ()
+    new_current: int | None = None
+    drop_currents_after: int | None = None
+    new_canary: NewCanary | None = None
+    ended_canary: CanaryEnd | None = None
+    log: tuple[LogEntry, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class FleetRetention:
+    """What stays of the fleet's reports: sums and failures by age, pictures also by size, traces by age and count."""
+
+    tally_days: float = 400.0
+    failure_days: float = 400.0
+    picture_bytes: int = 1_000_000_000
+    trace_days: float = 2.0
+    trace_rows: int = 3_000_000

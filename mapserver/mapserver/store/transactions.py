@@ -1,4 +1,4 @@
-"""The database of an open store: reading, write transactions, the log of who did what. Used by the store's parts."""
+"""Reading, write transactions and the log of an open store's database."""
 
 import sqlite3
 import threading
@@ -9,7 +9,7 @@ from typing import Any
 
 from fleetmap.errors import StoreError
 from mapserver.store.database import open_database, open_reader, transaction
-from mapserver.store.rows import Actor
+from mapserver.store.rows import LogEntry
 
 
 class Transactions:
@@ -32,7 +32,7 @@ class Transactions:
             raise StoreError(f"the store {path} cannot be read ({error}); check its disk") from error
 
     def close(self) -> None:
-        """Closes the database; the ledger must not be used afterwards."""
+        """Closes the database; nothing here must be used afterwards."""
         with self._lock, self._reading:
             self._reader.close()
             self._database.close()  # the last one tidies up the write-ahead log
@@ -60,20 +60,10 @@ class Transactions:
         except sqlite3.Error as error:
             raise StoreError(f"the store {self._path} cannot be read ({error}); check its disk") from error
 
-    def log(
-        self,
-        connection: sqlite3.Connection,
-        site: str,
-        kind: str,
-        detail: str,
-        *,
-        version: int | None = None,
-        actor: Actor | None = None,
-    ) -> None:
+    def log(self, connection: sqlite3.Connection, site: str, entry: LogEntry) -> None:
         """One line of a site's history, within a transaction."""
-        who = actor or Actor()
         connection.execute(
             """INSERT INTO events (stamp_ns, site, kind, detail, version, actor, reason)
                VALUES (?, ?, ?, ?, ?, ?, ?)""",
-            (self.now_ns(), site, kind, detail, version, who.name, who.reason),
+            (self.now_ns(), site, entry.kind, entry.detail, entry.version, entry.actor.name, entry.actor.reason),
         )

@@ -8,10 +8,11 @@ from fleetmap.mapformat import Manifest, current_path, decode_manifest
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.rows import VersionInfo
 from mapserver.store.transactions import Transactions
+from mapserver.store.version_rows import references
 
 
 @dataclass(slots=True)
-class Findings:
+class StoreFindings:
     """What was found. faults: each a sentence, none in a sound store.
 
     orphans and leftovers are files that nothing mentions, as a killed process leaves them; `gc` removes them.
@@ -26,34 +27,34 @@ class Findings:
     faults: list[str] = field(default_factory=list)
 
 
-def verify(root: Path, ledger: Transactions, blobs: BlobFolder) -> Findings:
+def verify(root: Path, transactions: Transactions, blobs: BlobFolder) -> StoreFindings:
     """Reads everything in the store. Raises StoreError only where the database cannot be read at all."""
-    found = Findings()
-    found.faults += [f"database: {row['integrity_check']}" for row in _unless_ok(ledger)]
-    found.faults += [f"database: a row of {row['table']} refers to nothing" for row in ledger.query(_FOREIGN)]
-    sound = _check_blobs(ledger, blobs, found)
-    for row in ledger.query("SELECT * FROM versions ORDER BY site, version"):
+    found = StoreFindings()
+    found.faults += [f"database: {row['integrity_check']}" for row in _unless_ok(transactions)]
+    found.faults += [f"database: a row of {row['table']} refers to nothing" for row in transactions.query(_FOREIGN)]
+    sound = _check_blobs(transactions, blobs, found)
+    for row in transactions.query("SELECT * FROM versions ORDER BY site, version"):
         found.versions += 1
-        _check_version(ledger, blobs, VersionInfo(**row), sound, found)
-    for row in ledger.query("SELECT * FROM sites ORDER BY site"):
+        _check_version(transactions, blobs, VersionInfo(**row), sound, found)
+    for row in transactions.query("SELECT * FROM sites ORDER BY site"):
         found.sites += 1
-        _check_site(root, ledger, row["site"], row["last_version"], row["vocabulary_sha256"], sound, found)
+        _check_site(root, transactions, row["site"], row["last_version"], row["vocabulary_sha256"], sound, found)
     return found
 
 
 _FOREIGN = "PRAGMA foreign_key_check"
 
 
-def _unless_ok(ledger: Transactions) -> list[dict[str, str]]:
-    return [row for row in ledger.query("PRAGMA integrity_check") if row["integrity_check"] != "ok"]
+def _unless_ok(transactions: Transactions) -> list[dict[str, str]]:
+    return [row for row in transactions.query("PRAGMA integrity_check") if row["integrity_check"] != "ok"]
 
 
-def _check_blobs(ledger: Transactions, blobs: BlobFolder, found: Findings) -> set[str]:
+def _check_blobs(transactions: Transactions, blobs: BlobFolder, found: StoreFindings) -> set[str]:
     """The addresses whose bytes are whole."""
-    mentioned = {row["sha256"] for row in ledger.query("SELECT DISTINCT sha256 FROM version_blobs")}
+    mentioned = {row["sha256"] for row in transactions.query("SELECT DISTINCT sha256 FROM version_blobs")}
     mentioned |= {
         row["vocabulary_sha256"]
-        for row in ledger.query("SELECT vocabulary_sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL")
+        for row in transactions.query("SELECT vocabulary_sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL")
     }
     present = blobs.addresses()
     found.orphans = len(present - mentioned)
@@ -67,7 +68,7 @@ def _check_blobs(ledger: Transactions, blobs: BlobFolder, found: Findings) -> se
 
 
 def _check_version(
-    ledger: Transactions, blobs: BlobFolder, info: VersionInfo, sound: set[str], found: Findings
+    transactions: Transactions, blobs: BlobFolder, info: VersionInfo, sound: set[str], found: StoreFindings
 ) -> None:
     name = f"version {info.version} of {info.site}"
     if info.manifest_sha256 not in sound:
@@ -77,7 +78,7 @@ def _check_version(
     except FleetmapError as error:
         found.faults.append(f"{name}: {error}")
         return
-    rows = ledger.query(
+    rows = transactions.query(
         "SELECT kind, sha256 FROM version_blobs WHERE site = ? AND version = ?", (info.site, info.version)
     )
     if {(row["kind"], row["sha256"]) for row in rows} != references(info, manifest):
@@ -87,13 +88,6 @@ def _check_version(
     for tile in manifest.tiles:
         if tile.sha256 in sound and blobs.path(tile.sha256).stat().st_size != tile.bytes:
             found.faults.append(f"{name}: tile {tile.x},{tile.y} has another size than its manifest says")
-
-
-def references(info: VersionInfo, manifest: Manifest) -> set[tuple[str, str]]:
-    """Kind and address of everything that belongs to a version."""
-    wanted = {("manifest", info.manifest_sha256), ("vocabulary", manifest.vocabulary.sha256)}
-    wanted |= {("tile", tile.sha256) for tile in manifest.tiles}
-    return wanted | ({("archive", info.archive_sha256)} if info.archive_sha256 is not None else set())
 
 
 def _figures(info: VersionInfo) -> tuple[object, ...]:
@@ -109,18 +103,18 @@ def _figures_of(manifest: Manifest) -> tuple[object, ...]:
 
 def _check_site(
     root: Path,
-    ledger: Transactions,
+    transactions: Transactions,
     site: str,
     last_version: int,
     vocabulary: str | None,
     sound: set[str],
-    found: Findings,
+    found: StoreFindings,
 ) -> None:
-    versions = {v["version"]: v for v in ledger.query("SELECT * FROM versions WHERE site = ?", (site,))}
+    versions = {v["version"]: v for v in transactions.query("SELECT * FROM versions WHERE site = ?", (site,))}
     if versions and max(versions) > last_version:
         found.faults.append(f"site {site}: version {max(versions)} is beyond the last number {last_version}")
     current = [number for number, row in versions.items() if row["state"] == "current"]
-    newest = ledger.query("SELECT version FROM currents WHERE site = ? ORDER BY id DESC LIMIT 1", (site,))
+    newest = transactions.query("SELECT version FROM currents WHERE site = ? ORDER BY id DESC LIMIT 1", (site,))
     if [row["version"] for row in newest] != current:
         found.faults.append(f"site {site}: current is {current}, the record of what was current ends with {newest}")
     if current and vocabulary != versions[current[0]]["vocabulary_sha256"]:

@@ -30,11 +30,12 @@ from fleetsim.estimator.simulated_run import EstimatorSession
 from fleetsim.recorder import Order, prepare
 from locclient.localization.estimate import Estimate
 from locclient.robot.health_report import FixFigures
+from mapserver import releases
 from mapserver.fleet.canary_controller import review
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.canary_test import CanarySettings, number_of
 from mapserver.serving.bus_service import BusService
-from mapserver.store import MapStore
+from mapserver.store import DraftContent, MapStore
 from support.storage.map_samples import draft_details
 
 SITE, SHIFT_M, AISLE_Y_M = "hall", np.array([0.5, 0.0, 0.0]), 3.8
@@ -89,8 +90,10 @@ def publish(folder: Path, clock: dict[str, int]) -> MapStore:
     from support.storage.map_samples import random_tile
 
     for _ in range(2):
-        store.save_draft(SITE, tiles=[random_tile(rng)], vocabulary=b"words" * 50, details=draft_details(path_m=40.0))
-    store.publish(SITE, 1)
+        store.save_draft(
+            SITE, DraftContent(tiles=[random_tile(rng)], vocabulary=b"words" * 50, details=draft_details(path_m=40.0))
+        )
+    releases.publish(store, SITE, 1)
     return store
 
 
@@ -113,7 +116,7 @@ def bench(robots: int, share: float) -> dict[str, Any]:
         service.announce_changes()
         _drive(fleet, names, told, series, clock, 120)
         begun_ns = clock["ns"]
-        canary = store.start_canary(SITE, 2, share)
+        canary = releases.start_canary(store, SITE, 2, share)
         members = {robot for robot in names if number_of(SITE, 2, robot) < canary.threshold}
         service.announce_changes()
         findings = []

@@ -30,8 +30,9 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from benchmarks.fleet.bench_service import _SOURCES, _cpu_s, _rss_mb, serving
 from benchmarks.fleet.fleet_clients import SITE, TILES
+from mapserver import releases
 from mapserver.fleet_statistics.kpis import TALLY_COLUMNS, Tally
-from mapserver.store import FailureFilter, FleetBatch, MapStore
+from mapserver.store import DraftContent, FailureFilter, FleetBatch, MapStore
 from support.storage.map_samples import draft_details, random_tile
 
 _PAGES = (
@@ -50,8 +51,8 @@ def make_site(folder: Path) -> None:
     rng = np.random.default_rng(0)
     tiles = [random_tile(rng, cell=(x, 0)) for x in range(TILES)]
     with MapStore.open(folder, create=True) as store:
-        store.save_draft(SITE, tiles=tiles, vocabulary=b"words" * 50, details=draft_details(path_m=100.0))
-        store.publish(SITE)
+        store.save_draft(SITE, DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(path_m=100.0)))
+        releases.publish(store, SITE)
 
 
 class Robots:

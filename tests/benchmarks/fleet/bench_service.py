@@ -33,7 +33,8 @@ from fleetmap.mapformat import Tile
 from fleetmap.messages import robot_key
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
-from mapserver.store import MapStore
+from mapserver import releases
+from mapserver.store import DraftContent, MapStore
 from support.storage.map_samples import draft_details, random_tile
 
 _TILE_LANDMARKS = 5000
@@ -77,8 +78,10 @@ def make_site(folder: Path, site_mb: float) -> int:
 def publish(folder: Path, tiles: list[Tile]) -> None:
     """Makes a version of these current, as another process than the server."""
     with MapStore.open(folder, create=True) as store:
-        store.save_draft(SITE, tiles=tiles, vocabulary=bytes(range(256)) * 4000, details=draft_details(path_m=1000.0))
-        store.publish(SITE)
+        store.save_draft(
+            SITE, DraftContent(tiles=tiles, vocabulary=bytes(range(256)) * 4000, details=draft_details(path_m=1000.0))
+        )
+        releases.publish(store, SITE)
 
 
 def next_night(folder: Path) -> list[Tile]:
@@ -273,8 +276,10 @@ def republish(store: MapStore) -> None:
     current = store.current(SITE)
     assert current is not None
     tiles = [decode_tile(store.blob(entry.sha256)) for entry in store.manifest(SITE, current.version).tiles]
-    store.save_draft(SITE, tiles=tiles, vocabulary=bytes(range(256)) * 4000, details=draft_details(path_m=1000.0))
-    store.publish(SITE)
+    store.save_draft(
+        SITE, DraftContent(tiles=tiles, vocabulary=bytes(range(256)) * 4000, details=draft_details(path_m=1000.0))
+    )
+    releases.publish(store, SITE)
 
 
 def measure_outage(folder: Path, cache_folder: Path, outage_s: float) -> dict[str, float]:

@@ -61,7 +61,8 @@ def large_site(work: Path, megabytes: float) -> Path:
     import msgspec
 
     from fleetmap.mapformat import encode_tile
-    from mapserver.store import MapStore
+    from mapserver import releases
+    from mapserver.store import DraftContent, MapStore
     from mapserver.store.rows import DraftDetails
 
     folder = work / f"large-{megabytes:g}"
@@ -92,8 +93,10 @@ def large_site(work: Path, megabytes: float) -> Path:
         report=msgspec.to_builtins(manifest.report),
     )  # fmt: skip
     with MapStore.open(folder, create=True) as store:
-        store.save_draft(SITE, tiles=tiles, vocabulary=source.vocabulary(manifest), details=details, archive=b"none")
-        store.publish(SITE)
+        store.save_draft(
+            SITE, DraftContent(tiles=tiles, vocabulary=source.vocabulary(manifest), details=details, archive=b"none")
+        )
+        releases.publish(store, SITE)
     (folder / "built").touch()
     return folder
 

@@ -7,6 +7,7 @@ import pytest
 
 from locclient import cli
 from locclient.daemon.preflight import _clock
+from mapserver import releases
 from mapserver.store import MapStore
 from support.recordings.recording_samples import make_sample, write_euroc
 from support.storage.map_samples import save_sample_draft
@@ -28,7 +29,7 @@ def config(tmp_path: Path) -> Path:
     write_euroc(tmp_path / "walk", make_sample(12))
     with MapStore.open(tmp_path / "store", create=True) as maps:
         save_sample_draft(maps)
-        maps.publish("lab")
+        releases.publish(maps, "lab")
     path = tmp_path / "robot.toml"
     path.write_text(
         f'[run]\nstore = "{tmp_path}/store"\nsite = "lab"\nrobot = "r1"\nspool = "{tmp_path}/spool"\n'

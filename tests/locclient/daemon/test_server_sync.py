@@ -23,6 +23,7 @@ from locclient.daemon.server_sync import ServerSync
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from locclient.robot.robot import Change, VersionChange
+from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
@@ -66,7 +67,7 @@ class World:
 
     def publish(self, seed: int) -> int:
         number = save_sample_draft(self.store, seed=seed)
-        self.store.publish("lab")
+        releases.publish(self.store, "lab")
         return number
 
 
@@ -75,7 +76,7 @@ def world(tmp_path: Path) -> Iterator[World]:
     hub, clock = MemoryHub(), {"s": 1000.0}
     with MapStore.open(tmp_path / "store", create=True) as store, MemoryBus(hub) as bus, MemoryBus(hub) as robot_bus:
         save_sample_draft(store)
-        store.publish("lab")
+        releases.publish(store, "lab")
         fleet = Fleet(store)
         made_late: list[World] = []
 
@@ -180,7 +181,7 @@ def test_a_manifest_of_another_site_is_refused(world: World) -> None:
     world.step()
     adopt(world)
     save_sample_draft(world.store, site="elsewhere", seed=3)
-    world.store.publish("elsewhere")
+    releases.publish(world.store, "elsewhere")
     foreign = world.store.current("elsewhere")
     told = WantedVersion(site="lab", version=7, manifest_sha256=foreign.manifest_sha256)
     with MemoryBus(world.hub) as server:

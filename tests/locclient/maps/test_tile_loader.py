@@ -13,7 +13,8 @@ from locclient.maps.map_client import LocalMapSource
 from locclient.maps.tile_cache import StoreFolder
 from locclient.maps.tile_loader import TileLoader
 from locclient.maps.tile_selection import Place, PositionBound, WindowSettings
-from mapserver.store import MapStore
+from mapserver import releases
+from mapserver.store import DraftContent, MapStore
 from support.fleet.estimates import estimate
 from support.storage.map_samples import draft_details, random_tile
 from support.worlds.robot_world import vocabulary
@@ -28,8 +29,10 @@ def row(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, MapSto
     rng = np.random.default_rng(0)
     with MapStore.open(folder, create=True) as store:
         tiles = [random_tile(rng, cell=(x, 0)) for x in range(10)]
-        store.save_draft("row", tiles=tiles, vocabulary=vocabulary(), details=draft_details(path_m=160.0), archive=b"a")
-        store.publish("row")
+        store.save_draft(
+            "row", DraftContent(tiles=tiles, vocabulary=vocabulary(), details=draft_details(path_m=160.0), archive=b"a")
+        )
+        releases.publish(store, "row")
         yield folder, store
 
 

@@ -9,6 +9,7 @@ import pytest
 from fleetmap.errors import UsageError
 from locclient import cli
 from locclient.replay.prior_option import parse_prior
+from mapserver import releases
 from mapserver.store import MapStore
 from support.recordings.recording_samples import make_sample, write_euroc
 from support.storage.map_samples import save_sample_draft
@@ -34,7 +35,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("store") / "store"
     with MapStore.open(folder, create=True) as maps:
         save_sample_draft(maps)
-        maps.publish("lab")
+        releases.publish(maps, "lab")
         save_sample_draft(maps, site="draft-only")
     return folder
 

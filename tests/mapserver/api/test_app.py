@@ -15,11 +15,12 @@ from prometheus_client.parser import text_string_to_metric_families
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.mapformat import TILE_FORMAT, blob_path, decode_manifest, decode_tile, sha256_hex
 from fleetmap.messages import FailureReport, RobotAck, RobotHealth, Thumbnail
+from mapserver import releases
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.api.writers import Writers
 from mapserver.fleet.fleet import Fleet
-from mapserver.store import MapStore
+from mapserver.store import DraftContent, MapStore
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
 
@@ -40,7 +41,7 @@ class Server:
 def server(tmp_path: Path) -> Iterator[Server]:
     with MapStore.open(tmp_path, create=True) as store, MemoryBus(MemoryHub()) as bus:
         save_sample_draft(store)
-        store.publish("lab")
+        releases.publish(store, "lab")
         save_sample_draft(store, seed=2)
         fleet = Fleet(store)
         app = create_app(store, fleet, Metrics(store, fleet), bus)
@@ -240,7 +241,9 @@ def test_an_operator_publishes_promotes_and_rolls_back(server: Server) -> None:
 
 def test_a_refused_draft_stays_with_its_reasons_and_can_be_forced(server: Server) -> None:
     thin = random_tile(np.random.default_rng(5), landmarks=10, cell=(0, 0))
-    server.store.save_draft("lab", tiles=[thin], vocabulary=b"words" * 50, details=draft_details(path_m=9.0))
+    server.store.save_draft(
+        "lab", DraftContent(tiles=[thin], vocabulary=b"words" * 50, details=draft_details(path_m=9.0))
+    )
     url = "/v1/sites/lab/versions/3"
     check_problem(server.client.post(f"{url}/publish", json=ADA), 409, "landmarks_share")
     quality = server.client.get(f"{url}/quality").json()

@@ -12,6 +12,7 @@ from schemathesis.specs.openapi.checks import (
 )
 
 from fleetmap.messages import FailureReport, Placement, Thumbnail
+from mapserver import releases
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
@@ -53,13 +54,13 @@ def test_no_question_breaks_the_server(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         for seed in range(2):
             save_sample_draft(store, site="hall", seed=seed)
-            store.publish("hall")
+            releases.publish(store, "hall")
         save_sample_draft(store, site="hall", seed=2)
         store.update_job(store.begin_job("hall", "nightly"), "done", "version 2 is published", {})
         fleet = Fleet(store)
         assert not fleet.take_failure("hall", "r1", FAILURE).refused
-        store.start_canary("hall", 1, 0.05)
-        store.rollback("hall")
+        releases.start_canary(store, "hall", 1, 0.05)
+        releases.roll_back(store, "hall")
         app = create_app(store, fleet, Metrics(store, fleet), None)
         schema = schemathesis.openapi.from_asgi("/openapi.json", app)
         asked = {operation.ok().label: ask_operation(operation.ok()) for operation in schema.get_all_operations()}

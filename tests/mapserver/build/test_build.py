@@ -16,6 +16,7 @@ from fleetmap.bow.shipped_vocabulary import DEFAULT_VOCABULARY_SHA256, default_v
 from fleetmap.errors import FleetmapError, RecordingError, StoreError, UsageError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import decode_tile
+from mapserver import releases
 from mapserver.cli import app
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
@@ -183,7 +184,7 @@ def test_a_site_keeps_its_vocabulary_whatever_is_surveyed(euroc: Path, done: Pat
         assert maps.manifest("lab", 1).vocabulary.sha256 == given
         assert maps.manifest("lab", 2).tiles != maps.manifest("lab", 1).tiles
         assert shipped.manifest("lab", 1).vocabulary.sha256 == DEFAULT_VOCABULARY_SHA256
-        maps.publish("lab", 2)
+        releases.publish(maps, "lab", 2)
     (tmp_path / "shipped.fmvb").write_bytes(default_vocabulary_bytes())
     assert "has published" in str(refused(*lab, "--vocabulary", tmp_path / "shipped.fmvb"))
 

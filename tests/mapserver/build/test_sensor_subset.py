@@ -9,10 +9,11 @@ from typer.testing import CliRunner
 from fleetmap.errors import GateRefusedError, RecordingError, SurveyError, UsageError
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.samples import SensorSet
+from mapserver import releases
 from mapserver.build.sensor_subset import REDUCTIONS, named_sensor_set, reduced, sensor_set_of
 from mapserver.cli import app
 from mapserver.config import survey_settings
-from mapserver.store import MapStore
+from mapserver.store import DraftContent, MapStore
 from mapserver.survey.settings import SurveySettings
 from support.recordings.recording_samples import make_sample, write_euroc
 from support.storage.map_samples import draft_details, random_tile
@@ -69,7 +70,9 @@ def test_the_gate_refuses_a_map_without_metres(tmp_path: Path) -> None:
     tiles = [random_tile(np.random.default_rng(1))]
     with MapStore.open(tmp_path / "store", create=True) as maps:
         for scale in ("unknown", "metric"):
-            maps.save_draft("lab", tiles=tiles, vocabulary=b"words" * 50, details=draft_details(scale=scale))
+            maps.save_draft(
+                "lab", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(scale=scale))
+            )
         with pytest.raises(GateRefusedError, match="has a scale of its own"):
-            maps.publish("lab", 1)
-        assert maps.publish("lab", 2) == 2
+            releases.publish(maps, "lab", 1)
+        assert releases.publish(maps, "lab", 2) == 2

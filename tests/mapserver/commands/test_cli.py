@@ -18,7 +18,7 @@ from mapserver import cli
 from mapserver.commands.fleet import fleet_app
 from mapserver.config import MapserverConfig, command_defaults, read_config
 from mapserver.quality.figures import Evidence, TileDirections
-from mapserver.store import MapStore
+from mapserver.store import DraftContent, MapStore
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -50,7 +50,7 @@ def test_the_command_line_imports_nothing_heavy(package: str) -> None:
 def test_exit_statuses(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with MapStore.open(tmp_path / "store", create=True) as maps:
         save_sample_draft(maps)
-        maps.save_draft("empty", tiles=[], vocabulary=b"w", details=draft_details())
+        maps.save_draft("empty", DraftContent(tiles=[], vocabulary=b"w", details=draft_details()))
     to_store = ("--store", tmp_path / "store")
     assert status(monkeypatch, "versions", "--site", "lab", *to_store) == 0
     assert status(monkeypatch, "--help") == 0
@@ -74,7 +74,8 @@ def test_publishing_says_which_way_nobody_drove(
         tiles = [random_tile(np.random.default_rng(0), cell=(3, -1))]
         seen = Evidence(directions=[TileDirections((3, -1), {"E": 12}, {"W": 12})])
         maps.save_draft(
-            "lab", tiles=tiles, vocabulary=b"words", details=draft_details(), archive=b"archive", evidence=seen
+            "lab",
+            DraftContent(tiles=tiles, vocabulary=b"words", details=draft_details(), archive=b"archive", evidence=seen),
         )
     assert status(monkeypatch, "publish", "--site", "lab", "--store", tmp_path / "store") == 0
     assert "tile 3,-1: 12 places face E and none near them W" in capsys.readouterr().out

@@ -21,12 +21,12 @@ from fleetmap.errors import GateRefusedError, StoreError, UnreachableError, Usag
 from fleetmap.messages import RobotHealth, WantedVersion
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
-from mapserver import cli
+from mapserver import cli, releases
 from mapserver.commands.releases.inspect import inspect
 from mapserver.commands.releases.publish import publish
 from mapserver.commands.releases.versions import versions
 from mapserver.commands.serve import serve
-from mapserver.store import MapStore
+from mapserver.store import DraftContent, MapStore
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
 PROGRAM = "import sys, typer; from mapserver.commands.serve import serve; typer.run(serve)"
@@ -55,7 +55,7 @@ def serving(store: Path, endpoint: str = "tcp/127.0.0.1:0") -> Iterator[tuple[su
 def test_a_robot_gets_its_map_and_is_seen(tmp_path: Path, number: signal.Signals) -> None:
     with MapStore.open(tmp_path / "store", create=True) as store:
         save_sample_draft(store)
-        store.publish("lab")
+        releases.publish(store, "lab")
     with serving(tmp_path / "store") as (process, http, zenoh), ZenohBus.connect(zenoh) as bus:
         link = MapClient(bus, TileCache(tmp_path / "cache"), "lab", "r1")
         heard: list[WantedVersion] = []
@@ -74,7 +74,7 @@ def test_a_robot_gets_its_map_and_is_seen(tmp_path: Path, number: signal.Signals
         # Another process publishes while the server runs.
         with MapStore.open(tmp_path / "store") as store:
             save_sample_draft(store, seed=5)
-            store.publish("lab")
+            releases.publish(store, "lab")
         while time.monotonic() < deadline and not any(wanted.version == 2 for wanted in heard):
             time.sleep(0.02)
         assert any(wanted.version == 2 for wanted in heard)
@@ -87,8 +87,8 @@ def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path
     rng = np.random.default_rng(0)
     with MapStore.open(tmp_path / "store", create=True) as store:
         tiles = [random_tile(rng, landmarks=5000, cell=(x, 0)) for x in range(6)]
-        store.save_draft("lab", tiles=tiles, vocabulary=b"words", details=draft_details())
-        store.publish("lab")
+        store.save_draft("lab", DraftContent(tiles=tiles, vocabulary=b"words", details=draft_details()))
+        releases.publish(store, "lab")
     with ExitStack() as servers:
         process, _, zenoh = servers.enter_context(serving(tmp_path / "store"))
         bus = servers.enter_context(ZenohBus.connect(zenoh))
@@ -167,7 +167,7 @@ def test_publish_versions_and_inspect(tmp_path: Path) -> None:
 
 def test_an_empty_draft_ends_with_the_gates_status(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
-        store.save_draft("lab", tiles=[], vocabulary=b"v", details=draft_details())
+        store.save_draft("lab", DraftContent(tiles=[], vocabulary=b"v", details=draft_details()))
     with pytest.raises(GateRefusedError) as refusal:
         run(publish, "--site", "lab", "--store", str(tmp_path))
     assert refusal.value.exit_status == 4

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fleetmap.mapformat import blob_path
-from mapserver import cli
+from mapserver import cli, releases
 from mapserver.store import MapStore
 from support.storage.map_samples import save_sample_draft
 
@@ -67,7 +67,7 @@ def test_a_reason_is_asked_for(run, tmp_path: Path) -> None:
 def test_the_gate_takes_its_limits_from_the_file(run, tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "store", create=True) as store:
         save_sample_draft(store, seed=1)
-        store.publish("lab")
+        releases.publish(store, "lab")
         save_sample_draft(store, seed=2)
     strict = tmp_path / "strict.toml"
     strict.write_text("[gate]\nmin_landmarks_share = 1.5\n")

@@ -12,6 +12,7 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from fleetmap.bus import ZenohBus
 from fleetmap.messages import FailureAck, decode_message, encode_message, robot_key
+from mapserver import releases
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import (
     SITE,
@@ -310,7 +311,7 @@ def test_publish_promote_and_roll_back_ask_first(page: Page, tmp_path: Path) -> 
 
         # Somebody else acts: the page follows.
         with MapStore.open(served.folder) as store:
-            store.rollback(SITE)
+            releases.roll_back(store, SITE)
         expect(page.locator(".nicegui-content")).to_contain_text("Robots are to use version 2.", timeout=10_000)
 
 
@@ -326,14 +327,14 @@ def test_without_a_token_only_the_machine_itself_changes_something(page: Page, s
 
 def test_a_version_taken_back_by_the_server_is_told_with_its_reason(page: Page, served: Served) -> None:
     with MapStore.open(served.folder) as store:
-        canary = store.start_canary(SITE, 1, 0.05)
+        canary = releases.start_canary(store, SITE, 1, 0.05)
         seen = opened(page, served, "map")
         expect(page.locator(".nicegui-content")).to_contain_text("Version 1 is tried by 5.0 % of them")
         expect(page.get_by_role("button", name="Stop trying version 1")).to_be_visible()
         expect(page.get_by_role("button", name="Roll back")).to_have_count(0)
         opened(page, served, "")
         expect(page.locator(".notice")).to_contain_text("Version 1 is tried by 5.0 % of the robots")
-        store.end_canary(canary, promote=False, outcome="it fails more often than the margin allows")
+        releases.end_canary(store, canary, promote=False, outcome="it fails more often than the margin allows")
     expect(page.locator(".notice")).to_contain_text("taken back", timeout=10_000)
     expect(page.locator(".notice")).to_contain_text("it fails more often than the margin allows")
     assert seen.faults == []

@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from typer.testing import CliRunner
 
 from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
+from mapserver import releases
 from mapserver.cli import app
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.shift_page import html_page
@@ -32,7 +33,7 @@ def run_made_site(folder: Path, *, start_ns: int, seconds: int = 200, cause: str
     with MapStore.open(folder, create=True, clock_ns=lambda: clock["ns"]) as store:
         for seed in (1, 2):
             save_sample_draft(store, site="hall", seed=seed)
-        store.publish("hall", 1)
+        releases.publish(store, "hall", 1)
         fleet = Fleet(store, clock_ns=lambda: clock["ns"])
         rng = np.random.default_rng(1)
         robots = [
@@ -48,7 +49,7 @@ def run_made_site(folder: Path, *, start_ns: int, seconds: int = 200, cause: str
             elif isinstance(message, FailureReport):
                 fleet.take_failure("hall", robot.name, message)
         fleet.flush()
-        store.start_canary("hall", 2, 0.3)
+        releases.start_canary(store, "hall", 2, 0.3)
     return known
 
 
@@ -138,7 +139,7 @@ def test_a_file_sets_options_of_grouped_commands(folder: tuple[Path, Known], tmp
 def test_a_canary_from_the_command_line(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         save_sample_draft(store)
-        store.publish("lab")
+        releases.publish(store, "lab")
         save_sample_draft(store, seed=3)
     done = CliRunner().invoke(
         app, ["promote", "2", "--site", "lab", "--store", str(tmp_path), "--canary", "5%", "--reason", "new racks"]

@@ -11,6 +11,7 @@ import pytest
 
 from fleetmap.errors import LinkError, StoreError
 from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
+from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Tally, measures
@@ -49,7 +50,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
     clock = {"ns": START_NS}
     with MapStore.open(tmp_path, create=True, clock_ns=lambda: clock["ns"]) as store:
         save_sample_draft(store)
-        store.publish("lab")
+        releases.publish(store, "lab")
         fleet = Fleet(store, clock_ns=lambda: clock["ns"])
         yield Site(store, fleet, lambda ns: clock.update(ns=ns))
 

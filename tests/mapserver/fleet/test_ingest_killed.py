@@ -11,6 +11,7 @@ from pathlib import Path
 from fleetmap.bus import ZenohBus
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import FailureAck, FailureReport, Thumbnail, decode_message, encode_message, robot_key
+from mapserver import releases
 from mapserver.store import FailureFilter, MapStore
 from support.storage.map_samples import save_sample_draft
 
@@ -64,7 +65,7 @@ class Robot(threading.Thread):
 def test_nothing_acknowledged_is_lost_and_nothing_is_counted_twice(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         save_sample_draft(store)
-        store.publish("lab")
+        releases.publish(store, "lab")
     acknowledged: set[tuple[str, str]] = set()
     process, endpoint = serve(tmp_path, "tcp/127.0.0.1:0")
     robots = [Robot(endpoint, f"r{n}", acknowledged) for n in range(ROBOTS)]

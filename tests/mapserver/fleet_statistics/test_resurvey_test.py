@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapserver import releases
 from mapserver.fleet.resurvey_list import resurvey_list
 from mapserver.fleet_statistics.kpis import HOUR_NS, Tally
 from mapserver.fleet_statistics.resurvey_test import (
@@ -89,7 +90,7 @@ def test_a_store_leads_to_where_the_survey_stood(tmp_path: Path) -> None:
         batch.add("lab", "tile", "0,0", 489_990, tally(0, 30.0))
         store.fleet.add(batch)
         assert resurvey_list(store, "lab", SETTINGS, now_ns).route == []  # nothing is published yet
-        store.publish("lab")
+        releases.publish(store, "lab")
         found = resurvey_list(store, "lab", SETTINGS, now_ns)
         assert [concern.tile for concern in found.tiles] == ["1,0"]
         assert found.tiles[0].failures_before.events == 2

@@ -25,13 +25,13 @@ from fleetmap.errors import (
 )
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import open_recording
-from mapserver import cli
+from mapserver import cli, releases
 from mapserver.build.build import BuildRequest, Draft
 from mapserver.build.survey_recordings import admit_recordings
 from mapserver.nightly import NightRequest, last_report, night, run_night
 from mapserver.nightly.inbox import arrivals
 from mapserver.quality.gate import GateSettings
-from mapserver.store import MapStore
+from mapserver.store import DraftContent, MapStore
 from mapserver.survey.settings import SurveySettings
 from support.recordings.recording_samples import make_sample, write_euroc
 from support.storage.faulty_disk import Disk, install
@@ -68,7 +68,11 @@ def built(order: BuildRequest, _: SurveySettings, unusable: dict[Path, str], *, 
     )
     tile = random_tile(np.random.default_rng(len(entries)), landmarks=landmarks, places=2)
     with MapStore.open(order.store) as maps:
-        version = maps.save_draft(order.site, tiles=[tile], vocabulary=b"words", details=details, actor=order.actor)
+        version = maps.save_draft(
+            order.site,
+            DraftContent(tiles=[tile], vocabulary=b"words", details=details, job=order.job),
+            actor=order.actor,
+        )
     return Draft(version, f"draft {version}", {"keyframes": 2}, left_out)
 
 
@@ -290,7 +294,7 @@ def test_a_draft_that_a_killed_night_left_is_published_without_building_again(
         raise KilledError
 
     with monkeypatch.context() as patch:
-        patch.setattr(MapStore, "publish", killed)
+        patch.setattr(releases, "publish", killed)
         with pytest.raises(KilledError):
             spend(hall)
     monkeypatch.setattr(night, "build_draft", lambda *_: pytest.fail("built again"))

@@ -8,6 +8,7 @@ import pytest
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import StoreError
 from fleetmap.messages import FailureReport, RobotHealth
+from mapserver import releases
 from mapserver.config import MapserverConfig
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
@@ -59,11 +60,11 @@ def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path) -> None:
     )
     with MapStore.open(tmp_path, create=True) as store, MemoryBus(MemoryHub()) as bus:
         save_sample_draft(store)
-        store.publish("lab")
+        releases.publish(store, "lab")
         save_sample_draft(store, seed=3)
         fleet = Fleet(store, settings=settings.ingest)
         service = BusService(store, fleet, bus, lambda *_: None)
-        store.start_canary("lab", 2, 0.1)
+        releases.start_canary(store, "lab", 2, 0.1)
         for robot, version in (("r1", 2), ("r2", 1), ("r3", 1)):
             for second in range(40):
                 health = RobotHealth(

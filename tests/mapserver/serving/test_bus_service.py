@@ -29,10 +29,11 @@ from fleetmap.messages import (
 )
 from locclient.maps.map_client import LocalMapSource, MapClient
 from locclient.maps.tile_cache import StoreFolder, TileCache
+from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving import bus_service
 from mapserver.serving.bus_service import BusService
-from mapserver.store import FailureFilter, MapStore
+from mapserver.store import DraftContent, FailureFilter, MapStore
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
 TILE_COLUMNS = (
@@ -55,8 +56,10 @@ class World:
 
     def publish(self, tiles: list[Tile]) -> WantedVersion:
         """Another version of site hall, which has none at first."""
-        self.store.save_draft("hall", tiles=tiles, vocabulary=b"words" * 50, details=draft_details(path_m=12.5))
-        self.store.publish("hall")
+        self.store.save_draft(
+            "hall", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(path_m=12.5))
+        )
+        releases.publish(self.store, "hall")
         return self.hall.wanted()
 
     def current_tiles(self) -> list[Tile]:
@@ -74,7 +77,7 @@ def world(tmp_path: Path) -> Iterator[World]:
     counts: list[tuple[str, str, int]] = []
     with MapStore.open(tmp_path / "store", create=True, clock_ns=lambda: clock["ns"]) as store, MemoryBus(hub) as bus:
         save_sample_draft(store)
-        store.publish("lab")
+        releases.publish(store, "lab")
         fleet = Fleet(store, clock_ns=lambda: clock["ns"])
         service = BusService(store, fleet, bus, lambda *event: counts.append(event))
         with MemoryBus(hub) as robot_bus:
@@ -208,7 +211,7 @@ def test_new_versions_are_announced_to_known_robots(world: World) -> None:
     assert world.service.announce_changes() == []
     with MapStore.open(world.folder) as other_process:
         save_sample_draft(other_process, seed=9)
-        other_process.publish("lab")
+        releases.publish(other_process, "lab")
     assert world.service.announce_changes() == ["lab"]
     assert [message.version for message in heard] == [1, 2]
     assert world.link.manifest(heard[-1]).version == 2

@@ -11,10 +11,12 @@ import pytest
 
 from fleetmap.errors import NewerFormatError
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_manifest, decode_tile, encode_manifest, pack
+from mapserver import releases
 from mapserver.store import Actor, FailureFilter, MapStore
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
 from mapserver.store.export_import import EXPORT_FORMAT
 from mapserver.store.migrations import MIGRATIONS
+from support.storage.map_samples import save_sample_draft
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 
@@ -70,7 +72,7 @@ def test_exports(tmp_path: Path) -> None:
         info = store.import_version(GOLDEN / "version-1.fmex", actor=Actor("ada"))
         assert (info.site, info.version, info.state, info.tiles) == ("lab", 1, "draft", 2)
         assert store.archive("lab", 1) == b"archive 1"
-        assert store.publish("lab") == 1
+        assert releases.publish(store, "lab") == 1
         assert store.verify().faults == []
 
 
@@ -84,9 +86,9 @@ def test_databases_of_every_format_open_whole(tmp_path: Path, number: int) -> No
         states = [info.state for info in store.versions("lab")]
         assert states == (["published", "current", "draft"] if number == 1 else ["current", "retired", "draft"])
         if number == 1:
-            assert store.rollback("lab") == 1
-        assert store.publish("lab") == 3
-        assert store.rollback("lab") == 1
+            assert releases.roll_back(store, "lab") == 1
+        assert releases.publish(store, "lab") == 3
+        assert releases.roll_back(store, "lab") == 1
         assert store.verify().faults == []
         if number >= 2:
             assert [job.state for job in store.jobs()] == ["done"]
@@ -97,6 +99,18 @@ def test_databases_of_every_format_open_whole(tmp_path: Path, number: int) -> No
             (failure,) = store.fleet.failures(FailureFilter())
             assert (failure.failure_id, store.fleet.picture(failure.number, 0)) == ("f1", b"jpeg")
             assert store.fleet.tallies("lab", "cause", key="dark")["lab", "dark"].failures == 1
+
+
+def test_a_draft_of_an_older_store_is_known_by_the_job_that_its_log_names(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        save_sample_draft(store, actor=Actor("nightly", "nightly job 17"))
+        save_sample_draft(store, actor=Actor("ada", "nightly job 18 was lost"))
+    connection = sqlite3.connect(tmp_path / "store.sqlite3")
+    connection.execute("ALTER TABLE versions DROP COLUMN job")
+    connection.execute("PRAGMA user_version = 4")
+    connection.close()
+    with MapStore.open(tmp_path) as store:
+        assert [info.job for info in store.versions("lab")] == [17, None]
 
 
 def test_newer_formats_are_refused_by_number(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ import pytest
 
 from fleetmap.errors import GateRefusedError, MapFormatError, NewerFormatError, StoreError, UsageError
 from fleetmap.mapformat import blob_path, current_path, decode_tile, sha256_hex
-from mapserver.store import MapStore, queries
+from mapserver import releases
+from mapserver.store import DraftContent, MapStore, map_store, queries
 from mapserver.store.database import MIGRATIONS
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
@@ -27,12 +28,12 @@ def store(tmp_path: Path):
 def test_a_draft_becomes_current_and_the_next_one_replaces_it(store: MapStore, tmp_path: Path) -> None:
     assert save_sample_draft(store, seed=1) == 1
     assert store.current("lab") is None
-    assert store.publish("lab") == 1
+    assert releases.publish(store, "lab") == 1
     first = store.current("lab")
     assert (first.state, first.parent, first.published_ns) == ("current", None, 1_000)
     assert save_sample_draft(store, seed=2) == 2
     assert store.current("lab").version == 1
-    assert store.publish("lab") == 2
+    assert releases.publish(store, "lab") == 2
     assert [(v.version, v.state, v.parent) for v in store.versions("lab")] == [
         (1, "published", None),
         (2, "current", 1),
@@ -64,7 +65,7 @@ def test_only_published_map_bytes_are_served(store: MapStore) -> None:
     info = store.version("lab", 1)
     tile = store.manifest("lab", 1).tiles[0].sha256
     assert store.served_kind(tile) is None
-    store.publish("lab")
+    releases.publish(store, "lab")
     assert store.served_kind(tile) == "tile"
     assert store.served_kind(tile, "lab") == "tile"
     assert store.served_kind(tile, "other") is None
@@ -77,9 +78,9 @@ def test_only_published_map_bytes_are_served(store: MapStore) -> None:
 def test_drafts_that_no_robot_could_use_are_refused(store: MapStore) -> None:
     empty = random_tile(np.random.default_rng(0), landmarks=0)
     for tiles in ([], [empty]):
-        store.save_draft("lab", tiles=tiles, vocabulary=b"v", details=draft_details())
+        store.save_draft("lab", DraftContent(tiles=tiles, vocabulary=b"v", details=draft_details()))
         with pytest.raises(GateRefusedError, match="0 landmarks"):
-            store.publish("lab")
+            releases.publish(store, "lab")
     assert store.current("lab") is None
     assert {info.state for info in store.versions("lab")} == {"draft"}
 
@@ -89,10 +90,10 @@ def test_a_site_keeps_its_vocabulary(store: MapStore) -> None:
     save_sample_draft(store, vocabulary=b"one")
     save_sample_draft(store, vocabulary=b"two")
     assert store.site_vocabulary("lab") == b"two"
-    store.publish("lab", 1)
+    releases.publish(store, "lab", 1)
     assert store.site_vocabulary("lab") == b"one"
     with pytest.raises(GateRefusedError, match="keeps"):
-        store.publish("lab", 2)
+        releases.publish(store, "lab", 2)
 
 
 def test_wrong_use_is_told(store: MapStore, tmp_path: Path) -> None:
@@ -100,12 +101,12 @@ def test_wrong_use_is_told(store: MapStore, tmp_path: Path) -> None:
         store.versions("lab")
     save_sample_draft(store)
     with pytest.raises(UsageError, match="no version 9"):
-        store.publish("lab", 9)
-    store.publish("lab")
+        releases.publish(store, "lab", 9)
+    releases.publish(store, "lab")
     with pytest.raises(UsageError, match="no draft"):
-        store.publish("lab")
+        releases.publish(store, "lab")
     with pytest.raises(UsageError, match="is current"):
-        store.publish("lab", 1)
+        releases.publish(store, "lab", 1)
     with pytest.raises(UsageError, match="site name"):
         save_sample_draft(store, site="../up")
     with pytest.raises(StoreError, match="no map store"):
@@ -118,14 +119,14 @@ def test_a_damaged_tile_is_not_published(store: MapStore, tmp_path: Path) -> Non
     path = tmp_path / "store" / blob_path(tile)
     path.write_bytes(path.read_bytes()[:-1] + b"?")
     with pytest.raises(MapFormatError, match=tile):
-        store.publish("lab")
+        releases.publish(store, "lab")
     path.unlink()
     with pytest.raises(StoreError, match="incomplete"):
-        store.publish("lab")
+        releases.publish(store, "lab")
     assert store.current("lab") is None
     # Saving the same bytes again heals the file.
     save_sample_draft(store)
-    assert store.publish("lab") == 2
+    assert releases.publish(store, "lab") == 2
 
 
 def test_robots_reports_are_kept(store: MapStore) -> None:
@@ -142,13 +143,13 @@ def test_robots_reports_are_kept(store: MapStore) -> None:
 def test_two_open_stores_share_one_folder(store: MapStore, tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "store") as other:
         assert [save_sample_draft(s) for s in (store, other, store)] == [1, 2, 3]
-        other.publish("lab", 2)
+        releases.publish(other, "lab", 2)
         assert store.current("lab").version == 2
 
 
 def test_readers_see_whole_versions_while_another_process_publishes(store: MapStore, tmp_path: Path) -> None:
     save_sample_draft(store)
-    store.publish("lab")
+    releases.publish(store, "lab")
     stop = threading.Event()
 
     def read() -> int:
@@ -165,7 +166,7 @@ def test_readers_see_whole_versions_while_another_process_publishes(store: MapSt
         reading = [readers.submit(read) for _ in range(3)]
         for seed in range(5):
             save_sample_draft(writer, seed=seed)
-            writer.publish("lab")
+            releases.publish(writer, "lab")
         stop.set()
         assert all(future.result(timeout=30) >= 1 for future in reading)
     assert store.current("lab").version == 6
@@ -197,31 +198,31 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 def test_a_crash_before_the_transaction_leaves_no_version(store: MapStore, tmp_path: Path, monkeypatch) -> None:
     save_sample_draft(store, seed=1)
-    store.publish("lab")
+    releases.publish(store, "lab")
 
     def crash(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(MapStore, "_insert_version", crash)
+    monkeypatch.setattr(map_store, "insert_draft", crash)
     with pytest.raises(KeyboardInterrupt):
         save_sample_draft(store, seed=2)
     monkeypatch.undo()
     with MapStore.open(tmp_path / "store") as again:
         assert [info.version for info in again.versions("lab")] == [1]
         assert save_sample_draft(again, seed=2) == 2
-        assert again.publish("lab") == 2
+        assert releases.publish(again, "lab") == 2
 
 
 def test_a_kill_between_the_transaction_and_the_derived_file_is_repaired(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         save_sample_draft(store, seed=1)
-        store.publish("lab")
+        releases.publish(store, "lab")
         save_sample_draft(store, seed=2)
         wanted = store.version("lab", 2).manifest_sha256
     program = (
-        "import os, sys\nfrom pathlib import Path\nfrom mapserver.store import map_store\n"
+        "import os, sys\nfrom pathlib import Path\nfrom mapserver import releases\nfrom mapserver.store import map_store\n"
         "map_store.MapStore._write_current_file = lambda *_: os._exit(9)\n"
-        "map_store.MapStore.open(Path(sys.argv[1])).publish('lab')\n"
+        "releases.publish(map_store.MapStore.open(Path(sys.argv[1])), 'lab')\n"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run([sys.executable, "-c", program, str(tmp_path)], env=environment, check=False, timeout=60)

@@ -28,8 +28,9 @@ from fleetmap.messages import (
     encode_message,
     robot_key,
 )
+from mapserver import releases
 from mapserver.fleet.fleet import Fleet
-from mapserver.store import Actor, MapStore
+from mapserver.store import Actor, DraftContent, MapStore
 from support.storage.map_samples import draft_details
 
 SITE = "hall"
@@ -93,9 +94,9 @@ def fill_store(folder: Path) -> None:
                 "findings": {"monday": ["camera 1 is blurred in 3 % of the frames"] if number == 2 else []},
             }
             tiles = hall_tiles(1, shifted_m=shifted_m, length_m=LENGTH_M - (TILE_M if number == 1 else 0))
-            store.save_draft(SITE, tiles=tiles, vocabulary=b"words" * 50, details=draft_details(**report))
+            store.save_draft(SITE, DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(**report)))
             if number < 3:
-                store.publish(SITE, number, actor=ada)
+                releases.publish(store, SITE, number, actor=ada)
         done = store.begin_job(SITE, "nightly")
         store.update_job(done, "done", "draft 3 of 403 keyframes", {"builds": [build_report()]})
         failed = store.begin_job(SITE, "build")

@@ -6,7 +6,8 @@ from fleetmap.geometry import se3_exp
 from fleetmap.mapformat import CameraEntry, RecordingEntry, Tile
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
-from mapserver.store import DraftDetails, MapStore
+from mapserver import releases
+from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.survey.survey_map import SurveyMap
 
 
@@ -86,10 +87,18 @@ def draft_details(**report: object) -> DraftDetails:
     )
 
 
-def save_sample_draft(store: MapStore, *, site: str = "lab", seed: int = 0, vocabulary: bytes = b"words" * 50) -> int:
+def save_sample_draft(
+    store: MapStore, *, site: str = "lab", seed: int = 0, vocabulary: bytes = b"words" * 50, actor: Actor = NOBODY
+) -> int:
     """A draft of two tiles."""
     rng = np.random.default_rng(seed)
     tiles = [random_tile(rng, cell=(1, 0)), random_tile(rng, cell=(0, 0))]
-    return store.save_draft(
-        site, tiles=tiles, vocabulary=vocabulary, details=draft_details(path_m=12.5), archive=b"archive"
-    )
+    content = DraftContent(tiles=tiles, vocabulary=vocabulary, details=draft_details(path_m=12.5), archive=b"archive")
+    return store.save_draft(site, content, actor=actor)
+
+
+def publish_samples(store: MapStore, count: int) -> None:
+    """That many versions of site `lab`, the last one current."""
+    for seed in range(count):
+        save_sample_draft(store, seed=seed)
+        releases.publish(store, "lab")

@@ -32,7 +32,8 @@ import numpy as np  # noqa: E402
 
 from fleetmap.errors import FleetmapError  # noqa: E402
 from fleetmap.mapformat import current_path  # noqa: E402
-from mapserver.store import Actor, MapStore, Retention  # noqa: E402
+from mapserver import releases  # noqa: E402
+from mapserver.store import Actor, DraftContent, MapStore, Retention  # noqa: E402
 from support.storage.faulty_disk import Disk, install  # noqa: E402
 from support.storage.lost_writes import POLICIES, DiskImage  # noqa: E402
 from support.storage.map_samples import draft_details, random_tile  # noqa: E402
@@ -79,7 +80,9 @@ class Scenario:
 def save(store: MapStore, seed: int) -> None:
     """A draft of two small tiles, one of which all drafts share."""
     tiles = [random_tile(np.random.default_rng(s), landmarks=6, places=1, cell=(s, 0)) for s in (0, seed)]
-    store.save_draft("lab", tiles=tiles, vocabulary=b"words" * 50, details=draft_details(), archive=b"archive" * seed)
+    store.save_draft(
+        "lab", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(), archive=b"archive" * seed)
+    )
 
 
 def scenarios(folder: Path) -> list[Scenario]:
@@ -88,7 +91,7 @@ def scenarios(folder: Path) -> list[Scenario]:
     with MapStore.open(start, create=True, clock_ns=clock_ns) as store:
         for seed in (1, 2, 3):
             save(store, seed)
-            store.publish("lab", force=True, actor=ADA)
+            releases.publish(store, "lab", force=True, actor=ADA)
         save(store, 4)
         save(store, 5)
         store._blobs.put(b"what a killed build left")
@@ -104,9 +107,9 @@ def scenarios(folder: Path) -> list[Scenario]:
     shutil.copytree(GOLDEN / "store-blobs", old / "blobs")
     nothing_kept = Retention(keep_versions=0, keep_drafts=0, keep_days=0)
     acts: tuple[tuple[str, Path, Act], ...] = (
-        ("publish", start, lambda store: store.publish("lab", 5, force=True, actor=ADA)),
-        ("promote", start, lambda store: store.promote("lab", 1, actor=ADA)),
-        ("rollback", start, lambda store: store.rollback("lab", actor=ADA)),
+        ("publish", start, lambda store: releases.publish(store, "lab", 5, force=True, actor=ADA)),
+        ("promote", start, lambda store: releases.promote(store, "lab", 1, actor=ADA)),
+        ("rollback", start, lambda store: releases.roll_back(store, "lab", actor=ADA)),
         ("gc", start, lambda store: store.collect_garbage(nothing_kept, actor=ADA)),
         ("import", start, lambda store: store.import_version(export, actor=ADA)),
         ("save a draft", start, lambda store: save(store, 9)),

@@ -19,7 +19,8 @@ from locclient.maps.loaded_map import LoadedMap
 from locclient.robot.robot import Robot
 from locclient.robot.sensor_bundle import SensorBundle
 from locclient.robot.version_trial import TrialSettings
-from mapserver.store import MapStore
+from mapserver import releases
+from mapserver.store import DraftContent, MapStore
 from support.recordings.recording_samples import FOCAL, HEIGHT, WIDTH, Sample, calibration
 from support.storage.map_samples import draft_details
 from support.worlds.box_room import out_and_back, points_seen, ride_sample
@@ -138,9 +139,12 @@ def save(store: MapStore, *, site: str = SITE, of: tuple[Tile, ...] | None = Non
     )
     details = msgspec.structs.replace(draft_details(path_m=10.0), tile_size_m=TILE_M, camera=entry)
     number = store.save_draft(
-        site, tiles=list(tiles() if of is None else of), vocabulary=vocabulary(), details=details, archive=b"archive"
+        site,
+        DraftContent(
+            tiles=list(tiles() if of is None else of), vocabulary=vocabulary(), details=details, archive=b"archive"
+        ),
     )
-    store.publish(site)
+    releases.publish(store, site)
     return number
 
 

@@ -8,7 +8,7 @@ import typer
 from mapserver.commands.print_json import print_json
 
 if TYPE_CHECKING:
-    from mapserver.store import Difference
+    from mapserver.releases import Difference
 
 
 def diff(
@@ -19,10 +19,11 @@ def diff(
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
     """Show what changed from version A to version B: tiles, landmarks, bytes to fetch, quality side by side."""
+    from mapserver import releases
     from mapserver.store import MapStore
 
     with MapStore.open(store) as maps:
-        found = maps.difference(site, before, after)
+        found = releases.difference(maps, site, before, after)
     if json:
         print_json(found)
     else:

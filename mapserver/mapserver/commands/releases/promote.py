@@ -25,6 +25,7 @@ def promote(
 
     With --canary some robots run it first (a draft goes through the gate before); the server then promotes it or takes it back.
     """
+    from mapserver import releases
     from mapserver.config import read_config
     from mapserver.store import MapStore
 
@@ -32,10 +33,10 @@ def promote(
     gate = read_config(config_path(context)).gate
     with MapStore.open(store) as maps:
         if share is None:
-            maps.promote(site, version, actor=acting(actor, reason))
+            releases.promote(maps, site, version, actor=acting(actor, reason))
             typer.echo(f"site {site}: version {version} is current")
             return
-        begun = maps.start_canary(site, version, share, actor=acting(actor, reason), gate=gate)
+        begun = releases.start_canary(maps, site, version, share, actor=acting(actor, reason), gate=gate)
     typer.echo(
         f"site {site}: {share:g} of the robots try version {version}, the others stay on {begun.base_version}; "
         "`mapserver serve` judges it, `rollback` takes it back"

@@ -24,13 +24,14 @@ def publish(
     config: ConfigFile = None,
 ) -> None:
     """Take a draft through the gate and make it the current version; ends with status 4 where the gate refuses it."""
+    from mapserver import releases
     from mapserver.config import read_config
     from mapserver.quality.directions import one_way_words
     from mapserver.store import MapStore
 
     gate = read_config(config_path(context)).gate
     with MapStore.open(store) as maps:
-        published = maps.publish(site, version, actor=acting(actor, reason), force=force, gate=gate)
+        published = releases.publish(maps, site, version, actor=acting(actor, reason), force=force, gate=gate)
         info = maps.version(site, published)
         verdict = maps.verdicts(site, published)[-1]
         evidence = maps.evidence(site, published)

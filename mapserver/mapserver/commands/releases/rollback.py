@@ -15,8 +15,9 @@ def rollback(
     reason: Reason = "",
 ) -> None:
     """Make the version current that was so before the current one, which retires."""
+    from mapserver import releases
     from mapserver.store import MapStore
 
     with MapStore.open(store) as maps:
-        version = maps.rollback(site, actor=acting(actor, reason))
+        version = releases.roll_back(maps, site, actor=acting(actor, reason))
     typer.echo(f"site {site}: version {version} is current again")

@@ -10,7 +10,7 @@ import msgspec
 from fleetmap.errors import UsageError
 from fleetmap.messages import FailureReport
 from mapserver.fleet_statistics.kpis import TALLY_COLUMNS, Tally, hour_of
-from mapserver.store.fleet_rows import (
+from mapserver.store.rows import (
     AXES,
     FailureDetail,
     FailureFilter,
@@ -45,16 +45,16 @@ class FleetBatch:
         self.tallies.setdefault((site, axis, key, hour), Tally()).add(tally)
 
 
-class FleetRecords:
+class FleetQueries:
     """The part of an open store that knows how the fleet does."""
 
-    def __init__(self, ledger: Transactions) -> None:
-        self._ledger = ledger
+    def __init__(self, transactions: Transactions) -> None:
+        self._transactions = transactions
         self._key_ids: dict[tuple[str, str, str], int] = {}
 
     def add(self, batch: FleetBatch) -> None:
         """Keeps a batch in one transaction. A power cut may lose the last ones, never failures."""
-        with self._ledger.write(durable=False) as connection:
+        with self._transactions.write(durable=False) as connection:
             keys = [key[:3] for key in batch.tallies] + [(row.site, "robot", row.robot) for row in batch.traces]
             ids = self._ids(connection, keys)
             _add_tallies(connection, ids, batch.tallies)
@@ -85,7 +85,7 @@ class FleetRecords:
         """Keeps a failure and its sums, durably; False (and nothing done) for one that is known already."""
         place = None if report.map_from_base is None else report.map_from_base.position_m
         bare = msgspec.msgpack.encode(msgspec.structs.replace(report, thumbnails=()))
-        with self._ledger.write() as connection:
+        with self._transactions.write() as connection:
             done = connection.execute(
                 """INSERT OR IGNORE INTO failures (site, robot, failure_id, received_ns, happened_ns, duration_s, kind,
                    cause, status, version, tile, x_map_m, y_map_m, report)
@@ -109,7 +109,7 @@ class FleetRecords:
         self, site: str | None, axis: str, *, since_hour: int = 0, until_hour: int = 1 << 60, key: str | None = None
     ) -> dict[tuple[str, str], Tally]:
         """Sums by (site, key) of an axis over hours from `since_hour` to before `until_hour`."""
-        rows = self._ledger.query(
+        rows = self._transactions.query(
             f"""SELECT k.site, k.key, {_SUMS} FROM tally_keys k JOIN tallies t ON t.key_id = k.id
                 WHERE k.axis = ?1 AND (?2 IS NULL OR k.site = ?2) AND (?3 IS NULL OR k.key = ?3)
                 AND t.hour >= ?4 AND t.hour < ?5 GROUP BY k.id ORDER BY k.site, k.key""",
@@ -121,7 +121,7 @@ class FleetRecords:
         self, site: str | None, axis: str, *, key: str | None = None, since_hour: int = 0, until_hour: int = 1 << 60
     ) -> dict[int, Tally]:
         """Sums of an axis (and key) by the hour."""
-        rows = self._ledger.query(
+        rows = self._transactions.query(
             f"""SELECT t.hour, {_SUMS} FROM tally_keys k JOIN tallies t ON t.key_id = k.id
                 WHERE k.axis = ?1 AND (?2 IS NULL OR k.site = ?2) AND (?3 IS NULL OR k.key = ?3)
                 AND t.hour >= ?4 AND t.hour < ?5 GROUP BY t.hour ORDER BY t.hour""",
@@ -135,7 +135,7 @@ class FleetRecords:
             wanted.site, wanted.robot, wanted.version, wanted.tile, wanted.cause, wanted.kind, wanted.since_ns,
             wanted.until_ns, before, limit,
         )  # fmt: skip
-        rows = self._ledger.query(
+        rows = self._transactions.query(
             f"""SELECT {_FAILURE_COLUMNS} FROM failures
                 WHERE (?1 IS NULL OR site = ?1) AND (?2 IS NULL OR robot = ?2) AND (?3 IS NULL OR version = ?3)
                 AND (?4 IS NULL OR tile = ?4) AND (?5 IS NULL OR cause = ?5) AND (?6 IS NULL OR kind = ?6)
@@ -147,11 +147,11 @@ class FleetRecords:
 
     def failure(self, number: int) -> FailureDetail:
         """One failure with its context; raises UsageError where it does not exist."""
-        rows = self._ledger.query(f"SELECT {_FAILURE_COLUMNS}, report FROM failures WHERE number = ?", (number,))
+        rows = self._transactions.query(f"SELECT {_FAILURE_COLUMNS}, report FROM failures WHERE number = ?", (number,))
         if not rows:
             raise UsageError(f"there is no failure {number}; the list of failures shows those that are kept")
         report = msgspec.msgpack.decode(rows[0].pop("report"), type=FailureReport)
-        pictures = self._ledger.query(
+        pictures = self._transactions.query(
             """SELECT place, kind, stamp_ns, length(jpeg) bytes FROM failure_pictures
                WHERE number = ? ORDER BY place""",
             (number,),
@@ -160,14 +160,16 @@ class FleetRecords:
 
     def picture(self, number: int, place: int) -> bytes:
         """The JPEG of a failure; raises UsageError where there is none, or none any more."""
-        rows = self._ledger.query("SELECT jpeg FROM failure_pictures WHERE number = ? AND place = ?", (number, place))
+        rows = self._transactions.query(
+            "SELECT jpeg FROM failure_pictures WHERE number = ? AND place = ?", (number, place)
+        )
         if not rows:
             raise UsageError(f"failure {number} has no picture {place}; old ones go when pictures need too much space")
         return bytes(rows[0]["jpeg"])
 
     def trace(self, site: str, robot: str, *, since_hour: int = 0) -> list[TraceRow]:
         """Where a robot was, oldest first."""
-        rows = self._ledger.query(
+        rows = self._transactions.query(
             """SELECT k.site, k.key robot, t.hour, t.stamp_ns, t.status, t.version, t.x_map_m, t.y_map_m, t.radius_95_m
                FROM traces t JOIN tally_keys k ON k.id = t.key_id
                WHERE t.hour >= ? AND k.site = ? AND k.axis = 'robot' AND k.key = ? ORDER BY t.hour, t.stamp_ns""",
@@ -177,12 +179,12 @@ class FleetRecords:
 
     def prune(self, retention: FleetRetention) -> int:
         """Removes what is too old or too much; returns how many rows went."""
-        now_ns = self._ledger.now_ns()
+        now_ns = self._transactions.now_ns()
 
         def before_ns(days: float) -> int:
             return now_ns - int(days * _DAY_NS)
 
-        with self._ledger.write(durable=False) as connection:
+        with self._transactions.write(durable=False) as connection:
             gone = connection.execute(
                 "DELETE FROM tallies WHERE hour < ?", (hour_of(before_ns(retention.tally_days)),)
             ).rowcount

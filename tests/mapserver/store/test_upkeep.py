@@ -1,4 +1,4 @@
-"""Promoting, rolling back, comparing, verifying, collecting garbage, carrying versions to another store."""
+"""The log of a store, verifying it, collecting garbage, carrying versions to another store."""
 
 import os
 import sqlite3
@@ -6,16 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from fleetmap.errors import FleetmapError, GateRefusedError, MapFormatError, StateError, StoreError, UsageError
+from fleetmap.errors import FleetmapError, MapFormatError, StateError, StoreError
 from fleetmap.mapformat import blob_path, current_path
-from mapserver.quality.gate import GateSettings
-from mapserver.store import Actor, MapStore, Retention, lifecycle
+from mapserver import releases
+from mapserver.store import Actor, MapStore, Retention
 from mapserver.store.files import locked
-from mapserver.store.version_diff import SideBySide
-from support.storage.map_samples import draft_details, random_tile, save_sample_draft
+from support.storage.map_samples import publish_samples, save_sample_draft
 
 ADA = Actor("ada", "a test")
 DAY_NS = 86_400_000_000_000
@@ -40,38 +38,8 @@ def store(tmp_path: Path, clock: Clock):
         yield opened
 
 
-def publish_samples(store: MapStore, count: int) -> None:
-    for seed in range(count):
-        save_sample_draft(store, seed=seed)
-        store.publish("lab")
-
-
 def states(store: MapStore) -> dict[int, str]:
     return {info.version: info.state for info in store.versions("lab")}
-
-
-def test_rollback_goes_back_step_by_step_and_promote_forth(store: MapStore, tmp_path: Path) -> None:
-    publish_samples(store, 3)
-    assert store.rollback("lab", actor=ADA) == 2
-    assert states(store) == {1: "published", 2: "current", 3: "retired"}
-    assert (tmp_path / "store" / current_path("lab")).read_text().strip() == store.version("lab", 2).manifest_sha256
-    assert store.rollback("lab") == 1
-    with pytest.raises(StateError, match="no version that was current before"):
-        store.rollback("lab")
-    store.promote("lab", 3, actor=ADA)
-    store.promote("lab", 3)  # is current already
-    assert states(store) == {1: "published", 2: "retired", 3: "current"}
-    assert store.rollback("lab") == 1
-    logged = [(event.kind, event.version, event.actor, event.reason) for event in store.events("lab")]
-    assert logged[6:9] == [
-        ("rolled_back", 2, "ada", "a test"),
-        ("rolled_back", 1, "", ""),
-        ("promoted", 3, "ada", "a test"),
-    ]
-    save_sample_draft(store, seed=9)
-    with pytest.raises(StateError, match="is a draft"):
-        store.promote("lab", 4)
-    assert store.verify().faults == []
 
 
 def test_the_log_is_never_changed(store: MapStore, tmp_path: Path) -> None:
@@ -81,86 +49,6 @@ def test_the_log_is_never_changed(store: MapStore, tmp_path: Path) -> None:
         with pytest.raises(sqlite3.IntegrityError, match="never"):
             connection.execute(statement)
     connection.close()
-
-
-def test_a_bad_version_is_not_gone_back_to(store: MapStore, tmp_path: Path) -> None:
-    publish_samples(store, 2)
-    tile = store.manifest("lab", 1).tiles[0].sha256
-    (tmp_path / "store" / blob_path(tile)).unlink()
-    for go_back in (lambda: store.rollback("lab"), lambda: store.promote("lab", 1)):
-        with pytest.raises(StoreError, match="incomplete"):
-            go_back()
-    assert store.current("lab").version == 2
-
-
-def test_the_gate_compares_with_the_current_version(store: MapStore) -> None:
-    publish_samples(store, 1)
-    small = [random_tile(np.random.default_rng(3), landmarks=70, cell=(0, 0))]
-    store.save_draft("lab", tiles=small, vocabulary=b"words" * 50, details=draft_details())
-    with pytest.raises(GateRefusedError, match=r"coverage_share 0\.50 of version 1"):
-        store.publish("lab", actor=ADA)
-    with pytest.raises(UsageError, match="--reason"):
-        store.publish("lab", actor=Actor("ada"), force=True)
-    assert states(store) == {1: "current", 2: "draft"}
-    (refused,) = store.verdicts("lab", 2)
-    assert (refused.accepted, refused.forced, len(refused.reasons)) == (False, False, 1)
-    assert store.publish("lab", actor=ADA, force=True) == 2
-    assert [(event.kind, event.actor) for event in store.events("lab")][-3:] == [
-        ("refused", "ada"),
-        ("forced", "ada"),
-        ("published", "ada"),
-    ]
-    save_sample_draft(store, seed=4)
-    assert store.publish("lab", gate=GateSettings(max_bytes_share=100)) == 3
-
-
-def test_a_draft_is_not_published_against_another_version_than_it_was_judged_by(store: MapStore, monkeypatch) -> None:
-    publish_samples(store, 1)
-    save_sample_draft(store, seed=2)
-    save_sample_draft(store, seed=3)
-    record = lifecycle.record_verdict
-
-    def slow(*args, **more) -> None:
-        monkeypatch.setattr(lifecycle, "record_verdict", record)
-        record(*args, **more)
-        store.publish("lab", 2)
-
-    monkeypatch.setattr(lifecycle, "record_verdict", slow)
-    with pytest.raises(StateError, match="compared with 1"):
-        store.publish("lab", 3)
-    assert states(store) == {1: "published", 2: "current", 3: "draft"}
-    assert store.publish("lab", 3) == 3
-
-
-def test_hard_limits_are_not_forced(store: MapStore) -> None:
-    store.save_draft("lab", tiles=[], vocabulary=b"v", details=draft_details())
-    with pytest.raises(GateRefusedError, match="cannot be forced"):
-        store.publish("lab", actor=ADA, force=True)
-
-
-def test_a_difference_counts_tiles_landmarks_and_bytes(store: MapStore) -> None:
-    rng = np.random.default_rng(0)
-    kept, old, gone, come = (random_tile(rng, cell=(x, 0)) for x in range(4))
-    shifted = old.points_map.copy()
-    shifted[:5, 2] += 0.5
-    new = type(old)(**{name: getattr(old, name) for name in old.__dataclass_fields__} | {"points_map": shifted})
-    for tiles, path_m in (([kept, old, gone], 10.0), ([kept, new, come], 11.0)):
-        store.save_draft("lab", tiles=tiles, vocabulary=b"v", details=draft_details(path_m=path_m))
-    found = store.difference("lab", 1, 2)
-    assert (found.tiles_added, found.tiles_changed, found.tiles_removed, found.tiles_kept) == (1, 1, 1, 1)
-    shared = np.intersect1d(gone.landmark_ids, come.landmark_ids)
-    only_old = np.union1d(old.landmark_ids, gone.landmark_ids)
-    only_new = np.union1d(old.landmark_ids, come.landmark_ids)
-    assert found.landmarks_added == len(np.setdiff1d(only_new, only_old))
-    assert found.landmarks_removed == len(np.setdiff1d(only_old, only_new))
-    assert 5 <= found.landmarks_moved <= 5 + len(shared)
-    entries = {(tile.x, tile.y): tile for tile in store.manifest("lab", 2).tiles}
-    info = store.version("lab", 2)
-    assert found.fetch_bytes == info.manifest_bytes + entries[1, 0].bytes + entries[3, 0].bytes
-    assert found.full_bytes == info.map_bytes + info.vocabulary_bytes
-    assert found.quality == {"path_m": SideBySide(10.0, 11.0)}
-    same = store.difference("lab", 2, 2)
-    assert (same.tiles_kept, same.landmarks_kept, same.moved_max_m) == (3, info.landmarks, None)
 
 
 def test_verify_names_what_is_wrong(store: MapStore, tmp_path: Path) -> None:
@@ -205,10 +93,10 @@ def test_garbage_goes_in_steps_and_nothing_that_is_used(store: MapStore, tmp_pat
     found = store.verify()
     assert (found.faults, found.orphans) == ([], 0)
     assert save_sample_draft(store, seed=14) == 10  # numbers are never used again
-    assert store.rollback("lab") == 4
+    assert releases.roll_back(store, "lab") == 4
     clock.now_ns += 40 * DAY_NS
     assert ("lab", 2) not in store.collect_garbage(keep).removed  # what a rollback would go to
-    assert store.rollback("lab") == 2
+    assert releases.roll_back(store, "lab") == 2
     assert store.verify().faults == []
 
 
@@ -251,7 +139,7 @@ def test_a_version_travels_in_one_file(store: MapStore, tmp_path: Path, archive:
         info = other.import_version(file, actor=ADA)
         assert (info.version, info.state, info.manifest_sha256) == (2, "draft", store.version("lab", 2).manifest_sha256)
         assert other.archive("lab", 2) == (b"archive" if archive else None)
-        assert other.publish("lab") == 2
+        assert releases.publish(other, "lab") == 2
         assert other.import_version(file).state == "current"
         assert save_sample_draft(other, seed=5) == 3
         assert other.verify().faults == []

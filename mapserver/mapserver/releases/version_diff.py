@@ -47,7 +47,9 @@ class Difference:
     quality: dict[str, SideBySide]
 
 
-def difference(before: Manifest, after: Manifest, after_manifest_bytes: int, read_tile: TileReader) -> Difference:
+def manifest_difference(
+    before: Manifest, after: Manifest, after_manifest_bytes: int, read_tile: TileReader
+) -> Difference:
     """The difference of two manifests; `read_tile` is asked only for tiles that are not in both."""
     old, new = ({(tile.x, tile.y): tile for tile in manifest.tiles} for manifest in (before, after))
     known = {tile.sha256 for tile in before.tiles}

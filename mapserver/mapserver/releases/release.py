@@ -1,0 +1,126 @@
+"""Releases of an open store: each is decided by `rules` within the one transaction that writes it, and is on the disk at its end."""
+
+from fleetmap.errors import UsageError
+from fleetmap.mapformat import decode_tile
+from mapserver.fleet_statistics.canary_test import threshold_for
+from mapserver.quality.gate import GateSettings, judge
+from mapserver.releases import rules
+from mapserver.releases.version_diff import Difference, manifest_difference
+from mapserver.store import NOBODY, Actor, CanaryRow, MapStore, NewCanary, VerdictRow, VersionInfo
+
+_USUAL_GATE = GateSettings()
+_RECENT_NS = 2 * 86_400_000_000_000  # robots silent for longer do not count as somebody to try a version
+
+
+def publish(
+    store: MapStore,
+    site: str,
+    version: int | None = None,
+    *,
+    actor: Actor = NOBODY,
+    force: bool = False,
+    gate: GateSettings = _USUAL_GATE,
+) -> int:
+    """Takes a draft (the newest one, if not named) through the gate, makes it current and returns its number.
+
+    force: what the gate says is logged with the actor, and only its hard limits refuse.
+
+    Raises UsageError where there is no such draft, GateRefusedError for one that is refused (its reasons stay with
+    it), StoreError or MapFormatError for one whose bytes are not all there.
+    """
+    draft = rules.chosen_draft(store.releases(site), version)
+    if force and not (actor.name and actor.reason):
+        raise UsageError("publishing by force needs who and why; name --reason")
+    judged_against = _pass_gate(store, draft, actor, gate, force=force)
+    store.change_releases(site, lambda rows: rules.publication(rows, draft.version, judged_against, actor))
+    return draft.version
+
+
+def promote(store: MapStore, site: str, version: int, *, actor: Actor = NOBODY) -> None:
+    """Makes a version that was published before the current one.
+
+    Raises UsageError for an unknown version, StateError for a draft, StoreError or MapFormatError for one whose
+    bytes are not all there.
+    """
+    store.check_bytes(store.version(site, version))
+    store.change_releases(site, lambda rows: rules.promotion(rows, version, actor))
+
+
+def roll_back(store: MapStore, site: str, *, actor: Actor = NOBODY) -> int:
+    """Makes the version current that was so before and returns its number; the one that is retires.
+
+    While some robots try another version, that is taken back instead, and the current one stays.
+
+    Raises StateError where none was current before, StoreError or MapFormatError if its bytes are not all there.
+    """
+    rows = store.releases(site)
+    if rows.canary is not None:
+        outcome = f"taken back by hand: {actor.reason or 'no reason given'}"
+        end_canary(store, rows.canary, promote=False, outcome=outcome, actor=actor)
+        return rows.canary.base_version
+    if rows.rollback_target is not None:
+        store.check_bytes(rows.versions[rows.rollback_target])
+    changes = store.change_releases(site, lambda rows: rules.rollback(rows, actor))
+    return next(version for version, state in changes.states if state == "current")
+
+
+def start_canary(
+    store: MapStore, site: str, version: int, share: float, *, actor: Actor = NOBODY, gate: GateSettings = _USUAL_GATE
+) -> CanaryRow:
+    """Lets a share of the site's robots run a version before the others; a draft goes through the gate first.
+
+    Raises what `rules.check_canary` raises, and what `publish` raises for drafts.
+    """
+    rows = store.releases(site)
+    base = rules.check_canary(rows, version, share).version
+    wanted = rows.versions[version]
+    if wanted.state == "draft":
+        _pass_gate(store, wanted, actor, gate, force=False)
+    else:
+        store.check_bytes(wanted)
+    recent_ns = store.now_ns() - _RECENT_NS
+    robots = [robot.robot for robot in store.robots(site) if robot.last_seen_ns >= recent_ns]
+    new = NewCanary(version, base, share, threshold_for(share, site, version, robots), actor)
+    store.change_releases(site, lambda rows: rules.canary_start(rows, new))
+    return store.canaries(site, running=True)[0]
+
+
+def end_canary(store: MapStore, canary: CanaryRow, *, promote: bool, outcome: str, actor: Actor = NOBODY) -> None:
+    """Makes the canary's version current, or takes it back from the robots that try it, and retires it.
+
+    Raises StateError where it does not run any more, and what `promote` raises.
+    """
+    if promote:
+        store.check_bytes(store.version(canary.site, canary.version))
+        who = Actor(actor.name, outcome)
+        store.change_releases(canary.site, lambda rows: rules.canary_promotion(rows, canary, who))
+    else:
+        store.change_releases(canary.site, lambda rows: rules.canary_withdrawal(rows, canary, outcome, actor))
+
+
+def difference(store: MapStore, site: str, before: int, after: int) -> Difference:
+    """What changed between two versions of a site; errors as of `MapStore.manifest`."""
+    manifests = (store.manifest(site, before), store.manifest(site, after))
+    size = store.version(site, after).manifest_bytes
+    return manifest_difference(*manifests, size, lambda sha256: decode_tile(store.blob(sha256)))
+
+
+def _pass_gate(store: MapStore, draft: VersionInfo, actor: Actor, gate: GateSettings, *, force: bool) -> int | None:
+    """The version that the draft was compared with; keeps the verdict, errors as of `publish`."""
+    site = draft.site
+    store.check_bytes(draft)
+    current = store.current(site)
+    verdict = judge(
+        store.manifest(site, draft.version),
+        None if current is None else store.manifest(site, current.version),
+        next(info.vocabulary_sha256 for info in store.sites() if info.site == site),
+        gate,
+        store.evidence(site, draft.version),
+    )
+    forced = rules.is_forced(verdict, force=force)
+    reasons = (*verdict.hard_reasons, *verdict.reasons)
+    row = VerdictRow(store.now_ns(), verdict.accepted, forced, reasons, verdict.report)
+    store.record_verdict(draft, row, actor)
+    if not verdict.accepted and not forced:
+        raise rules.refusal(draft, verdict)
+    return None if current is None else current.version

@@ -1,0 +1,175 @@
+"""Rules of releases: which version may become current, and what that changes. Pure functions over rows of the store.
+
+draft -> current when published; current -> published when another becomes current, -> retired when it is rolled back;
+published -> retired by `gc`, once newer ones are enough; published or retired -> current when promoted.
+"""
+
+from fleetmap.errors import GateRefusedError, StateError, UsageError
+from mapserver.quality.gate import Verdict
+from mapserver.store.rows import (
+    Actor,
+    CanaryEnd,
+    CanaryRow,
+    LogEntry,
+    NewCanary,
+    ReleaseChanges,
+    SiteReleases,
+    VersionInfo,
+)
+
+
+def chosen_draft(rows: SiteReleases, number: int | None) -> VersionInfo:
+    """The draft of this number, the newest one where none is named; UsageError without any, StateError for no draft."""
+    if number is not None:
+        return _draft(rows, number)
+    drafts = [info for info in rows.versions.values() if info.state == "draft"]
+    if not drafts:
+        raise UsageError(
+            f"site {rows.site} has no draft to publish; make one with `mapserver build --site {rows.site}`"
+        )
+    return drafts[-1]
+
+
+def is_forced(verdict: Verdict, *, force: bool) -> bool:
+    """Whether a draft that the gate refuses is published all the same: only where no hard reason stands against it."""
+    return force and bool(verdict.reasons) and not verdict.hard_reasons
+
+
+def refusal(draft: VersionInfo, verdict: Verdict) -> GateRefusedError:
+    """The error for a draft that the gate refuses."""
+    reasons = "; ".join((*verdict.hard_reasons, *verdict.reasons))
+    way_out = (
+        "this cannot be forced"
+        if verdict.hard_reasons
+        else "`mapserver inspect` shows the draft, `publish --force --reason TEXT` publishes it all the same"
+    )
+    return GateRefusedError(f"draft {draft.version} of {draft.site} is refused: {reasons}; {way_out}")
+
+
+def publication(rows: SiteReleases, draft: int, judged_against: int | None, actor: Actor) -> ReleaseChanges:
+    """Makes a draft current that was compared with version `judged_against`; StateError where someone was faster."""
+    left = None if rows.current is None else rows.current.version
+    if left != judged_against:
+        raise StateError(
+            f"version {left} of site {rows.site} became current while draft {draft} was compared with "
+            f"{judged_against}; publish again"
+        )
+    _draft(rows, draft)
+    detail = f"version {draft}, " + ("the first" if left is None else f"replacing {left}")
+    return _becomes_current(rows, draft, LogEntry("published", detail, draft, actor))
+
+
+def promotion(rows: SiteReleases, version: int, actor: Actor) -> ReleaseChanges:
+    """Makes a published or retired version current, nothing where it is; StateError for a draft."""
+    wanted = _known(rows, version)
+    if wanted.state == "current":
+        return ReleaseChanges()
+    if wanted.state == "draft":
+        raise StateError(
+            f"version {version} of site {rows.site} is a draft; `mapserver publish --version {version}` takes it through the gate"
+        )
+    left = None if rows.current is None else rows.current.version
+    return _becomes_current(rows, version, LogEntry("promoted", f"version {version}, replacing {left}", version, actor))
+
+
+def rollback(rows: SiteReleases, actor: Actor) -> ReleaseChanges:
+    """Makes the version current that was so before and retires the one that is; StateError where none was."""
+    current, target = rows.current, rows.rollback_target
+    if current is None or target is None:
+        raise StateError(f"site {rows.site} has no version that was current before; `versions` shows what to promote")
+    detail = f"from version {current.version} to {target}"
+    return ReleaseChanges(
+        states=((current.version, "retired"), (target, "current")),
+        drop_currents_after=rows.rollback_row,
+        log=(LogEntry("rolled_back", detail, target, actor),),
+    )
+
+
+def check_canary(rows: SiteReleases, version: int, share: float) -> VersionInfo:
+    """The current version, with which a canary of `version` would be compared.
+
+    Raises UsageError for an unknown version or a share outside of 0 to 1, StateError where the site has no current version, this
+    is it, or a canary runs already.
+    """
+    _known(rows, version)
+    if not 0 < share < 1:
+        raise UsageError(f"a canary of {share:g} of the robots: name a share between 0 and 1, such as 5%")
+    if rows.current is None or rows.current.version == version:
+        held = "has no current version" if rows.current is None else f"has version {version} as its current one"
+        raise StateError(f"site {rows.site} {held}; a canary is compared with another, current version")
+    if rows.canary is not None:
+        raise StateError(f"site {rows.site} tries version {rows.canary.version} already; `rollback` takes it back")
+    return rows.current
+
+
+def canary_start(rows: SiteReleases, new: NewCanary) -> ReleaseChanges:
+    """Begins a canary; a draft becomes a published version that is not current.
+
+    Raises StateError where another version became current meanwhile or another canary began, and what `check_canary` raises.
+    """
+    if rows.current is None or rows.current.version != new.base_version or rows.canary is not None:
+        raise StateError(f"site {rows.site} was changed by somebody else meanwhile; look at `versions`, try again")
+    check_canary(rows, new.version, new.share)
+    detail = f"version {new.version} for {new.share:.1%} of the robots, beside version {new.base_version}"
+    log: tuple[LogEntry, ...] = (LogEntry("canary_started", detail, new.version, new.actor),)
+    if rows.versions[new.version].state == "draft":
+        log = (LogEntry("admitted", f"version {new.version}, not current yet", new.version, new.actor), *log)
+    return ReleaseChanges(states=((new.version, "published"),), new_canary=new, log=log)
+
+
+def canary_promotion(rows: SiteReleases, canary: CanaryRow, actor: Actor) -> ReleaseChanges:
+    """Makes the canary's version current; raises StateError where it does not run any more."""
+    _check_running(rows, canary)
+    return promotion(rows, canary.version, actor)
+
+
+def canary_withdrawal(rows: SiteReleases, canary: CanaryRow, outcome: str, actor: Actor) -> ReleaseChanges:
+    """Ends a canary and retires its version; raises StateError where it does not run any more."""
+    _check_running(rows, canary)
+    detail = f"version {canary.version}; version {canary.base_version} stays current"
+    entry = LogEntry("canary_rolled_back", detail, canary.version, Actor(actor.name, outcome))
+    is_published = canary.version in rows.versions and rows.versions[canary.version].state == "published"
+    return ReleaseChanges(
+        states=((canary.version, "retired"),) if is_published else (),
+        ended_canary=CanaryEnd(canary.id, "rolled_back", outcome),
+        log=(entry,),
+    )
+
+
+def _becomes_current(rows: SiteReleases, version: int, entry: LogEntry) -> ReleaseChanges:
+    """Ends a canary that runs: its comparison is over."""
+    left = () if rows.current is None else ((rows.current.version, "published"),)
+    states = (*left, (version, "current"))
+    if rows.canary is None:
+        return ReleaseChanges(states=states, new_current=version, log=(entry,))
+    tried, actor = rows.canary.version, entry.actor
+    is_promoted = tried == version
+    outcome = actor.reason if is_promoted and actor.reason else f"version {version} became current"
+    kind = "canary_promoted" if is_promoted else "canary_stopped"
+    end = LogEntry(kind, f"version {tried}", tried, Actor(actor.name, outcome))
+    return ReleaseChanges(
+        states=states,
+        new_current=version,
+        ended_canary=CanaryEnd(rows.canary.id, "promoted" if is_promoted else "stopped", outcome),
+        log=(end, entry),
+    )
+
+
+def _check_running(rows: SiteReleases, canary: CanaryRow) -> None:
+    if rows.canary is None or rows.canary.id != canary.id:
+        raise StateError(f"version {canary.version} of site {canary.site} is not tried any more; look at `versions`")
+
+
+def _known(rows: SiteReleases, version: int) -> VersionInfo:
+    if version not in rows.versions:
+        raise UsageError(
+            f"site {rows.site} has no version {version}; `mapserver versions --site {rows.site}` lists them"
+        )
+    return rows.versions[version]
+
+
+def _draft(rows: SiteReleases, version: int) -> VersionInfo:
+    info = _known(rows, version)
+    if info.state != "draft":
+        raise StateError(f"version {version} of site {rows.site} is {info.state}, only a draft can be published")
+    return info

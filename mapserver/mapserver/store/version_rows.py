@@ -1,0 +1,112 @@
+"""SQL over versions, canaries and the record of what was current. What to change is decided in `releases`."""
+
+import json
+import sqlite3
+
+from fleetmap.mapformat import Manifest
+from mapserver.store.rows import CanaryRow, LogEntry, ReleaseChanges, SiteReleases, VerdictRow, VersionInfo
+from mapserver.store.transactions import Transactions
+
+# The newest row of a version that was current before the one that is current now.
+_ROLLBACK_TARGET = """
+    SELECT id, version FROM currents
+    WHERE site = ?1 AND version <> (SELECT version FROM versions WHERE site = ?1 AND state = 'current')
+    ORDER BY id DESC LIMIT 1"""
+
+
+def site_releases(transactions: Transactions, site: str) -> SiteReleases:
+    """What releases of a site are decided by; nothing at all for an unknown site."""
+    rows = transactions.query("SELECT * FROM versions WHERE site = ? ORDER BY version", (site,))
+    before = transactions.query(_ROLLBACK_TARGET, (site,))
+    running = canaries(transactions, site, running=True)
+    return SiteReleases(
+        site=site,
+        versions={row["version"]: VersionInfo(**row) for row in rows},
+        rollback_target=before[0]["version"] if before else None,
+        rollback_row=before[0]["id"] if before else None,
+        canary=running[0] if running else None,
+    )
+
+
+def canaries(transactions: Transactions, site: str | None, *, running: bool) -> list[CanaryRow]:
+    """Canaries (of a site), the last one first."""
+    rows = transactions.query(
+        """SELECT * FROM canaries WHERE (?1 IS NULL OR site = ?1) AND (?2 = 0 OR state = 'running') ORDER BY id DESC""",
+        (site, int(running)),
+    )
+    return [CanaryRow(**row) for row in rows]
+
+
+def apply_changes(
+    transactions: Transactions, connection: sqlite3.Connection, site: str, changes: ReleaseChanges
+) -> None:
+    """Writes what a release changes, within its transaction."""
+    now_ns = transactions.now_ns()
+    for version, state in changes.states:
+        set_state(connection, (site, version), state, now_ns)
+    if changes.drop_currents_after is not None:
+        connection.execute("DELETE FROM currents WHERE site = ? AND id > ?", (site, changes.drop_currents_after))
+    if changes.new_current is not None:
+        row = (site, changes.new_current, now_ns)
+        connection.execute("INSERT INTO currents (site, version, since_ns) VALUES (?, ?, ?)", row)
+        connection.execute(
+            """UPDATE sites SET vocabulary_sha256 = coalesce(vocabulary_sha256, (SELECT vocabulary_sha256 FROM versions
+               WHERE site = ?1 AND version = ?2)) WHERE site = ?1""",
+            (site, changes.new_current),
+        )
+    if (new := changes.new_canary) is not None:
+        connection.execute(
+            """INSERT INTO canaries (site, version, base_version, share, threshold, state, started_ns, actor, reason,
+               outcome) VALUES (?, ?, ?, ?, ?, 'running', ?, ?, ?, '')""",
+            (site, new.version, new.base_version, new.share, new.threshold, now_ns, new.actor.name, new.actor.reason),
+        )
+    if (end := changes.ended_canary) is not None:
+        connection.execute(
+            "UPDATE canaries SET state = ?, ended_ns = ?, outcome = ? WHERE id = ?",
+            (end.state, now_ns, end.outcome, end.id),
+        )
+    for entry in changes.log:
+        transactions.log(connection, site, entry)
+
+
+def set_state(connection: sqlite3.Connection, version: tuple[str, int], state: str, now_ns: int) -> None:
+    """Gives (site, number) its new state, published, current or retired, and the moment of the first and the last of them."""
+    connection.execute(
+        """UPDATE versions SET state = ?1, published_ns = coalesce(published_ns, ?2),
+           retired_ns = CASE WHEN ?1 = 'retired' THEN ?2 END WHERE site = ?3 AND version = ?4""",
+        (state, now_ns, *version),
+    )
+
+
+def insert_verdict(connection: sqlite3.Connection, version: tuple[str, int], verdict: VerdictRow) -> None:
+    """A verdict on (site, number)."""
+    judged = (verdict.stamp_ns, int(verdict.accepted), int(verdict.forced))
+    texts = (json.dumps(verdict.reasons), json.dumps(verdict.report, sort_keys=True))
+    connection.execute(
+        """INSERT INTO verdicts (site, version, stamp_ns, accepted, forced, reasons, report)
+           VALUES (?, ?, ?, ?, ?, ?, ?)""",
+        (*version, *judged, *texts),
+    )
+
+
+def insert_draft(
+    transactions: Transactions, connection: sqlite3.Connection, manifest: Manifest, draft: VersionInfo, log: LogEntry
+) -> None:
+    """The rows of a new draft, within a transaction; its bytes are on the disk already."""
+    row = {name: getattr(draft, name) for name in VersionInfo.__dataclass_fields__}
+    connection.execute(f"INSERT INTO versions ({', '.join(row)}) VALUES ({', '.join(f':{name}' for name in row)})", row)
+    connection.execute(
+        "UPDATE sites SET last_version = max(last_version, ?) WHERE site = ?", (draft.version, draft.site)
+    )
+    connection.executemany(
+        "INSERT INTO version_blobs (site, version, kind, sha256) VALUES (?, ?, ?, ?)",
+        [(draft.site, draft.version, kind, sha256) for kind, sha256 in sorted(references(draft, manifest))],
+    )
+    transactions.log(connection, draft.site, log)
+
+
+def references(info: VersionInfo, manifest: Manifest) -> set[tuple[str, str]]:
+    """Kind and address of everything that belongs to a version."""
+    found = {("manifest", info.manifest_sha256), ("vocabulary", manifest.vocabulary.sha256)}
+    found |= {("tile", tile.sha256) for tile in manifest.tiles}
+    return found | ({("archive", info.archive_sha256)} if info.archive_sha256 is not None else set())

@@ -1,0 +1,131 @@
+"""Publishing, promoting, rolling back, comparing two versions."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import GateRefusedError, StateError, StoreError, UsageError
+from fleetmap.mapformat import blob_path, current_path
+from mapserver import releases
+from mapserver.quality.gate import GateSettings
+from mapserver.releases.version_diff import SideBySide
+from mapserver.store import Actor, DraftContent, MapStore
+from support.storage.map_samples import draft_details, publish_samples, random_tile, save_sample_draft
+
+ADA = Actor("ada", "a test")
+DAY_NS = 86_400_000_000_000
+
+
+@pytest.fixture
+def store(tmp_path: Path):
+    with MapStore.open(tmp_path / "store", create=True) as opened:
+        yield opened
+
+
+def states(store: MapStore) -> dict[int, str]:
+    return {info.version: info.state for info in store.versions("lab")}
+
+
+def test_rollback_goes_back_step_by_step_and_promote_forth(store: MapStore, tmp_path: Path) -> None:
+    publish_samples(store, 3)
+    assert releases.roll_back(store, "lab", actor=ADA) == 2
+    assert states(store) == {1: "published", 2: "current", 3: "retired"}
+    assert (tmp_path / "store" / current_path("lab")).read_text().strip() == store.version("lab", 2).manifest_sha256
+    assert releases.roll_back(store, "lab") == 1
+    with pytest.raises(StateError, match="no version that was current before"):
+        releases.roll_back(store, "lab")
+    releases.promote(store, "lab", 3, actor=ADA)
+    releases.promote(store, "lab", 3)  # is current already
+    assert states(store) == {1: "published", 2: "retired", 3: "current"}
+    assert releases.roll_back(store, "lab") == 1
+    logged = [(event.kind, event.version, event.actor, event.reason) for event in store.events("lab")]
+    assert logged[6:9] == [
+        ("rolled_back", 2, "ada", "a test"),
+        ("rolled_back", 1, "", ""),
+        ("promoted", 3, "ada", "a test"),
+    ]
+    save_sample_draft(store, seed=9)
+    with pytest.raises(StateError, match="is a draft"):
+        releases.promote(store, "lab", 4)
+    assert store.verify().faults == []
+
+
+def test_a_bad_version_is_not_gone_back_to(store: MapStore, tmp_path: Path) -> None:
+    publish_samples(store, 2)
+    tile = store.manifest("lab", 1).tiles[0].sha256
+    (tmp_path / "store" / blob_path(tile)).unlink()
+    for go_back in (lambda: releases.roll_back(store, "lab"), lambda: releases.promote(store, "lab", 1)):
+        with pytest.raises(StoreError, match="incomplete"):
+            go_back()
+    assert store.current("lab").version == 2
+
+
+def test_the_gate_compares_with_the_current_version(store: MapStore) -> None:
+    publish_samples(store, 1)
+    small = [random_tile(np.random.default_rng(3), landmarks=70, cell=(0, 0))]
+    store.save_draft("lab", DraftContent(tiles=small, vocabulary=b"words" * 50, details=draft_details()))
+    with pytest.raises(GateRefusedError, match=r"coverage_share 0\.50 of version 1"):
+        releases.publish(store, "lab", actor=ADA)
+    with pytest.raises(UsageError, match="--reason"):
+        releases.publish(store, "lab", actor=Actor("ada"), force=True)
+    assert states(store) == {1: "current", 2: "draft"}
+    (refused,) = store.verdicts("lab", 2)
+    assert (refused.accepted, refused.forced, len(refused.reasons)) == (False, False, 1)
+    assert releases.publish(store, "lab", actor=ADA, force=True) == 2
+    assert [(event.kind, event.actor) for event in store.events("lab")][-3:] == [
+        ("refused", "ada"),
+        ("forced", "ada"),
+        ("published", "ada"),
+    ]
+    save_sample_draft(store, seed=4)
+    assert releases.publish(store, "lab", gate=GateSettings(max_bytes_share=100)) == 3
+
+
+def test_a_draft_is_not_published_against_another_version_than_it_was_judged_by(store: MapStore, monkeypatch) -> None:
+    publish_samples(store, 1)
+    save_sample_draft(store, seed=2)
+    save_sample_draft(store, seed=3)
+    record = MapStore.record_verdict
+
+    def slow(*args, **more) -> None:
+        monkeypatch.setattr(MapStore, "record_verdict", record)
+        record(*args, **more)
+        releases.publish(store, "lab", 2)
+
+    monkeypatch.setattr(MapStore, "record_verdict", slow)
+    with pytest.raises(StateError, match="compared with 1"):
+        releases.publish(store, "lab", 3)
+    assert states(store) == {1: "published", 2: "current", 3: "draft"}
+    assert releases.publish(store, "lab", 3) == 3
+
+
+def test_hard_limits_are_not_forced(store: MapStore) -> None:
+    store.save_draft("lab", DraftContent(tiles=[], vocabulary=b"v", details=draft_details()))
+    with pytest.raises(GateRefusedError, match="cannot be forced"):
+        releases.publish(store, "lab", actor=ADA, force=True)
+
+
+def test_a_difference_counts_tiles_landmarks_and_bytes(store: MapStore) -> None:
+    rng = np.random.default_rng(0)
+    kept, old, gone, come = (random_tile(rng, cell=(x, 0)) for x in range(4))
+    shifted = old.points_map.copy()
+    shifted[:5, 2] += 0.5
+    new = type(old)(**{name: getattr(old, name) for name in old.__dataclass_fields__} | {"points_map": shifted})
+    for tiles, path_m in (([kept, old, gone], 10.0), ([kept, new, come], 11.0)):
+        store.save_draft("lab", DraftContent(tiles=tiles, vocabulary=b"v", details=draft_details(path_m=path_m)))
+    found = releases.difference(store, "lab", 1, 2)
+    assert (found.tiles_added, found.tiles_changed, found.tiles_removed, found.tiles_kept) == (1, 1, 1, 1)
+    shared = np.intersect1d(gone.landmark_ids, come.landmark_ids)
+    only_old = np.union1d(old.landmark_ids, gone.landmark_ids)
+    only_new = np.union1d(old.landmark_ids, come.landmark_ids)
+    assert found.landmarks_added == len(np.setdiff1d(only_new, only_old))
+    assert found.landmarks_removed == len(np.setdiff1d(only_old, only_new))
+    assert 5 <= found.landmarks_moved <= 5 + len(shared)
+    entries = {(tile.x, tile.y): tile for tile in store.manifest("lab", 2).tiles}
+    info = store.version("lab", 2)
+    assert found.fetch_bytes == info.manifest_bytes + entries[1, 0].bytes + entries[3, 0].bytes
+    assert found.full_bytes == info.map_bytes + info.vocabulary_bytes
+    assert found.quality == {"path_m": SideBySide(10.0, 11.0)}
+    same = releases.difference(store, "lab", 2, 2)
+    assert (same.tiles_kept, same.landmarks_kept, same.moved_max_m) == (3, info.landmarks, None)
