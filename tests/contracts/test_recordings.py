@@ -64,7 +64,7 @@ def test_exactly_its_own_format_recognises_it(path: Path) -> None:
 
 def test_stamps_increase_and_images_are_the_samples(path: Path) -> None:
     recording = open_recording(path)
-    assert recording.losses == ()
+    assert recording.issues == ()
     assert len(recording) == len(SAMPLE.left)
     assert (np.diff(recording.frame_stamps_ns) > 0).all()
     for index in (3, 0, 4, 4):
@@ -104,7 +104,7 @@ def test_a_conversion_to_mcap_loses_nothing(path: Path, tmp_path: Path) -> None:
     source = open_recording(path)
     copy_to_mcap(source, tmp_path / "converted.mcap")
     with open_recording(tmp_path / "converted.mcap") as copy:
-        assert copy.losses == ()
+        assert copy.issues == ()
         assert (copy.name, copy.sensor_set) == (source.name, source.sensor_set)
         _assert_same_frames(source, copy)
         for field in ("stamps_ns", "gyro_radps", "accel_mps2"):

@@ -48,7 +48,7 @@ def test_an_mcap_recording_opens_with_everything_in_it(tmp_path: Path) -> None:
     recording = open_recording(_record(tmp_path, "--robot", "tote-1"))
     assert recording.sensor_set is SensorSet.STEREO_INERTIAL
     assert len(recording.frame_stamps_ns) == 6
-    assert recording.losses == ()
+    assert recording.issues == ()
     assert len(recording.priors) == 1
     assert len(recording.wheel) > 10
     assert recording.calibration.base_from_body[2, 3] == 0.25

@@ -88,8 +88,8 @@ def _run(path: Path, options: dict[str, Any], config: Any) -> None:
         connected(options) as link,
         Progress(console=console, disable=not console.is_terminal) as bar,
     ):
-        for loss in recording.losses:
-            console.print(f"note: {loss.what} {loss.detail}".rstrip())
+        for issue in recording.issues:
+            console.print(f"note: {issue.what} {issue.detail}".rstrip())
         source = ReplaySource.of(recording, selection, reverse=options["reverse"])
         task = bar.add_task("replay", total=len(source))
         result = play(

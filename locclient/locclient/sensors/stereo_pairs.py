@@ -3,7 +3,7 @@
 from collections import deque
 
 from fleetmap.recordings import StoredFrame, StoredImage
-from fleetmap.recordings.folders.table_files import PAIR_TOLERANCE_NS
+from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS
 
 _WAITING = 8
 

@@ -163,7 +163,7 @@ def full_report(
         "format": first.format,
         "sensor_set": first.sensor_set.value,
         "inertial": all(s.survey.first_guess.inertial for s in surveyed),
-        "losses": [{"what": loss.what, "detail": loss.detail} for s in surveyed for loss in s.losses],
+        "losses": [{"what": issue.what, "detail": issue.detail} for s in surveyed for issue in s.issues],
         "frames": len(survey_map.trajectory),
         "estimated_frames": int(survey_map.trajectory_estimated.sum()),
         "observations": len(survey_map.obs_landmark),

@@ -38,7 +38,7 @@ class Surveyed:
     entry: RecordingEntry
     format: str
     sensor_set: SensorSet
-    losses: tuple[DataIssue, ...]
+    issues: tuple[DataIssue, ...]
     truth: Trajectory | None
     survey: Survey
     placed: Array | None
@@ -52,7 +52,7 @@ class Surveyed:
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """A recording that may be surveyed: its losses and the doctor's remarks, in words; the correction of its clocks."""
+    """A recording that may be surveyed: its issues and the doctor's remarks, in words; the correction of its clocks."""
 
     remarks: tuple[str, ...]
     correction_s: float
@@ -90,8 +90,8 @@ def _admission(
 ) -> Admission:
     with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
         recording = reduced(opened, use)
-        for loss in recording.losses:
-            console.print(f"loss: {loss.what}: {loss.detail}", markup=False)
+        for issue in recording.issues:
+            console.print(f"issue: {issue.what}: {issue.detail}", markup=False)
         _check(recording, FrameSelection.parse(frames).apply(recording), needs_truth)
         examined = checked(recording, worker=worker)
         for remark in examined.remarks():
@@ -125,7 +125,7 @@ def survey_recording(
             entry,
             recording.format,
             recording.sensor_set,
-            recording.losses,
+            recording.issues,
             recording.ground_truth,
             done,
             placed,

@@ -31,8 +31,8 @@ def convert(
 
     console = Console(stderr=True)
     with open_recording(recording, OpenOptions(calibration_file=calibration)) as source:
-        for loss in source.losses:
-            console.print(f"loss: {loss.what}: {loss.detail}", markup=False)
+        for issue in source.issues:
+            console.print(f"issue: {issue.what}: {issue.detail}", markup=False)
         with Progress(console=console) as progress:
             task = progress.add_task("frames", total=len(source))
             copy_to_mcap(source, out, lambda: progress.advance(task))

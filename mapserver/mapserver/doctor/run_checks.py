@@ -73,7 +73,7 @@ def examine(
         timing.camera_gaps(stamps_ns),
         timing.imu_rate(imu.stamps_ns),
         timing.imu_gaps(imu.stamps_ns),
-        timing.stamp_order(recording.losses),
+        timing.stamp_order(recording.issues),
         timing.camera_imu_overlap(stamps_ns, imu.stamps_ns, shift_s),
         inertial.gravity_magnitude(imu),
     ]
@@ -85,7 +85,7 @@ def examine(
     turns = _camera_turns(recording, frames, rectifier, turn_frames, worker)
     checked, measured_offset_s = gyro_check(turns, imu, shift_s)
     findings += [*checked, sharpness(seen.variances), _readable(frames)]
-    return Examination(findings + timing.other_losses(recording.losses), measured_offset_s)
+    return Examination(findings + timing.other_issues(recording.issues), measured_offset_s)
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,18 +47,18 @@ def imu_gaps(imu_stamps_ns: Stamps) -> Finding:
     return _gaps("imu gaps", imu_stamps_ns, max(3.5 * median_period_s(imu_stamps_ns), 0.02), 0.2, "inertial samples")
 
 
-def stamp_order(losses: Sequence[DataIssue]) -> Finding:
+def stamp_order(issues: Sequence[DataIssue]) -> Finding:
     """Whether stamps that do not increase were left out when the recording was opened."""
-    found = [loss for loss in losses if "stamps not increasing" in loss.what]
+    found = [issue for issue in issues if "stamps not increasing" in issue.what]
     limit = "none may be out of order"
     if not found:
         return Finding("stamp order", Verdict.OK, 0.0, limit, "all stamps increase")
-    words = "; ".join(f"{loss.what}, {loss.detail}" for loss in found)
+    words = "; ".join(f"{issue.what}, {issue.detail}" for issue in found)
     sentence = f"{words}; look for a clock that is set while recording, or for a driver that sends late"
     return Finding("stamp order", Verdict.FAIL, float(len(found)), limit, sentence)
 
 
-def other_losses(losses: Sequence[DataIssue]) -> list[Finding]:
+def other_issues(issues: Sequence[DataIssue]) -> list[Finding]:
     """One warning for everything else that could not be read."""
     return [
         Finding(
@@ -66,10 +66,10 @@ def other_losses(losses: Sequence[DataIssue]) -> list[Finding]:
             Verdict.WARN,
             None,
             "nothing lost",
-            f"{loss.what}: {loss.detail}; copy the recording again if it has more",
+            f"{issue.what}: {issue.detail}; copy the recording again if it has more",
         )
-        for loss in losses
-        if "stamps not increasing" not in loss.what
+        for issue in issues
+        if "stamps not increasing" not in issue.what
     ]
 
 

@@ -47,10 +47,7 @@ Values = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class CalibrationFile:
-    """What a calibration file holds.
-
-    The calibration, and the topics that Kalibr noted (`rostopic`) as cam0, cam1, imu0.
-    """
+    """The calibration in a file, and the topics that Kalibr noted (`rostopic`) as cam0, cam1, imu0."""
 
     calibration: RigCalibration
     topics: Mapping[str, str]
@@ -109,10 +106,8 @@ def format_calibration(calibration: RigCalibration) -> str:
         distortion = "none" if len(camera.distortion) == 0 else model
         out.write(f"cam{number}:\n  camera_model: pinhole\n  distortion_model: {distortion}\n")
         out.write(f"  intrinsics: {_row(camera.intrinsics_px)}\n  distortion_coeffs: {_row(camera.distortion)}\n")
-        out.write(
-            f"  resolution: [{camera.width_px}, {camera.height_px}]\n  timeshift_cam_imu: "
-            f"{float(camera.imu_minus_cam_s)!r}\n"
-        )
+        out.write(f"  resolution: [{camera.width_px}, {camera.height_px}]\n")
+        out.write(f"  timeshift_cam_imu: {float(camera.imu_minus_cam_s)!r}\n")
         out.write(f"  T_cam_imu:\n{_rows(se3_inverse(camera.body_from_cam), '  ')}")
         out.write(f"  body_from_cam:\n{_rows(camera.body_from_cam, '  ')}")
     if calibration.imu is None:

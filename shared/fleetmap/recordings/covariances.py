@@ -11,7 +11,7 @@ import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
-from fleetmap.recordings.tum import format_stamp, parse_stamp_ns
+from fleetmap.recordings.tum import format_stamp, read_text, stamped_lines, write_text
 from fleetmap.sensors.samples import Stamps
 
 _ROWS, _COLUMNS = np.triu_indices(6)
@@ -40,46 +40,24 @@ def parse_covariances(text: str, what: str = "covariances") -> StampedCovariance
     Raises RecordingError, naming `what` and the line, for anything but 22 finite numbers of a positive definite matrix, or
     stamps that do not rise.
     """
-    stamps: list[int] = []
-    found: list[Array] = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        fields = line.replace(",", " ").split()
-        if not fields or fields[0].startswith("#"):
-            continue
-        try:
-            stamp_ns, values = parse_stamp_ns(fields[0]), np.array([float(field) for field in fields[1:]])
-        except ValueError as error:
-            raise RecordingError(f"{what}, line {number}: {line[:80]!r} is not all numbers ({error})") from error
-        if len(values) != len(_ROWS) or not np.isfinite(values).all():
-            raise RecordingError(
-                f"{what}, line {number}: {len(values)} numbers after the stamp, 21 finite ones are needed"
-            )
+    stamps, covariances = [], []
+    for line in stamped_lines(text, what):
+        if len(line.values) != len(_ROWS) or not np.isfinite(line.values).all():
+            raise RecordingError(f"{line.where}: {len(line.values)} numbers after the stamp, 21 finite ones are needed")
         covariance = np.zeros((6, 6))
-        covariance[_ROWS, _COLUMNS] = covariance[_COLUMNS, _ROWS] = values
+        covariance[_ROWS, _COLUMNS] = covariance[_COLUMNS, _ROWS] = line.values
         if np.linalg.eigvalsh(covariance)[0] <= 0:
-            raise RecordingError(
-                f"{what}, line {number}: the covariance is not positive definite; is its order rotation first?"
-            )
-        if stamps and stamp_ns <= stamps[-1]:
-            raise RecordingError(f"{what}, line {number}: stamp {fields[0]} does not rise; sort the lines by time")
-        stamps.append(stamp_ns)
-        found.append(covariance)
-    return StampedCovariances(np.array(stamps, np.int64), np.array(found).reshape(-1, 6, 6))
+            raise RecordingError(f"{line.where}: the covariance is not positive definite; is its order rotation first?")
+        stamps.append(line.stamp_ns)
+        covariances.append(covariance)
+    return StampedCovariances(np.array(stamps, np.int64), np.array(covariances).reshape(-1, 6, 6))
 
 
 def read_covariances(path: Path) -> StampedCovariances:
     """The covariances in the file at `path`; RecordingError as `parse_covariances`, and where it cannot be read."""
-    try:
-        return parse_covariances(path.read_text(encoding="utf-8"), str(path))
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the path") from error
-    except UnicodeDecodeError as error:
-        raise RecordingError(f"{path} is not a text file ({error.reason}); covariances as CSV are expected") from error
+    return parse_covariances(read_text(path, "covariances as CSV are expected"), str(path))
 
 
 def write_covariances(path: Path, given: StampedCovariances) -> None:
     """Writes them; RecordingError where the file cannot be written."""
-    try:
-        path.write_text(format_covariances(given), encoding="ascii")
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be written ({error.strerror}); check folder and space") from error
+    write_text(path, format_covariances(given))

@@ -9,9 +9,7 @@ from fleetmap.sensors.samples import Trajectory
 
 
 def copy_to_mcap(recording: Recording, path: Path, on_frame: Callable[[], None] = lambda: None) -> None:
-    """Writes all of `recording` to a new file at `path`; images keep their encoding.
-
-    `on_frame` is called after every frame.
+    """Writes all of `recording` to a new file at `path`; images keep their encoding, `on_frame` follows every frame.
 
     Samples go before the frame that follows them, so that the file is in the order of time to within one frame. The
     file appears at `path` only when it is complete.

@@ -1,4 +1,4 @@
-"""Images as recordings store them, and how they become grey or metres."""
+"""Images as recordings store them, and their decoding to grey or metres."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ _GREY_FROM = {
     "bgra8": cv2.COLOR_BGRA2GRAY,
 }
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-# Pictures with sensor noise hold no repetitions worth a search: runs alone are faster and, measured, smaller.
+# Images with sensor noise have no repetitions worth a search: run-length coding is faster and, measured, smaller.
 _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 
@@ -149,15 +149,11 @@ def _decode(stored: StoredImage) -> AnyArray:
     wire_type = np.dtype(dtype).newbyteorder(">" if stored.big_endian else "<")
     row_bytes = stored.width_px * channels * wire_type.itemsize
     step = stored.step_bytes or row_bytes
-    if (
-        step < row_bytes
-        or len(stored.data) < step * (stored.height_px - 1) + row_bytes
-        or 0 in (row_bytes, stored.height_px)
-    ):
+    needed = step * (stored.height_px - 1) + row_bytes
+    if step < row_bytes or len(stored.data) < needed or 0 in (row_bytes, stored.height_px):
         raise RecordingError(
             f"{stored.where}: {len(stored.data)} bytes for {stored.width_px}x{stored.height_px} {stored.encoding} in "
-            f"rows of "
-            f"{step} bytes; the message is damaged"
+            f"rows of {step} bytes; the message is damaged"
         )
     padded = stored.data[: step * stored.height_px].ljust(step * stored.height_px, b"\0")
     rows = np.frombuffer(padded, np.uint8).reshape(stored.height_px, step)[:, :row_bytes]

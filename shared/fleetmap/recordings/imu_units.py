@@ -1,4 +1,4 @@
-"""Is an IMU in the units that it should be in? Said only where the samples themselves leave no doubt."""
+"""Check of an IMU's units: an error only where the samples themselves leave no doubt."""
 
 import numpy as np
 
@@ -25,15 +25,14 @@ def check_imu_units(imu: ImuSamples, where: str) -> None:
     accel = float(np.median(np.linalg.norm(imu.accel_mps2, axis=1)))
     if _ACCEL_IN_G[0] <= accel <= _ACCEL_IN_G[1]:
         raise RecordingError(
-            f"{where}: the accelerometer seems to be in g (median {accel:.2f}, gravity is 9.81 m/s^2); multiply it by "
-            f"9.80665"
+            f"{where}: the accelerometer seems to be in g (median {accel:.2f}, gravity is 9.81 m/s^2); "
+            "multiply it by 9.80665"
         )
     rate = float(np.percentile(np.linalg.norm(imu.gyro_radps, axis=1), 99))
     if rate > _FASTEST_GYRO_RADPS or _accelerometer_prefers_degrees(imu):
         raise RecordingError(
             f"{where}: the gyro seems to be in degrees per second (99 % of the rates are below {rate:.1f} where rad/s "
-            f"are "
-            "expected, and the accelerometer does not see such turns); multiply it by pi/180"
+            "are expected, and the accelerometer does not see such turns); multiply it by pi/180"
         )
 
 

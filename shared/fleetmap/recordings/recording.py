@@ -1,4 +1,4 @@
-"""What a recording is, whatever format it came in."""
+"""A recording in memory, whatever format it came in."""
 
 import hashlib
 from dataclasses import dataclass, field
@@ -45,7 +45,7 @@ class OpenOptions:
 
 
 class FrameSource(Protocol):
-    """Where the images of a recording lie: F frames, in any order of access."""
+    """Access to the images of a recording: F frames, in any order."""
 
     def stored(self, index: int) -> StoredFrame:
         """Frame `index` as it was stored, images still encoded; RecordingError where the bytes are gone."""
@@ -57,7 +57,7 @@ class FrameSource(Protocol):
         """Feeds all that was read of the recording, images included, to `digest`, in an order that never changes."""
 
     def close(self) -> None:
-        """Lets go of open files."""
+        """Closes open files."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ class Recording:
 
     frame_stamps_ns (F,), strictly increasing: left frames that have their partner (right image or depth). imu: all
     samples, also those before the first frame; empty where the calibration does not say how the IMU is mounted (stated
-    in losses). ground_truth: frame_from_body of the body (the IMU, or the frame that the calibration's body_from_cam
-    refers to without one). losses: what could not be read.
+    in issues). ground_truth: frame_from_body of the body (the IMU, or the frame that the calibration's body_from_cam
+    refers to without one). issues: what could not be read.
     """
 
     path: Path
@@ -81,7 +81,7 @@ class Recording:
     wheel: tuple[WheelSample, ...] = ()
     priors: tuple[PositionPrior, ...] = ()
     ground_truth: Trajectory | None = None
-    losses: tuple[DataIssue, ...] = ()
+    issues: tuple[DataIssue, ...] = ()
 
     def __len__(self) -> int:
         return len(self.frame_stamps_ns)
@@ -93,21 +93,19 @@ class Recording:
         """
         self._check_index(index)
         frame = self.frames.frame(index)
-        for number, (image, camera) in enumerate(
-            zip((frame.left, frame.right), self.calibration.cameras, strict=False)
-        ):
+        images = zip((frame.left, frame.right), self.calibration.cameras, strict=False)
+        for number, (image, camera) in enumerate(images):
             if image is not None and image.shape != (camera.height_px, camera.width_px):
                 raise RecordingError(
                     f"{self.path}: the cam{number} image at {frame.stamp_ns} is {image.shape[1]}x{image.shape[0]} px, "
-                    f"the "
-                    f"calibration says {camera.width_px}x{camera.height_px}; pass the matching one with --calibration "
-                    f"FILE"
+                    f"the calibration says {camera.width_px}x{camera.height_px}; pass the matching one with "
+                    "--calibration FILE"
                 )
         if frame.depth_m is not None and frame.depth_m.shape != frame.left.shape:
+            (height, width), (colour_height, colour_width) = frame.depth_m.shape, frame.left.shape
             raise RecordingError(
-                f"{self.path}: the depth image at {frame.stamp_ns} is "
-                f"{frame.depth_m.shape[1]}x{frame.depth_m.shape[0]} px, "
-                f"the colour image {frame.left.shape[1]}x{frame.left.shape[0]}; record depth registered to colour"
+                f"{self.path}: the depth image at {frame.stamp_ns} is {width}x{height} px, the colour image "
+                f"{colour_width}x{colour_height}; record depth registered to colour"
             )
         return frame
 
@@ -123,7 +121,7 @@ class Recording:
         return digest.hexdigest()
 
     def close(self) -> None:
-        """Lets go of open files; the recording's arrays stay usable."""
+        """Closes open files; the recording's arrays stay usable."""
         self.frames.close()
 
     def __enter__(self) -> "Recording":

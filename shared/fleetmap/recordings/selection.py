@@ -1,4 +1,4 @@
-"""Which frames of a recording take part."""
+"""Selection of a recording's frames, A:B:C."""
 
 from dataclasses import dataclass
 

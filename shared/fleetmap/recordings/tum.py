@@ -3,13 +3,15 @@
 Stamps are written with nine decimals and read as decimals, never through a float, so that nanoseconds survive.
 """
 
+from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
+from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 from fleetmap.sensors.samples import Trajectory
 
 _NS = 1_000_000_000
@@ -32,45 +34,69 @@ def parse_tum(text: str, what: str = "trajectory") -> Trajectory:
     Raises RecordingError, naming `what` and the line, for anything but eight finite numbers, a quaternion that is not
     of unit length within 1 %, or stamps that do not rise.
     """
-    stamps: list[int] = []
-    frame_from_body = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        fields = line.replace(",", " ").split()
-        if not fields or fields[0].startswith("#"):
-            continue
-        try:
-            stamp = parse_stamp_ns(fields[0])
-            values = np.array([float(field) for field in fields[1:]])
-        except ValueError as error:
-            raise RecordingError(f"{what}, line {number}: {line[:80]!r} is not all numbers ({error})") from error
+    stamps, frame_from_body = [], []
+    for line in stamped_lines(text, what):
+        values = line.values
         if len(values) != 7 or not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 0.01:
-            raise RecordingError(
-                f"{what}, line {number}: {line[:80]!r} is not 't x y z qx qy qz qw' with a unit quaternion"
-            )
-        if stamps and stamp <= stamps[-1]:
-            raise RecordingError(f"{what}, line {number}: stamp {fields[0]} does not rise; sort the lines by time")
-        stamps.append(stamp)
+            raise RecordingError(f"{line.where}: {line.text!r} is not 't x y z qx qy qz qw' with a unit quaternion")
+        stamps.append(line.stamp_ns)
         frame_from_body.append(se3(rotation_from_quat_wxyz(values[[6, 3, 4, 5]]), values[:3]))
     return Trajectory(np.array(stamps, np.int64), np.array(frame_from_body).reshape(-1, 4, 4))
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Writes `trajectory` as TUM text; RecordingError where the file cannot be written."""
-    try:
-        path.write_text(format_tum(trajectory), encoding="ascii")
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be written ({error.strerror}); check folder and space") from error
+    write_text(path, format_tum(trajectory))
 
 
 def read_tum(path: Path) -> Trajectory:
     """The trajectory in the file at `path`; RecordingError as `parse_tum`, and where it cannot be read."""
+    return parse_tum(read_text(path, "a TUM trajectory is expected"), str(path))
+
+
+class StampedLine(NamedTuple):
+    """A line of numbers: where it is, its first 80 characters, its stamp and the values after it."""
+
+    where: str
+    text: str
+    stamp_ns: int
+    values: Array
+
+
+def stamped_lines(text: str, what: str) -> Iterator[StampedLine]:
+    """The lines of a table with rising stamps, comments and empty lines skipped; RecordingError for other lines."""
+    last_ns: int | None = None
+    for number, line in enumerate(text.splitlines(), start=1):
+        fields = line.replace(",", " ").split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        where = f"{what}, line {number}"
+        try:
+            stamp_ns, values = parse_stamp_ns(fields[0]), np.array([float(field) for field in fields[1:]])
+        except ValueError as error:
+            raise RecordingError(f"{where}: {line[:80]!r} is not all numbers ({error})") from error
+        yield StampedLine(where, line[:80], stamp_ns, values)
+        if last_ns is not None and stamp_ns <= last_ns:
+            raise RecordingError(f"{where}: stamp {fields[0]} does not rise; sort the lines by time")
+        last_ns = stamp_ns
+
+
+def read_text(path: Path, expected: str) -> str:
+    """The text in the file at `path`; RecordingError where it cannot be read or is no text."""
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); check the path") from error
     except UnicodeDecodeError as error:
-        raise RecordingError(f"{path} is not a text file ({error.reason}); a TUM trajectory is expected") from error
-    return parse_tum(text, str(path))
+        raise RecordingError(f"{path} is not a text file ({error.reason}); {expected}") from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes ASCII text; RecordingError where the file cannot be written."""
+    try:
+        path.write_text(text, encoding="ascii")
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be written ({error.strerror}); check folder and space") from error
 
 
 def format_stamp(stamp_ns: int) -> str:

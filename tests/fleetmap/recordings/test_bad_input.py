@@ -72,7 +72,7 @@ def test_zero_byte_image_is_left_out_and_counted(euroc: Path) -> None:
     (euroc / "mav0/cam0/data/image3.png").write_bytes(b"")
     recording = open_recording(euroc)
     assert len(recording) == 3
-    assert any("without a byte" in loss.what and "image3.png" in loss.detail for loss in recording.losses)
+    assert any("without a byte" in issue.what and "image3.png" in issue.detail for issue in recording.issues)
 
 
 def test_nothing_but_zero_byte_images(euroc: Path) -> None:
@@ -138,9 +138,9 @@ def test_backward_stamps_are_dropped_and_counted_never_sorted(euroc: Path) -> No
     recording = open_recording(euroc)
     assert (np.diff(recording.imu.stamps_ns) > 0).all()
     assert len(recording.imu) == len(stamps) - 3
-    (loss,) = recording.losses
-    assert loss.what == "imu: stamps not increasing"
-    assert f"3 of {len(stamps)}" in loss.detail
+    (issue,) = recording.issues
+    assert issue.what == "imu: stamps not increasing"
+    assert f"3 of {len(stamps)}" in issue.detail
     kept = np.isin(SAMPLE.imu_stamps_ns, recording.imu.stamps_ns)
     np.testing.assert_array_equal(recording.imu.gyro_radps[:50], SAMPLE.gyro_radps[kept][:50])
 
@@ -158,7 +158,7 @@ def test_camera_stamps_backwards(euroc: Path) -> None:
     recording = open_recording(euroc)
     assert len(recording) == 3
     assert (np.diff(recording.frame_stamps_ns) > 0).all()
-    assert any("cam0: stamps not increasing" in loss.what for loss in recording.losses)
+    assert any("cam0: stamps not increasing" in issue.what for issue in recording.issues)
 
 
 def test_table_cut_off_in_the_middle_of_a_line(euroc: Path) -> None:
@@ -167,7 +167,7 @@ def test_table_cut_off_in_the_middle_of_a_line(euroc: Path) -> None:
     file.write_text(text[: len(text) - 60])
     recording = open_recording(euroc)
     assert len(recording.imu) == len(SAMPLE.imu_stamps_ns) - 1
-    assert any("unreadable lines" in loss.what and loss.detail.startswith("1 of") for loss in recording.losses)
+    assert any("unreadable lines" in issue.what and issue.detail.startswith("1 of") for issue in recording.issues)
 
 
 def test_values_that_are_not_finite(euroc: Path) -> None:
@@ -176,7 +176,7 @@ def test_values_that_are_not_finite(euroc: Path) -> None:
     write_euroc_imu(euroc / "mav0/imu0/data.csv", SAMPLE.imu_stamps_ns, gyro, SAMPLE.accel_mps2)
     recording = open_recording(euroc)
     assert np.isfinite(recording.imu.gyro_radps).all()
-    assert any("impossible values" in loss.what for loss in recording.losses)
+    assert any("impossible values" in issue.what for issue in recording.issues)
 
 
 def test_truth_without_rotation_is_left_out(euroc: Path) -> None:
@@ -188,7 +188,7 @@ def test_truth_without_rotation_is_left_out(euroc: Path) -> None:
     recording = open_recording(euroc)
     assert recording.ground_truth is not None
     assert len(recording.ground_truth) == 3
-    assert any("unit quaternion" in loss.detail for loss in recording.losses)
+    assert any("unit quaternion" in issue.detail for issue in recording.issues)
 
 
 def test_missing_sensor_yaml(euroc: Path) -> None:
@@ -244,4 +244,4 @@ def test_imu_without_mounting_is_not_used_and_said_so(euroc: Path, tmp_path: Pat
     recording = open_recording(euroc, OpenOptions(calibration_file=file))
     assert recording.sensor_set.value == "stereo"
     assert len(recording.imu) == 0
-    assert [loss.what for loss in recording.losses] == ["imu not used"]
+    assert [issue.what for issue in recording.issues] == ["imu not used"]

@@ -79,8 +79,8 @@ def test_frames_without_partner_are_left_out_and_counted(tmp_path: Path) -> None
     recording = open_recording(folder)
     np.testing.assert_array_equal(recording.frame_stamps_ns, np.delete(SAMPLE.stamps_ns, 1))
     np.testing.assert_array_equal(recording.read_frame(1).right, SAMPLE.right[2])
-    assert [loss.what for loss in recording.losses] == ["cam1: images missing", "images without their partner"]
-    assert "1 of 4" in recording.losses[0].detail
+    assert [issue.what for issue in recording.issues] == ["cam1: images missing", "images without their partner"]
+    assert "1 of 4" in recording.issues[0].detail
 
 
 def test_right_images_a_little_late_are_paired(tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_right_images_a_little_late_are_paired(tmp_path: Path) -> None:
     (folder / "mav0/cam1/data.csv").write_text("\n".join(rows))
     recording = open_recording(folder)
     np.testing.assert_array_equal(recording.frame_stamps_ns, SAMPLE.stamps_ns)
-    assert recording.losses == ()
+    assert recording.issues == ()
 
 
 def test_jpeg_colour_and_16_bits(tmp_path: Path) -> None:

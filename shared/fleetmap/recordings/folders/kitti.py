@@ -6,13 +6,15 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3
-from fleetmap.recordings.finalize import Parts, assemble, calibration_of_options
-from fleetmap.recordings.folders.image_files import FileFrames, ImageFolder, existing_images
-from fleetmap.recordings.folders.table_files import forward_only, natural_key
+from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
+from fleetmap.recordings.folders.image_files import FileFrames, ImageFiles, existing_images
+from fleetmap.recordings.folders.table_files import natural_key
+from fleetmap.recordings.image_series import pair_images
 from fleetmap.recordings.images import StoredImage, decode_grey
+from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration, check_camera
-from fleetmap.sensors.samples import DataIssue, Stamps, Trajectory
+from fleetmap.sensors.samples import Stamps, Trajectory
 
 # Folder names and the rows of calib.txt that describe them
 _PAIRS = (("image_l", "image_r", 0, 1), ("image_0", "image_1", 0, 1), ("image_2", "image_3", 2, 3))
@@ -26,7 +28,7 @@ def recognises(path: Path) -> bool:
 
 def open_kitti(path: Path, options: OpenOptions) -> Recording:
     """The recording in a KITTI folder. The body is the camera that poses.txt is about (KITTI's rectified camera 0)."""
-    losses: list[DataIssue] = []
+    log = ReadLog()
     left_name, right_name, left_row, right_row = next(
         pair for pair in _PAIRS if (path / pair[0]).is_dir() or (path / pair[1]).is_dir()
     )
@@ -35,41 +37,31 @@ def open_kitti(path: Path, options: OpenOptions) -> Recording:
             raise RecordingError(
                 f"{path / name} is missing, the other camera's folder is there; copy the recording again"
             )
-    stamps_of_number, read_files = _stamps(path)
-    left = _images(path / left_name, stamps_of_number, losses)
-    right = _images(path / right_name, stamps_of_number, losses)
-    both, lefts, rights = np.intersect1d(left.stamps_ns, right.stamps_ns, return_indices=True)
-    alone = len(left.paths) + len(right.paths) - 2 * len(both)
-    if alone:
-        losses.append(DataIssue("images without their partner", f"{alone}; {len(both)} pairs remain"))
-    left, right = left.chosen(lefts), right.chosen(rights)
-    given = calibration_of_options(options)
-    if given is not None and options.calibration_file is not None:
-        read_files.append(options.calibration_file)
-    else:
-        read_files.append(path / "calib.txt")
-    calibration = given.calibration if given else _calibration(path / "calib.txt", left.paths[0], left_row, right_row)
-    return assemble(
-        Parts(
-            path=path,
-            name=path.resolve().name,
-            format="kitti",
-            calibration=calibration,
-            frame_stamps_ns=left.stamps_ns,
-            frames=FileFrames(path, left.stamps_ns, left.paths, right.paths, read_files),
-            has_right=True,
-            ground_truth=_ground_truth(path, stamps_of_number, read_files, losses),
-            losses=losses,
-        )
+    stamps_of_number = _stamps(path, log)
+    left, right = (_images(path / name, stamps_of_number, log) for name in (left_name, right_name))
+    given, file = calibration_of_options(options), options.calibration_file or path / "calib.txt"
+    calibration = given.calibration if given else _calibration(file, left.sources[0], left_row, right_row)
+    log.files.append(file)
+    left, right = pair_images(left, right, log, tolerance_ns=0)
+    parts = RecordingParts(
+        path=path,
+        format="kitti",
+        calibration=calibration,
+        frame_stamps_ns=left.stamps_ns,
+        frames=FileFrames(path, log.files, left, right),
+        has_right=True,
+        ground_truth=_ground_truth(path, stamps_of_number, log),
     )
+    return finalize(parts, log)
 
 
-def _stamps(path: Path) -> tuple[Stamps | None, list[Path]]:
-    """Stamps by image number from times.txt, None without one, and the files that were read."""
+def _stamps(path: Path, log: ReadLog) -> Stamps | None:
+    """Stamps by image number from times.txt, None without one."""
     file = path / "times.txt"
     if not file.is_file():
-        return None, []
-    return np.round(_table(file, (1,))[:, 0] * 1e9).astype(np.int64), [file]
+        return None
+    log.files.append(file)
+    return np.round(_table(file, (1,))[:, 0] * 1e9).astype(np.int64)
 
 
 def _stamp(number: int, stamps_of_number: Stamps | None, path: Path) -> int:
@@ -80,13 +72,12 @@ def _stamp(number: int, stamps_of_number: Stamps | None, path: Path) -> int:
     return int(stamps_of_number[number])
 
 
-def _images(folder: Path, stamps_of_number: Stamps | None, losses: list[DataIssue]) -> ImageFolder:
+def _images(folder: Path, stamps_of_number: Stamps | None, log: ReadLog) -> ImageFiles:
     paths = sorted((p for p in folder.iterdir() if p.is_file() and p.stem.isdigit()), key=lambda p: natural_key(p.name))
     if not paths:
         raise RecordingError(f"{folder} holds no numbered image such as 000000.png; copy the recording again")
     stamps_ns = np.array([_stamp(int(p.stem), stamps_of_number, p) for p in paths], np.int64)
-    kept = np.flatnonzero(forward_only(stamps_ns, folder.name, losses))
-    return existing_images(ImageFolder(stamps_ns, tuple(paths)).chosen(kept), folder.name, losses)
+    return existing_images(ImageFiles(stamps_ns, tuple(paths)), folder.name, log)
 
 
 def _calibration(file: Path, first_image: Path, left_row: int, right_row: int) -> RigCalibration:
@@ -125,18 +116,14 @@ def _projections(file: Path) -> dict[int, Array]:
     return rows
 
 
-def _ground_truth(
-    path: Path, stamps_of_number: Stamps | None, read_files: list[Path], losses: list[DataIssue]
-) -> Trajectory | None:
+def _ground_truth(path: Path, stamps_of_number: Stamps | None, log: ReadLog) -> Trajectory | None:
     file = path / "poses.txt"
     if not file.is_file():
         return None
-    read_files.append(file)
+    log.files.append(file)
     rows = _table(file, (12, 16))
     if stamps_of_number is not None and len(stamps_of_number) != len(rows):
-        losses.append(
-            DataIssue("ground truth not used", f"poses.txt has {len(rows)} rows, times.txt {len(stamps_of_number)}")
-        )
+        log.note("ground truth not used", f"poses.txt has {len(rows)} rows, times.txt {len(stamps_of_number)}")
         return None
     stamps_ns = np.arange(len(rows)) * _PERIOD_NS if stamps_of_number is None else stamps_of_number
     frame_from_body = np.tile(np.eye(4), (len(rows), 1, 1))

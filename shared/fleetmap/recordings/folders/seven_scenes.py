@@ -17,14 +17,15 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse, transform_points
-from fleetmap.recordings.finalize import Parts, assemble, calibration_of_options
+from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.folders.depth_registration_kernels import nearest_surface
-from fleetmap.recordings.folders.image_files import FileFrames, ImageFolder, existing_images
-from fleetmap.recordings.folders.table_files import forward_only
+from fleetmap.recordings.folders.image_files import FileFrames, ImageFiles, existing_images
+from fleetmap.recordings.image_series import pair_images
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_depth, decode_frame, decode_grey
+from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
-from fleetmap.sensors.samples import CameraFrame, DataIssue, Stamps, Trajectory
+from fleetmap.sensors.samples import CameraFrame, Trajectory
 
 _COLOUR_FOCAL_PX, _DEPTH_FOCAL_PX = 525.0, 585.0
 # Of a Kinect. On the red kitchen depth's edges lie on colour's edges best with 28 mm and these focal lengths.
@@ -42,36 +43,26 @@ def recognises(path: Path) -> bool:
 
 def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
     """The recording in a 7-Scenes folder. The body is the colour camera; depth comes registered to colour."""
-    losses: list[DataIssue] = []
-    colour, depth = _files(path, "color", losses), _files(path, "depth", losses)
-    stamps_ns, colours, depths = np.intersect1d(colour.stamps_ns, depth.stamps_ns, return_indices=True)
-    alone = len(colour.paths) + len(depth.paths) - 2 * len(stamps_ns)
-    if alone:
-        losses.append(DataIssue("images without their partner", f"{alone}; {len(stamps_ns)} pairs remain"))
-    if len(stamps_ns) == 0:
+    log = ReadLog()
+    colour, depth = pair_images(_files(path, "color", log), _files(path, "depth", log), log, tolerance_ns=0)
+    if len(colour) == 0:
         raise RecordingError(f"{path}: no colour image has its depth image; copy the recording again")
-    colour, depth = colour.chosen(colours), depth.chosen(depths)
     given = calibration_of_options(options)
-    calibration = given.calibration if given else _default_calibration(colour.paths[0], depth.paths[0])
-    read_files = [options.calibration_file] if options.calibration_file is not None else []
-    files = FileFrames(path, stamps_ns, colour.paths, None, read_files, depth.paths)
-    has_depth_lens = len(calibration.cameras) > 1
-    depth_camera = calibration.cameras[1] if has_depth_lens else calibration.cameras[0]
-    ground_truth = _ground_truth(colour, se3_inverse(depth_camera.body_from_cam), read_files, losses)
-    return assemble(
-        Parts(
-            path=path,
-            name=path.resolve().name,
-            format="7scenes",
-            calibration=RigCalibration(calibration.cameras[:1], None, calibration.base_from_body),
-            frame_stamps_ns=stamps_ns,
-            frames=RegisteredFrames(files, DepthRegistration(calibration.cameras[0], depth_camera)),
-            has_right=False,
-            has_depth=True,
-            ground_truth=ground_truth,
-            losses=losses,
-        )
+    calibration = given.calibration if given else _default_calibration(colour.sources[0], depth.sources[0])
+    if options.calibration_file is not None:
+        log.files.append(options.calibration_file)
+    colour_camera, depth_camera = calibration.cameras[0], calibration.cameras[min(1, len(calibration.cameras) - 1)]
+    files = FileFrames(path, log.files, colour, depth=depth)
+    parts = RecordingParts(
+        path=path,
+        format="7scenes",
+        calibration=RigCalibration((colour_camera,), None, calibration.base_from_body),
+        frame_stamps_ns=colour.stamps_ns,
+        frames=RegisteredFrames(files, DepthRegistration(colour_camera, depth_camera)),
+        has_depth=True,
+        ground_truth=_ground_truth(colour, se3_inverse(depth_camera.body_from_cam), log),
     )
+    return finalize(parts, log)
 
 
 class DepthRegistration:
@@ -103,8 +94,7 @@ class DepthRegistration:
             height, width = self._depth_size
             raise RecordingError(
                 f"{where}: the depth image is {depth_m.shape[1]}x{depth_m.shape[0]} px, the calibration says "
-                f"{width}x{height}; "
-                "pass the matching one with --calibration FILE"
+                f"{width}x{height}; pass the matching one with --calibration FILE"
             )
         if self._is_same_place:
             return np.asarray(cv2.remap(depth_m, self._map, None, cv2.INTER_NEAREST, borderValue=0.0), np.float32)  # type: ignore[call-overload]
@@ -117,7 +107,7 @@ class DepthRegistration:
 
 
 class RegisteredFrames:
-    """A FrameSource that registers the depth of another one."""
+    """A FrameSource that registers the depth images of `files` to colour."""
 
     def __init__(self, files: FileFrames, registration: DepthRegistration) -> None:
         self._files, self._registration = files, registration
@@ -125,41 +115,39 @@ class RegisteredFrames:
     def stored(self, index: int) -> StoredFrame:
         """Frame `index` with its colour image as it was and its depth registered, in whole mm, as PNG."""
         stored = self._files.stored(index)
-        if stored.depth is None:
-            return stored
-        depth_m = self._registration.registered(decode_depth(stored.depth), stored.depth.where)
-        depth_mm = np.round(depth_m * 1000).astype(np.uint16)
-        _, png = cv2.imencode(".png", depth_mm)
+        assert stored.depth is not None
+        depth_mm = self._registered_mm(decode_depth(stored.depth), stored)
+        _, png = cv2.imencode(".png", depth_mm.astype(np.uint16))
         return replace(stored, depth=StoredImage("file", png.tobytes(), stored.depth.where))
 
     def frame(self, index: int) -> CameraFrame:
         """Frame `index`, decoded; depth has the resolution of the file, one mm."""
         stored = self._files.stored(index)
         frame = decode_frame(stored)
-        where = stored.depth.where if stored.depth else ""
-        if frame.depth_m is None:
-            return frame
-        depth_m = self._registration.registered(frame.depth_m, where)
-        return replace(frame, depth_m=np.round(depth_m * 1000).astype(np.float32) / np.float32(1000.0))
+        assert frame.depth_m is not None
+        depth_mm = self._registered_mm(frame.depth_m, stored)
+        return replace(frame, depth_m=depth_mm.astype(np.float32) / np.float32(1000.0))
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
         """The files as they are."""
         self._files.hash_into(digest)
 
     def close(self) -> None:
-        """Closes the other one."""
+        """Closes the files."""
         self._files.close()
 
+    def _registered_mm(self, depth_m: Depth, stored: StoredFrame) -> Depth:
+        where = stored.depth.where if stored.depth else ""
+        return np.round(self._registration.registered(depth_m, where) * 1000)
 
-def _files(path: Path, kind: str, losses: list[DataIssue]) -> ImageFolder:
+
+def _files(path: Path, kind: str, log: ReadLog) -> ImageFiles:
     found = sorted((_number(file), file) for file in path.glob(f"frame-*.{kind}.*"))
     if not found:
         raise RecordingError(f"{path} holds no frame-NNNNNN.{kind} file; copy the recording again")
     numbers = np.array([number for number, _ in found], np.int64)
     stamps_ns = np.round(numbers * (1e9 / _FRAME_RATE_HZ)).astype(np.int64)
-    kept = np.flatnonzero(forward_only(stamps_ns, f"{kind} images", losses))
-    folder = ImageFolder(stamps_ns, tuple(file for _, file in found)).chosen(kept)
-    return existing_images(folder, f"{kind} images", losses)
+    return existing_images(ImageFiles(stamps_ns, tuple(file for _, file in found)), f"{kind} images", log)
 
 
 def _number(file: Path) -> int:
@@ -186,26 +174,19 @@ def _centred(shape: Sequence[int], focal_px: float) -> CameraCalibration:
     return CameraCalibration("radial-tangential", width, height, intrinsics, np.zeros(0), np.eye(4))
 
 
-def _ground_truth(
-    colour: ImageFolder, depth_from_body: Array, read_files: list[Path], losses: list[DataIssue]
-) -> Trajectory | None:
-    stamps: list[int] = []
-    frame_from_bodies: list[Array] = []
-    bad = 0
-    for stamp_ns, path in zip(colour.stamps_ns.tolist(), colour.paths, strict=True):
-        file = path.with_name(path.name.partition(".")[0] + ".pose.txt")
-        if not file.is_file():
-            continue
-        read_files.append(file)
-        matrix = _rigid(file)
-        if matrix is None:
-            bad += 1
-            continue
-        stamps.append(stamp_ns)
-        frame_from_bodies.append(matrix @ depth_from_body)
-    if bad:
-        losses.append(DataIssue("ground truth: no rigid transform", f"{bad} of {bad + len(stamps)} files left out"))
-    return Trajectory(_stamps(stamps), np.stack(frame_from_bodies)) if stamps else None
+def _ground_truth(colour: ImageFiles, depth_from_body: Array, log: ReadLog) -> Trajectory | None:
+    files = [path.with_name(path.name.partition(".")[0] + ".pose.txt") for path in colour.sources]
+    found = [
+        (stamp_ns, file) for stamp_ns, file in zip(colour.stamps_ns.tolist(), files, strict=True) if file.is_file()
+    ]
+    log.files += [file for _, file in found]
+    rows = [(stamp_ns, matrix) for stamp_ns, file in found if (matrix := _rigid(file)) is not None]
+    if len(rows) < len(found):
+        log.note("ground truth: no rigid transform", f"{len(found) - len(rows)} of {len(found)} files left out")
+    if not rows:
+        return None
+    stamps_ns = np.array([stamp_ns for stamp_ns, _ in rows], np.int64)
+    return Trajectory(stamps_ns, np.stack([frame_from_depth @ depth_from_body for _, frame_from_depth in rows]))
 
 
 def _rigid(file: Path) -> Array | None:
@@ -216,10 +197,6 @@ def _rigid(file: Path) -> Array | None:
         return None
     is_rotation = np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-2)
     return matrix if is_rotation and np.isfinite(matrix).all() else None
-
-
-def _stamps(values: Sequence[int]) -> Stamps:
-    return np.array(values, np.int64)
 
 
 def _pixels(camera: CameraCalibration) -> Array:

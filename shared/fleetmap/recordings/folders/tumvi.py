@@ -6,17 +6,11 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings.calibration_files import load_calibration
-from fleetmap.recordings.finalize import Parts, assemble
-from fleetmap.recordings.folders.image_files import FileFrames, ImageFolder, existing_images, paired_cameras
-from fleetmap.recordings.folders.table_files import (
-    clean_imu,
-    forward_only,
-    natural_key,
-    read_stamped_rows,
-    trajectory_of_rows,
-)
+from fleetmap.recordings.finalize import RecordingParts, finalize
+from fleetmap.recordings.folders.image_files import FileFrames, ImageFiles, existing_images, paired_cameras
+from fleetmap.recordings.folders.table_files import natural_key, read_ground_truth, read_imu
+from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
-from fleetmap.sensors.samples import DataIssue, ImuSamples, Trajectory
 
 _CAMERAS = ("cam0", "cam1")
 
@@ -28,39 +22,34 @@ def recognises(path: Path) -> bool:
 
 def open_tumvi(path: Path, options: OpenOptions) -> Recording:
     """The recording in a TUM-VI folder. The body is the IMU, as in Kalibr's camchain."""
-    losses: list[DataIssue] = []
-    read_files: list[Path] = []
+    log = ReadLog()
     if not (path / "cam0/images").is_dir():
         raise RecordingError(f"{path / 'cam0/images'} is missing, cam1 is there; copy the recording again")
     present = [name for name in _CAMERAS if (path / name / "images").is_dir()]
-    cameras = [_images(path / name, name, losses, read_files) for name in present]
-    left, right = paired_cameras(cameras, losses)
+    left, right = paired_cameras([_images(path / name, name, log) for name in present], log)
     calibration_file = options.calibration_file or path / "camchain.yaml"
     if options.calibration_file is None and not calibration_file.is_file():
         raise CalibrationError(f"{calibration_file} is missing; pass a calibration with --calibration FILE")
-    read_files.append(calibration_file)
-    return assemble(
-        Parts(
-            path=path,
-            name=path.resolve().name,
-            format="tumvi",
-            calibration=load_calibration(calibration_file).calibration,
-            frame_stamps_ns=left.stamps_ns,
-            frames=FileFrames(path, left.stamps_ns, left.paths, right.paths if right else None, read_files),
-            has_right=right is not None,
-            imu=_imu(path / "imu.txt", losses, read_files),
-            ground_truth=_ground_truth(path / "gt_imu.csv", losses, read_files),
-            losses=losses,
-        )
+    log.files.append(calibration_file)
+    parts = RecordingParts(
+        path=path,
+        format="tumvi",
+        calibration=load_calibration(calibration_file).calibration,
+        frame_stamps_ns=left.stamps_ns,
+        frames=FileFrames(path, log.files, left, right),
+        has_right=right is not None,
+        imu=read_imu(path / "imu.txt", log),
+        ground_truth=read_ground_truth(path / "gt_imu.csv", log),
     )
+    return finalize(parts, log)
 
 
-def _images(folder: Path, name: str, losses: list[DataIssue], read_files: list[Path]) -> ImageFolder:
+def _images(folder: Path, name: str, log: ReadLog) -> ImageFiles:
     """The images by times.txt (`name seconds exposure`), or by their names in ns where there is no such file."""
     files = {p.stem: p for p in (folder / "images").iterdir() if p.is_file()}
     times = folder / "times.txt"
     if times.is_file():
-        read_files.append(times)
+        log.files.append(times)
         rows = [line.split() for line in times.read_text(errors="replace").splitlines() if not line.startswith("#")]
         stamp_of = {row[0]: _stamp_ns(row[1], times) for row in rows if len(row) >= 2}
     else:
@@ -71,12 +60,9 @@ def _images(folder: Path, name: str, losses: list[DataIssue], read_files: list[P
             f"{folder / 'images'} holds none of the {len(stamp_of)} images listed; copy the recording again"
         )
     if len(listed) < len(stamp_of):
-        losses.append(
-            DataIssue(f"{name}: images missing", f"{len(stamp_of) - len(listed)} of {len(stamp_of)} in times.txt")
-        )
+        log.note(f"{name}: images missing", f"{len(stamp_of) - len(listed)} of {len(stamp_of)} in times.txt")
     stamps_ns = np.array([stamp_of[stem] for stem in listed], np.int64)
-    images = ImageFolder(stamps_ns, tuple(files[stem] for stem in listed))
-    return existing_images(images.chosen(np.flatnonzero(forward_only(stamps_ns, name, losses))), name, losses)
+    return existing_images(ImageFiles(stamps_ns, tuple(files[stem] for stem in listed)), name, log)
 
 
 def _stamp_ns(seconds: str, where: Path) -> int:
@@ -85,19 +71,3 @@ def _stamp_ns(seconds: str, where: Path) -> int:
     if not whole.isdigit() or (part and not part.isdigit()):
         raise RecordingError(f"{where}: {seconds!r} is no time in seconds; copy the recording again")
     return int(whole) * 1_000_000_000 + int(part[:9].ljust(9, "0"))
-
-
-def _imu(file: Path, losses: list[DataIssue], read_files: list[Path]) -> ImuSamples:
-    if not file.is_file():
-        return ImuSamples.empty()
-    read_files.append(file)
-    stamps_ns, rows = read_stamped_rows(file, 6, losses)
-    return clean_imu(stamps_ns, rows[:, :3], rows[:, 3:], losses)
-
-
-def _ground_truth(file: Path, losses: list[DataIssue], read_files: list[Path]) -> Trajectory | None:
-    if not file.is_file():
-        return None
-    read_files.append(file)
-    stamps_ns, rows = read_stamped_rows(file, 7, losses)
-    return trajectory_of_rows(stamps_ns, rows, losses, "ground truth")

@@ -1,9 +1,8 @@
-"""The calibration that an MCAP file carries.
-
-The attachment of this project, else CameraInfo messages and static transforms.
-"""
+"""Calibration from an MCAP file's CameraInfo messages and static transforms, where it has no attachment of ours."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,12 +22,20 @@ _LENSES = {
 _BASE_FRAMES = ("base", "base_link", "base_footprint")
 
 
+class InfoCamera(NamedTuple):
+    """A camera by its CameraInfo; `is_rectified`: its images are rectified already."""
+
+    info: CameraInfo
+    is_rectified: bool
+
+    @property
+    def frame(self) -> str:
+        """The name of its frame in the transforms."""
+        return self.info.frame_id.lstrip("/")
+
+
 def calibration_of_messages(
-    infos: Sequence[CameraInfo],
-    are_rectified: Sequence[bool],
-    links: Sequence[FrameLink],
-    imu_frame: str | None,
-    where: str,
+    cameras: Sequence[InfoCamera], links: Sequence[FrameLink], imu_frame: str | None, where: str
 ) -> RigCalibration:
     """The calibration told by CameraInfo (left first) and transforms between frames.
 
@@ -36,77 +43,61 @@ def calibration_of_messages(
     else the left camera; the right camera's place then comes from the transforms or from the baseline in its
     projection matrix.
     """
-    frames = [info.frame_id.lstrip("/") for info in infos]
-    lenses = [_camera(info, rectified, where) for info, rectified in zip(infos, are_rectified, strict=True)]
-    body_from_cams: Sequence[Array | None] = [
-        _target_from_source(links, imu_frame, frame) if imu_frame else None for frame in frames
-    ]
-    has_imu = all(body_from_cam is not None for body_from_cam in body_from_cams)
+    lenses = [_lens(camera, where) for camera in cameras]
+    found = [_target_from_source(links, imu_frame, camera.frame) if imu_frame else None for camera in cameras]
+    body_from_cams = [body_from_cam for body_from_cam in found if body_from_cam is not None]
+    has_imu = len(body_from_cams) == len(cameras)
     if not has_imu:
-        body_from_cams = [np.eye(4)] + [_left_from_right(infos, are_rectified, links, where) for _ in infos[1:]]
-    cameras = [
-        check_camera(_on_body(lens, body_from_cam), f"{where}: {info.frame_id}")
-        for lens, body_from_cam, info in zip(lenses, body_from_cams, infos, strict=True)
-        if body_from_cam is not None
+        body_from_cams = [np.eye(4)] + [_left_from_right(cameras, links, where) for _ in cameras[1:]]
+    placed = [
+        check_camera(replace(lens, body_from_cam=body_from_cam), f"{where}: {camera.info.frame_id}")
+        for lens, body_from_cam, camera in zip(lenses, body_from_cams, cameras, strict=True)
     ]
-    body_frame = imu_frame if has_imu and imu_frame else frames[0]
-    base_from_bodies = [
-        found for found in (_target_from_source(links, name, body_frame) for name in _BASE_FRAMES) if found is not None
-    ]
-    return RigCalibration(
-        tuple(cameras), ImuNoise() if has_imu else None, base_from_bodies[0] if base_from_bodies else np.eye(4)
-    )
+    body_frame = imu_frame if has_imu and imu_frame else cameras[0].frame
+    bases = (_target_from_source(links, name, body_frame) for name in _BASE_FRAMES)
+    base_from_body = next((base for base in bases if base is not None), np.eye(4))
+    return RigCalibration(tuple(placed), ImuNoise() if has_imu else None, base_from_body)
 
 
-def _camera(info: CameraInfo, is_rectified: bool, where: str) -> CameraCalibration:
-    matrix = info.projection[:, :3] if is_rectified else info.matrix
-    distortion = np.zeros(0) if is_rectified or not info.distortion.any() else info.distortion
+def _lens(camera: InfoCamera, where: str) -> CameraCalibration:
+    info = camera.info
+    matrix = info.projection[:, :3] if camera.is_rectified else info.matrix
+    distortion = np.zeros(0) if camera.is_rectified or not info.distortion.any() else info.distortion
     lens = info.lens
     if lens == "rational_polynomial" and not distortion[5:].any():
         lens, distortion = "plumb_bob", distortion[:5]
     if lens not in _LENSES and len(distortion):
         raise CalibrationError(
             f"{where}: the lens model {info.lens!r} of {info.frame_id} is not supported, known are plumb_bob and "
-            f"equidistant; "
-            "calibrate with one of these, or record rectified images, or pass a calibration with --calibration FILE"
+            "equidistant; calibrate with one of these, or record rectified images, or pass a calibration with "
+            "--calibration FILE"
         )
     model = _LENSES.get(lens, "radial-tangential") if len(distortion) else "radial-tangential"
     intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
     return CameraCalibration(model, info.width_px, info.height_px, intrinsics, distortion, np.eye(4))
 
 
-def _on_body(camera: CameraCalibration, body_from_cam: Array) -> CameraCalibration:
-    return CameraCalibration(
-        camera.model, camera.width_px, camera.height_px, camera.intrinsics_px, camera.distortion, body_from_cam
-    )
-
-
-def _left_from_right(
-    infos: Sequence[CameraInfo], are_rectified: Sequence[bool], links: Sequence[FrameLink], where: str
-) -> Array:
+def _left_from_right(cameras: Sequence[InfoCamera], links: Sequence[FrameLink], where: str) -> Array:
     """(4, 4) cam0_from_cam1 by the transforms, else by the right camera's projection.
 
     There, K, R and P are those of ROS's stereo calibration: P[0, 3] = -fx * baseline.
     """
-    left, right = infos[0], infos[1]
-    cam0_from_cam1 = (
-        _target_from_source(links, left.frame_id.lstrip("/"), right.frame_id.lstrip("/"))
-        if left.frame_id != right.frame_id
-        else None
-    )
-    if cam0_from_cam1 is not None:
-        return cam0_from_cam1
+    left, right = cameras[0].info, cameras[1].info
+    if left.frame_id != right.frame_id:
+        cam0_from_cam1 = _target_from_source(links, cameras[0].frame, cameras[1].frame)
+        if cam0_from_cam1 is not None:
+            return cam0_from_cam1
     fx = right.projection[0, 0]
     baseline_m = -right.projection[0, 3] / fx if fx else 0.0
     if baseline_m <= 0:
         raise CalibrationError(
             f"{where}: nothing says where the right camera sits (no transform from {left.frame_id} to "
-            f"{right.frame_id}, no "
-            f"baseline in its projection {right.projection[0].tolist()}); pass a calibration with --calibration FILE"
+            f"{right.frame_id}, no baseline in its projection {right.projection[0].tolist()}); pass a calibration "
+            "with --calibration FILE"
         )
     rect_from_rect = se3(np.eye(3), np.array([baseline_m, 0.0, 0.0]))
     left_rotation, right_rotation = (
-        np.eye(3) if rectified else info.rect_from_cam for info, rectified in zip(infos, are_rectified, strict=True)
+        np.eye(3) if camera.is_rectified else camera.info.rect_from_cam for camera in cameras
     )
     return se3_inverse(se3(left_rotation, np.zeros(3))) @ rect_from_rect @ se3(right_rotation, np.zeros(3))
 

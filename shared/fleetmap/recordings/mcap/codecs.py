@@ -1,6 +1,4 @@
-"""How the bytes of one message become values: one codec for each message encoding. To add one.
-
-A class and a line in CODECS.
+"""Decoding of single messages: one codec for each message encoding. To add one: a class and a line in CODECS.
 
 All methods raise ValueError for bytes that are no such message.
 """

@@ -1,7 +1,7 @@
 """Opens MCAP recordings: rosbag2 style (CDR) and Foxglove protobuf; whole, cut off or damaged."""
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -12,24 +12,19 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
-from fleetmap.recordings.finalize import Parts, assemble, calibration_of_options
+from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.folders.image_files import hash_file
-from fleetmap.recordings.folders.table_files import (
-    PAIR_TOLERANCE_NS,
-    clean_imu,
-    forward_only,
-    pair_stamps,
-    trajectory_of_rows,
-)
-from fleetmap.recordings.images import StoredFrame, StoredImage, decode_frame
-from fleetmap.recordings.mcap.calibration import calibration_of_messages
+from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, pair_images
+from fleetmap.recordings.images import StoredImage
+from fleetmap.recordings.mcap.calibration import InfoCamera, calibration_of_messages
 from fleetmap.recordings.mcap.codecs import CODECS, Codec
 from fleetmap.recordings.mcap.scan import MAGIC, Channel, Location, McapScan, MessageReader
-from fleetmap.recordings.mcap.topics import IMAGE_TYPES, KNOWN_TYPES, TopicParts, choose_topics, type_name
+from fleetmap.recordings.mcap.topics import IMAGE_TYPES, KNOWN_TYPES, choose_topics, type_name
 from fleetmap.recordings.mcap.writer import CALIBRATION_ATTACHMENT
+from fleetmap.recordings.ordering import ReadLog, clean_imu, trajectory_of_rows, values_forward
 from fleetmap.recordings.recording import OpenOptions, Recording, Topics
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, Stamps, Trajectory
+from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
 
 DEPTH_TOLERANCE_NS = 20_000_000  # depth and colour of consumer sensors are not triggered together
 V = TypeVar("V")
@@ -60,15 +55,8 @@ class _Stream:
         return found
 
 
-@dataclass(frozen=True, slots=True)
-class _Images:
-    """One camera's images: stamps (N,), and where each lies."""
-
-    stamps_ns: Stamps
-    places: tuple[tuple[_Stream, Location], ...]
-
-    def chosen(self, indices: NDArray[np.int64]) -> "_Images":
-        return _Images(self.stamps_ns[indices], tuple(self.places[int(i)] for i in indices))
+_Images = ImageSeries[tuple[_Stream, Location]]
+_Roles = Mapping[str, list[_Stream]]  # the streams by the role that `choose_topics` gives their topic
 
 
 def recognises(path: Path) -> bool:
@@ -77,7 +65,7 @@ def recognises(path: Path) -> bool:
 
 
 def open_mcap(path: Path, options: OpenOptions) -> Recording:
-    """The recording in an MCAP file (or the one in a rosbag2 folder), as far as it is whole; losses say what is not."""
+    """The recording in an MCAP file (or the one in a rosbag2 folder), as far as it is whole; its issues say what is not."""
     file_path = _mcap_file(path)
     if file_path is None:
         raise RecordingError(f"{path} is no MCAP file; choose a file that ends in .mcap")
@@ -93,44 +81,33 @@ def open_mcap(path: Path, options: OpenOptions) -> Recording:
         raise
 
 
-class McapFrames:
-    """A FrameSource over the image messages of an open file."""
+class McapFrames(SeriesFrames[tuple[_Stream, Location]]):
+    """A FrameSource over the image messages of an open file. `read_files`: the files that the content's hash covers."""
 
     def __init__(
         self,
-        path: Path,
         file: BinaryIO,
+        read_files: Sequence[Path],
         left: _Images,
-        right: _Images | None,
-        depth: _Images | None,
-        also: Sequence[Path],
+        right: _Images | None = None,
+        depth: _Images | None = None,
     ) -> None:
-        self._path, self._file, self._also = path, file, also
-        self._reader = MessageReader(path, file)
-        self._left, self._right, self._depth = left, right, depth
-
-    def stored(self, index: int) -> StoredFrame:
-        """Frame `index` as its messages carry it."""
-        right = None if self._right is None else self._image(self._right, index)
-        depth = None if self._depth is None else self._image(self._depth, index)
-        return StoredFrame(int(self._left.stamps_ns[index]), self._image(self._left, index), right, depth)
-
-    def frame(self, index: int) -> CameraFrame:
-        """Frame `index`, decoded."""
-        return decode_frame(self.stored(index))
+        super().__init__(self._image, left, right, depth)
+        self._path, self._file, self._read_files = read_files[0], file, read_files
+        self._reader = MessageReader(self._path, file)
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
         """The bytes of the whole file, then those of the calibration file where one was given."""
-        for path in (self._path, *self._also):
+        for path in self._read_files:
             hash_file(path, digest)
 
     def close(self) -> None:
         """Closes the file."""
         self._file.close()
 
-    def _image(self, images: _Images, index: int) -> StoredImage:
-        stream, location = images.places[index]
-        where = f"{self._path}: {stream.channel.topic} at {images.stamps_ns[index]}"
+    def _image(self, source: tuple[_Stream, Location], stamp_ns: int) -> StoredImage:
+        stream, location = source
+        where = f"{self._path}: {stream.channel.topic} at {stamp_ns}"
         if self._file.closed:
             raise RecordingError(
                 f"{where} was asked for after the recording was closed; keep it open while frames are read"
@@ -150,44 +127,45 @@ def _open(
     streams = _collect(scan, options.topics)
     channels = [stream.channel for stream in streams.values() if len(stream)]
     if not channels:
-        raise RecordingError(
-            f"{file_path} holds no message that can be read ({_in_words(scan.damage.all()) or 'it is empty'})"
-        )
+        issues = "; ".join(f"{issue.what}: {issue.detail}" for issue in scan.damage.all())
+        raise RecordingError(f"{file_path} holds no message that can be read ({issues or 'it is empty'})")
     topics = _with_hints(options.topics, given, {channel.topic for channel in channels})
-    chosen = choose_topics(channels, topics, str(file_path))
-    losses = [*scan.damage.all(), *chosen.losses]
-    imu, imu_frame = _imu(_streams(streams, chosen, "imu"), losses)
-    left = _images(_streams(streams, chosen, "left"), "left images", losses)
-    right = _images(_streams(streams, chosen, "right"), "right images", losses) if "right" in chosen.channels else None
-    depth = _images(_streams(streams, chosen, "depth"), "depth images", losses) if "depth" in chosen.channels else None
+    log = ReadLog(scan.damage.all(), [file_path])
+    chosen = choose_topics(channels, topics, str(file_path), log)
+    roles = {role: [streams[channel_id] for channel_id in ids] for role, ids in chosen.items()}
+    imu, imu_frame = _imu(roles.get("imu", ()), log)
+    left = _images(roles["left"], "left images", log)
+    right = _images(roles["right"], "right images", log) if "right" in roles else None
+    depth = _images(roles["depth"], "depth images", log) if "depth" in roles else None
     if right is not None:
-        left, right = _paired(left, right, PAIR_TOLERANCE_NS, losses)
-        depth = None
+        (left, right), depth = pair_images(left, right, log), None
     elif depth is not None:
-        left, depth = _paired(left, depth, DEPTH_TOLERANCE_NS, losses)
-    calibration = given.calibration if given else _calibration(scan, streams, chosen, right is not None, imu_frame)
-    wheel = [v for s in _streams(streams, chosen, "wheel") for v in s.values(s.codec.wheel)]
-    priors = [v for s in _streams(streams, chosen, "prior") for v in s.values(s.codec.prior)]
-    ground_truth = _ground_truth(_streams(streams, chosen, "ground_truth"), losses)
-    losses += [_damaged(stream) for stream in streams.values() if stream.damaged]
-    also = [options.calibration_file] if options.calibration_file is not None else []
-    return assemble(
-        Parts(
-            path=path,
-            name=scan.metadata.get("fleetmap", {}).get("name", path.stem),
-            format="mcap",
-            calibration=calibration,
-            frame_stamps_ns=left.stamps_ns,
-            frames=McapFrames(file_path, file, left, right, depth, also),
-            has_right=right is not None,
-            has_depth=depth is not None,
-            imu=imu,
-            wheel=tuple(_forward(wheel, [w.stamp_ns for w in wheel], "wheel odometry", losses)),
-            priors=tuple(_forward(priors, [p.stamp_ns for p in priors], "position priors", losses)),
-            ground_truth=ground_truth,
-            losses=losses,
-        )
+        left, depth = pair_images(left, depth, log, DEPTH_TOLERANCE_NS)
+    calibration = given.calibration if given else _calibration(scan, roles, right is not None, imu_frame)
+    wheel = [v for stream in roles.get("wheel", ()) for v in stream.values(stream.codec.wheel)]
+    priors = [v for stream in roles.get("prior", ()) for v in stream.values(stream.codec.prior)]
+    ground_truth = _ground_truth(roles.get("ground_truth", ()), log)
+    for stream in streams.values():
+        if stream.damaged:
+            what = f"{stream.channel.topic}: damaged messages"
+            log.note(what, f"{stream.damaged} left out, {len(stream)} were found")
+    if options.calibration_file is not None:
+        log.files.append(options.calibration_file)
+    parts = RecordingParts(
+        path=path,
+        name=scan.metadata.get("fleetmap", {}).get("name", path.stem),
+        format="mcap",
+        calibration=calibration,
+        frame_stamps_ns=left.stamps_ns,
+        frames=McapFrames(file, log.files, left, right, depth),
+        has_right=right is not None,
+        has_depth=depth is not None,
+        imu=imu,
+        wheel=values_forward(wheel, [sample.stamp_ns for sample in wheel], "wheel odometry", log),
+        priors=values_forward(priors, [prior.stamp_ns for prior in priors], "position priors", log),
+        ground_truth=ground_truth,
     )
+    return finalize(parts, log)
 
 
 def _collect(scan: McapScan, topics: Topics) -> dict[int, _Stream]:
@@ -242,26 +220,13 @@ def _with_hints(topics: Topics, given: CalibrationFile | None, present: set[str]
     return msgspec.structs.replace(topics, **changes)
 
 
-def _streams(streams: dict[int, _Stream], chosen: TopicParts, part: str) -> list[_Stream]:
-    return [streams[channel_id] for channel_id in chosen.channels.get(part, ())]
-
-
-def _images(streams: Sequence[_Stream], what: str, losses: list[DataIssue]) -> _Images:
+def _images(streams: Sequence[_Stream], what: str, log: ReadLog) -> _Images:
     stamps_ns = np.array([stamp for stream in streams for stamp in stream.stamps_ns], np.int64)
-    places = tuple((stream, location) for stream in streams for location in stream.locations)
-    return _Images(stamps_ns, places).chosen(np.flatnonzero(forward_only(stamps_ns, what, losses)))
+    sources = tuple((stream, location) for stream in streams for location in stream.locations)
+    return _Images(stamps_ns, sources).forward(what, log)
 
 
-def _paired(first: _Images, second: _Images, tolerance_ns: int, losses: list[DataIssue]) -> tuple[_Images, _Images]:
-    firsts, seconds = pair_stamps(first.stamps_ns, second.stamps_ns, tolerance_ns)
-    alone = len(first.places) + len(second.places) - 2 * len(firsts)
-    if alone:
-        counts = f"{alone} of {len(first.places)} and {len(second.places)}"
-        losses.append(DataIssue("images without their partner", f"{counts}; {len(firsts)} pairs remain"))
-    return first.chosen(firsts), second.chosen(seconds)
-
-
-def _imu(streams: Sequence[_Stream], losses: list[DataIssue]) -> tuple[ImuSamples, str | None]:
+def _imu(streams: Sequence[_Stream], log: ReadLog) -> tuple[ImuSamples, str | None]:
     parts: list[tuple[Stamps, NDArray[np.float64], NDArray[np.float64], str]] = []
     for stream in streams:
         codec = stream.codec
@@ -272,56 +237,35 @@ def _imu(streams: Sequence[_Stream], losses: list[DataIssue]) -> tuple[ImuSample
     if not parts:
         return ImuSamples.empty(), None
     stamps_ns, gyro, accel = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    return clean_imu(stamps_ns.astype(np.int64), gyro, accel, losses), parts[0][3]
+    return clean_imu(stamps_ns.astype(np.int64), gyro, accel, log), parts[0][3]
 
 
-def _ground_truth(streams: Sequence[_Stream], losses: list[DataIssue]) -> Trajectory | None:
+def _ground_truth(streams: Sequence[_Stream], log: ReadLog) -> Trajectory | None:
     rows = [value for stream in streams for value in stream.values(stream.codec.pose)]
     if not rows:
         return None
     stamps_ns = np.array([stamp for stamp, _ in rows], np.int64)
-    return trajectory_of_rows(stamps_ns, np.stack([row for _, row in rows]), losses, "ground truth")
+    return trajectory_of_rows(stamps_ns, np.stack([row for _, row in rows]), log)
 
 
-def _calibration(
-    scan: McapScan, streams: dict[int, _Stream], chosen: TopicParts, has_right: bool, imu_frame: str | None
-) -> RigCalibration:
+def _calibration(scan: McapScan, roles: _Roles, has_right: bool, imu_frame: str | None) -> RigCalibration:
     attached = scan.attachments.get(CALIBRATION_ATTACHMENT)
     if attached is not None:
         where = f"{scan.path}: attachment {CALIBRATION_ATTACHMENT}"
         return parse_calibration(attached.decode("utf-8", "replace"), where).calibration
-    infos, are_rectified = [], []
-    for part in ("left", "right") if has_right else ("left",):
-        found = [
-            v for stream in _streams(streams, chosen, f"{part}_info") for v in stream.values(stream.codec.camera_info)
-        ]
-        image_topic = _streams(streams, chosen, part)[0].channel.topic
-        if not found:
+    cameras = []
+    for role in ("left", "right") if has_right else ("left",):
+        streams, image_topic = roles.get(f"{role}_info", ()), roles[role][0].channel.topic
+        infos = [info for stream in streams for info in stream.values(stream.codec.camera_info)]
+        if not infos:
             raise CalibrationError(
                 f"{scan.path}: no CameraInfo beside {image_topic} says what its lens is; pass a calibration with "
-                f"--calibration FILE"
+                "--calibration FILE"
             )
-        infos.append(found[0])
-        are_rectified.append("rect" in image_topic)
-    links = [
-        link for s in _streams(streams, chosen, "tf_static") for found in s.values(s.codec.links) for link in found
-    ]
-    return calibration_of_messages(infos, are_rectified, links, imu_frame, str(scan.path))
-
-
-def _forward(values: Sequence[V], stamps_ns: Iterable[int], what: str, losses: list[DataIssue]) -> list[V]:
-    kept = forward_only(np.array(list(stamps_ns), np.int64), what, losses)
-    return [value for value, keep in zip(values, kept, strict=True) if keep]
-
-
-def _damaged(stream: _Stream) -> DataIssue:
-    return DataIssue(
-        f"{stream.channel.topic}: damaged messages", f"{stream.damaged} left out, {len(stream)} were found"
-    )
-
-
-def _in_words(losses: Iterable[DataIssue]) -> str:
-    return "; ".join(f"{loss.what}: {loss.detail}" for loss in losses)
+        cameras.append(InfoCamera(infos[0], "rect" in image_topic))
+    streams = roles.get("tf_static", ())
+    links = [link for stream in streams for found in stream.values(stream.codec.links) for link in found]
+    return calibration_of_messages(cameras, links, imu_frame, str(scan.path))
 
 
 def _mcap_file(path: Path) -> Path | None:

@@ -1,7 +1,7 @@
 """Walks through an MCAP file as far as it is whole, with or without its index, chunked or not.
 
-Written for files that recorders left behind at a power loss: what does not fit is a DataIssue, and where the file still has
-its index the walk goes on at the next chunk. Source of the layout: the MCAP specification (mcap.dev/spec).
+Written for files that recorders left behind at a power loss: what does not fit is noted as a DataIssue, and where the
+file still has its index the walk goes on at the next chunk. Source of the layout: the MCAP specification (mcap.dev/spec).
 """
 
 import struct
@@ -27,7 +27,7 @@ _LARGEST_CHUNK_BYTES = 1 << 31
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """What a channel's messages look like."""
+    """The type of a channel's messages."""
 
     name: str
     encoding: str
@@ -58,9 +58,9 @@ Message = tuple[Channel, int, Location, memoryview]
 
 @dataclass(slots=True)
 class Damage:
-    """What could not be read, counted while walking."""
+    """Records that could not be read, counted while walking."""
 
-    losses: list[DataIssue] = field(default_factory=list)
+    issues: list[DataIssue] = field(default_factory=list)
     bad_chunks: int = 0
     bad_chunk_bytes: int = 0
     first_bad_chunk_at: int = -1
@@ -74,18 +74,15 @@ class Damage:
     def all(self) -> list[DataIssue]:
         """Everything in words."""
         if not self.bad_chunks:
-            return self.losses
+            return self.issues
         detail = (
             f"{self.bad_chunks} with {self.bad_chunk_bytes} bytes left out, the first at byte {self.first_bad_chunk_at}"
         )
-        return [*self.losses, DataIssue("damaged chunks (checksum or compression)", detail)]
+        return [*self.issues, DataIssue("damaged chunks (checksum or compression)", detail)]
 
 
 class McapScan:
-    """One walk through a file. Iterate `messages()` to the end.
-
-    Channels, attachments, metadata and damage fill up meanwhile.
-    """
+    """One walk through a file: `messages()` fills channels, attachments, metadata and damage on its way to the end."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
         self.path, self._file = path, file
@@ -112,7 +109,7 @@ class McapScan:
             at = next_at
         self._file.seek(max(0, self.size - len(MAGIC)))
         if self._file.read() != MAGIC:
-            self._lose("the file ends inside its index", "no message is missing")
+            self._note("the file ends inside its index", "no message is missing")
 
     def _record(self, at: int) -> Generator[Message, None, int | None]:
         """Yields the messages of the record at `at`.
@@ -122,7 +119,7 @@ class McapScan:
         self._file.seek(at)
         head = self._file.read(_RECORD_HEAD.size)
         if len(head) < _RECORD_HEAD.size:
-            self._lose(
+            self._note(
                 "the file has no end mark",
                 "the recorder was stopped hard" if not head else "it ends inside a record's head",
             )
@@ -130,10 +127,10 @@ class McapScan:
         opcode, length = _RECORD_HEAD.unpack(head)
         start, rest = at + len(head), self.size - at - len(head)
         if not _HEADER <= opcode < 0x80 or length > _LARGEST_CHUNK_BYTES:
-            self._lose("not an MCAP record", f"{rest} bytes from byte {at} on are not readable in sequence")
+            self._note("not an MCAP record", f"{rest} bytes from byte {at} on are not readable in sequence")
             return None
         if length > rest:
-            self._lose(
+            self._note(
                 "the file ends inside a record",
                 f"{length - rest} of {length} bytes of the record at byte {at} are missing",
             )
@@ -201,7 +198,7 @@ class McapScan:
                 name, at = _text(content, 0)
                 self.metadata[name] = _text_map(content, at)
         except (struct.error, ValueError) as error:
-            self._lose("a damaged record", f"kind {opcode} at byte {location.at}: {error}")
+            self._note("a damaged record", f"kind {opcode} at byte {location.at}: {error}")
 
     def _read_schema(self, content: memoryview) -> None:
         (schema_id,) = struct.unpack_from("<H", content)
@@ -246,9 +243,9 @@ class McapScan:
         later = [int(chunk_at) for chunk_at in found if after < chunk_at < summary_at]
         return min(later, default=None)
 
-    def _lose(self, what: str, detail: str) -> None:
-        if len(self.damage.losses) < 20:
-            self.damage.losses.append(DataIssue(what, detail))
+    def _note(self, what: str, detail: str) -> None:
+        if len(self.damage.issues) < 20:
+            self.damage.issues.append(DataIssue(what, detail))
 
 
 def decompress(compression: str, packed: memoryview, uncompressed_size: int) -> bytes:

@@ -1,15 +1,11 @@
-"""Which topic of an MCAP file plays which part.
-
-By the conventional name, by type and name where that leaves one choice.
-"""
+"""Roles of the topics in an MCAP file: by the conventional name, else by type and name where one choice is left."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.mcap.scan import Channel
+from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import Topics
-from fleetmap.sensors.samples import DataIssue
 
 IMAGE_TYPES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")
 _TYPES = {
@@ -29,21 +25,13 @@ _ALONE = ("imu", "wheel", "prior", "ground_truth")
 _LEFT_HINTS, _RIGHT_HINTS, _DEPTH_HINTS = ("left", "cam0", "infra1"), ("right", "cam1", "infra2"), ("depth",)
 
 
-@dataclass(frozen=True, slots=True)
-class TopicParts:
-    """Channel ids by the part that they play; several where one topic was recorded on several channels."""
-
-    channels: Mapping[str, tuple[int, ...]]
-    losses: tuple[DataIssue, ...]
-
-
 def type_name(channel: Channel) -> str:
     """The message type without ROS 2's `/msg/`."""
     return channel.schema.name.replace("/msg/", "/")
 
 
-def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str) -> TopicParts:
-    """The channels for each part.
+def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str, log: ReadLog) -> dict[str, list[int]]:
+    """The ids of the channels for each role; several where one topic was recorded on several channels.
 
     RecordingError where a topic that was asked for by name is not there, or where no left image can be told from the
     others.
@@ -52,43 +40,34 @@ def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str) -> To
     for channel in channels:
         by_topic.setdefault(channel.topic, []).append(channel)
     chosen: dict[str, str] = {}
-    losses: list[DataIssue] = []
-    for part, types in _TYPES.items():
-        name = getattr(wanted, part)
-        found = next((t for t in (name, f"{name}/compressed") if type_name_of(by_topic, t) in types), None)
+    for role, types in _TYPES.items():
+        name = getattr(wanted, role)
+        found = next((t for t in (name, f"{name}/compressed") if _type_of(by_topic, t) in types), None)
+        candidates = sorted(topic for topic in by_topic if _type_of(by_topic, topic) in types)
         if found is not None:
-            chosen[part] = found
-        elif name and name != getattr(Topics(), part):
+            chosen[role] = found
+        elif name and name != getattr(Topics(), role):
             raise RecordingError(
                 f"{where} has no topic {name} of type {' or '.join(types)}; it has {_listed(by_topic)}"
             )
-        elif part in _ALONE and name:
-            _choose_alone(part, by_topic, chosen, losses)
+        elif role in _ALONE and name and len(candidates) == 1:
+            chosen[role] = candidates[0]
+        elif role in _ALONE and name and candidates:
+            log.note(f"{role} not chosen", f"{', '.join(candidates)} could be it; name one of them")
     _choose_images(by_topic, chosen, where)
     _choose_infos(by_topic, chosen)
-    ids = {part: tuple(channel.id for channel in by_topic[topic]) for part, topic in chosen.items()}
-    return TopicParts(ids, tuple(losses))
+    return {role: [channel.id for channel in by_topic[topic]] for role, topic in chosen.items()}
 
 
-def type_name_of(by_topic: Mapping[str, list[Channel]], topic: str) -> str:
+def _type_of(by_topic: Mapping[str, list[Channel]], topic: str) -> str:
     """The type of a topic's messages, empty where there is no such topic."""
     return type_name(by_topic[topic][0]) if topic in by_topic else ""
-
-
-def _choose_alone(
-    part: str, by_topic: Mapping[str, list[Channel]], chosen: dict[str, str], losses: list[DataIssue]
-) -> None:
-    candidates = [topic for topic in by_topic if type_name_of(by_topic, topic) in _TYPES[part]]
-    if len(candidates) == 1:
-        chosen[part] = candidates[0]
-    elif candidates:
-        losses.append(DataIssue(f"{part} not chosen", f"{', '.join(sorted(candidates))} could be it; name one of them"))
 
 
 def _choose_images(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str], where: str) -> None:
     if "left" in chosen:
         return
-    images = sorted(topic for topic in by_topic if type_name_of(by_topic, topic) in IMAGE_TYPES)
+    images = sorted(topic for topic in by_topic if _type_of(by_topic, topic) in IMAGE_TYPES)
     depth = [topic for topic in images if _has(topic, _DEPTH_HINTS)]
     lefts = [topic for topic in images if topic not in depth and _has(topic, _LEFT_HINTS)]
     rights = [topic for topic in images if topic not in depth and _has(topic, _RIGHT_HINTS)]
@@ -106,13 +85,13 @@ def _choose_images(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str]
 
 
 def _choose_infos(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str]) -> None:
-    for part in ("left", "right"):
-        if part not in chosen or f"{part}_info" in chosen:
+    for role in ("left", "right"):
+        if role not in chosen or f"{role}_info" in chosen:
             continue
-        parent = chosen[part].removesuffix("/compressed").rpartition("/")[0]
+        parent = chosen[role].removesuffix("/compressed").rpartition("/")[0]
         for name in ("camera_info", "calibration"):
-            if type_name_of(by_topic, f"{parent}/{name}") in _TYPES["left_info"]:
-                chosen[f"{part}_info"] = f"{parent}/{name}"
+            if _type_of(by_topic, f"{parent}/{name}") in _TYPES["left_info"]:
+                chosen[f"{role}_info"] = f"{parent}/{name}"
 
 
 def _has(topic: str, hints: tuple[str, ...]) -> bool:
@@ -120,4 +99,4 @@ def _has(topic: str, hints: tuple[str, ...]) -> bool:
 
 
 def _listed(by_topic: Mapping[str, list[Channel]]) -> str:
-    return ", ".join(f"{topic} ({type_name_of(by_topic, topic)})" for topic in sorted(by_topic)) or "no topic at all"
+    return ", ".join(f"{topic} ({_type_of(by_topic, topic)})" for topic in sorted(by_topic)) or "no topic at all"

@@ -1,4 +1,4 @@
-"""Under which keys rmw_zenoh carries ROS 2 topics: `<domain>/<topic>/<type>/<hash of the type>`, and what it attaches.
+"""Keys under which rmw_zenoh carries ROS 2 topics, `<domain>/<topic>/<type>/<hash of the type>`, and its attachments.
 
 Sources: rmw_zenoh's design document; REP 2011 and REP 2016 for the hash, RIHS01, of a type's description.
 """
@@ -14,10 +14,8 @@ from fleetmap.errors import UsageError
 from fleetmap.recordings.ros2.definitions import DEFINITIONS
 
 # type_description_interfaces/FieldType: numbers of the types, and what is added for fixed and for unbounded arrays.
-_TYPE_IDS = {
-    "int8": 2, "uint8": 3, "int16": 4, "uint16": 5, "int32": 6, "uint32": 7, "int64": 8, "uint64": 9, "float32": 10,
-    "float64": 11, "bool": 15, "byte": 16, "string": 17,
-}  # fmt: skip
+_NUMBERS = "int8 uint8 int16 uint16 int32 uint32 int64 uint64 float32 float64"
+_TYPE_IDS = dict(zip(_NUMBERS.split(), range(2, 12), strict=True)) | {"bool": 15, "byte": 16, "string": 17}
 _NESTED, _FIXED_ARRAY, _SEQUENCE = 1, 48, 144
 _FIELD = re.compile(r"^([\w/]+)(?:\[(\d*)\])? (\w+)")
 _GID_BYTES = 16

@@ -15,7 +15,7 @@ from fleetmap.recordings.ros2.cdr import CdrReader, CdrWriter
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import PositionPrior, Stamps, WheelSample
 
-# What odometry without a covariance is taken to be worth
+# Assumed of odometry without a covariance
 UNKNOWN_WHEEL_SIGMA_MPS, UNKNOWN_WHEEL_SIGMA_RADPS = 0.05, 0.05
 _ROT_TRANS_FROM_TRANS_ROT = [3, 4, 5, 0, 1, 2]
 _IMU_DOUBLES = 37
@@ -101,17 +101,12 @@ def encode_camera_info(stamp_ns: int, frame_id: str, camera: CameraCalibration) 
     """sensor_msgs/CameraInfo of an unrectified camera: its projection is that of the camera itself."""
     fx, fy, cx, cy = camera.intrinsics_px
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    # plumb_bob has five coefficients in ROS
-    distortion = (
-        camera.distortion
-        if camera.model == "equidistant"
-        else np.pad(camera.distortion, (0, 5 - len(camera.distortion)))
-    )
+    distortion = camera.distortion
+    if camera.model != "equidistant":  # plumb_bob has five coefficients in ROS
+        distortion = np.pad(distortion, (0, 5 - len(distortion)))
     writer = CdrWriter().header(stamp_ns, frame_id).unsigned(camera.height_px).unsigned(camera.width_px)
-    writer.text(_LENS_NAMES[camera.model]).unsigned(len(distortion)).doubles(distortion).doubles(matrix).doubles(
-        np.eye(3)
-    )
-    writer.doubles(np.hstack([matrix, np.zeros((3, 1))]))
+    writer.text(_LENS_NAMES[camera.model]).unsigned(len(distortion)).doubles(distortion)
+    writer.doubles(matrix).doubles(np.eye(3)).doubles(np.hstack([matrix, np.zeros((3, 1))]))
     for _ in range(6):  # binning_x binning_y and the region of interest: all zero means the whole image
         writer.unsigned(0)
     return writer.byte(0).message()
@@ -124,13 +119,9 @@ def decode_imu(messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
     find it.
     """
     if len({(len(data), data[:2]) for data in messages}) > 1:
-        parts = [decode_imu([data]) for data in messages]
-        return (
-            np.concatenate([part[0] for part in parts]),
-            np.concatenate([part[1] for part in parts]),
-            np.concatenate([part[2] for part in parts]),
-            parts[0][3],
-        )
+        *columns, frame_ids = zip(*(decode_imu([data]) for data in messages), strict=True)
+        stamps_ns, gyro, accel = (np.concatenate(column) for column in columns)
+        return stamps_ns, gyro, accel, frame_ids[0]
     reader = CdrReader(messages[0])
     _, frame_id = header_of(messages[0])
     name_bytes = int(np.frombuffer(messages[0][12:16], reader.endian + "u4")[0])
@@ -140,9 +131,8 @@ def decode_imu(messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
     table = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
     seconds = np.ascontiguousarray(table[:, 4:8]).view(reader.endian + "i4")[:, 0].astype(np.int64)
     nanoseconds = np.ascontiguousarray(table[:, 8:12]).view(reader.endian + "u4")[:, 0].astype(np.int64)
-    values = (
-        np.ascontiguousarray(table[:, start : start + 8 * _IMU_DOUBLES]).view(reader.endian + "f8").astype(np.float64)
-    )
+    doubles = np.ascontiguousarray(table[:, start : start + 8 * _IMU_DOUBLES])
+    values = doubles.view(reader.endian + "f8").astype(np.float64)
     return seconds * 1_000_000_000 + nanoseconds, values[:, 13:16].copy(), values[:, 25:28].copy(), frame_id
 
 

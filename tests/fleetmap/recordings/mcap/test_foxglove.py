@@ -102,7 +102,7 @@ def write(path: Path) -> Path:
 
 def test_everything_is_read(tmp_path: Path) -> None:
     with open_recording(write(tmp_path / "a.mcap")) as recording:
-        assert (recording.sensor_set, recording.losses) == (SensorSet.STEREO_INERTIAL, ())
+        assert (recording.sensor_set, recording.issues) == (SensorSet.STEREO_INERTIAL, ())
         np.testing.assert_array_equal(recording.frame_stamps_ns, SAMPLE.stamps_ns)
         for index in (2, 0):
             frame = recording.read_frame(index)

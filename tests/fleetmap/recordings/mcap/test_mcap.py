@@ -45,7 +45,7 @@ def write(path: Path, **keywords: Any) -> Path:
 
 def test_all_that_is_written_is_read(tmp_path: Path) -> None:
     with open_recording(write(tmp_path / "a.mcap", name="aisle")) as recording:
-        assert (recording.name, recording.format, recording.losses) == ("aisle", "mcap", ())
+        assert (recording.name, recording.format, recording.issues) == ("aisle", "mcap", ())
         assert recording.sensor_set is SensorSet.STEREO_INERTIAL
         np.testing.assert_array_equal(recording.read_frame(2).left, SAMPLE.left[2])
         np.testing.assert_array_equal(recording.read_frame(0).right, SAMPLE.right[0])
@@ -152,7 +152,7 @@ def assert_is_the_sample(recording: Recording) -> None:
 )
 def test_all_ways_to_store_it(tmp_path: Path, options: dict[str, Any]) -> None:
     with open_recording(write_foreign(tmp_path / "a.mcap", foreign_messages(), **options)) as recording:
-        assert recording.losses == ()
+        assert recording.issues == ()
         assert_is_the_sample(recording)
 
 
@@ -193,7 +193,7 @@ def test_two_imus_are_not_guessed(tmp_path: Path) -> None:
     messages = [*foreign_messages(imu="/imu/a"), ("/imu/b", "sensor_msgs/Imu", 5, imu)]
     recording = open_recording(write_foreign(tmp_path / "a.mcap", messages))
     assert recording.sensor_set is SensorSet.STEREO
-    assert any(loss.what == "imu not chosen" and "/imu/a, /imu/b" in loss.detail for loss in recording.losses)
+    assert any(issue.what == "imu not chosen" and "/imu/a, /imu/b" in issue.detail for issue in recording.issues)
 
 
 def test_topics_noted_in_the_calibration_file(tmp_path: Path) -> None:

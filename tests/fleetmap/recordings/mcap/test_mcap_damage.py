@@ -65,8 +65,8 @@ def test_cut_off(whole: bytes, tmp_path: Path, share: float) -> None:
             "most of what is whole is used, also of the last chunk"
         )
         assert_nothing_is_invented(recording)
-        assert recording.losses
-        assert "the file" in recording.losses[0].what
+        assert recording.issues
+        assert "the file" in recording.issues[0].what
 
 
 def test_cut_at_every_byte_around_a_message(whole: bytes, tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_a_tail_of_zeros_as_a_power_loss_leaves_it(whole: bytes, tmp_path: Path)
     cut = len(whole) // 2
     with open_recording(write_bytes(tmp_path, whole[:cut] + bytes(len(whole) - cut))) as recording:
         assert_nothing_is_invented(recording)
-        assert recording.losses
+        assert recording.issues
 
 
 @pytest.mark.parametrize("size", [0, 3, 8, 60, 3000])
@@ -112,7 +112,7 @@ def test_one_bad_chunk_costs_itself_alone(whole: bytes, tmp_path: Path) -> None:
         assert 5 <= len(recording) < len(SAMPLE.left)
         assert recording.frame_stamps_ns[0] == SAMPLE.stamps_ns[0]
         assert recording.frame_stamps_ns[-1] == SAMPLE.stamps_ns[-1]
-        assert any("damaged chunks" in loss.what and loss.detail.startswith("1 with") for loss in recording.losses)
+        assert any("damaged chunks" in issue.what and issue.detail.startswith("1 with") for issue in recording.issues)
         assert_nothing_is_invented(recording)
 
 
@@ -124,7 +124,7 @@ def test_a_bad_record_length_is_stepped_over_by_the_index(whole: bytes, tmp_path
     with open_recording(write_bytes(tmp_path, bytes(data))) as recording:
         assert recording.frame_stamps_ns[-1] == SAMPLE.stamps_ns[-1]
         assert len(recording) < len(SAMPLE.left)
-        assert recording.losses
+        assert recording.issues
         assert_nothing_is_invented(recording)
 
 
@@ -137,7 +137,7 @@ def test_cut_files_of_other_writers(tmp_path: Path, compression: CompressionType
     path.write_bytes(path.read_bytes()[: int(0.8 * path.stat().st_size)])
     with open_recording(path) as recording:
         assert len(recording) >= 1
-        assert recording.losses
+        assert recording.issues
 
 
 def _chunk_positions(data: bytes) -> list[int]:

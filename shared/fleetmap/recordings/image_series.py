@@ -1,0 +1,72 @@
+"""Images of each camera by their stamps, paired to frames and read one frame at a time."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.recordings.images import StoredFrame, StoredImage, decode_frame
+from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS, ReadLog, forward_only, pair_stamps
+from fleetmap.sensors.samples import CameraFrame, Stamps
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class ImageSeries(Generic[T]):
+    """One camera's images: stamps (N,), and where each one is stored."""
+
+    stamps_ns: Stamps
+    sources: tuple[T, ...]
+
+    def __len__(self) -> int:
+        return len(self.sources)
+
+    def take(self, indices: NDArray[np.int64]) -> "ImageSeries[T]":
+        """Those at `indices` (K,)."""
+        return ImageSeries(self.stamps_ns[indices], tuple(self.sources[int(i)] for i in indices))
+
+    def forward(self, what: str, log: ReadLog) -> "ImageSeries[T]":
+        """Those whose stamps increase, as `forward_only`."""
+        return self.take(np.flatnonzero(forward_only(self.stamps_ns, what, log)))
+
+
+def pair_images(
+    first: ImageSeries[T], second: ImageSeries[T], log: ReadLog, tolerance_ns: int = PAIR_TOLERANCE_NS
+) -> tuple[ImageSeries[T], ImageSeries[T]]:
+    """Images of two cameras taken at the same moments; those without a partner are noted in `log`."""
+    firsts, seconds = pair_stamps(first.stamps_ns, second.stamps_ns, tolerance_ns)
+    alone = len(first) + len(second) - 2 * len(firsts)
+    if alone:
+        detail = f"{alone} of {len(first)} and {len(second)}; {len(firsts)} pairs remain"
+        log.note("images without their partner", detail)
+    return first.take(firsts), second.take(seconds)
+
+
+class SeriesFrames(Generic[T]):
+    """Frames of paired series of equal length; `load` reads the image of a source with its stamp in ns."""
+
+    def __init__(
+        self,
+        load: Callable[[T, int], StoredImage],
+        left: ImageSeries[T],
+        right: ImageSeries[T] | None,
+        depth: ImageSeries[T] | None,
+    ) -> None:
+        self._load = load
+        self.left, self.right, self.depth = left, right, depth
+
+    def stored(self, index: int) -> StoredFrame:
+        """Frame `index` with its images as they are stored."""
+        left, right, depth = (
+            None if series is None else self._load(series.sources[index], int(series.stamps_ns[index]))
+            for series in (self.left, self.right, self.depth)
+        )
+        assert left is not None
+        return StoredFrame(int(self.left.stamps_ns[index]), left, right, depth)
+
+    def frame(self, index: int) -> CameraFrame:
+        """Frame `index`, decoded."""
+        return decode_frame(self.stored(index))

@@ -1,0 +1,129 @@
+"""Stamps put in order and paired, samples checked; everything that is left out is noted, never hidden."""
+
+import bisect
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import RecordingError
+from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3
+from fleetmap.sensors.samples import DataIssue, ImuSamples, Stamps, Trajectory
+
+_MAX_IMU_VALUE = 1e5  # no inertial sensor measures this in any unit; flipped bits do
+PAIR_TOLERANCE_NS = 5_000_000  # images of one rig that are further apart were not taken at one moment
+V = TypeVar("V")
+
+
+@dataclass(slots=True)
+class ReadLog:
+    """Notes taken while a recording is read: what is missing or damaged, and the files read beside the images."""
+
+    issues: list[DataIssue] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+
+    def note(self, what: str, detail: str) -> None:
+        """Adds an issue."""
+        self.issues.append(DataIssue(what, detail))
+
+
+def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
+    """(N,) mask of a longest strictly increasing subsequence; the other stamps are noted in `log`.
+
+    Stamps are never sorted: values that arrive out of order carry stamps that cannot be trusted. One stamp far in the
+    future costs itself, not all that follow. RecordingError where more than half would be left out.
+    """
+    backwards = np.flatnonzero(np.diff(stamps_ns) <= 0)
+    if len(backwards) == 0:
+        return np.ones(len(stamps_ns), np.bool_)
+    kept = _longest_increasing(stamps_ns)
+    dropped, first = int((~kept).sum()), int(backwards[0])
+    log.note(
+        f"{what}: stamps not increasing",
+        f"{dropped} of {len(kept)} left out; the first is {stamps_ns[first + 1]} after {stamps_ns[first]}",
+    )
+    if dropped > len(kept) // 2:
+        raise RecordingError(
+            f"{what}: stamps go backwards, {dropped} of {len(kept)} do not fit; the sensor's clock is broken, "
+            "record again"
+        )
+    return kept
+
+
+def values_forward(values: Sequence[V], stamps_ns: Sequence[int], what: str, log: ReadLog) -> tuple[V, ...]:
+    """The values whose stamps increase, as `forward_only`."""
+    kept = forward_only(np.array(stamps_ns, np.int64), what, log)
+    return tuple(value for value, keep in zip(values, kept, strict=True) if keep)
+
+
+def _longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
+    """(N,) a longest strictly increasing subsequence. Source: patience sorting."""
+    ends: list[int] = []  # ends[k]: smallest stamp that ends an increasing run of k + 1
+    end_index: list[int] = []
+    before = np.full(len(stamps_ns), -1)
+    for index, stamp in enumerate(stamps_ns.tolist()):
+        position = bisect.bisect_left(ends, stamp)
+        before[index] = end_index[position - 1] if position else -1
+        ends[position : position + 1] = [stamp]
+        end_index[position : position + 1] = [index]
+    kept = np.zeros(len(stamps_ns), np.bool_)
+    index = end_index[-1]
+    while index >= 0:
+        kept[index] = True
+        index = int(before[index])
+    return kept
+
+
+def clean_imu(stamps_ns: Stamps, gyro_radps: Array, accel_mps2: Array, log: ReadLog) -> ImuSamples:
+    """The samples with possible values and increasing stamps; the others are noted in `log`."""
+    possible = np.asarray((np.abs(np.hstack([gyro_radps, accel_mps2])) < _MAX_IMU_VALUE).all(axis=1))
+    if not possible.all():
+        log.note("imu: impossible values", f"{int((~possible).sum())} of {len(possible)} samples left out")
+    rows = np.flatnonzero(possible)
+    rows = rows[forward_only(stamps_ns[rows], "imu", log)]
+    return ImuSamples(stamps_ns[rows], gyro_radps[rows], accel_mps2[rows])
+
+
+def trajectory_of_rows(stamps_ns: Stamps, position_quat_wxyz: Array, log: ReadLog) -> Trajectory | None:
+    """The ground truth of rows x y z qw qx qy qz (N, 7), None where no row is usable.
+
+    Rows without a unit quaternion are left out and noted.
+    """
+    norms = np.linalg.norm(position_quat_wxyz[:, 3:7], axis=1)
+    good = np.isfinite(position_quat_wxyz).all(axis=1) & (np.abs(norms - 1) < 0.01)
+    if not good.all():
+        detail = f"{int((~good).sum())} of {len(good)} rows without a unit quaternion left out"
+        log.note("ground truth: no rotation", detail)
+    rows = np.flatnonzero(good)
+    rows = rows[forward_only(stamps_ns[rows], "ground truth", log)]
+    if not len(rows):
+        return None
+    frame_from_body = [se3(rotation_from_quat_wxyz(row[3:7]), row[:3]) for row in position_quat_wxyz[rows]]
+    return Trajectory(stamps_ns[rows], np.stack(frame_from_body))
+
+
+def pair_stamps(
+    left_ns: Stamps, right_ns: Stamps, tolerance_ns: int = PAIR_TOLERANCE_NS
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices (P,), (P,) of increasing left and right stamps that belong together.
+
+    Two belong together where each is the other's nearest and they are within the tolerance.
+    """
+    if len(left_ns) == 0 or len(right_ns) == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    right_of_left, left_of_right = _nearest(right_ns, left_ns), _nearest(left_ns, right_ns)
+    lefts = np.arange(len(left_ns))
+    is_mutual = left_of_right[right_of_left] == lefts
+    is_close = np.abs(right_ns[right_of_left] - left_ns) <= tolerance_ns
+    chosen = lefts[is_mutual & is_close]
+    return chosen, right_of_left[chosen]
+
+
+def _nearest(sorted_ns: Stamps, wanted_ns: Stamps) -> NDArray[np.int64]:
+    after = np.clip(np.searchsorted(sorted_ns, wanted_ns), 0, len(sorted_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    is_before = wanted_ns - sorted_ns[before] < sorted_ns[after] - wanted_ns
+    return np.where(is_before & (after > 0), before, after).astype(np.int64)
