@@ -24,13 +24,13 @@ from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver.build.draft_evidence import Before, examine_draft, replayed_probes
 from mapserver.build.image_spill import ImageSpill
 from mapserver.build.job_record import Job, recorded_job
+from mapserver.build.loop_overlay import loop_places
 from mapserver.build.progress import ProgressView, StageTimes
 from mapserver.build.report import Accuracy, BuildReport, accuracy, full_report, make_report, sessions_report
 from mapserver.build.survey_recordings import Admission, Surveyed, admit_recordings, survey_all, survey_recording
 from mapserver.build.vocabulary_selection import ChosenVocabulary, choose_vocabulary, judged
 from mapserver.build.worker import open_worker
 from mapserver.build.zones_file import read_zones
-from mapserver.dashboard.loop_overlay import loop_places
 from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
