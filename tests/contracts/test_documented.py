@@ -16,7 +16,7 @@ from fleetmap import messages
 from fleetmap.messages import Cause
 from locclient.replay.run_metrics import METRICS
 from mapserver.build.report import BuildReport
-from mapserver.fleet_statistics.kpis import Measures
+from mapserver.fleet_statistics.kpis import Kpis
 from mapserver.nightly.night import Night
 from mapserver.quality import figures
 from mapserver.survey.merge.pipeline import Counts
@@ -137,7 +137,7 @@ def test_replay_report_keys_are_documented() -> None:
 
 
 def test_fleet_measures_are_documented() -> None:
-    keys = {field.name for field in dataclasses.fields(Measures)}
+    keys = {field.name for field in dataclasses.fields(Kpis)}
     assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Fleet"))} == keys
 
 

@@ -7,7 +7,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from mapserver.api.views import Problem
-from mapserver.fleet_statistics.kpis import Tally, measures
+from mapserver.fleet_statistics.kpis import Counters, kpis
 from mapserver.store import FailureRow
 
 _PARAMETER_EXAMPLES: dict[str, Any] = {
@@ -43,9 +43,9 @@ _FAILURE = asdict(
         x_map_m=70.2, y_map_m=-3.1,
     )
 )  # fmt: skip
-_MEASURES = asdict(
-    measures(
-        Tally(
+_KPIS = asdict(
+    kpis(
+        Counters(
             reports=57000, observed_ms=57_000_000, driving_ms=40_000_000, after_fix_ms=56_000_000, localised_ms=55_000_000,
             usable_ms=55_500_000, first_fixes=3, first_fix_ms=9000, failures=1, blind_failures=1, blind_seen=1,
         )
@@ -56,10 +56,10 @@ _ANSWER_EXAMPLES: dict[str, Any] = {
     "/v1/failures/{number}": {"failure": _FAILURE, "report": {"sharpness": 0.4}, "pictures": []},
     "/v1/fleet/measures": {
         "by": "robot",
-        "measures": [{"site": "hall", "key": "tug-7", "measures": _MEASURES}],
+        "measures": [{"site": "hall", "key": "tug-7", "measures": _KPIS}],
         "next": None,
     },
-    "/v1/sites/{site}/hours": {"hours": [{"hour_ns": 1767322800000000000, "measures": _MEASURES}], "next": None},
+    "/v1/sites/{site}/hours": {"hours": [{"hour_ns": 1767322800000000000, "measures": _KPIS}], "next": None},
     "/v1/sites": {"sites": [_SITE], "next": None},
     "/v1/sites/{site}/versions": {"versions": [_VERSION], "next": None},
     "/v1/sites/{site}/current": _VERSION,

@@ -8,25 +8,25 @@ from prometheus_client.registry import Collector
 
 from fleetmap.messages import Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
-from mapserver.fleet_statistics.kpis import Tally
+from mapserver.fleet_statistics.kpis import Counters
 from mapserver.store import MapStore
 
 _SILENT_AFTER_S = 60.0
 
-_SITE_SUMS: tuple[tuple[str, str, Callable[[Tally], float]], ...] = (
-    ("reports", "Health reports.", lambda tally: tally.reports),
-    ("failures", "Position failures that robots reported.", lambda tally: tally.failures),
-    ("silent_failures_estimated", "Silent failures, an estimate.", lambda tally: tally.silent_estimated),
+_SITE_SUMS: tuple[tuple[str, str, Callable[[Counters], float]], ...] = (
+    ("reports", "Health reports.", lambda counts: counts.reports),
+    ("failures", "Position failures that robots reported.", lambda counts: counts.failures),
+    ("silent_failures_estimated", "Silent failures, an estimate.", lambda counts: counts.silent_estimated),
     ("unreported_blindness", "Stretches of blindness without a reported failure.", lambda t: t.unreported_blindness),
-    ("observed_seconds", "Time that reports cover.", lambda tally: tally.observed_ms / 1e3),
-    ("driving_seconds", "Of it driving; a robot-day is 57600 s.", lambda tally: tally.driving_ms / 1e3),
-    ("usable_seconds", "Of it with a usable position.", lambda tally: tally.usable_ms / 1e3),
-    ("after_first_fix_seconds", "Of it since the run's first fix.", lambda tally: tally.after_fix_ms / 1e3),
-    ("localised_seconds", "Of that TRACKING.", lambda tally: tally.localised_ms / 1e3),
-    ("frames", "Frames that were worked on.", lambda tally: tally.frames),
-    ("frames_dropped", "Frames that were not.", lambda tally: tally.frames_dropped),
-    ("docks", "Arrivals at docks.", lambda tally: tally.docks),
-    ("docks_wrong", "Of them with an estimate more than 0.30 m off.", lambda tally: tally.docks_wrong),
+    ("observed_seconds", "Time that reports cover.", lambda counts: counts.observed_ms / 1e3),
+    ("driving_seconds", "Of it driving; a robot-day is 57600 s.", lambda counts: counts.driving_ms / 1e3),
+    ("usable_seconds", "Of it with a usable position.", lambda counts: counts.usable_ms / 1e3),
+    ("after_first_fix_seconds", "Of it since the run's first fix.", lambda counts: counts.after_fix_ms / 1e3),
+    ("localised_seconds", "Of that TRACKING.", lambda counts: counts.localised_ms / 1e3),
+    ("frames", "Frames that were worked on.", lambda counts: counts.frames),
+    ("frames_dropped", "Frames that were not.", lambda counts: counts.frames_dropped),
+    ("docks", "Arrivals at docks.", lambda counts: counts.docks),
+    ("docks_wrong", "Of them with an estimate more than 0.30 m off.", lambda counts: counts.docks_wrong),
 )
 
 
@@ -39,11 +39,11 @@ class FleetCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Sums by site, failures and driving by version, failures by cause, robots by status."""
-        totals = self._store.fleet.tallies(None, "site")
+        totals = self._store.fleet.counters(None, "site")
         for name, words, value in _SITE_SUMS:
             family = CounterMetricFamily(f"fleetmap_site_{name}", words, labels=["site"])
-            for (site, _), tally in totals.items():
-                family.add_metric([site], value(tally))
+            for (site, _), counts in totals.items():
+                family.add_metric([site], value(counts))
             yield family
         yield from self._by_version()
         yield from self._by_cause()
@@ -52,7 +52,7 @@ class FleetCollector(Collector):
     def _by_version(self) -> Iterator[Metric]:
         sites = {info.site for info in self._store.sites()}
         kept = {(info.site, str(info.version)) for site in sites for info in self._store.versions(site)}
-        found = {key: tally for key, tally in self._store.fleet.tallies(None, "version").items() if key in kept}
+        found = {key: counts for key, counts in self._store.fleet.counters(None, "version").items() if key in kept}
         failures = CounterMetricFamily(
             "fleetmap_version_failures", "Failures on a version.", labels=["site", "version"]
         )
@@ -62,10 +62,10 @@ class FleetCollector(Collector):
         driving = CounterMetricFamily(
             "fleetmap_version_driving_seconds", "Driving with a version.", labels=["site", "version"]
         )
-        for key, tally in found.items():
-            failures.add_metric(key, tally.failures)
-            silent.add_metric(key, tally.silent_estimated)
-            driving.add_metric(key, tally.driving_ms / 1e3)
+        for key, counts in found.items():
+            failures.add_metric(key, counts.failures)
+            silent.add_metric(key, counts.silent_estimated)
+            driving.add_metric(key, counts.driving_ms / 1e3)
         running = GaugeMetricFamily(
             "fleetmap_site_canary_version", "Version that some robots try, 0 for none.", labels=["site"]
         )
@@ -76,8 +76,8 @@ class FleetCollector(Collector):
 
     def _by_cause(self) -> Iterator[Metric]:
         family = CounterMetricFamily("fleetmap_site_cause_failures", "Failures by cause.", labels=["site", "cause"])
-        for key, tally in self._store.fleet.tallies(None, "cause").items():
-            family.add_metric(key, tally.failures + tally.suspected)
+        for key, counts in self._store.fleet.counters(None, "cause").items():
+            family.add_metric(key, counts.failures + counts.suspected)
         yield family
 
     def _robots(self) -> Iterator[Metric]:

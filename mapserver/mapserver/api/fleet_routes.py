@@ -6,11 +6,11 @@ from typing import Annotated
 from fastapi import FastAPI, Path, Query, Response
 
 from fleetmap.messages import report_dict
-from mapserver.api.fleet_views import FailureList, FailureView, HourList, HourView, MeasuresList, MeasuresView
-from mapserver.api.pages import Limit, NumberCursor, TallyCursor, page
+from mapserver.api.fleet_views import FailureList, FailureView, HourList, HourView, KpisList, KpisView
+from mapserver.api.pages import CounterCursor, Limit, NumberCursor, page
 from mapserver.api.parameters import Axis, FailureNumber, Hours, KeyFilter, Site, SiteFilter
 from mapserver.fleet.fleet import finite
-from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of, measures
+from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of, kpis
 from mapserver.store import FailureFilter, MapStore
 
 VersionFilter = Annotated[int | None, Query(ge=1, le=1 << 31, description="on this version alone", examples=[None])]
@@ -21,14 +21,14 @@ def install_fleet_routes(app: FastAPI, store: MapStore) -> None:
 
     @app.get("/v1/fleet/measures")
     def fleet_measures(
-        by: Axis = "site", site: SiteFilter = None, hours: Hours = 24, limit: Limit = 100, cursor: TallyCursor = None
-    ) -> MeasuresList:
+        by: Axis = "site", site: SiteFilter = None, hours: Hours = 24, limit: Limit = 100, cursor: CounterCursor = None
+    ) -> KpisList:
         """Failures per robot-day with interval, availability and the rest, by site, robot, version, tile or cause."""
-        found = store.fleet.tallies(site, by, since_hour=_since(hours))
-        chosen = [(f"{key[0]}/{key[1]}", key, tally) for key, tally in found.items()]
+        found = store.fleet.counters(site, by, since_hour=_since(hours))
+        chosen = [(f"{key[0]}/{key[1]}", key, counts) for key, counts in found.items()]
         chosen = sorted(item for item in chosen if cursor is None or item[0] > cursor)
         shown, following = page(chosen, limit, lambda item: item[0])
-        return MeasuresList(by, [MeasuresView(*key, measures(tally)) for _, key, tally in shown], following)
+        return KpisList(by, [KpisView(*key, kpis(counts)) for _, key, counts in shown], following)
 
     @app.get("/v1/sites/{site}/hours")
     def fleet_hours(
@@ -39,7 +39,7 @@ def install_fleet_routes(app: FastAPI, store: MapStore) -> None:
         store.current(site)  # an unknown site is not an empty one
         found = store.fleet.hours(site, by, key=key, since_hour=max(_since(hours), (cursor or -1) + 1))
         shown, following = page(list(found.items()), limit, lambda item: str(item[0]))
-        return HourList([HourView(hour * HOUR_NS, measures(tally)) for hour, tally in shown], following)
+        return HourList([HourView(hour * HOUR_NS, kpis(counts)) for hour, counts in shown], following)
 
     @app.get("/v1/failures")
     def failures(

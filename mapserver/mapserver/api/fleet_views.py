@@ -7,25 +7,25 @@ from pydantic import ConfigDict, Field
 
 from mapserver.api.views import Act
 from mapserver.fleet_statistics.canary_test import CanaryFinding
-from mapserver.fleet_statistics.kpis import Measures
+from mapserver.fleet_statistics.kpis import Kpis
 from mapserver.store import CanaryRow, FailureRow, PictureRow
 
 
 @dataclass(frozen=True, slots=True)
-class MeasuresView:
+class KpisView:
     """The figures of one robot, version, tile, cause or site; key is empty for a site as a whole."""
 
     site: str
     key: str
-    measures: Measures
+    measures: Kpis
 
 
 @dataclass(frozen=True, slots=True)
-class MeasuresList:
+class KpisList:
     """Figures by site and key."""
 
     by: str
-    measures: list[MeasuresView]
+    measures: list[KpisView]
     next: str | None
 
 
@@ -34,7 +34,7 @@ class HourView:
     """The figures of one hour; hour_ns: its begin, nanoseconds since 1970."""
 
     hour_ns: int
-    measures: Measures
+    measures: Kpis
 
 
 @dataclass(frozen=True, slots=True)

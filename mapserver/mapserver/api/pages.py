@@ -14,7 +14,7 @@ NumberCursor = Annotated[
 ]
 NameCursor = Annotated[str | None, Query(max_length=64, description="`next` of the page before", examples=[None])]
 RobotCursor = Annotated[str | None, Query(max_length=129, description="`next` of the page before", examples=[None])]
-TallyCursor = Annotated[str | None, Query(max_length=160, description="`next` of the page before", examples=[None])]
+CounterCursor = Annotated[str | None, Query(max_length=160, description="`next` of the page before", examples=[None])]
 
 
 def page(items: Sequence[Item], limit: int, cursor_of: Callable[[Item], str]) -> tuple[list[Item], str | None]:

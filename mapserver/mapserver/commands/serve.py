@@ -74,20 +74,20 @@ def _run(
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     fleet = Fleet(maps, settings=settings.ingest)
     metrics = Metrics(maps, fleet)
-    service = BusService(maps, fleet, bus, metrics.count_bus)
+    bus_service = BusService(maps, fleet, bus, metrics.count_bus)
 
     @asynccontextmanager
     async def lifespan(_: "FastAPI") -> AsyncIterator[None]:
         import asyncio
 
-        chores = asyncio.create_task(run_background_tasks(server_tasks(maps, fleet, service, settings)))
+        background = asyncio.create_task(run_background_tasks(server_tasks(maps, fleet, bus_service, settings)))
         host, port = listener.getsockname()[:2]
         typer.echo(f"http: http://{f'[{host}]' if ':' in host else host}:{port}")
         typer.echo(f"zenoh: {bus.endpoint}")
         typer.echo("ready")
         yield
-        chores.cancel()
-        await asyncio.gather(chores, return_exceptions=True)
+        background.cancel()
+        await asyncio.gather(background, return_exceptions=True)
 
     app = create_app(
         maps, fleet, metrics, bus, lifespan, writers=writers, gate=settings.gate, canary=settings.canary,
@@ -102,7 +102,7 @@ def _run(
     try:
         uvicorn.Server(config).run(sockets=[listener])
     finally:
-        service.close()
+        bus_service.close()
         fleet.flush()
 
 

@@ -9,7 +9,7 @@ from scipy.special import bdtr
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet.resurvey_list import resurvey_list
 from mapserver.fleet_statistics.canary_test import CanarySettings
-from mapserver.fleet_statistics.kpis import HOUR_NS, Measures, Rate, Tally, hour_of, measures, rate
+from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, hour_of, kpis, rate
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings, TileConcern
 from mapserver.store import CanaryRow, FailureDetail, FailureFilter, FailureRow, MapStore
 
@@ -36,11 +36,11 @@ class SiteHealth:
     robots: each one's figures of the last 24 h. trend: how day compares with week, in words.
     """
 
-    day: Measures
-    week: Measures
+    day: Kpis
+    week: Kpis
     trend: str
     days: tuple[Rate, ...]
-    robots: Mapping[str, Measures]
+    robots: Mapping[str, Kpis]
     trials: tuple[Trial, ...]
     resurvey: tuple[TileConcern, ...]
 
@@ -87,8 +87,8 @@ class HealthData:
         """What the site's failures can be filtered by."""
 
         def keys(axis: str) -> list[str]:
-            found = self._store.fleet.tallies(site, axis)
-            return [key for (_, key), tally in found.items() if tally.failures or tally.suspected]
+            found = self._store.fleet.counters(site, axis)
+            return [key for (_, key), counts in found.items() if counts.failures or counts.suspected]
 
         def numbers_first(key: str) -> tuple[int, str]:
             return (int(key), "") if key.isdecimal() else (1 << 40, key)
@@ -101,13 +101,13 @@ class HealthData:
         hours = self._store.fleet.hours(site, "site", since_hour=next_hour - DAY_H * DAYS_SHOWN)
         days = [_sum(hours, next_hour - DAY_H * (n + 1), next_hour - DAY_H * n) for n in reversed(range(DAYS_SHOWN))]
         week = _sum(hours, next_hour - DAY_H * 8, next_hour - DAY_H)
-        robots = self._store.fleet.tallies(site, "robot", since_hour=next_hour - DAY_H)
+        robots = self._store.fleet.counters(site, "robot", since_hour=next_hour - DAY_H)
         return SiteHealth(
-            measures(days[-1]),
-            measures(week),
+            kpis(days[-1]),
+            kpis(week),
             trend_words(days[-1], week),
-            tuple(rate(tally.failures, tally.robot_days) for tally in days),
-            {robot: measures(tally) for (_, robot), tally in robots.items()},
+            tuple(rate(counts.failures, counts.robot_days) for counts in days),
+            {robot: kpis(counts) for (_, robot), counts in robots.items()},
             self._trials(site, now_ns),
             tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles),
         )
@@ -121,15 +121,15 @@ class HealthData:
         )
 
 
-def _sum(hours: Mapping[int, Tally], since: int, until: int) -> Tally:
-    total = Tally()
-    for hour, tally in hours.items():
+def _sum(hours: Mapping[int, Counters], since: int, until: int) -> Counters:
+    total = Counters()
+    for hour, counts in hours.items():
         if since <= hour < until:
-            total.add(tally)
+            total.add(counts)
     return total
 
 
-def trend_words(day: Tally, week: Tally) -> str:
+def trend_words(day: Counters, week: Counters) -> str:
     """How a day's failures compare with the week's before, as far as the counts can tell.
 
     Given all failures of both, those of the day are binomial with the day's share of the driving if nothing changed (the

@@ -6,7 +6,7 @@ from fleetmap.errors import FleetmapError
 from mapserver import releases
 from mapserver.fleet.ingest import arm_key
 from mapserver.fleet_statistics.canary_test import DAY_NS, CanaryFinding, CanarySettings, judge_canary
-from mapserver.fleet_statistics.kpis import Tally
+from mapserver.fleet_statistics.kpis import Counters
 from mapserver.store import Actor, CanaryRow, MapStore
 
 ACTOR = "canary"
@@ -15,9 +15,9 @@ _log = logging.getLogger(__name__)
 
 def find(store: MapStore, canary: CanaryRow, settings: CanarySettings, now_ns: int) -> CanaryFinding:
     """What both arms did since the canary began, and what follows from it."""
-    arms = store.fleet.tallies(canary.site, "arm")
-    ours = arms.get((canary.site, arm_key(canary.id, is_canary=True)), Tally())
-    theirs = arms.get((canary.site, arm_key(canary.id, is_canary=False)), Tally())
+    arms = store.fleet.counters(canary.site, "arm")
+    ours = arms.get((canary.site, arm_key(canary.id, is_canary=True)), Counters())
+    theirs = arms.get((canary.site, arm_key(canary.id, is_canary=False)), Counters())
     end_ns = now_ns if canary.ended_ns is None else canary.ended_ns
     return judge_canary(ours, theirs, (end_ns - canary.started_ns) / DAY_NS, settings)
 

@@ -20,8 +20,8 @@ from fleetmap.messages import (
     report_dict,
 )
 from mapserver.fleet.ingest import Ingest, IngestSettings
-from mapserver.fleet.rejected_reports import RejectedReports, refused
-from mapserver.fleet.version_assignment import VersionAssignment, read_plan
+from mapserver.fleet.rejected_reports import RejectedReports, rejection
+from mapserver.fleet.version_assignment import VersionAssignment, read_assignment
 from mapserver.fleet_statistics.clock_skew import ClockSkew
 from mapserver.store import MapStore
 
@@ -77,7 +77,7 @@ class Fleet:
         self._clock_ns = clock_ns
         self._lock = threading.Lock()
         self._ingest = Ingest(store, settings)
-        self._refused = RejectedReports(store.folder / "refused")
+        self._rejected = RejectedReports(store.folder / "refused")
         self._robots: dict[tuple[str, str], _Robot] = {}
         for info in store.robots():
             skew = ClockSkew(info.last_report.get("clock_ahead_s"))
@@ -90,12 +90,12 @@ class Fleet:
 
         Raises UsageError for an unknown site.
         """
-        return read_plan(self._store, site).wanted(robot)
+        return read_assignment(self._store, site).wanted(robot)
 
     def wanted_versions(self, site: str) -> dict[str, WantedVersion]:
         """The same for all robots of a site that ever asked or said something."""
-        plan = read_plan(self._store, site)
-        return {robot: plan.wanted(robot) for robot in self.known_robots(site)}
+        assignment = read_assignment(self._store, site)
+        return {robot: assignment.wanted(robot) for robot in self.known_robots(site)}
 
     def take_question(self, site: str, robot: str) -> WantedVersion:
         """As `wanted_version`, asked by the robot itself: from then on it is known, and told of the next version."""
@@ -159,9 +159,9 @@ class Fleet:
         try:
             ack = self.take_failure(site, robot, decode_message(payload, FailureReport))
         except LinkError as error:
-            ack = refused(payload, str(error))
+            ack = rejection(payload, str(error))
         if ack.refused:
-            self._refused.keep(site, robot, payload, ack.refused, self._clock_ns())
+            self._rejected.keep(site, robot, payload, ack.refused, self._clock_ns())
         return ack
 
     def take_presence(self, present: Iterable[tuple[str, str]]) -> None:
@@ -189,11 +189,11 @@ class Fleet:
         now_ns = self._clock_ns()
         with self._lock:
             chosen = [(key, robot) for key, robot in sorted(self._robots.items()) if site in {None, key[0]}]
-        plans: dict[str, VersionAssignment] = {}
+        assignments: dict[str, VersionAssignment] = {}
         for key, _ in chosen:
-            if key[0] not in plans:
-                plans[key[0]] = read_plan(self._store, key[0])
-        return [_status(key, robot, plans[key[0]], now_ns) for key, robot in chosen]
+            if key[0] not in assignments:
+                assignments[key[0]] = read_assignment(self._store, key[0])
+        return [_status(key, robot, assignments[key[0]], now_ns) for key, robot in chosen]
 
     def _entry(self, site: str, robot: str, now_ns: int, version: int | None) -> _Robot:
         """The robot, seen now; `version` is what it says it runs. The caller holds the lock."""
@@ -209,13 +209,13 @@ class Fleet:
         return entry
 
 
-def _status(key: tuple[str, str], robot: _Robot, plan: VersionAssignment, now_ns: int) -> RobotStatus:
+def _status(key: tuple[str, str], robot: _Robot, assignment: VersionAssignment, now_ns: int) -> RobotStatus:
     return RobotStatus(
         site=key[0],
         robot=key[1],
         version=robot.version,
-        wanted_version=plan.wanted(key[1]).version,
-        is_canary=plan.is_canary(key[1]),
+        wanted_version=assignment.wanted(key[1]).version,
+        is_canary=assignment.is_canary(key[1]),
         is_present=robot.is_present,
         clock_ahead_s=robot.skew.ahead_s,
         seconds_since=max(0, now_ns - robot.seen_ns) / 1e9,

@@ -13,15 +13,15 @@ from fleetmap.errors import FleetmapError
 from fleetmap.messages import FailureKind, FailureReport, PoseMessage, RobotHealth
 from mapserver.fleet_statistics.clock_skew import server_time_ns
 from mapserver.fleet_statistics.health_stream import HealthStream
-from mapserver.fleet_statistics.kpis import Tally, hour_of
-from mapserver.store import CanaryRow, FleetBatch, FleetRetention, MapStore, TallyKey, TraceRow, tile_key
+from mapserver.fleet_statistics.kpis import Counters, hour_of
+from mapserver.store import CanaryRow, CounterKey, FleetBatch, FleetRetention, MapStore, TraceRow, tile_key
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
 OUTSIDE = "outside"
 """Key of the tiles of positions that no tile of the version covers."""
 
-_PLAN_NS = 1_000_000_000
+_CANARIES_KEPT_NS = 1_000_000_000
 _MAX_CAUSES = 64
 _MAX_KEPT_TRACES = 200_000
 _DAY_NS = 86_400_000_000_000
@@ -47,7 +47,7 @@ class IngestSettings(Section, frozen=True):
 
 @dataclass(slots=True)
 class _Stream:
-    watch: HealthStream = field(default_factory=HealthStream)
+    health: HealthStream = field(default_factory=HealthStream)
     trace_ns: int = -(1 << 62)
     status: str = ""
 
@@ -88,7 +88,7 @@ class Ingest:
     def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
         """Follows a robot's estimate, for its speed."""
         with self._lock:
-            self._streams.setdefault((site, robot), _Stream()).watch.take_pose(message)
+            self._streams.setdefault((site, robot), _Stream()).health.take_pose(message)
 
     def take_health(
         self,
@@ -104,15 +104,15 @@ class Ingest:
         canary = self._canary(site, now_ns)
         with self._lock:
             stream = self._streams.setdefault((site, robot), _Stream())
-            tally = stream.watch.take_health(health)
+            counts = stream.health.take_health(health)
             self._batch.last_reports[site, robot] = (version, now_ns, report)
-            if tally is None:
+            if counts is None:
                 return
             place = None if estimate is None or estimate.map_version != health.version else estimate.position_map_m
             for axis, key in _keys(robot, _version_key(health.version, grid), _arm(canary, health.version)):
-                self._batch.add(site, axis, key, hour, tally)
+                self._batch.add(site, axis, key, hour, counts)
             if grid is not None and place is not None:
-                self._batch.add(site, "tile", grid.key(place[0], place[1]), hour, tally)
+                self._batch.add(site, "tile", grid.key(place[0], place[1]), hour, counts)
             if self._is_trace_due(stream, health, now_ns):
                 self._batch.traces.append(_trace(health, place, hour))
 
@@ -123,21 +123,21 @@ class Ingest:
         grid = self._grid(report.site, report.version)
         canary = self._canary(report.site, now_ns)
         arm = _arm(canary, report.version) if canary is not None and happened_ns >= canary.started_ns else None
-        tally = Tally(suspected=1) if report.kind == FailureKind.SUSPECTED else Tally(failures=1)
-        tally.blind_failures = int(report.kind == FailureKind.BLIND)
+        counts = Counters(suspected=1) if report.kind == FailureKind.SUSPECTED else Counters(failures=1)
+        counts.blind_failures = int(report.kind == FailureKind.BLIND)
         keys = _keys(report.robot, _version_key(report.version, grid), arm)
         keys.append(("cause", self._cause(report.site, report.cause)))
         if grid is not None and report.tile is not None:
             keys.append(("tile", grid.cell_key(report.tile)))
-        tallies: dict[TallyKey, Tally] = {(report.site, *key, hour_of(happened_ns)): tally for key in keys}
-        return self._store.fleet.add_failure(report, received_ns=now_ns, happened_ns=happened_ns, tallies=tallies)
+        counters: dict[CounterKey, Counters] = {(report.site, *key, hour_of(happened_ns)): counts for key in keys}
+        return self._store.fleet.add_failure(report, received_ns=now_ns, happened_ns=happened_ns, counters=counters)
 
     def flush(self) -> None:
         """Brings what was counted to the disk. Raises StoreError, and keeps it for the next time."""
         with self._flushing:
             with self._lock:
                 batch, self._batch = self._batch, FleetBatch()
-            if not (batch.tallies or batch.last_reports):
+            if not (batch.counters or batch.last_reports):
                 return
             try:
                 self._store.fleet.add(batch)
@@ -152,8 +152,8 @@ class Ingest:
 
     def _put_back(self, batch: FleetBatch) -> None:
         newer, self._batch = self._batch, batch
-        for (site, axis, key, hour), tally in newer.tallies.items():
-            batch.add(site, axis, key, hour, tally)
+        for (site, axis, key, hour), counts in newer.counters.items():
+            batch.add(site, axis, key, hour, counts)
         batch.last_reports |= newer.last_reports
         kept = deque((*batch.traces, *newer.traces), maxlen=_MAX_KEPT_TRACES)
         batch.traces = list(kept)
@@ -179,7 +179,7 @@ class Ingest:
         return self._grids[site, version]
 
     def _canary(self, site: str, now_ns: int) -> CanaryRow | None:
-        if not 0 <= now_ns - self._canaries_ns < _PLAN_NS:
+        if not 0 <= now_ns - self._canaries_ns < _CANARIES_KEPT_NS:
             self._canaries = {row.site: row for row in self._store.canaries(running=True)}
             self._canaries_ns = now_ns
         return self._canaries.get(site)

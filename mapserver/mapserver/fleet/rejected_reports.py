@@ -18,7 +18,7 @@ class _IdOnly(msgspec.Struct, frozen=True):
     id: Name
 
 
-def refused(payload: bytes, reason: str) -> FailureAck:
+def rejection(payload: bytes, reason: str) -> FailureAck:
     """The answer after which a robot does not send an unreadable report again; raises LinkError where not even its id can be read."""
     try:
         known = msgspec.msgpack.decode(payload, type=_IdOnly)

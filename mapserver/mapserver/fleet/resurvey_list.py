@@ -26,11 +26,11 @@ def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns
     now_hour = hour_of(now_ns)
     recent_hour = now_hour - round(settings.recent_days * 24)
     before_hour = recent_hour - round(settings.before_days * 24)
-    recent = store.fleet.tallies(site, "tile", since_hour=recent_hour)
-    before = store.fleet.tallies(site, "tile", since_hour=before_hour, until_hour=recent_hour)
+    recent = store.fleet.counters(site, "tile", since_hour=recent_hour)
+    before = store.fleet.counters(site, "tile", since_hour=before_hour, until_hour=recent_hour)
     found = concerns(
-        {key: tally for (_, key), tally in recent.items()},
-        {key: tally for (_, key), tally in before.items()},
+        {key: counts for (_, key), counts in recent.items()},
+        {key: counts for (_, key), counts in before.items()},
         settings,
     )
     if current is None:

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from html import escape
 
 from mapserver.fleet.shift_summary import FleetSummary
-from mapserver.fleet_statistics.kpis import HOUR_NS, Measures, Rate
+from mapserver.fleet_statistics.kpis import HOUR_NS, Kpis, Rate
 from mapserver.fleet_statistics.rate_format import driven_words, is_telling, rate_words
 
 _STYLE = """
@@ -34,8 +34,8 @@ def html_page(summary: FleetSummary) -> str:
         _figures(summary),
         _canary(summary),
         _trend(summary),
-        _measures_table("Robots, the worst first", "robot", summary.robots),
-        _measures_table("Map versions", "version", summary.versions),
+        _kpis_table("Robots, the worst first", "robot", summary.robots),
+        _kpis_table("Map versions", "version", summary.versions),
         _causes(summary),
         _resurvey(summary),
         _failures(summary),
@@ -114,7 +114,7 @@ def _trend(summary: FleetSummary) -> str:
     )
 
 
-def _measures_table(title: str, name: str, rows: Sequence[tuple[str, Measures]]) -> str:
+def _kpis_table(title: str, name: str, rows: Sequence[tuple[str, Kpis]]) -> str:
     body = [
         (
             key or "none", str(found.failures.events), _rate(found.failures), str(found.silent_estimated.events),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
 from mapserver.fleet_statistics.canary_test import CanaryFinding, CanarySettings
-from mapserver.fleet_statistics.kpis import HOUR_NS, Measures, Tally, hour_of, measures
+from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, hour_of, kpis
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings
 from mapserver.store import CanaryRow, FailureFilter, FailureRow, MapStore
 
@@ -20,12 +20,12 @@ class FleetSummary:
     until_ns: int
     hours: int
     current_version: int | None
-    total: Measures
-    before: Measures
-    robots: list[tuple[str, Measures]]
-    versions: list[tuple[str, Measures]]
-    causes: list[tuple[str, Measures]]
-    by_hour: list[tuple[int, Measures]]
+    total: Kpis
+    before: Kpis
+    robots: list[tuple[str, Kpis]]
+    versions: list[tuple[str, Kpis]]
+    causes: list[tuple[str, Kpis]]
+    by_hour: list[tuple[int, Kpis]]
     failures: list[FailureRow]
     canary: tuple[CanaryRow, CanaryFinding] | None
     resurvey: ResurveyList
@@ -50,18 +50,18 @@ def summarise(
         robots=_table(store, site, "robot", since),
         versions=_table(store, site, "version", since),
         causes=_table(store, site, "cause", since),
-        by_hour=[(hour, measures(tally)) for hour, tally in store.fleet.hours(site, "site", since_hour=since).items()],
+        by_hour=[(hour, kpis(counts)) for hour, counts in store.fleet.hours(site, "site", since_hour=since).items()],
         failures=store.fleet.failures(wanted, limit=_SHOWN_FAILURES),
         canary=(tried[0], find(store, tried[0], canary, now_ns)) if tried else None,
         resurvey=resurvey_list(store, site, resurvey, now_ns),
     )
 
 
-def _total(store: MapStore, site: str, since: int, until: int) -> Measures:
-    found = store.fleet.tallies(site, "site", since_hour=since, until_hour=until)
-    return measures(found.get((site, ""), Tally()))
+def _total(store: MapStore, site: str, since: int, until: int) -> Kpis:
+    found = store.fleet.counters(site, "site", since_hour=since, until_hour=until)
+    return kpis(found.get((site, ""), Counters()))
 
 
-def _table(store: MapStore, site: str, axis: str, since: int) -> list[tuple[str, Measures]]:
-    rows = [(key, measures(tally)) for (_, key), tally in store.fleet.tallies(site, axis, since_hour=since).items()]
+def _table(store: MapStore, site: str, axis: str, since: int) -> list[tuple[str, Kpis]]:
+    rows = [(key, kpis(counts)) for (_, key), counts in store.fleet.counters(site, axis, since_hour=since).items()]
     return sorted(rows, key=lambda row: (-row[1].failures.events, -row[1].silent_estimated.events, row[0]))

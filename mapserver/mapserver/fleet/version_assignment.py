@@ -25,8 +25,8 @@ class VersionAssignment:
         return self.tried if self.tried is not None and self.is_canary(robot) else self.current
 
 
-def read_plan(store: MapStore, site: str) -> VersionAssignment:
-    """The plan of a site as it is now; raises UsageError for an unknown one."""
+def read_assignment(store: MapStore, site: str) -> VersionAssignment:
+    """The assignment of a site as it is now; raises UsageError for an unknown one."""
     info = store.current(site)
     current = WantedVersion(
         site=site,

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import gammainc, gammaincinv
 
 from fleetmap.config import Section
-from mapserver.fleet_statistics.kpis import Rate, Tally, rate
+from mapserver.fleet_statistics.kpis import Counters, Rate, rate
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Probability = Annotated[float, msgspec.Meta(gt=0, lt=1)]
@@ -69,7 +69,7 @@ def threshold_for(share: float, site: str, version: int, robots: Iterable[str]) 
     return max(share, math.nextafter(min(numbers), 1.0)) if numbers else share
 
 
-def judge_canary(canary: Tally, others: Tally, age_days: float, settings: CanarySettings) -> CanaryFinding:
+def judge_canary(canary: Counters, others: Counters, age_days: float, settings: CanarySettings) -> CanaryFinding:
     """Whether to wait, promote or roll back, given what both arms did since the canary began."""
     ours, theirs = rate(canary.events, canary.robot_days), rate(others.events, others.robot_days)
     evidence = evidence_of_harm(ours, theirs, settings.margin_ratio)

@@ -4,7 +4,7 @@ import math
 
 from fleetmap.failure_definition import BLIND_S, CHI2_6_0999, GOOD_S, is_blind, is_usable, is_wrong
 from fleetmap.messages import PoseMessage, RobotHealth, Status
-from mapserver.fleet_statistics.kpis import Tally
+from mapserver.fleet_statistics.kpis import Counters
 
 MAX_GAP_S = 5.0  # a robot that is silent for longer was not observed meanwhile
 DRIVING_MPS = 0.05
@@ -40,7 +40,7 @@ class HealthStream:
             self._pose_mps = moved_m / dt_s if 0 < dt_s <= MAX_GAP_S and math.isfinite(moved_m) else None
         self._place = (message.stamp_ns, x_m, y_m)
 
-    def take_health(self, health: RobotHealth) -> Tally | None:
+    def take_health(self, health: RobotHealth) -> Counters | None:
         """What this report adds; None for one that was taken before."""
         if self._is_known(health):
             self.duplicates += 1
@@ -49,14 +49,14 @@ class HealthStream:
         if self._is_new_run(health, figures):
             self._begin_run()
         dt_ms = self._elapsed_ms(health)
-        tally = Tally(reports=1, observed_ms=dt_ms)
+        counts = Counters(reports=1, observed_ms=dt_ms)
         speed_mps = figures.get("speed_mps", self._pose_mps)
-        tally.driving_ms = dt_ms if speed_mps is not None and abs(speed_mps) >= DRIVING_MPS else 0
-        self._count_status(tally, health, figures, dt_ms)
-        self._count_fixes(tally, health.stamp_ns, figures)
-        self._count_work(tally, figures)
+        counts.driving_ms = dt_ms if speed_mps is not None and abs(speed_mps) >= DRIVING_MPS else 0
+        self._count_status(counts, health, figures, dt_ms)
+        self._count_fixes(counts, health.stamp_ns, figures)
+        self._count_work(counts, figures)
         self._stamp_ns, self._wall_ns, self._figures = health.stamp_ns, health.wall_ns, figures
-        return tally
+        return counts
 
     def _is_known(self, health: RobotHealth) -> bool:
         """A recording that is played again has old stamps, but is sent later."""
@@ -91,18 +91,18 @@ class HealthStream:
         self._silent_ms = self._silent_ms + dt_ms if health.stamp_ns == self._stamp_ns else 0
         return self._silent_ms > BLIND_S * 1e3
 
-    def _count_status(self, tally: Tally, health: RobotHealth, figures: dict[str, float], dt_ms: int) -> None:
+    def _count_status(self, counts: Counters, health: RobotHealth, figures: dict[str, float], dt_ms: int) -> None:
         is_stale = self._is_stale(health, dt_ms)
         is_tracking = health.status == Status.TRACKING and not is_stale
         radius_m = figures.get("radius_95_m", math.inf)
         self._has_fix = self._has_fix or is_tracking or "first_fix_s" in figures
-        tally.usable_ms = dt_ms if not is_stale and is_usable(health.status, radius_m) else 0
+        counts.usable_ms = dt_ms if not is_stale and is_usable(health.status, radius_m) else 0
         if self._has_fix:
-            tally.after_fix_ms = dt_ms
-            tally.localised_ms = dt_ms if is_tracking else 0
+            counts.after_fix_ms = dt_ms
+            counts.localised_ms = dt_ms if is_tracking else 0
             self._watched_ns += dt_ms * 1_000_000
             is_blind_now = is_stale or is_blind(health.status, radius_m)
-            tally.blind_seen = self._blindness(self._watched_ns, dt_ms, is_blind_now, is_tracking)
+            counts.blind_seen = self._blindness(self._watched_ns, dt_ms, is_blind_now, is_tracking)
 
     def _blindness(self, watched_ns: int, dt_ms: int, is_blind_now: bool, is_tracking: bool) -> int:
         """1 where a stretch of blindness became a failure with this report.
@@ -126,31 +126,31 @@ class HealthStream:
             self._in_failure = False
         return int(is_new)
 
-    def _count_fixes(self, tally: Tally, stamp_ns: int, figures: dict[str, float]) -> None:
+    def _count_fixes(self, counts: Counters, stamp_ns: int, figures: dict[str, float]) -> None:
         if "first_fix_s" in figures and not self._fix_counted:
             self._fix_counted = True
-            tally.first_fixes, tally.first_fix_ms = 1, round(min(abs(figures["first_fix_s"]), 1e6) * 1e3)
+            counts.first_fixes, counts.first_fix_ms = 1, round(min(abs(figures["first_fix_s"]), 1e6) * 1e3)
         innovation = figures.get("fix_innovation")
         if innovation is not None:
-            tally.innovations, tally.innovation_sum = 1, innovation
-            tally.innovation_m_sum = figures.get("fix_innovation_m", 0.0)
-            tally.exceeded = int(innovation > CHI2_6_0999)
+            counts.innovations, counts.innovation_sum = 1, innovation
+            counts.innovation_m_sum = figures.get("fix_innovation_m", 0.0)
+            counts.exceeded = int(innovation > CHI2_6_0999)
         if self._has_fix and is_wrong(figures.get("fix_innovation_m", 0.0)):
             # The estimate was wrong before, or is now. Jumps without 5 s between them are one; one within a failure belongs to it.
             is_new = self._jump_ns is None or stamp_ns - self._jump_ns >= GOOD_S * 1e9
-            tally.jumps = int(is_new and not self._in_failure)
+            counts.jumps = int(is_new and not self._in_failure)
             self._jump_ns = stamp_ns
         dock_m = figures.get("dock_error_m")
         if dock_m is not None:
-            tally.docks, tally.docks_wrong = 1, int(is_wrong(dock_m))
+            counts.docks, counts.docks_wrong = 1, int(is_wrong(dock_m))
 
-    def _count_work(self, tally: Tally, figures: dict[str, float]) -> None:
+    def _count_work(self, counts: Counters, figures: dict[str, float]) -> None:
         if "frame_ms_mean" in figures:
-            tally.cpu_reports, tally.cpu_ms_sum = 1, figures["frame_ms_mean"]
+            counts.cpu_reports, counts.cpu_ms_sum = 1, figures["frame_ms_mean"]
         for name in ("frames", "frames_dropped", "landmarks_expected", "landmarks_seen"):
             if name in figures:
                 grown = figures[name] - self._figures.get(name, 0.0 if self._figures else figures[name])
-                setattr(tally, name, int(min(max(0.0, grown), _MAX_COUNT)))
+                setattr(counts, name, int(min(max(0.0, grown), _MAX_COUNT)))
 
 
 def _figures(health: RobotHealth) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""What a fleet's reports say: sums that can be added up (Tally), and the rates, shares and intervals made of them. Pure.
+"""What a fleet's reports say: sums that can be added up (Counters), and the rates, shares and intervals made of them. Pure.
 
 A robot-day is 16 h of driving. Intervals hold the true rate with 95 %: exact for a Poisson count (Garwood 1936); where nothing
 was seen, one-sided, which is the rule of three. Shares of counts have the exact interval of Clopper and Pearson (1934).
@@ -15,7 +15,7 @@ _TAIL = 0.05
 
 
 @dataclass(slots=True)
-class Tally:
+class Counters:
     """Sums over some reports; two of them add up. Times in milliseconds, so that sums are exact.
 
     observed, driving: time that reports cover, and of it with the wheels turning; after_fix: since the run's first fix, localised: of
@@ -53,11 +53,11 @@ class Tally:
 
     def add(self, other: Self) -> None:
         """Adds what another one holds."""
-        for name in TALLY_COLUMNS:
+        for name in COUNTER_COLUMNS:
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
     def values(self) -> tuple[float, ...]:
-        """All sums in the order of TALLY_COLUMNS."""
+        """All sums in the order of COUNTER_COLUMNS."""
         return astuple(self)
 
     @property
@@ -84,7 +84,7 @@ class Tally:
         return self.failures + self.unreported_blindness + self.silent_estimated
 
 
-TALLY_COLUMNS = tuple(field.name for field in fields(Tally))
+COUNTER_COLUMNS = tuple(field.name for field in fields(Counters))
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +110,8 @@ class Share:
 
 
 @dataclass(frozen=True, slots=True)
-class Measures:
-    """The figures of one tally; None where nothing speaks for a figure.
+class Kpis:
+    """Key performance indicators of some counters; None where nothing was counted.
 
     silent_estimated is an estimate, not a count: robots do not know the truth. unreported_blindness: stretches of blindness in the
     statuses for which no failure was reported (yet).
@@ -134,25 +134,25 @@ class Measures:
     landmarks_seen_share: float | None
 
 
-def measures(tally: Tally) -> Measures:
-    """The figures of a tally."""
-    arrived = tally.frames + tally.frames_dropped
-    return Measures(
-        observed_h=tally.observed_ms / 3.6e6,
-        driving_h=tally.driving_ms / 3.6e6,
-        failures=rate(tally.failures, tally.robot_days),
-        silent_estimated=rate(tally.silent_estimated, tally.robot_days),
-        docks_wrong=share(tally.docks_wrong, tally.docks),
-        unreported_blindness=tally.unreported_blindness,
-        availability=_over(tally.usable_ms, tally.observed_ms),
-        localised_share=_over(tally.localised_ms, tally.after_fix_ms),
-        first_fix_mean_s=_over(tally.first_fix_ms / 1e3, tally.first_fixes),
-        fix_innovation_mean=_over(tally.innovation_sum, tally.innovations),
-        fix_innovation_mean_m=_over(tally.innovation_m_sum, tally.innovations),
-        fix_innovation_exceeded=share(tally.exceeded, tally.innovations),
-        frame_ms_mean=_over(tally.cpu_ms_sum, tally.cpu_reports),
-        frame_drop_share=_over(tally.frames_dropped, arrived),
-        landmarks_seen_share=_over(tally.landmarks_seen, tally.landmarks_expected),
+def kpis(counts: Counters) -> Kpis:
+    """The indicators of some counters."""
+    arrived = counts.frames + counts.frames_dropped
+    return Kpis(
+        observed_h=counts.observed_ms / 3.6e6,
+        driving_h=counts.driving_ms / 3.6e6,
+        failures=rate(counts.failures, counts.robot_days),
+        silent_estimated=rate(counts.silent_estimated, counts.robot_days),
+        docks_wrong=share(counts.docks_wrong, counts.docks),
+        unreported_blindness=counts.unreported_blindness,
+        availability=_over(counts.usable_ms, counts.observed_ms),
+        localised_share=_over(counts.localised_ms, counts.after_fix_ms),
+        first_fix_mean_s=_over(counts.first_fix_ms / 1e3, counts.first_fixes),
+        fix_innovation_mean=_over(counts.innovation_sum, counts.innovations),
+        fix_innovation_mean_m=_over(counts.innovation_m_sum, counts.innovations),
+        fix_innovation_exceeded=share(counts.exceeded, counts.innovations),
+        frame_ms_mean=_over(counts.cpu_ms_sum, counts.cpu_reports),
+        frame_drop_share=_over(counts.frames_dropped, arrived),
+        landmarks_seen_share=_over(counts.landmarks_seen, counts.landmarks_expected),
     )
 
 

@@ -13,7 +13,7 @@ import msgspec
 from scipy.special import betainc
 
 from fleetmap.config import Section
-from mapserver.fleet_statistics.kpis import Rate, Tally, measures, rate
+from mapserver.fleet_statistics.kpis import Counters, Rate, kpis, rate
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
@@ -56,20 +56,22 @@ class Waypoint:
     reason: str
 
 
-def concerns(recent: Mapping[str, Tally], before: Mapping[str, Tally], settings: ResurveySettings) -> list[TileConcern]:
+def concerns(
+    recent: Mapping[str, Counters], before: Mapping[str, Counters], settings: ResurveySettings
+) -> list[TileConcern]:
     """The tiles to survey again, the worst first. recent, before: sums by tile."""
-    total = Tally()
-    for tally in recent.values():
-        total.add(tally)
+    total = Counters()
+    for counts in recent.values():
+        total.add(counts)
     tests = max(1, len(recent))
     found = []
     for tile, now in recent.items():
         if "," not in tile:
             continue
-        then = before.get(tile, Tally())
+        then = before.get(tile, Counters())
         reasons = [*_rising(now, then, total, settings, tests), *_fading(now, then, settings)]
         if reasons:
-            old, new = measures(then).landmarks_seen_share, measures(now).landmarks_seen_share
+            old, new = kpis(then).landmarks_seen_share, kpis(now).landmarks_seen_share
             both = (rate(now.events, now.robot_days), rate(then.events, then.robot_days))
             found.append(TileConcern(tile, reasons, *both, new, old))
     return sorted(found, key=lambda concern: (-concern.failures.events, concern.tile))
@@ -114,7 +116,7 @@ def route_geojson(site: str, version: int, way: Sequence[Waypoint]) -> dict[str,
     }  # fmt: skip
 
 
-def _rising(now: Tally, then: Tally, total: Tally, settings: ResurveySettings, tests: int) -> list[str]:
+def _rising(now: Counters, then: Counters, total: Counters, settings: ResurveySettings, tests: int) -> list[str]:
     """The exact conditional test of two Poisson rates (Przyborowski and Wilenski 1940), Bonferroni over the site's tiles."""
     if now.events < settings.min_failures:
         return []
@@ -133,8 +135,8 @@ def _rising(now: Tally, then: Tally, total: Tally, settings: ResurveySettings, t
     return [told]
 
 
-def _fading(now: Tally, then: Tally, settings: ResurveySettings) -> list[str]:
-    new, old = measures(now).landmarks_seen_share, measures(then).landmarks_seen_share
+def _fading(now: Counters, then: Counters, settings: ResurveySettings) -> list[str]:
+    new, old = kpis(now).landmarks_seen_share, kpis(then).landmarks_seen_share
     if new is None or old is None or min(now.landmarks_expected, then.landmarks_expected) < settings.min_landmarks:
         return []
     return [f"{new:.0%} of the landmarks are found, {old:.0%} before"] if new < old - settings.fading else []

@@ -30,13 +30,15 @@ class BackgroundTask:
     due_s: float = 0.0
 
 
-def server_tasks(store: MapStore, fleet: Fleet, service: BusService, settings: MapserverConfig) -> list[BackgroundTask]:
-    """All chores of a server."""
+def server_tasks(
+    store: MapStore, fleet: Fleet, bus_service: BusService, settings: MapserverConfig
+) -> list[BackgroundTask]:
+    """All background tasks of a server."""
     ingest = settings.ingest
     return [
-        BackgroundTask("announcing versions", _ANNOUNCE_EVERY_S, service.announce_changes),
+        BackgroundTask("announcing versions", _ANNOUNCE_EVERY_S, bus_service.announce_changes),
         BackgroundTask("keeping reports", ingest.flush_every_s, fleet.flush),
-        BackgroundTask("looking for robots", ingest.presence_every_s, service.look_for_robots),
+        BackgroundTask("looking for robots", ingest.presence_every_s, bus_service.look_for_robots),
         BackgroundTask("removing old reports", ingest.prune_every_s, fleet.prune),
         BackgroundTask(
             "looking for jobs that were killed", _JOBS_EVERY_S, lambda: end_interrupted(store, time.time_ns())
@@ -49,19 +51,19 @@ def server_tasks(store: MapStore, fleet: Fleet, service: BusService, settings: M
     ]
 
 
-async def run_background_tasks(chores: list[BackgroundTask]) -> None:
+async def run_background_tasks(tasks: list[BackgroundTask]) -> None:
     """Does them in turn, in a thread, until it is cancelled. One that fails is tried again at its next time."""
     while True:
-        for chore in chores:
-            if time.monotonic() < chore.due_s:
+        for task in tasks:
+            if time.monotonic() < task.due_s:
                 continue
             try:
-                await asyncio.to_thread(chore.act)
+                await asyncio.to_thread(task.act)
             except FleetmapError as error:
                 # A store that is busy for a moment must not stop the server; robots also ask by themselves.
-                _log.warning("%s failed: %s", chore.name, error)
+                _log.warning("%s failed: %s", task.name, error)
             except Exception:
-                # A fault of ours in one chore must not end the others.
-                _log.exception("%s failed", chore.name)
-            chore.due_s = time.monotonic() + chore.every_s
+                # A fault in one task must not end the others.
+                _log.exception("%s failed", task.name)
+            task.due_s = time.monotonic() + task.every_s
         await asyncio.sleep(_LOOK_EVERY_S)

@@ -36,7 +36,7 @@ _RECENT_BYTES = 64_000_000
 _RECENT_PATCHES_BYTES = 32_000_000
 _PATCH_SHARE = 0.7  # of the whole, above which a patch is not worth its work
 _PATCHED_KINDS = {"tile", "manifest"}
-_PREPARE_S = 10.0  # in all: longer would keep robots and other chores waiting
+_PREPARE_S = 10.0  # in all: longer would keep robots and other background tasks waiting
 
 
 class BusService:

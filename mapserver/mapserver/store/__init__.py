@@ -1,6 +1,6 @@
 """Maps on the disk: content-addressed files and one SQLite database. SQL lives here alone."""
 
-from mapserver.store.fleet_queries import FleetBatch, FleetQueries, TallyKey, tile_key
+from mapserver.store.fleet_queries import CounterKey, FleetBatch, FleetQueries, tile_key
 from mapserver.store.garbage_collection import Garbage, Retention
 from mapserver.store.map_store import MapStore
 from mapserver.store.rows import (
@@ -36,6 +36,7 @@ __all__ = [
     "Actor",
     "CanaryEnd",
     "CanaryRow",
+    "CounterKey",
     "DraftContent",
     "DraftDetails",
     "Event",
@@ -57,7 +58,6 @@ __all__ = [
     "SiteInfo",
     "SiteReleases",
     "StoreFindings",
-    "TallyKey",
     "TraceRow",
     "VerdictRow",
     "VersionInfo",

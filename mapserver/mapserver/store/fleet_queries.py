@@ -9,7 +9,7 @@ import msgspec
 
 from fleetmap.errors import UsageError
 from fleetmap.messages import FailureReport
-from mapserver.fleet_statistics.kpis import TALLY_COLUMNS, Tally, hour_of
+from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters, hour_of
 from mapserver.store.rows import (
     AXES,
     FailureDetail,
@@ -21,14 +21,14 @@ from mapserver.store.rows import (
 )
 from mapserver.store.transactions import Transactions
 
-TallyKey = tuple[str, str, str, int]
+CounterKey = tuple[str, str, str, int]
 """Site, axis, key, hour."""
 
 _DAY_NS = 86_400_000_000_000
-_SUMS = ", ".join(f"sum(t.{name}) {name}" for name in TALLY_COLUMNS)
-_ADD = f"""INSERT INTO tallies (key_id, hour, {", ".join(TALLY_COLUMNS)})
-    VALUES (?, ?, {", ".join("?" * len(TALLY_COLUMNS))})
-    ON CONFLICT DO UPDATE SET {", ".join(f"{name} = {name} + excluded.{name}" for name in TALLY_COLUMNS)}"""
+_SUMS = ", ".join(f"sum(t.{name}) {name}" for name in COUNTER_COLUMNS)
+_ADD = f"""INSERT INTO tallies (key_id, hour, {", ".join(COUNTER_COLUMNS)})
+    VALUES (?, ?, {", ".join("?" * len(COUNTER_COLUMNS))})
+    ON CONFLICT DO UPDATE SET {", ".join(f"{name} = {name} + excluded.{name}" for name in COUNTER_COLUMNS)}"""
 _FAILURE_COLUMNS = ", ".join(FailureRow.__dataclass_fields__)
 
 
@@ -36,13 +36,13 @@ _FAILURE_COLUMNS = ", ".join(FailureRow.__dataclass_fields__)
 class FleetBatch:
     """What came since the last batch. last_reports: (site, robot) to what it runs and its last report."""
 
-    tallies: dict[TallyKey, Tally] = field(default_factory=dict)
+    counters: dict[CounterKey, Counters] = field(default_factory=dict)
     traces: list[TraceRow] = field(default_factory=list)
     last_reports: dict[tuple[str, str], tuple[int | None, int, dict[str, Any]]] = field(default_factory=dict)
 
-    def add(self, site: str, axis: str, key: str, hour: int, tally: Tally) -> None:
+    def add(self, site: str, axis: str, key: str, hour: int, counts: Counters) -> None:
         """Adds to one sum."""
-        self.tallies.setdefault((site, axis, key, hour), Tally()).add(tally)
+        self.counters.setdefault((site, axis, key, hour), Counters()).add(counts)
 
 
 class FleetQueries:
@@ -55,9 +55,9 @@ class FleetQueries:
     def add(self, batch: FleetBatch) -> None:
         """Keeps a batch in one transaction. A power cut may lose the last ones, never failures."""
         with self._transactions.write(durable=False) as connection:
-            keys = [key[:3] for key in batch.tallies] + [(row.site, "robot", row.robot) for row in batch.traces]
+            keys = [key[:3] for key in batch.counters] + [(row.site, "robot", row.robot) for row in batch.traces]
             ids = self._ids(connection, keys)
-            _add_tallies(connection, ids, batch.tallies)
+            _add_counters(connection, ids, batch.counters)
             connection.executemany(
                 "INSERT OR IGNORE INTO traces VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
                 [
@@ -80,7 +80,7 @@ class FleetQueries:
         self._key_ids |= ids  # only what was committed
 
     def add_failure(
-        self, report: FailureReport, *, received_ns: int, happened_ns: int, tallies: Mapping[TallyKey, Tally]
+        self, report: FailureReport, *, received_ns: int, happened_ns: int, counters: Mapping[CounterKey, Counters]
     ) -> bool:
         """Keeps a failure and its sums, durably; False (and nothing done) for one that is known already."""
         place = None if report.map_from_base is None else report.map_from_base.position_m
@@ -102,12 +102,12 @@ class FleetQueries:
                 "INSERT INTO failure_pictures VALUES (?, ?, ?, ?, ?)",
                 [(done.lastrowid, n, t.kind, t.stamp_ns, t.jpeg) for n, t in enumerate(report.thumbnails)],
             )
-            _add_tallies(connection, self._ids(connection, [key[:3] for key in tallies]), tallies)
+            _add_counters(connection, self._ids(connection, [key[:3] for key in counters]), counters)
         return True
 
-    def tallies(
+    def counters(
         self, site: str | None, axis: str, *, since_hour: int = 0, until_hour: int = 1 << 60, key: str | None = None
-    ) -> dict[tuple[str, str], Tally]:
+    ) -> dict[tuple[str, str], Counters]:
         """Sums by (site, key) of an axis over hours from `since_hour` to before `until_hour`."""
         rows = self._transactions.query(
             f"""SELECT k.site, k.key, {_SUMS} FROM tally_keys k JOIN tallies t ON t.key_id = k.id
@@ -115,11 +115,11 @@ class FleetQueries:
                 AND t.hour >= ?4 AND t.hour < ?5 GROUP BY k.id ORDER BY k.site, k.key""",
             (_axis(axis), site, key, since_hour, until_hour),
         )
-        return {(row.pop("site"), row.pop("key")): Tally(**row) for row in rows}
+        return {(row.pop("site"), row.pop("key")): Counters(**row) for row in rows}
 
     def hours(
         self, site: str | None, axis: str, *, key: str | None = None, since_hour: int = 0, until_hour: int = 1 << 60
-    ) -> dict[int, Tally]:
+    ) -> dict[int, Counters]:
         """Sums of an axis (and key) by the hour."""
         rows = self._transactions.query(
             f"""SELECT t.hour, {_SUMS} FROM tally_keys k JOIN tallies t ON t.key_id = k.id
@@ -127,7 +127,7 @@ class FleetQueries:
                 AND t.hour >= ?4 AND t.hour < ?5 GROUP BY t.hour ORDER BY t.hour""",
             (_axis(axis), site, key, since_hour, until_hour),
         )
-        return {row.pop("hour"): Tally(**row) for row in rows}
+        return {row.pop("hour"): Counters(**row) for row in rows}
 
     def failures(self, wanted: FailureFilter, *, before: int | None = None, limit: int = -1) -> list[FailureRow]:
         """Failures, the last to arrive first, of numbers below `before`."""
@@ -224,11 +224,12 @@ def _axis(axis: str) -> str:
     return axis
 
 
-def _add_tallies(
-    connection: sqlite3.Connection, ids: Mapping[tuple[str, str, str], int], tallies: Mapping[TallyKey, Tally]
+def _add_counters(
+    connection: sqlite3.Connection, ids: Mapping[tuple[str, str, str], int], counters: Mapping[CounterKey, Counters]
 ) -> None:
     connection.executemany(
-        _ADD, [(ids[key[:3]], key[3], *tally.values()) for key, tally in sorted(tallies.items(), key=lambda kv: kv[0])]
+        _ADD,
+        [(ids[key[:3]], key[3], *counts.values()) for key, counts in sorted(counters.items(), key=lambda kv: kv[0])],
     )
 
 

@@ -31,7 +31,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from benchmarks.fleet.bench_service import _SOURCES, _cpu_s, _rss_mb, serving
 from benchmarks.fleet.fleet_clients import SITE, TILES
 from mapserver import releases
-from mapserver.fleet_statistics.kpis import TALLY_COLUMNS, Tally
+from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters
 from mapserver.store import DraftContent, FailureFilter, FleetBatch, MapStore
 from support.storage.map_samples import draft_details, random_tile
 
@@ -157,12 +157,12 @@ def _bus_counts(text: str) -> Counter[str]:
 def _compare(store: MapStore, said: dict[str, Any]) -> int:
     """The number of failures in the store, after every marginal was compared with what the robots know."""
     for axis in ("site", "robot", "version", "tile", "cause"):
-        counted = {key: tally for (_, key), tally in store.fleet.tallies(SITE, axis).items()}
+        counted = {key: counts for (_, key), counts in store.fleet.counters(SITE, axis).items()}
         for name in ("failures", "suspected"):
-            mine = {key: getattr(tally, name) for key, tally in counted.items() if getattr(tally, name)}
+            mine = {key: getattr(counts, name) for key, counts in counted.items() if getattr(counts, name)}
             theirs = {key.partition("|")[2]: n for key, n in said[name].items() if key.partition("|")[0] == axis}
             assert mine == theirs, (axis, name)
-    total = store.fleet.tallies(SITE, "site")[SITE, ""]
+    total = store.fleet.counters(SITE, "site")[SITE, ""]
     assert total.reports == said["health"], (total.reports, said["health"])
     assert abs(total.driving_ms / 1e3 / said["driving_s"] - 1) < 0.02, (total.driving_ms, said["driving_s"])
     count = len(store.fleet.failures(FailureFilter(site=SITE)))
@@ -186,13 +186,13 @@ def measure_month(folder: Path, robots: int) -> dict[str, float]:
                     axis,
                     key,
                     hour,
-                    Tally(*(int(value) for value in rng.integers(0, 3_600_000, len(TALLY_COLUMNS)))),
+                    Counters(*(int(value) for value in rng.integers(0, 3_600_000, len(COUNTER_COLUMNS)))),
                 )
             store.fleet.add(batch)
         timed: dict[str, Callable[[], object]] = {
-            "robots_day_ms": lambda: store.fleet.tallies(SITE, "robot", since_hour=696),
-            "robots_month_ms": lambda: store.fleet.tallies(SITE, "robot"),
-            "tiles_month_ms": lambda: store.fleet.tallies(SITE, "tile"),
+            "robots_day_ms": lambda: store.fleet.counters(SITE, "robot", since_hour=696),
+            "robots_month_ms": lambda: store.fleet.counters(SITE, "robot"),
+            "tiles_month_ms": lambda: store.fleet.counters(SITE, "tile"),
             "hours_month_ms": lambda: store.fleet.hours(SITE, "site"),
         }
         figures = {name: min(_timed_ms(ask) for _ in range(3)) for name, ask in timed.items()}

@@ -22,7 +22,7 @@ from mapserver.dashboard.markup import address, age, choices, facts, link, size,
 from mapserver.dashboard.plan import make_plan
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.canary_test import CanarySettings
-from mapserver.fleet_statistics.kpis import Tally
+from mapserver.fleet_statistics.kpis import Counters
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings
 from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore
@@ -196,28 +196,28 @@ def test_many_pages_look_once(store: MapStore) -> None:
     assert fleet.looked == 2
 
 
-def tally(failures: int, robot_days: float) -> Tally:
-    return Tally(failures=failures, driving_ms=round(robot_days * 16 * 3.6e6))
+def counts(failures: int, robot_days: float) -> Counters:
+    return Counters(failures=failures, driving_ms=round(robot_days * 16 * 3.6e6))
 
 
 @pytest.mark.parametrize(
     ("day", "week", "words"),
     [
-        (tally(0, 0), tally(3, 7), "nothing to compare with yet"),
-        (tally(0, 1), tally(0, 7), "none in the week before either"),
-        (tally(2, 1), tally(7, 7), "no clear change from the week before"),
-        (tally(20, 10), tally(20, 70), "more than in the week before"),
-        (tally(1, 10), tally(100, 70), "fewer than in the week before"),
+        (counts(0, 0), counts(3, 7), "nothing to compare with yet"),
+        (counts(0, 1), counts(0, 7), "none in the week before either"),
+        (counts(2, 1), counts(7, 7), "no clear change from the week before"),
+        (counts(20, 10), counts(20, 70), "more than in the week before"),
+        (counts(1, 10), counts(100, 70), "fewer than in the week before"),
     ],
 )
-def test_the_trend_says_only_what_the_counts_can_tell(day: Tally, week: Tally, words: str) -> None:
+def test_the_trend_says_only_what_the_counts_can_tell(day: Counters, week: Counters, words: str) -> None:
     assert trend_words(day, week) == words
 
 
 def test_chance_alone_seldom_makes_a_trend() -> None:
     rng = np.random.default_rng(0)
     told = [
-        trend_words(tally(int(rng.poisson(6)), 10), tally(int(rng.poisson(42)), 70))
+        trend_words(counts(int(rng.poisson(6)), 10), counts(int(rng.poisson(42)), 70))
         != "no clear change from the week before"
         for _ in range(1000)
     ]

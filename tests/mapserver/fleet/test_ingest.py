@@ -14,7 +14,7 @@ from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
 from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
-from mapserver.fleet_statistics.kpis import HOUR_NS, Tally, measures
+from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, kpis
 from mapserver.store import FailureFilter, FleetRetention, MapStore
 from support.fleet.made_fleet import NS, Known, MadeRobot, drive
 from support.storage.map_samples import save_sample_draft
@@ -67,7 +67,7 @@ def test_the_store_counts_what_the_robots_know(site: Site) -> None:
     assert known.failures["site", ""] >= 10
     assert known.suspected["site", ""] >= 5
     for axis in ("site", "robot", "version", "tile", "cause"):
-        counted = {key: tally for (_, key), tally in site.store.fleet.tallies("lab", axis).items()}
+        counted = {key: counts for (_, key), counts in site.store.fleet.counters("lab", axis).items()}
         failures = {key: t.failures for key, t in counted.items() if t.failures}
         assert failures == {key: n for (a, key), n in known.failures.items() if a == axis}, axis
         suspected = {key: t.suspected for key, t in counted.items() if t.suspected}
@@ -75,10 +75,10 @@ def test_the_store_counts_what_the_robots_know(site: Site) -> None:
         if axis != "cause":
             driven = {key: t.driving_ms / 1e3 for key, t in counted.items() if t.driving_ms}
             assert driven == {key: s for (a, key), s in known.driving_s.items() if a == axis}, axis
-    total = site.store.fleet.tallies("lab", "site")["lab", ""]
+    total = site.store.fleet.counters("lab", "site")["lab", ""]
     assert total.reports == known.health
     assert total.blind_seen == total.blind_failures == total.failures
-    found = measures(total)
+    found = kpis(total)
     assert found.failures.per_robot_day == known.failures["site", ""] / (known.driving_s["site", ""] / 57600)
     assert found.landmarks_seen_share == pytest.approx(0.7)
     assert found.first_fix_mean_s == 1.5
@@ -91,17 +91,17 @@ def test_hours_add_up_to_the_whole(site: Site) -> None:
     site.run(made(site, 2), 120, START_NS + 1840 * NS)
     hours = site.store.fleet.hours("lab", "site")
     assert sorted(hours) == [490_000, 490_001]
-    whole = Tally()
-    for tally in hours.values():
-        whole.add(tally)
-    assert whole == site.store.fleet.tallies("lab", "site")["lab", ""]
-    assert site.store.fleet.tallies("lab", "site", since_hour=490_001)["lab", ""] == hours[490_001]
+    whole = Counters()
+    for counts in hours.values():
+        whole.add(counts)
+    assert whole == site.store.fleet.counters("lab", "site")["lab", ""]
+    assert site.store.fleet.counters("lab", "site", since_hour=490_001)["lab", ""] == hours[490_001]
 
 
 def test_what_comes_again_is_counted_once(site: Site) -> None:
     reports = site.run(made(site, 2, rate_per_robot_day=2000.0), 120)
     assert reports
-    before = site.store.fleet.tallies("lab", "robot")
+    before = site.store.fleet.counters("lab", "robot")
     for report in reports * 2:
         assert site.fleet.take_failure("lab", report.robot, report).id == report.id
     health = RobotHealth(
@@ -109,7 +109,7 @@ def test_what_comes_again_is_counted_once(site: Site) -> None:
     )
     site.fleet.take_health("lab", "r0", health)
     site.fleet.flush()
-    assert site.store.fleet.tallies("lab", "robot") == before
+    assert site.store.fleet.counters("lab", "robot") == before
     rows = site.store.fleet.failures(FailureFilter())
     assert len(rows) == len({(row.robot, row.failure_id) for row in rows}) == len(reports)
 
@@ -156,7 +156,7 @@ def test_names_that_robots_make_up_do_not_make_keys(site: Site) -> None:
             msgspec.structs.replace(report, id=f"n{number}", cause=f"c{number}", version=5 + number, tile=(number, 9)),
         )
     for axis, most in (("cause", 66), ("version", 2), ("tile", 3)):
-        assert len(site.store.fleet.tallies("lab", axis)) <= most, axis
+        assert len(site.store.fleet.counters("lab", axis)) <= most, axis
 
 
 def test_a_disk_that_refuses_costs_nothing(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,7 +170,7 @@ def test_a_disk_that_refuses_costs_nothing(site: Site, monkeypatch: pytest.Monke
         site.run(made(site, 2), 30)
     monkeypatch.setattr(site.store.fleet, "add", add)
     site.run(made(site, 2), 1, START_NS + 30 * NS)
-    total = site.store.fleet.tallies("lab", "site")["lab", ""]
+    total = site.store.fleet.counters("lab", "site")["lab", ""]
     assert total.reports == site.known.health
 
 
@@ -199,7 +199,7 @@ def test_old_and_many_things_go(site: Site) -> None:
     assert {row.hour for row in fleet.trace("lab", "r0")} == {490_010}
     site.set_ns(START_NS + 500 * 24 * HOUR_NS)
     assert fleet.prune(usual) > 0
-    assert fleet.tallies("lab", "site") == {}
+    assert fleet.counters("lab", "site") == {}
     assert fleet.failures(FailureFilter()) == []
     assert fleet.trace("lab", "r0") == []
     assert site.store.verify().faults == []
@@ -209,14 +209,14 @@ def test_sums_of_a_month_are_small(site: Site, tmp_path: Path) -> None:
     """30 days of 300 robots below 500 MB: measured on a tenth of the robots for a tenth of the hours, which is a hundredth."""
     from mapserver.store import FleetBatch
 
-    tally = Tally(*range(10**6, 10**6 + len(Tally.__slots__)))
+    counts = Counters(*range(10**6, 10**6 + len(Counters.__slots__)))
     before = _size(tmp_path)
     for hour in range(72):
         batch = FleetBatch()
         for number in range(30):
-            batch.add("lab", "robot", f"robot-{number}", hour, tally)
+            batch.add("lab", "robot", f"robot-{number}", hour, counts)
         for number in range(60):  # a site of 600 tiles, all of them driven through every hour
-            batch.add("lab", "tile", f"{number % 25},{number // 25}", hour, tally)
+            batch.add("lab", "tile", f"{number % 25},{number // 25}", hour, counts)
         site.store.fleet.add(batch)
     assert (_size(tmp_path) - before) * 100 < 500e6
 

@@ -98,4 +98,4 @@ def test_nothing_acknowledged_is_lost_and_nothing_is_counted_twice(tmp_path: Pat
         kept = [(row.robot, row.failure_id) for row in store.fleet.failures(FailureFilter())]
         assert sorted(kept) == sorted(acknowledged)
         for axis, key, count in (("site", "", 80), ("robot", "r0", 20), ("tile", "0,0", 80), ("cause", "dark", 80)):
-            assert store.fleet.tallies("lab", axis, key=key)["lab", key].failures == count
+            assert store.fleet.counters("lab", axis, key=key)["lab", key].failures == count

@@ -12,14 +12,14 @@ from mapserver.fleet_statistics.canary_test import (
     threshold_for,
     within_margin,
 )
-from mapserver.fleet_statistics.kpis import Tally, rate
+from mapserver.fleet_statistics.kpis import Counters, rate
 
 DAY_MS = 57_600_000
 SETTINGS = CanarySettings()
 
 
-def tally(failures: int, days: float) -> Tally:
-    return Tally(failures=failures, driving_ms=round(days * DAY_MS))
+def counts(failures: int, days: float) -> Counters:
+    return Counters(failures=failures, driving_ms=round(days * DAY_MS))
 
 
 def test_robots_are_chosen_as_if_by_lot_and_always_the_same() -> None:
@@ -64,17 +64,17 @@ def test_a_harmless_version_is_rarely_taken_back_however_often_it_is_looked_at()
 @pytest.mark.parametrize(
     ("canary", "others", "days", "action"),
     [
-        (tally(0, 0.0), tally(0, 0.0), 0.1, "wait"),
-        (tally(1, 0.05), tally(0, 1.0), 0.1, "wait"),  # one failure proves nothing
-        (tally(8, 0.5), tally(3, 10.0), 0.3, "roll_back"),
-        (tally(0, 2.0), tally(2, 40.0), 1.0, "wait"),
-        (tally(0, 4.5), tally(2, 90.0), 1.0, "promote"),
-        (tally(3, 4.5), tally(60, 90.0), 1.0, "wait"),
-        (tally(4, 15.0), tally(60, 300.0), 1.0, "promote"),
-        (tally(3, 2.0), tally(30, 40.0), 7.5, "roll_back"),  # not proven in time
+        (counts(0, 0.0), counts(0, 0.0), 0.1, "wait"),
+        (counts(1, 0.05), counts(0, 1.0), 0.1, "wait"),  # one failure proves nothing
+        (counts(8, 0.5), counts(3, 10.0), 0.3, "roll_back"),
+        (counts(0, 2.0), counts(2, 40.0), 1.0, "wait"),
+        (counts(0, 4.5), counts(2, 90.0), 1.0, "promote"),
+        (counts(3, 4.5), counts(60, 90.0), 1.0, "wait"),
+        (counts(4, 15.0), counts(60, 300.0), 1.0, "promote"),
+        (counts(3, 2.0), counts(30, 40.0), 7.5, "roll_back"),  # not proven in time
     ],
 )
-def test_decisions(canary: Tally, others: Tally, days: float, action: str) -> None:
+def test_decisions(canary: Counters, others: Counters, days: float, action: str) -> None:
     finding = judge_canary(canary, others, days, SETTINGS)
     assert finding.action == action, finding.reason
     assert "robot-day" in finding.reason
@@ -82,5 +82,5 @@ def test_decisions(canary: Tally, others: Tally, days: float, action: str) -> No
 
 def test_everything_that_speaks_against_a_map_counts() -> None:
     for name in ("failures", "suspected", "docks_wrong", "blind_seen"):
-        bad = Tally(driving_ms=DAY_MS, **{name: 9})
-        assert judge_canary(bad, tally(3, 20.0), 0.3, SETTINGS).action == "roll_back", name
+        bad = Counters(driving_ms=DAY_MS, **{name: 9})
+        assert judge_canary(bad, counts(3, 20.0), 0.3, SETTINGS).action == "roll_back", name

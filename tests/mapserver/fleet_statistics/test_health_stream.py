@@ -7,7 +7,7 @@ import pytest
 from fleetmap.messages import PoseMessage, RobotHealth
 from mapserver.fleet_statistics.clock_skew import ClockSkew, server_time_ns
 from mapserver.fleet_statistics.health_stream import HealthStream
-from mapserver.fleet_statistics.kpis import Tally
+from mapserver.fleet_statistics.kpis import Counters
 
 NS = 1_000_000_000
 
@@ -18,12 +18,12 @@ def health(second: float, status: str = "TRACKING", *, wall_ns: int | None = Non
     )
 
 
-def total(reports: list[RobotHealth], watch: HealthStream | None = None) -> Tally:
-    watch, found = watch or HealthStream(), Tally()
+def total(reports: list[RobotHealth], stream: HealthStream | None = None) -> Counters:
+    stream, found = stream or HealthStream(), Counters()
     for report in reports:
-        tally = watch.take_health(report)
-        if tally is not None:
-            found.add(tally)
+        counts = stream.take_health(report)
+        if counts is not None:
+            found.add(counts)
     return found
 
 
@@ -79,15 +79,15 @@ def test_driving_by_speed_else_by_poses_else_not_at_all() -> None:
     assert total([health(n, speed_mps=1.0) for n in range(5)]).driving_ms == 4000
     assert total([health(n, speed_mps=0.0) for n in range(5)]).driving_ms == 0
     assert total([health(n) for n in range(5)]).driving_ms == 0
-    watch, found = HealthStream(), Tally()
+    stream, found = HealthStream(), Counters()
     for n in range(5):
-        watch.take_pose(
+        stream.take_pose(
             PoseMessage(
                 stamp_ns=n * NS, position_map_m=(0.5 * n, 0.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0),
                 cov_rot_trans=(0.0,) * 36, status="TRACKING", map_version=1,
             )
         )  # fmt: skip
-        found.add(watch.take_health(health(n)))
+        found.add(stream.take_health(health(n)))
     assert found.driving_ms == 4000
 
 
@@ -100,16 +100,16 @@ def test_counters_are_differences_and_a_run_begins_anew() -> None:
 
 
 def test_repeated_and_replayed_reports() -> None:
-    watch = HealthStream()
-    assert total([health(5, wall_ns=5 * NS), health(5, wall_ns=5 * NS), health(4, wall_ns=4 * NS)], watch).reports == 1
-    assert watch.duplicates == 2
-    assert total([health(3, wall_ns=60 * NS)], watch).reports == 1  # the same recording, played again
+    stream = HealthStream()
+    assert total([health(5, wall_ns=5 * NS), health(5, wall_ns=5 * NS), health(4, wall_ns=4 * NS)], stream).reports == 1
+    assert stream.duplicates == 2
+    assert total([health(3, wall_ns=60 * NS)], stream).reports == 1  # the same recording, played again
 
 
 def test_nonsense_counts_nothing() -> None:
     nonsense = {"frames": "many", "fix_innovation": float("nan"), "speed_mps": True, "landmarks_seen": 1e300}
     found = total([health(0, **nonsense), health(1, **nonsense)])
-    assert found == Tally(reports=2, observed_ms=1000, after_fix_ms=1000, localised_ms=1000, usable_ms=1000)
+    assert found == Counters(reports=2, observed_ms=1000, after_fix_ms=1000, localised_ms=1000, usable_ms=1000)
 
 
 def test_docks_and_innovations() -> None:
@@ -128,8 +128,8 @@ def test_fixes_far_from_where_the_robot_took_itself_to_be() -> None:
     assert total(start).jumps == 0  # before the first fix nothing was known
     lost = [health(n, "TRACKING" if n < 3 or n > 6 else "LOST", fix_innovation_m=5.0 * (n == 7)) for n in range(20)]
     assert (total(lost).blind_seen, total(lost).jumps) == (1, 0)  # a carried robot: one failure, not two
-    assert Tally(jumps=2, suspected=3).silent_estimated == 3
-    assert Tally(jumps=4, suspected=3, docks_wrong=1).silent_estimated == 5
+    assert Counters(jumps=2, suspected=3).silent_estimated == 3
+    assert Counters(jumps=4, suspected=3, docks_wrong=1).silent_estimated == 5
 
 
 def test_skew_is_that_of_the_fastest_message_and_follows() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mapserver.fleet_statistics.kpis import TALLY_COLUMNS, Tally, measures, poisson_interval, rate, share
+from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters, kpis, poisson_interval, rate, share
 from mapserver.store.migrations import MIGRATIONS
 
 
@@ -42,15 +42,17 @@ def test_a_rate_without_driving_is_not_known() -> None:
 
 
 def test_what_is_not_known_is_none_not_zero() -> None:
-    found = measures(Tally(reports=3, observed_ms=2000))
+    found = kpis(Counters(reports=3, observed_ms=2000))
     assert found.availability == 0.0
     assert (found.localised_share, found.first_fix_mean_s, found.frame_drop_share) == (None, None, None)
     assert (found.docks_wrong.share, found.failures.per_robot_day) == (None, None)
 
 
 def test_silent_failures_are_estimates_apart() -> None:
-    found = measures(
-        Tally(driving_ms=57_600_000, failures=2, suspected=3, docks=10, docks_wrong=1, blind_seen=4, blind_failures=1)
+    found = kpis(
+        Counters(
+            driving_ms=57_600_000, failures=2, suspected=3, docks=10, docks_wrong=1, blind_seen=4, blind_failures=1
+        )
     )
     assert (found.failures.events, found.silent_estimated.events) == (2, 4)
     assert found.docks_wrong.share == 0.1
@@ -60,6 +62,6 @@ def test_silent_failures_are_estimates_apart() -> None:
 def test_every_sum_has_its_column() -> None:
     text = next(statement for step in MIGRATIONS for statement in step if "CREATE TABLE tallies" in statement)
     columns = [line.split()[0] for line in text.splitlines()[1:]]
-    assert tuple(columns[2:-1]) == TALLY_COLUMNS
+    assert tuple(columns[2:-1]) == COUNTER_COLUMNS
     kinds = {line.split()[0]: line.split()[1] for line in text.splitlines()[3:-1]}
-    assert all((kinds[f.name] == "REAL") == (f.type in {float, "float"}) for f in fields(Tally))
+    assert all((kinds[f.name] == "REAL") == (f.type in {float, "float"}) for f in fields(Counters))

@@ -9,7 +9,7 @@ import pytest
 
 from mapserver import releases
 from mapserver.fleet.resurvey_list import resurvey_list
-from mapserver.fleet_statistics.kpis import HOUR_NS, Tally
+from mapserver.fleet_statistics.kpis import HOUR_NS, Counters
 from mapserver.fleet_statistics.resurvey_test import (
     ResurveySettings,
     TileConcern,
@@ -24,29 +24,31 @@ from support.storage.map_samples import save_sample_draft
 SETTINGS = ResurveySettings()
 
 
-def tally(failures: int = 0, hours: float = 10.0, expected: int = 0, seen: int = 0) -> Tally:
-    return Tally(failures=failures, driving_ms=round(hours * 3.6e6), landmarks_expected=expected, landmarks_seen=seen)
+def counts(failures: int = 0, hours: float = 10.0, expected: int = 0, seen: int = 0) -> Counters:
+    return Counters(
+        failures=failures, driving_ms=round(hours * 3.6e6), landmarks_expected=expected, landmarks_seen=seen
+    )
 
 
 @pytest.mark.parametrize(
     ("now", "then", "words"),
     [
-        (tally(12), tally(2, 70.0), "12 failures in 10.0 h of driving, 2 in 70.0 h before"),
-        (tally(2), tally(0, 70.0), ""),  # too few to say
-        (tally(4), tally(20, 70.0), ""),  # as before
-        (tally(9), Tally(), "elsewhere on the site"),  # no before
+        (counts(12), counts(2, 70.0), "12 failures in 10.0 h of driving, 2 in 70.0 h before"),
+        (counts(2), counts(0, 70.0), ""),  # too few to say
+        (counts(4), counts(20, 70.0), ""),  # as before
+        (counts(9), Counters(), "elsewhere on the site"),  # no before
         (
-            tally(0, expected=9000, seen=4000),
-            tally(0, 70.0, 90_000, 63_000),
+            counts(0, expected=9000, seen=4000),
+            counts(0, 70.0, 90_000, 63_000),
             "44% of the landmarks are found, 70% before",
         ),
-        (tally(0, expected=9000, seen=5700), tally(0, 70.0, 90_000, 63_000), ""),
-        (tally(0, expected=90, seen=0), tally(0, 70.0, 90_000, 63_000), ""),
+        (counts(0, expected=9000, seen=5700), counts(0, 70.0, 90_000, 63_000), ""),
+        (counts(0, expected=90, seen=0), counts(0, 70.0, 90_000, 63_000), ""),
     ],
 )
-def test_a_tile_is_listed_for_a_reason(now: Tally, then: Tally, words: str) -> None:
-    recent = {"0,0": now} | {f"{n},5": tally(1, 40.0) for n in range(10)}
-    before = {"0,0": then} | {f"{n},5": tally(5, 280.0) for n in range(10)}
+def test_a_tile_is_listed_for_a_reason(now: Counters, then: Counters, words: str) -> None:
+    recent = {"0,0": now} | {f"{n},5": counts(1, 40.0) for n in range(10)}
+    before = {"0,0": then} | {f"{n},5": counts(5, 280.0) for n in range(10)}
     found = concerns(recent, before, SETTINGS)
     assert [concern.tile for concern in found] == (["0,0"] if words else [])
     assert not words or words in found[0].reasons[0]
@@ -56,18 +58,18 @@ def test_chance_alone_lists_almost_nothing() -> None:
     rng = np.random.default_rng(3)
     listed = 0
     for _ in range(100):
-        recent = {f"{n},0": tally(int(rng.poisson(1.0)), 16.0) for n in range(60)}
-        before = {f"{n},0": tally(int(rng.poisson(7.0)), 112.0) for n in range(60)}
+        recent = {f"{n},0": counts(int(rng.poisson(1.0)), 16.0) for n in range(60)}
+        before = {f"{n},0": counts(int(rng.poisson(7.0)), 112.0) for n in range(60)}
         listed += len(concerns(recent, before, SETTINGS))
     assert listed <= 3  # of 6000 tiles; alpha is for all tiles of a list together
 
 
 def test_positions_outside_of_all_tiles_are_no_tile() -> None:
-    assert concerns({"outside": tally(50)}, {}, SETTINGS) == []
+    assert concerns({"outside": counts(50)}, {}, SETTINGS) == []
 
 
 def test_the_route_goes_to_the_nearest_that_is_left() -> None:
-    (one,) = concerns({"0,0": tally(50), "9,9": tally(0, 400.0)}, {}, SETTINGS)
+    (one,) = concerns({"0,0": counts(50), "9,9": counts(0, 400.0)}, {}, SETTINGS)
     found = [one] + [TileConcern(tile, ["x"], one.failures, one.failures, None, None) for tile in ("9,0", "1,0", "5,0")]
     places = {concern.tile: (10.0 * int(concern.tile[0]), 0.0) for concern in found}
     way = route(found, places)
@@ -85,9 +87,9 @@ def test_a_store_leads_to_where_the_survey_stood(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True, clock_ns=lambda: now_ns) as store:
         save_sample_draft(store)
         batch = FleetBatch()
-        batch.add("lab", "tile", "1,0", 489_990, tally(20))
-        batch.add("lab", "tile", "1,0", 489_990 - 24 * 7, tally(2, 100.0))
-        batch.add("lab", "tile", "0,0", 489_990, tally(0, 30.0))
+        batch.add("lab", "tile", "1,0", 489_990, counts(20))
+        batch.add("lab", "tile", "1,0", 489_990 - 24 * 7, counts(2, 100.0))
+        batch.add("lab", "tile", "0,0", 489_990, counts(0, 30.0))
         store.fleet.add(batch)
         assert resurvey_list(store, "lab", SETTINGS, now_ns).route == []  # nothing is published yet
         releases.publish(store, "lab")

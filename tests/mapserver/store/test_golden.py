@@ -98,7 +98,7 @@ def test_databases_of_every_format_open_whole(tmp_path: Path, number: int) -> No
         if number >= 4:
             (failure,) = store.fleet.failures(FailureFilter())
             assert (failure.failure_id, store.fleet.picture(failure.number, 0)) == ("f1", b"jpeg")
-            assert store.fleet.tallies("lab", "cause", key="dark")["lab", "dark"].failures == 1
+            assert store.fleet.counters("lab", "cause", key="dark")["lab", "dark"].failures == 1
 
 
 def test_a_draft_of_an_older_store_is_known_by_the_job_that_its_log_names(tmp_path: Path) -> None:
