@@ -5,8 +5,9 @@ from fleetmap.inertial.preintegration import (
     GRAVITY_MPS2,
     NavTrack,
     Preintegrated,
+    imu_intervals,
     preintegrate,
     propagate_nav,
 )
 
-__all__ = ["GRAVITY_MAP", "GRAVITY_MPS2", "NavTrack", "Preintegrated", "preintegrate", "propagate_nav"]
+__all__ = ["GRAVITY_MAP", "GRAVITY_MPS2", "NavTrack", "Preintegrated", "imu_intervals", "preintegrate", "propagate_nav"]

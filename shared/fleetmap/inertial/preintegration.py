@@ -198,3 +198,21 @@ def _step_variances(dt_s: Array, missing: NDArray[np.bool_], blind: bool, noise:
         ],
         axis=1,
     )
+
+
+def imu_intervals(imu: ImuSamples, start_ns: int, end_ns: int) -> tuple[Array, Array, Array]:
+    """Intervals (N,) seconds between start and end with gyro and accel (N, 3) at their middles, linearly interpolated.
+
+    Beyond the first and last sample the nearest one is held.
+    """
+    if end_ns <= start_ns or len(imu) == 0:
+        return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
+    first, end = np.searchsorted(imu.stamps_ns, [start_ns + 1, end_ns]).tolist()
+    edges = np.concatenate([[start_ns], imu.stamps_ns[first:end], [end_ns]]).astype(np.int64)
+    origin = edges[0]
+    middles = 0.5 * ((edges[1:] - origin) + (edges[:-1] - origin))
+    around = slice(max(first - 1, 0), end + 1)
+    at = (imu.stamps_ns[around] - origin).astype(np.float64)
+    gyro = np.stack([np.interp(middles, at, imu.gyro_radps[around, k]) for k in range(3)], axis=1)
+    accel = np.stack([np.interp(middles, at, imu.accel_mps2[around, k]) for k in range(3)], axis=1)
+    return np.diff(edges) * 1e-9, gyro, accel

@@ -96,3 +96,22 @@ def exp_so3(rotvec: Array) -> Array:
     out[1, 2] = b * y * z - a * x
     out[2, 1] = b * y * z + a * x
     return out
+
+
+@kernel
+def skew(v: Array) -> Array:
+    """(3, 3) matrix of the cross product with v (3,)."""
+    out = np.zeros((3, 3))
+    out[0, 1], out[0, 2], out[1, 2] = -v[2], v[1], -v[0]
+    out[1, 0], out[2, 0], out[2, 1] = v[2], -v[1], v[0]
+    return out
+
+
+@kernel
+def rotate(rotation: Array, vector: Array) -> Array:
+    """(3,) rotation @ vector."""
+    out = np.zeros(3)
+    for a in range(3):
+        for b in range(3):
+            out[a] += rotation[a, b] * vector[b]
+    return out

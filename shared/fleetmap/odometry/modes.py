@@ -12,9 +12,12 @@ from fleetmap.odometry.checks.divergence_monitor import DivergenceMonitor
 from fleetmap.odometry.checks.imu_faults import longest_gap_ns
 from fleetmap.odometry.checks.zero_velocity import ZeroVelocityDetector
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
-from fleetmap.odometry.filter.msckf import NavState
+from fleetmap.odometry.filter.measurements import wheel_odometry, zero_velocity
+from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
-from fleetmap.odometry.init.filter_initialization import Start, dynamic_initialization, is_steady, static_initialization
+from fleetmap.odometry.init.dynamic_initialization import dynamic_initialization
+from fleetmap.odometry.init.initial_state import InitialState
+from fleetmap.odometry.init.static_initialization import is_steady, static_initialization
 from fleetmap.odometry.sensor_buffer import SensorBuffer
 from fleetmap.odometry.tracking.tracker import Tracked
 from fleetmap.sensors.calibration import ImuNoise
@@ -223,11 +226,11 @@ class StartingMode(VisualMode):
         change = np.asarray(mode.window.filter.state.odom_from_body @ se3_inverse(old_odom_from_body))
         return Step(mode, step.used, change)
 
-    def _static_start(self, stamp_ns: int) -> Start | None:
+    def _static_start(self, stamp_ns: int) -> InitialState | None:
         since = self._imu.samples.imu.between(self._not_before_ns, stamp_ns + 1)
-        return static_initialization(since, stamp_ns, self._rig.settings.start, self._rig.settings.filter)
+        return static_initialization(since, stamp_ns, self._rig.settings)
 
-    def _dynamic_start(self, stamp_ns: int, odom_from_body: Array, lost: bool) -> Start | None:
+    def _dynamic_start(self, stamp_ns: int, odom_from_body: Array, lost: bool) -> InitialState | None:
         settings = self._rig.settings.start
         if lost:
             self._trajectory.clear()
@@ -241,8 +244,7 @@ class StartingMode(VisualMode):
         ):
             return None
         vision = Trajectory(stamps, np.array([odom_from_body for _, odom_from_body in recent]))
-        imu = self._imu
-        return dynamic_initialization(vision, imu.samples.imu, imu.weighing_noise, settings, self._rig.settings.filter)
+        return dynamic_initialization(vision, self._imu.samples.imu, self._imu.weighing_noise, self._rig.settings)
 
 
 class InertialMode(WindowMode):
@@ -260,7 +262,7 @@ class InertialMode(WindowMode):
         self._last_odom_from_body = window.filter.state.odom_from_body  # at the frame before
 
     @classmethod
-    def started(cls, old: SlidingWindow, imu: ImuInputs, start: Start) -> "InertialMode":
+    def started(cls, old: SlidingWindow, imu: ImuInputs, start: InitialState) -> "InertialMode":
         """The mode with an empty window in the place of another."""
         return cls(old.restarted(start.state, start.covariance, start.stamp_ns), imu)
 
@@ -292,7 +294,8 @@ class InertialMode(WindowMode):
         self._update_zero_velocity(tracked)
         wheel = self._imu.samples.take_wheel(window.stamp_ns)
         if wheel is not None:
-            window.filter.roll(*wheel, self._rig.base_from_body, _GATE_4)
+            by_wheels = wheel_odometry(window.filter.state, *wheel, self._rig.base_from_body, self._rig.settings.filter)
+            window.filter.correct_with(by_wheels, gate=_GATE_4)
         used = window.update(frame_index, tracked, self._rig.settings.filter.chunk_frames, 1)
         if monitor.is_wrong_start(window.filter.imu_minus_cam_s, self.cam_from_earlier(frame_index - 1), seen):
             return Step(self._begin_again(frame_index, tracked), used, np.eye(4))
@@ -323,7 +326,9 @@ class InertialMode(WindowMode):
             return
         duration_s = (now_ns - still[1]) * 1e-9
         sigma_radps = self._imu.noise.gyro_noise_radps_rthz / np.sqrt(duration_s)
-        self.window.filter.zero_velocity_update(since.gyro_radps.mean(axis=0), float(sigma_radps), _GATE_6)
+        state, gyro_radps = self.window.filter.state, since.gyro_radps.mean(axis=0)
+        standing = zero_velocity(state, gyro_radps, float(sigma_radps), self._rig.settings.filter)
+        self.window.filter.correct_with(standing, gate=_GATE_6)
 
     def _begin_again(self, frame_index: int, tracked: Tracked) -> Mode:
         """Vision alone from where the last frame was, until gravity is known anew.

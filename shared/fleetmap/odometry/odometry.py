@@ -10,7 +10,7 @@ import numpy as np
 from fleetmap.features.stereo import StereoSettings
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry.estimate import OdometryEstimate
-from fleetmap.odometry.filter.msckf import NavState
+from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.modes import Mode, StartingMode, VisualMode, imu_inputs
 from fleetmap.odometry.sensor_buffer import SensorBuffer

@@ -5,8 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transform_points
-from fleetmap.odometry.filter.msckf import InvariantFilter, NavState, Track
+from fleetmap.odometry.filter.msckf import InvariantFilter
+from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.settings import FilterSettings
+from fleetmap.odometry.tracking.tracks import Track
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples

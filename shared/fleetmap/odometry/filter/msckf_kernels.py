@@ -6,6 +6,7 @@ error (r, nu, rho): R = Exp(r) R^, v = Exp(r) v^ + nu, p = Exp(r) p^ + rho (to f
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,84 +19,10 @@ from fleetmap.numerics.linear_kernels import (
     forward_substitute,
     matmul,
     matmul_nt,
+    rotate,
+    skew,
     solve_spd,
 )
-
-
-@kernel
-def _skew(v: Array) -> Array:
-    out = np.zeros((3, 3))
-    out[0, 1], out[0, 2], out[1, 2] = -v[2], v[1], -v[0]
-    out[1, 0], out[2, 0], out[2, 1] = v[2], -v[1], v[0]
-    return out
-
-
-@kernel
-def _rotate(rotation: Array, vector: Array) -> Array:
-    out = np.zeros(3)
-    for a in range(3):
-        for b in range(3):
-            out[a] += rotation[a, b] * vector[b]
-    return out
-
-
-@kernel
-def propagate(
-    rotation: Array, velocity: Array, position: Array, gyro_bias: Array, accel_bias: Array, gravity: Array,
-    steps_s: Array, gyro: Array, accel: Array, noises: Array, state_to_state: Array, processes: Array,
-) -> None:  # fmt: skip
-    """Moves the state (in place) through N intervals of constant rate and specific force.
-
-    steps_s (N,), gyro and accel (N, 3) at each interval's middle. noises (D, 4): densities of gyro, accel, gyro walk,
-    accel walk, as so many may judge them. state_to_state (15, 15) and processes (D, 15, 15) receive the accumulated error
-    transition and, for each of the judgements, the noise, order r nu rho bg ba.
-    """
-    phi = np.eye(15)
-    processes[:, :, :] = 0.0
-    for n in range(len(steps_s)):
-        dt = steps_s[n]
-        rate = gyro[n] - gyro_bias
-        middle = matmul(rotation, exp_so3(0.5 * dt * rate))
-        acceleration = _rotate(middle, accel[n] - accel_bias) + gravity
-        step = np.eye(15)
-        g = _skew(gravity)
-        step[3:6, 0:3] = g * dt
-        step[6:9, 0:3] = 0.5 * dt * dt * g
-        step[6:9, 3:6] = np.eye(3) * dt
-        mid_velocity = velocity + 0.5 * dt * acceleration
-        mid_position = position + 0.5 * dt * velocity
-        lever_v, lever_p = matmul(_skew(mid_velocity), middle), matmul(_skew(mid_position), middle)
-        # bias columns by the middle of the interval: first order in it, second where the chain r -> nu -> rho needs it
-        step[0:3, 9:12] = -middle * dt
-        step[3:6, 9:12] = -lever_v * dt - 0.5 * dt * dt * matmul(g, middle)
-        step[6:9, 9:12] = -lever_p * dt - 0.5 * dt * dt * lever_v
-        step[3:6, 12:15] = -middle * dt
-        step[6:9, 12:15] = -0.5 * dt * dt * middle
-        shape = np.zeros((15, 6))
-        shape[0:3, 0:3], shape[3:6, 0:3], shape[6:9, 0:3] = middle, lever_v, lever_p
-        shape[3:6, 3:6] = middle
-        phi = matmul(step, phi)
-        for d in range(len(noises)):
-            processes[d] = matmul_nt(matmul(step, processes[d]), step) + _diffusion(shape, noises[d], dt)
-        position += velocity * dt + 0.5 * dt * dt * acceleration
-        velocity += acceleration * dt
-        rotation[:, :] = matmul(rotation, exp_so3(dt * rate))
-    state_to_state[:, :] = phi
-
-
-@kernel
-def _diffusion(shape: Array, noise: Array, duration_s: float) -> Array:
-    """(15, 15) noise that one interval adds; shape (9, 6): how gyro and accelerometer enter rotation, velocity, position."""
-    diffusion = np.zeros((15, 15))
-    for k in range(6):
-        density = noise[0] if k < 3 else noise[1]
-        for a in range(9):
-            for b in range(9):
-                diffusion[a, b] += shape[a, k] * shape[b, k] * density * density * duration_s
-    for a in range(3):
-        diffusion[9 + a, 9 + a] = noise[2] * noise[2] * duration_s
-        diffusion[12 + a, 12 + a] = noise[3] * noise[3] * duration_s
-    return diffusion
 
 
 @kernel
@@ -188,9 +115,17 @@ def _chi_square_limit(dof: int, normal_quantile: float) -> float:
 
 @kernel
 def linearize_track(
-    point: Array, rotations: Array, positions: Array, clones: NDArray[np.int64], pixels: Array, camera: Array,
-    weights: Array, by_clone: Array, by_point: Array, residual: Array,
-) -> int:  # fmt: skip
+    point: Array,
+    rotations: Array,
+    positions: Array,
+    clones: NDArray[np.int64],
+    pixels: Array,
+    camera: Array,
+    weights: Array,
+    by_clone: Array,
+    by_point: Array,
+    residual: Array,
+) -> int:
     """Whitened residuals of one track and their derivatives; returns how many rows were filled.
 
     point (3,) odom; rotations (M, 3, 3) odom_from_cam, positions (M, 3); clones (n,), pixels (n, 3) u_left v u_right
@@ -198,7 +133,7 @@ def linearize_track(
     order of `clones`; by_point (3 n, 3); residual (3 n,) measured minus predicted, as 1/sigma in weights (2,) says.
     """
     z = np.empty(6)
-    lever = _skew(point)
+    lever = skew(point)
     rows = 0
     for k in range(len(clones)):
         turn = rotations[clones[k]].T
@@ -293,33 +228,80 @@ def share_that_passes(limit: float, mean_square: float) -> float:
     return 1.0 - 2.0 * edge * density / math.erf(edge / math.sqrt(2.0))
 
 
+class Clones(NamedTuple):
+    """Bodies of M clones: rotations (M, 3, 3) and positions (M, 3) of odom_from_body; body_from_cam (4, 4)."""
+
+    rotations: Array
+    positions: Array
+    body_from_cam: Array
+
+
+class Tracks(NamedTuple):
+    """T tracks: starts (T + 1,) delimits each one's rows of clones (n,) and pixels (n, 3) u_left v u_right (NaN none).
+
+    first_points (T, 3): where triangulation starts, in the camera of clone anchors (T,).
+    """
+
+    starts: NDArray[np.int64]
+    clones: NDArray[np.int64]
+    pixels: Array
+    anchors: NDArray[np.int64]
+    first_points: Array
+
+
+class PixelModel(NamedTuple):
+    """camera: focal, cx, cy, focal * baseline; weights (2,): 1/sigma of pixels and of disparity.
+
+    noise (4,): variance that the whitened rows really have, and sigmas of a track's own errors as in `add_error_sources`,
+    of which what passes the gate counts (`share_that_passes`). normal_quantile: of the gate's share.
+    """
+
+    camera: Array
+    weights: Array
+    noise: Array
+    normal_quantile: float
+
+
+class NormalEquations(NamedTuple):
+    """vector (6 M,) = information (6 M, 2 + 6 M) @ (disparity offset, depth scale, clones' errors) + noise.
+
+    scatter (6 M, 6 M) is the covariance that the noise really has.
+    """
+
+    information: Array
+    scatter: Array
+    vector: Array
+
+
 @kernel
 def accumulate_tracks(
-    odom_from_body_rotations: Array, body_positions: Array, body_from_cam: Array, starts: NDArray[np.int64],
-    clones: NDArray[np.int64], pixels: Array, anchors: NDArray[np.int64], first_points: Array, camera: Array,
-    weights: Array, noise: Array, clone_covariance: Array, moved: Array, normal_quantile: float,
-    information: Array, scatter: Array, vector: Array, used: NDArray[np.int8],
-) -> None:  # fmt: skip
+    bodies: Clones,
+    tracks: Tracks,
+    model: PixelModel,
+    clone_covariance: Array,
+    moved: Array,
+    equations: NormalEquations,
+    used: NDArray[np.int8],
+) -> None:
     """Adds every track that passes its gate to the normal equations of the clone errors, points projected out.
 
-    starts (T + 1,) delimits each track's rows of clones (n,) and pixels (n, 3). first_points (T, 3): where
-    triangulation starts, in the camera of clone anchors (T,). noise (4,): variance that the whitened rows really have,
-    and sigmas of a track's own errors as in `add_error_sources`, of which what passes the gate counts (`share_that_passes`).
     clone_covariance (6 M, 6 M) in the error of this module, order rotation then position. moved (6 M,): how far the
-    clones given here stand from the prior mean, when an iterated filter relinearises. Summed into: vector (6 M,), which
-    is information (6 M, 2 + 6 M) times disparity offset, depth scale and the clones' errors, plus noise that really has
-    the covariance scatter (6 M, 6 M). used (T,) becomes 1 for a track that was taken, 0 for one that could not be
-    triangulated and -1 for one that failed its gate.
+    clones given here stand from the prior mean, when an iterated filter relinearises. used (T,) becomes 1 for a track
+    that was taken, 0 for one that could not be triangulated and -1 for one that failed its gate.
+    Source: Mourikis and Roumeliotis 2007, equations 23 to 26 (null space of the point).
     """
-    count = len(body_positions)
+    starts, camera, weights, noise = tracks.starts, model.camera, model.weights, model.noise
+    information, scatter, vector = equations.information, equations.scatter, equations.vector
+    count = len(bodies.positions)
     rotations, positions = np.empty((count, 3, 3)), np.empty((count, 3))
     for m in range(count):
-        rotations[m] = matmul(odom_from_body_rotations[m], body_from_cam[:3, :3])
-        positions[m] = _rotate(odom_from_body_rotations[m], body_from_cam[:3, 3]) + body_positions[m]
+        rotations[m] = matmul(bodies.rotations[m], bodies.body_from_cam[:3, :3])
+        positions[m] = rotate(bodies.rotations[m], bodies.body_from_cam[:3, 3]) + bodies.positions[m]
     for t in range(len(starts) - 1):
-        seen = clones[starts[t] : starts[t + 1]]
-        measured = pixels[starts[t] : starts[t + 1]]
-        point = _rotate(rotations[anchors[t]], first_points[t]) + positions[anchors[t]]
+        seen = tracks.clones[starts[t] : starts[t + 1]]
+        measured = tracks.pixels[starts[t] : starts[t + 1]]
+        anchor = tracks.anchors[t]
+        point = rotate(rotations[anchor], tracks.first_points[t]) + positions[anchor]
         used[t] = 0
         if not triangulate(rotations, positions, seen, measured, camera, weights, point):
             continue
@@ -351,7 +333,7 @@ def accumulate_tracks(
         if not cholesky_in_place(innovation):
             continue
         forward_substitute(innovation, whitened)
-        limit = _chi_square_limit(dof, normal_quantile)
+        limit = _chi_square_limit(dof, model.normal_quantile)
         if (whitened * whitened).sum() > limit:
             used[t] = -1
             continue
@@ -420,4 +402,4 @@ def turn_clones(rotations: Array, positions: Array, errors: Array) -> None:
     for m in range(len(positions)):
         turn = exp_so3(errors[6 * m : 6 * m + 3])
         rotations[m] = matmul(turn, rotations[m])
-        positions[m] = _rotate(turn, positions[m]) + errors[6 * m + 3 : 6 * m + 6]
+        positions[m] = rotate(turn, positions[m]) + errors[6 * m + 3 : 6 * m + 6]

@@ -11,8 +11,9 @@ from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter import msckf_kernels
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
-from fleetmap.odometry.init.filter_initialization import Start, static_initialization
+from fleetmap.odometry.init.initial_state import InitialState
 from fleetmap.odometry.init.mono_inertial_init import mono_inertial_initialization
+from fleetmap.odometry.init.static_initialization import static_initialization
 from fleetmap.odometry.modes import ImuInputs, InertialMode, Mode, Step
 from fleetmap.odometry.mono.mono_vo import Sight, VisualOdometry
 from fleetmap.odometry.tracking.tracker import Tracked
@@ -211,11 +212,11 @@ class MonocularMode(Mode):
             self._still_since_ns = self._stamp_ns
         self._newest_pixels = (tracked.ids, tracked.pixels[:, :2].copy())
 
-    def _metric_start(self, imu: ImuInputs, sight: Sight) -> tuple[Start, float | None] | None:
+    def _metric_start(self, imu: ImuInputs, sight: Sight) -> tuple[InitialState, float | None] | None:
         """By rest, if picture and IMU agree on it, else by motion; with the metres in one unit of vision, which rest leaves open."""
         stamp_ns, settings = self._stamp_ns, self._rig.settings
         if self._still_since_ns is not None and (stamp_ns - self._still_since_ns) * 1e-9 > _STILL_S:
-            resting = static_initialization(imu.samples.imu, stamp_ns, settings.start, settings.filter)
+            resting = static_initialization(imu.samples.imu, stamp_ns, settings)
             if resting is not None and stamp_ns - resting.stamp_ns < int(0.1e9):
                 covariance = resting.covariance
                 covariance[3:6, 3:6] = _STILL_SIGMA_MPS**2 * np.eye(3)
@@ -228,10 +229,8 @@ class MonocularMode(Mode):
         vision = self._spaced_trajectory()
         if len(vision) < settings.monocular.metric_samples:
             return None
-        found = mono_inertial_initialization(
-            vision, imu.samples.imu, imu.weighing_noise, self._rig.body_from_cam, settings.monocular, settings.start,
-            settings.filter,
-        )  # fmt: skip
+        noise, body_from_cam = imu.weighing_noise, self._rig.body_from_cam
+        found = mono_inertial_initialization(vision, imu.samples.imu, noise, body_from_cam, settings)
         return None if found is None else (found.start, found.metres_per_unit)
 
     def _spaced_trajectory(self) -> Trajectory:
@@ -251,7 +250,7 @@ class MonocularMode(Mode):
             vision_from_cams.append(there)
         return Trajectory(np.array(stamps[::-1], np.int64), np.array(vision_from_cams[::-1]).reshape(-1, 4, 4))
 
-    def _metric_window(self, start: Start, metres_per_unit: float | None) -> MonocularWindow:
+    def _metric_window(self, start: InitialState, metres_per_unit: float | None) -> MonocularWindow:
         window = MonocularWindow(self._rig, start.state, start.covariance, start.stamp_ns)
         window.scene_depth_m = self._sight.depth * (1.0 if metres_per_unit is None else metres_per_unit)
         return window

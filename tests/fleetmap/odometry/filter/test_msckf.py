@@ -5,7 +5,9 @@ import pytest
 from msgspec.structs import replace
 
 from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log, so3_exp
-from fleetmap.odometry.filter.msckf import InvariantFilter, NavState
+from fleetmap.odometry.filter.measurements import LinearMeasurement, wheel_odometry, zero_velocity
+from fleetmap.odometry.filter.msckf import InvariantFilter
+from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 from support.worlds.inertial_motion import analytic_motion
@@ -170,7 +172,7 @@ def test_relative_motion_is_the_composition_and_its_covariance_the_scatter() -> 
     np.testing.assert_allclose(same, np.eye(4), atol=1e-12)
     assert np.abs(nothing).max() < 1e-12
     # scatter of the relative motion when the clones are drawn from their joint covariance
-    joint = 1e-4 * estimate.budget[20:, 20:]  # scaled down so that first order holds
+    joint = 1e-4 * estimate.true_error_cov[20:, 20:]  # scaled down so that first order holds
     drawn = rng.multivariate_normal(np.zeros(len(joint)), joint, size=4000, method="eigh")
     offs = []
     for error in drawn:
@@ -238,7 +240,7 @@ def test_linear_measurement_is_the_kalman_update() -> None:
     jacobian = np.zeros((3, 16))
     jacobian[:, 12:15] = np.eye(3)
     residual, noise = np.array([0.01, -0.02, 0.005]), 1e-4 * np.eye(3)
-    innovation = estimate.correct_with(jacobian, residual, noise)
+    innovation = estimate.correct_with(LinearMeasurement(jacobian, residual, noise))
     information = np.linalg.inv(covariance) + jacobian[:, :15].T @ np.linalg.inv(noise) @ jacobian[:, :15]
     np.testing.assert_allclose(estimate.covariance[:15, :15], np.linalg.inv(information), atol=1e-9)
     expected = np.linalg.solve(information, jacobian[:, :15].T @ np.linalg.solve(noise, residual))
@@ -283,14 +285,17 @@ def test_wheels_and_standing_measure_what_they_say() -> None:
     error = np.concatenate([np.zeros(3), 0.02 * np.array([1.0, -2.0, 1.5]), np.zeros(9)])
     covariance = np.diag(np.repeat([1e-9, 0.05, 1e-9, 1e-9, 1e-9], 3) ** 2)
     estimate = InvariantFilter(perturbed(truth, np.eye(3), error), covariance, settings, CAMERA, BODY_FROM_CAM)
-    assert estimate.roll(sample, motion.gyro_radps, base_from_body, gate=100.0) < 100.0
+    rolled = wheel_odometry(estimate.state, sample, motion.gyro_radps, base_from_body, settings)
+    assert estimate.correct_with(rolled, gate=100.0) < 100.0
     np.testing.assert_allclose(estimate.state.velocity_mps, truth.velocity_mps, atol=1e-4)
     slipped = WheelSample(0, 1.6 * sample.velocity_base_mps, sample.yaw_rate_radps, 1e-4, 1e-4)
     before = estimate.covariance.copy()
-    assert estimate.roll(slipped, motion.gyro_radps, base_from_body, gate=100.0) > 100.0
+    rolled = wheel_odometry(estimate.state, slipped, motion.gyro_radps, base_from_body, settings)
+    assert estimate.correct_with(rolled, gate=100.0) > 100.0
     np.testing.assert_array_equal(estimate.covariance, before)
     standing = NavState(velocity_mps=np.array([0.02, -0.01, 0.03]))
     estimate = InvariantFilter(standing, np.diag(START_SIGMAS**2), SETTINGS, CAMERA, BODY_FROM_CAM)
-    assert estimate.zero_velocity_update(np.array([0.004, 0.0, -0.003]), 1e-5, gate=22.0) < 22.0
+    still = zero_velocity(estimate.state, np.array([0.004, 0.0, -0.003]), 1e-5, SETTINGS)
+    assert estimate.correct_with(still, gate=22.0) < 22.0
     assert np.linalg.norm(estimate.state.velocity_mps) < 1e-3
     np.testing.assert_allclose(estimate.state.gyro_bias_radps, [0.004, 0.0, -0.003], atol=1e-5)

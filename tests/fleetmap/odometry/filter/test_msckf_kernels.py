@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3_inverse, so3_exp, transform_points
-from fleetmap.odometry.filter import msckf_kernels
-from fleetmap.odometry.filter.msckf import NavState, imu_intervals
+from fleetmap.inertial import imu_intervals
+from fleetmap.odometry.filter import msckf_kernels, propagation_kernels
+from fleetmap.odometry.filter.msckf_kernels import Clones, NormalEquations, PixelModel, Tracks
+from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.sensors.samples import ImuSamples
 from support.worlds.inertial_motion import analytic_motion, sample_motion
 from support.worlds.point_world import BODY_FROM_CAM, CAMERA, NOISE, error_of, perturbed, room, true_state
@@ -22,10 +24,8 @@ def moved(state: NavState, steps_s: Array, gyro: Array, accel: Array) -> tuple[N
     """The state after the intervals, transition and process noise."""
     s = NavState(**{name: value.copy() for name, value in vars(state).items()})
     phi, processes = np.empty((15, 15)), np.empty((1, 15, 15))
-    msckf_kernels.propagate(
-        s.rotation, s.velocity_mps, s.position_m, s.gyro_bias_radps, s.accel_bias_mps2, GRAVITY, steps_s, gyro, accel,
-        DENSITIES[None], phi, processes,
-    )  # fmt: skip
+    state = s.rotation, s.velocity_mps, s.position_m, s.gyro_bias_radps, s.accel_bias_mps2
+    propagation_kernels.propagate(*state, GRAVITY, steps_s, gyro, accel, DENSITIES[None], phi, processes)
     return s, phi, processes[0]
 
 
@@ -183,11 +183,13 @@ def test_vision_says_nothing_about_where_the_world_is() -> None:
         first.append(transform_points(se3_inverse(wrong[0] @ BODY_FROM_CAM), point[None])[0])
     information, scatter, vector = np.zeros((30, 32)), np.zeros((30, 30)), np.zeros(30)
     used = np.zeros(len(first), np.int8)
-    msckf_kernels.accumulate_tracks(
-        np.ascontiguousarray(wrong[:, :3, :3]), np.ascontiguousarray(wrong[:, :3, 3]), BODY_FROM_CAM,
-        np.array(starts), np.array(clones), np.array(pixels), np.zeros(len(first), np.int64), np.array(first), INTRINSICS,
-        WEIGHTS, np.array([1.0, 0.0, 0.0, 0.0]), np.eye(30), np.zeros(30), 2.3, information, scatter, vector, used,
-    )  # fmt: skip
+    rotations, positions = np.ascontiguousarray(wrong[:, :3, :3]), np.ascontiguousarray(wrong[:, :3, 3])
+    anchors = np.zeros(len(first), np.int64)
+    tracks = Tracks(np.array(starts), np.array(clones), np.array(pixels), anchors, np.array(first))
+    model = PixelModel(INTRINSICS, WEIGHTS, np.array([1.0, 0.0, 0.0, 0.0]), 2.3)
+    equations = NormalEquations(information, scatter, vector)
+    bodies_of = Clones(rotations, positions, BODY_FROM_CAM)
+    msckf_kernels.accumulate_tracks(bodies_of, tracks, model, np.eye(30), np.zeros(30), equations, used)
     assert (used == 1).sum() > 10
     information = information[:, 2:]
     np.testing.assert_allclose(scatter, information, atol=1e-9 * np.abs(information).max())  # nothing but white noise

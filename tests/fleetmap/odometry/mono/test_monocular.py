@@ -15,7 +15,6 @@ from fleetmap.odometry import (
     make_odometry,
 )
 from fleetmap.odometry.init.mono_inertial_init import mono_inertial_initialization
-from fleetmap.odometry.settings import FilterSettings, MonocularSettings, StartSettings
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import Trajectory
@@ -109,9 +108,7 @@ def test_the_start_finds_scale_gravity_and_speed(unit_m: float) -> None:
     rng = np.random.default_rng(3)
     imu = noisy_imu(rng, 6.0, IMU, GYRO_BIAS, ACCEL_BIAS)
     times_s = np.arange(0.5, 4.5, 0.2)
-    found = mono_inertial_initialization(
-        vision(times_s, unit_m, rng), imu, IMU, BODY_FROM_CAM, MonocularSettings(), StartSettings(), FilterSettings()
-    )
+    found = mono_inertial_initialization(vision(times_s, unit_m, rng), imu, IMU, BODY_FROM_CAM, OdometrySettings())
     assert found is not None
     assert found.metres_per_unit == pytest.approx(unit_m, rel=0.04)  # noise of the places hides some of the way
     assert abs(found.metres_per_unit / unit_m - 1) < 4 * found.scale_sigma_share
@@ -133,8 +130,6 @@ def test_a_steady_way_shows_no_scale() -> None:
     samples = noisy_imu(rng, 5.0, IMU, np.zeros(3), np.zeros(3))
     level = np.tile([0.0, 0.0, 9.81], (len(samples), 1)) + 0.02 * rng.normal(size=(len(samples), 3))
     still = replace(samples, gyro_radps=1e-3 * rng.normal(size=level.shape), accel_mps2=level)
-    found = mono_inertial_initialization(
-        Trajectory(np.round(times_s * 1e9).astype(np.int64), cams), still, IMU, BODY_FROM_CAM, MonocularSettings(),
-        StartSettings(), FilterSettings(),
-    )  # fmt: skip
+    trajectory = Trajectory(np.round(times_s * 1e9).astype(np.int64), cams)
+    found = mono_inertial_initialization(trajectory, still, IMU, BODY_FROM_CAM, OdometrySettings())
     assert found is None

@@ -4,14 +4,17 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3_exp, so3_exp
+from fleetmap.odometry.filter.measurements import LinearMeasurement
 from fleetmap.odometry.filter.msckf import InvariantFilter
-from fleetmap.odometry.init.filter_initialization import dynamic_initialization, static_initialization
-from fleetmap.odometry.settings import FilterSettings, StartSettings
+from fleetmap.odometry.init.dynamic_initialization import dynamic_initialization
+from fleetmap.odometry.init.static_initialization import static_initialization
+from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.sensors.samples import ImuSamples, Trajectory
 from support.worlds.inertial_motion import analytic_motion
 from support.worlds.point_world import BODY_FROM_CAM, CAMERA, NOISE, noisy_imu
 
-SETTINGS, FILTER = StartSettings(), FilterSettings()
+SETTINGS = OdometrySettings()
+START, FILTER = SETTINGS.start, SETTINGS.filter
 GYRO_BIAS = np.array([0.02, -0.015, 0.01])
 DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -32,10 +35,10 @@ def means_agree(window: ImuSamples) -> bool:
     means = np.array([part.mean(axis=0) for part in parts])
     spread, mean = means.std(axis=0), means.mean(axis=0)
     return bool(
-        spread[:3].max() < SETTINGS.steady_gyro_sigma_radps
-        and spread[3:].max() < SETTINGS.steady_accel_sigma_mps2
-        and np.linalg.norm(mean[:3]) < SETTINGS.steady_gyro_mean_radps
-        and abs(np.linalg.norm(mean[3:]) - 9.81) < SETTINGS.max_gravity_error_mps2
+        spread[:3].max() < START.steady_gyro_sigma_radps
+        and spread[3:].max() < START.steady_accel_sigma_mps2
+        and np.linalg.norm(mean[:3]) < START.steady_gyro_mean_radps
+        and abs(np.linalg.norm(mean[3:]) - 9.81) < START.max_gravity_error_mps2
     )
 
 
@@ -50,7 +53,7 @@ def test_the_latest_steady_window_is_found(seed: int) -> None:
     until_ns, window_ns = int(imu.stamps_ns[-1]), 800_000_000
     ends = [until_ns - k * window_ns // 4 for k in range(17)]
     steady = [end for end in ends if end >= window_ns and means_agree(imu.between(end - window_ns, end))]
-    start = static_initialization(imu, until_ns, SETTINGS, FILTER)
+    start = static_initialization(imu, until_ns, SETTINGS)
     assert (None if start is None else start.stamp_ns) == (max(steady) if steady else None)
 
 
@@ -58,7 +61,7 @@ def test_shaken_all_the_time_there_is_no_start() -> None:
     imu = at_rest(np.random.default_rng(4), np.eye(3), np.zeros(3))
     wave = np.sin(np.arange(len(imu)) / 9.0)[:, None] * np.array([0.3, 0.0, 0.0])
     shaken = ImuSamples(imu.stamps_ns, imu.gyro_radps + wave, imu.accel_mps2)
-    assert static_initialization(shaken, int(imu.stamps_ns[-1]), SETTINGS, FILTER) is None
+    assert static_initialization(shaken, int(imu.stamps_ns[-1]), SETTINGS) is None
 
 
 def angle_deg(a: Array, b: Array) -> float:
@@ -69,7 +72,7 @@ def angle_deg(a: Array, b: Array) -> float:
 def test_rest_tells_gravity_and_gyro_bias(tilt: list[float]) -> None:
     rotation = so3_exp(np.array(tilt))
     imu = at_rest(np.random.default_rng(1), rotation, np.zeros(3))
-    start = static_initialization(imu, int(imu.stamps_ns[-1]), SETTINGS, FILTER)
+    start = static_initialization(imu, int(imu.stamps_ns[-1]), SETTINGS)
     assert start is not None
     assert angle_deg(start.state.rotation.T @ DOWN, rotation.T @ DOWN) < 0.1
     np.testing.assert_allclose(start.state.gyro_bias_radps, GYRO_BIAS, atol=1.5e-3)
@@ -82,14 +85,14 @@ def test_learning_the_accelerometer_bias_sets_the_tilt_right() -> None:
     """At rest bias and tilt cannot be told apart; the covariance must know, so that a measured bias corrects the tilt."""
     rotation, accel_bias = so3_exp(np.array([0.3, -0.2, 0.5])), np.array([0.1, -0.08, 0.05])
     imu = at_rest(np.random.default_rng(2), rotation, accel_bias)
-    start = static_initialization(imu, int(imu.stamps_ns[-1]), SETTINGS, FILTER)
+    start = static_initialization(imu, int(imu.stamps_ns[-1]), SETTINGS)
     assert start is not None
     before = angle_deg(start.state.rotation.T @ DOWN, rotation.T @ DOWN)
     assert before > 0.4
     estimate = InvariantFilter(start.state, start.covariance, FILTER, CAMERA, BODY_FROM_CAM)
     jacobian = np.zeros((3, 16))
     jacobian[:, 12:15] = np.eye(3)
-    estimate.correct_with(jacobian, accel_bias - estimate.state.accel_bias_mps2, 1e-8 * np.eye(3))
+    estimate.correct_with(LinearMeasurement(jacobian, accel_bias - estimate.state.accel_bias_mps2, 1e-8 * np.eye(3)))
     assert angle_deg(estimate.state.rotation.T @ DOWN, rotation.T @ DOWN) < 0.05
 
 
@@ -103,15 +106,15 @@ def test_the_latest_steady_window_counts() -> None:
         np.concatenate([rest.gyro_radps, moving.gyro_radps]),
         np.concatenate([rest.accel_mps2, moving.accel_mps2]),
     )
-    start = static_initialization(both, int(both.stamps_ns[-1]), SETTINGS, FILTER)
+    start = static_initialization(both, int(both.stamps_ns[-1]), SETTINGS)
     assert start is not None
     assert 1.7e9 < start.stamp_ns < 2.1e9
 
 
 def test_motion_is_not_rest() -> None:
     imu = noisy_imu(np.random.default_rng(4), 2.0, NOISE, np.zeros(3), np.zeros(3))
-    assert static_initialization(imu, int(imu.stamps_ns[-1]), SETTINGS, FILTER) is None
-    assert static_initialization(ImuSamples.empty(), 10**9, SETTINGS, FILTER) is None
+    assert static_initialization(imu, int(imu.stamps_ns[-1]), SETTINGS) is None
+    assert static_initialization(ImuSamples.empty(), 10**9, SETTINGS) is None
 
 
 def seen_motion(rng: np.random.Generator, sigma_rad: float, sigma_m: float) -> tuple[Trajectory, Array]:
@@ -128,7 +131,7 @@ def test_motion_tells_gravity_velocity_and_biases(accel_bias: Array) -> None:
     rng = np.random.default_rng(5)
     imu = noisy_imu(rng, 2.5, NOISE, GYRO_BIAS, accel_bias)
     vision, old_from_map = seen_motion(rng, 3e-4, 1e-3)
-    start = dynamic_initialization(vision, imu, NOISE, SETTINGS, FILTER)
+    start = dynamic_initialization(vision, imu, NOISE, SETTINGS)
     assert start is not None
     truth = analytic_motion(2.1)
     assert start.stamp_ns == 2_100_000_000
@@ -151,7 +154,7 @@ def test_its_covariance_covers_its_error() -> None:
         rng = np.random.default_rng(seed)
         imu = noisy_imu(rng, 2.5, NOISE, GYRO_BIAS, 0.04 * rng.normal(size=3))
         vision, old_from_map = seen_motion(rng, 1e-3, 8e-3)
-        start = dynamic_initialization(vision, imu, NOISE, SETTINGS, FILTER)
+        start = dynamic_initialization(vision, imu, NOISE, SETTINGS)
         assert start is not None
         tilt = np.cross(DOWN, start.odom_from_old[:3, :3] @ old_from_map[:3, :3] @ DOWN)[:2]
         tilts.append(tilt @ np.linalg.solve(start.covariance[:2, :2], tilt) / 2)
@@ -169,4 +172,4 @@ def test_gravity_of_the_wrong_size_is_refused() -> None:
     imu = noisy_imu(rng, 2.5, NOISE, GYRO_BIAS, np.zeros(3))
     vision, _ = seen_motion(rng, 0.0, 0.0)
     weak = ImuSamples(imu.stamps_ns, imu.gyro_radps, 0.8 * imu.accel_mps2)
-    assert dynamic_initialization(vision, weak, NOISE, SETTINGS, FILTER) is None
+    assert dynamic_initialization(vision, weak, NOISE, SETTINGS) is None

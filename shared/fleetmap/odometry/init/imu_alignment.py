@@ -1,0 +1,203 @@
+"""Alignment of visual odometry with an IMU: gyro bias, gravity, accelerometer bias, velocities, and the scale where it is open.
+
+Sources: Mur-Artal and Tardos 2017 (linear alignment), Qin et al. 2018 (gravity on a sphere).
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from fleetmap.geometry import Array, rotation_between_vectors, skew, so3_exp, so3_log
+from fleetmap.inertial import GRAVITY_MPS2, Preintegrated, preintegrate
+from fleetmap.odometry.filter.nav_state import NavState
+from fleetmap.odometry.init.initial_state import InitialState
+from fleetmap.odometry.settings import OdometrySettings
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.samples import ImuSamples, Trajectory
+
+_MAX_BIAS_SIGMAS = 6.0  # an accelerometer bias beyond it means that something else was fitted
+
+
+@dataclass(frozen=True, slots=True)
+class VisualMotion:
+    """K views in axes of vision: rotations (K, 3, 3) vision_from_body, positions (K, 3) positions_m + scale * unscaled.
+
+    unscaled (K, 3) is None where vision has metres. Sigmas are those of one interval's position and velocity;
+    gravity_weights are those of the first, linear step.
+    """
+
+    stamps_ns: list[int]
+    rotations: Array
+    positions_m: Array
+    unscaled: Array | None
+    sigma_m: float
+    sigma_mps: float
+    gravity_weights: tuple[float, float]
+
+    @property
+    def unknowns(self) -> int:
+        """Before the velocities in `solve`'s order: gravity's direction (2), accelerometer bias (3), scale where it is open."""
+        return 5 if self.unscaled is None else 6
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Gravity's direction (3,) in axes of vision with a basis (3, 2) across it, biases (3,), and the last step's result.
+
+    solution (n,), covariance (n, n): direction (2), accelerometer bias (3), scale where it was open, velocities (3 each).
+    """
+
+    direction: Array
+    basis: Array
+    gyro_bias_radps: Array
+    accel_bias_mps2: Array
+    solution: Array
+    covariance: Array
+
+
+def align(
+    motion: VisualMotion,
+    imu: ImuSamples,
+    noise: ImuNoise,
+    settings: OdometrySettings,
+    *,
+    gravity_slack: float,
+    steps: int,
+) -> Alignment | None:
+    """The alignment after so many Gauss-Newton steps; None where what fits is no gravity or too large a bias.
+
+    gravity_slack: how many times the settings' error gravity's size may have in the linear step.
+    """
+    gyro_bias = np.zeros(3)
+    for _ in range(2):
+        gyro_bias = gyro_bias + _gyro_bias_step(motion, imu, noise, gyro_bias)
+    terms = [preintegrate(imu, a, b, gyro_bias, np.zeros(3), noise) for a, b in pairwise(motion.stamps_ns)]
+    gravity = _free_gravity(motion, terms)
+    max_error = gravity_slack * settings.start.max_gravity_error_mps2
+    if gravity is None or abs(np.linalg.norm(gravity) - GRAVITY_MPS2) > max_error:
+        return None
+    direction, accel_bias = gravity / np.linalg.norm(gravity), np.zeros(3)
+    bias_sigma = settings.filter.initial_accel_bias_sigma_mps2
+    for _ in range(steps):
+        basis = _tangent(direction)
+        solution, covariance = _sphere_step(motion, terms, GRAVITY_MPS2 * direction, basis, accel_bias, bias_sigma)
+        direction = so3_exp(np.cross(direction, basis @ solution[:2])) @ direction
+        accel_bias = accel_bias + solution[2:5]
+    if np.linalg.norm(accel_bias) > _MAX_BIAS_SIGMAS * bias_sigma:
+        return None
+    return Alignment(direction, basis, gyro_bias, accel_bias, solution, covariance)
+
+
+def initial_state(vision: Trajectory, alignment: Alignment) -> InitialState:
+    """The filter's first state and covariance at the last view, in the old frame turned so that gravity points down."""
+    down = np.array([0.0, 0.0, -1.0])
+    turn = rotation_between_vectors(alignment.direction, down)
+    odom_from_old = np.eye(4)
+    odom_from_old[:3, :3] = turn
+    last = odom_from_old @ vision.frame_from_body[-1]
+    state = NavState(
+        last[:3, :3].copy(),
+        turn @ alignment.solution[-3:],
+        last[:3, 3].copy(),
+        alignment.gyro_bias_radps,
+        alignment.accel_bias_mps2,
+    )
+    size = len(alignment.covariance)
+    # order: gravity direction, accelerometer bias, last velocity, then what vision and gyro leave open
+    joint = np.zeros((8, size))
+    joint[:5, :5] = np.eye(5)
+    joint[5:8, size - 3 :] = np.eye(3)
+    solved = joint @ alignment.covariance @ joint.T
+    to_error = np.zeros((15, 8))
+    # gravity known as d, truly d + B x: the frame must turn by r with r x d_odom = -T B x, so r = -d_odom x (T B x)
+    to_error[0:3, 0:2] = -skew(down) @ turn @ alignment.basis
+    to_error[3:6, 5:8] = turn
+    to_error[12:15, 2:5] = np.eye(3)
+    to_error[3:6] += skew(state.velocity_mps) @ to_error[0:3]
+    to_error[6:9] = skew(state.position_m) @ to_error[0:3]
+    covariance = 4.0 * to_error @ solved @ to_error.T
+    floor = np.diag([1e-6] * 3 + [1e-4] * 3 + [1e-6] * 3 + [4e-6] * 3 + [1e-4] * 3)
+    return InitialState(state, covariance + floor, int(vision.stamps_ns[-1]), odom_from_old)
+
+
+def _gyro_bias_step(motion: VisualMotion, imu: ImuSamples, noise: ImuNoise, gyro_bias: Array) -> Array:
+    hessian, gradient = np.zeros((3, 3)), np.zeros(3)
+    for k, (start_ns, end_ns) in enumerate(pairwise(motion.stamps_ns)):
+        term = preintegrate(imu, start_ns, end_ns, gyro_bias, np.zeros(3), noise)
+        seen = motion.rotations[k].T @ motion.rotations[k + 1]
+        error = so3_log(term.delta_rotation.T @ seen)
+        hessian += term.d_rotation_d_gyro.T @ term.d_rotation_d_gyro
+        gradient += term.d_rotation_d_gyro.T @ error
+    return np.asarray(np.linalg.solve(hessian + 1e-12 * np.eye(3), gradient))
+
+
+def _free_gravity(motion: VisualMotion, terms: list[Preintegrated]) -> Array | None:
+    """Gravity (3,) with its size free, by linear least squares over all velocities, and the scale where it is open.
+
+    For each interval, p and v of the body: p' - p - R dp = 0.5 dt^2 g + dt v and -R dv = dt g + v - v'.
+    """
+    count, first = len(motion.rotations), motion.unknowns - 2
+    rows, right = np.zeros((6 * (count - 1), first + 3 * count)), np.zeros(6 * (count - 1))
+    for k, term in enumerate(terms):
+        dt, rotation, at, v = term.dt_s, motion.rotations[k], 6 * k, first + 3 * k
+        rows[at : at + 3, 0:3] = 0.5 * dt * dt * np.eye(3)
+        if motion.unscaled is not None:
+            rows[at : at + 3, 3] = -(motion.unscaled[k + 1] - motion.unscaled[k])
+        rows[at : at + 3, v : v + 3] = dt * np.eye(3)
+        right[at : at + 3] = motion.positions_m[k + 1] - motion.positions_m[k] - rotation @ term.delta_position_m
+        rows[at + 3 : at + 6, 0:3] = dt * np.eye(3)
+        rows[at + 3 : at + 6, v : v + 3] = np.eye(3)
+        rows[at + 3 : at + 6, v + 3 : v + 6] = -np.eye(3)
+        right[at + 3 : at + 6] = -rotation @ term.delta_velocity_mps
+    weights = np.tile(np.repeat(motion.gravity_weights, 3), count - 1)
+    solution, _, rank, _ = np.linalg.lstsq(rows * weights[:, None], right * weights, rcond=None)
+    return np.asarray(solution[:3]) if rank == rows.shape[1] else None
+
+
+def _sphere_step(
+    motion: VisualMotion, terms: list[Preintegrated], gravity: Array, basis: Array, accel_bias: Array, bias_sigma: float
+) -> tuple[Array, Array]:
+    """One Gauss-Newton step with gravity's size known: solution and covariance, see `Alignment`.
+
+    Where the scale is open, residuals beyond the sigmas widen the covariance.
+    """
+    count, first = len(motion.rotations), motion.unknowns
+    size = first + 3 * count
+    hessian, gradient, squares = np.zeros((size, size)), np.zeros(size), 0.0
+    weights = np.repeat([motion.sigma_m**-2, motion.sigma_mps**-2], 3)
+    for k, term in enumerate(terms):
+        dt, rotation, v = term.dt_s, motion.rotations[k], first + 3 * k
+        rows = np.zeros((6, size))
+        rows[0:3, 0:2] = 0.5 * dt * dt * GRAVITY_MPS2 * basis
+        rows[0:3, 2:5] = rotation @ term.d_position_d_accel
+        if motion.unscaled is not None:
+            rows[0:3, 5] = -(motion.unscaled[k + 1] - motion.unscaled[k])
+        rows[0:3, v : v + 3] = dt * np.eye(3)
+        rows[3:6, 0:2] = dt * GRAVITY_MPS2 * basis
+        rows[3:6, 2:5] = rotation @ term.d_velocity_d_accel
+        rows[3:6, v : v + 3] = np.eye(3)
+        rows[3:6, v + 3 : v + 6] = -np.eye(3)
+        moved = term.delta_position_m + term.d_position_d_accel @ accel_bias
+        gained = term.delta_velocity_mps + term.d_velocity_d_accel @ accel_bias
+        shift = motion.positions_m[k + 1] - motion.positions_m[k] - 0.5 * dt * dt * gravity - rotation @ moved
+        right = np.concatenate([shift, -dt * gravity - rotation @ gained])
+        hessian += rows.T @ (weights[:, None] * rows)
+        gradient += rows.T @ (weights * right)
+        squares += float(right @ (weights * right))
+    hessian[2:5, 2:5] += np.eye(3) / bias_sigma**2
+    gradient[2:5] -= accel_bias / bias_sigma**2
+    covariance = np.linalg.inv(hessian + 1e-9 * np.eye(size))
+    solution = np.asarray(covariance @ gradient)
+    if motion.unscaled is not None:
+        left = max(squares - float(gradient @ solution), 0.0) / max(6 * (count - 1) - size + 3, 1)
+        covariance = max(left, 1.0) * covariance
+    return solution, np.asarray(covariance)
+
+
+def _tangent(direction: Array) -> Array:
+    """(3, 2) orthonormal basis across a direction."""
+    other = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    first = np.cross(direction, other)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(direction, first)], axis=1)

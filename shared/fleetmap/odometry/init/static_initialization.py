@@ -1,0 +1,66 @@
+"""Static initialization: gravity, tilt and gyro bias from a steady IMU."""
+
+import numpy as np
+
+from fleetmap.geometry import Array, rotation_between_vectors
+from fleetmap.inertial import GRAVITY_MPS2
+from fleetmap.odometry.filter.nav_state import NavState
+from fleetmap.odometry.init import static_initialization_kernels
+from fleetmap.odometry.init.initial_state import InitialState
+from fleetmap.odometry.settings import FilterSettings, OdometrySettings, StartSettings
+from fleetmap.sensors.samples import ImuSamples
+
+_MAX_LOOK_BACK_S = 20.0
+
+
+def static_initialization(imu: ImuSamples, until_ns: int, settings: OdometrySettings) -> InitialState | None:
+    """The state at the end of the latest steady window before `until_ns`; None where the IMU was never steady."""
+    window_ns = int(settings.start.steady_window_s * 1e9)
+    if not len(imu):
+        return None
+    first_ns = max(int(imu.stamps_ns[0]), until_ns - int(_MAX_LOOK_BACK_S * 1e9))
+    end_ns = static_initialization_kernels.latest_steady(
+        imu.stamps_ns, imu.gyro_radps, imu.accel_mps2, first_ns, until_ns, window_ns, _limits(settings.start)
+    )
+    if end_ns < first_ns:
+        return None
+    return _steady_state(imu.between(end_ns - window_ns, end_ns), end_ns, settings.filter)
+
+
+def is_steady(window: ImuSamples, settings: StartSettings) -> bool:
+    """Whether the means of tenths of the window agree: vibration averages out, motion that matters does not.
+
+    Standing still and rolling at constant speed look alike here; gravity can be read in both, so the speed stays open.
+    """
+    return static_initialization_kernels.is_steady(window.gyro_radps, window.accel_mps2, _limits(settings))
+
+
+def _limits(settings: StartSettings) -> Array:
+    spreads = settings.steady_gyro_sigma_radps, settings.steady_accel_sigma_mps2
+    return np.array([*spreads, settings.steady_gyro_mean_radps, GRAVITY_MPS2, settings.max_gravity_error_mps2])
+
+
+def _steady_state(window: ImuSamples, stamp_ns: int, settings: FilterSettings) -> InitialState:
+    force = window.accel_mps2.mean(axis=0)
+    rotation = rotation_between_vectors(force, np.array([0.0, 0.0, 1.0]))
+    state = NavState(rotation=rotation, gyro_bias_radps=window.gyro_radps.mean(axis=0))
+    # the accelerometer's bias along gravity shows in its size; across gravity it hides in the tilt
+    up_body = force / np.linalg.norm(force)
+    state.accel_bias_mps2 = 0.5 * (np.linalg.norm(force) - GRAVITY_MPS2) * up_body
+    velocity, gyro, accel = (
+        sigma**2
+        for sigma in (
+            settings.initial_velocity_sigma_mps,
+            settings.initial_gyro_bias_sigma_radps,
+            settings.initial_accel_bias_sigma_mps2,
+        )
+    )
+    covariance = np.diag([0.0] * 3 + [velocity] * 3 + [1e-8] * 3 + [gyro] * 3 + [accel] * 3)
+    # tilt and bias errors are one: R (a_m - ba) must keep pointing up, so r_xy follows from R dba
+    tilt_from_force = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]) / GRAVITY_MPS2
+    by_bias = tilt_from_force @ rotation
+    tilt = settings.initial_tilt_sigma_rad**2
+    covariance[0:3, 0:3] = accel * by_bias @ by_bias.T + np.diag([tilt, tilt, 1e-8])
+    covariance[0:3, 12:15] = accel * by_bias
+    covariance[12:15, 0:3] = covariance[0:3, 12:15].T
+    return InitialState(state, covariance, stamp_ns, np.eye(4))
