@@ -1,16 +1,16 @@
 """The command `mapserver`. Heavy imports happen inside the commands, after their arguments are checked."""
 
 import os
-
-import typer
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fleetmap.cli_exit import run
+from fleetmap.cli_options import Commands, ConfigFile, Options, make_app
 from mapserver.commands.build import build
-from mapserver.commands.config_option import ConfigFile
 from mapserver.commands.convert import convert
 from mapserver.commands.doctor import doctor
 from mapserver.commands.evaluate import evaluate
-from mapserver.commands.fleet import fleet_app
+from mapserver.commands.fleet import FLEET
 from mapserver.commands.nightly import nightly
 from mapserver.commands.releases.diff import diff
 from mapserver.commands.releases.inspect import inspect
@@ -25,26 +25,45 @@ from mapserver.commands.store.import_ import import_
 from mapserver.commands.store.verify import verify
 from mapserver.commands.train_vocabulary import train_vocabulary
 
-COMMANDS = (
-    build, nightly, publish, promote, rollback, versions, inspect, diff, serve, verify, gc, export, import_,
-    convert, doctor, evaluate, train_vocabulary,
-)  # fmt: skip
+if TYPE_CHECKING:
+    from mapserver.config import MapserverConfig
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+COMMANDS: Commands = {
+    "build": build,
+    "nightly": nightly,
+    "publish": publish,
+    "promote": promote,
+    "rollback": rollback,
+    "versions": versions,
+    "inspect": inspect,
+    "diff": diff,
+    "serve": serve,
+    "verify": verify,
+    "gc": gc,
+    "export": export,
+    "import": import_,
+    "convert": convert,
+    "doctor": doctor,
+    "evaluate": evaluate,
+    "train-vocabulary": train_vocabulary,
+    "fleet": FLEET,
+}
 
 
-@app.callback()
 def mapserver(config: ConfigFile = None) -> None:
     """Build, keep and serve the maps of a fleet of camera robots.
 
-    Every option can also stand in the TOML file of --config, in a section named after its command.
+    Every option can also be set in the TOML file of --config, in a section named after its command.
     """
 
 
-for _command in COMMANDS:
-    app.command(_command.__name__.rstrip("_").replace("_", "-"))(_command)
-app.add_typer(fleet_app, name="fleet")
+def _read_config(path: Path | None) -> "tuple[MapserverConfig, Options]":
+    from mapserver.config import read_config
 
+    return read_config(path, COMMANDS)
+
+
+app = make_app(COMMANDS, mapserver, _read_config)
 
 # Before anything imports numpy: many small products, for which a second BLAS thread costs more than it brings.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -1,17 +1,32 @@
-"""Settings: frozen structs decoded from TOML, unknown keys refused."""
+"""Settings: frozen structs decoded from TOML, unknown keys refused, internal constants too.
 
+Settings come in three tiers. A file may set user and tuning settings; each program lists their keys in its `Tiers`. Every other
+field of a section is an internal constant: it has its reason beside it in the code, and no key in a file.
+"""
+
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
 from fleetmap.errors import UsageError
 
 S = TypeVar("S", bound="Section")
+# By tier and section ("" is the top of the file), keys separated by spaces, or `*`.
+Tiers = Mapping[str, Mapping[str, str]]
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Base of every configuration section. Key names carry their units."""
+
+
+class Setting(NamedTuple):
+    """One value of a configuration."""
+
+    section: str  # dotted name
+    key: str
+    value: Any
 
 
 def load_toml(path: Path, section_type: type[S]) -> S:
@@ -19,12 +34,63 @@ def load_toml(path: Path, section_type: type[S]) -> S:
 
     Raises UsageError naming the file and the offending key for unreadable files, unknown keys and wrong types.
     """
+    settings: S = _decoded(path, section_type)
+    return settings
+
+
+def read_given(path: Path, file_type: type[Section]) -> dict[str, Any]:
+    """The keys that the file at `path` sets, checked against `file_type`; UsageError as `load_toml`."""
+    _decoded(path, file_type)
+    given: dict[str, Any] = _decoded(path, dict[str, Any])
+    return given
+
+
+def _decoded(path: Path, kind: Any) -> Any:
     try:
-        return msgspec.toml.decode(path.read_bytes(), type=section_type)
+        return msgspec.toml.decode(path.read_bytes(), type=kind)
     except OSError as error:
         raise UsageError(f"configuration file {path} cannot be read ({error.strerror}); check the path") from error
     except msgspec.MsgspecError as error:
-        raise UsageError(f"configuration file {path}: {error}; the settings are listed in the README") from error
+        raise UsageError(f"configuration file {path}: {error}; docs/settings.md lists the settings") from error
+
+
+def settings_in(section: Section, name: str = "") -> Iterator[Setting]:
+    """All values of a section and of the sections in it, in order."""
+    for field in msgspec.structs.fields(section):
+        value = getattr(section, field.name)
+        if isinstance(value, Section):
+            yield from settings_in(value, f"{name}.{field.encode_name}".lstrip("."))
+        else:
+            yield Setting(name, field.encode_name, value)
+
+
+def tier_of(setting: Setting, tiers: Tiers) -> str | None:
+    """The tier of a setting, None for an internal constant."""
+    fitting = (name for name, keys in tiers.items() if {setting.key, "*"} & set(keys.get(setting.section, "").split()))
+    return next(fitting, None)
+
+
+def refuse_internal(path: Path, given: Mapping[str, Any], defaults: Section, tiers: Tiers) -> None:
+    """Raises UsageError where the file at `path`, with the keys `given`, sets an internal constant of `defaults`."""
+    for setting in settings_in(defaults):
+        section: Any = given
+        for word in filter(None, setting.section.split(".")):
+            section = section.get(word, {})
+        if setting.key in section and tier_of(setting, tiers) is None:
+            name = f"{setting.section}.{setting.key}".lstrip(".")
+            raise UsageError(
+                f"configuration file {path}: {name} is an internal constant now; delete the key. "
+                "docs/settings.md lists the settings"
+            )
+
+
+def over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Two contents of files as one: where both set a key, that of `above` counts."""
+    merged = dict(below)
+    for key, value in above.items():
+        old = merged.get(key)
+        merged[key] = over(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return merged
 
 
 def to_dict(section: Section) -> dict[str, object]:

@@ -1,30 +1,40 @@
 """`mapserver evaluate`: an estimated trajectory against the truth."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from mapserver.commands.config_option import ConfigFile
+from fleetmap.cli_options import ConfigFile, expand_options
+from mapserver.commands.options import Json
+from mapserver.commands.print_json import print_json
 
 
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """Options of `evaluate`."""
+
+    ground_truth: Annotated[Path, typer.Option(metavar="FILE", help="True trajectory of the same body, TUM text.")]
+    covariances: Annotated[
+        Path | None, typer.Option(metavar="FILE.csv", help="Covariances of the estimate; adds their NEES.")
+    ] = None
+    from_first: Annotated[
+        bool, typer.Option("--from-first", help="Align the first pose with the truth: for odometry without a map.")
+    ] = False
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Number of frames that should have an estimate, for evaluated_share.")
+    ] = None
+
+
+@expand_options
 def evaluate(
     estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE.tum", help="Estimated trajectory, TUM text.")],
-    ground_truth: Annotated[Path, typer.Option(metavar="FILE", help="True trajectory of the same body, TUM text.")],
-    covariances: Annotated[
-        Path | None, typer.Option(metavar="FILE.csv", help="The estimate's own covariances: judges them too (NEES).")
-    ] = None,
-    from_first: Annotated[
-        bool, typer.Option("--from-first", help="Place the first stamp on the truth: for odometry, which has no map.")
-    ] = False,
-    frames: Annotated[
-        int | None, typer.Option(min=1, help="Frames that should have an estimate, the base of evaluated_share.")
-    ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    options: EvaluateOptions,
+    json: Json = False,
     config: ConfigFile = None,
 ) -> None:
     """Print the errors of a trajectory: aligned rigidly, aligned with scale, as it is, from stamp to stamp, and its drift."""
-    import msgspec
     from rich.console import Console
     from rich.table import Table
 
@@ -32,14 +42,13 @@ def evaluate(
     from fleetmap.recordings.tum import read_tum
     from mapserver.evaluation.summary_table import summary
 
-    found = summary(
-        read_tum(estimate), read_tum(ground_truth), frames=frames, from_first=from_first,
-        covariances=None if covariances is None else read_covariances(covariances),
-    )  # fmt: skip
+    covariances = None if options.covariances is None else read_covariances(options.covariances)
+    trajectories = read_tum(estimate), read_tum(options.ground_truth)
+    found = summary(*trajectories, frames=options.frames, from_first=options.from_first, covariances=covariances)
     if json:
-        typer.echo(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
+        print_json(found)
         return
-    table = Table("error", "value", title=f"{estimate.name} against {ground_truth.name}")
+    table = Table("error", "value", title=f"{estimate.name} against {options.ground_truth.name}")
     for key, value in found.items():
         table.add_row(key, f"{value:.5g}" if isinstance(value, float) else str(value))
     Console().print(table)

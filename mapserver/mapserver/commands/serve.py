@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mapserver.commands.config_option import ConfigFile, config_path
+from fleetmap.cli_options import ConfigFile, settings_of
+from mapserver.commands.options import StoreFolder
 
 if TYPE_CHECKING:
     import socket
@@ -25,13 +26,14 @@ _SWITCH_INTERVAL_S = 0.001
 
 def serve(
     context: typer.Context,
-    store: Annotated[Path, typer.Option(help="Folder of the map store.")],
-    http: Annotated[str, typer.Option(help="Where to listen for HTTP; port 0 takes a free one.")] = "127.0.0.1:8080",
+    store: StoreFolder,
+    http: Annotated[str, typer.Option(help="HTTP address to listen on; port 0 picks a free port.")] = "127.0.0.1:8080",
     zenoh: Annotated[
-        str, typer.Option(help="Where to listen for robots; port 0 takes a free one.")
+        str, typer.Option(help="zenoh endpoint to listen on; port 0 picks a free port.")
     ] = "tcp/127.0.0.1:7447",
     token_file: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="File with the token that changes over HTTP need.")
+        Path | None,
+        typer.Option(metavar="FILE", help="File with the token that HTTP requests need to change anything."),
     ] = None,
     config: ConfigFile = None,
 ) -> None:
@@ -42,11 +44,10 @@ def serve(
 
     check_endpoint(zenoh)
     from mapserver.api.writers import Writers, is_loopback_name
-    from mapserver.config import read_config
     from mapserver.store import MapStore
 
     writers = Writers(token, is_loopback_name(host))
-    settings = read_config(config_path(context))
+    settings = settings_of(context)
     # The sockets come before the store is read, so that a wrong address is told at once.
     with _listening(host, port) as listener, MapStore.open(store) as maps, ZenohBus.listen(zenoh) as bus:
         _run(maps, bus, listener, writers, settings)

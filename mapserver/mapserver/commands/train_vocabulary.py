@@ -1,12 +1,13 @@
 """`mapserver train-vocabulary`: words of place recognition from pictures."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fleetmap.cli_options import ConfigFile, expand_options, settings_of
 from fleetmap.errors import UsageError
-from mapserver.commands.config_option import ConfigFile, config_path
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -17,14 +18,22 @@ if TYPE_CHECKING:
     from fleetmap.features.orb import OrbSettings
 
 
+@dataclass(frozen=True, kw_only=True)
+class VocabularyOptions:
+    """Size of the tree, and the frames that it is trained on."""
+
+    frames: Annotated[str, typer.Option(metavar="A:B:C", help="Slice of each recording's frames.")] = "::10"
+    branching: Annotated[int, typer.Option(min=2, max=64, help="Children of each node.")] = 10
+    levels: Annotated[int, typer.Option(min=1, max=6, help="Levels of the tree.")] = 4
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the clustering.")] = 0
+
+
+@expand_options
 def train_vocabulary(
     context: typer.Context,
     recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folders or .mcap files.")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="File to write.")],
-    frames: Annotated[str, typer.Option(metavar="A:B:C", help="Slice of each recording's frames.")] = "::10",
-    branching: Annotated[int, typer.Option(min=2, max=64, help="Children of each node.")] = 10,
-    levels: Annotated[int, typer.Option(min=1, max=6, help="Levels of the tree.")] = 4,
-    seed: Annotated[int, typer.Option(min=0, help="Of the clustering.")] = 0,
+    options: VocabularyOptions,
     config: ConfigFile = None,
 ) -> None:
     """Make a vocabulary from the pictures of recordings; `build --vocabulary` uses it."""
@@ -32,21 +41,20 @@ def train_vocabulary(
 
     if not out.parent.is_dir():
         raise UsageError(f"--out {out}: the folder {out.parent} does not exist; create it first")
+    branching, levels = options.branching, options.levels
     if branching**levels > MAX_NODES // 2:
-        raise UsageError(
-            f"--branching {branching} --levels {levels}: up to {branching**levels} words are too many; use fewer"
-        )
+        words = f"up to {branching**levels} words are too many; use fewer"
+        raise UsageError(f"--branching {branching} --levels {levels}: {words}")
     import numpy as np
 
     from fleetmap.bow import encode_vocabulary, vocabulary_hash
     from fleetmap.bow import train_vocabulary as train
-    from mapserver.config import read_config
 
-    orb = read_config(config_path(context)).survey.orb
-    pictures = [rows for recording in recordings for rows in _descriptors(recording, frames, orb)]
+    orb = settings_of(context).survey.orb
+    pictures = [rows for recording in recordings for rows in _descriptors(recording, options.frames, orb)]
     images = np.repeat(np.arange(len(pictures)), [len(rows) for rows in pictures])
     rows = np.concatenate(pictures)
-    vocabulary = train(rows, branching, levels, np.random.default_rng(seed), images)
+    vocabulary = train(rows, branching, levels, np.random.default_rng(options.seed), images)
     data = encode_vocabulary(vocabulary)
     try:
         out.write_bytes(data)

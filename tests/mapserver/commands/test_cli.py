@@ -1,6 +1,5 @@
 """The command line as a whole: exit statuses, configuration file, speed of --help."""
 
-import inspect
 import json
 import subprocess
 import sys
@@ -9,14 +8,16 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import typer
 
+from fleetmap.cli_options import file_type
+from fleetmap.config import Section
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3_exp
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver import cli
-from mapserver.commands.fleet import fleet_app
-from mapserver.config import MapserverConfig, command_defaults, read_config
+from mapserver.config import MapserverConfig, read_config
 from mapserver.quality.figures import Evidence, TileDirections
 from mapserver.store import DraftContent, MapStore
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
@@ -95,24 +96,21 @@ def test_interruption_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
 
 def test_every_option_has_its_key_in_the_file() -> None:
     """And every section and key belongs to a command, to a command of a group, or to settings of their own."""
-    commands = {command.__name__: command for command in cli.COMMANDS}
-    sections = {field.name: field.default for field in msgspec.structs.fields(MapserverConfig)}
-    assert set(sections) == {*commands, "fleet", "survey", "gate", "ingest", "canary", "resurvey"}
-    grouped = {command.callback.__name__: command.callback for command in fleet_app.registered_commands}
-    assert set(sections["fleet"].__struct_fields__) == set(grouped)
-    commands |= {f"fleet.{name}": command for name, command in grouped.items()}
-    sections |= {f"fleet.{name}": getattr(sections["fleet"], name) for name in grouped}
-    for name, command in commands.items():
-        options = set()
-        for parameter in inspect.signature(command).parameters.values():
-            kinds = [type(m).__name__ for m in getattr(parameter.annotation, "__metadata__", ())]
-            if "OptionInfo" in kinds and parameter.name != "config":
-                options.add(parameter.name)
-        keys = set(sections[name].__struct_fields__)
-        missing = options - keys
-        assert not missing, f"{name}: {missing} cannot stand in the file"
-        if name not in ("versions", "inspect", "diff", "verify"):  # these share a section type
-            assert keys == options
+    file = file_type(MapserverConfig, cli.COMMANDS)()
+    settings = {"site", "store", "survey", "gate", "ingest", "canary", "resurvey"}
+    assert set(_keys(file)) == settings | {name.replace("-", "_") for name in cli.COMMANDS}
+    shown = typer.main.get_command(cli.app).commands
+    commands = {name: (command, _keys(file)[name.replace("-", "_")]) for name, command in shown.items()}
+    _, fleet = commands.pop("fleet")
+    assert set(_keys(fleet)) == set(shown["fleet"].commands)
+    commands |= {f"fleet {name}": (command, _keys(fleet)[name]) for name, command in shown["fleet"].commands.items()}
+    for name, (command, section) in commands.items():
+        options = {p.name.rstrip("_") for p in command.params if p.param_type_name == "option"}
+        assert set(_keys(section)) == options - {"config"}, name
+
+
+def _keys(section: Section) -> dict[str, object]:
+    return {field.encode_name: getattr(section, field.name) for field in msgspec.structs.fields(section)}
 
 
 def test_the_file_gives_defaults_and_the_command_line_wins(
@@ -130,6 +128,21 @@ def test_the_file_gives_defaults_and_the_command_line_wins(
     ):
         assert status(monkeypatch, *arguments) == 0
         assert len(json.loads(capsys.readouterr().out)) == count
+
+
+def test_site_and_store_are_said_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with MapStore.open(tmp_path / "store", create=True) as maps:
+        save_sample_draft(maps, site="lab")
+        save_sample_draft(maps, site="hall")
+        save_sample_draft(maps, site="hall")
+    file = tmp_path / "site.toml"
+    file.write_text(f'site = "lab"\nstore = "{tmp_path / "store"}"\n[inspect]\nsite = "hall"\nversion = 2\n')
+    assert status(monkeypatch, "--config", file, "versions", "--json") == 0
+    assert [info["site"] for info in json.loads(capsys.readouterr().out)] == ["lab"]
+    assert status(monkeypatch, "--config", file, "inspect") == 0
+    assert "site hall version 2" in capsys.readouterr().out
 
 
 def test_build_takes_its_settings_from_the_file(
@@ -160,6 +173,7 @@ def test_build_takes_its_settings_from_the_file(
         ("[build]\nsight = 'lab'", "sight"),
         ("[survey.loops]\ntop = 'many'", "survey.loops.top"),
         ("[biuld]", "biuld"),
+        ("[survey.bundle]\npcg_tolerance = 1e-3", "survey.bundle.pcg_tolerance is an internal constant now"),
         ("[build", "site.toml"),
     ],
 )
@@ -169,13 +183,13 @@ def test_a_wrong_file_is_a_usage_error(
     file = tmp_path / "site.toml"
     file.write_text(text)
     with pytest.raises(UsageError, match=said):
-        read_config(file)
+        read_config(file, cli.COMMANDS)
     assert status(monkeypatch, "build", "r", "--site", "lab", "--store", "s", "--config", file) == 2
     assert said in capsys.readouterr().err
 
 
 def test_no_file_sets_nothing() -> None:
-    assert all(not options for options in command_defaults(read_config(None)).values())
+    assert read_config(None, cli.COMMANDS) == (MapserverConfig(), {})
 
 
 def test_evaluate_prints_the_errors(

@@ -22,14 +22,12 @@ from fleetmap.messages import RobotHealth, WantedVersion
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver import cli, releases
-from mapserver.commands.releases.inspect import inspect
-from mapserver.commands.releases.publish import publish
-from mapserver.commands.releases.versions import versions
 from mapserver.commands.serve import serve
+from mapserver.config import MapserverConfig
 from mapserver.store import DraftContent, MapStore
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
-PROGRAM = "import sys, typer; from mapserver.commands.serve import serve; typer.run(serve)"
+PROGRAM = ("-m", "mapserver.cli", "serve")
 
 
 @contextmanager
@@ -38,7 +36,7 @@ def serving(store: Path, endpoint: str = "tcp/127.0.0.1:0") -> Iterator[tuple[su
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     arguments = ["--store", str(store), "--http", "127.0.0.1:0", "--zenoh", endpoint]
     process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, *arguments], env=environment, stdout=subprocess.PIPE, text=True
+        [sys.executable, *PROGRAM, *arguments], env=environment, stdout=subprocess.PIPE, text=True
     )
     try:
         addresses = dict(process.stdout.readline().strip().split(": ", 1) for _ in range(2))
@@ -119,7 +117,7 @@ def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path
 
 
 def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:
-    context = typer.Context(typer.main.get_command(cli.app))
+    context = typer.Context(typer.main.get_command(cli.app), obj=lambda _: (MapserverConfig(), {}))
     with pytest.raises(UsageError, match="--http 'nonsense'"):
         serve(context, tmp_path, "nonsense", "tcp/127.0.0.1:0")
     with pytest.raises(UsageError, match="endpoint"):
@@ -134,10 +132,8 @@ def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:
             serve(context, tmp_path, "127.0.0.1:0", "tcp/127.0.0.1:0", file)
 
 
-def run(command: object, *arguments: str) -> str:
-    app = typer.Typer()
-    app.command()(command)
-    result = CliRunner().invoke(app, list(arguments))
+def run(*arguments: str) -> str:
+    result = CliRunner().invoke(cli.app, list(arguments))
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     assert result.exit_code == 0, result.output
@@ -148,27 +144,27 @@ def test_publish_versions_and_inspect(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         save_sample_draft(store)
     where = ("--site", "lab", "--store", str(tmp_path))
-    assert "version 1 is current (2 tiles, 80 landmarks" in run(publish, *where)
-    (row,) = json.loads(run(versions, *where, "--json"))
+    assert "version 1 is current (2 tiles, 80 landmarks" in run("publish", *where)
+    (row,) = json.loads(run("versions", *where, "--json"))
     assert (row["version"], row["state"], row["landmarks"]) == (1, "current", 80)
-    assert "current" in run(versions, *where)
-    shown = json.loads(run(inspect, *where, "--json"))
+    assert "current" in run("versions", *where)
+    shown = json.loads(run("inspect", *where, "--json"))
     assert shown["manifest"]["report"] == {"path_m": 12.5}
     assert shown["bytes_per_m"] == pytest.approx(shown["map_bytes"] / 12.5)
-    text = run(inspect, *where)
+    text = run("inspect", *where)
     assert "bytes per metre" in text
     assert "2 tiles of 16 m" in text
     assert "walk" in text
     with pytest.raises(UsageError, match="no draft"):
-        run(publish, *where)
+        run("publish", *where)
     with pytest.raises(UsageError, match="no version 5"):
-        run(inspect, *where, "--version", "5")
+        run("inspect", *where, "--version", "5")
 
 
 def test_an_empty_draft_ends_with_the_gates_status(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         store.save_draft("lab", DraftContent(tiles=[], vocabulary=b"v", details=draft_details()))
     with pytest.raises(GateRefusedError) as refusal:
-        run(publish, "--site", "lab", "--store", str(tmp_path))
+        run("publish", "--site", "lab", "--store", str(tmp_path))
     assert refusal.value.exit_status == 4
-    assert json.loads(run(inspect, "--site", "lab", "--store", str(tmp_path), "--json"))["bytes_per_m"] is None
+    assert json.loads(run("inspect", "--site", "lab", "--store", str(tmp_path), "--json"))["bytes_per_m"] is None

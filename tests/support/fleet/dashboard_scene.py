@@ -36,7 +36,7 @@ from support.storage.map_samples import draft_details
 SITE = "hall"
 TILE_M = 16.0
 LENGTH_M, WIDTH_M, AISLE_M = 64.0, 32.0, 8.0
-PROGRAM = "import sys, typer; from mapserver.commands.serve import serve; typer.run(serve)"
+PROGRAM = ("-m", "mapserver.cli", "serve")
 _STATUSES = ("TRACKING",) * 17 + ("DEGRADED", "LOST", "AMBIGUOUS")
 
 
@@ -261,7 +261,7 @@ def serving(folder: Path, *options: str, http: str = "127.0.0.1:0") -> Iterator[
     arguments = ["--store", str(folder), "--http", http, "--zenoh", "tcp/127.0.0.1:0", *options]
     with (folder / "server.log").open("w+", encoding="utf-8") as log:
         process = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, *arguments], env=environment, stdout=subprocess.PIPE, stderr=log, text=True
+            [sys.executable, *PROGRAM, *arguments], env=environment, stdout=subprocess.PIPE, stderr=log, text=True
         )
         try:
             addresses = dict(process.stdout.readline().strip().split(": ", 1) for _ in range(2))

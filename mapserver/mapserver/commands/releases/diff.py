@@ -1,10 +1,10 @@
 """`mapserver diff`: what changed from one version to another."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mapserver.commands.options import Json, SiteName, StoreFolder
 from mapserver.commands.print_json import print_json
 
 if TYPE_CHECKING:
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 def diff(
     before: Annotated[int, typer.Argument(min=1, metavar="A", help="The older version.")],
     after: Annotated[int, typer.Argument(min=1, metavar="B", help="The newer version.")],
-    site: Annotated[str, typer.Option(help="Name of the site.")],
-    store: Annotated[Path, typer.Option(help="Folder of the map store.")],
-    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    site: SiteName,
+    store: StoreFolder,
+    json: Json = False,
 ) -> None:
     """Show what changed from version A to version B: tiles, landmarks, bytes to fetch, quality side by side."""
     from mapserver import releases

@@ -1,10 +1,10 @@
 """`mapserver inspect`: what is in a version."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mapserver.commands.options import Json, SiteName, StoreFolder
 from mapserver.commands.print_json import print_json
 
 if TYPE_CHECKING:
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 def inspect(
-    site: Annotated[str, typer.Option(help="Name of the site.")],
-    store: Annotated[Path, typer.Option(help="Folder of the map store.")],
+    site: SiteName,
+    store: StoreFolder,
     version: Annotated[
         int | None, typer.Option(min=1, help="Version; the current one if left out, else the newest.")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    json: Json = False,
 ) -> None:
     """Show a version's manifest: tiles, sizes, recordings and the build's report."""
     from mapserver.store import MapStore

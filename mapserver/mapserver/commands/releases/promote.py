@@ -1,24 +1,22 @@
 """`mapserver promote`: a version becomes current, for all robots at once or for some of them first."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from mapserver.commands.actor_option import ActorName, Reason, acting
-from mapserver.commands.config_option import ConfigFile, config_path
+from fleetmap.cli_options import ConfigFile, expand_options, settings_of
+from mapserver.commands.options import ActorOptions, SiteOptions
 
 
+@expand_options
 def promote(
     context: typer.Context,
     version: Annotated[int, typer.Argument(min=1, metavar="VERSION", help="The version; `versions` lists them.")],
-    site: Annotated[str, typer.Option(help="Name of the site.")],
-    store: Annotated[Path, typer.Option(help="Folder of the map store.")],
+    where: SiteOptions,
+    by: ActorOptions,
     canary: Annotated[
         str | None, typer.Option(metavar="SHARE", help="Let such a share of the robots try it first, such as 5%.")
     ] = None,
-    actor: ActorName = None,
-    reason: Reason = "",
     config: ConfigFile = None,
 ) -> None:
     """Make VERSION, published before, the current version of its site.
@@ -26,19 +24,18 @@ def promote(
     With --canary some robots run it first (a draft goes through the gate before); the server then promotes it or takes it back.
     """
     from mapserver import releases
-    from mapserver.config import read_config
     from mapserver.store import MapStore
 
     share = None if canary is None else _share(canary)
-    gate = read_config(config_path(context)).gate
-    with MapStore.open(store) as maps:
+    gate = settings_of(context).gate
+    with MapStore.open(where.store) as maps:
         if share is None:
-            releases.promote(maps, site, version, actor=acting(actor, reason))
-            typer.echo(f"site {site}: version {version} is current")
+            releases.promote(maps, where.site, version, actor=by.named())
+            typer.echo(f"site {where.site}: version {version} is current")
             return
-        begun = releases.start_canary(maps, site, version, share, actor=acting(actor, reason), gate=gate)
+        begun = releases.start_canary(maps, where.site, version, share, actor=by.named(), gate=gate)
     typer.echo(
-        f"site {site}: {share:g} of the robots try version {version}, the others stay on {begun.base_version}; "
+        f"site {where.site}: {share:g} of the robots try version {version}, the others stay on {begun.base_version}; "
         "`mapserver serve` judges it, `rollback` takes it back"
     )
 

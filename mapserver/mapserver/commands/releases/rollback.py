@@ -1,23 +1,21 @@
 """`mapserver rollback`: back to the version that was current before."""
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
-from mapserver.commands.actor_option import ActorName, Reason, acting
+from fleetmap.cli_options import expand_options
+from mapserver.commands.options import ActorOptions, SiteName, StoreFolder
 
 
+@expand_options
 def rollback(
-    site: Annotated[str, typer.Option(help="Name of the site.")],
-    store: Annotated[Path, typer.Option(help="Folder of the map store.")],
-    actor: ActorName = None,
-    reason: Reason = "",
+    site: SiteName,
+    store: StoreFolder,
+    by: ActorOptions,
 ) -> None:
     """Make the version current that was so before the current one, which retires."""
     from mapserver import releases
     from mapserver.store import MapStore
 
     with MapStore.open(store) as maps:
-        version = releases.roll_back(maps, site, actor=acting(actor, reason))
+        version = releases.roll_back(maps, site, actor=by.named())
     typer.echo(f"site {site}: version {version} is current again")

@@ -1,17 +1,13 @@
 """`mapserver versions`: what versions a site has."""
 
-from pathlib import Path
-from typing import Annotated
-
-import typer
-
+from mapserver.commands.options import Json, SiteName, StoreFolder
 from mapserver.commands.print_json import print_json
 
 
 def versions(
-    site: Annotated[str, typer.Option(help="Name of the site.")],
-    store: Annotated[Path, typer.Option(help="Folder of the map store.")],
-    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    site: SiteName,
+    store: StoreFolder,
+    json: Json = False,
 ) -> None:
     """List the versions of a site with their states, oldest first."""
     from rich.console import Console

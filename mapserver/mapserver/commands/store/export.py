@@ -6,12 +6,13 @@ from typing import Annotated
 import typer
 
 from fleetmap.errors import UsageError
+from mapserver.commands.options import SiteName, StoreFolder
 
 
 def export(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write; replaced where it exists.")],
-    site: Annotated[str, typer.Option(help="Name of the site.")],
-    store: Annotated[Path, typer.Option(help="Folder of the map store.")],
+    site: SiteName,
+    store: StoreFolder,
     version: Annotated[int | None, typer.Option(min=1, help="Version; the current one if left out.")] = None,
     without_archive: Annotated[
         bool, typer.Option("--without-archive", help="Leave out what only a later survey needs.")

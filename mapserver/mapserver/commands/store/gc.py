@@ -1,26 +1,34 @@
 """`mapserver gc`: removes what nobody needs from a store."""
 
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Annotated
 
 import typer
 
-from mapserver.commands.actor_option import ActorName, Reason, acting
+from fleetmap.cli_options import expand_options
+from mapserver.commands.options import ActorOptions, Json, StoreFolder
 from mapserver.commands.print_json import print_json
 
 
-def gc(
-    store: Annotated[Path, typer.Option(help="Folder of the map store.")],
-    keep_versions: Annotated[int, typer.Option(min=0, help="Published versions of a site that stay.")] = 5,
-    keep_drafts: Annotated[int, typer.Option(min=0, help="Drafts of a site that stay.")] = 3,
-    keep_days: Annotated[float, typer.Option(min=0, help="Days that retired versions and old drafts stay.")] = 7.0,
+@dataclass(frozen=True, kw_only=True)
+class RetentionOptions:
+    """Versions that stay."""
+
+    keep_versions: Annotated[int, typer.Option(min=0, help="Published versions of a site to keep.")] = 5
+    keep_drafts: Annotated[int, typer.Option(min=0, help="Drafts of a site to keep.")] = 3
+    keep_days: Annotated[float, typer.Option(min=0, help="Days to keep retired versions and old drafts.")] = 7.0
     robot_days: Annotated[
-        float, typer.Option(min=0, help="Days that a silent robot still counts as using its version.")
-    ] = 30.0,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would go, remove nothing.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of sentences.")] = False,
-    actor: ActorName = None,
-    reason: Reason = "",
+        float, typer.Option(min=0, help="Days for which a silent robot still counts as using its version.")
+    ] = 30.0
+
+
+@expand_options
+def gc(
+    store: StoreFolder,
+    retention: RetentionOptions,
+    by: ActorOptions,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would be removed; remove nothing.")] = False,
+    json: Json = False,
 ) -> None:
     """Remove drafts and retired versions beyond retention, and files that nothing mentions.
 
@@ -28,9 +36,8 @@ def gc(
     """
     from mapserver.store import MapStore, Retention
 
-    retention = Retention(keep_versions, keep_drafts, keep_days, robot_days)
     with MapStore.open(store) as maps:
-        garbage = maps.collect_garbage(retention, dry_run=dry_run, actor=acting(actor, reason))
+        garbage = maps.collect_garbage(Retention(**vars(retention)), dry_run=dry_run, actor=by.named())
     if json:
         print_json(garbage)
         return

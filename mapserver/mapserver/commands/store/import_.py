@@ -5,18 +5,19 @@ from typing import Annotated
 
 import typer
 
-from mapserver.commands.actor_option import ActorName, Reason, acting
+from fleetmap.cli_options import expand_options
+from mapserver.commands.options import ActorOptions, NewStoreFolder
 
 
+@expand_options
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File that `mapserver export` wrote.")],
-    store: Annotated[Path, typer.Option(help="Folder of the map store; made if it is not there.")],
-    actor: ActorName = None,
-    reason: Reason = "",
+    store: NewStoreFolder,
+    by: ActorOptions,
 ) -> None:
     """Take the version in FILE into a store, as a draft of its site under its own number."""
     from mapserver.store import MapStore
 
     with MapStore.open(store, create=True) as maps:
-        info = maps.import_version(file, actor=acting(actor, reason))
+        info = maps.import_version(file, actor=by.named())
     typer.echo(f"site {info.site}: version {info.version} is in the store ({info.state})")

@@ -1,18 +1,16 @@
 """`mapserver verify`: whether a store is whole."""
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
+from mapserver.commands.options import Json, StoreFolder
 from mapserver.commands.print_json import print_json
 
 EXIT_STATUS_FAULTS = 3
 
 
 def verify(
-    store: Annotated[Path, typer.Option(help="Folder of the map store.")],
-    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of sentences.")] = False,
+    store: StoreFolder,
+    json: Json = False,
 ) -> None:
     """Check every hash and every reference of a store, and its database; ends with status 3 where something is wrong."""
     from mapserver.store import MapStore

@@ -1,0 +1,80 @@
+"""Options that several commands share."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleetmap.errors import UsageError
+
+if TYPE_CHECKING:
+    from mapserver.store import Actor
+
+SiteName = Annotated[str, typer.Option(help="Name of the site.")]
+StoreFolder = Annotated[Path, typer.Option(help="Folder of the map store.")]
+NewStoreFolder = Annotated[Path, typer.Option(help="Folder of the map store; created if it does not exist.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+Calibration = Annotated[Path | None, typer.Option(metavar="FILE", help="Kalibr camchain to use.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SiteOptions:
+    """A site in a store."""
+
+    site: SiteName
+    store: StoreFolder
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActorOptions:
+    """The person who changes a store, and the reason; both go into its log."""
+
+    actor: Annotated[str | None, typer.Option(metavar="NAME", help="Who acts; default: the user's name.")] = None
+    reason: Annotated[str, typer.Option(metavar="TEXT", help="Why; kept in the log.")] = ""
+
+    def named(self) -> "Actor":
+        """The actor for the store's log."""
+        import getpass
+        import os
+
+        from mapserver.store import Actor
+
+        name = self.actor
+        if not name:
+            try:
+                name = getpass.getuser()
+            except (KeyError, OSError):  # a user without an entry, as in containers
+                name = f"uid {os.getuid()}"
+        return Actor(name, self.reason)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurveyOptions(SiteOptions):
+    """Options of `build` and `nightly`."""
+
+    store: NewStoreFolder
+    frames: Annotated[str, typer.Option(metavar="A:B:C", help="Slice of the frames to use.")] = "::"
+    calibration: Calibration = None
+    zones: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="TOML file with areas that cannot see each other.")
+    ] = None
+    report: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the JSON report to this file.")] = None
+    threads: Annotated[int | None, typer.Option(min=1, help="Number of threads; default: one per core.")] = None
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Run on this dask cluster; `local` starts one on this machine."),
+    ] = None
+
+    def check(self) -> None:
+        """Raises UsageError for a report that cannot be written and for an impossible name of the site."""
+        from fleetmap.mapformat import check_name
+
+        check_output("--report", self.report)
+        check_name(self.site, "site")
+
+
+def check_output(option: str, path: Path | None) -> None:
+    """Raises UsageError unless `path` can be a file."""
+    if path is not None and (path.is_dir() or not path.parent.is_dir()):
+        raise UsageError(f"{option} {path}: name a file in a folder that exists")

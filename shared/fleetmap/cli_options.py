@@ -1,0 +1,188 @@
+"""Options of commands: frozen dataclasses that typer shows as options, and a TOML file that gives their defaults.
+
+A command takes a train of options as one value of a dataclass whose fields are annotated as typer's parameters are;
+`expand_options` shows typer the fields. The configuration file has a section for each command, derived from its signature.
+"""
+
+import dataclasses
+import functools
+import inspect
+import types
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
+
+import typer
+
+if TYPE_CHECKING:
+    from fleetmap.config import Section
+
+Command = Callable[..., None]
+Options = dict[str, Any]  # values by option; by command and option for a program or a group
+ReadConfig = Callable[[Path | None], tuple[Any, Options]]  # a file's settings, and the options that it sets
+
+COMMON_KEYS = ("site", "store")  # said once at the top of a file, they reach every command that needs them
+_FILE = "fleetmap.config"
+
+
+class Group(NamedTuple):
+    """Commands behind a common first word."""
+
+    help: str
+    commands: Mapping[str, Command]
+
+
+Commands = Mapping[str, Command | Group]
+
+
+def expand_options(command: Command) -> Command:
+    """The command with the fields of its dataclass parameters in their place, as options of their own."""
+    groups: dict[str, Any] = {}
+    parameters: list[inspect.Parameter] = []
+    for parameter in inspect.signature(command, eval_str=True).parameters.values():
+        if dataclasses.is_dataclass(parameter.annotation):
+            groups[parameter.name] = parameter.annotation
+            parameters += _fields(parameter.annotation)
+        else:
+            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        for name, kind in groups.items():
+            values[name] = kind(**{field.name: values.pop(field.name) for field in dataclasses.fields(kind)})
+        command(**values)
+
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {}  # the signature above is complete
+    return run
+
+
+def _fields(kind: Any) -> list[inspect.Parameter]:
+    hints = get_type_hints(kind, include_extras=True)
+    return [
+        inspect.Parameter(
+            field.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if field.default is dataclasses.MISSING else field.default,
+            annotation=hints[field.name],
+        )
+        for field in dataclasses.fields(kind)
+    ]
+
+
+def make_app(commands: Commands, callback: Command, read_config: ReadConfig) -> typer.Typer:
+    """A program of these commands; `callback` holds its own options, `read_config` serves --config."""
+    settings: dict[str, Any] = {"obj": read_config}
+    app = typer.Typer(
+        no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, context_settings=settings
+    )
+    app.callback()(callback)
+    for name, command in commands.items():
+        if isinstance(command, Group):
+            group = typer.Typer(no_args_is_help=True, add_completion=False, help=command.help)
+            for inner_name, inner in command.commands.items():
+                group.command(inner_name)(inner)
+            app.add_typer(group, name=name)
+        else:
+            app.command(name)(command)
+    return app
+
+
+def options_of(command: Command) -> dict[str, inspect.Parameter]:
+    """A command's options by their keys in the file; --config has none."""
+    return {
+        name.rstrip("_"): parameter
+        for name, parameter in inspect.signature(command, eval_str=True).parameters.items()
+        if name != "config" and any(_is_option(mark) for mark in getattr(parameter.annotation, "__metadata__", ()))
+    }
+
+
+def _is_option(mark: object) -> bool:
+    return isinstance(mark, typer.models.OptionInfo)
+
+
+def file_type(settings: "type[Section]", commands: Commands) -> "type[Section]":
+    """Type of a configuration file: the settings, and beside them a section for each command."""
+    import msgspec
+
+    from fleetmap.config import Section
+
+    fields: list[tuple[str, Any, Any]] = []
+    names: dict[str, str] = {}
+    for name, command in commands.items():
+        key = name.replace("-", "_")
+        names[f"{key}_"] = key  # such as `import`, which cannot name a field
+        if isinstance(command, Group):
+            kind: Any = file_type(Section, command.commands)
+        else:
+            options = [(option, toml_type(p) | None, None) for option, p in options_of(command).items()]
+            kind = msgspec.defstruct("Options", options, bases=(Section,), frozen=True, kw_only=True)
+        fields.append((f"{key}_", kind, kind()))
+    found: type[Section] = msgspec.defstruct(  # type: ignore[assignment]
+        "File", fields, bases=(settings,), rename=names, frozen=True, kw_only=True
+    )
+    return found
+
+
+def toml_type(parameter: inspect.Parameter) -> Any:
+    """Type of an option's value in a TOML file."""
+    hint = get_args(parameter.annotation)[0]
+    if get_origin(hint) is types.UnionType:
+        (hint,) = (kind for kind in get_args(hint) if kind is not type(None))
+    if get_origin(hint) is list:
+        return list[str]
+    return hint if hint in (bool, int, float) else str
+
+
+def command_defaults(given: Mapping[str, Any], commands: Commands) -> Options:
+    """Options that a file's content sets, by command; the common keys where a command needs one and its section has none."""
+    common = {key: given[key] for key in COMMON_KEYS if key in given}
+    found: Options = {}
+    for name, command in commands.items():
+        section = given.get(name.replace("-", "_"), {})
+        if isinstance(command, Group):
+            found[name] = command_defaults({**common, **section}, command.commands)
+        else:
+            options = options_of(command)
+            needed = {key: value for key, value in common.items() if key in options and _is_required(options[key])}
+            found[name] = {options[key].name: value for key, value in (needed | section).items()}
+    return found
+
+
+def _is_required(parameter: inspect.Parameter) -> bool:
+    return parameter.default is inspect.Parameter.empty
+
+
+def take_defaults(context: typer.Context, path: Path | None) -> Path | None:
+    """Callback of --config: the file's section becomes the command's defaults (before the command: all sections)."""
+    if path is None or context.resilient_parsing:
+        return path
+    _, sections = context.obj(path)
+    for word in _words(context):
+        sections = sections.get(word, {})
+    context.default_map = sections
+    context.meta[_FILE] = path
+    return path
+
+
+def _words(context: typer.Context) -> list[str]:
+    """The command's words behind the program's name: none for the program itself, two for a command of a group."""
+    parent: Any = context.parent
+    return [] if parent is None else [*_words(parent), context.info_name or ""]
+
+
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="FILE", is_eager=True, callback=take_defaults, help="TOML file with settings."),
+]
+
+
+def config_path(context: typer.Context) -> Path | None:
+    """The file that --config named, behind the command or before it."""
+    path: Path | None = context.meta.get(_FILE)
+    return path
+
+
+def settings_of(context: typer.Context) -> Any:
+    """Settings of the file that --config named; the defaults without one."""
+    return context.obj(config_path(context))[0]
