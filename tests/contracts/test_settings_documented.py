@@ -1,14 +1,18 @@
-"""Every setting stands in docs/settings.md with the default that it has in the code, and nothing else does."""
+"""Every setting that a file may set stands in docs/settings.md, in its tier and with its default, and nothing else does."""
 
+import ast
 import importlib
 import re
 
 import msgspec
 import pytest
 
-from fleetmap.config import Section
+from fleetmap.config import Section, Setting, Tiers, settings_in, tier_of
+from locclient.config import TIERS as LOCCLIENT_TIERS
+from locclient.config import LocclientConfig
+from mapserver.config import TIERS as MAPSERVER_TIERS
 from mapserver.config import MapserverConfig
-from support.fleet.contracts_documents import REPOSITORY, code_words, rows, section, text
+from support.fleet.contracts_documents import REPOSITORY, code_words, rows, text
 
 DOCUMENT = "docs/settings.md"
 # The simulator has no configuration file: its sections are values in its code.
@@ -16,6 +20,10 @@ PACKAGES = {
     "shared/fleetmap": "fleetmap",
     "mapserver/mapserver": "mapserver",
     "locclient/locclient": "locclient",
+}
+PROGRAMS: dict[str, tuple[Section, Tiers]] = {
+    "mapserver": (MapserverConfig(), MAPSERVER_TIERS),
+    "locclient": (LocclientConfig(), LOCCLIENT_TIERS),
 }
 
 
@@ -35,30 +43,91 @@ def _sections() -> dict[str, type[Section]]:
 def _shown(default: object) -> str:
     if default is None:
         return "none"
-    if isinstance(default, Section):
-        return f"[{type(default).__name__}]"
     return str(default).lower() if isinstance(default, bool) else str(default)
 
 
-SECTIONS = _sections()
+def _documented() -> dict[tuple[str, str, str], dict[str, str]]:
+    """By tier, program and section, the defaults by key."""
+    found = {}
+    for tier in ("user", "tuning"):
+        part = text(DOCUMENT).split(f"\n## {tier.capitalize()} settings\n")[1].split("\n## ")[0]
+        for heading, body in re.findall(r"^### (.*)$([^#]*)", part, re.MULTILINE):
+            section, program = re.fullmatch(r"(?:`\[([\w.]+)\]`|Top of the file) of `(\w+)`", heading).groups()
+            found[tier, program, section or ""] = {code_words(row[0])[0]: row[1].strip("`") for row in rows(body)}
+    return found
 
 
-def test_the_sections_are_found() -> None:
-    assert len(SECTIONS) > 15
+def _settings(program: str) -> list[Setting]:
+    """All but the options of commands, which docs/command_line.md lists."""
+    return [setting for setting in settings_in(PROGRAMS[program][0]) if setting.section != "replay"]
 
 
-@pytest.mark.parametrize("name", SECTIONS)
-def test_section_is_documented(name: str) -> None:
-    fields = msgspec.structs.fields(SECTIONS[name])
-    wanted = {field.encode_name: _shown(field.default) for field in fields}
-    documented = {code_words(row[0])[0]: row[1].strip("`") for row in rows(section(DOCUMENT, f"`{name}`"))}
-    expected = "\n".join(f"| `{key}` | {default} | ... |" for key, default in wanted.items())
-    assert documented == wanted, f"{DOCUMENT} needs a heading with `{name}` and under it the rows\n{expected}"
+def test_the_settings_are_found() -> None:
+    assert len(_sections()) > 15
+    assert len(_settings("mapserver")) > 200
 
 
-def test_no_section_is_documented_that_is_gone() -> None:
-    documented = re.findall(r"^### `(\w+)`", text(DOCUMENT), re.MULTILINE)
-    assert sorted(set(documented) - set(SECTIONS)) == []
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_settings_are_documented_in_their_tier(program: str) -> None:
+    wanted: dict[tuple[str, str, str], dict[str, str]] = {}
+    for setting in _settings(program):
+        if tier := tier_of(setting, PROGRAMS[program][1]):
+            wanted.setdefault((tier, program, setting.section), {})[setting.key] = _shown(setting.value)
+    assert {place: keys for place, keys in _documented().items() if place[1] == program} == wanted
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_tiers_name_settings_that_exist(program: str) -> None:
+    existing = {(setting.section, setting.key) for setting in settings_in(PROGRAMS[program][0])}
+    existing |= {(section, "*") for section, _ in existing}
+    named = {
+        (section, key)
+        for keys in PROGRAMS[program][1].values()
+        for section, words in keys.items()
+        for key in words.split()
+    }
+    assert named <= existing
+
+
+def test_internal_constants_say_what_they_are() -> None:
+    """Each has a comment in the code, on its line or above it."""
+    internal = {
+        (kind.__name__, setting.key)
+        for program, (config, tiers) in PROGRAMS.items()
+        for setting, kind in _with_types(config)
+        if tier_of(setting, tiers) is None
+    }
+    silent = []
+    for name, kind in _sections().items():
+        module = REPOSITORY.joinpath(*_path_of(kind)).read_text("utf-8")
+        lines = module.splitlines()
+        (definition,) = (
+            node for node in ast.parse(module).body if isinstance(node, ast.ClassDef) and node.name == name
+        )
+        for node in definition.body:
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                around = "".join(lines[node.lineno - 2 : node.end_lineno])
+                if (name, node.target.id) in internal and "#" not in around:
+                    silent.append(f"{name}.{node.target.id}")
+    assert silent == []
+
+
+def _with_types(section: Section, name: str = "") -> list[tuple[Setting, type[Section]]]:
+    found = []
+    for field in msgspec.structs.fields(section):
+        value = getattr(section, field.name)
+        if isinstance(value, Section):
+            found += _with_types(value, f"{name}.{field.encode_name}".lstrip("."))
+        else:
+            found.append((Setting(name, field.encode_name, value), type(section)))
+    return found
+
+
+def _path_of(kind: type[Section]) -> list[str]:
+    package, *parts = kind.__module__.split(".")
+    (folder,) = (folder for folder, name in PACKAGES.items() if name == package)
+    path = REPOSITORY.joinpath(folder, *parts)
+    return [folder, *parts, "__init__.py"] if path.is_dir() else [folder, *parts[:-1], f"{parts[-1]}.py"]
 
 
 def test_every_setting_is_read_somewhere() -> None:
@@ -66,13 +135,9 @@ def test_every_setting_is_read_somewhere() -> None:
     source = "\n".join(
         path.read_text("utf-8") for folder in PACKAGES for path in sorted((REPOSITORY / folder).rglob("*.py"))
     )
-    by_name = {type(section).__name__ for section in msgspec.structs.astuple(MapserverConfig())}
-    by_name -= {"SurveySettings", "GateSettings", "IngestSettings", "CanarySettings", "ResurveySettings"}
-    by_name |= {name for name in SECTIONS if name.startswith("Fleet") and name.endswith("Section")}
     unread = [
         f"{name}.{field.name}"
-        for name, kind in SECTIONS.items()
-        if name not in by_name
+        for name, kind in _sections().items()
         for field in msgspec.structs.fields(kind)
         if not re.search(rf"\.{field.name}\b|[\"']{field.name}[\"']", source)
     ]

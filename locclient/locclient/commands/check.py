@@ -11,10 +11,9 @@ def check(
     seconds: Annotated[float, typer.Option(min=0.0, help="How long to listen to the sensors; 0 does not.")] = 3.0,
 ) -> None:
     """Look over a robot before it drives; status 3 where something must be mended first."""
-    from fleetmap.config import load_toml
-    from locclient.config import LocclientConfig
+    from locclient.config import read_config
 
-    settings = load_toml(config, LocclientConfig)
+    settings = read_config(config)
     from locclient.daemon.preflight import FAIL, run_preflight
 
     failed = False

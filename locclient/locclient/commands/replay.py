@@ -39,10 +39,9 @@ def replay(
     given = {
         name: value for name, value in locals().items() if name not in ("recording", "config") and value is not None
     }
-    from fleetmap.config import load_toml
-    from locclient.config import LocclientConfig
+    from locclient.config import read_config
 
-    loaded = load_toml(config, LocclientConfig) if config is not None else LocclientConfig()
+    loaded = read_config(config)
     options = _merged(loaded, given)
     if options["site"] is None:
         raise UsageError("--site NAME is missing: which site's map?")

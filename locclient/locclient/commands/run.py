@@ -14,13 +14,12 @@ def run(
     import logging
     import signal
 
-    from fleetmap.config import load_toml
-    from locclient.config import LocclientConfig
+    from locclient.config import read_config
 
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
     )
-    settings = load_toml(config, LocclientConfig)
+    settings = read_config(config)
     from locclient.daemon.daemon import check_run, daemon_parts
 
     check_run(settings)

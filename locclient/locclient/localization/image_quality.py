@@ -23,7 +23,7 @@ class ImageQualitySettings(Section, frozen=True):
     dark_contrast: float = 4.0
     glare_share: float = 0.6
     blurred_share: float = 0.1
-    typical_frames: int = 150
+    typical_frames: int = 150  # over which the usual contrast and depth are taken
     occluded_depth_share: float = 0.4
 
 

@@ -13,32 +13,34 @@ class TrackSettings(Section, frozen=True):
 
     fix_interval_s: float = 0.2
     settled_interval_s: float = 0.4
-    settled_fixes: int = 10
-    search_after_failed: int = 1
-    confirming_fixes: int = 3
-    confirming_distance_m: float = 1.0
+    settled_fixes: int = 10  # successful fixes in a row before the longer interval
+    search_after_failed: int = 1  # failed fixes at the prediction before a global search
+    confirming_fixes: int = 3  # that must agree before tracking begins
+    confirming_distance_m: float = 1.0  # motion between them
     strong_inliers: int = 60
-    strong_share: float = 0.55
+    strong_share: float = 0.55  # inlier share of a fix that is accepted at once
+    # Votes of another place, as a share of the best one's, that forbid it; chance reaches 0.36
     strong_twin_share: float = 0.5
-    tight_prior_sigma_m: float = 0.6
+    tight_prior_sigma_m: float = 0.6  # a prior this tight confirms the first fix
+    # Squared Mahalanobis distance from the prediction: 0.999 of chi-square, 6 degrees of freedom
     innovation_limit: float = 22.458
-    hypothesis_distance_m: float = 0.5
-    hypothesis_angle_deg: float = 6.0
-    rival_share: float = 0.6
-    rival_hit_share: float = 0.8
-    rival_least_share: float = 0.25
+    hypothesis_distance_m: float = 0.5  # within which fixes support one hypothesis
+    hypothesis_angle_deg: float = 6.0  # within which fixes support one hypothesis
+    rival_share: float = 0.6  # a competitor with this share of the best one's inliers makes the pose ambiguous
+    rival_hit_share: float = 0.8  # so does one with this share of its landmark recall
+    rival_least_share: float = 0.25  # and at least this share of its inliers
     is_whole_site_mapped: bool = False
     telling_evidence: float = 4.0
-    evidence_kept_share: float = 0.8
-    max_misses: int = 4
-    drift_share: float = 0.01
-    drift_floor_m: float = 0.005
+    evidence_kept_share: float = 0.8  # decay of a hypothesis's inliers from fix to fix
+    max_misses: int = 4  # contradicting fixes in a row that end a hypothesis
+    drift_share: float = 0.01  # error of odometry beyond its own covariance, as a share of the way
+    drift_floor_m: float = 0.005  # the same for each step
     degraded_after_s: float = 0.9
     degraded_radius_m: float = 0.3
     lost_radius_m: float = 3.0
     kidnap_fixes: int = 3
-    map_sigma_m: float = 0.02
-    map_sigma_rad: float = 0.006
+    map_sigma_m: float = 0.02  # of the map itself, added to the estimate
+    map_sigma_rad: float = 0.006  # of the map itself, added to the estimate
 
 
 class LocalizerSettings(Section, frozen=True):

@@ -30,15 +30,15 @@ _DAY_NS = 86_400_000_000_000
 class IngestSettings(Section, frozen=True):
     """How often robots' reports go to the disk, how thinned, and how long they stay there."""
 
-    flush_every_s: Positive = 2.0
+    flush_every_s: Positive = 2.0  # a crash loses this much of the counts; failures are written at once
     trace_every_s: Positive = 10.0
     trace_days: Positive = 2.0
-    trace_rows: PositiveInt = 3_000_000
+    trace_rows: PositiveInt = 3_000_000  # whole hours are deleted, the oldest first
     tally_days: Positive = 400.0
     failure_days: Positive = 400.0
     picture_bytes: PositiveInt = 1_000_000_000
-    prune_every_s: Positive = 600.0
-    presence_every_s: Positive = 5.0
+    prune_every_s: Positive = 600.0  # between deletions of old rows
+    presence_every_s: Positive = 5.0  # between looks at the robots on the bus
 
     def retention(self) -> FleetRetention:
         """What stays in the store."""

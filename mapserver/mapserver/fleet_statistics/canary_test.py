@@ -38,11 +38,12 @@ class CanarySettings(Section, frozen=True):
     share: Probability = 0.05
     margin_ratio: Annotated[float, msgspec.Meta(ge=1)] = 1.5
     margin_per_robot_day: Annotated[float, msgspec.Meta(ge=0)] = 0.5
-    alpha: Probability = 0.01
+    alpha: Probability = 0.01  # probability that a version within margin_ratio is rolled back, over all looks
+    # Probability of being within the margin, for promotion; below its complement a version may be rolled back
     confidence: Probability = 0.95
     min_robot_days: Positive = 3.0
     max_days: Positive = 7.0
-    check_every_s: Positive = 10.0
+    check_every_s: Positive = 10.0  # between judgements
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,9 +29,10 @@ class ResurveySettings(Section, frozen=True):
     before_days: Positive = 14.0
     min_failures: Annotated[int, msgspec.Meta(ge=1)] = 3
     rising_ratio: Annotated[float, msgspec.Meta(ge=1)] = 1.5
+    # Probability that any tile of an unchanged site is listed
     alpha: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.01
     fading: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.15
-    min_landmarks: Annotated[int, msgspec.Meta(ge=1)] = 2000
+    min_landmarks: Annotated[int, msgspec.Meta(ge=1)] = 2000  # looked for in both periods, for their share to count
 
 
 @dataclass(frozen=True, slots=True)

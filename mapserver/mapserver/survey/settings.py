@@ -19,73 +19,74 @@ class KeyframeSettings(Section, frozen=True):
     max_rotation_deg: float = 12.0
     max_parallax: float = 0.12
     max_interval_s: float = 2.0
-    min_sharpness: float = 0.5
-    break_overlap: float = 0.3
+    min_sharpness: float = 0.5  # frames below this share of the recent median are skipped
+    break_overlap: float = 0.3  # share of shared points below which even a blurred frame is taken
 
 
 class PairSettings(Section, frozen=True):
     """Which keyframes are matched with each other, and how."""
 
-    previous: int = 6
-    covisible: int = 10
-    min_overlap: float = 0.15
-    max_distance: int = 70
-    ratio: float = 0.85
-    guided_distance: int = 60
-    guided_radius_px: float = 6.0
-    search_px: float = 8.0
-    min_inliers: int = 12
-    match_sigma_px: float = 1.5
+    previous: int = 6  # keyframes that each one is matched with
+    covisible: int = 10  # further keyframes, those with the largest predicted overlap
+    min_overlap: float = 0.15  # predicted share of common view
+    max_distance: int = 70  # bits of 256
+    ratio: float = 0.85  # best over second best distance
+    guided_distance: int = 60  # bits, near the predicted position
+    guided_radius_px: float = 6.0  # with the motion known from matches
+    search_px: float = 8.0  # with the motion predicted only
+    min_inliers: int = 12  # of one rigid motion
+    match_sigma_px: float = 1.5  # of a match before refinement
 
 
 class LoopSettings(Section, frozen=True):
     """Which revisits are looked for and believed."""
 
     top: int = 8
-    depth: int = 128
-    per_place: int = 8
+    depth: int = 128  # earlier keyframes, by similarity, that pass through the position gate
+    per_place: int = 8  # accepted candidates of one place
     min_gap_keyframes: int = 8
     max_innovation: float = 22.458  # 0.999 of chi-square with 6 degrees of freedom
-    view_range_depths: float = 1.0
+    view_range_depths: float = 1.0  # largest distance between keyframes with common view, in median scene depths
     repeats_every_m: float = (
         0.0  # how far apart aisles that look alike are, where the site's people know it; 0 where they do not
     )
-    min_inliers: int = 15
-    alone_inliers: int = 30
-    min_cells: int = 6
-    rotation_sigma_limit_rad: float = 0.12
+    min_inliers: int = 15  # of one rigid motion
+    alone_inliers: int = 30  # the same without a neighbouring keyframe that confirms the revisit
+    min_cells: int = 6  # of 48 image cells with inliers
+    rotation_sigma_limit_rad: float = 0.12  # the graph's rotation guides matching where it is known this well
 
 
 class NoiseSettings(Section, frozen=True):
     """What the bundle adjustment believes of its measurements."""
 
-    aligned_sigma_px: float = 0.35
-    descriptor_sigma_px: float = 0.9
+    aligned_sigma_px: float = 0.35  # of a feature that patch alignment refined
+    descriptor_sigma_px: float = 0.9  # of one that it could not refine, at the finest image scale
     disparity_sigma_px: float = 0.2
-    cut_sigmas: float = 4.0
+    cut_sigmas: float = 4.0  # observations farther off are removed between adjustments
+    # Error of the estimated stereo yaw with an exact calibration, measured in the simulator
     turn_floor_px: float = 0.02
-    turn_sigmas: float = 3.0
-    accel_noise_scale: float = 5.0
-    gyro_noise_scale: float = 2.0
-    walk_scale: float = 1.0
+    turn_sigmas: float = 3.0  # significance at which that yaw is corrected
+    accel_noise_scale: float = 5.0  # factor on the calibration's noise, for vibration above the IMU's bandwidth
+    gyro_noise_scale: float = 2.0  # factor on the calibration's noise, for vibration above the IMU's bandwidth
+    walk_scale: float = 1.0  # factor on the calibration's bias walks
 
 
 class SingleCameraSettings(Section, frozen=True):
     """How the survey of one camera places features and lets the scale wander."""
 
-    depth_views: int = 5
-    match_sigma_px: float = 1.0
-    min_angle_deg: float = 0.8
-    max_depth_sigma_share: float = 0.12
-    scale_walk: float = 0.01
+    depth_views: int = 5  # keyframes before and after each that triangulate its features
+    match_sigma_px: float = 1.0  # of a matched feature
+    min_angle_deg: float = 0.8  # smallest angle between two rays that triangulate
+    max_depth_sigma_share: float = 0.12  # of the depth
+    scale_walk: float = 0.01  # sigma of the scale's logarithm per keyframe, where nothing observes the scale
 
 
 class VocabularySettings(Section, frozen=True):
     """The tree trained on a site's first survey."""
 
-    branching: int = 10
-    levels: int = 4
-    max_descriptors: int = 200_000
+    branching: int = 10  # children of each node
+    levels: int = 4  # of the tree: up to branching ** levels words
+    max_descriptors: int = 200_000  # for training
 
 
 class BudgetSettings(Section, frozen=True):
@@ -101,39 +102,41 @@ class BudgetSettings(Section, frozen=True):
 class CullSettings(Section, frozen=True):
     """What a finished survey does not hand on, and what takes no part in adjusting it."""
 
+    # Candidates for one landmark; it also needs overlapping 3 sigma regions, no keyframe that sees both, and
     duplicate_m: float = 0.05
-    duplicate_distance: int = 50
-    min_parallax_deg: float = 0.5
-    redundant_share: float = 0.9
-    redundant_observers: int = 3
+    duplicate_distance: int = 50  # at most so many differing descriptor bits
+    min_parallax_deg: float = 0.5  # over all keyframes and the baseline
+    redundant_share: float = 0.9  # a keyframe is redundant if this share of its landmarks is seen by
+    redundant_observers: int = 3  # so many others at the same scale or a finer one
+    # A keyframe is left out of the global adjustment if this share of its tracks is seen on
     repeated_share: float = 0.7
-    repeated_visits: int = 3
+    repeated_visits: int = 3  # so many other visits; it is placed among its landmarks afterwards
 
 
 class SessionSettings(Section, frozen=True):
     """How a survey is found in the map, what may move there, and when landmarks come and go."""
 
-    fix_keyframes: int = 60
-    top_places: int = 6
-    min_inliers: int = 20
-    min_cells: int = 6
-    min_fixes: int = 4
-    agreement_m: float = 0.3
+    fix_keyframes: int = 60  # spread over the survey, that are localized in the map
+    top_places: int = 6  # candidates for each of them
+    min_inliers: int = 20  # landmarks of the map that a keyframe must see
+    min_cells: int = 6  # of 48 image cells with inliers
+    min_fixes: int = 4  # keyframes that must agree on the alignment
+    agreement_m: float = 0.3  # between the alignments of two fixes
     agreement_share: float = 0.02  # of the way between two fixes: what the survey's own shape may be off by
-    agreement_deg: float = 3.0
-    rival_share: float = 0.5
-    search_px: float = 15.0
-    guided_px: float = 6.0
-    max_view_angle_deg: float = 35.0
-    anchor_sigma_m: float = 0.01
-    anchor_sigma_deg: float = 0.1
-    still_m: float = 0.005
+    agreement_deg: float = 3.0  # between the alignments of two fixes
+    rival_share: float = 0.5  # a survey is left out if this share of as many fixes agrees on another alignment
+    search_px: float = 15.0  # around predicted landmarks at first
+    guided_px: float = 6.0  # around them after the first joint adjustment
+    max_view_angle_deg: float = 35.0  # outside the directions from which a landmark was seen
+    anchor_sigma_m: float = 0.01  # of published keyframes
+    anchor_sigma_deg: float = 0.1  # of published keyframes
+    still_m: float = 0.005  # added to covariances when shifts are judged
     significance: float = 25.902  # 0.99999 of chi-square with 3 degrees of freedom: a site has 10,000s of landmarks
     fade_probability: float = 0.001
     look_weight: float = 0.7  # looks of one survey resemble each other: each counts for less than one
     min_confirmations: int = 3
-    covered_share: float = 0.2
-    new_place_landmarks: int = 40
+    covered_share: float = 0.2  # an image cell lacks landmarks below this share of the survey's own
+    new_place_landmarks: int = 40  # new landmarks that make a new keyframe a place
 
 
 class SurveySettings(Section, frozen=True):
@@ -158,6 +161,7 @@ class SurveySettings(Section, frozen=True):
     budget: BudgetSettings = BudgetSettings()
     cull: CullSettings = CullSettings()
     sessions: SessionSettings = SessionSettings()
-    local_window: int = 20
-    min_observations: int = 2
+    local_window: int = 20  # keyframes adjusted together while the chain grows
+    min_observations: int = 2  # keyframes that must see a landmark
+    # Odometry's sigma across a blackout up to which components are joined; else the largest one is the map
     join_sigma_m: float = 0.1

@@ -25,9 +25,9 @@ class OrbSettings(Section, frozen=True):
     """How many features and where."""
 
     count: int = 1000
-    levels: int = 8
-    fast_threshold: int = 12
-    min_distance_px: float = 7.0
+    levels: int = 8  # of the image pyramid, 1.2 apart
+    fast_threshold: int = 12  # grey levels; halved where too few corners are found
+    min_distance_px: float = 7.0  # between features of a level
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,9 +18,9 @@ _LEVELS = 3
 class AlignSettings(Section, frozen=True):
     """Window and acceptance of patch alignment."""
 
-    half_window_px: int = 4
-    max_shift_px: float = 3.0
-    min_correlation: float = 0.8
+    half_window_px: int = 4  # half of the patch
+    max_shift_px: float = 3.0  # from the initial position
+    min_correlation: float = 0.8  # of the aligned patches
 
 
 def half_pyramid(image: Image) -> Pyramid:

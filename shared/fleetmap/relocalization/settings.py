@@ -10,27 +10,27 @@ from fleetmap.features.stereo import StereoSettings
 class FixSettings(Section, frozen=True):
     """How one frame is placed in the map."""
 
-    min_inliers: int = 15
-    min_cells: int = 6
+    min_inliers: int = 15  # of a pose
+    min_cells: int = 6  # of the image with inliers
     min_hit_share: float = 0.13
-    top_places: int = 8
-    top_places_found: int = 1
-    twin_votes_share: float = 0.2
-    most_twins: int = 64
-    max_distance: int = 75
-    ratio: float = 0.9
-    guided_distance: int = 70
-    guided_ratio: float = 0.95
-    guided_radius_px: float = 12.0
-    max_radius_px: float = 60.0
-    feature_sigma_px: float = 0.8
-    disparity_sigma_px: float = 0.2
-    ransac_px: float = 5.0
-    rotation_sigma_rad: float = 0.03
-    covariance_scale: float = 4.0
-    floor_m: float = 0.01
-    floor_rad: float = 0.002
-    max_view_angle_deg: float = 75.0
+    top_places: int = 8  # most similar places that are tried
+    top_places_found: int = 1  # the same while a pose is known that agrees
+    twin_votes_share: float = 0.2  # also try every place whose votes reach this share of the best one's
+    most_twins: int = 64  # aliases that are tried
+    max_distance: int = 75  # bits of 256
+    ratio: float = 0.9  # best over second best distance
+    guided_distance: int = 70  # bits, near the predicted pixel
+    guided_ratio: float = 0.95  # best over second best distance there
+    guided_radius_px: float = 12.0  # smallest search radius
+    max_radius_px: float = 60.0  # above this uncertainty the search starts from similar places
+    feature_sigma_px: float = 0.8  # at the finest image scale
+    disparity_sigma_px: float = 0.2  # at every scale
+    ransac_px: float = 5.0  # inlier distance
+    rotation_sigma_rad: float = 0.03  # of the rotation that gravity and odometry predict
+    covariance_scale: float = 4.0  # factor on the fix's own covariance: matches share errors of the map
+    floor_m: float = 0.01  # smallest sigma of a fix
+    floor_rad: float = 0.002  # smallest sigma of a fix
+    max_view_angle_deg: float = 75.0  # outside the directions from which a landmark was seen
 
 
 class RelocalizerSettings(NamedTuple):
