@@ -17,7 +17,7 @@ from fleetmap.relocalization.map_view import CovisibleLandmarks
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, WheelSample
-from locclient.localization.alias_disambiguation import Tally, evidence, mark_shared
+from locclient.localization.alias_disambiguation import ObservationHistory, log_odds, mark_shared
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
 
@@ -50,7 +50,7 @@ def warm_up(calibration: RigCalibration, rectifier: Rectifier, settings: Localiz
         localizer.handle_wheel([WheelSample(int(stamps_ns[0]), np.zeros(3), 0.0, 0.1, 0.1)])
         frame = _view(wall, camera, number)
         found += localizer.handle_stereo(frame).fix is not None
-    _tell_apart()
+    _disambiguate()
     return found
 
 
@@ -66,15 +66,17 @@ def gc_frozen() -> Iterator[None]:
         gc.unfreeze()
 
 
-def _tell_apart() -> None:
-    """What only an ambiguous place needs."""
-    one, other = Tally(), Tally()
-    seen = CovisibleLandmarks(np.zeros(1, np.uint32), np.zeros((1, 3)), np.zeros((1, 32), np.uint8), np.ones(1, bool))
-    for tally in (one, other):
-        tally.look(np.eye(4), seen)
-    shared = [np.zeros(1, bool) for _ in range(2)]
-    mark_shared(one, other, *shared)
-    evidence(one, other, *shared)
+def _disambiguate() -> None:
+    """Runs what only competing hypotheses need."""
+    one, other = ObservationHistory(), ObservationHistory()
+    observed = CovisibleLandmarks(
+        np.zeros(1, np.uint32), np.zeros((1, 3)), np.zeros((1, 32), np.uint8), np.ones(1, bool)
+    )
+    for history in (one, other):
+        history.add(np.eye(4), observed)
+    shared = np.zeros(1, bool)
+    mark_shared(one, other, shared, shared.copy())
+    log_odds(one, other, shared, shared)
 
 
 def _wall(camera: StereoCamera) -> NDArray[np.uint8]:

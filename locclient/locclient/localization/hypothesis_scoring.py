@@ -1,4 +1,4 @@
-"""Places that fixes speak for before one of them is believed: who votes for which, who leads, who is a rival. Pure."""
+"""Scoring of competing pose hypotheses: votes of fixes, ranking, competitors, disambiguation. Pure."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -7,104 +7,101 @@ import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.relocalization.relocalizer import Fix, TimeSliced
-from locclient.localization.alias_disambiguation import evidence, mark_shared
-from locclient.localization.pose_hypothesis import PoseHypothesis, difference
+from locclient.localization.alias_disambiguation import log_odds, mark_shared
+from locclient.localization.pose_covariance import boxminus
+from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
-_PAIRS_AT_ONCE = 4  # comparisons in a slice of a look
+_PAIRS_AT_ONCE = 4  # comparisons in a time slice of a query
 
 
-def begin_look(candidates: Sequence[PoseHypothesis], settings: TrackSettings, *, is_elsewhere: bool) -> None:
-    """One more look at the map, in which none of them has been spoken for yet; is_elsewhere: from another spot than the last."""
-    for candidate in candidates:
-        candidate.misses += 1
-        candidate.fade(settings.evidence_kept_share)
-        if is_elsewhere:
-            candidate.tally.begin_look()
+def begin_query(hypotheses: Sequence[PoseHypothesis], settings: TrackSettings, *, is_new_viewpoint: bool) -> None:
+    """Begins a map query: so far no fix supports any of them."""
+    for hypothesis in hypotheses:
+        hypothesis.misses += 1
+        hypothesis.decay(settings.evidence_kept_share)
+        if is_new_viewpoint:
+            hypothesis.history.begin_view()
 
 
 def vote(
-    candidates: list[PoseHypothesis],
-    fresh: PoseHypothesis,
+    hypotheses: list[PoseHypothesis],
     fix: Fix,
+    fresh: PoseHypothesis,
     odom_from_body: Array | None,
     settings: TrackSettings,
 ) -> None:
-    """The place of a fix, carried to the present: a vote for the candidate that is there, which takes it over, or a new candidate.
+    """A fix votes for the hypothesis at its pose, which takes that over, or founds one. fresh: the fix's pose at present.
 
-    odom_from_body: at present, None where the look is from the same spot as the last one and its landmarks are not counted.
+    odom_from_body: at present, None where the viewpoint is not new and its landmarks are not counted.
     """
-    for candidate in candidates:
-        if _is_same_place(fresh, candidate, settings):
-            if candidate.misses:  # at most one vote a frame
-                candidate.support, candidate.misses = candidate.support + 1, 0
-                candidate.speak(fix.inliers, fix.landmark_recall)
-                _count(candidate, fresh, fix, odom_from_body, settings)
-            candidate.moved_to(fresh)
+    for hypothesis in hypotheses:
+        if _is_same_pose(fresh, hypothesis, settings):
+            if hypothesis.misses:  # at most one vote a query
+                hypothesis.support, hypothesis.misses = hypothesis.support + 1, 0
+                _count(hypothesis, fix, fresh, odom_from_body, settings)
+            hypothesis.take_pose(fresh)
             return
-    fresh.fade(0.0)
-    fresh.speak(fix.inliers, fix.landmark_recall)
-    _count(fresh, fresh, fix, odom_from_body, settings)
-    candidates.append(fresh)
+    fresh.decay(0.0)
+    _count(fresh, fix, fresh, odom_from_body, settings)
+    hypotheses.append(fresh)
 
 
-def still_held(candidates: Sequence[PoseHypothesis], settings: TrackSettings) -> list[PoseHypothesis]:
-    """Those that some recent look spoke for."""
-    return [c for c in candidates if c.misses < settings.max_misses]
+def recent(hypotheses: Sequence[PoseHypothesis], settings: TrackSettings) -> list[PoseHypothesis]:
+    """Those that some recent query supported."""
+    return [h for h in hypotheses if h.misses < settings.max_misses]
 
 
-def ranked(candidates: Sequence[PoseHypothesis]) -> list[PoseHypothesis]:
-    """The one that most speaks for first."""
-    return sorted(candidates, key=lambda c: -c.evidence)
+def ranked(hypotheses: Sequence[PoseHypothesis]) -> list[PoseHypothesis]:
+    """The one with most inliers first."""
+    return sorted(hypotheses, key=lambda h: -h.inlier_sum)
 
 
-def rivals(
-    candidates: Sequence[PoseHypothesis], settings: TrackSettings, best: PoseHypothesis | None = None
+def competitors(
+    hypotheses: Sequence[PoseHypothesis], settings: TrackSettings, best: PoseHypothesis | None = None
 ) -> list[PoseHypothesis]:
-    """Candidates besides the best for which nearly as much speaks, look by look since they were thought of: as many inliers,
-    or as many of the landmarks that should be seen there. A place where the map is thin is no less likely than its twin."""
-    if not candidates:
+    """Hypotheses besides the best with nearly its support per query since they were founded: by inliers, or by landmark recall, since
+    a place where the map is thin is no less likely than its alias."""
+    if not hypotheses:
         return []
-    best = best or ranked(candidates)[0]
-    return [
-        c
-        for c in candidates
-        if c is not best
-        and (
-            c.inliers >= settings.rival_share * best.inliers
-            or (
-                c.hits >= settings.rival_hit_share * best.hits
-                and c.inliers >= settings.rival_least_share * best.inliers
-            )
-        )
-    ]
+    best = best or ranked(hypotheses)[0]
+    inliers, recall = best.mean_inliers, best.mean_recall
+
+    def competes(other: PoseHypothesis) -> bool:
+        if other.mean_inliers >= settings.rival_share * inliers:
+            return True
+        has_recall = other.mean_recall >= settings.rival_hit_share * recall
+        return has_recall and other.mean_inliers >= settings.rival_least_share * inliers
+
+    return [h for h in hypotheses if h is not best and competes(h)]
 
 
-def disambiguated(candidates: Sequence[PoseHypothesis], settings: TrackSettings) -> TimeSliced[PoseHypothesis | None]:
-    """The one that what stands there tells from every other that totals would name its rival; None while nothing does. In slices.
+def disambiguated(hypotheses: Sequence[PoseHypothesis], settings: TrackSettings) -> TimeSliced[PoseHypothesis | None]:
+    """The hypothesis whose log odds against every competitor reach the threshold; None while there is none. In time slices.
 
-    It need not be the one that totals rank first: a sign is little beside all that the places share. Only where the right one must be
-    among them: of the twins of a place that the map does not hold, one is always the least unlike it.
+    It need not rank first: a sign is little beside all that aliases share. Only where the whole site is mapped: of the aliases of a
+    place that the map does not hold, one is always the least unlike it. The test is repeated with every query, as in a sequential
+    test (Wald 1945); it never rejects.
     """
-    if not settings.is_whole_site_mapped or not rivals(candidates, settings):
+    if not settings.is_whole_site_mapped or not competitors(hypotheses, settings):
         return None
-    places = ranked(candidates)
-    shared = [np.zeros(len(c.tally.ids), bool) for c in places]
-    for number, (i, j) in enumerate(combinations(range(len(places)), 2)):
+    order = ranked(hypotheses)
+    shared = [np.zeros(len(h.history.ids), bool) for h in order]
+    for number, (i, j) in enumerate(combinations(range(len(order)), 2)):
         if number and number % _PAIRS_AT_ONCE == 0:
             yield
-        mark_shared(places[i].tally, places[j].tally, shared[i], shared[j])
-    known = {id(c): (c.tally, flags) for c, flags in zip(places, shared, strict=True)}
+        mark_shared(order[i].history, order[j].history, shared[i], shared[j])
+    known = {id(h): (h.history, flags) for h, flags in zip(order, shared, strict=True)}
 
     def lead(one: PoseHypothesis, other: PoseHypothesis) -> float:
-        (tally, flags), (other_tally, other_flags) = known[id(one)], known[id(other)]
-        return evidence(tally, other_tally, flags, other_flags)
+        (history, flags), (other_history, other_flags) = known[id(one)], known[id(other)]
+        return log_odds(history, other_history, flags, other_flags)
 
     yield
-    best = max(places[1:], key=lambda other: lead(other, places[0]))
-    if lead(best, places[0]) < settings.telling_evidence:
-        best = places[0]
-    for number, other in enumerate(rivals(candidates, settings, best)):
+    best = max(order[1:], key=lambda other: lead(other, order[0]))
+    if lead(best, order[0]) < settings.telling_evidence:
+        best = order[0]
+    for number, other in enumerate(competitors(hypotheses, settings, best)):
         if number and number % _PAIRS_AT_ONCE == 0:
             yield
         if lead(best, other) < settings.telling_evidence:
@@ -112,29 +109,27 @@ def disambiguated(candidates: Sequence[PoseHypothesis], settings: TrackSettings)
     return best
 
 
-def is_proven(candidate: PoseHypothesis, settings: TrackSettings) -> bool:
-    """By fixes and way enough."""
-    return candidate.support >= settings.confirming_fixes and candidate.travelled_m >= settings.confirming_distance_m
+def is_supported(hypothesis: PoseHypothesis, settings: TrackSettings) -> bool:
+    """Whether enough fixes agreed over enough distance."""
+    return hypothesis.support >= settings.confirming_fixes and hypothesis.travelled_m >= settings.confirming_distance_m
 
 
 def is_unambiguous(fix: Fix, settings: TrackSettings) -> bool:
-    """Whether a fix, alone of all places that were tried, is so strong that no other place of this map can be meant."""
-    return (
-        fix.inliers >= settings.strong_inliers
-        and fix.inlier_share >= settings.strong_share
-        and fix.alias_ratio < settings.strong_twin_share
-    )
+    """Whether a fix, the only one of its query, is so strong that no other place of this map can be meant."""
+    is_strong = fix.inliers >= settings.strong_inliers and fix.inlier_share >= settings.strong_share
+    return is_strong and fix.alias_ratio < settings.strong_twin_share
 
 
 def _count(
-    candidate: PoseHypothesis, fresh: PoseHypothesis, fix: Fix, odom_from_body: Array | None, settings: TrackSettings
+    hypothesis: PoseHypothesis, fix: Fix, fresh: PoseHypothesis, odom_from_body: Array | None, settings: TrackSettings
 ) -> None:
+    hypothesis.add_fix(fix.inliers, fix.landmark_recall)
     if settings.is_whole_site_mapped and fix.covisible is not None and odom_from_body is not None:
-        candidate.tally.look(odom_from_body @ se3_inverse(fresh.now_map_from_body), fix.covisible)
+        hypothesis.history.add(odom_from_body @ se3_inverse(fresh.now_map_from_body), fix.covisible)
 
 
-def _is_same_place(fresh: PoseHypothesis, candidate: PoseHypothesis, settings: TrackSettings) -> bool:
-    error, covariance = difference(fresh.now_map_from_body, candidate.now_map_from_body), candidate.now_cov
+def _is_same_pose(fresh: PoseHypothesis, hypothesis: PoseHypothesis, settings: TrackSettings) -> bool:
+    error, covariance = boxminus(fresh.now_map_from_body, hypothesis.now_map_from_body), hypothesis.now_cov
     far_m = settings.hypothesis_distance_m + 3 * np.sqrt(np.trace(covariance[3:, 3:]))
     far_rad = np.radians(settings.hypothesis_angle_deg) + 3 * np.sqrt(np.trace(covariance[:3, :3]))
     return bool(np.linalg.norm(error[3:]) < far_m and np.linalg.norm(error[:3]) < far_rad)

@@ -9,7 +9,7 @@ from locclient.localization.image_quality import ImageQualitySettings
 
 
 class TrackSettings(Section, frozen=True):
-    """When an estimate may be believed."""
+    """Tracking: map queries, confirmation, competitors, drift, status."""
 
     fix_interval_s: float = 0.2
     settled_interval_s: float = 0.4
@@ -44,7 +44,7 @@ class TrackSettings(Section, frozen=True):
 
 
 class LocalizerSettings(Section, frozen=True):
-    """All of it."""
+    """Settings of a localizer."""
 
     seed: int = 0
     odometry: OdometrySettings = OdometrySettings()
@@ -56,5 +56,5 @@ class LocalizerSettings(Section, frozen=True):
 
     @property
     def relocalizer(self) -> RelocalizerSettings:
-        """The part of it that places one frame in a map."""
+        """Those of relocalization."""
         return RelocalizerSettings(self.seed, self.stereo, self.orb, self.fix)

@@ -8,7 +8,12 @@ import pytest
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.relocalization.map_view import CovisibleLandmarks
 from locclient.localization import alias_disambiguation
-from locclient.localization.alias_disambiguation import Spot, Tally, log_found, mark_shared
+from locclient.localization.alias_disambiguation import (
+    ObservationHistory,
+    ViewpointGate,
+    log_beta_binomial,
+    mark_shared,
+)
 
 PITCH_M = 5.0
 DECIDES, ONE_BLOCK = 4.0, 3.0
@@ -40,15 +45,17 @@ class Aisles:
     def _spoiled(self, looks: np.ndarray) -> np.ndarray:
         return np.asarray(looks ^ np.packbits(self.rng.random((*looks.shape, 8)) < 0.08, axis=-1)[..., 0])
 
-    def drive(self, aisle: int | None, *, moved: bool = False, looks: int = 12, rate: float = 0.4) -> list[Tally]:
-        """The tallies of all aisles after a drive along one of them (None: one that is not in the map). moved: the box there is gone."""
-        tallies = [Tally() for _ in self.points]
+    def drive(
+        self, aisle: int | None, *, moved: bool = False, looks: int = 12, rate: float = 0.4
+    ) -> list[ObservationHistory]:
+        """The histories of all aisles after a drive along one of them (None: one that is not in the map). moved: the box there is gone."""
+        histories = [ObservationHistory() for _ in self.points]
         rates = [self.rng.beta(2 * rate * 2, 2 * (1 - rate) * 2, len(points)) for points in self.points]
         odom_from_true = se3(so3_exp(np.array([0.0, 0.0, 0.6])), np.array([3.0, -2.0, 0.1]))
         for number in range(looks):
             at_m = -14.0 + number
-            for tally, points, looks_like, things, shares in zip(
-                tallies, self.points, self.looks, self.things, rates, strict=True
+            for history, points, looks_like, things, shares in zip(
+                histories, self.points, self.looks, self.things, rates, strict=True
             ):
                 ahead = np.flatnonzero((points[:, 0] > at_m + 1.0) & (points[:, 0] < at_m + 13.0))
                 stands = (things == 0) | (things == (-1 if aisle is None else 1 + aisle))
@@ -56,44 +63,44 @@ class Aisles:
                     stands &= ~((points > BOX[0]) & (points < BOX[1])).all(axis=1)
                 found = self.rng.random(len(ahead)) < np.where(stands[ahead], shares[ahead], 0.04)
                 seen = CovisibleLandmarks(ahead.astype(np.uint32), points[ahead], looks_like[ahead], found)
-                tally.begin_look()
-                tally.look(odom_from_true, seen)
-        return tallies
+                history.begin_view()
+                history.add(odom_from_true, seen)
+        return histories
 
 
-def evidence(one: Tally, other: Tally, *others: Tally) -> float:
+def log_odds(one: ObservationHistory, other: ObservationHistory, *others: ObservationHistory) -> float:
     """For one place against another, where the robot may be at these and others."""
     places = [one, other, *others]
     shared = [np.zeros(len(place.ids), bool) for place in places]
     for i, j in combinations(range(len(places)), 2):
         mark_shared(places[i], places[j], shared[i], shared[j])
-    return alias_disambiguation.evidence(one, other, shared[0], shared[1])
+    return alias_disambiguation.log_odds(one, other, shared[0], shared[1])
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_signs_at_an_aisles_end_decide(seed: int) -> None:
     one, other = Aisles(seed).drive(0)
-    assert evidence(one, other) > DECIDES
+    assert log_odds(one, other) > DECIDES
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_aisles_without_signs_stay_alike(seed: int) -> None:
     one, other = Aisles(seed, signs=0).drive(0)
-    assert abs(evidence(one, other)) < ONE_BLOCK
+    assert abs(log_odds(one, other)) < ONE_BLOCK
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_box_that_was_moved_in_the_true_aisle_does_not_decide(seed: int) -> None:
     one, other = Aisles(seed, signs=0).drive(0, moved=True)
-    assert abs(evidence(one, other)) < ONE_BLOCK
+    assert abs(log_odds(one, other)) < ONE_BLOCK
     one, other = Aisles(seed).drive(0, moved=True)
-    assert evidence(one, other) > DECIDES, "the signs still do"
+    assert log_odds(one, other) > DECIDES, "the signs still do"
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_of_two_twins_none_is_right_where_the_own_aisle_is_unmapped(seed: int) -> None:
     one, other = Aisles(seed).drive(None)
-    assert abs(evidence(one, other)) < ONE_BLOCK
+    assert abs(log_odds(one, other)) < ONE_BLOCK
 
 
 def test_signs_that_the_map_holds_in_one_aisle_only_say_nothing() -> None:
@@ -104,7 +111,7 @@ def test_signs_that_the_map_holds_in_one_aisle_only_say_nothing() -> None:
     hall.things[1] = hall.things[1][~is_sign]
     for aisle in (0, 1):
         one, other = hall.drive(aisle)
-        assert abs(evidence(one, other)) < ONE_BLOCK
+        assert abs(log_odds(one, other)) < ONE_BLOCK
 
 
 WALLS = (((2.0, 0.6, 0.4), (2.1, 1.4, 1.2)), ((2.0, -1.6, 1.0), (2.1, -0.8, 1.8)), ((2.0, -0.4, 2.2), (2.1, 0.4, 3.0)))
@@ -124,27 +131,27 @@ def test_what_a_third_place_shares_does_not_tell(seed: int) -> None:
         stands = np.full(len(wall), 0 if is_like else 99)
         hall.things[aisle] = np.concatenate([hall.things[aisle], stands])
     one, other, third = hall.drive(None)
-    assert evidence(one, other) > DECIDES, "a wall tells from the other one, and that is all that this pair knows"
-    assert abs(evidence(one, other, third)) < ONE_BLOCK
+    assert log_odds(one, other) > DECIDES, "a wall tells from the other one, and that is all that this pair knows"
+    assert abs(log_odds(one, other, third)) < ONE_BLOCK
 
 
 def test_evidence_for_one_is_evidence_against_the_other() -> None:
     one, other = Aisles(0).drive(1)
-    assert evidence(one, other) == pytest.approx(-evidence(other, one), abs=1e-9)
-    assert evidence(one, one) == evidence(one, Tally()) == evidence(Tally(), one) == 0.0
+    assert log_odds(one, other) == pytest.approx(-log_odds(other, one), abs=1e-9)
+    assert log_odds(one, one) == log_odds(one, ObservationHistory()) == log_odds(ObservationHistory(), one) == 0.0
 
 
 def test_the_odometry_may_begin_anew() -> None:
     one, other = Aisles(0).drive(0)
-    before = evidence(one, other)
+    before = log_odds(one, other)
     change = se3(np.eye(3), np.array([126.0, 12.6, 0.0]))  # whole cells, so that the lattices lie as they lay
-    one.carry(change)
-    assert evidence(one, other) == 0.0
-    other.carry(change)
-    assert evidence(one, other) == pytest.approx(before, abs=1e-6)
+    one.redefine_odom(change)
+    assert log_odds(one, other) == 0.0
+    other.redefine_odom(change)
+    assert log_odds(one, other) == pytest.approx(before, abs=1e-6)
 
 
-def plainly(one: Tally, other: Tally) -> float:
+def plainly(one: ObservationHistory, other: ObservationHistory) -> float:
     """The evidence by dictionaries and loops."""
     near = (np.abs(one.points_odom[:, None] - other.points_odom) <= 0.15).all(axis=2)
     bits = np.bitwise_count(one.descriptors[:, None] ^ other.descriptors).sum(axis=2)
@@ -152,16 +159,19 @@ def plainly(one: Tally, other: Tally) -> float:
     blocks: dict[tuple[int, ...], Array] = {}
     for lattice, (cell_m, shift) in enumerate(alias_disambiguation._LATTICES):
         cells: list[dict[tuple[int, ...], list[Array]]] = [{}, {}]
-        for side, (tally, alike) in enumerate(
+        for side, (history, alike) in enumerate(
             zip((one, other), ({n for n, _ in pairs}, {m for _, m in pairs}), strict=True)
         ):
-            for n in set(range(len(tally.ids))) - alike:
-                cell = tuple(np.floor(tally.points_odom[n] / cell_m + shift).astype(int).tolist())
-                looks = one.looks & other.looks
-                counts = (int(tally.expected[n]) & looks).bit_count(), (int(tally.found[n]) & looks).bit_count()
+            for n in set(range(len(history.ids))) - alike:
+                cell = tuple(np.floor(history.points_odom[n] / cell_m + shift).astype(int).tolist())
+                looks = one.views & other.views
+                counts = (int(history.expected[n]) & looks).bit_count(), (int(history.found[n]) & looks).bit_count()
                 if not counts[0]:
                     continue
-                gone, often = np.exp(log_found(*counts, 0.5, 10.0)), np.exp(log_found(*counts, 2.0, 2.8))
+                gone, often = (
+                    np.exp(log_beta_binomial(*counts, 0.5, 10.0)),
+                    np.exp(log_beta_binomial(*counts, 2.0, 2.8)),
+                )
                 cells[side].setdefault(cell, []).append(np.array([0.12 * gone + 0.88 * often, gone]))
         for cell in set(cells[0]) & set(cells[1]):
             (there, gone), (other_there, other_gone) = (np.prod(side[cell], axis=0) for side in cells)
@@ -181,16 +191,16 @@ def plainly(one: Tally, other: Tally) -> float:
 def test_evidence_is_what_its_definition_says(seed: int) -> None:
     for aisle in (0, None):
         one, other = Aisles(seed).drive(aisle)
-        assert evidence(one, other) == pytest.approx(plainly(one, other), abs=1e-6)
+        assert log_odds(one, other) == pytest.approx(plainly(one, other), abs=1e-6)
 
 
 def test_two_looks_from_the_same_spot_count_once() -> None:
     place, nearly = se3(np.eye(3), np.zeros(3)), se3(np.eye(3), np.array([0.1, 0, 0]))
     ahead, turned = se3(np.eye(3), np.array([0.3, 0, 0])), se3(so3_exp(np.array([0, 0, 0.2])), np.array([0.3, 0, 0]))
-    spot = Spot()
+    spot = ViewpointGate()
     assert [spot.is_new(at) for at in (place, nearly, ahead, turned, turned)] == [True, False, True, True, False]
     change = se3(so3_exp(np.array([0.0, 0.0, 1.0])), np.array([5.0, 0.0, 0.0]))
-    spot.carry(change)
+    spot.redefine_odom(change)
     assert not spot.is_new(change @ turned)
     assert spot.is_new(turned)
 
@@ -199,46 +209,46 @@ def test_a_look_that_only_one_place_stands_for_does_not_count() -> None:
     """A bad fix finds less of what is there; that is no evidence against the place."""
     rng = np.random.default_rng(2)
     one, other = Aisles(1, signs=0).drive(0)
-    before = evidence(one, other)
+    before = log_odds(one, other)
     for _ in range(8):
-        one.begin_look()
-        other.begin_look()
-        one.look(
+        one.begin_view()
+        other.begin_view()
+        one.add(
             np.eye(4), CovisibleLandmarks(one.ids, one.points_odom, one.descriptors, rng.random(len(one.ids)) < 0.02)
         )
-    assert evidence(one, other) == pytest.approx(before, abs=1e-9)
+    assert log_odds(one, other) == pytest.approx(before, abs=1e-9)
 
 
 def test_looks_are_counted_one_by_one() -> None:
-    tally = Tally()
+    history = ObservationHistory()
     for number in range(6):
-        tally.begin_look()
+        history.begin_view()
         if number % 2 == 0:
             ids = np.array([7, 3] if number < 4 else [9, 3], np.uint32)
             seen = CovisibleLandmarks(
                 ids, np.full((2, 3), float(number)), np.zeros((2, 32), np.uint8), np.array([True, False])
             )
-            tally.look(np.eye(4), seen)
-    assert tally.ids.tolist() == [3, 7, 9]
-    assert tally.looks == 0b101010
-    expected, found = tally.counts(tally.looks)
+            history.add(np.eye(4), seen)
+    assert history.ids.tolist() == [3, 7, 9]
+    assert history.views == 0b101010
+    expected, found = history.counts(history.views)
     assert (expected.tolist(), found.tolist()) == ([3, 2, 1], [0, 2, 1])
-    expected, found = tally.counts(0b1010)
+    expected, found = history.counts(0b1010)
     assert (expected.tolist(), found.tolist()) == ([2, 1, 1], [0, 1, 1])
-    np.testing.assert_allclose(tally.points_odom[:, 0], [2.0, 1.0, 4.0])
+    np.testing.assert_allclose(history.points_odom[:, 0], [2.0, 1.0, 4.0])
 
 
-def test_a_tally_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_history_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """In looks, and in landmarks: those that were expected longest ago are forgotten."""
-    monkeypatch.setattr(alias_disambiguation, "_MOST_LANDMARKS", 30)
-    tally = Tally()
+    monkeypatch.setattr(alias_disambiguation, "_MAX_LANDMARKS", 30)
+    history = ObservationHistory()
     for number in range(60):
         ids = np.arange(number // 10 * 10, number // 10 * 10 + 20, dtype=np.uint32)
         points = np.tile(ids[:, None], (1, 3)).astype(float)
-        tally.begin_look()
-        tally.look(np.eye(4), CovisibleLandmarks(ids, points, np.zeros((20, 32), np.uint8), np.ones(20, bool)))
-    assert tally.ids.tolist() == list(range(40, 70))
-    np.testing.assert_allclose(tally.points_odom[:, 0], range(40, 70))
+        history.begin_view()
+        history.add(np.eye(4), CovisibleLandmarks(ids, points, np.zeros((20, 32), np.uint8), np.ones(20, bool)))
+    assert history.ids.tolist() == list(range(40, 70))
+    np.testing.assert_allclose(history.points_odom[:, 0], range(40, 70))
     for _ in range(64):
-        tally.begin_look()
-    assert len(tally.ids) == tally.looks == 0
+        history.begin_view()
+    assert len(history.ids) == history.views == 0

@@ -41,7 +41,7 @@ class Ride:
         covariance = np.diag([unknown] * 3 + [sigma_m**2, sigma_m**2, unknown])
         self.prior = InitialPosePrior(PositionPrior(0, map_from_base, covariance), BASE_FROM_BODY)
         self.odometry: Any = Steady()
-        self.prior.follow(self.odometry, self._estimate(), np.eye(4), SETTINGS)
+        self.prior.propagate(self.odometry, self._estimate(), np.eye(4), SETTINGS)
 
     def _estimate(self) -> OdometryEstimate:
         return OdometryEstimate(
@@ -53,7 +53,7 @@ class Ride:
         for _ in range(steps):
             self.odometry.frame += 1
             self.map_from_body = self.map_from_body @ STEP
-            self.prior.follow(self.odometry, self._estimate(), STEP, SETTINGS)
+            self.prior.propagate(self.odometry, self._estimate(), STEP, SETTINGS)
 
     def place(self, x_m: float = 0.0, y_m: float = 0.0, turned_rad: float = 0.0) -> PoseHypothesis:
         beside = self.map_from_body.copy()
@@ -66,26 +66,26 @@ class Ride:
 def test_the_robots_own_place_is_allowed_and_its_twin_is_not(steps: int) -> None:
     ride = Ride(0.5)
     ride.drive(steps)
-    assert ride.prior.allows(ride.place())
-    assert ride.prior.allows(ride.place(y_m=0.8))
-    assert not ride.prior.allows(ride.place(y_m=5.0))
-    assert not ride.prior.allows(ride.place(x_m=-5.0))
+    assert ride.prior.is_compatible(ride.place())
+    assert ride.prior.is_compatible(ride.place(y_m=0.8))
+    assert not ride.prior.is_compatible(ride.place(y_m=5.0))
+    assert not ride.prior.is_compatible(ride.place(x_m=-5.0))
 
 
 def test_a_place_that_is_right_but_turned_round_does_not_lead_back() -> None:
     ride = Ride(0.3)
     ride.drive(12)
-    assert ride.prior.allows(ride.place())
-    assert not ride.prior.allows(ride.place(turned_rad=np.pi))
+    assert ride.prior.is_compatible(ride.place())
+    assert not ride.prior.is_compatible(ride.place(turned_rad=np.pi))
 
 
 def test_a_wrong_prior_is_got_over() -> None:
     ride = Ride(0.3, off_m=3.0)
-    assert not ride.prior.allows(ride.place())
+    assert not ride.prior.is_compatible(ride.place())
     ride.drive(4)
-    assert not ride.prior.allows(ride.place())
+    assert not ride.prior.is_compatible(ride.place())
     ride.drive(20)
-    assert ride.prior.allows(ride.place())
+    assert ride.prior.is_compatible(ride.place())
 
 
 def test_a_prior_is_tight_only_for_some_way() -> None:
@@ -105,7 +105,7 @@ def test_what_is_near_grows_with_the_way() -> None:
 
 
 def test_only_a_prior_with_a_heading_is_a_place() -> None:
-    assert Ride(0.1).prior.place is None
-    place = Ride(0.1, whole=True).prior.place
+    assert Ride(0.1).prior.hypothesis is None
+    place = Ride(0.1, whole=True).prior.hypothesis
     assert place is not None
     np.testing.assert_allclose(place.map_from_body, Ride(0.1).map_from_body, atol=1e-9)

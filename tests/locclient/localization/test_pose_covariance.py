@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
-from locclient.localization.pose_hypothesis import applied, chained, difference, led_back
+from locclient.localization.pose_covariance import boxminus, boxplus, compose_end_cov, compose_inverse_cov
 
 SAMPLES = 4000
 
@@ -20,7 +20,7 @@ def place(rng: np.random.Generator) -> Array:
 
 
 def drawn(mean: Array, covariance: Array, rng: np.random.Generator) -> list[Array]:
-    return [applied(error, mean) for error in rng.multivariate_normal(np.zeros(6), covariance, SAMPLES)]
+    return [boxplus(mean, error) for error in rng.multivariate_normal(np.zeros(6), covariance, SAMPLES)]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -29,10 +29,13 @@ def test_a_place_led_back_along_the_way_and_a_place_led_on(seed: int) -> None:
     map_from_body, covariance, way, cov_way = place(rng), spd(rng), place(rng), spd(rng)
     pairs = list(zip(drawn(map_from_body, covariance, rng), drawn(way, cov_way, rng), strict=True))
     for (mean, claimed), found in (
-        (led_back(map_from_body, covariance, way, cov_way), [at @ se3_inverse(since) for at, since in pairs]),
-        (chained(map_from_body, covariance, way, cov_way), [at @ since for at, since in pairs]),
+        (
+            compose_inverse_cov(map_from_body, covariance, way, cov_way),
+            [at @ se3_inverse(since) for at, since in pairs],
+        ),
+        (compose_end_cov(map_from_body, covariance, way, cov_way), [at @ since for at, since in pairs]),
     ):
-        errors = np.array([difference(sample, mean) for sample in found])
+        errors = np.array([boxminus(sample, mean) for sample in found])
         scale = np.sqrt(np.diag(claimed))
         np.testing.assert_allclose(
             np.cov(errors.T) / np.outer(scale, scale), claimed / np.outer(scale, scale), atol=0.08
@@ -44,6 +47,6 @@ def test_there_and_back_is_where_one_began() -> None:
     rng = np.random.default_rng(5)
     map_from_body, way, nothing = place(rng), place(rng), np.zeros((6, 6))
     covariance = spd(rng)
-    again, claimed = led_back(*chained(map_from_body, covariance, way, nothing), way, nothing)
+    again, claimed = compose_inverse_cov(*compose_end_cov(map_from_body, covariance, way, nothing), way, nothing)
     np.testing.assert_allclose(again, map_from_body, atol=1e-12)
     np.testing.assert_allclose(claimed, covariance, atol=1e-12)

@@ -1,0 +1,72 @@
+"""Assembly of an estimate from hypotheses: status, pose with covariance, degradation cause. Pure."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleetmap.failure_definition import radius_95_m
+from fleetmap.messages import Cause, Status
+from fleetmap.odometry import OdometryStatus
+from locclient.localization.estimate import Estimate, Hypothesis
+from locclient.localization.hypothesis_set import HypothesisSet
+from locclient.localization.pose_hypothesis import PoseHypothesis
+from locclient.localization.settings import TrackSettings
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizationState:
+    """What an estimate tells of. confirmed: the pose that is tracked; candidates: competing ones while there is none. prior: the pose
+    by the prior and the motion since. has_failed: the last map query found no fix."""
+
+    confirmed: PoseHypothesis | None
+    candidates: HypothesisSet
+    prior: PoseHypothesis | None
+    has_failed: bool
+    was_tracking: bool
+
+
+def assemble(estimate: Estimate, state: LocalizationState, settings: TrackSettings) -> Estimate:
+    """`estimate`, whose cause is that of its images, with status, pose and cause by the state."""
+    if state.confirmed is not None:
+        return _of_confirmed(estimate, state.confirmed, state.has_failed, settings)
+    ranking, competitors = state.candidates.ranking()
+    status = Status.AMBIGUOUS if competitors else Status.LOST if state.was_tracking else Status.INITIALISING
+    estimate = replace(estimate, status=status, hypotheses=_published(ranking))
+    if ranking:
+        return estimate if competitors else _with_pose(estimate, ranking[0], settings)
+    if state.prior is None or estimate.map_version is None:
+        return estimate
+    # Nothing in the map agrees: the prior and the odometry since, as far as that goes.
+    if radius_95_m(state.prior.now_cov) <= settings.lost_radius_m:
+        status = Status.DEGRADED
+    estimate = replace(estimate, status=status, cause=estimate.cause or Cause.UNMATCHED)
+    return _with_pose(estimate, state.prior, settings)
+
+
+def _of_confirmed(estimate: Estimate, confirmed: PoseHypothesis, has_failed: bool, settings: TrackSettings) -> Estimate:
+    radius_m = radius_95_m(confirmed.now_cov)
+    age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9
+    is_lost = estimate.odometry.status is OdometryStatus.DEGRADED
+    cause = estimate.cause or (Cause.ODOMETRY if is_lost else Cause.UNMATCHED if has_failed else Cause.NONE)
+    if radius_m > settings.lost_radius_m:
+        status = Status.LOST
+    elif radius_m > settings.degraded_radius_m or age_s > settings.degraded_after_s or cause is Cause.FROZEN:
+        status = Status.DEGRADED
+    else:
+        status, cause = Status.TRACKING, Cause.NONE
+    estimate = replace(estimate, status=status, cause=cause)
+    if status is not Status.TRACKING and confirmed.kidnap_hypotheses:  # either there or where fixes have said since
+        places = _published([confirmed, *confirmed.kidnap_hypotheses])
+        return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)
+    return _with_pose(estimate, confirmed, settings)
+
+
+def _with_pose(estimate: Estimate, hypothesis: PoseHypothesis, settings: TrackSettings) -> Estimate:
+    """With the map's own uncertainty, which is common to all fixes: no number of them averages it away."""
+    of_map = np.diag([settings.map_sigma_rad**2] * 3 + [settings.map_sigma_m**2] * 3)
+    return replace(estimate, map_from_body=hypothesis.now_map_from_body, cov_rot_trans=hypothesis.now_cov + of_map)
+
+
+def _published(hypotheses: Sequence[PoseHypothesis]) -> tuple[Hypothesis, ...]:
+    return tuple(Hypothesis(h.now_map_from_body, h.support) for h in hypotheses)
