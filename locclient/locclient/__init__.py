@@ -1,1 +1,80 @@
-"""The localization client that runs on a robot."""
+"""Localization of camera robots in the maps of their fleet.
+
+A whole recording, as `locclient replay` does it:
+
+    from locclient import localize
+
+    result = localize("drive.mcap", "maps", "hall")  # or "tcp/127.0.0.1:7447" for a server
+    result.report["localised_share"], result.map_from_body, result.statuses
+    result.save_picture("drive.png")
+
+`Localizer` takes samples one by one and gives an `Estimate` for each frame; `Robot` adds failures and new map versions to it.
+
+One frame alone, without odometry or history, is relocalized in three steps:
+
+    from locclient import LocalizerSettings, MapView, Relocalizer, fetch_map, finished
+
+    loaded, settings = fetch_map("maps", "hall"), LocalizerSettings().relocalizer
+    view = MapView(loaded.tiles.values(), loaded.vocabulary, loaded.manifest.camera.focal_px)
+    relocalizer = Relocalizer(view, rectifier.camera, settings)
+    fixes = finished(relocalizer.anywhere(finished(relocalizer.extract(rectifier.rectify(frame)))))
+
+`fixes` are the places that verify, the best first; fixes[0].map_from_cam is (4, 4). Several similar ones mean that the place is
+ambiguous: racks repeat.
+"""
+
+from importlib import import_module, metadata
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fleetmap.relocalization.map_view import MapView
+    from fleetmap.relocalization.relocalizer import Fix, Relocalizer, finished
+    from locclient.localization.estimate import Estimate
+    from locclient.localization.localizer import Localizer
+    from locclient.localization.settings import LocalizerSettings
+    from locclient.replay.localize import LocalizeOptions, fetch_map, localize
+    from locclient.replay.run_result import ReplayResult
+    from locclient.robot.robot import Robot
+
+__all__ = [
+    "Estimate",
+    "Fix",
+    "LocalizeOptions",
+    "Localizer",
+    "LocalizerSettings",
+    "MapView",
+    "Relocalizer",
+    "ReplayResult",
+    "Robot",
+    "__version__",
+    "fetch_map",
+    "finished",
+    "localize",
+]
+_MODULES = {
+    "Estimate": "locclient.localization.estimate",
+    "Fix": "fleetmap.relocalization.relocalizer",
+    "LocalizeOptions": "locclient.replay.localize",
+    "Localizer": "locclient.localization.localizer",
+    "LocalizerSettings": "locclient.localization.settings",
+    "MapView": "fleetmap.relocalization.map_view",
+    "Relocalizer": "fleetmap.relocalization.relocalizer",
+    "ReplayResult": "locclient.replay.run_result",
+    "Robot": "locclient.robot.robot",
+    "fetch_map": "locclient.replay.localize",
+    "finished": "fleetmap.relocalization.relocalizer",
+    "localize": "locclient.replay.localize",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Imports a public name when it is first used, so that `import locclient` stays light (PEP 562)."""
+    if name == "__version__":
+        return metadata.version("fleetmap")
+    if name not in _MODULES:
+        raise AttributeError(f"module 'locclient' has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -68,7 +68,7 @@ def test_wheel_holds_the_four_packages_and_nothing_else(wheel: Path) -> None:
     tops = {name.partition("/")[0] for name in names}
     assert {top for top in tops if not top.endswith(".dist-info")} == PACKAGES
     assert any(name.endswith("licenses/LICENSE") for name in names)
-    assert {"fleetmap/py.typed", "fleetmap/data/vocabulary.fmvb"} <= set(names)
+    assert {"fleetmap/py.typed", "locclient/py.typed", "fleetmap/data/vocabulary.fmvb"} <= set(names)
 
 
 def test_robot_has_no_server_library(robot: Path) -> None:

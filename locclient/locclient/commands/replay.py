@@ -1,5 +1,6 @@
 """`locclient replay`: a recording played to the localizer against a published map."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -65,7 +66,6 @@ def _merged(config: Any, given: dict[str, Any]) -> dict[str, Any]:
 def _run(path: Path, options: dict[str, Any], config: Any) -> None:
     import json
 
-    import cv2
     import msgspec
     from rich.console import Console
     from rich.progress import Progress
@@ -73,8 +73,8 @@ def _run(path: Path, options: dict[str, Any], config: Any) -> None:
     from fleetmap.recordings import FrameSelection, OpenOptions, open_recording
     from fleetmap.recordings.tum import write_tum
     from locclient.maps.connection import connected
-    from locclient.replay.plots import replay_picture
     from locclient.replay.prior_option import parse_prior
+    from locclient.replay.replay import ReplayOptions
     from locclient.replay.replay import replay as play
     from locclient.replay.replay_sources import ReplaySource
 
@@ -84,29 +84,27 @@ def _run(path: Path, options: dict[str, Any], config: Any) -> None:
     console = Console(stderr=True)
     with (
         open_recording(path, OpenOptions(calibration_file=calibration, topics=config.topics)) as recording,
-        connected(options) as link,
+        connected(options) as connection,
         Progress(console=console, disable=not console.is_terminal) as bar,
     ):
         for issue in recording.issues:
             console.print(f"note: {issue.what} {issue.detail}".rstrip())
         source = ReplaySource.of(recording, selection, reverse=options["reverse"])
         task = bar.add_task("replay", total=len(source))
-        result = play(
-            source,
-            link,
-            config.localizer,
-            prior,
-            realtime=options["realtime"],
-            progress=lambda n: bar.update(task, completed=n + 1),
-        )
-    built = result.report()
+        progress = partial(_advance, bar, task)
+        result = play(source, connection, ReplayOptions(config.localizer, prior, options["realtime"], progress))
+    report = result.report
     if options["report"] is not None:
-        Path(options["report"]).write_text(json.dumps(msgspec.to_builtins(built), indent=2) + "\n")
+        Path(options["report"]).write_text(json.dumps(msgspec.to_builtins(report), indent=2) + "\n")
     if options["trajectory"] is not None:
-        write_tum(Path(options["trajectory"]), result.trajectory())
-    if options["picture"] is not None and not cv2.imwrite(str(options["picture"]), replay_picture(result)):
-        raise UsageError(f"the picture cannot be written to {options['picture']}; give a path that ends in .png")
-    _print_table(built)
+        write_tum(Path(options["trajectory"]), result.trajectory)
+    if options["picture"] is not None:
+        result.save_picture(options["picture"])
+    _print_table(report)
+
+
+def _advance(bar: Any, task: Any, number: int) -> None:
+    bar.update(task, completed=number + 1)
 
 
 def _print_table(report: dict[str, object]) -> None:

@@ -15,7 +15,7 @@ from fleetmap.recordings.ros2.keys import attachment, ros_key
 from fleetmap.recordings.ros2.messages import FrameLink, encode_frame_links, encode_prior, encode_text
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.estimate import Estimate
-from locclient.robot.continuous_odom import Placed
+from locclient.robot.continuous_odom import PublishedPose
 
 _MAX_HYPOTHESES = 16
 
@@ -38,7 +38,7 @@ class OutputSection(Section, frozen=True):
 class Output(Protocol):
     """Tells one estimate; what cannot be sent at once is lost, because the next one is worth more."""
 
-    def publish(self, estimate: Estimate, placed: Placed, base_from_body: Array) -> None:
+    def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
         """Tells this estimate."""
 
 
@@ -48,14 +48,14 @@ class MessagePackOutput:
     def __init__(self, bus: Bus, site: str, robot: str, _: OutputSection) -> None:
         self._bus, self._key = bus, robot_key(site, robot, "estimate")
 
-    def publish(self, estimate: Estimate, placed: Placed, base_from_body: Array) -> None:
+    def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
         """See Output."""
-        covariance = estimate.cov_rot_trans if placed.map_from_odom is not None else None
+        covariance = estimate.cov_rot_trans if published.map_from_odom is not None else None
         body_from_base = se3_inverse(base_from_body)
         message = EstimateMessage(
             stamp_ns=estimate.stamp_ns, status=estimate.status.value, cause=estimate.cause.value, map_version=estimate.map_version,
-            odom_from_base=Placement.of(placed.odom_from_base),
-            map_from_odom=None if placed.map_from_odom is None else Placement.of(placed.map_from_odom),
+            odom_from_base=Placement.of(published.odom_from_base),
+            map_from_odom=None if published.map_from_odom is None else Placement.of(published.map_from_odom),
             cov_rot_trans=None if covariance is None else tuple(float(v) for v in covariance.ravel()),
             hypotheses=tuple(Placement.of(h.map_from_body @ body_from_base) for h in estimate.hypotheses[:_MAX_HYPOTHESES]),
         )  # fmt: skip
@@ -74,18 +74,18 @@ class Ros2Output:
             "status": ros_key(section.domain, section.status_topic, "std_msgs/String"),
         }
 
-    def publish(self, estimate: Estimate, placed: Placed, base_from_body: Array) -> None:
+    def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
         """See Output. A pose is told only with a covariance, and covers the base, in the axes of the map."""
         section, stamp_ns = self._section, estimate.stamp_ns
         links = []
-        if placed.map_from_odom is not None:
-            links.append(FrameLink(section.map_frame, section.odom_frame, placed.map_from_odom))
+        if published.map_from_odom is not None:
+            links.append(FrameLink(section.map_frame, section.odom_frame, published.map_from_odom))
             if estimate.cov_rot_trans is not None:
-                map_from_base = placed.map_from_odom @ placed.odom_from_base
+                map_from_base = published.map_from_odom @ published.odom_from_base
                 prior = PositionPrior(stamp_ns, map_from_base, np.asarray(estimate.cov_rot_trans))
                 self._send("pose", stamp_ns, encode_prior(prior, section.map_frame))
         if section.publish_odom:
-            links.append(FrameLink(section.odom_frame, section.base_frame, placed.odom_from_base))
+            links.append(FrameLink(section.odom_frame, section.base_frame, published.odom_from_base))
         if links:
             self._send("tf", stamp_ns, encode_frame_links(stamp_ns, links))
         self._send("status", stamp_ns, encode_text(estimate.status.value))

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from fleetmap.errors import FleetmapError, RecordingError
-from fleetmap.messages import PoseMessage, WantedVersion, encode_message
+from fleetmap.messages import WantedVersion, encode_message
 from fleetmap.sensors.rectification import StereoCamera
 from locclient.daemon.failure_files import write_failure
 from locclient.daemon.outbox import Outbox, QueuedReport
@@ -148,18 +148,13 @@ class Runtime:
     def _after_frame(self, outcome: Outcome) -> None:
         parts, estimate = self._parts, outcome.estimate
         if parts.output is not None:
-            self._tell(lambda: parts.output.publish(estimate, outcome.placed, parts.robot.base_from_body))  # type: ignore[union-attr]
+            self._tell(lambda: parts.output.publish(estimate, outcome.published, parts.robot.base_from_body))  # type: ignore[union-attr]
         self._figures.handle(outcome)
         self._shared.place = self._whereabouts.handle(estimate)
         self._note_failure(outcome.failure, 0.0)
-        if parts.link is None or estimate.cov_rot_trans is None or outcome.placed.map_from_odom is None:
-            return
-        if estimate.stamp_ns - self._pose_ns >= _POSE_EVERY_NS:
+        message = outcome.pose_message()
+        if parts.link is not None and message is not None and estimate.stamp_ns - self._pose_ns >= _POSE_EVERY_NS:
             self._pose_ns = estimate.stamp_ns
-            map_from_base = outcome.placed.map_from_odom @ outcome.placed.odom_from_base
-            message = PoseMessage.of(
-                estimate.stamp_ns, map_from_base, estimate.cov_rot_trans, estimate.status.value, estimate.map_version
-            )
             self._tell(lambda: parts.link.publish_pose(message))  # type: ignore[union-attr]
 
     def _tell(self, publish: Callable[[], None]) -> None:

@@ -1,13 +1,17 @@
 """The picture of a replay: top-down path coloured by error over the map's landmarks, and the error over time."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.errors import UsageError
 from fleetmap.failure_definition import ERROR_LIMIT_M
 from fleetmap.geometry import Array
-from locclient.replay.replay import ReplayResult
-from locclient.replay.run_metrics import localised
+from locclient.replay.run_metrics import FrameRecord, localised, localised_share
 
 Canvas = NDArray[np.uint8]
 _SIZE = (900, 1500)
@@ -16,7 +20,27 @@ _INK, _GREY, _PALE = (40, 40, 40), (130, 130, 130), (205, 205, 205)
 _FULL_SCALE_M = 0.1
 
 
-def replay_picture(result: ReplayResult) -> Canvas:
+@dataclass(frozen=True)
+class RunPlot:
+    """Values of the picture: positions_map_m, truths_map_m (N, 3), NaN where unknown, of N frames; landmarks_map_m (M, 3)."""
+
+    title: str
+    frames: Sequence[FrameRecord]
+    positions_map_m: Array
+    truths_map_m: Array
+    landmarks_map_m: Array
+
+
+def save_picture(plot: RunPlot, path: Path) -> None:
+    """Writes the picture as PNG; UsageError where it cannot be written."""
+    _, data = cv2.imencode(".png", draw_run(plot))
+    try:
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise UsageError(f"the picture cannot be written to {path} ({error.strerror}); check the path") from error
+
+
+def draw_run(result: RunPlot) -> Canvas:
     """(900, 1500, 3) BGR."""
     canvas = np.full((*_SIZE, 3), 255, np.uint8)
     _plan(canvas, result)
@@ -24,9 +48,9 @@ def replay_picture(result: ReplayResult) -> Canvas:
     return canvas
 
 
-def _plan(canvas: Canvas, result: ReplayResult) -> None:
-    points = np.concatenate([t.points_map for t in result.tiles.tiles.values()])
-    path = np.array([e.map_from_body[:3, 3] for e in result.estimates if e.map_from_body is not None]).reshape(-1, 3)
+def _plan(canvas: Canvas, result: RunPlot) -> None:
+    points = result.landmarks_map_m
+    path = result.positions_map_m[~np.isnan(result.positions_map_m[:, 0])]
     shown = np.vstack([path[:, :2], np.percentile(points[:, :2], [3, 97], axis=0)])
     low, high = shown.min(axis=0) - 1.0, shown.max(axis=0) + 1.0
     scale = min((_PLAN_WIDTH - 80) / (high[0] - low[0]), (_SIZE[0] - 120) / (high[1] - low[1]))
@@ -39,19 +63,19 @@ def _plan(canvas: Canvas, result: ReplayResult) -> None:
         if 0 <= x < _PLAN_WIDTH and 60 <= y < _SIZE[0]:
             canvas[y : y + 2, x : x + 2] = (175, 175, 175)
     good = localised(result.frames)
-    for k, (estimate, frame) in enumerate(zip(result.estimates, result.frames, strict=True)):
-        if estimate.map_from_body is None:
+    for k, (position, frame) in enumerate(zip(result.positions_map_m, result.frames, strict=True)):
+        if np.isnan(position[0]):
             continue
         colour = _colour(frame.error_m) if good[k] else (200, 120, 200)
-        cv2.circle(canvas, pixel(estimate.map_from_body[:3, 3]), 4, colour, -1, cv2.LINE_AA)
-        truth = result.truths[k]
-        if truth is not None:
-            cv2.line(canvas, pixel(estimate.map_from_body[:3, 3]), pixel(truth[:3, 3]), _INK, 1, cv2.LINE_AA)
+        cv2.circle(canvas, pixel(position), 4, colour, -1, cv2.LINE_AA)
+        truth = result.truths_map_m[k]
+        if not np.isnan(truth[0]):
+            cv2.line(canvas, pixel(position), pixel(truth), _INK, 1, cv2.LINE_AA)
     metre = 10.0 ** np.floor(np.log10(0.3 * (high[0] - low[0])))
     cv2.line(canvas, (40, _SIZE[0] - 20), (int(40 + metre * scale), _SIZE[0] - 20), _INK, 3)
     _text(canvas, f"{metre:g} m", (int(50 + metre * scale), _SIZE[0] - 15))
-    share = result.report()["localised_share"]
-    title = f"{result.manifest.site} version {result.manifest.version}: {len(result.frames)} frames, localised "
+    share = localised_share(result.frames)
+    title = f"{result.title}: {len(result.frames)} frames, localised "
     _text(
         canvas,
         title + ("never" if not isinstance(share, float) else f"{100 * share:.1f} % after the first fix"),
@@ -61,7 +85,7 @@ def _plan(canvas: Canvas, result: ReplayResult) -> None:
     _text(canvas, f"green 0 .. red {_FULL_SCALE_M * 1000:.0f} mm of error; violet: not localised", (40, 60))
 
 
-def _errors(canvas: Canvas, result: ReplayResult) -> None:
+def _errors(canvas: Canvas, result: RunPlot) -> None:
     left, right, top, bottom = _PLAN_WIDTH + 60, _SIZE[1] - 30, 100, _SIZE[0] - 60
     start = result.frames[0].stamp_ns
     length = max((result.frames[-1].stamp_ns - start) * 1e-9, 1e-3)

@@ -9,8 +9,8 @@ from locclient.localization.estimate import Estimate
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
-    """One estimate in the frames that are published; map_from_odom is None while there is no single place to name."""
+class PublishedPose:
+    """One estimate in the published frames; map_from_odom is None while there is no single pose."""
 
     odom_from_base: Array
     map_from_odom: Array | None
@@ -28,13 +28,15 @@ class ContinuousOdom:
         self._odom_from_own = np.eye(4)
         self._named = False
 
-    def handle(self, estimate: Estimate) -> Placed:
+    def handle(self, estimate: Estimate) -> PublishedPose:
         """What is published for this frame."""
         change = estimate.odometry.new_odom_from_old_odom
         if change is not None and self._named:
             self._odom_from_own = self._odom_from_own @ se3_inverse(change)
         odom_from_body = self._odom_from_own @ estimate.odometry.odom_from_body
         if estimate.map_from_body is None:
-            return Placed(odom_from_body @ self._body_from_base, None)
+            return PublishedPose(odom_from_body @ self._body_from_base, None)
         self._named = True
-        return Placed(odom_from_body @ self._body_from_base, estimate.map_from_body @ se3_inverse(odom_from_body))
+        return PublishedPose(
+            odom_from_body @ self._body_from_base, estimate.map_from_body @ se3_inverse(odom_from_body)
+        )

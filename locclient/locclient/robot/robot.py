@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from fleetmap.geometry import Array
-from fleetmap.messages import WantedVersion
+from fleetmap.messages import PoseMessage, WantedVersion
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
@@ -15,7 +15,7 @@ from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap
-from locclient.robot.continuous_odom import ContinuousOdom, Placed
+from locclient.robot.continuous_odom import ContinuousOdom, PublishedPose
 from locclient.robot.dock_check import DockCheck
 from locclient.robot.failure_monitor import Failure, FailureMonitor
 from locclient.robot.sensor_bundle import SensorBundle
@@ -58,10 +58,21 @@ class Outcome:
     """What one frame brought. cpu_s: from encoded images to estimate. dock_error_m: as `DockCheck` says, None without an arrival."""
 
     estimate: Estimate
-    placed: Placed
+    published: PublishedPose
     cpu_s: float
+    stage_s: dict[str, float]
     failure: FailureContext | None
     dock_error_m: float | None = None
+
+    def pose_message(self) -> PoseMessage | None:
+        """The pose for the server; None while there is no single one with a covariance."""
+        estimate, map_from_odom = self.estimate, self.published.map_from_odom
+        if map_from_odom is None or estimate.cov_rot_trans is None:
+            return None
+        map_from_base = map_from_odom @ self.published.odom_from_base
+        return PoseMessage.of(
+            estimate.stamp_ns, map_from_base, estimate.cov_rot_trans, estimate.status, estimate.map_version
+        )
 
 
 @dataclass
@@ -146,16 +157,19 @@ class Robot:
             return None
         begun_s = self._clock_s()
         raw = decode_frame(bundle.frame) if isinstance(bundle.frame, StoredFrame) else bundle.frame
+        decoded_s = self._clock_s()
         frame = self._rectifier.rectify(raw)
+        rectified_s = self._clock_s()
         estimate = self.localizer.handle_stereo(frame)
         cpu_s = self._clock_s() - begun_s
+        stage_s = {"decode": decoded_s - begun_s, "rectify": rectified_s - decoded_s, **estimate.stage_s}
         self._try(estimate, frame)
         failure = self.monitor.handle(estimate)
         context = None if failure is None else self._context(failure)
         if not self._pictures or estimate.stamp_ns - self._pictures[-1][0] >= _THUMBNAIL_EVERY_NS:
             self._pictures.append((estimate.stamp_ns, frame.left))
         dock_error_m = self._docks.handle(bundle.priors, estimate)
-        return Outcome(estimate, self._odom.handle(estimate), cpu_s, context, dock_error_m)
+        return Outcome(estimate, self._odom.handle(estimate), cpu_s, stage_s, context, dock_error_m)
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """The failure that a source which sends no frames is."""

@@ -16,8 +16,9 @@ from typing import Any
 from fleetmap.recordings import FrameSelection, open_recording
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import connected
-from locclient.replay.replay import ReplayResult, replay
+from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.replay_sources import ReplaySource
+from locclient.replay.run_result import ReplayResult
 
 SITE = "hall"
 LIBRARIES = ("numpy", "numba", "opencv-python-headless")
@@ -127,4 +128,4 @@ def played(
     options = {"site": SITE, "store": store, "server": None, "robot": "bench"}
     with open_recording(path) as recording, connected(options) as link:
         source = ReplaySource.of(recording, FrameSelection.parse(frames), reverse=reverse)
-        return replay(source, link, settings, None, realtime=False, progress=lambda _: None)
+        return replay(source, link, ReplayOptions(settings))

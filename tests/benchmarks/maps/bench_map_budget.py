@@ -24,10 +24,9 @@ from numpy.typing import NDArray
 from fleetmap.mapformat import Manifest, Tile, decode_tile, encode_tile
 from fleetmap.messages import WantedVersion
 from fleetmap.recordings import FrameSelection, open_recording
-from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import MapConnection
 from locclient.maps.map_client import FetchedTiles, ReadyVersion
-from locclient.replay.replay import replay
+from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.replay_sources import ReplaySource
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
@@ -68,7 +67,7 @@ def row(
     encoded = [encode_tile(tile) for tile in tiles_from_survey(survey, made.tile_size_m, chosen=chosen)]
     link = MapConnection(Cut(made, words, [decode_tile(data) for data in encoded]), None, made.site, "bench")
     begun_s = time.process_time()
-    report = replay(source, link, LocalizerSettings(), None, realtime=False, progress=lambda _: None).report()
+    report = replay(source, link, ReplayOptions()).report
     size = sum(len(data) for data in encoded)
     return {
         "budget": name,

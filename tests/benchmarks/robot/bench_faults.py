@@ -18,7 +18,7 @@ from benchmarks.common.recorded_runs import parsed, played, recorded, surveyed, 
 from fleetsim.scenarios import find_scenario
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
-from locclient.replay.replay import ReplayResult
+from locclient.replay.run_result import ReplayResult
 
 TRACKING, DEGRADED = {Status.TRACKING}, {Status.DEGRADED, Status.LOST}
 # Robot of the scenario `faults`: statuses of which one must be said within WITHIN_S, cause that must be named ("" for none).

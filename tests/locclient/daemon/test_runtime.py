@@ -21,7 +21,7 @@ from locclient.maps.map_client import CachedMap, LocalMapSource, MapClient
 from locclient.maps.tile_cache import StoreFolder, TileCache
 from locclient.maps.tile_loader import TileLoader
 from locclient.maps.tile_selection import Place, WindowSettings
-from locclient.robot.continuous_odom import Placed
+from locclient.robot.continuous_odom import PublishedPose
 from locclient.robot.robot import Robot
 from locclient.robot.sensor_bundle import SensorBundle
 from locclient.sensors.intake import Intake
@@ -63,7 +63,7 @@ class Listener:
 
     estimates: list[Estimate] = field(default_factory=list)
 
-    def publish(self, estimate: Estimate, placed: Placed, base_from_body: np.ndarray) -> None:
+    def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: np.ndarray) -> None:
         self.estimates.append(estimate)
 
 

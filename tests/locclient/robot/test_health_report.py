@@ -14,8 +14,12 @@ from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.estimate import Estimate
 from locclient.maps.connection import MapConnection
 from locclient.maps.map_client import FetchedTiles
-from locclient.replay.replay import ReplayResult, _record, _Reporter
+from locclient.replay.replay import frame_record
+from locclient.replay.run_reporter import RunReporter
+from locclient.replay.run_result import ReplayResult
+from locclient.robot.continuous_odom import ContinuousOdom
 from locclient.robot.health_report import FixFigures, HealthFigures
+from locclient.robot.robot import Outcome
 from mapserver.fleet_statistics.health_stream import HealthStream
 from mapserver.store import MapStore
 from support.fleet.estimates import estimate
@@ -110,12 +114,14 @@ def test_a_replay_tells_the_server_what_it_counts_with(store: MapStore) -> None:
     link, manifest = _Link(), store.manifest(robot_world.SITE, 1)
     result = ReplayResult([], [], [], manifest, FetchedTiles({}, {}))
     to: Any = link
-    reporter, watch, sums = _Reporter(MapConnection(to, to, robot_world.SITE, "r1"), result), HealthStream(), []
+    reporter, watch, sums = RunReporter(MapConnection(to, to, robot_world.SITE, "r1"), result), HealthStream(), []
     for number in range(50):
         said = look(0.1 * number, 4.0, 0.4 if number == 35 else 0.02, 50, 40)
-        result.frames.append(_record(said, None, 0.01, 0.01, {}))
+        dock_error_m = 0.5 if number == 25 else None
+        outcome = Outcome(said, ContinuousOdom(np.eye(4)).handle(said), 0.01, {}, None, dock_error_m)
+        result.frames.append(frame_record(outcome, None, 0.01, 0.0))
         result.estimates.append(said)
-        reporter.after_frame(said, np.eye(4), 0.5 if number == 25 else None)
+        reporter.handle(outcome)
     for health in link.told:
         added = watch.take_health(health)
         assert added is not None

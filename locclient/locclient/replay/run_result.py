@@ -1,0 +1,85 @@
+"""Result of a replay: estimates, ground truth, report, trajectory and picture."""
+
+import resource
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from fleetmap.mapformat import Manifest
+from fleetmap.messages import Status
+from fleetmap.sensors.samples import Stamps, Trajectory
+from locclient.localization.estimate import Estimate
+from locclient.maps.map_client import FetchedTiles
+from locclient.replay.plots import RunPlot, save_picture
+from locclient.replay.run_metrics import METRICS, FrameRecord, localised
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """A finished replay, one entry a frame: records, estimates, and the true map_from_body (4, 4), None where unknown.
+
+    manifest, tiles: the map that was used. notes: what a user should know of the run, in words.
+    """
+
+    frames: list[FrameRecord]
+    estimates: list[Estimate]
+    truths: list[Array | None]
+    manifest: Manifest
+    tiles: FetchedTiles
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def stamps_ns(self) -> Stamps:
+        """(N,) stamps of the frames."""
+        return np.array([estimate.stamp_ns for estimate in self.estimates], np.int64)
+
+    @property
+    def map_from_body(self) -> Array:
+        """(N, 4, 4) estimated poses; NaN where there is none."""
+        unknown = np.full((4, 4), np.nan)
+        found = [unknown if e.map_from_body is None else e.map_from_body for e in self.estimates]
+        return np.array(found).reshape(-1, 4, 4)
+
+    @property
+    def cov_rot_trans(self) -> Array:
+        """(N, 6, 6) covariances of the poses in map axes, rotation first; NaN where there is none."""
+        unknown = np.full((6, 6), np.nan)
+        found = [unknown if e.cov_rot_trans is None else e.cov_rot_trans for e in self.estimates]
+        return np.array(found).reshape(-1, 6, 6)
+
+    @property
+    def statuses(self) -> list[Status]:
+        """Status of each frame."""
+        return [estimate.status for estimate in self.estimates]
+
+    @property
+    def report(self) -> dict[str, object]:
+        """Figures of the run; docs/reports.md explains the keys."""
+        built: dict[str, object] = {name: metric(self.frames) for name, metric in METRICS.items()}
+        built["peak_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+        built["map_version"] = self.manifest.version
+        built["site"] = self.manifest.site
+        built["tiles"] = len(self.tiles.tiles)
+        built["tiles_refused"] = {f"{x},{y}": reason for (x, y), reason in sorted(self.tiles.refused.items())}
+        built["notes"] = self.notes
+        return built
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """map_from_body of the localised frames."""
+        kept = np.array(localised(self.frames), bool) & ~np.isnan(self.map_from_body[:, 0, 0])
+        return Trajectory(self.stamps_ns[kept], self.map_from_body[kept])
+
+    def save_picture(self, path: str | Path) -> None:
+        """Draws path, landmarks and errors into a PNG file; UsageError where it cannot be written."""
+        truths_m = [np.full(3, np.nan) if truth is None else truth[:3, 3] for truth in self.truths]
+        plot = RunPlot(
+            title=f"{self.manifest.site}, version {self.manifest.version}",
+            frames=self.frames,
+            positions_map_m=self.map_from_body[:, :3, 3],
+            truths_map_m=np.array(truths_m).reshape(-1, 3),
+            landmarks_map_m=np.concatenate([tile.points_map for tile in self.tiles.tiles.values()]),
+        )
+        save_picture(plot, Path(path))
