@@ -26,17 +26,11 @@ from fleetmap.numerics.linear_kernels import (
 
 
 @kernel
-def _observe(
-    point: Array,
-    cam_from_odom_rotation: Array,
-    cam_position: Array,
-    focal: float,
-    cx: float,
-    cy: float,
-    focal_base: float,
-    out: Array,
-) -> bool:
-    """u_left, v, disparity of a point, and its camera coordinates in out[3:6]; False behind the camera."""
+def _observe(point: Array, cam_from_odom_rotation: Array, cam_position: Array, camera: Array, out: Array) -> bool:
+    """u_left, v, disparity of a point, and its camera coordinates in out[3:6]; False behind the camera.
+
+    camera: focal, cx, cy, focal * baseline.
+    """
     for a in range(3):
         out[3 + a] = 0.0
         for b in range(3):
@@ -44,9 +38,9 @@ def _observe(
     z = out[5]
     if z < 0.05:
         return False
-    out[0] = focal * out[3] / z + cx
-    out[1] = focal * out[4] / z + cy
-    out[2] = focal_base / z
+    out[0] = camera[0] * out[3] / z + camera[1]
+    out[1] = camera[0] * out[4] / z + camera[2]
+    out[2] = camera[3] / z
     return True
 
 
@@ -72,7 +66,7 @@ def triangulate(
         jacobian = np.empty((3, 3))
         for k in range(len(clones)):
             turn = rotations[clones[k]].T
-            if not _observe(point, turn, positions[clones[k]], camera[0], camera[1], camera[2], camera[3], z):
+            if not _observe(point, turn, positions[clones[k]], camera, z):
                 return False
             inverse = 1.0 / z[5]
             for b in range(3):
@@ -99,9 +93,7 @@ def triangulate(
         if np.abs(gradient).max() < 1e-4 * (1.0 + z[5]):
             break
     for k in range(len(clones)):
-        if not _observe(
-            point, rotations[clones[k]].T, positions[clones[k]], camera[0], camera[1], camera[2], camera[3], z
-        ):
+        if not _observe(point, rotations[clones[k]].T, positions[clones[k]], camera, z):
             return False
     return bool(np.isfinite(point).all())
 
@@ -137,7 +129,7 @@ def linearize_track(
     rows = 0
     for k in range(len(clones)):
         turn = rotations[clones[k]].T
-        _observe(point, turn, positions[clones[k]], camera[0], camera[1], camera[2], camera[3], z)
+        _observe(point, turn, positions[clones[k]], camera, z)
         inverse = 1.0 / z[5]
         stereo = pixels[k, 2] == pixels[k, 2]
         for row in range(3 if stereo else 2):
