@@ -5,45 +5,34 @@ from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from http import HTTPMethod
 from importlib import metadata
-from typing import Annotated
 
-from fastapi import FastAPI, Path, Request, Response
+from fastapi import FastAPI, Request, Response
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from fleetmap.bus import Bus
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT
 from mapserver.api import describe, problems
-from mapserver.api.action_routes import ActionSettings, install_action_routes
 from mapserver.api.bytes_response import bytes_response
 from mapserver.api.fleet_routes import install_fleet_routes
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
-from mapserver.api.pages import Limit, NameCursor, NumberCursor, RobotCursor, page
-from mapserver.api.parameters import Sha256, Site, SiteFilter, Version
-from mapserver.api.version_routes import install_version_routes
+from mapserver.api.parameters import Limit, NameCursor, Number, NumberCursor, Sha256, Site, SiteFilter, Version, page
+from mapserver.api.version_routes import ApiSettings, install_version_routes
 from mapserver.api.views import (
     EventList,
     JobList,
     RobotList,
     ServerVersion,
+    ServiceState,
     SiteList,
-    SiteView,
-    State,
     VersionList,
     VersionView,
 )
-from mapserver.api.writers import Writers
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet_statistics.canary_test import CanarySettings
-from mapserver.fleet_statistics.resurvey_test import ResurveySettings
-from mapserver.quality.gate import GateSettings
-from mapserver.store import JobInfo, MapStore
+from mapserver.store import JobInfo, MapStore, VersionInfo
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
-ONLY_LOOPBACK = Writers()
-USUAL_GATE = GateSettings()
-USUAL_CANARY = CanarySettings()
-USUAL_RESURVEY = ResurveySettings()
+USUAL_SETTINGS = ApiSettings()
 
 
 def create_app(
@@ -52,16 +41,9 @@ def create_app(
     metrics: Metrics,
     bus: Bus | None,
     lifespan: Lifespan | None = None,
-    *,
-    writers: Writers = ONLY_LOOPBACK,
-    gate: GateSettings = USUAL_GATE,
-    canary: CanarySettings = USUAL_CANARY,
-    resurvey: ResurveySettings = USUAL_RESURVEY,
+    settings: ApiSettings = USUAL_SETTINGS,
 ) -> FastAPI:
-    """The application over an open store; `bus` is looked at for readiness only, None where none is served.
-
-    writers: who may change something. gate: what publishing over HTTP refuses. canary, resurvey: how the fleet's reports are judged.
-    """
+    """The application over an open store; `bus` is looked at for readiness only, None where none is served."""
     app = FastAPI(
         title="fleetmap",
         description="Versions of maps, the robots that use them, and the jobs that make them.",
@@ -76,9 +58,8 @@ def create_app(
     _install_service_routes(app, store, metrics, bus)
     _install_list_routes(app, store, fleet)
     _install_map_routes(app, store)
-    install_version_routes(app, store, writers, gate)
-    install_fleet_routes(app, store)
-    install_action_routes(app, store, writers, ActionSettings(gate, canary, resurvey))
+    install_version_routes(app, store, settings)
+    install_fleet_routes(app, store, settings.resurvey)
     describe.install(app)
     return app
 
@@ -93,17 +74,17 @@ def fleetmap_version() -> str:
 
 def _install_service_routes(app: FastAPI, store: MapStore, metrics: Metrics, bus: Bus | None) -> None:
     @app.get("/healthz")
-    def healthz() -> State:
+    def healthz() -> ServiceState:
         """The process runs."""
-        return State("ok")
+        return ServiceState("ok")
 
     @app.get("/readyz")
-    def readyz() -> State:
+    def readyz() -> ServiceState:
         """The store answers and the bus is open."""
         store.sites()
         if bus is not None and bus.closed():
             raise HTTPException(503, "the bus is closed; the server is stopping")
-        return State("ok")
+        return ServiceState("ok")
 
     @app.get("/version")
     def version() -> ServerVersion:
@@ -121,15 +102,14 @@ def _install_list_routes(app: FastAPI, store: MapStore, fleet: Fleet) -> None:
     def sites(limit: Limit = 100, cursor: NameCursor = None) -> SiteList:
         """Sites by name."""
         found = [info for info in store.sites() if cursor is None or info.site > cursor]
-        shown, following = page(found, limit, lambda info: info.site)
-        return SiteList([SiteView.of(info) for info in shown], following)
+        return SiteList(*page(found, limit, lambda info: info.site))
 
     @app.get("/v1/sites/{site}/versions")
     def versions(site: Site, limit: Limit = 100, cursor: NumberCursor = None) -> VersionList:
         """Versions of a site, oldest first, drafts too."""
         found = store.versions(site, after=cursor or 0, limit=limit + 1)
         shown, following = page(found, limit, lambda info: str(info.version))
-        return VersionList([VersionView.of(info) for info in shown], following)
+        return VersionList([VersionView.model_validate(info) for info in shown], following)
 
     @app.get("/v1/sites/{site}/events")
     def events(site: Site, limit: Limit = 100, cursor: NumberCursor = None) -> EventList:
@@ -145,12 +125,12 @@ def _install_list_routes(app: FastAPI, store: MapStore, fleet: Fleet) -> None:
         return JobList(*page(found, limit, lambda job: str(job.id)))
 
     @app.get("/v1/jobs/{job}")
-    def job(job: Annotated[int, Path(ge=1, le=1 << 62)]) -> JobInfo:
+    def job(job: Number) -> JobInfo:
         """One job."""
         return store.job(job)
 
     @app.get("/v1/robots")
-    def robots(site: SiteFilter = None, limit: Limit = 100, cursor: RobotCursor = None) -> RobotList:
+    def robots(site: SiteFilter = None, limit: Limit = 100, cursor: NameCursor = None) -> RobotList:
         """Robots (of a site) by site and name: the version that each runs and should run, and its last messages."""
         found = [robot for robot in fleet.robots(site) if cursor is None or f"{robot.site}/{robot.robot}" > cursor]
         found.sort(key=lambda robot: f"{robot.site}/{robot.robot}")
@@ -164,13 +144,13 @@ def _install_map_routes(app: FastAPI, store: MapStore) -> None:
         sha256 = store.version(site, version).manifest_sha256
         return bytes_response(request, store.blob(sha256), sha256, "application/json", immutable=True)
 
-    @app.get("/v1/sites/{site}/current")
-    def current(site: Site) -> VersionView:
+    @app.get("/v1/sites/{site}/current", response_model=VersionView)
+    def current(site: Site) -> VersionInfo:
         """The current version of a site."""
         info = store.current(site)
         if info is None:
             raise HTTPException(404, f"site {site} has no published version; publish one with `mapserver publish`")
-        return VersionView.of(info)
+        return info
 
     @app.head("/v1/tiles/{sha256}", response_class=Response, include_in_schema=False)
     @app.get("/v1/tiles/{sha256}", response_class=Response)

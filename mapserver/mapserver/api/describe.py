@@ -8,49 +8,22 @@ from fastapi.openapi.utils import get_openapi
 
 from mapserver.api.views import Problem
 from mapserver.fleet_statistics.kpis import Counters, kpis
-from mapserver.store import FailureRow
+from mapserver.store import Event, FailureRow, JobInfo, SiteInfo
 
-_PARAMETER_EXAMPLES: dict[str, Any] = {
-    "site": "hall", "version": 3, "before": 2, "after": 3, "job": 17, "sha256": "5e" * 32, "limit": 100,
-    "number": 12, "place": 1, "hours": 24, "by": "version",
-}  # fmt: skip
+_NOW_NS = 1_767_323_045_000_000_000
+_SITE = asdict(SiteInfo("hall", 3, 3, "cd" * 32))
 _VERSION = {
-    "site": "hall",
-    "version": 3,
-    "state": "current",
-    "parent": 2,
-    "created": "2026-01-02T03:04:05Z",
-    "manifest_sha256": "ab" * 32,
-    "tiles": 42,
-    "landmarks": 80412,
-    "map_bytes": 1830220,
-    "vocabulary_sha256": "cd" * 32,
-    "vocabulary_bytes": 512000,
+    **{"site": "hall", "version": 3, "state": "current", "parent": 2, "created": "2026-01-02T03:04:05Z"},
+    **{"manifest_sha256": "ab" * 32, "tiles": 42, "landmarks": 80412, "map_bytes": 1830220},
+    **{"vocabulary_sha256": "cd" * 32, "vocabulary_bytes": 512000},
 }
-_SITE = {"site": "hall", "current_version": 3, "versions": 3, "vocabulary_sha256": "cd" * 32}
-_EVENT = {
-    "id": 7, "stamp_ns": 1767323045000000000, "site": "hall", "kind": "promoted",
-    "detail": "version 2, replacing 3", "version": 2, "actor": "ada", "reason": "robots lose themselves in aisle 3",
-}  # fmt: skip
-_JOB = {
-    "id": 17, "site": "hall", "kind": "nightly", "state": "done", "started": "2026-01-02T01:00:00Z",
-    "finished": "2026-01-02T01:40:00Z", "message": "version 3 is published", "report": {},
-}  # fmt: skip
-_FAILURE = asdict(
-    FailureRow(
-        number=12, site="hall", robot="tug-7", failure_id="3f9a", received_ns=1767323049000000000,
-        happened_ns=1767323045000000000, duration_s=3.5, kind="blind", cause="dark", status="LOST", version=3, tile="4,-1",
-        x_map_m=70.2, y_map_m=-3.1,
-    )
-)  # fmt: skip
-_KPIS = asdict(
-    kpis(
-        Counters(
-            reports=57000, observed_ms=57_000_000, driving_ms=40_000_000, after_fix_ms=56_000_000, localised_ms=55_000_000,
-            usable_ms=55_500_000, first_fixes=3, first_fix_ms=9000, failures=1, blind_failures=1, blind_seen=1,
-        )
-    )
-)  # fmt: skip
+_REASON = "robots lose themselves in aisle 3"
+_EVENT = asdict(Event(7, _NOW_NS, "hall", "promoted", "version 2, replacing 3", 2, "ada", _REASON))
+_NIGHT = ("2026-01-02T01:00:00Z", "2026-01-02T01:40:00Z", "version 3 is published")
+_JOB = asdict(JobInfo(17, "hall", "nightly", "done", *_NIGHT, {}))
+_WHERE = (3, "4,-1", 70.2, -3.1)
+_FAILURE = asdict(FailureRow(12, "hall", "tug-7", "3f9a", _NOW_NS + 4, _NOW_NS, 3.5, "blind", "dark", "LOST", *_WHERE))
+_KPIS = asdict(kpis(Counters(57_000, 57_000_000, 40_000_000, 56_000_000, 55_000_000, 55_500_000, 3, 9000, failures=1)))
 _ANSWER_EXAMPLES: dict[str, Any] = {
     "/v1/failures": {"failures": [_FAILURE], "next": None},
     "/v1/failures/{number}": {"failure": _FAILURE, "report": {"sharpness": 0.4}, "pictures": []},
@@ -75,7 +48,7 @@ _ANSWER_EXAMPLES: dict[str, Any] = {
 
 
 def install(app: FastAPI) -> None:
-    """Gives `app` its document, made at the first question."""
+    """Gives `app` its document, made when it is first asked for."""
 
     def document() -> dict[str, Any]:
         if app.openapi_schema is None:
@@ -95,9 +68,6 @@ def _described(app: FastAPI) -> dict[str, Any]:
     for path, operations in found["paths"].items():
         for method, operation in operations.items():
             operation["responses"].pop("422", None)  # one of 4XX
-            for parameter in operation.get("parameters", []):
-                if parameter["name"] in _PARAMETER_EXAMPLES:
-                    parameter["example"] = _PARAMETER_EXAMPLES[parameter["name"]]
             answer = operation["responses"].get("200", {}).get("content", {}).get("application/json")
             if answer is not None and path in _ANSWER_EXAMPLES:
                 answer["example"] = _ANSWER_EXAMPLES[path]

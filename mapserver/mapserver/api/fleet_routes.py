@@ -1,27 +1,39 @@
-"""Reading the fleet's health: figures by what they are counted by, failures with their context and pictures."""
+"""Reading the fleet's health: figures by what they are counted by, failures with their pictures, tiles to survey again."""
 
 import time
-from typing import Annotated
+from typing import Annotated, Any
 
-from fastapi import FastAPI, Path, Query, Response
+from fastapi import FastAPI, Query, Response
 
 from fleetmap.messages import report_dict
-from mapserver.api.fleet_views import FailureList, FailureView, HourList, HourView, KpisList, KpisView
-from mapserver.api.pages import CounterCursor, Limit, NumberCursor, page
-from mapserver.api.parameters import Axis, FailureNumber, Hours, KeyFilter, Site, SiteFilter
+from mapserver.api.parameters import (
+    Axis,
+    FailureQuery,
+    Hours,
+    KeyFilter,
+    Limit,
+    NameCursor,
+    Number,
+    NumberCursor,
+    PictureNumber,
+    Site,
+    SiteFilter,
+    page,
+)
+from mapserver.api.views import FailureList, FailureView, HourList, HourView, KpisList, KpisView
 from mapserver.fleet.fleet import finite
+from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
 from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of, kpis
-from mapserver.store import FailureFilter, MapStore
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings, route_geojson
+from mapserver.store import MapStore
 
-VersionFilter = Annotated[int | None, Query(ge=1, le=1 << 31, description="on this version alone", examples=[None])]
 
-
-def install_fleet_routes(app: FastAPI, store: MapStore) -> None:
+def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettings) -> None:
     """Adds the endpoints."""
 
     @app.get("/v1/fleet/measures")
     def fleet_measures(
-        by: Axis = "site", site: SiteFilter = None, hours: Hours = 24, limit: Limit = 100, cursor: CounterCursor = None
+        by: Axis = "site", site: SiteFilter = None, hours: Hours = 24, limit: Limit = 100, cursor: NameCursor = None
     ) -> KpisList:
         """Failures per robot-day with interval, availability and the rest, by site, robot, version, tile or cause."""
         found = store.fleet.counters(site, by, since_hour=_since(hours))
@@ -32,9 +44,13 @@ def install_fleet_routes(app: FastAPI, store: MapStore) -> None:
 
     @app.get("/v1/sites/{site}/hours")
     def fleet_hours(
-        site: Site, by: Axis = "site", key: KeyFilter = None, hours: Hours = 24, limit: Limit = 100,
+        site: Site,
+        by: Axis = "site",
+        key: KeyFilter = None,
+        hours: Hours = 24,
+        limit: Limit = 100,
         cursor: NumberCursor = None,
-    ) -> HourList:  # fmt: skip
+    ) -> HourList:
         """The same figures hour by hour, of a site or of one of its robots, versions, tiles or causes."""
         store.current(site)  # an unknown site is not an empty one
         found = store.fleet.hours(site, by, key=key, since_hour=max(_since(hours), (cursor or -1) + 1))
@@ -42,26 +58,33 @@ def install_fleet_routes(app: FastAPI, store: MapStore) -> None:
         return HourList([HourView(hour * HOUR_NS, kpis(counts)) for hour, counts in shown], following)
 
     @app.get("/v1/failures")
-    def failures(
-        site: SiteFilter = None, robot: KeyFilter = None, version: VersionFilter = None, tile: KeyFilter = None,
-        cause: KeyFilter = None, kind: KeyFilter = None, limit: Limit = 100, cursor: NumberCursor = None,
-    ) -> FailureList:  # fmt: skip
+    def failures(query: Annotated[FailureQuery, Query()]) -> FailureList:
         """Failures, the last to arrive first; kind `suspected` are estimates of silent ones."""
-        wanted = FailureFilter(site=site, robot=robot, version=version, tile=tile, cause=cause, kind=kind)
-        found = store.fleet.failures(wanted, before=cursor, limit=limit + 1)
-        return FailureList(*page(found, limit, lambda failure: str(failure.number)))
+        found = store.fleet.failures(query.filter(), before=query.cursor, limit=query.limit + 1)
+        return FailureList(*page(found, query.limit, lambda failure: str(failure.number)))
 
     @app.get("/v1/failures/{number}")
-    def failure(number: FailureNumber) -> FailureView:
+    def failure(number: Number) -> FailureView:
         """One failure with what the robot told about it."""
         found = store.fleet.failure(number)
         return FailureView(found.failure, finite(report_dict(found.report)), found.pictures)
 
     @app.get("/v1/failures/{number}/pictures/{place}", response_class=Response)
-    def picture(number: FailureNumber, place: Annotated[int, Path(ge=0, le=100)]) -> Response:
+    def picture(number: Number, place: PictureNumber) -> Response:
         """A picture of a failure, as JPEG."""
         headers = {"Cache-Control": "private, max-age=86400", "X-Content-Type-Options": "nosniff"}
         return Response(store.fleet.picture(number, place), media_type="image/jpeg", headers=headers)
+
+    @app.get("/v1/sites/{site}/resurvey")
+    def resurvey(site: Site) -> ResurveyList:
+        """Tiles to survey again, the worst first, each with its reasons, and a route through them."""
+        return resurvey_list(store, site, settings, time.time_ns())
+
+    @app.get("/v1/sites/{site}/resurvey/route")
+    def resurvey_route(site: Site) -> dict[str, Any]:
+        """The route as GeoJSON, metres in `map` in the place of degrees."""
+        found = resurvey_list(store, site, settings, time.time_ns())
+        return route_geojson(site, found.version or 0, found.route)
 
 
 def _since(hours: int) -> int:

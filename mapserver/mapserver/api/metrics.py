@@ -1,46 +1,79 @@
-"""Prometheus metrics of the server. Labels take values from fixed sets, or names of sites, which only builds make."""
+"""Prometheus metrics of the server.
 
-from collections.abc import Iterator
+Labels take values from fixed sets, or names of sites, which only builds make, versions that the store has, causes (at most some
+dozens) and statuses.
+"""
+
+from collections import Counter as Counts
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TypeVar
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector, generate_latest
-from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from mapserver.api.fleet_metrics import FleetCollector
-from mapserver.fleet.fleet import Fleet
+from fleetmap.messages import Status
+from mapserver.fleet.fleet import Fleet, RobotStatus
+from mapserver.fleet_statistics.kpis import Counters
 from mapserver.store import MapStore
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _SEEN_WITHIN_S = 60.0
+_BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)
+Family = TypeVar("Family", CounterMetricFamily, GaugeMetricFamily)
+
+_SITE_SUMS: tuple[tuple[str, str, Callable[[Counters], float]], ...] = (
+    ("reports", "Health reports.", lambda counts: counts.reports),
+    ("failures", "Position failures that robots reported.", lambda counts: counts.failures),
+    ("silent_failures_estimated", "Silent failures, an estimate.", lambda counts: counts.silent_estimated),
+    ("unreported_blindness", "Stretches of blindness without a reported failure.", lambda c: c.unreported_blindness),
+    ("observed_seconds", "Time that reports cover.", lambda counts: counts.observed_ms / 1e3),
+    ("driving_seconds", "Of it driving; a robot-day is 57600 s.", lambda counts: counts.driving_ms / 1e3),
+    ("usable_seconds", "Of it with a usable position.", lambda counts: counts.usable_ms / 1e3),
+    ("after_first_fix_seconds", "Of it since the run's first fix.", lambda counts: counts.after_fix_ms / 1e3),
+    ("localised_seconds", "Of that TRACKING.", lambda counts: counts.localised_ms / 1e3),
+    ("frames", "Frames that were worked on.", lambda counts: counts.frames),
+    ("frames_dropped", "Frames that were not.", lambda counts: counts.frames_dropped),
+    ("docks", "Arrivals at docks.", lambda counts: counts.docks),
+    ("docks_wrong", "Of them with an estimate more than 0.30 m off.", lambda counts: counts.docks_wrong),
+)
+_VERSION_SUMS: tuple[tuple[str, str, Callable[[Counters], float]], ...] = (
+    ("failures", "Failures on a version.", lambda counts: counts.failures),
+    ("silent_failures_estimated", "Silent failures, an estimate.", lambda counts: counts.silent_estimated),
+    ("driving_seconds", "Driving with a version.", lambda counts: counts.driving_ms / 1e3),
+)
+_SITE_ROBOTS: tuple[tuple[str, str, Callable[[list[RobotStatus]], float]], ...] = (
+    ("robots", "Robots that ever reported.", len),
+    ("robots_seen", "Robots that reported in the last minute.", lambda robots: len(_seen(robots))),
+    (
+        "robots_current",
+        "Robots on the wanted version.",
+        lambda robots: sum(robot.version == robot.wanted_version is not None for robot in robots),
+    ),
+    ("robots_present", "Robots on the bus now.", lambda robots: sum(robot.is_present is True for robot in robots)),
+    (
+        "clock_skew_max_seconds",
+        "The most that a robot's clock is wrong.",
+        lambda robots: max((abs(robot.clock_ahead_s or 0.0) for robot in robots), default=0.0),
+    ),
+)
 
 
 class Metrics:
     """Counters of one server, in a registry of their own."""
 
     def __init__(self, store: MapStore, fleet: Fleet) -> None:
-        self._registry = CollectorRegistry()
-        ProcessCollector(registry=self._registry)
-        self._requests = Counter(
-            "fleetmap_http_requests_total", "HTTP requests.", ["method", "route", "status"], registry=self._registry
-        )
-        self._seconds = Histogram(
-            "fleetmap_http_request_seconds",
-            "Time to answer an HTTP request.",
-            ["route"],
-            registry=self._registry,
-            buckets=(0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0),
-        )
-        self._bus_messages = Counter(
-            "fleetmap_bus_messages_total",
-            "Questions and messages on the bus.",
-            ["what", "result"],
-            registry=self._registry,
-        )
-        self._bus_bytes = Counter(
-            "fleetmap_bus_sent_bytes_total", "Bytes sent in answers.", ["what"], registry=self._registry
-        )
-        self._registry.register(_SiteCollector(store, fleet))
-        self._registry.register(FleetCollector(store, fleet))
+        own = self._registry = CollectorRegistry()
+        ProcessCollector(registry=own)
+        labels = ["method", "route", "status"]
+        self._requests = Counter("fleetmap_http_requests_total", "HTTP requests.", labels, registry=own)
+        name, words = "fleetmap_http_request_seconds", "Time to answer an HTTP request."
+        self._seconds = Histogram(name, words, ["route"], registry=own, buckets=_BUCKETS_S)
+        name, words = "fleetmap_bus_messages_total", "Questions and messages on the bus."
+        self._bus_messages = Counter(name, words, ["what", "result"], registry=own)
+        name, words = "fleetmap_bus_sent_bytes_total", "Bytes sent in answers."
+        self._bus_bytes = Counter(name, words, ["what"], registry=own)
+        own.register(_FleetCollector(store, fleet))
 
     def count_http(self, method: str, route: str, status: int, seconds_s: float) -> None:
         """One HTTP request; `route` is the template, not the path, so that paths cannot make new series."""
@@ -57,26 +90,70 @@ class Metrics:
         return generate_latest(self._registry)
 
 
-class _SiteCollector(Collector):
-    """Reads the state of sites and robots when it is asked."""
+class _FleetCollector(Collector):
+    """Reads sites, robots and the fleet's sums when it is asked.
+
+    The store forgets what is too old, which Prometheus takes for a restart.
+    """
 
     def __init__(self, store: MapStore, fleet: Fleet) -> None:
-        self._store = store
-        self._fleet = fleet
+        self._store, self._fleet = store, fleet
 
     def collect(self) -> Iterator[Metric]:
-        """Gauges per site."""
-        version = GaugeMetricFamily("fleetmap_site_current_version", "Current version, 0 for none.", labels=["site"])
-        known = GaugeMetricFamily("fleetmap_site_robots", "Robots that ever reported.", labels=["site"])
-        seen = GaugeMetricFamily(
-            "fleetmap_site_robots_seen", "Robots that reported in the last minute.", labels=["site"]
-        )
-        current = GaugeMetricFamily("fleetmap_site_robots_current", "Robots on the wanted version.", labels=["site"])
+        """State of sites and robots, sums by site, version and cause."""
+        sites, counters = self._store.sites(), self._store.fleet.counters
+        current = {(info.site,): info.current_version or 0 for info in sites}
+        yield _filled(_gauge("site_current_version", "Current version, 0 for none."), current.items())
+        tried = {row.site: row.version for row in self._store.canaries(running=True)}
+        trials = [((info.site,), tried.get(info.site, 0)) for info in sites]
+        yield _filled(_gauge("site_canary_version", "Version that some robots try, 0 for none."), trials)
+        yield from self._robots([info.site for info in sites])
+        totals = [((site,), counts) for (site, _), counts in counters(None, "site").items()]
+        yield from _sums("site", _SITE_SUMS, ["site"], totals)
+        kept = {(info.site, str(version.version)) for info in sites for version in self._store.versions(info.site)}
+        by_version = [(key, counts) for key, counts in counters(None, "version").items() if key in kept]
+        yield from _sums("version", _VERSION_SUMS, ["site", "version"], by_version)
+        by_cause = counters(None, "cause").items()
+        family = CounterMetricFamily("fleetmap_site_cause_failures", "Failures by cause.", labels=["site", "cause"])
+        yield _filled(family, ((key, counts.failures + counts.suspected) for key, counts in by_cause))
+
+    def _robots(self, sites: list[str]) -> Iterator[Metric]:
         robots = self._fleet.robots()
-        for info in self._store.sites():
-            own = [robot for robot in robots if robot.site == info.site]
-            version.add_metric([info.site], info.current_version or 0)
-            known.add_metric([info.site], len(own))
-            seen.add_metric([info.site], sum(robot.seconds_since <= _SEEN_WITHIN_S for robot in own))
-            current.add_metric([info.site], sum(robot.version == robot.wanted_version is not None for robot in own))
-        yield from (version, known, seen, current)
+        of_site = {site: [robot for robot in robots if robot.site == site] for site in sites}
+        for name, words, value in _SITE_ROBOTS:
+            yield _filled(_gauge(f"site_{name}", words), (((site,), value(own)) for site, own in of_site.items()))
+        statuses = _gauge("site_robots_status", "Robots heard in the last minute.", "status")
+        for site, own in of_site.items():
+            counts = Counts(_status(robot) for robot in _seen(own))
+            _filled(statuses, (((site, status), counts[status]) for status in (*Status, "other")))
+        yield statuses
+
+
+def _gauge(name: str, words: str, *labels: str) -> GaugeMetricFamily:
+    return GaugeMetricFamily(f"fleetmap_{name}", words, labels=["site", *labels])
+
+
+def _sums(
+    prefix: str,
+    sums: Iterable[tuple[str, str, Callable[[Counters], float]]],
+    labels: list[str],
+    counters: Sequence[tuple[tuple[str, ...], Counters]],
+) -> Iterator[Metric]:
+    for name, words, value in sums:
+        family = CounterMetricFamily(f"fleetmap_{prefix}_{name}", words, labels=labels)
+        yield _filled(family, ((key, value(counts)) for key, counts in counters))
+
+
+def _filled(family: Family, values: Iterable[tuple[tuple[str, ...], float]]) -> Family:
+    for labels, value in values:
+        family.add_metric(labels, value)
+    return family
+
+
+def _seen(robots: list[RobotStatus]) -> list[RobotStatus]:
+    return [robot for robot in robots if robot.seconds_since <= _SEEN_WITHIN_S]
+
+
+def _status(robot: RobotStatus) -> str:
+    told = (robot.last_health or {}).get("status")
+    return told if told in tuple(Status) else "other"

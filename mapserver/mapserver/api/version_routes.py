@@ -1,19 +1,35 @@
-"""What operators do with versions: compare, judge, publish, promote, roll back."""
+"""Judging and releasing versions: compare, publish, promote, roll back, try with some robots first."""
+
+import time
+from typing import NamedTuple
 
 from fastapi import Depends, FastAPI
+from starlette.exceptions import HTTPException
 
 from mapserver import releases
 from mapserver.api.parameters import Site, Version
-from mapserver.api.views import Act, PublishAct, QualityView, VersionView
-from mapserver.api.writers import Writers, checked_by
+from mapserver.api.views import Act, CanaryAct, CanaryView, PublishAct, QualityView, VersionView
+from mapserver.api.writers import Writers
+from mapserver.fleet.canary_controller import find
+from mapserver.fleet_statistics.canary_test import CanarySettings, number_of
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
-from mapserver.store import MapStore
+from mapserver.store import CanaryRow, MapStore, VersionInfo
 
 
-def install_version_routes(app: FastAPI, store: MapStore, writers: Writers, gate: GateSettings) -> None:
-    """Adds the endpoints; those that change something ask `writers`."""
-    allowed = [Depends(checked_by(writers))]
+class ApiSettings(NamedTuple):
+    """Who may change something, and how drafts, canaries and tiles are judged."""
+
+    writers: Writers = Writers()
+    gate: GateSettings = GateSettings()
+    canary: CanarySettings = CanarySettings()
+    resurvey: ResurveySettings = ResurveySettings()
+
+
+def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings) -> None:
+    """Adds the endpoints; those that change something ask the writers."""
+    allowed = [Depends(settings.writers.check)]
 
     @app.get("/v1/sites/{site}/versions/{version}/quality")
     def quality(site: Site, version: Version) -> QualityView:
@@ -27,19 +43,45 @@ def install_version_routes(app: FastAPI, store: MapStore, writers: Writers, gate
         """What changed between two versions: tiles, landmarks, bytes to fetch, quality side by side."""
         return releases.difference(store, site, before, after)
 
-    @app.post("/v1/sites/{site}/versions/{version}/publish", dependencies=allowed)
-    def publish(site: Site, version: Version, act: PublishAct) -> VersionView:
+    @app.post("/v1/sites/{site}/versions/{version}/publish", dependencies=allowed, response_model=VersionView)
+    def publish(site: Site, version: Version, act: PublishAct) -> VersionInfo:
         """Takes a draft through the gate and makes it current."""
-        releases.publish(store, site, version, actor=act.who(), force=act.force, gate=gate)
-        return VersionView.of(store.version(site, version))
+        releases.publish(store, site, version, actor=act.who(), force=act.force, gate=settings.gate)
+        return store.version(site, version)
 
-    @app.post("/v1/sites/{site}/versions/{version}/promote", dependencies=allowed)
-    def promote(site: Site, version: Version, act: Act) -> VersionView:
+    @app.post("/v1/sites/{site}/versions/{version}/promote", dependencies=allowed, response_model=VersionView)
+    def promote(site: Site, version: Version, act: Act) -> VersionInfo:
         """Makes a version that was published before the current one."""
         releases.promote(store, site, version, actor=act.who())
-        return VersionView.of(store.version(site, version))
+        return store.version(site, version)
 
-    @app.post("/v1/sites/{site}/rollback", dependencies=allowed)
-    def rollback(site: Site, act: Act) -> VersionView:
+    @app.post("/v1/sites/{site}/rollback", dependencies=allowed, response_model=VersionView)
+    def rollback(site: Site, act: Act) -> VersionInfo:
         """Makes the version current that was so before; the current one retires."""
-        return VersionView.of(store.version(site, releases.roll_back(store, site, actor=act.who())))
+        return store.version(site, releases.roll_back(store, site, actor=act.who()))
+
+    @app.get("/v1/sites/{site}/canary")
+    def canary(site: Site) -> CanaryView:
+        """The version that some robots try, or tried last, beside the others' counts."""
+        store.current(site)
+        found = store.canaries(site)
+        if not found:
+            raise HTTPException(404, f"site {site} never had a canary; `mapserver promote --canary 5%` begins one")
+        return _view(store, found[0], settings.canary)
+
+    @app.post("/v1/sites/{site}/versions/{version}/canary", dependencies=allowed)
+    def start_canary(site: Site, version: Version, act: CanaryAct) -> CanaryView:
+        """Lets a share of the robots run a version before the others; a draft goes through the gate first.
+
+        `rollback` takes it back, promoting it ends it early; otherwise the server decides by the failures of both sides.
+        """
+        share = settings.canary.share if act.share is None else act.share
+        begun = releases.start_canary(store, site, version, share, actor=act.who(), gate=settings.gate)
+        return _view(store, begun, settings.canary)
+
+
+def _view(store: MapStore, row: CanaryRow, settings: CanarySettings) -> CanaryView:
+    members = [
+        robot.robot for robot in store.robots(row.site) if number_of(row.site, row.version, robot.robot) < row.threshold
+    ]
+    return CanaryView(row, find(store, row, settings, time.time_ns()), members)

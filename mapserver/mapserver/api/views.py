@@ -1,4 +1,4 @@
-"""What the API shows, as its own types: the store may change its rows without changing an answer."""
+"""Answers of the API, and what is asked of it when something is to be changed."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, Self
@@ -6,28 +6,15 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mapserver.fleet.fleet import RobotStatus
-from mapserver.store import Actor, Event, JobInfo, SiteInfo, VerdictRow, VersionInfo
+from mapserver.fleet_statistics.canary_test import CanaryFinding
+from mapserver.fleet_statistics.kpis import Kpis
+from mapserver.store import Actor, CanaryRow, Event, FailureRow, JobInfo, PictureRow, SiteInfo, VerdictRow
 
 
-@dataclass(frozen=True, slots=True)
-class SiteView:
-    """A site and its current version, null before the first publication."""
-
-    site: str
-    current_version: int | None
-    versions: int
-    vocabulary_sha256: str | None
-
-    @classmethod
-    def of(cls, info: SiteInfo) -> "SiteView":
-        """The view of a row."""
-        return cls(info.site, info.current_version, info.versions, info.vocabulary_sha256)
-
-
-@dataclass(frozen=True, slots=True)
-class VersionView:
+class VersionView(BaseModel):
     """A version; map_bytes is what a robot downloads for the whole site, vocabulary apart."""
 
+    model_config = ConfigDict(from_attributes=True)
     site: str
     version: int
     state: str
@@ -40,29 +27,12 @@ class VersionView:
     vocabulary_sha256: str
     vocabulary_bytes: int
 
-    @classmethod
-    def of(cls, info: VersionInfo) -> "VersionView":
-        """The view of a row."""
-        return cls(
-            site=info.site,
-            version=info.version,
-            state=info.state,
-            parent=info.parent,
-            created=info.created,
-            manifest_sha256=info.manifest_sha256,
-            tiles=info.tiles,
-            landmarks=info.landmarks,
-            map_bytes=info.map_bytes,
-            vocabulary_sha256=info.vocabulary_sha256,
-            vocabulary_bytes=info.vocabulary_bytes,
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class SiteList:
     """Sites by name."""
 
-    sites: list[SiteView]
+    sites: list[SiteInfo]
     next: str | None
 
 
@@ -109,6 +79,66 @@ class QualityView:
     report: dict[str, Any]
 
 
+@dataclass(frozen=True, slots=True)
+class KpisView:
+    """The figures of one robot, version, tile, cause or site; key is empty for a site as a whole."""
+
+    site: str
+    key: str
+    measures: Kpis
+
+
+@dataclass(frozen=True, slots=True)
+class KpisList:
+    """Figures by site and key."""
+
+    by: str
+    measures: list[KpisView]
+    next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class HourView:
+    """The figures of one hour; hour_ns: its begin, nanoseconds since 1970."""
+
+    hour_ns: int
+    measures: Kpis
+
+
+@dataclass(frozen=True, slots=True)
+class HourList:
+    """Figures by the hour, oldest first; hours without reports are left out."""
+
+    hours: list[HourView]
+    next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class FailureList:
+    """Failures, the last to arrive first."""
+
+    failures: list[FailureRow]
+    next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class FailureView:
+    """One failure. report: all that the robot told, without pictures; pictures: those that are still kept."""
+
+    failure: FailureRow
+    report: dict[str, Any]
+    pictures: list[PictureRow]
+
+
+@dataclass(frozen=True, slots=True)
+class CanaryView:
+    """The last version that some robots tried first, and what its counts say; robots: those that take part and are known."""
+
+    canary: CanaryRow
+    finding: CanaryFinding
+    robots: list[str]
+
+
 class Act(BaseModel):
     """Who changes something, and why."""
 
@@ -138,6 +168,16 @@ class PublishAct(Act):
         if self.force and not self.reason:
             raise ValueError("publishing by force needs a reason")
         return self
+
+
+class CanaryAct(Act):
+    """Who lets some robots try a version, and why; share of the robots, the setting's without it."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"examples": [{"actor": "ada", "reason": "the nightly map", "share": 0.05}]},
+    )
+    share: Annotated[float | None, Field(gt=0, lt=1)] = None
 
 
 class Problem(BaseModel):
@@ -173,7 +213,7 @@ class ServerVersion:
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class ServiceState:
     """`ok`, or what is missing."""
 
     status: str

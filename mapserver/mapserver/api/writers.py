@@ -1,7 +1,6 @@
 """Who may change something over HTTP: everybody on the server's own machine, elsewhere whoever shows the token."""
 
 import hmac
-from collections.abc import Callable
 from dataclasses import dataclass
 from ipaddress import ip_address
 
@@ -42,15 +41,6 @@ def is_loopback_name(host: str) -> bool:
         return host == "localhost" or ip_address(host).is_loopback
     except ValueError:
         return False
-
-
-def checked_by(writers: Writers) -> Callable[[Request], None]:
-    """The dependency of endpoints that change something."""
-
-    def check(request: Request) -> None:
-        writers.check(request)
-
-    return check
 
 
 def _host_of(request: Request) -> str:

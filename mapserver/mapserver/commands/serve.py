@@ -65,6 +65,7 @@ def _run(
 
     from mapserver.api.app import create_app
     from mapserver.api.metrics import Metrics
+    from mapserver.api.version_routes import ApiSettings
     from mapserver.dashboard.install import install_dashboard
     from mapserver.fleet.fleet import Fleet
     from mapserver.serving.background_tasks import run_background_tasks, server_tasks
@@ -90,10 +91,8 @@ def _run(
         background.cancel()
         await asyncio.gather(background, return_exceptions=True)
 
-    app = create_app(
-        maps, fleet, metrics, bus, lifespan, writers=writers, gate=settings.gate, canary=settings.canary,
-        resurvey=settings.resurvey,
-    )  # fmt: skip
+    api = ApiSettings(writers, settings.gate, settings.canary, settings.resurvey)
+    app = create_app(maps, fleet, metrics, bus, lifespan, api)
     install_dashboard(app, maps, fleet, writers, settings.gate, settings.canary, settings.resurvey)
     config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=_STOP_WITHIN_S)
     # uvicorn stops on these signals by itself and afterwards raises them again for the handlers that were there before:

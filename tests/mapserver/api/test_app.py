@@ -18,6 +18,7 @@ from fleetmap.messages import FailureReport, RobotAck, RobotHealth, Thumbnail
 from mapserver import releases
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
+from mapserver.api.version_routes import ApiSettings
 from mapserver.api.writers import Writers
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import DraftContent, MapStore
@@ -304,7 +305,9 @@ TOKEN = "a-token-of-some-length"
     ],
 )
 def test_only_those_write_who_may(server: Server, writers: Writers, headers: dict[str, str], status: int) -> None:
-    app = create_app(server.store, server.fleet, Metrics(server.store, server.fleet), None, writers=writers)
+    app = create_app(
+        server.store, server.fleet, Metrics(server.store, server.fleet), None, settings=ApiSettings(writers)
+    )
     with TestClient(app, "http://127.0.0.1") as client:
         response = client.post("/v1/sites/lab/versions/2/publish", json=ADA, headers=headers)
         assert response.status_code == status
