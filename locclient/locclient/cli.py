@@ -1,26 +1,33 @@
 """The command `locclient`. Heavy imports happen inside the commands, after their arguments are checked."""
 
 import os
-from importlib import import_module
-from pkgutil import iter_modules
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-import typer
+from fleetmap.cli_exit import run as run_program
+from fleetmap.cli_options import Commands, Options, make_app
+from locclient.commands.check import check
+from locclient.commands.config import CONFIG
+from locclient.commands.replay import replay
+from locclient.commands.run import run
 
-from fleetmap.cli_exit import run
-from locclient import commands
+if TYPE_CHECKING:
+    from locclient.config import LocclientConfig
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+COMMANDS: Commands = {"check": check, "replay": replay, "run": run, "config": CONFIG}
 
 
-@app.callback()
 def locclient() -> None:
-    """Localise a camera robot in the maps of its fleet."""
+    """Localize a camera robot in the maps of its fleet."""
 
 
-# One file in `commands` for each command, with a function of the same name.
-for _module in sorted(iter_modules(commands.__path__), key=lambda module: module.name):
-    app.command()(getattr(import_module(f"{commands.__name__}.{_module.name}"), _module.name))
+def _read_config(path: Path | None) -> "tuple[LocclientConfig, Options]":
+    from locclient.config import read_config
 
+    return read_config(path), {}
+
+
+app = make_app(COMMANDS, locclient, _read_config)
 
 # Before anything imports numpy: many small products, for which a second BLAS thread costs more than it brings.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -28,7 +35,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 def main() -> None:
     """Runs the command line."""
-    run(app)
+    run_program(app)
 
 
 if __name__ == "__main__":

@@ -79,9 +79,15 @@ def read_config(path: Path | None) -> LocclientConfig:
         return LocclientConfig()
     given = read_given(path, LocclientConfig)
     refuse_internal(path, given, LocclientConfig(), TIERS)
+    return msgspec.convert(with_common(given), LocclientConfig)
+
+
+def with_common(given: dict[str, Any]) -> dict[str, Any]:
+    """The content of a file, its [run] and [replay] completed by the keys at the top."""
+    completed = dict(given)
     for name in ("run", "replay"):
         section: dict[str, Any] = given.get(name, {})
         left_out = {"store", "server"} if {"store", "server"} & set(section) else set()
         keys = {"site", "store", "server"} - left_out
-        given[name] = {key: given[key] for key in keys if key in given} | section
-    return msgspec.convert(given, LocclientConfig)
+        completed[name] = {key: given[key] for key in keys if key in given} | section
+    return completed

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from fleetmap.cli_exit import run
 from fleetmap.cli_options import Commands, ConfigFile, Options, make_app
 from mapserver.commands.build import build
+from mapserver.commands.config import CONFIG
 from mapserver.commands.convert import convert
 from mapserver.commands.doctor import doctor
 from mapserver.commands.evaluate import evaluate
@@ -47,6 +48,7 @@ COMMANDS: Commands = {
     "evaluate": evaluate,
     "train-vocabulary": train_vocabulary,
     "fleet": FLEET,
+    "config": CONFIG,
 }
 
 

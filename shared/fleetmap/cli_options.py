@@ -35,6 +35,13 @@ class Group(NamedTuple):
 Commands = Mapping[str, Command | Group]
 
 
+class Program(NamedTuple):
+    """A command line; commands find it as `context.obj`."""
+
+    commands: Commands
+    read_config: ReadConfig
+
+
 def expand_options(command: Command) -> Command:
     """The command with the fields of its dataclass parameters in their place, as options of their own."""
     groups: dict[str, Any] = {}
@@ -72,7 +79,7 @@ def _fields(kind: Any) -> list[inspect.Parameter]:
 
 def make_app(commands: Commands, callback: Command, read_config: ReadConfig) -> typer.Typer:
     """A program of these commands; `callback` holds its own options, `read_config` serves --config."""
-    settings: dict[str, Any] = {"obj": read_config}
+    settings: dict[str, Any] = {"obj": Program(commands, read_config)}
     app = typer.Typer(
         no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, context_settings=settings
     )
@@ -157,7 +164,7 @@ def take_defaults(context: typer.Context, path: Path | None) -> Path | None:
     """Callback of --config: the file's section becomes the command's defaults (before the command: all sections)."""
     if path is None or context.resilient_parsing:
         return path
-    _, sections = context.obj(path)
+    _, sections = context.obj.read_config(path)
     for word in _words(context):
         sections = sections.get(word, {})
     context.default_map = sections
@@ -185,4 +192,4 @@ def config_path(context: typer.Context) -> Path | None:
 
 def settings_of(context: typer.Context) -> Any:
     """Settings of the file that --config named; the defaults without one."""
-    return context.obj(config_path(context))[0]
+    return context.obj.read_config(config_path(context))[0]

@@ -17,7 +17,7 @@ from fleetmap.geometry import se3_exp
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver import cli
-from mapserver.config import MapserverConfig, read_config
+from mapserver.config import MapserverConfig, read_config, survey_settings
 from mapserver.quality.figures import Evidence, TileDirections
 from mapserver.store import DraftContent, MapStore
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
@@ -101,9 +101,10 @@ def test_every_option_has_its_key_in_the_file() -> None:
     assert set(_keys(file)) == settings | {name.replace("-", "_") for name in cli.COMMANDS}
     shown = typer.main.get_command(cli.app).commands
     commands = {name: (command, _keys(file)[name.replace("-", "_")]) for name, command in shown.items()}
-    _, fleet = commands.pop("fleet")
-    assert set(_keys(fleet)) == set(shown["fleet"].commands)
-    commands |= {f"fleet {name}": (command, _keys(fleet)[name]) for name, command in shown["fleet"].commands.items()}
+    for group in ("fleet", "config"):
+        _, sections = commands.pop(group)
+        assert set(_keys(sections)) == set(shown[group].commands)
+        commands |= {f"{group} {name}": (one, _keys(sections)[name]) for name, one in shown[group].commands.items()}
     for name, (command, section) in commands.items():
         options = {p.name.rstrip("_") for p in command.params if p.param_type_name == "option"}
         assert set(_keys(section)) == options - {"config"}, name
@@ -143,6 +144,23 @@ def test_site_and_store_are_said_once(
     assert [info["site"] for info in json.loads(capsys.readouterr().out)] == ["lab"]
     assert status(monkeypatch, "--config", file, "inspect") == 0
     assert "site hall version 2" in capsys.readouterr().out
+
+
+def test_config_show_prints_a_file_that_means_the_same(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, shown = tmp_path / "site.toml", tmp_path / "shown.toml"
+    file.write_text('site = "lab"\n[survey.keyframes]\nmin_overlap = 0.5\n[build]\nreplay = ["a", "b"]\nstore = "s"\n')
+    assert status(monkeypatch, "--config", file, "config", "show", "--use", "mono") == 0
+    text = capsys.readouterr().out
+    shown.write_text(text)
+    settings, options = read_config(shown, cli.COMMANDS)
+    assert settings.survey == survey_settings(file, SensorSet.MONO)
+    assert (options["build"]["replay"], options["build"]["store"]) == (["a", "b"], "s")
+    assert options["publish"]["site"] == "lab"
+    assert f"min_overlap = 0.5  # {file}" in text
+    assert "max_parallax = 0.1  # preset mono" in text
+    assert "max_interval_s = 2.0  # default" in text
 
 
 def test_build_takes_its_settings_from_the_file(

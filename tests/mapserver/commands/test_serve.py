@@ -17,6 +17,7 @@ import typer
 from typer.testing import CliRunner
 
 from fleetmap.bus import ZenohBus
+from fleetmap.cli_options import Program
 from fleetmap.errors import GateRefusedError, StoreError, UnreachableError, UsageError
 from fleetmap.messages import RobotHealth, WantedVersion
 from locclient.maps.map_client import MapClient
@@ -117,7 +118,7 @@ def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path
 
 
 def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:
-    context = typer.Context(typer.main.get_command(cli.app), obj=lambda _: (MapserverConfig(), {}))
+    context = typer.Context(typer.main.get_command(cli.app), obj=Program({}, lambda _: (MapserverConfig(), {})))
     with pytest.raises(UsageError, match="--http 'nonsense'"):
         serve(context, tmp_path, "nonsense", "tcp/127.0.0.1:0")
     with pytest.raises(UsageError, match="endpoint"):

@@ -1,0 +1,56 @@
+"""`mapserver config show`: the effective configuration file."""
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
+
+import typer
+
+from fleetmap.cli_options import Command, ConfigFile, Group, config_path, options_of, settings_of
+
+
+def show(
+    context: typer.Context,
+    use: Annotated[str | None, typer.Option(metavar="SENSORS", help="Apply the preset of these sensors.")] = None,
+    config: ConfigFile = None,
+) -> None:
+    """Print the effective configuration as TOML, with the origin of every value."""
+    settings = settings_of(context)
+    import msgspec
+
+    from fleetmap.config_show import Layer, effective_settings
+    from mapserver.build.sensor_subset import named_sensor_set
+    from mapserver.config import TIERS, preset, survey_settings
+
+    path = config_path(context)
+    given = {} if path is None else msgspec.toml.decode(path.read_bytes())
+    layers: tuple[Layer, ...] = (Layer(str(path), given),)
+    if use is not None:
+        sensors = named_sensor_set(use)
+        settings = msgspec.structs.replace(settings, survey=survey_settings(path, sensors))
+        layers = (*layers, Layer(f"preset {sensors.value}", {"survey": preset(sensors)}))
+    lines = [*effective_settings(settings, TIERS, layers)]
+    _, defaults = context.obj.read_config(path)
+    for name, command in context.obj.commands.items():
+        section = name.replace("-", "_")
+        if not isinstance(command, Group):
+            lines += _options(section, command, defaults.get(name, {}), str(path))
+            continue
+        for inner, member in command.commands.items():
+            lines += _options(f"{section}.{inner}", member, defaults.get(name, {}).get(inner, {}), str(path))
+    typer.echo("\n".join(lines))
+
+
+def _options(section: str, command: Command, given: Mapping[str, Any], origin: str) -> Iterator[str]:
+    from fleetmap.config import Setting
+    from fleetmap.config_show import setting_line
+
+    options = options_of(command)
+    if options:
+        yield f"\n[{section}]"
+    for key, parameter in options.items():
+        default = None if parameter.default is parameter.empty else parameter.default
+        value = given.get(parameter.name, default)
+        yield setting_line(Setting(section, key, value), origin if parameter.name in given else "default")
+
+
+CONFIG = Group("The configuration file.", {"show": show})
