@@ -12,7 +12,7 @@ from fleetmap.messages import Cause, Status
 from fleetmap.odometry import Odometry, OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
-from fleetmap.relocalization.relocalizer import Fix, Relocalizer, TimeSliced
+from fleetmap.relocalization.relocalizer import Fix, Relocalizer, TimeSliced, is_reliable
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
@@ -252,12 +252,7 @@ class Localizer:
         return [fix for fix, hypothesis in self._observations(fixes) if self._prior.is_compatible(hypothesis)]
 
     def _is_reliable(self, fix: Fix) -> bool:
-        """Whether a fix may found a hypothesis: not by few landmarks where most of those to be expected were not seen. Racks repeat:
-        some landmarks of any agree with some of any other."""
-        settings = self._settings.fix
-        if fix.inliers >= self._track.strong_inliers:
-            return True
-        return fix.inliers >= settings.min_inliers and fix.landmark_recall >= settings.min_hit_share
+        return is_reliable(fix, self._settings.fix, self._track.strong_inliers)
 
     def _observations(self, fixes: Sequence[Fix]) -> Observations:
         """The fixes of the query that goes on, with their poses at the present."""

@@ -4,7 +4,7 @@ from fleetmap.config import Section
 from fleetmap.features.orb import OrbSettings
 from fleetmap.features.stereo import StereoSettings
 from fleetmap.odometry import OdometrySettings
-from fleetmap.relocalization.settings import FixSettings, RelocalizerSettings
+from fleetmap.relocalization.settings import STRONG_INLIERS, FixSettings, RelocalizerSettings
 from locclient.localization.image_quality import ImageQualitySettings
 
 
@@ -17,7 +17,7 @@ class TrackSettings(Section, frozen=True):
     search_after_failed: int = 1  # failed fixes at the prediction before a global search
     confirming_fixes: int = 3  # that must agree before tracking begins
     confirming_distance_m: float = 1.0  # motion between them
-    strong_inliers: int = 60
+    strong_inliers: int = STRONG_INLIERS
     strong_share: float = 0.55  # inlier share of a fix that is accepted at once
     # Votes of another place, as a share of the best one's, that forbid it; chance reaches 0.36
     strong_twin_share: float = 0.5

@@ -21,7 +21,7 @@ from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import SensorSet, Trajectory
-from mapserver.build.draft_evidence import Before, examine_draft, replayed_probes
+from mapserver.build.draft_evidence import Before, JudgedSession, examine_draft, replayed_probes
 from mapserver.build.image_spill import ImageSpill
 from mapserver.build.job_record import Job, recorded_job
 from mapserver.build.loop_overlay import loop_places
@@ -235,7 +235,7 @@ def _keep(order: BuildRequest, built: _Built, parent: Before | None, settings: S
     for_robots = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M, _wanted_ids(parent, survey_map))
     tiles = tiles_from_survey(survey_map, chosen=for_robots)
     built.times.begin("examining")
-    evidence = _examined(order, built, tiles, parent, settings)
+    evidence = _examined(order, built, tiles, parent)
     built.times.begin("storing")
     archive = encode_archive(survey_map)
     vocabulary = encode_vocabulary(built.vocabulary.vocabulary)
@@ -277,16 +277,15 @@ def _keep(order: BuildRequest, built: _Built, parent: Before | None, settings: S
     )
 
 
-def _examined(
-    order: BuildRequest, built: _Built, tiles: list[Tile], before: Before | None, settings: SurveySettings
-) -> Evidence:
-    replayed = [] if before is None else replayed_probes(
-        order.replay, before, order.frames, order.calibration, order.use, built.joined.map.camera, settings
-    )  # fmt: skip
-    return examine_draft(
-        tiles, before, _map_trajectories(built.joined), [s.held_out for s in built.taken], [s.survey for s in built.taken],
-        replayed, built.vocabulary.vocabulary, settings,
-    )  # fmt: skip
+def _examined(order: BuildRequest, built: _Built, tiles: list[Tile], before: Before | None) -> Evidence:
+    camera = built.joined.map.camera
+    replayed = []
+    if before is not None:
+        options = (order.frames, order.calibration, order.use)
+        replayed = replayed_probes(order.replay, before, *options, camera)
+    trajectories = _map_trajectories(built.joined)
+    sessions = [JudgedSession(t, s.held_out, s.survey) for t, s in zip(trajectories, built.taken, strict=True)]
+    return examine_draft(tiles, camera, built.vocabulary.vocabulary, before, sessions, replayed)
 
 
 def _map_trajectories(joined: Joined) -> list[Trajectory]:

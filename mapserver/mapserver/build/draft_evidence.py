@@ -1,8 +1,9 @@
-"""The rim around `quality`: frames are read from recordings, tiles as robots get them, and the draft is measured."""
+"""Evidence about a draft: frames read from recordings, relocalized in the tiles as robots get them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -13,17 +14,17 @@ from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Manifest, RecordingEntry, Tile, decode_tile, encode_tile
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
+from fleetmap.relocalization.frame_features import FrameFeatures
+from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver.build.sensor_subset import reduced
 from mapserver.quality.directions import tile_directions
-from mapserver.quality.evidence import Offered, examine, trajectory_breaks
-from mapserver.quality.figures import Evidence, Motion
-from mapserver.quality.probes import Look, Probe, held_out_frames, look_at, probes_of_map, spread
-from mapserver.quality.tile_map import TileMap
+from mapserver.quality.evidence import Probes, examine, trajectory_breaks
+from mapserver.quality.figures import Evidence, TrajectoryBreaks
+from mapserver.quality.probes import Probe, held_out_frames, probe_features, probes_of_map, spread
 from mapserver.store import MapStore
 from mapserver.survey.pipeline import Survey
-from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_map import SurveyMap
 
 PROBES = 40  # of each kind: one wrong or missing frame weighs 2.5 %
@@ -31,32 +32,42 @@ PROBES = 40  # of each kind: one wrong or missing frame weighs 2.5 %
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """A look of a recording that the build did not use: its frame's number among the selected ones, and body_from_cam (4, 4)."""
+    """A frame of a recording that the build did not use: its number among the selected ones, its camera and what that saw."""
 
     number: int
-    look: Look
+    camera: StereoCamera
     body_from_cam: Array
+    features: FrameFeatures
+
+    def probe(self, map_from_body: Array) -> Probe:
+        """It as a probe; map_from_body (F, 4, 4) of all selected frames."""
+        return Probe(self.camera, self.features, map_from_body[self.number] @ self.body_from_cam)
 
 
-def held_out_of(
-    recording: Recording, selected: Sequence[int], rectifier: Rectifier, survey: Survey, settings: SurveySettings
-) -> list[HeldOut]:
+class JudgedSession(NamedTuple):
+    """A recording in the map: where its frames are in `map` now, frames that the build left out, and its survey."""
+
+    trajectory: Trajectory
+    held_out: Sequence[HeldOut]
+    survey: Survey
+
+
+def held_out_of(recording: Recording, selected: Sequence[int], rectifier: Rectifier, survey: Survey) -> list[HeldOut]:
     """Frames of a surveyed recording that did not become keyframes, read again. Damaged ones are left out."""
     keyframes = [k.frame_index for k in survey.first_guess.keyframes]
     numbers = held_out_frames(keyframes, survey.map.trajectory_estimated, PROBES)
-    return _looks(recording, selected, numbers, rectifier, settings)
+    return _read(recording, selected, numbers, rectifier)
 
 
-def _looks(
-    recording: Recording, selected: Sequence[int], numbers: Sequence[int], rectifier: Rectifier, settings: SurveySettings
-) -> list[HeldOut]:  # fmt: skip
+def _read(recording: Recording, selected: Sequence[int], numbers: Sequence[int], rectifier: Rectifier) -> list[HeldOut]:
     found = []
     for number in numbers:
         try:
             frame = rectifier.rectify(recording.read_frame(int(selected[number])))
         except RecordingError:
             continue
-        found.append(HeldOut(number, look_at(frame, rectifier.camera, settings), rectifier.body_from_cam))
+        features = probe_features(frame, rectifier.camera)
+        found.append(HeldOut(number, rectifier.camera, rectifier.body_from_cam, features))
     return found
 
 
@@ -90,9 +101,13 @@ class Before:
 
 
 def replayed_probes(
-    paths: Sequence[Path], before: Before, frames: str, calibration: Path | None, use: SensorSet | None, pinhole: StereoCamera,
-    settings: SurveySettings,
-) -> list[Probe]:  # fmt: skip
+    paths: Sequence[Path],
+    before: Before,
+    frames: str,
+    calibration: Path | None,
+    use: SensorSet | None,
+    pinhole: StereoCamera,
+) -> list[Probe]:
     """Frames of earlier recordings where the version that was made of them says they are; none of recordings it knows not."""
     probes: list[Probe] = []
     for path in paths:
@@ -106,47 +121,42 @@ def replayed_probes(
             has_depth = recording.sensor_set is SensorSet.RGBD
             rectifier = Rectifier(recording.calibration, has_depth=has_depth, pinhole=pinhole)
             map_from_body, free = known
-            looks = _looks(
-                recording, selected.tolist(), spread(np.flatnonzero(free), PROBES // len(paths)), rectifier, settings
-            )
-            probes += [Probe(x.look, map_from_body[x.number] @ x.body_from_cam) for x in looks]
+            numbers = spread(np.flatnonzero(free), PROBES // len(paths))
+            probes += [x.probe(map_from_body) for x in _read(recording, selected.tolist(), numbers, rectifier)]
     return probes
 
 
 def examine_draft(
-    tiles: Sequence[Tile], before: Before | None, trajectories: Sequence[Trajectory], held_out: Sequence[Sequence[HeldOut]],
-    surveys: Sequence[Survey], replayed: Sequence[Probe], vocabulary: Vocabulary, settings: SurveySettings,
-) -> Evidence:  # fmt: skip
-    """What probes find in the tiles as they are stored.
-
-    trajectories, held_out and surveys go along: of each recording in the map, where its frames are in `map` now, frames that
-    the build left out, and its survey.
-    """
-    probes = [
-        Probe(x.look, trajectory.frame_from_body[x.number] @ x.body_from_cam)
-        for trajectory, looks in zip(trajectories, held_out, strict=True)
-        for x in looks[:: len(held_out)]
+    tiles: Sequence[Tile],
+    camera: StereoCamera,
+    vocabulary: Vocabulary,
+    before: Before | None,
+    sessions: Sequence[JudgedSession],
+    replayed: Sequence[Probe],
+) -> Evidence:
+    """The findings of probes in the tiles as they are stored; camera: that of the map, whose recordings are `sessions`."""
+    held_out = [
+        x.probe(session.trajectory.frame_from_body) for session in sessions for x in session.held_out[:: len(sessions)]
     ]
     last = [] if before is None else probes_of_map(before.survey, PROBES)
     stored = [decode_tile(encode_tile(tile)) for tile in tiles]
-    evidence = examine(
-        TileMap(stored), None if before is None else TileMap(before.tiles), Offered(probes, replayed, last),
-        _motion(trajectories, surveys), vocabulary, settings,
-    )  # fmt: skip
+    draft = MapView(stored, vocabulary, camera.focal_px)
+    current = None if before is None else MapView(before.tiles, vocabulary, before.survey.camera.focal_px)
+    evidence = examine(draft, current, Probes(held_out, replayed, last), _breaks(sessions))
     return msgspec.structs.replace(evidence, directions=tile_directions(stored))
 
 
-def _motion(trajectories: Sequence[Trajectory], surveys: Sequence[Survey]) -> Motion | None:
+def _breaks(sessions: Sequence[JudgedSession]) -> TrajectoryBreaks | None:
     """All recordings together; a single camera's odometry knows no metres to compare with."""
-    found = [
-        trajectory_breaks(
-            trajectory.stamps_ns, trajectory.frame_from_body, survey.first_guess.odom_from_body, survey.first_guess.covariances,
-            survey.first_guess.tracked.astype(bool),
-        )
-        for trajectory, survey in zip(trajectories, surveys, strict=True)
-        if survey.state.camera.baseline_m > 0
-    ]  # fmt: skip
-    known = [motion for motion in found if motion is not None]
+    found = []
+    for trajectory, _, survey in sessions:
+        if survey.state.camera.baseline_m > 0:
+            guess = survey.first_guess
+            odometry = (guess.odom_from_body, guess.covariances, guess.tracked.astype(bool))
+            found.append(trajectory_breaks(trajectory.stamps_ns, trajectory.frame_from_body, *odometry))
+    known = [breaks for breaks in found if breaks is not None]
     if not known:
         return None
-    return Motion(sum(m.stretches for m in known), sum(m.breaks for m in known), max(m.worst_m for m in known))
+    return TrajectoryBreaks(
+        sum(b.stretches for b in known), sum(b.breaks for b in known), max(b.worst_m for b in known)
+    )

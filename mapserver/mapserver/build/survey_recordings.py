@@ -120,7 +120,7 @@ def survey_recording(
         )  # fmt: skip
         done, placed = _placed(done, recording.priors, recording.calibration.base_from_body)
         entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices))
-        held_out = held_out_of(recording, indices.tolist(), rectifier, done, settings)
+        held_out = held_out_of(recording, indices.tolist(), rectifier, done)
         return Surveyed(
             entry,
             recording.format,

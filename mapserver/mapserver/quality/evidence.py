@@ -1,4 +1,4 @@
-"""What speaks for and against a draft's tiles, measured."""
+"""Evidence for and against a draft's tiles: probes relocalized in them, and the survey's trajectory against odometry."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,15 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import Vocabulary
-from fleetmap.failure_definition import ERROR_LIMIT_DEG, ERROR_LIMIT_M
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.failure_definition import is_wrong
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
+from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import Stamps
-from mapserver.quality.figures import Aliasing, Compared, Evidence, Looks, Motion
-from mapserver.quality.locate import PRIOR_RADIUS_M, Fix, locate
-from mapserver.quality.probes import Probe
-from mapserver.quality.tile_map import Lookalikes, TileMap
-from mapserver.survey.settings import SurveySettings
+from mapserver.quality.figures import Aliasing, Compared, Evidence, ProbeFigures, TrajectoryBreaks
+from mapserver.quality.probes import PRIOR_RADIUS_M, Probe, most_similar_beyond, relocalized
 
 _ELSEWHERE_M = 2 * PRIOR_RADIUS_M + 2.0  # a neighbourhood that shares no place with the true one's
 _STRETCH_M, _APART_M = 3.0, 1.0
@@ -23,79 +21,82 @@ _CONTINUOUS_NS = 500_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Offered:
-    """The probes of each kind: held-out frames of the new recordings, frames of older ones, the current version's keyframes."""
+class Probes:
+    """Held-out frames of the new recordings, frames of older ones, the current version's keyframes."""
 
     held_out: Sequence[Probe]
     replayed: Sequence[Probe]
     last_version: Sequence[Probe]
 
 
-def examine(
-    draft: TileMap, before: TileMap | None, offered: Offered, motion: Motion | None, vocabulary: Vocabulary,
-    settings: SurveySettings,
-) -> Evidence:  # fmt: skip
+def examine(draft: MapView, before: MapView | None, probes: Probes, motion: TrajectoryBreaks | None) -> Evidence:
     """What the probes find in the draft, and in the current version's tiles where there are any."""
-    look_alike = [*offered.held_out, *offered.replayed] or offered.last_version
+    frames = [*probes.held_out, *probes.replayed] or probes.last_version
     return Evidence(
-        compare(draft, before, offered.held_out, settings),
-        compare(draft, before, offered.replayed, settings),
-        compare(draft, before, offered.last_version, settings),
-        aliasing(draft, look_alike, vocabulary, settings),
-        None if before is None else aliasing(before, look_alike, vocabulary, settings),
-        motion,
+        held_out=compare(draft, before, probes.held_out),
+        replayed=compare(draft, before, probes.replayed),
+        last_version=compare(draft, before, probes.last_version),
+        aliasing=aliasing(draft, frames),
+        aliasing_before=None if before is None else aliasing(before, frames),
+        motion=motion,
     )
 
 
-def compare(
-    draft: TileMap, before: TileMap | None, probes: Sequence[Probe], settings: SurveySettings
-) -> Compared | None:
-    """Each probe localised in both maps from a prior where it was taken; None without probes."""
+def compare(draft: MapView, before: MapView | None, probes: Sequence[Probe]) -> Compared | None:
+    """Each probe relocalized in both maps from a prior where it was taken; None without probes."""
     if not probes:
         return None
-    now = [locate(draft, probe.look, probe.map_from_cam, settings) for probe in probes]
+    now = [relocalized(draft, probe, probe.map_from_cam) for probe in probes]
     if before is None:
-        return Compared(_looks(probes, now))
-    then = [locate(before, probe.look, probe.map_from_cam, settings) for probe in probes]
+        return Compared(_figures(draft, probes, now))
+    then = [relocalized(before, probe, probe.map_from_cam) for probe in probes]
     shares = [a.inliers / b.inliers for a, b in zip(now, then, strict=True) if a is not None and b is not None]
-    return Compared(_looks(probes, now), _looks(probes, then), round(float(np.median(shares)), 4) if shares else None)
+    inliers_share = round(float(np.median(shares)), 4) if shares else None
+    return Compared(_figures(draft, probes, now), _figures(before, probes, then), inliers_share)
 
 
-def _looks(probes: Sequence[Probe], fixes: Sequence[Fix | None]) -> Looks:
-    found = [(fix, se3_inverse(p.map_from_cam) @ fix.map_from_cam) for p, fix in zip(probes, fixes, strict=True) if fix]
+def _figures(view: MapView, probes: Sequence[Probe], fixes: Sequence[Fix | None]) -> ProbeFigures:
+    found = [(probe, fix) for probe, fix in zip(probes, fixes, strict=True) if fix is not None]
     if not found:
-        return Looks(len(probes), 0.0, 0.0, None, None, None, None)
-    errors_m = np.array([np.linalg.norm(off[:3, 3]) for _, off in found])
-    turns_rad = np.array([rotation_angle_rad(off[:3, :3]) for _, off in found])
-    wrong = (errors_m > ERROR_LIMIT_M) | (turns_rad > np.radians(ERROR_LIMIT_DEG))
-    return Looks(
-        len(probes),
-        round(len(found) / len(probes), 4),
-        round(float(wrong.mean()), 4),
-        round(float(np.median(errors_m)), 5),
-        round(float(np.percentile(errors_m, 95)), 5),
-        float(np.median([fix.inliers for fix, _ in found])),
-        round(float(np.median([fix.residual_px for fix, _ in found])), 4),
+        return ProbeFigures(len(probes), 0.0, 0.0, None, None, None, None)
+    off = np.stack([se3_inverse(probe.map_from_cam) @ fix.map_from_cam for probe, fix in found])
+    errors_m = np.linalg.norm(off[:, :3, 3], axis=1)
+    wrong = [
+        is_wrong(error_m, rotation_angle_rad(turn)) for error_m, turn in zip(errors_m, off[:, :3, :3], strict=True)
+    ]
+    return ProbeFigures(
+        frames=len(probes),
+        localised_share=round(len(found) / len(probes), 4),
+        wrong_share=round(float(np.mean(wrong)), 4),
+        median_error_m=round(float(np.median(errors_m)), 5),
+        p95_error_m=round(float(np.percentile(errors_m, 95)), 5),
+        median_inliers=float(np.median([fix.inliers for _, fix in found])),
+        residual_px=round(float(np.median([_residual_px(view, probe, fix) for probe, fix in found])), 4),
     )
 
 
-def aliasing(
-    tile_map: TileMap, probes: Sequence[Probe], vocabulary: Vocabulary, settings: SurveySettings
-) -> Aliasing | None:
+def _residual_px(view: MapView, probe: Probe, fix: Fix) -> float:
+    """Median distance of a fix's landmarks from the pixels at which they should be."""
+    assert fix.matches is not None
+    features, rows = fix.matches.T
+    expected = probe.camera.pixel_from_point(transform_points(se3_inverse(fix.map_from_cam), view.points_map[rows]))
+    return float(np.median(np.linalg.norm(expected[:, :2] - probe.features.pixels[features, :2], axis=1)))
+
+
+def aliasing(view: MapView, probes: Sequence[Probe]) -> Aliasing | None:
     """Each probe offered with the prior of the far place that looks most like it; None where there is no such place."""
-    lookalikes = Lookalikes(tile_map, vocabulary)
     offered = accepted = 0
     for probe in probes:
-        elsewhere = lookalikes.of(probe.look, probe.map_from_cam, _ELSEWHERE_M)
+        elsewhere = most_similar_beyond(view, probe, _ELSEWHERE_M)
         if elsewhere is not None:
             offered += 1
-            accepted += locate(tile_map, probe.look, elsewhere, settings) is not None
+            accepted += relocalized(view, probe, elsewhere) is not None
     return Aliasing(offered, round(accepted / offered, 4)) if offered else None
 
 
 def trajectory_breaks(
     stamps_ns: Stamps, map_from_body: Array, odom_from_body: Array, covariances: Array, tracked: NDArray[np.bool_]
-) -> Motion | None:
+) -> TrajectoryBreaks | None:
     """Where a survey's trajectory leaves what odometry saw, over stretches of three metres; None where it is shorter.
 
     Both (F, 4, 4) of the frames at stamps_ns (F,), covariances (F, 6, 6) of odometry, rotation first; stretches with a frame that
@@ -123,4 +124,4 @@ def trajectory_breaks(
     torn = np.flatnonzero(off_m > allowed_m)
     begun_m = along_m[starts[torn]]
     breaks = int(len(torn) > 0) + int((np.diff(begun_m) > _APART_M).sum())
-    return Motion(len(starts), breaks, round(float(off_m.max()), 4))
+    return TrajectoryBreaks(len(starts), breaks, round(float(off_m.max()), 4))

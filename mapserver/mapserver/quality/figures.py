@@ -1,10 +1,10 @@
-"""What speaks for and against a draft's tiles, as figures; docs/reports.md says what they mean. Light: the store reads them."""
+"""Figures of the evidence about a draft's tiles; docs/reports.md says what they mean. Light: the store reads them."""
 
 import msgspec
 
 
-class Looks(msgspec.Struct, frozen=True):
-    """How frames fared in one map. Errors and inliers are of the localised ones, None without any."""
+class ProbeFigures(msgspec.Struct, frozen=True):
+    """Results of frames in one map. Errors and inliers are of the localised ones, None without any."""
 
     frames: int
     localised_share: float
@@ -18,8 +18,8 @@ class Looks(msgspec.Struct, frozen=True):
 class Compared(msgspec.Struct, frozen=True):
     """The same frames in the draft and in the current version; inliers_share: draft against before, median over frames found in both."""
 
-    draft: Looks
-    before: Looks | None = None
+    draft: ProbeFigures
+    before: ProbeFigures | None = None
     inliers_share: float | None = None
 
 
@@ -30,7 +30,7 @@ class Aliasing(msgspec.Struct, frozen=True):
     accepted_share: float
 
 
-class Motion(msgspec.Struct, frozen=True):
+class TrajectoryBreaks(msgspec.Struct, frozen=True):
     """Stretches of the survey against odometry: in how many separate places its trajectory is torn, and the worst difference."""
 
     stretches: int
@@ -39,7 +39,7 @@ class Motion(msgspec.Struct, frozen=True):
 
 
 class TileDirections(msgspec.Struct, frozen=True):
-    """Which way the places of a tile look, by heading (E along x of `map`, N along y); tile: its x and y.
+    """Places of a tile by the heading that they look (E along x of `map`, N along y); tile: its x and y.
 
     seen: places by their heading. missing: headings of which nothing was seen at places that were passed the other way, with how
     many those are; empty where both ways were driven.
@@ -58,5 +58,5 @@ class Evidence(msgspec.Struct, frozen=True):
     last_version: Compared | None = None
     aliasing: Aliasing | None = None
     aliasing_before: Aliasing | None = None
-    motion: Motion | None = None
+    motion: TrajectoryBreaks | None = None
     directions: list[TileDirections] | None = None

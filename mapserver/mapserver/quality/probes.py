@@ -1,4 +1,4 @@
-"""What is offered to a map to be localised in it: looks of a camera whose place is known from elsewhere."""
+"""Probes: the features of single images whose place is known from elsewhere, to be relocalized in a map."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,37 +6,52 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import orb, stereo
+from fleetmap.features.orb import Features
 from fleetmap.geometry import Array
+from fleetmap.relocalization.frame_features import FrameFeatures, features_with_depth
+from fleetmap.relocalization.landmark_visibility import places_around
+from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.relocalizer import Fix, Relocalizer, finished, is_credible
+from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
-from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_map import SurveyMap
 
-
-@dataclass(frozen=True, slots=True)
-class Look:
-    """N features of one picture: pixels (N, 3) u_left, v, u_right (NaN without a right match), octaves (N,), descriptors (N, 32)."""
-
-    camera: StereoCamera
-    pixels: Array
-    octaves: NDArray[np.int8]
-    descriptors: NDArray[np.uint8]
+PRIOR_RADIUS_M = 3.0
+_SAME_WAY_COSINE = 0.5
+_ROBOTS = RelocalizerSettings()
 
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """A look, and map_from_cam (4, 4) where it was taken, as the reference says."""
+    """What a camera saw, and map_from_cam (4, 4) where that was, as the reference says."""
 
-    look: Look
+    camera: StereoCamera
+    features: FrameFeatures
     map_from_cam: Array
 
 
-def look_at(frame: RectifiedFrame, camera: StereoCamera, settings: SurveySettings) -> Look:
-    """What a survey's keyframe would keep of one frame."""
-    features = orb.detect(frame.left, settings.orb)
-    disparities = stereo.disparities(frame, camera, features.pixels, settings.stereo)
-    pixels = np.column_stack([features.pixels, features.pixels[:, 0] - disparities[:, 0]])
-    return Look(camera, pixels, features.octaves, features.descriptors)
+def probe_features(frame: RectifiedFrame, camera: StereoCamera) -> FrameFeatures:
+    """What a robot would extract from a frame, with the depth of all features."""
+    return features_with_depth(frame, camera, _ROBOTS.orb, _ROBOTS.stereo)
+
+
+def relocalized(view: MapView, probe: Probe, prior_map_from_cam: Array) -> Fix | None:
+    """The best fix that robots would believe around a prior: within PRIOR_RADIUS_M, looking a similar way.
+
+    Only places around the prior are searched, so its accuracy does not matter.
+    """
+    around = (prior_map_from_cam, PRIOR_RADIUS_M, _SAME_WAY_COSINE)
+    relocalizer = Relocalizer(view, probe.camera, _ROBOTS)
+    fixes = finished(relocalizer.anywhere(probe.features, places_around(view.map_from_cam, *around)))
+    near = (fix for fix in fixes if places_around(fix.map_from_cam[None], *around).all())
+    return next((fix for fix in near if is_credible(fix, _ROBOTS.fix)), None)
+
+
+def most_similar_beyond(view: MapView, probe: Probe, radius_m: float) -> Array | None:
+    """(4, 4) map_from_cam of the place that looks most like a probe among those beyond a radius around it; None without any."""
+    is_far = np.linalg.norm(view.map_from_cam[:, :3, 3] - probe.map_from_cam[:3, 3], axis=1) > radius_m
+    places = view.similar_places(probe.features.features.descriptors, is_far, 1)
+    return np.asarray(view.map_from_cam[places[0]]) if len(places) else None
 
 
 def held_out_frames(keyframes: Sequence[int], measured: NDArray[np.bool_], count: int) -> list[int]:
@@ -58,7 +73,7 @@ def spread(numbers: NDArray[np.int64], count: int) -> list[int]:
 
 
 def probes_of_map(survey_map: SurveyMap, count: int) -> list[Probe]:
-    """At most `count` keyframes of a version as looks at its own landmarks, from its archive, without pictures.
+    """At most `count` keyframes of a version, with its own landmarks as features, from its archive, without images.
 
     They reach all of the site, and the place of each is what robots are told today.
     """
@@ -68,9 +83,8 @@ def probes_of_map(survey_map: SurveyMap, count: int) -> list[Probe]:
     probes = []
     for k in spread(np.flatnonzero(np.diff(bounds)), count):
         rows = order[bounds[k] : bounds[k + 1]]
-        look = Look(
-            survey_map.camera, survey_map.obs_pixels[rows], survey_map.obs_octave[rows],
-            survey_map.descriptors[survey_map.obs_landmark[rows]],
-        )  # fmt: skip
-        probes.append(Probe(look, map_from_cam[k]))
+        pixels, descriptors = survey_map.obs_pixels[rows], survey_map.descriptors[survey_map.obs_landmark[rows]]
+        angles = np.zeros(len(rows), np.float32)
+        features = Features(pixels[:, :2].copy(), survey_map.obs_octave[rows], angles, descriptors)
+        probes.append(Probe(survey_map.camera, FrameFeatures(features, pixels), map_from_cam[k]))
     return probes

@@ -15,7 +15,7 @@ from fleetmap.relocalization.alias_search import AliasCandidate, LandmarkSet, fi
 from fleetmap.relocalization.frame_features import FrameFeatures, extract_features
 from fleetmap.relocalization.landmark_visibility import Rows, image_coverage, match_visible, places_around
 from fleetmap.relocalization.map_view import CovisibleLandmarks, MapView
-from fleetmap.relocalization.settings import RelocalizerSettings
+from fleetmap.relocalization.settings import STRONG_INLIERS, FixSettings, RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 
 _RANKED = 8  # so many times as many places are ranked as are tried
@@ -272,6 +272,15 @@ def finished(work: TimeSliced[T]) -> T:
             next(work)
         except StopIteration as done:
             return cast(T, done.value)
+
+
+def is_credible(fix: Fix, settings: FixSettings, strong_inliers: int = STRONG_INLIERS) -> bool:
+    """Whether a fix may name a place: not by few landmarks where most of what stands there should have been seen and was not.
+
+    Racks repeat: some landmarks of any agree with some of any other.
+    """
+    has_recall = fix.inliers >= settings.min_inliers and fix.landmark_recall >= settings.min_hit_share
+    return fix.inliers >= strong_inliers or has_recall
 
 
 def _count_at(places: Sequence[Array], map_from_cam: Array) -> int:

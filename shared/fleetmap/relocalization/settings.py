@@ -6,6 +6,8 @@ from fleetmap.config import Section
 from fleetmap.features.orb import OrbSettings
 from fleetmap.features.stereo import StereoSettings
 
+STRONG_INLIERS = 60  # of a fix that may name a place however many landmarks it lacks
+
 
 class FixSettings(Section, frozen=True):
     """How one frame is placed in the map."""

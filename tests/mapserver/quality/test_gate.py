@@ -14,11 +14,11 @@ from fleetmap.mapformat import BlobEntry, CameraEntry, Manifest, Tile, TileEntry
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, Trajectory
-from mapserver.build.draft_evidence import Before, HeldOut, examine_draft
+from mapserver.build.draft_evidence import Before, HeldOut, JudgedSession, examine_draft
 from mapserver.quality.evidence import trajectory_breaks
 from mapserver.quality.figures import Evidence
 from mapserver.quality.gate import GateSettings, Verdict, judge
-from mapserver.quality.probes import held_out_frames, look_at
+from mapserver.quality.probes import held_out_frames, probe_features
 from mapserver.survey.loops.zones import Zones
 from mapserver.survey.pipeline import Survey, survey
 from mapserver.survey.settings import SurveySettings
@@ -51,8 +51,9 @@ def surveyed(rig: RigCalibration) -> tuple[Survey, list[HeldOut]]:
     done = survey(iter(frames), FRAMES, imu, rig, rectifier, WORDS, SETTINGS, Zones(), lambda *_: None)
     keyframes = [k.frame_index for k in done.first_guess.keyframes]
     numbers = held_out_frames(keyframes, done.map.trajectory_estimated, 40)
-    looks = [look_at(rectifier.rectify(frames[n]), rectifier.camera, SETTINGS) for n in numbers]
-    return done, [HeldOut(n, look, rectifier.body_from_cam) for n, look in zip(numbers, looks, strict=True)]
+    seen = [probe_features(rectifier.rectify(frames[n]), rectifier.camera) for n in numbers]
+    camera, body_from_cam = rectifier.camera, rectifier.body_from_cam
+    return done, [HeldOut(n, camera, body_from_cam, found) for n, found in zip(numbers, seen, strict=True)]
 
 
 @lru_cache(maxsize=1)
@@ -81,10 +82,8 @@ def verdict(
     done, own = sound()
     tiles, current = tiles_from_survey(survey_map), tiles_from_survey(done.map)
     before = Before(manifest(current, 1), done.map, current) if has_current else None
-    evidence = examine_draft(
-        tiles, before, [trajectory or done.map.trajectory], [own if held_out is None else held_out], [done], [],
-        done.vocabulary, SETTINGS,
-    )  # fmt: skip
+    session = JudgedSession(trajectory or done.map.trajectory, own if held_out is None else held_out, done)
+    evidence = examine_draft(tiles, survey_map.camera, done.vocabulary, before, [session], [])
     said = judge(manifest(tiles, 2), manifest(current, 1) if has_current else None, None, GateSettings(), evidence)
     return said, evidence
 
