@@ -11,7 +11,7 @@ from fleetmap.geometry import Array
 from fleetmap.relocalization.frame_features import FrameFeatures, features_with_depth
 from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.map_view import MapView
-from fleetmap.relocalization.relocalizer import Fix, Relocalizer, finished, is_credible
+from fleetmap.relocalization.relocalizer import Fix, Relocalizer, finished, is_reliable
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from mapserver.survey.survey_map import SurveyMap
@@ -44,7 +44,7 @@ def relocalized(view: MapView, probe: Probe, prior_map_from_cam: Array) -> Fix |
     relocalizer = Relocalizer(view, probe.camera, _ROBOTS)
     fixes = finished(relocalizer.anywhere(probe.features, places_around(view.map_from_cam, *around)))
     near = (fix for fix in fixes if places_around(fix.map_from_cam[None], *around).all())
-    return next((fix for fix in near if is_credible(fix, _ROBOTS.fix)), None)
+    return next((fix for fix in near if is_reliable(fix, _ROBOTS.fix)), None)
 
 
 def most_similar_beyond(view: MapView, probe: Probe, radius_m: float) -> Array | None:

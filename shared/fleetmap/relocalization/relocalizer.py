@@ -274,7 +274,7 @@ def finished(work: TimeSliced[T]) -> T:
             return cast(T, done.value)
 
 
-def is_credible(fix: Fix, settings: FixSettings, strong_inliers: int = STRONG_INLIERS) -> bool:
+def is_reliable(fix: Fix, settings: FixSettings, strong_inliers: int = STRONG_INLIERS) -> bool:
     """Whether a fix may name a place: not by few landmarks where most of what stands there should have been seen and was not.
 
     Racks repeat: some landmarks of any agree with some of any other.
