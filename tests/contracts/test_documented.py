@@ -117,9 +117,9 @@ def test_evidence_keys_are_documented() -> None:
     kinds = (
         figures.Evidence,
         figures.Compared,
-        figures.Looks,
+        figures.ProbeFigures,
         figures.Aliasing,
-        figures.Motion,
+        figures.TrajectoryBreaks,
         figures.TileDirections,
     )
     keys = {field.name for kind in kinds for field in msgspec.structs.fields(kind)}
