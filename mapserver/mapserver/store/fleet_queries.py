@@ -2,7 +2,7 @@
 
 import sqlite3
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import Any
 
 import msgspec
@@ -24,21 +24,27 @@ from mapserver.store.transactions import Transactions
 CounterKey = tuple[str, str, str, int]
 """Site, axis, key, hour."""
 
+LastReports = dict[tuple[str, str], tuple[int | None, int, dict[str, Any]]]
+"""By (site, robot): the version that it runs, None where it did not say, when it was heard, and its last report."""
+
 _DAY_NS = 86_400_000_000_000
 _SUMS = ", ".join(f"sum(t.{name}) {name}" for name in COUNTER_COLUMNS)
+_COUNTED = """FROM tally_keys k JOIN tallies t ON t.key_id = k.id
+    WHERE k.axis = ?1 AND (?2 IS NULL OR k.site = ?2) AND (?3 IS NULL OR k.key = ?3) AND t.hour >= ?4 AND t.hour < ?5"""
 _ADD = f"""INSERT INTO tallies (key_id, hour, {", ".join(COUNTER_COLUMNS)})
     VALUES (?, ?, {", ".join("?" * len(COUNTER_COLUMNS))})
     ON CONFLICT DO UPDATE SET {", ".join(f"{name} = {name} + excluded.{name}" for name in COUNTER_COLUMNS)}"""
+_REPORT_COLUMNS = ("site", "robot", "duration_s", "kind", "cause", "status", "version")
 _FAILURE_COLUMNS = ", ".join(FailureRow.__dataclass_fields__)
 
 
 @dataclass(slots=True)
 class FleetBatch:
-    """What came since the last batch. last_reports: (site, robot) to what it runs and its last report."""
+    """What came since the last batch."""
 
     counters: dict[CounterKey, Counters] = field(default_factory=dict)
     traces: list[TraceRow] = field(default_factory=list)
-    last_reports: dict[tuple[str, str], tuple[int | None, int, dict[str, Any]]] = field(default_factory=dict)
+    last_reports: LastReports = field(default_factory=dict)
 
     def add(self, site: str, axis: str, key: str, hour: int, counts: Counters) -> None:
         """Adds to one sum."""
@@ -46,7 +52,7 @@ class FleetBatch:
 
 
 class FleetQueries:
-    """The part of an open store that knows how the fleet does."""
+    """The part of an open store that holds the health of the fleet."""
 
     def __init__(self, transactions: Transactions) -> None:
         self._transactions = transactions
@@ -58,44 +64,31 @@ class FleetQueries:
             keys = [key[:3] for key in batch.counters] + [(row.site, "robot", row.robot) for row in batch.traces]
             ids = self._ids(connection, keys)
             _add_counters(connection, ids, batch.counters)
+            where = [(ids[row.site, "robot", row.robot], row) for row in batch.traces]
             connection.executemany(
-                "INSERT OR IGNORE INTO traces VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-                [
-                    (
-                        t.hour, ids[t.site, "robot", t.robot], t.stamp_ns, t.status, t.version, t.x_map_m, t.y_map_m,
-                        t.radius_95_m,
-                    )
-                    for t in batch.traces
-                ],
-            )  # fmt: skip
-            connection.executemany(
-                """INSERT INTO robots (site, robot, version, last_seen_ns, last_report) VALUES (?, ?, ?, ?, ?)
-                   ON CONFLICT DO UPDATE SET version = coalesce(excluded.version, version),
-                   last_seen_ns = excluded.last_seen_ns, last_report = excluded.last_report""",
-                [
-                    (site, robot, version, seen_ns, msgspec.json.encode(report).decode())
-                    for (site, robot), (version, seen_ns, report) in batch.last_reports.items()
-                ],
+                """INSERT OR IGNORE INTO traces (key_id, hour, stamp_ns, status, version, x_map_m, y_map_m, radius_95_m)
+                   VALUES (?, ?, ?, ?, ?, ?, ?, ?)""",
+                [(key_id, *astuple(row)[2:]) for key_id, row in where],
             )
+            keep_last_reports(connection, batch.last_reports)
         self._key_ids |= ids  # only what was committed
 
     def add_failure(
         self, report: FailureReport, *, received_ns: int, happened_ns: int, counters: Mapping[CounterKey, Counters]
     ) -> bool:
         """Keeps a failure and its sums, durably; False (and nothing done) for one that is known already."""
-        place = None if report.map_from_base is None else report.map_from_base.position_m
-        bare = msgspec.msgpack.encode(msgspec.structs.replace(report, thumbnails=()))
+        x_map_m, y_map_m = (None, None) if report.map_from_base is None else report.map_from_base.position_m[:2]
+        row = {
+            **{name: getattr(report, name) for name in _REPORT_COLUMNS},
+            **{"failure_id": report.id, "received_ns": received_ns, "happened_ns": happened_ns},
+            **{"tile": tile_key(report.tile), "x_map_m": x_map_m, "y_map_m": y_map_m},
+            "report": msgspec.msgpack.encode(msgspec.structs.replace(report, thumbnails=())),
+        }
         with self._transactions.write() as connection:
             done = connection.execute(
-                """INSERT OR IGNORE INTO failures (site, robot, failure_id, received_ns, happened_ns, duration_s, kind,
-                   cause, status, version, tile, x_map_m, y_map_m, report)
-                   VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)""",
-                (
-                    report.site, report.robot, report.id, received_ns, happened_ns, report.duration_s, report.kind,
-                    report.cause, report.status, report.version, tile_key(report.tile),
-                    None if place is None else place[0], None if place is None else place[1], bare,
-                ),
-            )  # fmt: skip
+                f"INSERT OR IGNORE INTO failures ({', '.join(row)}) VALUES ({', '.join(f':{name}' for name in row)})",
+                row,
+            )
             if done.rowcount != 1:
                 return False
             connection.executemany(
@@ -109,11 +102,9 @@ class FleetQueries:
         self, site: str | None, axis: str, *, since_hour: int = 0, until_hour: int = 1 << 60, key: str | None = None
     ) -> dict[tuple[str, str], Counters]:
         """Sums by (site, key) of an axis over hours from `since_hour` to before `until_hour`."""
+        values = (_axis(axis), site, key, since_hour, until_hour)
         rows = self._transactions.query(
-            f"""SELECT k.site, k.key, {_SUMS} FROM tally_keys k JOIN tallies t ON t.key_id = k.id
-                WHERE k.axis = ?1 AND (?2 IS NULL OR k.site = ?2) AND (?3 IS NULL OR k.key = ?3)
-                AND t.hour >= ?4 AND t.hour < ?5 GROUP BY k.id ORDER BY k.site, k.key""",
-            (_axis(axis), site, key, since_hour, until_hour),
+            f"SELECT k.site, k.key, {_SUMS} {_COUNTED} GROUP BY k.id ORDER BY k.site, k.key", values
         )
         return {(row.pop("site"), row.pop("key")): Counters(**row) for row in rows}
 
@@ -121,27 +112,19 @@ class FleetQueries:
         self, site: str | None, axis: str, *, key: str | None = None, since_hour: int = 0, until_hour: int = 1 << 60
     ) -> dict[int, Counters]:
         """Sums of an axis (and key) by the hour."""
-        rows = self._transactions.query(
-            f"""SELECT t.hour, {_SUMS} FROM tally_keys k JOIN tallies t ON t.key_id = k.id
-                WHERE k.axis = ?1 AND (?2 IS NULL OR k.site = ?2) AND (?3 IS NULL OR k.key = ?3)
-                AND t.hour >= ?4 AND t.hour < ?5 GROUP BY t.hour ORDER BY t.hour""",
-            (_axis(axis), site, key, since_hour, until_hour),
-        )
+        values = (_axis(axis), site, key, since_hour, until_hour)
+        rows = self._transactions.query(f"SELECT t.hour, {_SUMS} {_COUNTED} GROUP BY t.hour ORDER BY t.hour", values)
         return {row.pop("hour"): Counters(**row) for row in rows}
 
     def failures(self, wanted: FailureFilter, *, before: int | None = None, limit: int = -1) -> list[FailureRow]:
         """Failures, the last to arrive first, of numbers below `before`."""
-        values = (
-            wanted.site, wanted.robot, wanted.version, wanted.tile, wanted.cause, wanted.kind, wanted.since_ns,
-            wanted.until_ns, before, limit,
-        )  # fmt: skip
         rows = self._transactions.query(
             f"""SELECT {_FAILURE_COLUMNS} FROM failures
                 WHERE (?1 IS NULL OR site = ?1) AND (?2 IS NULL OR robot = ?2) AND (?3 IS NULL OR version = ?3)
                 AND (?4 IS NULL OR tile = ?4) AND (?5 IS NULL OR cause = ?5) AND (?6 IS NULL OR kind = ?6)
                 AND (?7 IS NULL OR happened_ns >= ?7) AND (?8 IS NULL OR happened_ns < ?8)
                 AND (?9 IS NULL OR number < ?9) ORDER BY number DESC LIMIT ?10""",
-            values,
+            (*astuple(wanted), before, limit),
         )
         return [FailureRow(**row) for row in rows]
 
@@ -180,37 +163,40 @@ class FleetQueries:
     def prune(self, retention: FleetRetention) -> int:
         """Removes what is too old or too much; returns how many rows went."""
         now_ns = self._transactions.now_ns()
-
-        def before_ns(days: float) -> int:
-            return now_ns - int(days * _DAY_NS)
-
+        tallies_ns, traces_ns, failures_ns = (
+            now_ns - int(days * _DAY_NS)
+            for days in (retention.tally_days, retention.trace_days, retention.failure_days)
+        )
         with self._transactions.write(durable=False) as connection:
-            gone = connection.execute(
-                "DELETE FROM tallies WHERE hour < ?", (hour_of(before_ns(retention.tally_days)),)
-            ).rowcount
-            gone += connection.execute(
-                "DELETE FROM traces WHERE hour < ?", (hour_of(before_ns(retention.trace_days)),)
-            ).rowcount
+            gone = connection.execute("DELETE FROM tallies WHERE hour < ?", (hour_of(tallies_ns),)).rowcount
+            gone += connection.execute("DELETE FROM traces WHERE hour < ?", (hour_of(traces_ns),)).rowcount
             gone += _prune_traces(connection, retention.trace_rows)
-            gone += connection.execute(
-                "DELETE FROM failures WHERE happened_ns < ?", (before_ns(retention.failure_days),)
-            ).rowcount
-            gone += _prune_pictures(connection, retention.picture_bytes)
-        return gone
+            gone += connection.execute("DELETE FROM failures WHERE happened_ns < ?", (failures_ns,)).rowcount
+            return gone + _prune_pictures(connection, retention.picture_bytes)
 
     def _ids(
         self, connection: sqlite3.Connection, keys: Iterable[tuple[str, str, str]]
     ) -> dict[tuple[str, str, str], int]:
         """Numbers of keys, which are never removed: those in memory stay right."""
-        found = {}
-        for key in set(keys):
-            if key not in self._key_ids:
-                connection.execute("INSERT OR IGNORE INTO tally_keys (site, axis, key) VALUES (?, ?, ?)", key)
-                row = connection.execute("SELECT id FROM tally_keys WHERE site = ? AND axis = ? AND key = ?", key)
-                found[key] = int(row.fetchone()[0])
-            else:
-                found[key] = self._key_ids[key]
+        found = {key: self._key_ids.get(key, 0) for key in keys}
+        for key in (key for key, number in found.items() if number == 0):
+            connection.execute("INSERT OR IGNORE INTO tally_keys (site, axis, key) VALUES (?, ?, ?)", key)
+            row = connection.execute("SELECT id FROM tally_keys WHERE site = ? AND axis = ? AND key = ?", key)
+            found[key] = int(row.fetchone()[0])
         return found
+
+
+def keep_last_reports(connection: sqlite3.Connection, reports: LastReports) -> None:
+    """Keeps what robots said last, within a transaction."""
+    connection.executemany(
+        """INSERT INTO robots (site, robot, version, last_seen_ns, last_report) VALUES (?, ?, ?, ?, ?)
+           ON CONFLICT DO UPDATE SET version = coalesce(excluded.version, version),
+           last_seen_ns = excluded.last_seen_ns, last_report = excluded.last_report""",
+        [
+            (site, robot, version, seen_ns, msgspec.json.encode(report).decode())
+            for (site, robot), (version, seen_ns, report) in reports.items()
+        ],
+    )
 
 
 def tile_key(tile: tuple[int, int] | None) -> str | None:

@@ -1,4 +1,4 @@
-"""What is read from a store, and what is only noted in it: robots' reports, jobs, events."""
+"""Queries of a store, and rows that change no version: robots' reports, jobs, events."""
 
 import json
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from fleetmap.errors import UsageError
 from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest
 from mapserver.quality.figures import Evidence
 from mapserver.store.blobs import BlobFolder
-from mapserver.store.fleet_queries import FleetQueries
+from mapserver.store.fleet_queries import FleetQueries, keep_last_reports
 from mapserver.store.rows import (
     NOBODY,
     Actor,
@@ -170,39 +170,36 @@ class StoreQueries:
         rows = self._transactions.query(
             "SELECT * FROM robots WHERE ?1 IS NULL OR site = ?1 ORDER BY site, robot", (site,)
         )
-        return [RobotInfo(**{**row, "last_report": json.loads(row["last_report"])}) for row in rows]
+        return [RobotInfo(**row | {"last_report": json.loads(row["last_report"])}) for row in rows]
 
     def jobs(self, site: str | None = None, *, before: int | None = None, limit: int = -1) -> list[JobInfo]:
         """Jobs (of a site), newest first, older than job `before`."""
-        rows = self._transactions.query(
-            """SELECT * FROM jobs WHERE (?1 IS NULL OR site = ?1) AND (?2 IS NULL OR id < ?2)
-               ORDER BY id DESC LIMIT ?3""",
+        return self._jobs(
+            "WHERE (?1 IS NULL OR site = ?1) AND (?2 IS NULL OR id < ?2) ORDER BY id DESC LIMIT ?3",
             (site, before, limit),
         )
-        return [JobInfo(**{**row, "report": json.loads(row["report"])}) for row in rows]
 
     def running_jobs(self) -> list[JobInfo]:
-        """Jobs that stand as running, oldest first."""
-        rows = self._transactions.query("SELECT * FROM jobs WHERE state = 'running' ORDER BY id")
-        return [JobInfo(**{**row, "report": json.loads(row["report"])}) for row in rows]
+        """Jobs whose row says that they run, oldest first."""
+        return self._jobs("WHERE state = 'running' ORDER BY id", ())
 
     def job(self, number: int) -> JobInfo:
         """One job; raises UsageError where it does not exist."""
-        rows = self._transactions.query("SELECT * FROM jobs WHERE id = ?", (number,))
-        if not rows:
+        found = self._jobs("WHERE id = ?", (number,))
+        if not found:
             raise UsageError(f"there is no job {number}; the list of jobs shows those that are kept")
-        return JobInfo(**{**rows[0], "report": json.loads(rows[0]["report"])})
+        return found[0]
+
+    def _jobs(self, which: str, values: tuple[object, ...]) -> list[JobInfo]:
+        rows = self._transactions.query(f"SELECT * FROM jobs {which}", values)
+        return [JobInfo(**row | {"report": json.loads(row["report"])}) for row in rows]
 
     def record_robot_report(self, site: str, robot: str, report: dict[str, Any], version: int | None = None) -> None:
         """Keeps what a robot said; `version` is what it runs, None where it did not say."""
-        text = msgspec.json.encode(report).decode()
+        check_name(site, "site")
+        check_name(robot, "robot")
         with self._transactions.write(durable=False) as connection:
-            connection.execute(
-                """INSERT INTO robots (site, robot, version, last_seen_ns, last_report) VALUES (?, ?, ?, ?, ?)
-                   ON CONFLICT DO UPDATE SET version = coalesce(excluded.version, version),
-                   last_seen_ns = excluded.last_seen_ns, last_report = excluded.last_report""",
-                (check_name(site, "site"), check_name(robot, "robot"), version, self._clock_ns(), text),
-            )
+            keep_last_reports(connection, {(site, robot): (version, self._clock_ns(), report)})
 
     def record_event(
         self, site: str, kind: str, detail: str, *, version: int | None = None, actor: Actor = NOBODY

@@ -1,14 +1,15 @@
-"""Whether a store is what it claims to be: every hash, every reference, the database itself."""
+"""Verification of a store: every hash, every reference, the database itself."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import Manifest, current_path, decode_manifest
 from mapserver.store.blobs import BlobFolder
-from mapserver.store.rows import VersionInfo
+from mapserver.store.rows import SiteReleases, VersionInfo
 from mapserver.store.transactions import Transactions
-from mapserver.store.version_rows import references
+from mapserver.store.version_rows import references, site_releases
 
 
 @dataclass(slots=True)
@@ -30,33 +31,32 @@ class StoreFindings:
 def verify(root: Path, transactions: Transactions, blobs: BlobFolder) -> StoreFindings:
     """Reads everything in the store. Raises StoreError only where the database cannot be read at all."""
     found = StoreFindings()
-    found.faults += [f"database: {row['integrity_check']}" for row in _unless_ok(transactions)]
-    found.faults += [f"database: a row of {row['table']} refers to nothing" for row in transactions.query(_FOREIGN)]
+    integrity = [row["integrity_check"] for row in transactions.query("PRAGMA integrity_check")]
+    found.faults += [f"database: {text}" for text in integrity if text != "ok"]
+    foreign = transactions.query("PRAGMA foreign_key_check")
+    found.faults += [f"database: a row of {row['table']} refers to nothing" for row in foreign]
     sound = _check_blobs(transactions, blobs, found)
-    for row in transactions.query("SELECT * FROM versions ORDER BY site, version"):
+    sites = transactions.query("SELECT * FROM sites ORDER BY site")
+    releases = [site_releases(transactions, row["site"]) for row in sites]
+    for info in (info for rows in releases for info in rows.versions.values()):
         found.versions += 1
-        _check_version(transactions, blobs, VersionInfo(**row), sound, found)
-    for row in transactions.query("SELECT * FROM sites ORDER BY site"):
+        found.faults += _version_faults(transactions, blobs, info, sound)
+    for row, rows in zip(sites, releases, strict=True):
         found.sites += 1
-        _check_site(root, transactions, row["site"], row["last_version"], row["vocabulary_sha256"], sound, found)
+        found.faults += _site_faults(transactions, row, rows)
+        found.faults += _file_faults(root, rows)
+        if any(info.state != "draft" and info.manifest_sha256 not in sound for info in rows.versions.values()):
+            found.faults.append(f"site {rows.site}: a published version has no whole manifest")
     return found
-
-
-_FOREIGN = "PRAGMA foreign_key_check"
-
-
-def _unless_ok(transactions: Transactions) -> list[dict[str, str]]:
-    return [row for row in transactions.query("PRAGMA integrity_check") if row["integrity_check"] != "ok"]
 
 
 def _check_blobs(transactions: Transactions, blobs: BlobFolder, found: StoreFindings) -> set[str]:
     """The addresses whose bytes are whole."""
-    mentioned = {row["sha256"] for row in transactions.query("SELECT DISTINCT sha256 FROM version_blobs")}
-    mentioned |= {
-        row["vocabulary_sha256"]
-        for row in transactions.query("SELECT vocabulary_sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL")
-    }
-    present = blobs.addresses()
+    rows = transactions.query(
+        """SELECT sha256 FROM version_blobs UNION
+           SELECT vocabulary_sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL"""
+    )
+    mentioned, present = {row["sha256"] for row in rows}, blobs.addresses()
     found.orphans = len(present - mentioned)
     found.leftovers = len(blobs.strangers())
     found.blobs = len(present)
@@ -67,27 +67,27 @@ def _check_blobs(transactions: Transactions, blobs: BlobFolder, found: StoreFind
     return (mentioned & present) - damaged
 
 
-def _check_version(
-    transactions: Transactions, blobs: BlobFolder, info: VersionInfo, sound: set[str], found: StoreFindings
-) -> None:
+def _version_faults(transactions: Transactions, blobs: BlobFolder, info: VersionInfo, sound: set[str]) -> list[str]:
     name = f"version {info.version} of {info.site}"
     if info.manifest_sha256 not in sound:
-        return  # told with the blobs, unless nothing mentions it
+        return []  # reported with the blobs, unless nothing mentions it
     try:
         manifest = decode_manifest(blobs.get(info.manifest_sha256))
     except FleetmapError as error:
-        found.faults.append(f"{name}: {error}")
-        return
+        return [f"{name}: {error}"]
+    faults = []
     rows = transactions.query(
         "SELECT kind, sha256 FROM version_blobs WHERE site = ? AND version = ?", (info.site, info.version)
     )
     if {(row["kind"], row["sha256"]) for row in rows} != references(info, manifest):
-        found.faults.append(f"{name}: the database does not mention exactly the bytes of its manifest")
-    if _figures_of(manifest) != _figures(info):
-        found.faults.append(f"{name}: the database says {_figures(info)}, its manifest {_figures_of(manifest)}")
-    for tile in manifest.tiles:
-        if tile.sha256 in sound and blobs.path(tile.sha256).stat().st_size != tile.bytes:
-            found.faults.append(f"{name}: tile {tile.x},{tile.y} has another size than its manifest says")
+        faults.append(f"{name}: the database does not mention exactly the bytes of its manifest")
+    stored, made = _figures(info), _figures_of(manifest)
+    if stored != made:
+        faults.append(f"{name}: the database says {stored}, its manifest {made}")
+    wrong = [
+        tile for tile in manifest.tiles if tile.sha256 in sound and blobs.path(tile.sha256).stat().st_size != tile.bytes
+    ]
+    return faults + [f"{name}: tile {tile.x},{tile.y} has another size than its manifest says" for tile in wrong]
 
 
 def _figures(info: VersionInfo) -> tuple[object, ...]:
@@ -95,36 +95,28 @@ def _figures(info: VersionInfo) -> tuple[object, ...]:
 
 
 def _figures_of(manifest: Manifest) -> tuple[object, ...]:
-    return (
-        manifest.site, manifest.version, manifest.parent, len(manifest.tiles), manifest.tile_bytes,
-        manifest.landmarks, manifest.vocabulary.sha256,
-    )  # fmt: skip
+    sizes = (len(manifest.tiles), manifest.tile_bytes, manifest.landmarks)
+    return (manifest.site, manifest.version, manifest.parent, *sizes, manifest.vocabulary.sha256)
 
 
-def _check_site(
-    root: Path,
-    transactions: Transactions,
-    site: str,
-    last_version: int,
-    vocabulary: str | None,
-    sound: set[str],
-    found: StoreFindings,
-) -> None:
-    versions = {v["version"]: v for v in transactions.query("SELECT * FROM versions WHERE site = ?", (site,))}
-    if versions and max(versions) > last_version:
-        found.faults.append(f"site {site}: version {max(versions)} is beyond the last number {last_version}")
-    current = [number for number, row in versions.items() if row["state"] == "current"]
-    newest = transactions.query("SELECT version FROM currents WHERE site = ? ORDER BY id DESC LIMIT 1", (site,))
+def _site_faults(transactions: Transactions, site: dict[str, Any], rows: SiteReleases) -> list[str]:
+    """Faults of a site's row and of the record of what was current."""
+    faults, name = [], f"site {rows.site}"
+    if rows.versions and max(rows.versions) > site["last_version"]:
+        faults.append(f"{name}: version {max(rows.versions)} is beyond the last number {site['last_version']}")
+    current = [number for number, info in rows.versions.items() if info.state == "current"]
+    newest = transactions.query("SELECT version FROM currents WHERE site = ? ORDER BY id DESC LIMIT 1", (rows.site,))
     if [row["version"] for row in newest] != current:
-        found.faults.append(f"site {site}: current is {current}, the record of what was current ends with {newest}")
-    if current and vocabulary != versions[current[0]]["vocabulary_sha256"]:
-        found.faults.append(f"site {site}: the current version has another vocabulary than the site")
-    if not current and any(row["state"] in {"published", "retired"} for row in versions.values()):
-        found.faults.append(f"site {site}: it has published versions, none of them current")
-    path = root / current_path(site)
-    wanted = f"{versions[current[0]]['manifest_sha256']}\n" if current else None
+        faults.append(f"{name}: current is {current}, the record of what was current ends with {newest}")
+    if rows.current is not None and site["vocabulary_sha256"] != rows.current.vocabulary_sha256:
+        faults.append(f"{name}: the current version has another vocabulary than the site")
+    if not current and any(info.state in {"published", "retired"} for info in rows.versions.values()):
+        faults.append(f"{name}: it has published versions, none of them current")
+    return faults
+
+
+def _file_faults(root: Path, rows: SiteReleases) -> list[str]:
+    path = root / current_path(rows.site)
+    wanted = None if rows.current is None else f"{rows.current.manifest_sha256}\n"
     text = path.read_text("ascii", "replace") if path.is_file() else None
-    if text != wanted:
-        found.faults.append(f"{path} does not name the current version; open the store again to repair it")
-    if any(row["state"] != "draft" and row["manifest_sha256"] not in sound for row in versions.values()):
-        found.faults.append(f"site {site}: a published version has no whole manifest")
+    return [] if text == wanted else [f"{path} does not name the current version; open the store again to repair it"]
