@@ -20,9 +20,10 @@ from locclient.daemon.publishers import Output, open_output
 from locclient.daemon.run_settings import RunSection
 from locclient.daemon.runtime import Parts
 from locclient.daemon.server_sync import ServerSync
-from locclient.maps.connection import default_cache_folder
-from locclient.maps.map_client import CachedMap, LocalMapSource, MapClient, MapSource
-from locclient.maps.tile_cache import StoreFolder, TileCache
+from locclient.maps.connection import cache_folder
+from locclient.maps.map_client import MapClient
+from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
+from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
 from locclient.replay.prior_option import parse_prior
 from locclient.robot.robot import Robot
@@ -96,7 +97,7 @@ def spool_path(run: RunSection, site: str, robot: str) -> Path:
     """Where the spool lies: as set, else beside the cache, one for each robot of the machine."""
     if run.spool is not None:
         return Path(run.spool)
-    return default_cache_folder().parent / "spool" / f"{site}.{robot}.sqlite3"
+    return cache_folder().parent / "spool" / f"{site}.{robot}.sqlite3"
 
 
 def _output(config: LocclientConfig, bus: Bus | None, site: str, name: str, stack: ExitStack) -> Output | None:
@@ -111,15 +112,14 @@ def _maps(
 ) -> tuple[MapClient | None, MapSource, WantedVersion | None, tuple[TileCache, ...]]:
     """The link to a server, what maps are read from, and the version to begin with; from the disk alone, without waiting."""
     if bus is None:
-        folder = LocalMapSource(StoreFolder(Path(run.store or "")), site)
+        folder = LocalMapSource(Path(run.store or ""), site)
         wanted = folder.wanted()
         if wanted.version is None:
             raise LinkError(
                 f"site {site} has no published version in {run.store}; publish one with `mapserver publish`"
             )
         return None, folder, wanted, ()
-    cache = Path(run.cache) if run.cache is not None else default_cache_folder()
     # Two views of the same folder, because a cache is not for two threads; the second only reads.
-    caches = tuple(TileCache(cache, max_bytes=run.cache_bytes) for _ in range(2))
+    caches = tuple(TileCache(cache_folder(run.cache), max_bytes=run.cache_bytes) for _ in range(2))
     link = MapClient(bus, caches[0], site, name, patience_s=_PATIENCE_S)
     return link, CachedMap(caches[1], site), link.active(), caches

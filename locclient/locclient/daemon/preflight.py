@@ -15,9 +15,10 @@ from fleetmap.sensors.samples import CameraFrame
 from locclient.config import LocclientConfig
 from locclient.daemon.daemon import check_run, spool_path
 from locclient.daemon.outbox import Outbox
-from locclient.maps.connection import default_cache_folder
-from locclient.maps.map_client import LocalMapSource, MapClient
-from locclient.maps.tile_cache import StoreFolder, TileCache
+from locclient.maps.connection import cache_folder
+from locclient.maps.map_client import MapClient
+from locclient.maps.map_source import LocalMapSource
+from locclient.maps.tile_cache import TileCache
 from locclient.sensors.intake import Intake
 from locclient.sensors.source import Source, open_source
 
@@ -167,7 +168,7 @@ def _spool(config: LocclientConfig) -> Iterator[Finding]:
 
 
 def _store(config: LocclientConfig) -> Iterator[Finding]:
-    link = LocalMapSource(StoreFolder(Path(str(config.run.store))), str(config.run.site))
+    link = LocalMapSource(Path(str(config.run.store)), str(config.run.site))
     wanted = link.wanted()
     fetched = link.tiles(link.manifest(wanted))
     yield _tiles("store", wanted.version, len(fetched.tiles), fetched.refused)
@@ -175,7 +176,7 @@ def _store(config: LocclientConfig) -> Iterator[Finding]:
 
 def _cache_and_server(config: LocclientConfig) -> Iterator[Finding]:
     run = config.run
-    folder = Path(run.cache) if run.cache is not None else default_cache_folder()
+    folder = cache_folder(run.cache)
     cache = TileCache(folder, max_bytes=run.cache_bytes)
     free_bytes = shutil.disk_usage(folder).free
     if free_bytes < _MIN_FREE_BYTES:

@@ -2,7 +2,7 @@
 
 from fleetmap.config import Section
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
-from locclient.maps.tile_selection import WindowSettings
+from locclient.maps.tile_selection import TileSelectionSettings
 from locclient.robot.version_trial import TrialSettings
 
 
@@ -21,5 +21,5 @@ class RunSection(Section, frozen=True):
     failures: str | None = None
     frame_queue: int = 2
     imu_wait_s: float = 0.05
-    window: WindowSettings = WindowSettings()
+    window: TileSelectionSettings = TileSelectionSettings()
     trial: TrialSettings = TrialSettings()

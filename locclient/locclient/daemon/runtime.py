@@ -22,7 +22,7 @@ from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
-from locclient.maps.tile_selection import Cell, Place, PositionBound
+from locclient.maps.tile_selection import Cell, PositionBound, PositionBoundTracker
 from locclient.robot.failure_report import failure_report
 from locclient.robot.health_report import Figure, HealthFigures
 from locclient.robot.robot import FailureContext, Outcome, Robot
@@ -62,7 +62,7 @@ class Parts:
 class _Shared:
     """What threads leave for each other; deques and plain values, which need no lock."""
 
-    place: Place = field(default_factory=Place)
+    place: PositionBound = field(default_factory=PositionBound)
     held: list[WantedVersion] = field(default_factory=list)
     loaded: deque[LoadedMap] = field(default_factory=deque)
     failures: deque[tuple[FailureContext, int]] = field(default_factory=lambda: deque(maxlen=_MAX_PENDING))
@@ -78,7 +78,7 @@ class Runtime:
         self._sensors_stop = threading.Event()
         self._shared = _Shared()
         self._figures = HealthFigures()
-        self._whereabouts = PositionBound(parts.room.settings)
+        self._whereabouts = PositionBoundTracker(parts.room.settings)
         self._last_frame_s: float | None = None
         self._health_s, self._pose_ns = 0.0, -(2**62)
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
@@ -233,7 +233,7 @@ class Runtime:
         while talk is not None and talk.fetched:
             version = talk.fetched.popleft()
             self._offers[version.manifest_sha256 or ""] = version
-            room.forget_refusals(version)
+            room.retry_refused(version)
         held = list(shared.held)
         for version in held:
             self._offers.pop(version.manifest_sha256 or "", None)

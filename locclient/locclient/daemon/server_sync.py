@@ -162,7 +162,7 @@ class ServerSync:
                 self._spool.refused(report.id)
                 continue
             try:
-                ack = self._link.tell_failure(report.payload)
+                ack = self._link.report_failure(report.payload)
             except UnreachableError:
                 raise
             except LinkError as error:

@@ -1,4 +1,4 @@
-"""Bytes in parts over the bus: nothing that came is asked for twice, and an absent server is waited for."""
+"""Download of bytes in chunks over the bus: resumed where it broke off, patient with an absent server."""
 
 import time
 from collections.abc import Callable
@@ -8,21 +8,21 @@ from fleetmap.errors import LinkError, UnreachableError
 from fleetmap.messages import ChunkRequest, Part, decode_message, encode_message
 
 _RETRY_S = 0.2
-_MAX_BEGUN = 8
+_MAX_INCOMPLETE = 8
 
 
 class ChunkReader:
-    """Reads what a server sends in parts. What was begun is kept until it is whole, over errors and calls."""
+    """Reads what a server sends in chunks. Chunks of an incomplete download are kept over errors and calls."""
 
     def __init__(
         self, bus: Bus, *, timeout_s: float, patience_s: float, clock_s: Callable[[], float] = time.monotonic
     ) -> None:
-        """timeout_s: for each part. patience_s: without any part, after which a read gives up (and can be taken up again)."""
+        """timeout_s: for each chunk. patience_s: without any chunk, after which a read gives up; a later one resumes it."""
         self._bus = bus
         self._timeout_s = timeout_s
         self._patience_s = patience_s
         self._clock_s = clock_s
-        self._begun: dict[str, bytearray] = {}
+        self._incomplete: dict[str, bytearray] = {}
         self.received_bytes = 0
 
     def read(self, key: str, *, max_bytes: int) -> bytes:
@@ -30,34 +30,34 @@ class ChunkReader:
 
         Raises UnreachableError where nobody answers, LinkError for a refusal, for more than max_bytes and for nonsense.
         """
-        data = self._begun.pop(key, bytearray())
+        data = self._incomplete.pop(key, bytearray())
         try:
-            while (part := self._part(key, len(data), max_bytes)).total_bytes > len(data) + len(part.data):
-                data += part.data
-            return bytes(data + part.data)
+            while (chunk := self._chunk(key, len(data), max_bytes)).total_bytes > len(data) + len(chunk.data):
+                data += chunk.data
+            return bytes(data + chunk.data)
         except UnreachableError:
-            self._begun[key] = data
-            while len(self._begun) > _MAX_BEGUN:
-                self._begun.pop(next(iter(self._begun)))
+            self._incomplete[key] = data
+            while len(self._incomplete) > _MAX_INCOMPLETE:
+                self._incomplete.pop(next(iter(self._incomplete)))
             raise
 
-    def _part(self, key: str, offset: int, max_bytes: int) -> Part:
-        part = self._patiently(key, encode_message(ChunkRequest(offset=offset)))
-        self.received_bytes += len(part.data)
-        if part.total_bytes > max_bytes:
-            raise LinkError(f"{key} has {part.total_bytes} bytes where at most {max_bytes} are expected")
-        if part.offset != offset or offset + len(part.data) > part.total_bytes:
-            raise LinkError(f"{key}: asked from byte {offset} on, got {len(part.data)} from {part.offset} on")
-        if not part.data and part.total_bytes > offset:
-            raise LinkError(f"{key}: nothing from byte {offset} on, though there are {part.total_bytes}")
-        return part
+    def _chunk(self, key: str, offset: int, max_bytes: int) -> Part:
+        chunk = self._request(key, encode_message(ChunkRequest(offset=offset)))
+        self.received_bytes += len(chunk.data)
+        if chunk.total_bytes > max_bytes:
+            raise LinkError(f"{key} has {chunk.total_bytes} bytes where at most {max_bytes} are expected")
+        if chunk.offset != offset or offset + len(chunk.data) > chunk.total_bytes:
+            raise LinkError(f"{key}: asked from byte {offset} on, got {len(chunk.data)} from {chunk.offset} on")
+        if not chunk.data and chunk.total_bytes > offset:
+            raise LinkError(f"{key}: nothing from byte {offset} on, though there are {chunk.total_bytes}")
+        return chunk
 
-    def _patiently(self, key: str, question: bytes) -> Part:
-        """Asks until somebody answers or patience ends. Raises UnreachableError, or LinkError for a refusal."""
+    def _request(self, key: str, request: bytes) -> Part:
+        """Repeats the request until it is answered or patience ends. Raises UnreachableError, or LinkError for a refusal."""
         deadline_s = self._clock_s() + self._patience_s
         while True:
             try:
-                return decode_message(self._bus.get(key, question, timeout_s=self._timeout_s), Part)
+                return decode_message(self._bus.get(key, request, timeout_s=self._timeout_s), Part)
             except UnreachableError:
                 if self._clock_s() >= deadline_s:
                     raise

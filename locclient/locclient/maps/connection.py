@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from fleetmap.bus import ZenohBus
-from locclient.maps.map_client import LocalMapSource, MapClient, MapSource
-from locclient.maps.tile_cache import StoreFolder, TileCache
+from locclient.maps.map_client import MapClient
+from locclient.maps.map_source import LocalMapSource, MapSource
+from locclient.maps.tile_cache import TileCache
 
 _log = logging.getLogger(__name__)
 _PATIENCE_S = 120.0  # with a server that goes away in the middle of a fetch; one that is restarted is back by then
@@ -28,24 +29,25 @@ class MapConnection:
 
 @contextmanager
 def connected(options: dict[str, Any]) -> Iterator[MapConnection]:
-    """A link for the options `server` or `store`, `site`, `robot`, `cache`, `cache_bytes`; closed afterwards."""
+    """A connection for the options `server` or `store`, `site`, `robot`, `cache`, `cache_bytes`; closed afterwards."""
     site, robot = options["site"], options["robot"]
     if options["store"] is not None:
-        yield MapConnection(LocalMapSource(StoreFolder(Path(options["store"])), site), None, site, robot)
+        yield MapConnection(LocalMapSource(Path(options["store"]), site), None, site, robot)
         return
-    folder = Path(options["cache"]) if options["cache"] is not None else default_cache_folder()
+    cache = TileCache(cache_folder(options["cache"]), max_bytes=options["cache_bytes"])
     bus = ZenohBus.connect(options["server"])
     try:
-        cache = TileCache(folder, max_bytes=options["cache_bytes"])
-        link = MapClient(bus, cache, site, robot, patience_s=_PATIENCE_S)
-        link.announce_presence()
-        yield MapConnection(link, link, site, robot)
+        client = MapClient(bus, cache, site, robot, patience_s=_PATIENCE_S)
+        client.announce_presence()
+        yield MapConnection(client, client, site, robot)
         for fault in cache.take_faults():
             _log.warning("tile cache: %s", fault)
     finally:
         bus.close()
 
 
-def default_cache_folder() -> Path:
-    """`fleetmap/tiles` in the user's cache folder (XDG_CACHE_HOME)."""
+def cache_folder(setting: str | None = None) -> Path:
+    """The folder of the setting `cache`, else `fleetmap/tiles` in the user's cache folder (XDG_CACHE_HOME)."""
+    if setting is not None:
+        return Path(setting)
     return Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))) / "fleetmap" / "tiles"

@@ -1,4 +1,4 @@
-"""The robot's disk cache of map bytes, addressed by their SHA-256 and bounded in size. Also reads a store's folder."""
+"""The robot's disk cache of map bytes, addressed by their SHA-256 and bounded in size."""
 
 import os
 import secrets
@@ -10,27 +10,30 @@ from typing import Annotated
 import msgspec
 
 from fleetmap.errors import MapFormatError, StoreError
-from fleetmap.mapformat import blob_path, check_name, check_sha256, current_path, verified
+from fleetmap.mapformat import blob_path, check_name, check_sha256, verified
+from fleetmap.messages import WantedVersion
 
 DEFAULT_MAX_BYTES = 2_000_000_000
 _MAX_FAULTS = 100  # that wait to be taken
 
 
 class ActiveVersion(msgspec.Struct, frozen=True):
-    """The version of a site that this robot has whole; blobs: addresses of all its bytes, that of its manifest first."""
+    """The version of a site that this robot has whole; blobs: all its addresses, the manifest's first."""
 
     version: Annotated[int, msgspec.Meta(ge=1)]
     blobs: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
 
+    def wanted(self, site: str) -> WantedVersion:
+        """The same as a server names a version."""
+        return WantedVersion(site=site, version=self.version, manifest_sha256=self.blobs[0])
+
 
 class TileCache:
-    """Files below one folder; the least recently used go first when `max_bytes` is exceeded, but never what is in use.
+    """Files below one folder. Above `max_bytes` the least recently used are evicted, but never those of an active or reserved version.
 
-    In use is what the active version of a site consists of, and the version that is on its way.
-
-    Nothing here trusts the disk: bytes are verified whenever they are read. A disk that refuses costs the cache, not
-    the robot's map: what went wrong is told by `take_faults`. Not for several threads at once. One process at a time
-    should use a folder; a second one does no harm but may evict what the first one still wants.
+    Bytes are verified whenever they are read. A disk that fails costs the cache, not the robot's map: `take_faults` has the reasons.
+    For one thread at a time, but for `take_faults`. One process should use a folder; a second one does no harm but may evict what
+    the first one still wants.
     """
 
     def __init__(self, folder: Path, *, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
@@ -39,7 +42,7 @@ class TileCache:
         self._max_bytes = max_bytes
         self._faults: deque[str] = deque(maxlen=_MAX_FAULTS)
         self._last_fault = ""
-        self._on_the_way: dict[str, frozenset[str]] = {}
+        self._reserved: dict[str, frozenset[str]] = {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._sizes = self._scan()
@@ -56,7 +59,7 @@ class TileCache:
         return sum(self._sizes.values())
 
     def get(self, sha256: str) -> bytes | None:
-        """The bytes of an address; None where they are not here. Damaged ones are removed and told as a fault."""
+        """The bytes of an address; None where they are not here. Damaged ones are removed, which is a fault."""
         path = self._path(sha256)
         try:
             data = verified(path.read_bytes(), sha256)
@@ -73,23 +76,23 @@ class TileCache:
         return data
 
     def put(self, sha256: str, data: bytes) -> None:
-        """Keeps `data`, written whole or not at all, and makes room for it.
+        """Keeps `data`, written whole or not at all, and evicts others for it.
 
-        Raises MapFormatError for bytes of another address. A disk that refuses is told as a fault.
+        Raises MapFormatError for bytes of another address. A disk that refuses is a fault.
         """
         verified(data, sha256)
         if not self._write(self._path(sha256), data):
             return
         self._sizes.pop(sha256, None)
         self._sizes[sha256] = len(data)
-        self._make_room(keep=sha256)
+        self._evict(keep=sha256)
 
-    def hold(self, site: str, blobs: Sequence[str]) -> None:
-        """Keeps these from being removed until the site's next version is held or active: they are on their way."""
-        self._on_the_way[site] = frozenset(blobs)
+    def reserve(self, site: str, blobs: Sequence[str]) -> None:
+        """Keeps these addresses from eviction until the site's next version is reserved or active."""
+        self._reserved[site] = frozenset(blobs)
 
     def activate(self, site: str, version: int, blobs: Sequence[str]) -> None:
-        """Makes a version the active one, whole or not at all. blobs: all it consists of, the manifest's address first.
+        """Makes a version the active one, whole or not at all. blobs: all its addresses, the manifest's first.
 
         Raises StoreError where one of them is missing or the disk refuses; what was active stays so.
         """
@@ -103,8 +106,8 @@ class TileCache:
         if not self._write(self._active_path(site), msgspec.json.encode(record)):
             raise StoreError(f"version {version} of {site} cannot be made active: {self._last_fault}")
         self._active[site] = record
-        self._on_the_way.pop(site, None)
-        self._make_room(keep="")
+        self._reserved.pop(site, None)
+        self._evict(keep="")
 
     def active(self, site: str) -> ActiveVersion | None:
         """The site's version that this robot has whole, None before the first one."""
@@ -140,11 +143,11 @@ class TileCache:
                 self._note(f"{path} is damaged ({error}); the version has to be fetched again")
         return found
 
-    def _make_room(self, keep: str) -> None:
+    def _evict(self, keep: str) -> None:
         total = self.total_bytes
         if total <= self._max_bytes:
             return
-        used = {keep}.union(*self._on_the_way.values(), *(record.blobs for record in self._active.values()))
+        used = {keep}.union(*self._reserved.values(), *(record.blobs for record in self._active.values()))
         for sha256 in list(self._sizes):
             if total <= self._max_bytes:
                 return
@@ -193,32 +196,3 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-class StoreFolder:
-    """Reads what a map store keeps in files, without its database: current manifests and bytes by address."""
-
-    def __init__(self, folder: Path) -> None:
-        """Raises StoreError where `folder` is no store."""
-        if not (folder / "sites").is_dir():
-            raise StoreError(f"{folder} is no map store; check --store, or make one with `mapserver build`")
-        self._folder = folder
-
-    def current_manifest(self, site: str) -> str | None:
-        """The address of the manifest of the site's current version, None where nothing is published."""
-        path = self._folder / current_path(site)
-        try:
-            return check_sha256(path.read_text("ascii").strip())
-        except FileNotFoundError:
-            return None
-        except (OSError, UnicodeDecodeError, MapFormatError) as error:
-            raise StoreError(f"{path} cannot be read ({error}); open the store with mapserver to repair it") from error
-
-    def blob(self, sha256: str) -> bytes:
-        """The bytes of an address; raises StoreError for missing ones, MapFormatError for damaged ones."""
-        path = self._folder / blob_path(sha256)
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise StoreError(f"{path} cannot be read ({error.strerror}); the store is incomplete") from error
-        return verified(data, sha256)

@@ -1,4 +1,4 @@
-"""Brings tiles of the versions that a robot holds from its disk into its memory. Slow work: not for the thread that localizes."""
+"""Loading of tiles from the robot's disk into its memory. Slow work: not for the thread that localizes."""
 
 from dataclasses import dataclass, field
 
@@ -7,8 +7,8 @@ from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import Manifest, Tile
 from fleetmap.messages import WantedVersion
 from locclient.maps.loaded_map import LoadedMap
-from locclient.maps.map_client import MapSource
-from locclient.maps.tile_selection import Cell, Place, WindowSettings, window
+from locclient.maps.map_source import MapSource
+from locclient.maps.tile_selection import Cell, PositionBound, TileSelectionSettings, select_tiles
 
 
 @dataclass
@@ -23,17 +23,17 @@ class _Version:
 class TileLoader:
     """Reads from one MapSource. A tile that cannot be read is left out, and its reason kept; the others stay usable."""
 
-    def __init__(self, source: MapSource, settings: WindowSettings) -> None:
+    def __init__(self, source: MapSource, settings: TileSelectionSettings) -> None:
         self._source, self.settings = source, settings
         self._versions: dict[str, _Version] = {}
 
-    def load(self, wanted: WantedVersion, place: Place) -> LoadedMap | None:
-        """The version's tiles around a place, all for anywhere; None where they are those that were loaded last.
+    def load(self, wanted: WantedVersion, bound: PositionBound) -> LoadedMap | None:
+        """The version's tiles around the robot; None where they are those that were loaded last.
 
         Raises FleetmapError where its manifest or vocabulary cannot be had, or none of its tiles.
         """
         version = self._version(wanted)
-        cells = window(version.manifest, version.cells, place, self.settings)
+        cells = select_tiles(version.manifest, version.cells, bound, self.settings)
         if cells == version.cells:
             return None
         missing = cells - version.tiles.keys() - version.refused.keys()
@@ -51,18 +51,17 @@ class TileLoader:
         version = self._versions.get(wanted.manifest_sha256 or "")
         return {} if version is None else dict(version.refused)
 
-    def forget_refusals(self, wanted: WantedVersion) -> None:
-        """What could not be read may be read again: it was fetched anew."""
+    def retry_refused(self, wanted: WantedVersion) -> None:
+        """Lets refused tiles of a version be read again, after it was fetched anew."""
         version = self._versions.get(wanted.manifest_sha256 or "")
         if version is not None and version.refused:
             version.refused.clear()
             version.cells = None
 
     def keep_only(self, held: list[WantedVersion]) -> None:
-        """Lets go of all other versions."""
+        """Drops all other versions."""
         kept = {wanted.manifest_sha256 for wanted in held}
-        for sha256 in [sha256 for sha256 in self._versions if sha256 not in kept]:
-            del self._versions[sha256]
+        self._versions = {sha256: version for sha256, version in self._versions.items() if sha256 in kept}
 
     def _version(self, wanted: WantedVersion) -> _Version:
         sha256 = wanted.manifest_sha256 or ""

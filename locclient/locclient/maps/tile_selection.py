@@ -1,4 +1,4 @@
-"""Which tiles a robot holds in memory: those within reach, and those ahead. Pure."""
+"""Selection of the tiles that a robot holds in memory: those within reach, and those ahead. Pure."""
 
 from dataclasses import dataclass, field
 
@@ -11,10 +11,10 @@ from fleetmap.messages import Status
 from locclient.localization.estimate import Estimate
 
 Cell = tuple[int, int]
-_DOUBT_STEP_M = 10.0  # so that tiles are not read anew with every frame
+_RADIUS_STEP_M = 10.0  # so that tiles are not read anew with every frame
 
 
-class WindowSettings(Section, frozen=True):
+class TileSelectionSettings(Section, frozen=True):
     """How far around the robot tiles are held."""
 
     reach_m: float = 35.0
@@ -24,40 +24,40 @@ class WindowSettings(Section, frozen=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where a robot is or was, (3,), with its velocity (3,), and how far from there it may be; position None for anywhere."""
+class PositionBound:
+    """The robot is within radius_m of a position (3,), None for anywhere; with its velocity (3,)."""
 
     position_map_m: Array | None = None
     velocity_map_mps: Array = field(default_factory=lambda: np.zeros(3))
-    doubt_m: float = 0.0
+    radius_m: float = 0.0
 
 
-class PositionBound:
-    """Follows a robot's estimates: while it is lost, it is within what it, or who carries it, can have come since it was not.
+class PositionBoundTracker:
+    """Follows a robot's estimates. While it is lost, the bound grows at the maximum speed assumed for it.
 
     A lost robot's own estimate leads out of the tiles that it holds, and without them it finds no other place. All tiles of a
     large site at once are more than its memory should have to take.
     """
 
-    def __init__(self, settings: WindowSettings) -> None:
+    def __init__(self, settings: TileSelectionSettings) -> None:
         self._settings = settings
-        self._known: tuple[int, Array] | None = None  # stamp and position of the last place that was one
+        self._known: tuple[int, Array] | None = None  # stamp and position of the last estimate with a pose
 
-    def handle(self, estimate: Estimate) -> Place:
-        """The place after an estimate."""
+    def handle(self, estimate: Estimate) -> PositionBound:
+        """The bound after an estimate."""
         if estimate.map_from_body is not None and estimate.status in {Status.TRACKING, Status.DEGRADED}:
             self._known = (estimate.stamp_ns, estimate.map_from_body[:3, 3])
-            odom = estimate.odometry
-            turn = estimate.map_from_body[:3, :3] @ odom.odom_from_body[:3, :3].T
-            return Place(self._known[1], np.asarray(turn @ odom.velocity_odom_mps))
+            odometry = estimate.odometry
+            turn = estimate.map_from_body[:3, :3] @ odometry.odom_from_body[:3, :3].T
+            return PositionBound(self._known[1], np.asarray(turn @ odometry.velocity_odom_mps))
         if self._known is None:
-            return Place()
-        way_m = (estimate.stamp_ns - self._known[0]) * 1e-9 * self._settings.most_mps
-        return Place(self._known[1], doubt_m=_DOUBT_STEP_M * np.ceil(way_m / _DOUBT_STEP_M))
+            return PositionBound()
+        radius_m = (estimate.stamp_ns - self._known[0]) * 1e-9 * self._settings.most_mps
+        return PositionBound(self._known[1], radius_m=_RADIUS_STEP_M * np.ceil(radius_m / _RADIUS_STEP_M))
 
 
-def cells_within(manifest: Manifest, position_map_m: Array, reach_m: float) -> frozenset[Cell]:
-    """Cells of the version that come nearer than reach_m to a place (3,)."""
+def tiles_within(manifest: Manifest, position_map_m: Array, reach_m: float) -> frozenset[Cell]:
+    """Tiles of the version that come nearer than reach_m to a position (3,)."""
     size_m = manifest.tile_size_m
     near = set()
     for entry in manifest.tiles:
@@ -68,20 +68,20 @@ def cells_within(manifest: Manifest, position_map_m: Array, reach_m: float) -> f
     return frozenset(near)
 
 
-def window(
-    manifest: Manifest, held: frozenset[Cell] | None, place: Place, settings: WindowSettings
-) -> frozenset[Cell]:  # fmt: skip
-    """The cells to hold now. held: those that are, None for none.
+def select_tiles(
+    manifest: Manifest, held: frozenset[Cell] | None, bound: PositionBound, settings: TileSelectionSettings
+) -> frozenset[Cell]:
+    """The tiles to hold now: all of them without a position. held: those that are, None for none.
 
-    Without a position all of them, because the robot may be anywhere. What is held stays as long as it is within reach and a
-    spare, so that a robot that turns on the border of a tile does not load it again and again.
+    A held tile stays within the reach plus a hysteresis (spare_m): a robot that turns on the border of a tile does not load it again
+    and again.
     """
-    position_map_m = place.position_map_m
+    position_map_m = bound.position_map_m
     if position_map_m is None:
         return frozenset((entry.x, entry.y) for entry in manifest.tiles)
-    reach_m = settings.reach_m + place.doubt_m
-    wanted = cells_within(manifest, position_map_m, reach_m)
-    wanted |= cells_within(manifest, position_map_m + settings.ahead_s * place.velocity_map_mps, reach_m)
+    reach_m = settings.reach_m + bound.radius_m
+    wanted = tiles_within(manifest, position_map_m, reach_m)
+    wanted |= tiles_within(manifest, position_map_m + settings.ahead_s * bound.velocity_map_mps, reach_m)
     if held is not None:
-        wanted |= held & cells_within(manifest, position_map_m, reach_m + settings.spare_m)
+        wanted |= held & tiles_within(manifest, position_map_m, reach_m + settings.spare_m)
     return wanted

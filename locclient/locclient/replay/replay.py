@@ -15,7 +15,7 @@ from locclient.daemon.jit_warmup import gc_frozen
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import MapConnection
 from locclient.maps.loaded_map import LoadedMap
-from locclient.maps.map_client import FetchedTiles, MapSource
+from locclient.maps.map_source import FetchedTiles, MapSource
 from locclient.replay.replay_sources import ReplaySource
 from locclient.replay.run_metrics import FrameRecord
 from locclient.replay.run_reporter import RunReporter

@@ -11,7 +11,7 @@ from fleetmap.mapformat import Manifest
 from fleetmap.messages import Status
 from fleetmap.sensors.samples import Stamps, Trajectory
 from locclient.localization.estimate import Estimate
-from locclient.maps.map_client import FetchedTiles
+from locclient.maps.map_source import FetchedTiles
 from locclient.replay.plots import RunPlot, save_picture
 from locclient.replay.run_metrics import METRICS, FrameRecord, localised
 

@@ -25,7 +25,7 @@ from fleetmap.mapformat import Manifest, Tile, decode_tile, encode_tile
 from fleetmap.messages import WantedVersion
 from fleetmap.recordings import FrameSelection, open_recording
 from locclient.maps.connection import MapConnection
-from locclient.maps.map_client import FetchedTiles, ReadyVersion
+from locclient.maps.map_source import FetchedTiles, ReadyVersion
 from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.replay_sources import ReplaySource
 from mapserver.store import MapStore

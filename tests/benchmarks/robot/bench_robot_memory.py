@@ -36,10 +36,9 @@ from benchmarks.common.recorded_runs import (
 from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.sensors.rectification import Rectifier
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.map_client import LocalMapSource
-from locclient.maps.tile_cache import StoreFolder
+from locclient.maps.map_source import LocalMapSource
 from locclient.maps.tile_loader import TileLoader
-from locclient.maps.tile_selection import Place, PositionBound, WindowSettings
+from locclient.maps.tile_selection import PositionBound, PositionBoundTracker, TileSelectionSettings
 from locclient.replay.replay_sources import ReplaySource
 from locclient.robot.health_report import HealthFigures
 from locclient.robot.robot import Robot
@@ -68,7 +67,7 @@ def large_site(work: Path, megabytes: float) -> Path:
     folder = work / f"large-{megabytes:g}"
     if (folder / "built").exists():
         return folder
-    source = LocalMapSource(StoreFolder(surveyed(work)), SITE)
+    source = LocalMapSource(surveyed(work), SITE)
     manifest = source.manifest(source.ready().wanted)
     own = list(source.tiles(manifest).tiles.values())
     rounds = int(np.ceil(megabytes * 1e6 / sum(len(encode_tile(tile)) for tile in own)))
@@ -111,22 +110,26 @@ def long_enough(recording: Recording, minutes: float) -> Recording:
 def drive(store: Path, recording: Path, minutes: float) -> dict[str, Any]:
     """The robot's life, and its memory minute by minute."""
     cv2.setNumThreads(1)
-    link = LocalMapSource(StoreFolder(store), SITE)
+    link = LocalMapSource(store, SITE)
     wanted = link.ready().wanted
     site_mb = sum(entry.bytes for entry in link.manifest(wanted).tiles) / 1e6
-    figures, room, whereabouts = HealthFigures(), TileLoader(link, WindowSettings()), PositionBound(WindowSettings())
+    figures, loader, tracker = (
+        HealthFigures(),
+        TileLoader(link, TileSelectionSettings()),
+        PositionBoundTracker(TileSelectionSettings()),
+    )
     memory, tiles_held, begun_s = [], [], time.process_time()
     with open_recording(recording) as opened:
         source = ReplaySource.of(long_enough(opened, minutes), FrameSelection.parse(":"), reverse=False)
         rectifier = Rectifier(source.calibration)
         robot = Robot(source.calibration, rectifier, LocalizerSettings(), TrialSettings(), time.process_time)
-        place, first_ns = Place(), None
+        bound, first_ns = PositionBound(), None
         for number, imu in enumerate(source.imu_before_each()):
             priors = source.priors_before(number)
             if number == 0 and priors:  # a robot that starts on its dock
-                place = Place(priors[0].map_from_base[:3, 3])
+                bound = PositionBound(priors[0].map_from_base[:3, 3])
             if number % _MAP_EVERY == 0:
-                loaded = room.load(wanted, place)
+                loaded = loader.load(wanted, bound)
                 if loaded is not None:
                     robot.use(loaded)
                 tiles_held.append(sum(len(held.tiles) for held in robot.held))
@@ -135,7 +138,7 @@ def drive(store: Path, recording: Path, minutes: float) -> dict[str, Any]:
             assert outcome is not None
             figures.handle(outcome)
             estimate = outcome.estimate
-            place = whereabouts.handle(estimate)
+            bound = tracker.handle(estimate)
             first_ns = estimate.stamp_ns if first_ns is None else first_ns
             if estimate.stamp_ns - first_ns >= 60e9 * len(memory):
                 memory.append(resident_mb())

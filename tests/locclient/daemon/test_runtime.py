@@ -17,10 +17,11 @@ from locclient.daemon.runtime import Parts, Runtime
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.systemd_notify import ServiceManager
 from locclient.localization.estimate import Estimate
-from locclient.maps.map_client import CachedMap, LocalMapSource, MapClient
-from locclient.maps.tile_cache import StoreFolder, TileCache
+from locclient.maps.map_client import MapClient
+from locclient.maps.map_source import CachedMap, LocalMapSource
+from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
-from locclient.maps.tile_selection import Place, WindowSettings
+from locclient.maps.tile_selection import PositionBound, TileSelectionSettings
 from locclient.robot.continuous_odom import PublishedPose
 from locclient.robot.robot import Robot
 from locclient.robot.sensor_bundle import SensorBundle
@@ -83,7 +84,7 @@ class World:
         intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=True, imu_wait_s=1.0)
         return Parts(
             site="room", robot_name="r1", source=source, intake=intake, robot=robot,
-            room=TileLoader(CachedMap(caches[1], "room"), WindowSettings()), spool=spool,
+            room=TileLoader(CachedMap(caches[1], "room"), TileSelectionSettings()), spool=spool,
             camera=robot_world.rectifier().camera, settings=robot_world.SETTINGS, output=listener, link=link,
             talk=ServerSync(link, spool, retry_s=600.0), first=link.active(), caches=caches,
         )  # fmt: skip
@@ -112,8 +113,8 @@ def world(tmp_path: Path) -> Iterator[World]:
 def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world: World) -> None:
     """Without a network from frame 30 to 120, dark from 60 to 100: the estimates are to the bit those of a robot alone."""
     bundles = list(robot_world.bundles(130, dark=range(60, 100)))
-    folder = LocalMapSource(StoreFolder(world.folder / "store"), "room")
-    whole = TileLoader(folder, WindowSettings()).load(folder.wanted(), Place())
+    folder = LocalMapSource(world.folder / "store", "room")
+    whole = TileLoader(folder, TileSelectionSettings()).load(folder.wanted(), PositionBound())
     assert whole is not None
     alone = robot_world.new_robot()
     alone.use(whole)

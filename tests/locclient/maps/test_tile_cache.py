@@ -8,7 +8,7 @@ import pytest
 
 from fleetmap.errors import MapFormatError, StoreError
 from fleetmap.mapformat import blob_path, sha256_hex
-from locclient.maps.tile_cache import ActiveVersion, StoreFolder, TileCache
+from locclient.maps.tile_cache import ActiveVersion, TileCache
 
 
 def put(cache: TileCache, data: bytes) -> str:
@@ -81,23 +81,10 @@ def test_a_full_disk_costs_the_cache_only(tmp_path: Path, monkeypatch: pytest.Mo
     assert not list(tmp_path.rglob("*.tmp"))
 
 
-def test_a_file_is_no_cache_and_no_store(tmp_path: Path) -> None:
+def test_a_file_is_no_cache(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cache"):
         TileCache(tmp_path / "file")
-    with pytest.raises(StoreError, match="no map store"):
-        StoreFolder(tmp_path)
-
-
-def test_a_damaged_current_file_is_told(tmp_path: Path) -> None:
-    (tmp_path / "sites" / "lab").mkdir(parents=True)
-    folder = StoreFolder(tmp_path)
-    assert folder.current_manifest("lab") is None
-    (tmp_path / "sites" / "lab" / "current").write_bytes(b"\xff\xfe nonsense")
-    with pytest.raises(StoreError, match="repair"):
-        folder.current_manifest("lab")
-    with pytest.raises(StoreError, match="incomplete"):
-        folder.blob("0" * 64)
 
 
 def test_what_is_in_use_is_not_removed(tmp_path: Path) -> None:
@@ -108,7 +95,7 @@ def test_what_is_in_use_is_not_removed(tmp_path: Path) -> None:
     assert [sha256 in cache for sha256 in (a, b, c, d, e)] == [True, True, False, False, True]
     # The next version on its way: nothing of both goes, even where that is more than the limit.
     later = [sha256_hex(letter * 100) for letter in (b"f", b"g")]
-    cache.hold("lab", [a, *later])
+    cache.reserve("lab", [a, *later])
     put(cache, b"f" * 100)
     put(cache, b"g" * 100)
     assert [sha256 in cache for sha256 in (a, b, e, *later)] == [True, True, False, True, True]

@@ -9,17 +9,16 @@ import pytest
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import blob_path
 from fleetmap.messages import Status, WantedVersion
-from locclient.maps.map_client import LocalMapSource
-from locclient.maps.tile_cache import StoreFolder
+from locclient.maps.map_source import LocalMapSource
 from locclient.maps.tile_loader import TileLoader
-from locclient.maps.tile_selection import Place, PositionBound, WindowSettings
+from locclient.maps.tile_selection import PositionBound, PositionBoundTracker, TileSelectionSettings
 from mapserver import releases
 from mapserver.store import DraftContent, MapStore
 from support.fleet.estimates import estimate
 from support.storage.map_samples import draft_details, random_tile
 from support.worlds.robot_world import vocabulary
 
-SETTINGS = WindowSettings(reach_m=20.0, ahead_s=8.0, spare_m=10.0)
+SETTINGS = TileSelectionSettings(reach_m=20.0, ahead_s=8.0, spare_m=10.0)
 
 
 @pytest.fixture(scope="module")
@@ -41,39 +40,39 @@ def at(x_m: float) -> np.ndarray:
 
 
 def test_memory_follows_the_robot(row: tuple[Path, MapStore]) -> None:
-    link = LocalMapSource(StoreFolder(row[0]), "row")
-    room, wanted = TileLoader(link, SETTINGS), link.wanted()
-    everywhere = room.load(wanted, Place())
+    link = LocalMapSource(row[0], "row")
+    loader, wanted = TileLoader(link, SETTINGS), link.wanted()
+    everywhere = loader.load(wanted, PositionBound())
     assert everywhere is not None
     assert sorted(everywhere.tiles) == [(x, 0) for x in range(10)]
-    near = room.load(wanted, Place(at(8.0)))
+    near = loader.load(wanted, PositionBound(at(8.0)))
     assert near is not None
     assert sorted(near.tiles) == [(0, 0), (1, 0), (2, 0)]  # those held within reach and a spare stay
-    assert room.load(wanted, Place(at(8.5))) is None, "nothing changed"
-    ahead = room.load(wanted, Place(at(30.0), np.array([4.0, 0, 0])))
+    assert loader.load(wanted, PositionBound(at(8.5))) is None, "nothing changed"
+    ahead = loader.load(wanted, PositionBound(at(30.0), np.array([4.0, 0, 0])))
     assert ahead is not None
     assert sorted(ahead.tiles) == [(x, 0) for x in range(6)]
-    room.keep_only([])
-    assert room.load(wanted, Place(at(8.0))) is not None, "forgotten and read again"
+    loader.keep_only([])
+    assert loader.load(wanted, PositionBound(at(8.0))) is not None, "forgotten and read again"
 
 
 def test_a_lost_robot_holds_the_tiles_that_it_can_have_come_to(row: tuple[Path, MapStore]) -> None:
-    """Not those where it says that it is: it would drive out of the map, and never find another place."""
-    whereabouts, room = PositionBound(SETTINGS), TileLoader(LocalMapSource(StoreFolder(row[0]), "row"), SETTINGS)
-    wanted = LocalMapSource(StoreFolder(row[0]), "row").wanted()
-    assert whereabouts.handle(estimate(0.0, Status.AMBIGUOUS, known=False)).position_map_m is None, "anywhere"
-    assert whereabouts.handle(estimate(1.0, x_m=40.0)).doubt_m == 0
+    """Not those where it says that it is: it would drive out of the map, and never find another bound."""
+    tracker, loader = PositionBoundTracker(SETTINGS), TileLoader(LocalMapSource(row[0], "row"), SETTINGS)
+    wanted = LocalMapSource(row[0], "row").wanted()
+    assert tracker.handle(estimate(0.0, Status.AMBIGUOUS, known=False)).position_map_m is None, "anywhere"
+    assert tracker.handle(estimate(1.0, x_m=40.0)).radius_m == 0
     held = []
     for seconds in (1, 10, 40):
-        place = whereabouts.handle(estimate(1.0 + seconds, Status.LOST, x_m=40.0 + 900.0 * seconds))
-        np.testing.assert_array_equal(place.position_map_m, [40.0, 0.0, 0.0])
-        assert SETTINGS.most_mps * seconds <= place.doubt_m <= SETTINGS.most_mps * seconds + 10
-        loaded = room.load(wanted, place)
+        bound = tracker.handle(estimate(1.0 + seconds, Status.LOST, x_m=40.0 + 900.0 * seconds))
+        np.testing.assert_array_equal(bound.position_map_m, [40.0, 0.0, 0.0])
+        assert SETTINGS.most_mps * seconds <= bound.radius_m <= SETTINGS.most_mps * seconds + 10
+        loaded = loader.load(wanted, bound)
         assert loaded is not None
         held.append(sorted(x for x, _ in loaded.tiles))
     assert held == [list(range(5)), list(range(6)), list(range(10))]
-    found = whereabouts.handle(estimate(42.0, Status.DEGRADED, x_m=140.0))
-    assert (float(found.position_map_m[0]), found.doubt_m) == (140.0, 0.0)  # type: ignore[index]
+    found = tracker.handle(estimate(42.0, Status.DEGRADED, x_m=140.0))
+    assert (float(found.position_map_m[0]), found.radius_m) == (140.0, 0.0)  # type: ignore[index]
 
 
 def test_bad_tiles_are_left_out(row: tuple[Path, MapStore], tmp_path: Path) -> None:
@@ -81,22 +80,22 @@ def test_bad_tiles_are_left_out(row: tuple[Path, MapStore], tmp_path: Path) -> N
     manifest = store.manifest("row", 1)
     victim = folder / blob_path(manifest.tiles[4].sha256)
     good = victim.read_bytes()
-    link = LocalMapSource(StoreFolder(folder), "row")
-    room, wanted = TileLoader(link, SETTINGS), link.wanted()
+    link = LocalMapSource(folder, "row")
+    loader, wanted = TileLoader(link, SETTINGS), link.wanted()
     victim.chmod(0o644)
     victim.write_bytes(good[:-7])
     try:
-        loaded = room.load(wanted, Place())
+        loaded = loader.load(wanted, PositionBound())
         assert loaded is not None
         assert len(loaded.tiles) == 9
-        assert list(room.refused(wanted)) == [(4, 0)]
-        assert room.load(wanted, Place()) is None, "not read again and again"
+        assert list(loader.refused(wanted)) == [(4, 0)]
+        assert loader.load(wanted, PositionBound()) is None, "not read again and again"
     finally:
         victim.write_bytes(good)
-    room.forget_refusals(wanted)
-    mended = room.load(wanted, Place())
+    loader.retry_refused(wanted)
+    mended = loader.load(wanted, PositionBound())
     assert mended is not None
     assert len(mended.tiles) == 10
     foreign = WantedVersion(site="else", version=1, manifest_sha256=wanted.manifest_sha256)
     with pytest.raises(FleetmapError, match="manifest is of row version 1"):
-        TileLoader(LocalMapSource(StoreFolder(folder), "else"), SETTINGS).load(foreign, Place())
+        TileLoader(LocalMapSource(folder, "else"), SETTINGS).load(foreign, PositionBound())

@@ -13,7 +13,7 @@ from fleetmap.messages import HEALTH_FIGURES, RobotHealth, Status
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.estimate import Estimate
 from locclient.maps.connection import MapConnection
-from locclient.maps.map_client import FetchedTiles
+from locclient.maps.map_source import FetchedTiles
 from locclient.replay.replay import frame_record
 from locclient.replay.run_reporter import RunReporter
 from locclient.replay.run_result import ReplayResult

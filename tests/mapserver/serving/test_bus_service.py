@@ -27,8 +27,9 @@ from fleetmap.messages import (
     patch_key,
     robot_key,
 )
-from locclient.maps.map_client import LocalMapSource, MapClient
-from locclient.maps.tile_cache import StoreFolder, TileCache
+from locclient.maps.map_client import MapClient
+from locclient.maps.map_source import LocalMapSource
+from locclient.maps.tile_cache import TileCache
 from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving import bus_service
@@ -106,7 +107,7 @@ def test_a_robot_fetches_everything_once(world: World) -> None:
 
 
 def test_a_store_folder_gives_the_same(world: World) -> None:
-    folder = LocalMapSource(StoreFolder(world.folder), "lab")
+    folder = LocalMapSource(world.folder, "lab")
     wanted = folder.wanted()
     assert wanted == world.link.wanted()
     manifest = folder.manifest(wanted)
@@ -115,7 +116,7 @@ def test_a_store_folder_gives_the_same(world: World) -> None:
     mine, theirs = folder.tiles(manifest).tiles, world.link.tiles(manifest).tiles
     assert sorted(mine) == sorted(theirs)
     np.testing.assert_array_equal(mine[0, 0].points_map, theirs[0, 0].points_map)
-    other = LocalMapSource(StoreFolder(world.folder), "elsewhere")
+    other = LocalMapSource(world.folder, "elsewhere")
     assert other.wanted().version is None
     with pytest.raises(LinkError, match="no published version"):
         other.manifest(other.wanted())
@@ -131,7 +132,7 @@ def test_a_corrupt_tile_is_refused_and_the_rest_stays(world: World, damage: str)
         path.unlink()
     else:
         path.write_bytes(data[:-1] if damage == "cut" else data[:100] + bytes([data[100] ^ 1]) + data[101:])
-    for link in (world.link, LocalMapSource(StoreFolder(world.folder), "lab")):
+    for link in (world.link, LocalMapSource(world.folder, "lab")):
         fetched = link.tiles(manifest)
         assert sorted(fetched.tiles) == [(1, 0)]
         assert list(fetched.refused) == [(0, 0)]

@@ -1,0 +1,182 @@
+"""Sources of published maps, and those without a network: the tile cache alone, or a store's folder."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
+from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError
+from fleetmap.mapformat import (
+    Manifest,
+    Tile,
+    TileEntry,
+    blob_path,
+    check_name,
+    check_sha256,
+    current_path,
+    decode_manifest,
+    decode_tile,
+    verified,
+)
+from fleetmap.messages import WantedVersion
+from locclient.maps.tile_cache import TileCache
+
+
+@dataclass(frozen=True)
+class FetchedTiles:
+    """Tiles that are whole, and for each other one the reason why it is missing."""
+
+    tiles: dict[tuple[int, int], Tile] = field(default_factory=dict)
+    refused: dict[tuple[int, int], str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ReadyVersion:
+    """The version to run now. note: why it is not the wanted one, or not whole; empty where it is."""
+
+    wanted: WantedVersion
+    note: str = ""
+
+
+class MapSource(Protocol):
+    """What a robot reads its map from."""
+
+    def ready(self) -> ReadyVersion:
+        """The version to run now."""
+
+    def manifest(self, wanted: WantedVersion) -> Manifest:
+        """The manifest of that version."""
+
+    def vocabulary(self, manifest: Manifest) -> bytes:
+        """The vocabulary of that version."""
+
+    def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
+        """Tiles of that version: all, or those of `cells` that it has."""
+
+
+class _DiskMapSource(ABC):
+    """A MapSource over bytes on this machine's disk."""
+
+    def __init__(self, site: str) -> None:
+        """Raises UsageError for a name that no site can have."""
+        self._site = check_name(site, "site")
+
+    @abstractmethod
+    def blob(self, sha256: str) -> bytes:
+        """The verified bytes of an address."""
+
+    def manifest(self, wanted: WantedVersion) -> Manifest:
+        """The wanted version's manifest; errors as of `blob`, LinkError without a version, MapFormatError where it is another."""
+        return checked_manifest(self.blob(address_of(wanted)[1]), wanted)
+
+    def vocabulary(self, manifest: Manifest) -> bytes:
+        """The version's vocabulary; errors as of `blob`."""
+        return shipped_vocabulary(manifest.vocabulary.sha256) or self.blob(manifest.vocabulary.sha256)
+
+    def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
+        """Tiles of the version, as `MapClient.tiles`."""
+        return collect_tiles(manifest, cells, lambda entry: self.blob(entry.sha256))
+
+
+class CachedMap(_DiskMapSource):
+    """Reads from the cache alone and waits for nobody; for another thread than the MapClient's, with a TileCache of its own."""
+
+    def __init__(self, cache: TileCache, site: str) -> None:
+        super().__init__(site)
+        self._cache = cache
+
+    def ready(self) -> ReadyVersion:
+        """The active version; raises LinkError before the first one."""
+        active = self._cache.active(self._site)
+        if active is None:
+            raise LinkError(f"the cache has no version of site {self._site} yet; it has to come from a server first")
+        return ReadyVersion(active.wanted(self._site))
+
+    def blob(self, sha256: str) -> bytes:
+        """The verified bytes of an address; LinkError where they are not here."""
+        data = self._cache.get(sha256)
+        if data is None:
+            raise LinkError(f"{sha256} is not in the cache; it has to be fetched again")
+        return data
+
+
+class LocalMapSource(_DiskMapSource):
+    """Reads from a store's folder, without its database; for a robot without a server."""
+
+    def __init__(self, folder: Path, site: str) -> None:
+        """Raises StoreError where `folder` is no store, UsageError for a name that no site can have."""
+        super().__init__(site)
+        if not (folder / "sites").is_dir():
+            raise StoreError(f"{folder} is no map store; check --store, or make one with `mapserver build`")
+        self._folder = folder
+
+    def ready(self) -> ReadyVersion:
+        """The site's current version."""
+        return ReadyVersion(self.wanted())
+
+    def wanted(self) -> WantedVersion:
+        """The site's current version; raises StoreError where that cannot be read."""
+        path = self._folder / current_path(self._site)
+        try:
+            sha256 = check_sha256(path.read_text("ascii").strip())
+        except FileNotFoundError:
+            return WantedVersion(site=self._site, version=None, manifest_sha256=None)
+        except (OSError, UnicodeDecodeError, MapFormatError) as error:
+            raise StoreError(f"{path} cannot be read ({error}); open the store with mapserver to repair it") from error
+        return WantedVersion(
+            site=self._site, version=decode_manifest(self.blob(sha256)).version, manifest_sha256=sha256
+        )
+
+    def blob(self, sha256: str) -> bytes:
+        """The verified bytes of an address; raises StoreError for missing ones, MapFormatError for damaged ones."""
+        path = self._folder / blob_path(sha256)
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise StoreError(f"{path} cannot be read ({error.strerror}); the store is incomplete") from error
+        return verified(data, sha256)
+
+
+def address_of(wanted: WantedVersion) -> tuple[int, str]:
+    """Number and manifest's address of a version; LinkError where the site has none."""
+    if wanted.version is None or wanted.manifest_sha256 is None:
+        raise LinkError(f"site {wanted.site} has no published version; publish one with `mapserver publish`")
+    return wanted.version, check_sha256(wanted.manifest_sha256)
+
+
+def checked_manifest(data: bytes, wanted: WantedVersion) -> Manifest:
+    """The decoded manifest; MapFormatError where it is not the wanted version's."""
+    manifest = decode_manifest(data)
+    if (manifest.site, manifest.version) != (wanted.site, wanted.version):
+        raise MapFormatError(
+            f"the manifest is of {manifest.site} version {manifest.version}, wanted was {wanted.site} {wanted.version}"
+        )
+    return manifest
+
+
+def collect_tiles(
+    manifest: Manifest, cells: Iterable[tuple[int, int]] | None, blob: Callable[[TileEntry], bytes]
+) -> FetchedTiles:
+    """The version's tiles, all or those of `cells`. One that cannot be used is refused with its reason, the others are kept."""
+    fetched = FetchedTiles()
+    asked = None if cells is None else set(cells)
+    for entry in manifest.tiles:
+        cell = (entry.x, entry.y)
+        if asked is None or cell in asked:
+            try:
+                fetched.tiles[cell] = checked_tile(entry, manifest.tile_size_m, blob(entry))
+            except FleetmapError as error:
+                fetched.refused[cell] = str(error)
+    return fetched
+
+
+def checked_tile(entry: TileEntry, size_m: float, data: bytes) -> Tile:
+    """The decoded tile; MapFormatError where it is not the manifest's."""
+    tile = decode_tile(data)
+    if (tile.tile_x, tile.tile_y, tile.size_m, len(tile)) != (entry.x, entry.y, size_m, entry.landmarks):
+        raise MapFormatError(
+            f"{tile.name} with {len(tile)} landmarks is not the manifest's ({entry.x}, {entry.y}) of {entry.landmarks}"
+        )
+    return tile
