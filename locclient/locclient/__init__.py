@@ -27,8 +27,9 @@ from importlib import import_module, metadata
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from fleetmap.numerics.time_sliced import finished
     from fleetmap.relocalization.map_view import MapView
-    from fleetmap.relocalization.relocalizer import Fix, Relocalizer, finished
+    from fleetmap.relocalization.relocalizer import Fix, Relocalizer
     from locclient.localization.estimate import Estimate
     from locclient.localization.localizer import Localizer
     from locclient.localization.settings import LocalizerSettings
@@ -62,7 +63,7 @@ _MODULES = {
     "ReplayResult": "locclient.replay.run_result",
     "Robot": "locclient.robot.robot",
     "fetch_map": "locclient.replay.localize",
-    "finished": "fleetmap.relocalization.relocalizer",
+    "finished": "fleetmap.numerics.time_sliced",
     "localize": "locclient.replay.localize",
 }
 

@@ -29,7 +29,7 @@ TIERS = {
         "source": "domain speed width_px height_px rate_hz delay_s",
         "output": "domain pose_topic status_topic tf_topic map_frame odom_frame base_frame publish_odom",
         "localizer": "seed",
-        "localizer.orb": "count",
+        "localizer.orb": "extractor count",
         "localizer.stereo": "min_depth_m depth_sigma_px",
         "localizer.odometry.filter": "use_wheels",
         "localizer.fix": "min_hit_share",

@@ -29,7 +29,7 @@ TIERS = {
         "canary": "share margin_ratio margin_per_robot_day min_robot_days max_days",
         "resurvey": "recent_days before_days min_failures rising_ratio fading",
         "survey": "seed",
-        "survey.orb": "count",
+        "survey.orb": "extractor count",
         "survey.stereo": "min_depth_m depth_sigma_px",
         "survey.keyframes": "policy every_nth min_overlap max_rotation_deg max_parallax max_interval_s",
         "survey.loops": "top min_gap_keyframes repeats_every_m",

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
-from fleetmap.features import orb
+from fleetmap.features import extract, orb
 from fleetmap.geometry import se3
 from fleetmap.mapformat import Tile
 from fleetmap.relocalization.map_view import CovisibleLandmarks
@@ -97,7 +97,7 @@ def _view(wall: NDArray[np.uint8], camera: StereoCamera, number: int) -> Rectifi
 
 def _tile_of(left: NDArray[np.uint8], camera: StereoCamera, settings: LocalizerSettings) -> Tile:
     """A map of the features of one picture."""
-    features = orb.detect(left, settings.orb)
+    features = extract(left, settings.orb)
     count = len(features)
     points_cam = camera.point_from_pixel(features.pixels, np.full(count, float(_DISPARITY_PX)))
     towards = -points_cam @ _MAP_FROM_CAM[:3, :3].T

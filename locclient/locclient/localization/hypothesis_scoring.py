@@ -6,7 +6,8 @@ from itertools import combinations
 import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.relocalization.relocalizer import Fix, TimeSliced
+from fleetmap.numerics.time_sliced import TimeSliced
+from fleetmap.relocalization.relocalizer import Fix
 from locclient.localization.alias_disambiguation import log_odds, mark_shared
 from locclient.localization.pose_covariance import boxminus
 from locclient.localization.pose_hypothesis import PoseHypothesis

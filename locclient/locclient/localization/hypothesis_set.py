@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from fleetmap.geometry import Array
-from fleetmap.relocalization.relocalizer import Fix, TimeSliced
+from fleetmap.numerics.time_sliced import TimeSliced
+from fleetmap.relocalization.relocalizer import Fix
 from locclient.localization.alias_disambiguation import ViewpointGate
 from locclient.localization.hypothesis_scoring import (
     begin_query,

@@ -9,10 +9,11 @@ from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.messages import Cause, Status
+from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.odometry import Odometry, OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
-from fleetmap.relocalization.relocalizer import Fix, Relocalizer, TimeSliced, is_reliable
+from fleetmap.relocalization.relocalizer import Fix, Relocalizer, is_reliable
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample

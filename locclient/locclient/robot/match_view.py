@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import orb
+from fleetmap.features import extract
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile
 from fleetmap.relocalization.landmark_visibility import cones_of_tiles, match_visible, visible_landmarks
@@ -35,7 +35,7 @@ def match_view(
     max_angle_rad = np.radians(settings.fix.max_view_angle_deg)
     expected = visible_landmarks(cones_of_tiles(tiles), map_from_cam, camera, 0.0, max_angle_rad)
     pixels = expected.pixels
-    features = orb.detect(left, settings.orb)
+    features = extract(left, settings.orb)
     hit = np.full(len(pixels), -1, np.int64)
     if len(pixels) and len(features):
         descriptors = np.concatenate([tile.descriptors for tile in tiles])[expected.rows]

@@ -68,7 +68,7 @@ def train_vocabulary(
 
 def _descriptors(path: Path, frames: str, orb: "OrbSettings") -> "Iterator[NDArray[np.uint8]]":
     """Descriptors (N, 32) of each selected left picture, rectified."""
-    from fleetmap.features.orb import detect
+    from fleetmap.features import extract
     from fleetmap.recordings import FrameSelection, open_recording
     from fleetmap.sensors.rectification import Rectifier
     from fleetmap.sensors.samples import SensorSet
@@ -76,4 +76,4 @@ def _descriptors(path: Path, frames: str, orb: "OrbSettings") -> "Iterator[NDArr
     with open_recording(path) as recording:
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
         for index in FrameSelection.parse(frames).apply(recording):
-            yield detect(rectifier.rectify(recording.read_frame(int(index))).left, orb).descriptors
+            yield extract(rectifier.rectify(recording.read_frame(int(index))).left, orb).descriptors

@@ -1,8 +1,25 @@
-"""What is found in pictures: corners, descriptors, matches, sub-pixel positions.
+"""Features of images: corners, descriptors, matches, sub-pixel positions. To add an extractor: a file here and a line in EXTRACTORS."""
 
-To add an extractor: a file and a line.
-"""
+from collections.abc import Callable
 
+from fleetmap.errors import UsageError
 from fleetmap.features import orb
+from fleetmap.numerics.time_sliced import TimeSliced, finished
+from fleetmap.sensors.samples import Image
 
-EXTRACTORS = {"grid-orb": orb.detect}
+Extractor = Callable[[Image, orb.OrbSettings], TimeSliced[orb.Features]]
+"""Features of a rectified grey image (H, W); the same image and settings give the same features."""
+
+EXTRACTORS: dict[str, Extractor] = {"grid-orb": orb.detect_in_slices}
+
+
+def extract(image: Image, settings: orb.OrbSettings) -> orb.Features:
+    """The features of an image by the extractor of the settings; UsageError for one that does not exist."""
+    return finished(extract_in_slices(image, settings))
+
+
+def extract_in_slices(image: Image, settings: orb.OrbSettings) -> TimeSliced[orb.Features]:
+    """As `extract`, in slices."""
+    if settings.extractor not in EXTRACTORS:
+        raise UsageError(f"there is no feature extractor {settings.extractor!r}; choose one of {', '.join(EXTRACTORS)}")
+    return EXTRACTORS[settings.extractor](image, settings)

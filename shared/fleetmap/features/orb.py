@@ -1,9 +1,7 @@
 """Grid ORB: oriented FAST corners spread over the image and its scales, with OpenCV's rotated binary descriptors."""
 
-from collections.abc import Generator
 from dataclasses import dataclass
 from itertools import repeat
-from typing import cast
 
 import cv2
 import numpy as np
@@ -13,6 +11,7 @@ from fleetmap.config import Section
 from fleetmap.features.corner_kernels import centroid_angles_deg, min_eigenvalue_scores, select_spread
 from fleetmap.features.corners import fast_corners
 from fleetmap.geometry import Array
+from fleetmap.numerics.time_sliced import TimeSliced, finished
 from fleetmap.sensors.samples import Image
 
 SCALE_FACTOR = 1.2
@@ -22,8 +21,9 @@ _SLICE_LEVEL = 2  # the two finest levels are as much work as all the others
 
 
 class OrbSettings(Section, frozen=True):
-    """How many features and where."""
+    """The extractor, a name in `EXTRACTORS`, how many features it finds and where."""
 
+    extractor: str = "grid-orb"
     count: int = 1000
     levels: int = 8  # of the image pyramid, 1.2 apart
     fast_threshold: int = 12  # grey levels; halved where too few corners are found
@@ -62,16 +62,11 @@ def detect(image: Image, settings: OrbSettings) -> Features:
 
     Source: Rublee et al. 2011 (ORB), Mur-Artal 2015 (levels).
     """
-    work = detect_in_slices(image, settings)
-    while True:
-        try:
-            next(work)
-        except StopIteration as done:
-            return cast(Features, done.value)
+    return finished(detect_in_slices(image, settings))
 
 
-def detect_in_slices(image: Image, settings: OrbSettings) -> Generator[None, None, Features]:
-    """As `detect`, in three pieces of about equal work, for who must not stop for long."""
+def detect_in_slices(image: Image, settings: OrbSettings) -> TimeSliced[Features]:
+    """As `detect`, in three slices of about equal work."""
     keypoints: list[cv2.KeyPoint] = []
     for level, quota in enumerate(_quotas(settings)):
         if level == _SLICE_LEVEL:

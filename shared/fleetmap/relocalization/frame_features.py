@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import orb, stereo
+from fleetmap.features import extract, extract_in_slices, orb, stereo
 from fleetmap.features.stereo import StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
@@ -40,7 +40,7 @@ class FrameFeatures:
 
 def extract_features(frame: RectifiedFrame, settings: orb.OrbSettings) -> Generator[None, None, FrameFeatures]:
     """The features of one frame, no depth measured yet, in slices."""
-    features = yield from orb.detect_in_slices(frame.left, settings)
+    features = yield from extract_in_slices(frame.left, settings)
     pixels = np.column_stack([features.pixels, np.full(len(features), np.nan)])
     return FrameFeatures(features, pixels, frame, np.zeros(len(features), bool))
 
@@ -49,6 +49,6 @@ def features_with_depth(
     frame: RectifiedFrame, camera: StereoCamera, settings: orb.OrbSettings, stereo_settings: StereoSettings
 ) -> FrameFeatures:
     """The features of one frame with the depth of all of them; the frame itself is not kept."""
-    features = orb.detect(frame.left, settings)
+    features = extract(frame.left, settings)
     found = stereo.disparities(frame, camera, features.pixels, stereo_settings)
     return FrameFeatures(features, np.column_stack([features.pixels, features.pixels[:, 0] - found[:, 0]]))

@@ -1,8 +1,7 @@
 """One frame placed in the map: by projection where it nearly is, by words where it might be anywhere. Pure."""
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 from fleetmap.features import orb
 from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.pnp.pnp import PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
 from fleetmap.relocalization.alias_search import AliasCandidate, LandmarkSet, find_aliases
 from fleetmap.relocalization.frame_features import FrameFeatures, extract_features
@@ -23,9 +23,6 @@ _TRIALS_AT_A_PLACE = 2
 _FIRST_DOUBT = 3.0  # of the sigmas, while the place that matches were looked for around is only a guess
 _SAME_PLACE_M, _SAME_PLACE_COSINE = 1.2, 0.8  # less than half a bay: no other place looks so much the same so near
 _MIN_INLIER_SHARE, _MIN_RANSAC_SHARE = 0.35, 0.15
-
-T = TypeVar("T")
-TimeSliced = Generator[None, None, T]  # work that may be interrupted wherever it yields
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,15 +260,6 @@ class Relocalizer:
         angle = float(np.sqrt(np.linalg.eigvalsh(cov_rot_trans[:3, :3])[-1]))
         three_sigmas_px = 3.0 * self._camera.focal_px * (position / max(depth, 0.5) + angle)
         return max(self._settings.fix.guided_radius_px, three_sigmas_px)
-
-
-def finished(work: TimeSliced[T]) -> T:
-    """The result of work in slices, all of them at once."""
-    while True:
-        try:
-            next(work)
-        except StopIteration as done:
-            return cast(T, done.value)
 
 
 def is_reliable(fix: Fix, settings: FixSettings, strong_inliers: int = STRONG_INLIERS) -> bool:

@@ -5,9 +5,9 @@ from numpy.typing import NDArray
 
 from fleetmap.features.matching import packed
 from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.numerics.time_sliced import finished
 from fleetmap.relocalization import alias_search_kernels
 from fleetmap.relocalization.alias_search import AliasCandidate, LandmarkSet, find_aliases
-from fleetmap.relocalization.relocalizer import finished
 
 PITCH_M, AISLES = 5.0, 7
 BODY_FROM_CAM = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import orb, patch_align, stereo
+from fleetmap.features import extract, orb, patch_align, stereo
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
@@ -121,7 +121,7 @@ def _extract(
     camera, settings = shared
     found = []
     for frame in frames:
-        features = orb.detect(frame.left, settings.orb)
+        features = extract(frame.left, settings.orb)
         found.append((features, stereo.disparities(frame, camera, features.pixels, settings.stereo)))
     return found
 

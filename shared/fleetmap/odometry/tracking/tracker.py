@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import flow, orb, patch_align, stereo
+from fleetmap.features import extract, flow, orb, patch_align, stereo
 from fleetmap.features.corners import spread_corners
 from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, transform_points
@@ -235,7 +235,7 @@ class Tracker:
         return tuple(sorted(found, key=lambda e: -len(e.ids))), share
 
     def _remember(self, frame: RectifiedFrame, frame_index: int) -> _Remembered:
-        features = orb.detect(frame.left, self._orb)
+        features = extract(frame.left, self._orb)
         depth = stereo.disparities(frame, self._camera, features.pixels, self._stereo)[:, 0]
         points = self._camera.point_from_pixel(features.pixels, depth)
         return _Remembered(frame_index, patch_align.half_pyramid(frame.left), features, depth, points)
