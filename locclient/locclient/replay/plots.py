@@ -1,7 +1,8 @@
-"""The picture of a replay: top-down path coloured by error over the map's landmarks, and the error over time."""
+"""Picture of a replay: the path over the map's landmarks, coloured by error, and errors and statuses over time beside it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -9,15 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import UsageError
-from fleetmap.failure_definition import ERROR_LIMIT_M
+from fleetmap.failure_definition import ERROR_LIMIT_M, radius_95_m
 from fleetmap.geometry import Array
-from locclient.replay.run_metrics import FrameRecord, localised, localised_share
+from fleetmap.messages import Status
+from locclient.replay.drawing import INK, QUIET, Canvas, ChartAxes, Colour, draw_legend, ticks
+from locclient.replay.run_metrics import FrameRecord, error_m, frame_ms, localised, localised_share
 
-Canvas = NDArray[np.uint8]
-_SIZE = (900, 1500)
-_PLAN_WIDTH = 900
-_INK, _GREY, _PALE = (40, 40, 40), (130, 130, 130), (205, 205, 205)
-_FULL_SCALE_M = 0.1
+_WIDTH, _PLAN_WIDTH, _BESIDE_WIDTH = 2040, 1220.0, 640.0
+_TOP, _MIN_PLAN_HEIGHT, _MAX_PLAN_HEIGHT = 140.0, 520.0, 1100.0
+_POINT, _ERROR, _BAND, _NOT_LOCALISED = (161, 149, 139), (235, 99, 37), (253, 236, 222), (168, 60, 190)
+_GOOD, _BAD = (75, 146, 20), (47, 52, 209)
+_SCALE = np.array([[255, 201, 156], [235, 99, 37], [92, 31, 11]], float)  # light to dark blue
+_LIMIT_MM = 1e3 * ERROR_LIMIT_M
+_STATUS_COLOURS: dict[Status, Colour] = {
+    Status.INITIALISING: (200, 190, 180),
+    Status.TRACKING: (120, 180, 90),
+    Status.DEGRADED: (60, 190, 240),
+    Status.AMBIGUOUS: (190, 100, 170),
+    Status.LOST: (70, 70, 215),
+}
+_MAX_LANDMARKS = 40_000
 
 
 @dataclass(frozen=True)
@@ -30,6 +42,17 @@ class RunPlot:
     truths_map_m: Array
     landmarks_map_m: Array
 
+    @property
+    def seconds(self) -> Array:
+        """(N,) since the first frame."""
+        stamps_ns = np.array([frame.stamp_ns for frame in self.frames], np.int64)
+        return np.asarray((stamps_ns - stamps_ns[:1]) * 1e-9)
+
+    @property
+    def errors_mm(self) -> Array:
+        """(N,) distances from the truth; NaN where unknown."""
+        return np.array([np.nan if f.error_m is None else 1e3 * f.error_m for f in self.frames])
+
 
 def save_picture(plot: RunPlot, path: Path) -> None:
     """Writes the picture as PNG; UsageError where it cannot be written."""
@@ -40,87 +63,134 @@ def save_picture(plot: RunPlot, path: Path) -> None:
         raise UsageError(f"the picture cannot be written to {path} ({error.strerror}); check the path") from error
 
 
-def draw_run(result: RunPlot) -> Canvas:
-    """(900, 1500, 3) BGR."""
-    canvas = np.full((*_SIZE, 3), 255, np.uint8)
-    _plan(canvas, result)
-    _errors(canvas, result)
-    return canvas
+def draw_run(plot: RunPlot) -> NDArray[np.uint8]:
+    """(H, 2040, 3) BGR; the height follows the shape of the map."""
+    low, high = _view(plot)
+    height = float(np.clip(_PLAN_WIDTH * (high - low)[1] / (high - low)[0], _MIN_PLAN_HEIGHT, _MAX_PLAN_HEIGHT))
+    grow = np.array([_PLAN_WIDTH, height]) / min(_PLAN_WIDTH / (high - low)[0], height / (high - low)[1]) - (high - low)
+    corner = np.array([100.0, _TOP])
+    plan = ChartAxes(corner, np.array([corner[0] + _PLAN_WIDTH, _TOP + height]), low - 0.5 * grow, high + 0.5 * grow)
+    canvas = Canvas(_WIDTH, round(_TOP + height + 140.0))
+    canvas.text(plot.title, np.array([42.0, 44.0]), 21.0, bold=True)
+    canvas.text(_figures(plot), np.array([42.0, 78.0]), 12.0, QUIET)
+    values, label = (plot.errors_mm, "position error, mm")
+    if np.isnan(values).all():
+        radii_mm = [1e3 * radius_95_m(frame.cov_rot_trans) for frame in plot.frames]
+        values, label = np.where(np.isfinite(radii_mm), radii_mm, np.nan), "95 % radius of the position, mm"
+    known = values[~np.isnan(values)]
+    ceiling = (
+        min(1.1 * float(known.max(initial=0.0)), 2.0 * _LIMIT_MM) or 1.0
+    )  # what is beyond stands at the upper edge
+    scale = min(ceiling, _LIMIT_MM)
+    _draw_plan(canvas, plan, plot, values / scale)
+    _draw_colour_bar(canvas, plan, scale, label)
+    _draw_over_time(canvas, plan, plot, values, ceiling, label)
+    return canvas.image()
 
 
-def _plan(canvas: Canvas, result: RunPlot) -> None:
-    points = result.landmarks_map_m
-    path = result.positions_map_m[~np.isnan(result.positions_map_m[:, 0])]
-    shown = np.vstack([path[:, :2], np.percentile(points[:, :2], [3, 97], axis=0)])
-    low, high = shown.min(axis=0) - 1.0, shown.max(axis=0) + 1.0
-    scale = min((_PLAN_WIDTH - 80) / (high[0] - low[0]), (_SIZE[0] - 120) / (high[1] - low[1]))
+def _view(plot: RunPlot) -> tuple[Array, Array]:
+    """Corners (2,) in metres that show the path and most landmarks."""
+    path = plot.positions_map_m[~np.isnan(plot.positions_map_m[:, 0]), :2]
+    spread = np.percentile(plot.landmarks_map_m[:, :2], [2, 98], axis=0) if len(plot.landmarks_map_m) else path[:2]
+    shown = np.vstack([path, spread, [[0.0, 0.0]] if not len(path) and not len(spread) else path[:0]])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    edge = 0.05 * float((high - low).max()) + 0.3
+    return low - edge, high + edge
 
-    def pixel(point: Array) -> tuple[int, int]:
-        return int(40 + (point[0] - low[0]) * scale), int(_SIZE[0] - 50 - (point[1] - low[1]) * scale)
 
-    for point in points[:: max(1, len(points) // 20000)]:
-        x, y = pixel(point)
-        if 0 <= x < _PLAN_WIDTH and 60 <= y < _SIZE[0]:
-            canvas[y : y + 2, x : x + 2] = (175, 175, 175)
-    good = localised(result.frames)
-    for k, (position, frame) in enumerate(zip(result.positions_map_m, result.frames, strict=True)):
-        if np.isnan(position[0]):
-            continue
-        colour = _colour(frame.error_m) if good[k] else (200, 120, 200)
-        cv2.circle(canvas, pixel(position), 4, colour, -1, cv2.LINE_AA)
-        truth = result.truths_map_m[k]
-        if not np.isnan(truth[0]):
-            cv2.line(canvas, pixel(position), pixel(truth), _INK, 1, cv2.LINE_AA)
-    metre = 10.0 ** np.floor(np.log10(0.3 * (high[0] - low[0])))
-    cv2.line(canvas, (40, _SIZE[0] - 20), (int(40 + metre * scale), _SIZE[0] - 20), _INK, 3)
-    _text(canvas, f"{metre:g} m", (int(50 + metre * scale), _SIZE[0] - 15))
-    share = localised_share(result.frames)
-    title = f"{result.title}: {len(result.frames)} frames, localised "
-    _text(
-        canvas,
-        title + ("never" if not isinstance(share, float) else f"{100 * share:.1f} % after the first fix"),
-        (40, 36),
-        0.7,
+def _figures(plot: RunPlot) -> str:
+    share, errors, times = localised_share(plot.frames), error_m(plot.frames), frame_ms(plot.frames)
+    told = [f"{len(plot.frames)} frames in {plot.seconds[-1]:.0f} s" if plot.frames else "no frames"]
+    told.append("never localised" if share is None else f"localised {100 * share:.1f} % after the first fix")
+    if errors is not None:
+        told.append(f"error: median {1e3 * errors['median']:.0f} mm, 99 % below {1e3 * errors['p99']:.0f} mm")
+    if times is not None:
+        told.append(f"{times['mean']:.1f} ms CPU a frame")
+    return "   |   ".join(told)
+
+
+def _draw_plan(canvas: Canvas, axes: ChartAxes, plot: RunPlot, shares: Array) -> None:
+    axes.draw(canvas, ("x, m", "y, m"))
+    landmarks = plot.landmarks_map_m[:: len(plot.landmarks_map_m) // _MAX_LANDMARKS + 1, :2]
+    inside = ((landmarks > axes.data_low) & (landmarks < axes.data_high)).all(axis=1)
+    radius = float(np.clip(1.6 * (10_000 / max(len(landmarks), 1)) ** 0.5, 0.7, 1.6))
+    for point in axes.pixels(landmarks[inside]):
+        canvas.dot(point, radius, _POINT)
+    truths = plot.truths_map_m[~np.isnan(plot.truths_map_m[:, 0]), :2]
+    canvas.line(axes.pixels(truths), INK, 1.5)
+    places = axes.pixels(plot.positions_map_m[:, :2])
+    good, known = np.array(localised(plot.frames), bool), ~np.isnan(places[:, 0])
+    for k in np.flatnonzero(known):
+        colour = _colour(shares[k]) if good[k] else _NOT_LOCALISED
+        if k and known[k - 1] and np.linalg.norm(places[k] - places[k - 1]) < 40.0:
+            canvas.line(places[k - 1 : k + 1], colour, 6.0)
+        else:
+            canvas.dot(places[k], 3.0, colour)
+    for at, colour in ((places[known][:1], _GOOD), (places[known][-1:], _BAD)):
+        for point in at:
+            canvas.dot(point, 9.0, (255, 255, 255))
+            canvas.dot(point, 7.5, colour)
+    entries = [("dot", "start", _GOOD), ("dot", "end", _BAD), ("dot", "landmark", _POINT)]
+    entries += [("line", "ground truth", INK)] if len(truths) else []
+    entries += [("line", "not localised", _NOT_LOCALISED)] if (known & ~good).any() else []
+    entries += [("line", f"over {_LIMIT_MM:.0f} mm", _BAD)] if (shares[known & good] > 1.0).any() else []
+    draw_legend(canvas, np.array([axes.low[0], axes.low[1] - 18.0]), entries)
+
+
+def _draw_colour_bar(canvas: Canvas, plan: ChartAxes, ceiling: float, label: str) -> None:
+    low = np.array([plan.low[0] + 60.0, plan.high[1] + 66.0])
+    bar = ChartAxes(low, np.array([plan.high[0] - 60.0, low[1] + 14.0]), np.zeros(2), np.array([ceiling, 1.0]))
+    edges = np.linspace(0.0, ceiling, 201)
+    for begin, end in pairwise(edges):
+        canvas.box(bar.pixels(np.array([begin, 1.0])), bar.pixels(np.array([end, 0.0])), _colour(begin / ceiling))
+    for value in ticks(0.0, ceiling, 10):
+        at = np.array([bar.pixels(np.array([value, 0.0]))[0], bar.high[1] + 19.0])
+        canvas.text(f"{value:g}", at, colour=QUIET, anchor=0.5)
+    canvas.text(label, np.array([0.5 * (bar.low[0] + bar.high[0]), bar.high[1] + 42.0]), colour=QUIET, anchor=0.5)
+
+
+def _draw_over_time(canvas: Canvas, plan: ChartAxes, plot: RunPlot, values: Array, ceiling: float, label: str) -> None:
+    seconds, span_s = plot.seconds, max(float(plot.seconds[-1]), 1e-3) if plot.frames else 1.0
+    left, right = plan.high[0] + 130.0, plan.high[0] + _BESIDE_WIDTH + 20.0
+    limits = np.array([0.0, 0.0]), np.array([span_s, ceiling])
+    axes = ChartAxes(np.array([left, plan.low[1]]), np.array([right, plan.high[1]]), *limits)
+    known = np.flatnonzero(~np.isnan(values))
+    points = axes.pixels(np.column_stack([seconds, np.minimum(values, ceiling)]))
+    pieces = [points[run] for run in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1) if len(run)]
+    for piece in pieces:
+        foot = [[piece[-1, 0], plan.high[1]], [piece[0, 0], plan.high[1]]]
+        canvas.area(np.vstack([piece, foot]), _BAND)
+    axes.draw(canvas, ("seconds since the start", label))
+    for piece in pieces:
+        canvas.line(piece, _ERROR, 1.8)
+    entries: list[tuple[str, str, Colour]] = [("line", "each frame", _ERROR)]
+    levels = [(float(np.median(values[known])), "median {:.0f} mm", INK)] if len(known) else []
+    levels += [(_LIMIT_MM, "limit of a failure", _BAD)] if ceiling > _LIMIT_MM else []
+    for level, words, colour in levels:
+        canvas.dashes(axes.pixels(np.array([[0.0, level], [span_s, level]])), colour, 1.5)
+        entries.append(("dashes", words.format(level), colour))
+    draw_legend(canvas, np.array([left, plan.low[1] - 18.0]), entries)
+    _draw_statuses(
+        canvas, ChartAxes(np.array([left, plan.high[1] + 66.0]), np.array([right, plan.high[1] + 80.0]), *limits), plot
     )
-    _text(canvas, f"green 0 .. red {_FULL_SCALE_M * 1000:.0f} mm of error; violet: not localised", (40, 60))
 
 
-def _errors(canvas: Canvas, result: RunPlot) -> None:
-    left, right, top, bottom = _PLAN_WIDTH + 60, _SIZE[1] - 30, 100, _SIZE[0] - 60
-    start = result.frames[0].stamp_ns
-    length = max((result.frames[-1].stamp_ns - start) * 1e-9, 1e-3)
-    values = [f.error_m for f in result.frames if f.error_m is not None]
-    _text(
-        canvas,
-        "position error, unaligned [mm], over time [s]" if values else "no ground truth in the map's frame",
-        (left, 60),
-        0.6,
-    )
-    cv2.rectangle(canvas, (left, top), (right, bottom), _GREY, 1)
-    if not values:
-        return
-    ceiling = max(0.02, min(float(np.percentile(values, 98)) * 1.3, 2 * ERROR_LIMIT_M))
-    for share in (0.25, 0.5, 0.75, 1.0):
-        y = int(bottom - share * (bottom - top))
-        cv2.line(canvas, (left, y), (right, y), _PALE, 1)
-        _text(canvas, f"{1000 * share * ceiling:.0f}", (left - 50, y + 5))
-    for share in (0.0, 0.5, 1.0):
-        _text(canvas, f"{share * length:.0f}", (int(left + share * (right - left)) - 10, bottom + 25))
-    good = localised(result.frames)
-    for k, frame in enumerate(result.frames):
-        if frame.error_m is not None:
-            x = int(left + (frame.stamp_ns - start) * 1e-9 / length * (right - left))
-            y = int(bottom - min(frame.error_m / ceiling, 1.0) * (bottom - top))
-            cv2.circle(canvas, (x, y), 3, _colour(frame.error_m) if good[k] else (200, 120, 200), -1, cv2.LINE_AA)
+def _draw_statuses(canvas: Canvas, strip: ChartAxes, plot: RunPlot) -> None:
+    """The status of each frame as a coloured piece of a strip along the axis of time."""
+    ends_s = np.append(plot.seconds, strip.data_high[0])
+    for frame, (begin_s, end_s) in zip(plot.frames, pairwise(ends_s), strict=True):
+        corners = strip.pixels(np.array([[begin_s, strip.data_high[1]], [end_s, 0.0]]))
+        canvas.box(corners[0], corners[1], _STATUS_COLOURS[frame.status])
+    met = [status for status in Status if any(frame.status is status for frame in plot.frames)]
+    shown = [("square", status.lower(), _STATUS_COLOURS[status]) for status in met]
+    draw_legend(canvas, np.array([strip.low[0], strip.high[1] + 30.0]), shown)
 
 
-def _colour(error_m: float | None) -> tuple[int, int, int]:
-    """Green without error, through yellow, to red; blue where no truth is known."""
-    if error_m is None:
-        return 200, 120, 40
-    share = min(error_m / _FULL_SCALE_M, 1.0)
-    return 40, int(200 * min(1.0, 2 - 2 * share)), int(220 * min(1.0, 2 * share))
-
-
-def _text(canvas: Canvas, text: str, at: tuple[int, int], size: float = 0.5) -> None:
-    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
+def _colour(share: float) -> Colour:
+    """Light blue at 0 to dark blue at 1; red beyond, grey for NaN."""
+    if np.isnan(share) or share > 1.0:
+        return _POINT if np.isnan(share) else _BAD
+    place = float(max(share, 0.0)) * (len(_SCALE) - 1)
+    k = min(int(place), len(_SCALE) - 2)
+    blue, green, red = _SCALE[k] + (place - k) * (_SCALE[k + 1] - _SCALE[k])
+    return int(blue), int(green), int(red)
