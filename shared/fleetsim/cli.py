@@ -1,8 +1,11 @@
-"""The command `fleetsim`: lists scenarios, records them, shows what they look like."""
+"""The command `fleetsim`: lists scenarios, records them, draws contact sheets of them."""
 
+import inspect
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
@@ -12,15 +15,68 @@ from fleetmap.errors import UsageError
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, help="The warehouse simulator: recordings with exact truth."
 )
+T = TypeVar("T")
+Option = typer.Option
 
-ScenarioName = Annotated[str, typer.Argument(metavar="SCENARIO", help="A name that `fleetsim scenarios` lists.")]
-Seed = Annotated[int, typer.Option(help="Everything random follows from it: the site, its stock, noise, motion.")]
-Day = Annotated[int, typer.Option(help="Day of the site's life: stock moves from day to day.")]
-Light = Annotated[str, typer.Option(help="day, evening or night.")]
-Robot = Annotated[str | None, typer.Option(help="Which of the scenario's robots; its first one unless given.")]
-Lens = Annotated[str | None, typer.Option(help="pinhole, radial-tangential or equidistant instead of the robot's own.")]
-Size = Annotated[str | None, typer.Option(metavar="WxH", help="Picture size in pixels, 640x480 unless given.")]
-Faults = Annotated[list[str] | None, typer.Option("--fault", metavar="NAME@START+SECONDS", help="A fault; repeatable.")]
+
+@dataclass(kw_only=True)
+class RunOptions:
+    """A run of a scenario, as the command line names it."""
+
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A name that `fleetsim scenarios` lists.")]
+    out: Annotated[Path, Option(help="PNG to write.")]
+    seed: Annotated[int, Option(help="Everything random follows from it: the site, its stock, noise, motion.")] = 0
+    day: Annotated[int, Option(help="Day of the site's life: stock moves from day to day.")] = 0
+    light: Annotated[str, Option(help="day, evening or night.")] = "day"
+    robot: Annotated[str | None, Option(help="Which of the scenario's robots; its first one unless given.")] = None
+    lens: Annotated[
+        str | None, Option(help="pinhole, radial-tangential or equidistant instead of the robot's own.")
+    ] = None
+
+
+@dataclass(kw_only=True)
+class RecordOptions(RunOptions):
+    """Options of `record`."""
+
+    out: Annotated[Path, Option(help="File to write (.mcap), or folder for --format euroc.")]
+    size: Annotated[str | None, Option(metavar="WxH", help="Picture size in pixels, 640x480 unless given.")] = None
+    frames: Annotated[int | None, Option(min=1, help="At most so many frames.")] = None
+    fault: Annotated[list[str] | None, Option("--fault", metavar="NAME@START+SECONDS", help="A fault; repeatable.")] = (
+        None
+    )
+    camera_delay_ms: Annotated[
+        float, Option(min=-100.0, max=100.0, help="Frames carry stamps this much too early.")
+    ] = 0.0
+    camera_turn_deg: Annotated[
+        float, Option(min=0.0, max=5.0, help="Each camera is turned this much from its calibration.")
+    ] = 0.0
+    camera_shift_mm: Annotated[
+        float, Option(min=0.0, max=50.0, help="Each camera sits this far from its calibrated place.")
+    ] = 0.0
+    format_: Annotated[str, Option("--format", help="mcap or euroc.")] = "mcap"
+    images: Annotated[str, Option(help="How mcap stores pictures: png, jpeg (smaller, with loss) or raw.")] = "png"
+    force: Annotated[bool, Option("--force", help="Write over an existing file.")] = False
+
+
+@dataclass(kw_only=True)
+class ShowOptions(RunOptions):
+    """Options of `show`."""
+
+    pictures: Annotated[int, Option(min=1, max=64, help="How many moments of the run.")] = 12
+
+
+def _command(options: type[T]) -> Callable[[Callable[[T], None]], None]:
+    """Makes a command of a function of one dataclass, whose fields become the arguments and options."""
+
+    def register(command: Callable[[T], None]) -> None:
+        def run_command(**values: object) -> None:
+            command(options(**values))
+
+        run_command.__doc__, run_command.__annotations__ = command.__doc__, get_type_hints(options, include_extras=True)
+        run_command.__signature__ = inspect.signature(options)  # type: ignore[attr-defined]
+        app.command(command.__name__)(run_command)
+
+    return register
 
 
 @app.command()
@@ -33,70 +89,46 @@ def scenarios() -> None:
         typer.echo(f"{name}  [{' '.join(scenario.runs)}]  {scenario.description}")
 
 
-@app.command()
-def record(
-    scenario: ScenarioName,
-    out: Annotated[Path, typer.Option(help="File to write (.mcap), or folder for --format euroc.")],
-    seed: Seed = 0,
-    day: Day = 0,
-    light: Light = "day",
-    robot: Robot = None,
-    lens: Lens = None,
-    size: Size = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="At most so many frames.")] = None,
-    fault: Faults = None,
-    camera_delay_ms: Annotated[
-        float, typer.Option(min=-100.0, max=100.0, help="Frames carry stamps this much too early.")
-    ] = 0.0,
-    camera_turn_deg: Annotated[
-        float, typer.Option(min=0.0, max=5.0, help="Each camera is turned this much from its calibration.")
-    ] = 0.0,
-    camera_shift_mm: Annotated[
-        float, typer.Option(min=0.0, max=50.0, help="Each camera sits this far from its calibrated place.")
-    ] = 0.0,
-    format_: Annotated[str, typer.Option("--format", help="mcap or euroc.")] = "mcap",
-    images: Annotated[
-        str, typer.Option(help="How mcap stores pictures: png, jpeg (smaller, with loss) or raw.")
-    ] = "png",
-    force: Annotated[bool, typer.Option("--force", help="Write over an existing file.")] = False,
-) -> None:
+@_command(RecordOptions)
+def record(given: RecordOptions) -> None:
     """Records one robot's run: pictures, IMU, wheels, position priors, exact ground truth."""
+    out, format_, images = given.out, given.format_, given.images
     if format_ not in ("mcap", "euroc"):
         raise UsageError(f"unknown format {format_!r}; there are mcap and euroc")
     if images not in ("png", "jpeg", "raw") or (format_ == "euroc" and images != "png"):
         raise UsageError(f"pictures as {images!r}: mcap holds png, jpeg or raw ones, euroc png alone")
-    if out.exists() and not (force and out.is_file()):
+    if out.exists() and not (given.force and out.is_file()):
         raise UsageError(f"{out} exists already; choose another name{' or pass --force' if out.is_file() else ''}")
     from fleetsim.recorder import Order
     from fleetsim.sensors.faults import parse_fault
     from fleetsim.sensors.robots import HiddenErrors
 
-    faults = tuple(parse_fault(text) for text in fault or [])
-    hidden = HiddenErrors(camera_delay_ms * 1e-3, math.radians(camera_turn_deg), camera_shift_mm * 1e-3)
-    order = Order(scenario, seed, day, light, robot, lens, frames, faults, _size_px(size), hidden)
+    turn_rad = math.radians(given.camera_turn_deg)
+    order = Order(
+        **_run_of(given),
+        frames=given.frames,
+        faults=tuple(parse_fault(text) for text in given.fault or []),
+        size_px=_size_px(given.size),
+        hidden=HiddenErrors(given.camera_delay_ms * 1e-3, turn_rad, given.camera_shift_mm * 1e-3),
+    )
     from fleetsim.commands import record_order
 
     typer.echo(record_order(order, out, format_, images))
 
 
-@app.command()
-def show(
-    scenario: ScenarioName,
-    out: Annotated[Path, typer.Option(help="PNG to write.")],
-    seed: Seed = 0,
-    day: Day = 0,
-    light: Light = "day",
-    robot: Robot = None,
-    lens: Lens = None,
-    pictures: Annotated[int, typer.Option(min=1, max=64, help="How many moments of the run.")] = 12,
-) -> None:
+@_command(ShowOptions)
+def show(given: ShowOptions) -> None:
     """A contact sheet: moments of a run, evenly spread, and the plan of the site with the route."""
-    if out.suffix.lower() != ".png":
-        raise UsageError(f"{out} should end in .png")
+    if given.out.suffix.lower() != ".png":
+        raise UsageError(f"{given.out} should end in .png")
     from fleetsim.commands import show_order
     from fleetsim.recorder import Order
 
-    typer.echo(show_order(Order(scenario, seed, day, light, robot, lens), out, pictures))
+    typer.echo(show_order(Order(**_run_of(given)), given.out, given.pictures))
+
+
+def _run_of(given: RunOptions) -> dict[str, Any]:
+    return {name: getattr(given, name) for name in ("scenario", "seed", "day", "light", "robot", "lens")}
 
 
 def _size_px(text: str | None) -> tuple[int, int] | None:

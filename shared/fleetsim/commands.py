@@ -1,4 +1,4 @@
-"""What the commands do: recording with progress, contact sheets."""
+"""Work of the commands: recording with progress, contact sheets."""
 
 import time
 from collections.abc import Callable
@@ -65,7 +65,7 @@ class _EncodingWriter(McapRecordingWriter):
 
 
 def record_order(order: Order, out: Path, format_: str, images: str = "png") -> str:
-    """Records to `out`; a line that says what was written and how long it took. images: a key of IMAGE_ENCODINGS."""
+    """Records to `out`; a line with the amount and the time. images: a key of IMAGE_ENCODINGS."""
     started = time.monotonic()
     with _progress() as progress, ThreadPoolExecutor(2) as workers:
         session = _ready(order, progress, workers)
@@ -89,29 +89,27 @@ def record_order(order: Order, out: Path, format_: str, images: str = "png") -> 
 
 
 def show_order(order: Order, out: Path, pictures: int) -> str:
-    """Writes a contact sheet to `out`; a line that says so."""
+    """Writes a contact sheet to `out`; a line that names it."""
     with _progress() as progress, ThreadPoolExecutor(2) as workers:
         session = _ready(order, progress, workers)
         task = progress.add_task("taking pictures", total=pictures)
         thumbnails = []
         last = len(session.frame_times_s) - 1
         for number in np.linspace(0, last, pictures + 2)[1:-1]:
-            shot = session.renderer.shoot(session.frame_times_s[round(float(number))])
-            height = round(_THUMBNAIL_PX * shot.left.shape[0] / shot.left.shape[1])
-            thumbnails.append(
-                np.asarray(cv2.resize(shot.left, (_THUMBNAIL_PX, height), interpolation=cv2.INTER_AREA), np.uint8)
-            )
+            image = session.renderer.shoot(session.frame_times_s[round(float(number))]).left
+            thumbnails.append(_scaled(image, _THUMBNAIL_PX))
             progress.advance(task)
         session.renderer.close()
     sheet = _tile(thumbnails, 4)
-    plan = _plan(find_scenario(order.scenario).layout, session)
-    scale = sheet.shape[1] / plan.shape[1]
-    plan = np.asarray(
-        cv2.resize(plan, (sheet.shape[1], round(plan.shape[0] * scale)), interpolation=cv2.INTER_AREA), np.uint8
-    )
+    plan = _scaled(_plan(find_scenario(order.scenario).layout, session), sheet.shape[1])
     if not cv2.imwrite(str(out), np.concatenate([sheet, plan])):
         raise FleetmapError(f"{out} cannot be written; does the folder exist?")
     return f"{out}: {pictures} moments and the plan"
+
+
+def _scaled(image: Image, width_px: int) -> Image:
+    height_px = round(image.shape[0] * (width_px / image.shape[1]))
+    return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _tile(images: list[Image], columns: int) -> Image:
@@ -133,7 +131,6 @@ def _plan(layout: Layout, session: Session) -> Image:
         image[rows, max(0, round(x_min * scale)) : round(x_max * scale)] = 110
     places = session.truth.positions_m[:, :2] * scale
     points = np.stack([places[:, 0], image.shape[0] - places[:, 1]], axis=1)
-    cv2.polylines(
-        image, [np.rint(points).astype(np.int32)], isClosed=False, color=255, thickness=2, lineType=cv2.LINE_AA
-    )
+    polyline = np.rint(points).astype(np.int32)
+    cv2.polylines(image, [polyline], isClosed=False, color=255, thickness=2, lineType=cv2.LINE_AA)
     return image

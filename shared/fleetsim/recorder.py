@@ -1,10 +1,10 @@
-"""Records one run of a scenario: every sensor's samples and pictures in the order of time."""
+"""Recording of one run of a scenario: every sensor's samples and pictures in the order of time."""
 
 import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 
@@ -14,22 +14,21 @@ from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Tra
 from fleetsim.motion.body_motion import CarriedMotion, Motion, RouteMotion
 from fleetsim.motion.routes import check_clear
 from fleetsim.render.painter import Look
-from fleetsim.render.renderer import StereoRenderer
+from fleetsim.render.renderer import RenderOptions, StereoRenderer
 from fleetsim.scenarios import Run, find_scenario
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.light import LIGHT_STATES
 from fleetsim.scene.world import World
 from fleetsim.sensors.faults import LATE_S, Fault, FaultPlan
 from fleetsim.sensors.measurements import measure_imu, measure_priors, measure_wheels, sample_times, stamps_from_s
-from fleetsim.sensors.robots import HiddenErrors, nominal_calibration, true_calibration
+from fleetsim.sensors.robots import HiddenErrors, RobotKind, nominal_calibration, true_calibration
 
 _TRUTH_STEP_S = 0.02
-S = TypeVar("S", WheelSample, PositionPrior)
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What to record. robot: a run of the scenario, its first one for None. frames: at most so many, all for None.
+    """A run to record. robot: a run of the scenario, its first one for None. frames: at most so many, all for None.
 
     hidden: errors of mounting and clock that the recording's calibration does not admit.
     """
@@ -47,27 +46,22 @@ class Order:
 
 
 class Writer(Protocol):
-    """Where samples go; fleetmap's McapRecordingWriter is one."""
+    """Receiver of samples; fleetmap's McapRecordingWriter is one."""
 
     def write_frame(self, frame: CameraFrame) -> None:
         """One pair, as pixels."""
-        ...
 
     def write_imu(self, samples: ImuSamples) -> None:
         """Inertial samples."""
-        ...
 
     def write_wheel(self, samples: tuple[WheelSample, ...]) -> None:
         """Wheel odometry."""
-        ...
 
     def write_prior(self, priors: tuple[PositionPrior, ...]) -> None:
         """Position priors."""
-        ...
 
     def write_ground_truth(self, trajectory: Trajectory) -> None:
         """True transforms."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,13 +98,12 @@ def _generator(order: Order, robot: str, purpose: str) -> np.random.Generator:
     return np.random.default_rng([order.seed, order.day, zlib.crc32(robot.encode()), zlib.crc32(purpose.encode())])
 
 
-def drive(run: Run, layout: Layout, rng: np.random.Generator) -> Motion:
+def drive(run: Run, kind: RobotKind, layout: Layout, rng: np.random.Generator) -> Motion:
     """The run's motion; UsageError where it comes too near to a solid thing."""
-    kind = run.kind
     pieces = [RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, rng) for route in run.routes]
     motion: Motion = pieces[0] if len(pieces) == 1 else CarriedMotion(pieces)
-    places = motion.map_from_body(sample_times(motion.duration_s, 20.0))[:, :2, 3]
-    check_clear(places, layout, kind.clearance_m)
+    positions = motion.map_from_body(sample_times(motion.duration_s, 20.0))[:, :2, 3]
+    check_clear(positions, layout, kind.clearance_m)
     return motion
 
 
@@ -126,33 +119,30 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     if order.size_px is not None:
         kind = replace(kind, width_px=order.size_px[0], height_px=order.size_px[1])
     nominal, true = nominal_calibration(kind), true_calibration(kind, _generator(order, name, "mounting"))
-    shaking = _generator(order, name, "motion")
-    pieces = [RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, shaking) for route in run.routes]
-    motion: Motion = pieces[0] if len(pieces) == 1 else CarriedMotion(pieces)
-    check_clear(
-        motion.map_from_body(sample_times(motion.duration_s, 20.0))[:, :2, 3], scenario.layout, kind.clearance_m
-    )
+    motion = drive(run, kind, scenario.layout, _generator(order, name, "motion"))
     plan = FaultPlan((*run.faults, *order.faults))
     every_time = [float(t) for t in sample_times(motion.duration_s, run.rate_hz)]
     times = [t for t in every_time if not plan.has("frames-dropped", t)][: order.frames]
     end_s = times[-1] + 0.1 if times else motion.duration_s
     world = World(scenario.layout, seed=order.seed, day=order.day, workers=workers)
-    renderer = StereoRenderer(
-        world, true, motion, order.light, look=Look(has_blur=not run.is_sharp), movers=scenario.movers,
-        faults=plan, key=zlib.crc32(name.encode()),
-    )  # fmt: skip
-    imu = plan.spoil_imu(measure_imu(motion, kind.imu, _generator(order, name, "imu")))
-    wheel = plan.spoil_wheels(
-        measure_wheels(motion, kind.body_height_m, kind.wheels, _generator(order, name, "wheels"))
-    )
+    look = Look(has_blur=not run.is_sharp)
+    options = RenderOptions(order.light, look, scenario.movers, plan, zlib.crc32(name.encode()))
+    wheel = measure_wheels(motion, kind.body_height_m, kind.wheels, _generator(order, name, "wheels"))
     priors = measure_priors(motion, nominal.base_from_body, run.zone_period_s, _generator(order, name, "priors"))
     last_ns = int(stamps_from_s(np.array([end_s]))[0])
     return Session(
-        order, world, nominal, true, renderer, motion, tuple(times), imu.between(0, last_ns),
-        tuple(sample for sample in wheel if sample.stamp_ns < last_ns),
-        tuple(prior for prior in priors if prior.stamp_ns < last_ns),
-        _truth(motion, times, end_s),
-    )  # fmt: skip
+        order=order,
+        world=world,
+        nominal=nominal,
+        true=true,
+        renderer=StereoRenderer(world, true, motion, options),
+        motion=motion,
+        frame_times_s=tuple(times),
+        imu=plan.spoil_imu(measure_imu(motion, kind.imu, _generator(order, name, "imu"))).between(0, last_ns),
+        wheel=tuple(sample for sample in plan.spoil_wheels(wheel) if sample.stamp_ns < last_ns),
+        priors=tuple(prior for prior in priors if prior.stamp_ns < last_ns),
+        truth=_truth(motion, times, end_s),
+    )
 
 
 def _truth(motion: Motion, frame_times_s: list[float], end_s: float) -> Trajectory:
@@ -164,33 +154,20 @@ def _truth(motion: Motion, frame_times_s: list[float], end_s: float) -> Trajecto
 
 def write_session(session: Session, writer: Writer, on_frame: Callable[[int], None] = lambda done: None) -> None:
     """Writes everything in the order of time, a frame's worth at a time."""
-    frames = session.frames()
-    wheel, priors = list(session.wheel), list(session.priors)
     start_ns = 0
-    for done, frame in enumerate(frames, start=1):
-        end_ns = frame.stamp_ns
-        _write_between(session, writer, start_ns, end_ns, wheel, priors)
+    for done, frame in enumerate(session.frames(), start=1):
+        _write_between(session, writer, start_ns, frame.stamp_ns)
         writer.write_frame(frame)
         on_frame(done)
-        start_ns = end_ns
-    _write_between(session, writer, start_ns, 1 << 62, wheel, priors)
+        start_ns = frame.stamp_ns
+    _write_between(session, writer, start_ns, 1 << 62)
 
 
-def _write_between(
-    session: Session, writer: Writer, start_ns: int, end_ns: int, wheel: list[WheelSample], priors: list[PositionPrior]
-) -> None:
-    """Writes the samples with start <= stamp < end, taking them from the lists."""
+def _write_between(session: Session, writer: Writer, start_ns: int, end_ns: int) -> None:
+    """Writes the samples with start <= stamp < end."""
     truth = session.truth
     first, last = np.searchsorted(truth.stamps_ns, [start_ns, end_ns])
-    writer.write_prior(tuple(_take(priors, end_ns)))
+    writer.write_prior(tuple(prior for prior in session.priors if start_ns <= prior.stamp_ns < end_ns))
     writer.write_imu(session.imu.between(start_ns, end_ns))
-    writer.write_wheel(tuple(_take(wheel, end_ns)))
+    writer.write_wheel(tuple(sample for sample in session.wheel if start_ns <= sample.stamp_ns < end_ns))
     writer.write_ground_truth(Trajectory(truth.stamps_ns[first:last], truth.frame_from_body[first:last]))
-
-
-def _take(samples: list[S], end_ns: int) -> list[S]:
-    """Removes and returns the samples before end_ns, which come first."""
-    count = sum(1 for sample in samples if sample.stamp_ns < end_ns)
-    taken = samples[:count]
-    del samples[:count]
-    return taken

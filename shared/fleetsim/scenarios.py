@@ -102,11 +102,8 @@ def _clip() -> Scenario:
     y = layout.aisle_y_m(0)
     straight = Route(((5.0, y), (8.0, y)), rest_s=0.5)
     turn = Route(((3.0, y - 0.2), (5.0, y - 0.2), (9.0, y + 0.2)), rest_s=0.5)
-    return Scenario(
-        "three metres of one aisle, for tests and first looks",
-        layout,
-        {"survey": Run("surveyor", (straight,), is_sharp=True), "tote-1": Run("tote", (turn,))},
-    )
+    runs = {"survey": Run("surveyor", (straight,), is_sharp=True), "tote-1": Run("tote", (turn,))}
+    return Scenario("three metres of one aisle, for tests and first looks", layout, runs)
 
 
 def _five_aisles() -> Scenario:
@@ -178,16 +175,8 @@ def _site() -> Scenario:
     layout = Layout(aisles=44, bays=70, end_m=5.5, aisle_width_m=2.3)
     across = [layout.aisle_y_m(aisle) for aisle in (20, 22)]
     left, right = _END_M, layout.length_m - _END_M
-    tour = Route(
-        (
-            (left, across[0]),
-            (right, across[0]),
-            (right, across[1]),
-            (left, across[1]),
-            (left, across[0]),
-            (left + 8, across[0]),
-        )
-    )
+    corners = ((left, across[0]), (right, across[0]), (right, across[1]), (left, across[1]), (left, across[0]))
+    tour = Route((*corners, (left + 8, across[0])))
     runs = {
         "survey": Run("surveyor", (_loop(layout, 0, 1),), is_sharp=True, zone_period_s=20.0),
         "survey-middle": Run("surveyor", (tour,), is_sharp=True, zone_period_s=20.0),

@@ -10,7 +10,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetsim.motion.body_motion import RouteMotion
 from fleetsim.motion.routes import Route
 from fleetsim.render.painter import Look
-from fleetsim.render.renderer import StereoRenderer
+from fleetsim.render.renderer import RenderOptions, StereoRenderer
 from fleetsim.sensors.robots import ROBOTS, nominal_calibration
 from support.worlds.simulated_views import small_world
 
@@ -25,7 +25,7 @@ def _renderer(lens: str, *, has_blur: bool) -> tuple[RigCalibration, StereoRende
     kind = ROBOTS["surveyor"].with_lens(lens)
     motion = RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, np.random.default_rng(0))
     rig = nominal_calibration(kind)
-    return rig, StereoRenderer(world, rig, motion, "day", look=Look(has_blur=has_blur))
+    return rig, StereoRenderer(world, rig, motion, RenderOptions(look=Look(has_blur=has_blur)))
 
 
 def _track(
@@ -77,7 +77,8 @@ def test_exposure_follows_the_light() -> None:
     means = {}
     for light in ("day", "evening", "night"):
         _, renderer = _renderer("pinhole", has_blur=False)
-        by_light = StereoRenderer(small_world(), nominal_calibration(ROBOTS["surveyor"]), renderer._motion, light)
+        rig, options = nominal_calibration(ROBOTS["surveyor"]), RenderOptions(light)
+        by_light = StereoRenderer(small_world(), rig, renderer._motion, options)
         exposure, shot = by_light.exposure(6.0), by_light.shoot(6.0)
         means[light] = float(shot.left.mean()), exposure.time_s * exposure.gain
         renderer.close()

@@ -1,4 +1,4 @@
-"""The landmarks of a world, chunk by chunk, and which of them each stretch of a drive can see."""
+"""The landmarks of a world, chunk by chunk, and those that each stretch of a drive can see."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, se3_inverse
 from fleetsim.estimator import landmark_kernels
 from fleetsim.estimator.statistics import PITCH_PX
-from fleetsim.render import ray_kernels
+from fleetsim.render.ray_kernels import BoxGrid, box_grid
 from fleetsim.scene.world import NEAR_COLUMNS, NEAR_ROWS, World
 
 CELLS_M = np.array([0.08, 0.16, 0.32, 0.64, 1.28])  # lattice spacings: with distance coarser ones take over
@@ -50,61 +50,45 @@ class LandmarkField:
         self._weights = _texture_weights(world)
         self._chunks: dict[tuple[int, int], Landmarks] = {}
         self._bounds: dict[tuple[int, int], Array] = {}
-        self._solids: dict[tuple[int, int], _Solids] = {}
+        self._grids: dict[tuple[int, int], tuple[list[tuple[int, int]], BoxGrid]] = {}
 
     def chunk(self, column: int, row: int) -> Landmarks:
         """All landmarks of a chunk."""
         key = (column, row)
         if key not in self._chunks:
             faces = self._world.detailed_faces(column, row)
-            parts, firsts, total = [], [], 0
-            for cell_m in CELLS_M:
-                part = self._seed(faces.quads, faces.values, faces.numbers, np.array([cell_m]))
-                firsts.append(total)
-                total += len(part[0])
-                parts.append(part)
-            points, normals, sizes, keys = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-            self._chunks[key] = Landmarks(points, normals, sizes, keys, np.array(firsts, np.int64))
+            columns = (faces.quads, faces.values, faces.numbers, self._weights)
+            parts = [landmark_kernels.seed_landmarks(*columns, cell_m) for cell_m in CELLS_M.tolist()]
+            firsts = np.cumsum([0] + [len(part[0]) for part in parts[:-1]])
+            points, normals, sizes, keys = (np.concatenate(column) for column in zip(*parts, strict=True))
+            self._chunks[key] = Landmarks(points, normals, sizes, keys, firsts)
             self._bounds[key] = faces.bounds_m()
         return self._chunks[key]
 
     def seen_from(self, map_from_cam: Array, focal_px: float, widest: Array) -> Landmarks:
         """Landmarks that a camera there may see: in a cone |x/z|, |y/z| < widest (2,), near enough, with nothing between."""
-        centre = np.ascontiguousarray(map_from_cam[:3, 3])
+        centre, reach_per_m = np.ascontiguousarray(map_from_cam[:3, 3]), focal_px / PITCH_PX
         cam_from_map = np.ascontiguousarray(se3_inverse(map_from_cam)[:3, :3])
-        solids = self._solids_around(centre)
-        reach_per_m = focal_px / PITCH_PX
+        view = landmark_kernels.Viewpoint(cam_from_map, centre, reach_per_m, widest, _OCTAVE_SPAN)
+        keys, grid = self._boxes_around(centre)
         found: list[Landmarks] = []
-        for key in solids.keys:
+        for key in keys:
             chunk = self.chunk(*key)
             gap_m = _gap(self._bounds[key], centre)
             reaching = np.flatnonzero(CELLS_M * _LARGEST * reach_per_m > gap_m)
             if not len(chunk) or not len(reaching):
                 continue
             rows = np.empty(len(chunk), np.int32)
-            count = landmark_kernels.visible_from(
-                int(chunk.firsts[reaching[0]]), chunk.points_map, chunk.normals_map, chunk.sizes_m, cam_from_map, centre,
-                reach_per_m, widest, _OCTAVE_SPAN, solids.boxes, solids.starts, solids.items, solids.low, _GRID_M,
-                solids.counts, rows,
-            )  # fmt: skip
+            first, columns = int(chunk.firsts[reaching[0]]), (chunk.points_map, chunk.normals_map, chunk.sizes_m)
+            count = landmark_kernels.visible_from(first, *columns, view, grid, rows)
             found.append(chunk.take(rows[:count]))
         return _joined(found)
 
-    def _seed(
-        self, quads: Array, values: Array, numbers: NDArray[np.int32], cells_m: Array
-    ) -> tuple[Array, Array, Array, NDArray[np.uint64]]:
-        none = np.zeros((0, 3))
-        arguments = (quads, values, numbers, self._weights, cells_m)
-        count = landmark_kernels.seed_landmarks(*arguments, True, none, none, np.zeros(0), np.zeros((0, 3), np.uint64))
-        points, normals = np.empty((count, 3)), np.empty((count, 3))
-        sizes, keys = np.empty(count), np.empty((count, 3), np.uint64)
-        landmark_kernels.seed_landmarks(*arguments, False, points, normals, sizes, keys)
-        return points, normals, sizes, keys
-
-    def _solids_around(self, centre: Array) -> "_Solids":
+    def _boxes_around(self, centre: Array) -> tuple[list[tuple[int, int]], BoxGrid]:
+        """The chunks around the chunk that holds a place, and a grid of their boxes."""
         layout = self._world.layout
         middle = layout.chunk_at(float(centre[0]), float(centre[1]))
-        if middle not in self._solids:
+        if middle not in self._grids:
             columns, rows = layout.chunk_counts
             keys = [
                 (column, row)
@@ -112,26 +96,11 @@ class LandmarkField:
                 for column in range(max(0, middle[0] - NEAR_COLUMNS), min(columns, middle[0] + NEAR_COLUMNS + 1))
             ]
             boxes = np.concatenate([self._world.detailed_faces(*key).boxes for key in keys])
-            low = np.array([-1.0, -1.0, -1.0])
             high = np.array([layout.length_m, layout.width_m, layout.ceiling_m]) + 1.0
-            near_low = np.maximum(low, np.append(centre[:2] - 40.0, -1.0))
+            near_low = np.maximum(-1.0, np.append(centre[:2] - 40.0, -1.0))
             near_high = np.minimum(high, np.append(centre[:2] + 40.0, high[2]))
-            counts = np.ceil((near_high - near_low) / _GRID_M).astype(np.int64)
-            starts, items = ray_kernels.fill_grid(boxes, near_low, _GRID_M, counts)
-            self._solids[middle] = _Solids(tuple(keys), boxes, starts, items, near_low, counts)
-        return self._solids[middle]
-
-
-@dataclass(frozen=True, slots=True)
-class _Solids:
-    """Chunks around one chunk and a grid of their boxes, see ray_kernels."""
-
-    keys: tuple[tuple[int, int], ...]
-    boxes: Array
-    starts: NDArray[np.int32]
-    items: NDArray[np.int32]
-    low: Array
-    counts: NDArray[np.int64]
+            self._grids[middle] = keys, box_grid(boxes, near_low, near_high, _GRID_M)
+        return self._grids[middle]
 
 
 def _joined(parts: list[Landmarks]) -> Landmarks:
@@ -140,12 +109,12 @@ def _joined(parts: list[Landmarks]) -> Landmarks:
         return Landmarks(
             np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3), np.uint64), np.zeros(1, np.int64)
         )
-    keys = np.concatenate([part.keys for part in parts])
+    points, normals, sizes, keys = (
+        np.concatenate([getattr(part, column) for part in parts])
+        for column in ("points_map", "normals_map", "sizes_m", "keys")
+    )
     order = np.argsort(keys[:, 2], kind="stable")
-    points = np.concatenate([part.points_map for part in parts])[order]
-    normals = np.concatenate([part.normals_map for part in parts])[order]
-    sizes = np.concatenate([part.sizes_m for part in parts])[order]
-    return Landmarks(points, normals, sizes, keys[order], np.zeros(1, np.int64))
+    return Landmarks(points[order], normals[order], sizes[order], keys[order], np.zeros(1, np.int64))
 
 
 def _gap(bounds_m: Array, place: Array) -> float:

@@ -1,15 +1,27 @@
 """Measurement noise by hashing: the same for a landmark and a frame whatever was asked before."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.numerics.kernel import inner_kernel, kernel
 from fleetsim.estimator.landmark_kernels import mixed, uniform
+from fleetsim.estimator.statistics import FeatureStatistics, FlowStatistics
 
 Float = NDArray[np.float64]
 Words = NDArray[np.uint64]
+_BORDER_PX = 19.0  # without clutter
+
+
+class FeatureBuffers(NamedTuple):
+    """Arrays that features are written to: rows (N,) of landmarks, pixels (N, 3), octaves (N,), descriptors (N, 4)."""
+
+    rows: NDArray[np.int32]
+    pixels: Float
+    octaves: NDArray[np.int8]
+    words: Words
 
 
 @inner_kernel
@@ -30,13 +42,18 @@ def slow_normal(key: np.uint64, phase: float, table: Float) -> float:
 
 @kernel
 def flow_noise(
-    ids: Words, exact: Float, begun: Float, is_floor: NDArray[np.bool_], frame: int, seed: int, white_px: float,
-    lag: float, along: float, across: float, floor_lag: float, floor_along: float, slip_share: float, slip: float,
-    lost_share: float, stretch_frames: float, known_share: float, disparity_px: float, rough_share: float,
-    rough_px: float, rough_bias_px: float, wrong_share: float, wrong_px: float, table: Float, pixels: Float,
+    ids: Words,
+    exact: Float,
+    begun: Float,
+    is_floor: NDArray[np.bool_],
+    frame: int,
+    seed: int,
+    model: FlowStatistics,
+    table: Float,
+    pixels: Float,
     kept: NDArray[np.bool_],
-) -> None:  # fmt: skip
-    """What following corners by optical flow makes of exact pixels (N, 3) begun at (N, 2).
+) -> None:
+    """Fills `pixels` with the measurement by optical flow of exact pixels (N, 3), corners that began at (N, 2).
 
     `kept` is false where the flow loses one. The error grows with the way since the beginning, along it and across it,
     by factors of the landmark's own (`slip` for the share that slides along edges; the floor's reflections hold corners
@@ -45,72 +62,82 @@ def flow_noise(
     for n in range(ids.shape[0]):
         own = mixed(ids[n], np.uint64(seed))
         now = mixed(own, np.uint64(frame + 1000))
-        is_slipping = uniform(mixed(own, np.uint64(2))) < slip_share
-        own_along = slip if is_slipping else floor_along if is_floor[n] else along
-        gain_along = own_along * normal(mixed(own, np.uint64(10)), table) - (floor_lag if is_floor[n] else lag)
-        gain_across = (0.5 * slip if is_slipping else across) * normal(mixed(own, np.uint64(11)), table)
+        is_slipping = uniform(mixed(own, np.uint64(2))) < model.slip_share
+        own_along = model.slip if is_slipping else model.floor_along if is_floor[n] else model.along
+        gain_along = own_along * normal(mixed(own, np.uint64(10)), table) - (
+            model.floor_lag if is_floor[n] else model.lag
+        )
+        gain_across = (0.5 * model.slip if is_slipping else model.across) * normal(mixed(own, np.uint64(11)), table)
         du, dv = exact[n, 0] - begun[n, 0], exact[n, 1] - begun[n, 1]
         white_u, white_v = normal(mixed(now, np.uint64(20)), table), normal(mixed(now, np.uint64(21)), table)
-        pixels[n, 0] = exact[n, 0] + gain_along * du - gain_across * dv + white_px * white_u
-        pixels[n, 1] = exact[n, 1] + gain_along * dv + gain_across * du + white_px * white_v
-        kept[n] = uniform(mixed(now, np.uint64(3))) >= lost_share
-        phase = frame / stretch_frames + uniform(mixed(own, np.uint64(1)))
+        pixels[n, 0] = exact[n, 0] + gain_along * du - gain_across * dv + model.white_px * white_u
+        pixels[n, 1] = exact[n, 1] + gain_along * dv + gain_across * du + model.white_px * white_v
+        kept[n] = uniform(mixed(now, np.uint64(3))) >= model.lost_share
+        phase = frame / model.stretch_frames + uniform(mixed(own, np.uint64(1)))
         stretch = mixed(own, np.uint64(int(phase) + 100))
         draw = uniform(mixed(stretch, np.uint64(5)))
         disparity = exact[n, 0] - exact[n, 2]
-        if draw < wrong_share:
-            disparity += wrong_px * (2.0 * uniform(mixed(stretch, np.uint64(6))) - 1.0)
-        elif draw < wrong_share + rough_share:
-            disparity += rough_bias_px + rough_px * normal(mixed(stretch, np.uint64(7)), table)
+        if draw < model.disparity_wrong_share:
+            disparity += model.disparity_wrong_px * (2.0 * uniform(mixed(stretch, np.uint64(6))) - 1.0)
+        elif draw < model.disparity_wrong_share + model.disparity_rough_share:
+            disparity += model.disparity_rough_bias_px + model.disparity_rough_px * normal(
+                mixed(stretch, np.uint64(7)), table
+            )
         slow, white = slow_normal(mixed(own, np.uint64(12)), phase, table), normal(mixed(now, np.uint64(22)), table)
-        disparity += disparity_px * 0.7071 * (slow + white)
-        is_known = uniform(mixed(stretch, np.uint64(4))) < known_share
+        disparity += model.disparity_px * 0.7071 * (slow + white)
+        is_known = uniform(mixed(stretch, np.uint64(4))) < model.disparity_known_share
         pixels[n, 2] = pixels[n, 0] - disparity if is_known else np.nan
 
 
 @kernel
 def detect(
-    keys: Words, exact: Float, exact_octaves: Float, directions: Float, frame: int, seed: int, found_share: float,
-    view_share: float, corner_px: float, slip_share: float, slip_px: float, octave_sigma: float, known_share: float,
-    disparity_px: float, wrong_share: float, wrong_px: float, dirt_bits: int, view_bits: int, view_step_rad: float, noise_bits: float,
-    table: Float, rows: NDArray[np.int32], pixels: Float, octaves: NDArray[np.int8], words: Words,
-) -> int:  # fmt: skip
-    """Number of features that a detector finds at exact pixels (N, 3).
+    keys: Words,
+    exact: Float,
+    exact_octaves: Float,
+    directions: Float,
+    frame: int,
+    seed: int,
+    model: FeatureStatistics,
+    table: Float,
+    found: FeatureBuffers,
+) -> int:
+    """Number of features that a detector finds at exact pixels (N, 3); so many rows of `found` are filled.
 
-    rows, pixels, octaves and descriptors (N, 4) are filled so far. directions (N, 2): azimuth and elevation of the view.
-    A descriptor follows from the look, with bits changed by the dirt, by the direction of view (in steps), by noise.
+    directions (N, 2): azimuth and elevation of the view. A descriptor follows from the look, with bits changed by the
+    dirt, by the direction of view (in steps), by noise.
     """
+    rows, pixels, octaves, words = found
     count = 0
     for n in range(keys.shape[0]):
         own = mixed(keys[n, 2], np.uint64(seed))
         now = mixed(own, np.uint64(frame + 5000))
-        if uniform(mixed(now, np.uint64(1))) >= found_share:
+        if uniform(mixed(now, np.uint64(1))) >= model.found_share:
             continue
         view = mixed(keys[n, 0], np.uint64(42))
         for axis in range(2):
             offset = uniform(mixed(keys[n, 0], np.uint64(41 + 10 * axis)))
-            view = mixed(view, np.uint64(math.floor(directions[n, axis] / view_step_rad + offset) + 1000))
-        if uniform(mixed(view, keys[n, 1])) >= view_share:
+            view = mixed(view, np.uint64(math.floor(directions[n, axis] / model.view_step_rad + offset) + 1000))
+        if uniform(mixed(view, keys[n, 1])) >= model.view_share:
             continue
-        octave = round(exact_octaves[n] + octave_sigma * normal(mixed(now, np.uint64(2)), table))
+        octave = round(exact_octaves[n] + model.octave_sigma * normal(mixed(now, np.uint64(2)), table))
         if octave < 0 or octave > 7:
             continue
-        is_slipping = uniform(mixed(now, np.uint64(7))) < slip_share
-        sigma = (slip_px if is_slipping else corner_px) * 1.2**octave
+        is_slipping = uniform(mixed(now, np.uint64(7))) < model.slip_share
+        sigma = (model.slip_px if is_slipping else model.corner_px) * 1.2**octave
         for axis in range(2):
             pixels[count, axis] = exact[n, axis] + sigma * normal(mixed(now, np.uint64(10 + axis)), table)
-        disparity = exact[n, 0] - exact[n, 2] + disparity_px * normal(mixed(now, np.uint64(12)), table)
-        if uniform(mixed(now, np.uint64(5))) < wrong_share:
-            disparity += wrong_px * (2.0 * uniform(mixed(now, np.uint64(6))) - 1.0)
-        is_known = uniform(mixed(now, np.uint64(4))) < known_share
+        disparity = exact[n, 0] - exact[n, 2] + model.disparity_px * normal(mixed(now, np.uint64(12)), table)
+        if uniform(mixed(now, np.uint64(5))) < model.disparity_wrong_share:
+            disparity += model.disparity_wrong_px * (2.0 * uniform(mixed(now, np.uint64(6))) - 1.0)
+        is_known = uniform(mixed(now, np.uint64(4))) < model.disparity_known_share
         pixels[count, 2] = pixels[count, 0] - disparity if is_known else np.nan
         state = mixed(keys[n, 0], np.uint64(40))
         for word in range(4):
             state = mixed(state, np.uint64(word))
             words[count, word] = state
-        change_bits(words, count, mixed(keys[n, 0], keys[n, 1]), dirt_bits)
-        change_bits(words, count, view, view_bits)
-        noise = int(noise_bits * 2.0 * uniform(mixed(now, np.uint64(44))) + 0.5)
+        change_bits(words, count, mixed(keys[n, 0], keys[n, 1]), model.dirt_bits)
+        change_bits(words, count, view, model.view_bits)
+        noise = int(model.noise_bits * 2.0 * uniform(mixed(now, np.uint64(44))) + 0.5)
         change_bits(words, count, mixed(now, np.uint64(43)), noise)
         octaves[count] = octave
         rows[count] = n
@@ -131,15 +158,15 @@ def change_bits(words: Words, row: int, key: np.uint64, bits: int) -> None:
 
 @kernel
 def add_clutter(
-    first: int, total: int, key: np.uint64, width_px: float, height_px: float, border_px: float, known_share: float,
-    pixels: Float, octaves: NDArray[np.int8], words: Words,
-) -> None:  # fmt: skip
+    first: int, total: int, key: np.uint64, size_px: tuple[float, float], known_share: float, found: FeatureBuffers
+) -> None:
     """Features that no other picture will show again, spread over the picture and the octaves as a detector spreads them."""
+    _, pixels, octaves, words = found
     state = key
     for n in range(first, total):
         state = mixed(state, np.uint64(n))
-        pixels[n, 0] = border_px + uniform(mixed(state, np.uint64(1))) * (width_px - 2 * border_px)
-        pixels[n, 1] = border_px + uniform(mixed(state, np.uint64(2))) * (height_px - 2 * border_px)
+        pixels[n, 0] = _BORDER_PX + uniform(mixed(state, np.uint64(1))) * (size_px[0] - 2 * _BORDER_PX)
+        pixels[n, 1] = _BORDER_PX + uniform(mixed(state, np.uint64(2))) * (size_px[1] - 2 * _BORDER_PX)
         depth_draw = uniform(mixed(state, np.uint64(3)))
         is_known = uniform(mixed(state, np.uint64(4))) < known_share
         pixels[n, 2] = pixels[n, 0] - (3.0 + 30.0 * depth_draw * depth_draw) if is_known else np.nan
@@ -162,12 +189,11 @@ def spread(
     taken: Float,
     min_distance_px: float,
     count: int,
-    width_px: float,
-    height_px: float,
+    size_px: tuple[float, float],
 ) -> NDArray[np.int64]:
     """Up to `count` of the pixels (N, 2) at `order`, first come first served, none nearer than min_distance_px to another."""
     cell = min_distance_px
-    columns, rows = int(width_px / cell) + 1, int(height_px / cell) + 1
+    columns, rows = int(size_px[0] / cell) + 1, int(size_px[1] / cell) + 1
     grid = np.full((rows, columns, 4), -1, np.int64)
     total = taken.shape[0]
     places = np.empty((total + count, 2))

@@ -1,4 +1,4 @@
-"""A run without pictures: what an estimator would measure, landmark by landmark, at many times real time.
+"""A run without pictures: the measurements of an estimator, landmark by landmark, at many times real time.
 
 The world, its stock, the motion, IMU, wheels, priors and dropped frames are those of the rendered run; the landmarks
 lie on the same surfaces and hide behind the same boxes. Movers and faults of the pictures other than darkness have no
@@ -20,7 +20,6 @@ from fleetsim.recorder import Session
 _STATION_M, _STATION_RAD = 0.5, 0.15
 _CONE_MARGIN = 0.3  # of the tangent: what turning and moving within a station may bring into the picture
 _TABLE = 1 << 16
-_BORDER_PX = 19.0
 _FLOW_BORDER_PX = 8.0
 _FLOOR_M = 0.05
 _FINEST_OCTAVES = 4.0  # what the flow's corners are found on
@@ -67,9 +66,13 @@ class EstimatorSession:
     """
 
     def __init__(
-        self, session: Session, *, flow: FlowStatistics | None = None, features: FeatureStatistics | None = None,
+        self,
+        session: Session,
+        *,
+        flow: FlowStatistics | None = None,
+        features: FeatureStatistics | None = None,
         field: LandmarkField | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.session = session
         self._flow, self._features = flow or FlowStatistics(), features or FeatureStatistics()
         self._field = field or LandmarkField(session.world)
@@ -78,6 +81,7 @@ class EstimatorSession:
         self.body_from_cam: Array = rectifier.body_from_cam
         self.stamps_ns = session.frame_stamps_ns()
         self.map_from_body = session.motion.map_from_body(np.array(session.frame_times_s))
+        self._size_px = float(self.camera.width_px), float(self.camera.height_px)
         self._rect_from_body = [
             _rectified_from_body(nominal.body_from_cam, true.body_from_cam, self.body_from_cam)
             for nominal, true in zip(session.nominal.cameras, session.true.cameras, strict=True)
@@ -102,19 +106,14 @@ class EstimatorSession:
 
         begun_px (N, 2): exact pixels where each began to be followed, as `corners` gave them.
         """
-        seen, flow = self.sighting(frame), self._flow
+        seen = self.sighting(frame)
         at = np.minimum(np.searchsorted(seen.ids, ids), max(len(seen.ids) - 1, 0))
         kept = seen.ids[at] == ids if len(seen.ids) else np.zeros(len(ids), bool)
         pixels, held = np.full((len(ids), 3), np.nan), np.zeros(int(kept.sum()), bool)
         measured = np.empty((int(kept.sum()), 3))
         exact, is_floor = seen.pixels[at[kept]], seen.points_map[at[kept], 2] < _FLOOR_M
-        noise_kernels.flow_noise(
-            ids[kept], exact, begun_px[kept], is_floor, frame, self._seed, flow.white_px, flow.lag, flow.along,
-            flow.across, flow.floor_lag, flow.floor_along, flow.slip_share, flow.slip, flow.lost_share,
-            flow.stretch_frames, flow.disparity_known_share, flow.disparity_px, flow.disparity_rough_share,
-            flow.disparity_rough_px, flow.disparity_rough_bias_px, flow.disparity_wrong_share, flow.disparity_wrong_px,
-            self._table, measured, held,
-        )  # fmt: skip
+        instant = (frame, self._seed, self._flow, self._table)
+        noise_kernels.flow_noise(ids[kept], exact, begun_px[kept], is_floor, *instant, measured, held)
         pixels[kept] = measured
         kept[kept] = held
         return pixels, kept
@@ -130,43 +129,29 @@ class EstimatorSession:
         room = np.minimum(pixels, (camera.width_px - 1, camera.height_px - 1) - pixels).min(axis=1)
         order = np.flatnonzero((room > _FLOW_BORDER_PX) & (seen.octaves < _FINEST_OCTAVES))
         order = order[np.argsort(seen.keys[order, 0], kind="stable")]
-        chosen = noise_kernels.spread(
-            pixels,
-            order,
-            np.ascontiguousarray(taken[:, :2]),
-            min_distance_px,
-            count,
-            float(camera.width_px),
-            float(camera.height_px),
-        )
+        near = np.ascontiguousarray(taken[:, :2])
+        chosen = noise_kernels.spread(pixels, order, near, min_distance_px, count, self._size_px)
         return seen.ids[chosen], pixels[chosen]
 
     def features(self, frame: int) -> Found:
         """What a detector finds in a frame's left picture, landmarks first, then clutter."""
         seen, model = self.sighting(frame), self._features
-        room = max(len(seen.ids), model.count)
-        rows, pixels = np.full(room, -1, np.int32), np.empty((room, 3))
-        octaves, words = np.empty(room, np.int8), np.empty((room, 4), np.uint64)
+        room = max(len(seen.ids), model.total)
+        rows, words = np.full(room, -1, np.int32), np.empty((room, 4), np.uint64)
+        found = noise_kernels.FeatureBuffers(rows, np.empty((room, 3)), np.empty(room, np.int8), words)
         centre = (self.map_from_body[frame] @ self.body_from_cam)[:3, 3]
         toward = centre - seen.points_map
         level = np.hypot(toward[:, 0], toward[:, 1])
         directions = np.stack([np.arctan2(toward[:, 1], toward[:, 0]), np.arctan2(toward[:, 2], level)], axis=1)
-        count = noise_kernels.detect(
-            seen.keys, seen.pixels, seen.octaves, directions, frame, self._seed, model.found_share, model.view_share,
-            model.corner_px, model.slip_share, model.slip_px, model.octave_sigma, model.disparity_known_share, model.disparity_px,
-            model.disparity_wrong_share, model.disparity_wrong_px, model.dirt_bits, model.view_bits,
-            model.view_step_rad, model.noise_bits, self._table, rows, pixels, octaves, words,
-        )  # fmt: skip
-        count = min(count, model.count)
-        total = model.count if len(seen.ids) else 0
+        instant = (frame, self._seed, model, self._table)
+        count = noise_kernels.detect(seen.keys, seen.pixels, seen.octaves, directions, *instant, found)
+        count = min(count, model.total)
+        total = model.total if len(seen.ids) else 0
         key = np.uint64((self._seed * 1000003 + frame) & ((1 << 63) - 1))
-        noise_kernels.add_clutter(
-            count, total, key, float(self.camera.width_px), float(self.camera.height_px), _BORDER_PX,
-            model.disparity_known_share, pixels, octaves, words,
-        )  # fmt: skip
+        noise_kernels.add_clutter(count, total, key, self._size_px, model.disparity_known_share, found)
         rows[count:total] = -1
         descriptors = words[:total].view(np.uint8).reshape(total, 32)
-        return Found(rows[:total], pixels[:total], octaves[:total], descriptors)
+        return Found(rows[:total], found.pixels[:total], found.octaves[:total], descriptors)
 
     def _look(self, frame: int) -> Sighting:
         landmarks, camera = self._landmarks(frame), self.camera
@@ -176,18 +161,14 @@ class EstimatorSession:
         pixels, octaves, distances = np.empty((size, 3)), np.empty(size), np.empty(size)
         rows = np.empty(size, np.int32)
         body_from_map = se3_inverse(self.map_from_body[frame])
-        left, right = (np.ascontiguousarray((rect @ body_from_map)[:3]) for rect in self._rect_from_body)
+        rect_from_map = np.stack([(rect @ body_from_map)[:3] for rect in self._rect_from_body])
         pinhole = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px])
-        count = landmark_kernels.project(
-            landmarks.points_map, landmarks.sizes_m, left, right, pinhole, 0.0, camera.focal_px / PITCH_PX, pixels, octaves,
-            distances, rows,
-        )  # fmt: skip
-        rows = rows[:count]
-        keys = landmarks.keys[rows]
-        return Sighting(
-            keys[:, 2], landmarks.points_map[rows], landmarks.normals_map[rows], keys, pixels[:count], octaves[:count],
-            distances[:count],
-        )  # fmt: skip
+        view, reach_per_m = (rect_from_map, pinhole), camera.focal_px / PITCH_PX
+        points, sizes = landmarks.points_map, landmarks.sizes_m
+        count = landmark_kernels.project(points, sizes, *view, reach_per_m, pixels, octaves, distances, rows)
+        seen = landmarks.take(rows[:count])
+        columns = (pixels[:count], octaves[:count], distances[:count])
+        return Sighting(seen.keys[:, 2], seen.points_map, seen.normals_map, seen.keys, *columns)
 
     def _landmarks(self, frame: int) -> Landmarks:
         """Those that the frame's station can see; a station is the middle of a short stretch of the drive."""

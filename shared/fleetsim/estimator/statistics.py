@@ -1,15 +1,15 @@
-"""What pictures of the simulator do to an estimator's measurements, as numbers.
+"""Statistics of what an estimator measures on the simulator's pictures.
 
 Measured by `python tests/benchmarks/simulator/measure_statistics.py` on `small-loop` (survey by day; tote by day and night, the next
 day's stock). Figures in the comments are that command's.
 """
 
-from fleetmap.config import Section
+from typing import NamedTuple
 
 PITCH_PX = 9.5  # a corner of a given extent is found up to the distance at which it spans so many pixels
 
 
-class FlowStatistics(Section, frozen=True):
+class FlowStatistics(NamedTuple):
     """Corners followed by optical flow. The tracker's error is white_px plus shares of the way since a corner was begun.
 
     lag, along, across: mean and rms of the share along the way (corners lag behind: measured -0.003 and -0.0015, rms
@@ -39,21 +39,21 @@ class FlowStatistics(Section, frozen=True):
     disparity_wrong_px: float = 10.0
 
 
-class FeatureStatistics(Section, frozen=True):
+class FeatureStatistics(NamedTuple):
     """Features found by a detector and their descriptors.
 
     corner_px, slip_px: rms at the octave's own scale, of a good corner and of the slip_share that sits elsewhere on its
     edge or pattern. Fitted to the localizer's guided matches of rendered pictures, from their true places, against true
     surfaces: 0.15, 0.35, 0.65, 0.81 and 0.90 of them lie within 0.5, 1, 2.5, 4 and 6 pixels. A landmark is found in a picture
     with found_share, provided that it can be found from that direction, which holds for view_share of the directions
-    (in steps of view_step_rad in azimuth and elevation); `count` is filled up with clutter that shows in no other
+    (in steps of view_step_rad in azimuth and elevation); `total` is filled up with clutter that shows in no other
     picture. Found again: 0.66 after 0.25 m, 0.57 after 1 m, 0.45 by a lower camera on the next day, when an eighth of
     the stock is new. Bits apart, of 256, below 80: median 41 (10..90 %: 23..69), 49, 56; noise_bits are the mean of one
     picture, view_bits those of one direction's step. view_share is such that the localizer's fixes have as many inliers
     as on pictures (309 against 312 a fix). dirt_bits between two cartons of one kind is an assumption.
     """
 
-    count: int = 1000
+    total: int = 1000
     found_share: float = 0.72
     view_share: float = 0.57
     corner_px: float = 0.42

@@ -1,4 +1,4 @@
-"""How a robot's body moves: a quintic spline in x, y, z, yaw, pitch, roll, so that rates and accelerations are exact.
+"""Motion of a robot's body: a quintic spline in x, y, z, yaw, pitch, roll, so that rates and accelerations are exact.
 
 Euler angles are safe here: a floor robot never pitches anywhere near 90 degrees.
 """
@@ -24,19 +24,15 @@ class Motion(Protocol):
     @property
     def duration_s(self) -> float:
         """Length in time."""
-        ...
 
     def map_from_body(self, times_s: Array) -> Array:
         """(N, 4, 4)."""
-        ...
 
     def rates(self, times_s: Array) -> tuple[Array, Array]:
         """Angular rate rad/s and specific force m/s^2, both (N, 3) in body axes."""
-        ...
 
     def velocity_body(self, times_s: Array) -> Array:
         """(N, 3) m/s in body axes."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -127,11 +127,8 @@ def check_clear(points_map: Array, layout: Layout, clearance_m: float) -> None:
     gap, blocker = float(walls.min()), "a wall"
     worst = int(np.argmin(walls))
     for x_min, y_min, x_max, y_max in layout.solid_rectangles():
-        outside_x, outside_y = (
-            np.maximum(np.maximum(x_min - x, x - x_max), 0),
-            np.maximum(np.maximum(y_min - y, y - y_max), 0),
-        )
-        distance = np.hypot(outside_x, outside_y)
+        outside_x, outside_y = np.maximum(x_min - x, x - x_max), np.maximum(y_min - y, y - y_max)
+        distance = np.hypot(np.maximum(outside_x, 0), np.maximum(outside_y, 0))
         if distance.min() < gap:
             gap, worst = float(distance.min()), int(np.argmin(distance))
             blocker = f"the solid at x {x_min:.1f}..{x_max:.1f}, y {y_min:.1f}..{y_max:.1f} m"

@@ -1,4 +1,4 @@
-"""How a camera maps pixels to rays, prepared for the painter: a pinhole plane and, for a lens, a look-up into it."""
+"""Mapping of a camera's pixels to rays, prepared for the painter: a pinhole plane and, for a lens, a look-up into it."""
 
 from dataclasses import dataclass
 
@@ -61,9 +61,7 @@ def make_optics(camera: CameraCalibration) -> Optics:
     right, left = _normalised(camera, u + _DIFFERENCE_PX, v)[0], _normalised(camera, u - _DIFFERENCE_PX, v)[0]
     down, up = _normalised(camera, u, v + _DIFFERENCE_PX)[1], _normalised(camera, u, v - _DIFFERENCE_PX)[1]
     rays = np.stack([xn, yn, right - left, down - up], axis=-1)
-    unseen = (
-        ~np.isfinite(rays).all(-1) | (np.abs(rays[..., 0]) > _WIDEST_TANGENT) | (np.abs(rays[..., 1]) > _WIDEST_TANGENT)
-    )
+    unseen = ~np.isfinite(rays).all(-1) | (np.abs(rays[..., :2]) > _WIDEST_TANGENT).any(-1)
     if unseen.all():
         raise CalibrationError(
             f"no pixel of the {camera.model} lens with intrinsics {camera.intrinsics_px.tolist()} has a ray"

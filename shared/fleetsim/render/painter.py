@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.samples import Image
 from fleetsim.render import sensor_kernels, shading_kernels, visibility_kernels
 from fleetsim.render.optics import Optics
+from fleetsim.render.shading_kernels import Canvas, Instant, Surfaces, Visible
 from fleetsim.scene.faces import MATERIAL_FLOOR
 from fleetsim.scene.light import Exposure
 from fleetsim.scene.movers import AnyMover, add_movers, mover_light
@@ -24,7 +26,7 @@ _NOISE_TABLE = 1 << 18
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """How pictures are painted.
+    """Quality of the pictures.
 
     samples: per pixel side, for sharp pictures' edges. reflectance: of the floor seen from above.
     """
@@ -59,7 +61,7 @@ class Painter:
         self._movers = movers
         self._scene: Scene | None = None
         self._groups = np.zeros(3)
-        self._buffers: dict[int, tuple[NDArray[np.float32], NDArray[np.int32]]] = {}
+        self._buffers: dict[int, _Buffer] = {}
         self._indices: dict[int, NDArray[np.int32]] = {}
         self._normals = np.random.default_rng(99).standard_normal(_NOISE_TABLE).astype(np.float32)
 
@@ -67,16 +69,18 @@ class Painter:
         """The picture whose exposure is centred at t; `groups` are the strengths of the lamp groups."""
         self._prepare(scene, groups, t_s)
         height, width = self._optics.height_px, self._optics.width_px
-        radiance = np.zeros((height, width))
         depth, faces = np.zeros((height, width), np.float32), np.full((height, width), -1, np.int32)
+        canvas = Canvas(np.zeros((height, width)), depth, faces)
         count = self.subframes(path, t_s, exposure) if self._look.has_blur else 1
-        samples = self._look.samples if count == 1 else 1
+        samples, look = self._look.samples if count == 1 else 1, self._look
         for number in range(count):
             moment = t_s + ((number + 0.5) / count - 0.5) * exposure.time_s
             # Sub-pixel shifts of a low-discrepancy sequence smooth the edges of blurred pictures at no cost.
             shift = (0.5 + _R2_SEQUENCE * (number + 0.5)) % 1.0 - 0.5 if count > 1 else np.zeros(2)
-            self._add(radiance, path(moment), moment, 1.0 / count, samples, shift, (depth, faces), number == count // 2)
-        return Shot(self._develop(radiance, exposure, noise_key), depth, faces, count)
+            is_middle = number == count // 2
+            instant = Instant(samples, shift, 1.0 / count, look.most_taps, look.reflectance, is_middle)
+            self._add(canvas, instant, path(moment), moment)
+        return Shot(self._develop(canvas.radiance, exposure, noise_key), depth, faces, count)
 
     def subframes(self, path: Path, t_s: float, exposure: Exposure) -> int:
         """How many pictures are averaged so that a thing 1.5 m away moves at most 1.2 px from one to the next."""
@@ -88,16 +92,12 @@ class Painter:
 
     def _develop(self, radiance: Array, exposure: Exposure, noise_key: int) -> Image:
         image = np.empty(radiance.shape, np.uint8)
-        gain = exposure.gain if self._look.has_noise else 0.0
-        read = (
-            float(np.hypot(_AFTER_GAIN_GREY, gain * _READ_ELECTRONS / _ELECTRONS_PER_GREY))
-            if self._look.has_noise
-            else 0.0
-        )
-        sensor_kernels.develop(
-            radiance, exposure.grey_per_radiance, gain / _ELECTRONS_PER_GREY, read, self._normals,
-            noise_key * 2 + self._number, self._optics.vignetting, image,
-        )  # fmt: skip
+        shot, read = 0.0, 0.0
+        if self._look.has_noise:
+            shot = exposure.gain / _ELECTRONS_PER_GREY
+            read = float(np.hypot(_AFTER_GAIN_GREY, exposure.gain * _READ_ELECTRONS / _ELECTRONS_PER_GREY))
+        noise = sensor_kernels.Noise(shot, read, self._normals, noise_key * 2 + self._number)
+        sensor_kernels.develop(radiance, exposure.grey_per_radiance, noise, self._optics.vignetting, image)
         return image
 
     def _prepare(self, scene: Scene, groups: Array, t_s: float) -> None:
@@ -135,15 +135,15 @@ class Painter:
         self._quads[-len(self._mover_faces) :] = builder.finish().quads
         return shadows
 
-    def _buffer(self, samples: int, *, is_mirror: bool = False) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    def _buffer(self, samples: int, *, is_mirror: bool = False) -> "_Buffer":
         key = -1 if is_mirror else samples
         if key not in self._buffers:
             width, height = int(self._optics.pinhole[4]) * samples, int(self._optics.pinhole[5]) * samples
-            self._buffers[key] = np.zeros((height, width), np.float32), np.zeros((height, width), np.int32)
-        nearness, owner = self._buffers[key]
-        nearness.fill(0.0)
-        owner.fill(-1)
-        return nearness, owner
+            nearness, owner = np.zeros((height, width), np.float32), np.zeros((height, width), np.int32)
+            self._buffers[key] = _Buffer(nearness, owner, samples)
+        self._buffers[key].nearness.fill(0.0)
+        self._buffers[key].owner.fill(-1)
+        return self._buffers[key]
 
     def _through_lens(self, owner: NDArray[np.int32], samples: int) -> NDArray[np.int32]:
         if not self._optics.has_lens:
@@ -154,37 +154,41 @@ class Painter:
         visibility_kernels.gather(owner, self._indices[samples], seen)
         return seen
 
-    def _add(
-        self, radiance: Array, map_from_cam: Array, t_s: float, weight: float, samples: int, shift: Array,
-        truth: tuple[NDArray[np.float32], NDArray[np.int32]], wants_truth: bool,
-    ) -> None:  # fmt: skip
-        """Adds one instant to `radiance`."""
+    def _add(self, canvas: Canvas, instant: Instant, map_from_cam: Array, t_s: float) -> None:
+        """Adds one instant to the canvas."""
         shadows = self._move(t_s)
-        optics, look, world = self._optics, self._look, self._world
+        pinhole, world, plan, mirror = self._optics.pinhole, self._world, self._plan, self._mirror_plan
         cam_from_map = np.ascontiguousarray(se3_inverse(map_from_cam)[:3, :3])
         centre = np.ascontiguousarray(map_from_cam[:3, 3])
-        plan, mirror = self._plan, self._mirror_plan
-        nearness, owner = self._buffer(samples)
+        buffer, mirror_buffer = self._buffer(instant.samples), self._buffer(1, is_mirror=True)
         count = self._project(plan, cam_from_map, centre, is_mirrored=False)
-        plan.paint(count, optics.pinhole, samples, shift, 0, nearness, owner)
-        mirror_nearness, mirror_owner = self._buffer(1, is_mirror=True)
-        first_row = visibility_kernels.first_floor_row(owner, plan.face_of, self._numbers, MATERIAL_FLOOR, samples)
-        if look.reflectance > 0 and first_row < mirror_owner.shape[0]:
+        plan.paint(count, pinhole, instant.shift, 0, buffer)
+        first_row = visibility_kernels.first_floor_row(
+            buffer.owner, plan.face_of, self._numbers, MATERIAL_FLOOR, instant.samples
+        )
+        if instant.reflectance > 0 and first_row < mirror_buffer.owner.shape[0]:
             count = self._project(mirror, cam_from_map, centre, is_mirrored=True)
-            mirror.paint(count, optics.pinhole, 1, np.zeros(2), max(0, first_row - 6), mirror_nearness, mirror_owner)
-        shading_kernels.shade_image(
-            samples, shift, weight, self._through_lens(owner, samples), plan.homographies, plan.face_of,
-            mirror_owner, mirror.homographies, mirror.face_of, self._quads, self._values, self._numbers, self._light,
-            self._groups, world.textures.atlas.texels, world.textures.atlas.table, world.decals, world.floor_numbers,
-            optics.pinhole, optics.rays, look.reflectance, float(centre[2]), shadows, look.most_taps,
-            radiance, wants_truth, truth[0], truth[1],
-        )  # fmt: skip
+            mirror.paint(count, pinhole, np.zeros(2), max(0, first_row - 6), mirror_buffer)
+        visible = Visible(self._through_lens(buffer.owner, instant.samples), plan.homographies, plan.face_of)
+        mirrored = Visible(mirror_buffer.owner, mirror.homographies, mirror.face_of)
+        atlas = (world.textures.atlas.texels, world.textures.atlas.table, world.decals, world.floor_numbers)
+        surfaces = Surfaces(self._quads, self._values, self._numbers, self._light, self._groups, *atlas)
+        view = (pinhole, self._optics.rays, float(centre[2]))
+        shading_kernels.shade_image(surfaces, visible, mirrored, instant, *view, shadows, canvas)
 
     def _project(self, plan: "_Plan", cam_from_map: Array, centre_map: Array, *, is_mirrored: bool) -> int:
-        return visibility_kernels.project_faces(
-            self._quads, self._ranges, self._bounds, cam_from_map, centre_map, self._optics.pinhole, is_mirrored,
-            plan.homographies, plan.polygons, plan.corner_counts, plan.face_of,
-        )  # fmt: skip
+        chunks = (self._quads, self._ranges, self._bounds)
+        arguments = (*chunks, cam_from_map, centre_map, self._optics.pinhole, is_mirrored)
+        columns = (plan.homographies, plan.polygons, plan.corner_counts, plan.face_of)
+        return visibility_kernels.project_faces(*arguments, *columns)
+
+
+class _Buffer(NamedTuple):
+    """1/z and visible polygon of each sample, samples x samples per pixel."""
+
+    nearness: NDArray[np.float32]
+    owner: NDArray[np.int32]
+    samples: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,25 +205,8 @@ class _Plan:
         polygons = np.zeros((faces, visibility_kernels.MOST_CORNERS, 2))
         return cls(np.zeros((faces, 9)), polygons, np.zeros(faces, np.int32), np.zeros(faces, np.int32))
 
-    def paint(
-        self,
-        count: int,
-        pinhole: Array,
-        samples: int,
-        shift: Array,
-        first_row: int,
-        nearness: NDArray[np.float32],
-        owner: NDArray[np.int32],
-    ) -> None:
-        visibility_kernels.paint_polygons(
-            count,
-            self.polygons,
-            self.corner_counts,
-            self.homographies,
-            pinhole,
-            samples,
-            shift,
-            first_row * samples,
-            nearness,
-            owner,
-        )
+    def paint(self, count: int, pinhole: Array, shift: Array, first_row: int, buffer: _Buffer) -> None:
+        nearness, owner, samples = buffer
+        polygons = (self.polygons, self.corner_counts, self.homographies)
+        first_row *= samples
+        visibility_kernels.paint_polygons(count, *polygons, pinhole, samples, shift, first_row, nearness, owner)

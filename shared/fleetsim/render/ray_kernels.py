@@ -1,6 +1,7 @@
 """Rays against yawed boxes in a uniform grid: for baking light, and in the tests to check the painter."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +10,29 @@ from fleetmap.numerics.kernel import kernel
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+Int32 = NDArray[np.int32]
 _FAR = 1e30
 
 
+class BoxGrid(NamedTuple):
+    """Boxes (B, 8) as in `Faces` in a uniform grid of counts (3,) cells from the corner `low` (3,) on, as CSR lists."""
+
+    boxes: Float
+    low: Float
+    cell_m: float
+    counts: Int
+    starts: Int32
+    items: Int32
+
+
+def box_grid(boxes: Float, low: Float, high: Float, cell_m: float) -> BoxGrid:
+    """The grid of boxes between two corners (3,)."""
+    counts = np.ceil((high - low) / cell_m).astype(np.int64)
+    return BoxGrid(boxes, low, cell_m, counts, *fill_grid(boxes, low, cell_m, counts))
+
+
 @kernel
-def fill_grid(boxes: Float, low: Float, cell_m: float, counts: Int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def fill_grid(boxes: Float, low: Float, cell_m: float, counts: Int) -> tuple[Int32, Int32]:
     """CSR lists of the boxes (B, 8) that touch each cell: starts (cells + 1,), items.
 
     Boxes outside the grid are clamped out.
@@ -84,22 +103,13 @@ def hit_box(boxes: Float, b: int, origin: Float, direction: Float) -> tuple[floa
 
 @kernel
 def cast_ray(
-    boxes: Float,
-    starts: NDArray[np.int32],
-    items: NDArray[np.int32],
-    low: Float,
-    cell_m: float,
-    counts: Int,
-    origin: Float,
-    direction: Float,
-    farthest: float,
-    is_any_enough: bool,
-    skipped_box: int,
+    grid: BoxGrid, origin: Float, direction: Float, farthest: float, is_any_enough: bool, skipped_box: int
 ) -> tuple[float, int, int]:
     """Nearest hit (parameter, box, side) up to `farthest`, box -1 without one; any hit if that is enough (shadows).
 
     Walks the grid cell by cell from an origin inside it. Source: Amanatides and Woo 1987.
     """
+    boxes, low, cell_m, counts, starts, items = grid
     cell = np.empty(3, np.int64)
     step = np.empty(3, np.int64)
     crossing = np.empty(3)
@@ -140,31 +150,24 @@ def cast_ray(
 
 @kernel
 def bake_faces(
-    first: int,
-    last: int,
     quads: Float,
-    numbers: NDArray[np.int32],
-    owners: NDArray[np.int32],
+    numbers: Int32,
+    owners: Int32,
     owner_shift: int,
-    boxes: Float,
-    starts: NDArray[np.int32],
-    items: NDArray[np.int32],
-    low: Float,
-    cell_m: float,
-    counts: Int,
+    grid: BoxGrid,
     lamps: Float,
     reach_m: float,
     has_shadows: bool,
     light: NDArray[np.float32],
 ) -> None:
-    """Adds the direct light of `lamps` (L, 5: x y z power group) to the light samples of faces first..last.
+    """Adds the direct light of `lamps` (L, 5: x y z power group) to the light samples of faces.
 
     light (groups, samples). The lamp term is 1 / (r^2 + 3), softened because lamps are long; it fades to 0 at reach_m.
-    owners' boxes are at owner_shift + their number in `boxes`.
+    owners' boxes are at owner_shift + their number in the grid's boxes.
     """
     origin = np.empty(3)
     direction = np.empty(3)
-    for f in range(first, last):
+    for f in range(quads.shape[0]):
         ux, uy, uz = quads[f, 3], quads[f, 4], quads[f, 5]
         vx, vy, vz = quads[f, 6], quads[f, 7], quads[f, 8]
         nx, ny, nz = vy * uz - vz * uy, vz * ux - vx * uz, vx * uy - vy * ux
@@ -192,9 +195,7 @@ def bake_faces(
                     cosine /= distance
                     if has_shadows:
                         direction[0], direction[1], direction[2] = dx / distance, dy / distance, dz / distance
-                        _, box, _ = cast_ray(
-                            boxes, starts, items, low, cell_m, counts, origin, direction, distance, True, skipped
-                        )
+                        _, box, _ = cast_ray(grid, origin, direction, distance, True, skipped)
                         if box >= 0:
                             continue
                     fade = 1.0 - squared / (reach_m * reach_m)

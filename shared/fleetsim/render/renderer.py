@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,23 +34,30 @@ class StereoShot:
     subframes: int
 
 
+@dataclass(frozen=True, slots=True)
+class RenderOptions:
+    """Light and movers of the scene, quality and faults of the pictures; `key` chooses the noise."""
+
+    light: str = "day"
+    look: Look = field(default_factory=Look)
+    movers: tuple[AnyMover, ...] = ()
+    faults: FaultPlan = field(default_factory=FaultPlan)
+    key: int = 0
+
+
 class StereoRenderer:
     """Renders what a rig sees while it moves through a world. Its two threads end with `close`."""
 
-    def __init__(
-        self, world: World, rig: RigCalibration, motion: Motion, light: str, *, look: Look | None = None,
-        movers: tuple[AnyMover, ...] = (), faults: FaultPlan | None = None, key: int = 0,
-    ) -> None:  # fmt: skip
+    def __init__(self, world: World, rig: RigCalibration, motion: Motion, options: RenderOptions) -> None:
         self._world, self._rig, self._motion = world, rig, motion
-        self._groups = np.array(LIGHT_STATES[light])
-        self.faults = faults or FaultPlan()
+        self._groups, self._key, self.faults = np.array(LIGHT_STATES[options.light]), options.key, options.faults
         self.imu_minus_cam_s = rig.cameras[0].imu_minus_cam_s
-        self._key = key
         self._exposure = AutoExposure()
+        movers = options.movers
         if any(fault.name == "person-in-front" for fault in self.faults.faults):
             movers = (*movers, Apparition("person", self._person_in_front))
-        look = look or Look()
-        self._painters = [Painter(world, make_optics(c), look, number, movers) for number, c in enumerate(rig.cameras)]
+        optics = [make_optics(camera) for camera in rig.cameras]
+        self._painters = [Painter(world, each, options.look, number, movers) for number, each in enumerate(optics)]
         self._workers = ThreadPoolExecutor(len(self._painters))
         self._last_right: Image | None = None
 
@@ -100,7 +107,6 @@ class StereoRenderer:
         if not self.faults.has("person-in-front", t_s):
             return None
         map_from_cam = self.path(0)(t_s)
-        ahead = map_from_cam[:3, 3] + _PERSON_AHEAD_M * map_from_cam[:3, 2] / np.hypot(
-            map_from_cam[0, 2], map_from_cam[1, 2]
-        )
-        return float(ahead[0]), float(ahead[1]), float(np.arctan2(map_from_cam[1, 2], map_from_cam[0, 2])) + np.pi
+        x, y, _ = map_from_cam[:3, 2]
+        ahead = map_from_cam[:3, 3] + _PERSON_AHEAD_M * map_from_cam[:3, 2] / np.hypot(x, y)
+        return float(ahead[0]), float(ahead[1]), float(np.arctan2(y, x)) + np.pi

@@ -1,6 +1,7 @@
 """From radiance to grey levels: gain, vignetting, shot and read noise."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,22 +9,28 @@ from numpy.typing import NDArray
 from fleetmap.numerics.kernel import kernel
 
 
+class Noise(NamedTuple):
+    """Shot noise of variance `shot` * value, read noise of standard deviation `read`, both in grey levels.
+
+    normals: table of standard normals, its length a power of two; each row starts at a place mixed from `key`.
+    """
+
+    shot: float
+    read: float
+    normals: NDArray[np.float32]
+    key: int
+
+
 @kernel
 def develop(
     radiance: NDArray[np.float64],
     gain: float,
-    shot: float,
-    read: float,
-    normals: NDArray[np.float32],
-    noise_key: int,
+    noise: Noise,
     vignetting: NDArray[np.float32],
     image: NDArray[np.uint8],
 ) -> None:
-    """Fills `image` (H, W) with gain * vignetting * radiance plus noise of variance read^2 + shot * value, clipped.
-
-    normals: table of standard normals, its length a power of two; each row starts at a place mixed from noise_key.
-    Source of the mixing: splitmix64.
-    """
+    """Fills `image` (H, W) with gain * vignetting * radiance plus noise, clipped. Source of the mixing: splitmix64."""
+    shot, read, normals, noise_key = noise
     height, width = radiance.shape
     mask = normals.shape[0] - 1
     state = np.uint64(noise_key) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(0x1234567)

@@ -5,6 +5,7 @@ Helpers and caller share this file because numba's cache does not see changes in
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,54 @@ Bytes = NDArray[np.uint8]
 _WRAP = 1048575.5
 _GLOSS = 9.0  # footprint area of a reflection: the polish is not perfect
 _JOINT_M = 4.4
+
+
+class Surfaces(NamedTuple):
+    """All that is painted: columns of faces as in `Faces` with their light at this moment, textures as in `Atlas`.
+
+    groups (3,): strengths of the lamp groups. decals (rows, columns): texture * 4 + quarter turns of each cell of the
+    floor, -1 for none. floor (2,): numbers of the coarse concrete and the dirt texture.
+    """
+
+    quads: Float
+    values: Float
+    numbers: Int32
+    light: NDArray[np.float32]
+    groups: Float
+    texels: Bytes
+    table: Int32
+    decals: Int32
+    floor: Int32
+
+
+class Visible(NamedTuple):
+    """Visible polygons: owner (H S, W S) is the one of each sample; homographies and face of each."""
+
+    owner: Int32
+    homographies: Float
+    face_of: Int32
+
+
+class Instant(NamedTuple):
+    """One instant of an exposure: samples per pixel side, shift of the samples (2,) in pixels, weight in the picture.
+
+    most_taps, reflectance as in `Look`. wants_truth: whether depth and faces are filled.
+    """
+
+    samples: int
+    shift: Float
+    weight: float
+    most_taps: int
+    reflectance: float
+    wants_truth: bool
+
+
+class Canvas(NamedTuple):
+    """A picture in the making (H, W): radiance, depth along the optical axis, face of each pixel (-1 for nothing)."""
+
+    radiance: Float
+    depth_m: NDArray[np.float32]
+    faces: Int32
 
 
 @inline_kernel
@@ -41,8 +90,7 @@ def bilinear(
 
 @inner_kernel
 def sample(
-    texels: Bytes,
-    table: Int32,
+    surfaces: Surfaces,
     texture: int,
     x: float,
     y: float,
@@ -59,6 +107,7 @@ def sample(
     Up to `most_taps` taps along the footprint's long axis, each from the nearest level; with one tap two levels are
     blended. area: factor on the footprint's area.
     """
+    texels, table = surfaces.texels, surfaces.table
     longer, shorter = ax * ax + ay * ay, bx * bx + by * by
     if longer < shorter:
         ax, ay = bx, by
@@ -129,16 +178,15 @@ def joint_factor(distance_m: float, width_texels: float) -> float:
 
 @inner_kernel
 def floor_pattern(
-    texels: Bytes, table: Int32, decals: Int32, coarse: int, x: float, y: float, ax: float, ay: float, bx: float, by:
-    float, most_taps: int, area: float,
-) -> float:  # fmt: skip
-    """What multiplies the concrete at texel (x, y): a coarse second tiling, decals in cells of 1.28 m, joints."""
+    surfaces: Surfaces, x: float, y: float, ax: float, ay: float, bx: float, by: float, most_taps: int, area: float
+) -> float:
+    """Factor of the concrete's grey at texel (x, y): a coarse second tiling, decals in cells of 1.28 m, joints."""
     shrink = 0.155  # the second tiling is 6.5 times larger and turned by 31 degrees
     cosine, sine = 0.857 * shrink, 0.515 * shrink
-    factor = sample(
-        texels, table, coarse, x * cosine - y * sine, x * sine + y * cosine,
-        ax * shrink, ay * shrink, bx * shrink, by * shrink, 1, area, False,
-    ) * (1.0 / 128.0)  # fmt: skip
+    cx, cy, cax, cay = x * cosine - y * sine, x * sine + y * cosine, ax * shrink, ay * shrink
+    coarse = sample(surfaces, surfaces.floor[0], cx, cy, cax, cay, bx * shrink, by * shrink, 1, area, False)
+    factor = coarse * (1.0 / 128.0)
+    decals = surfaces.decals
     column, row = int(x * (1.0 / 512.0)), int(y * (1.0 / 512.0))
     decal = decals[row & (decals.shape[0] - 1), column & (decals.shape[1] - 1)]
     if decal >= 0:
@@ -149,7 +197,7 @@ def floor_pattern(
             qax, qay, qbx, qby = qay, -qax, qby, -qbx
         if decal & 2:
             px, py = 256.0 - px, 256.0 - py
-        factor *= sample(texels, table, decal >> 2, px, py, qax, qay, qbx, qby, most_taps, area, True) * (1.0 / 128.0)
+        factor *= sample(surfaces, decal >> 2, px, py, qax, qay, qbx, qby, most_taps, area, True) * (1.0 / 128.0)
     x_m, y_m = x * 0.0025, y * 0.0025
     off_x = abs(x_m - _JOINT_M * math.floor(x_m * (1.0 / _JOINT_M) + 0.5))
     off_y = abs(y_m - _JOINT_M * math.floor(y_m * (1.0 / _JOINT_M) + 0.5))
@@ -162,28 +210,22 @@ def floor_pattern(
 
 @inner_kernel
 def shade(
+    surfaces: Surfaces,
+    visible: Visible,
     k: int,
-    f: int,
     xn: float,
     yn: float,
     per_px_x: float,
     per_px_y: float,
-    homographies: Float,
-    values: Float,
-    numbers: Int32,
-    light: NDArray[np.float32],
-    groups: Float,
-    texels: Bytes,
-    table: Int32,
-    decals: Int32,
-    floor: Int32,
     most_taps: int,
     area: float,
 ) -> tuple[float, float, float, float]:
-    """Radiance of face f (visible polygon k) along the ray (xn, yn, 1), and u, v, 1/z there.
+    """Radiance of visible polygon k along the ray (xn, yn, 1), and u, v, 1/z there.
 
-    per_px_x, per_px_y: how far xn and yn move per pixel. floor: numbers of the coarse concrete and the dirt texture.
+    per_px_x, per_px_y: how far xn and yn move per pixel. area: as in `sample`.
     """
+    f, homographies = visible.face_of[k], visible.homographies
+    values, numbers, light = surfaces.values, surfaces.numbers, surfaces.light
     # Each entry by itself: a row of the array would be a counted reference, which costs more than the arithmetic.
     h0, h1, h2 = homographies[k, 0], homographies[k, 1], homographies[k, 2]
     h3, h4, h5 = homographies[k, 3], homographies[k, 4], homographies[k, 5]
@@ -194,7 +236,7 @@ def shade(
     v = (h3 * xn + h4 * yn + h5) * z
     material = numbers[f, 0]
     if material == 2:
-        return values[f, 5] * groups[numbers[f, 2]], u, v, w
+        return values[f, 5] * surfaces.groups[numbers[f, 2]], u, v, w
     along_u, along_v = values[f, 0], values[f, 1]
     step_x, step_y = per_px_x * z, per_px_y * z
     ax, ay = (h0 - u * h6) * step_x * along_u, (h3 - v * h6) * step_x * along_v
@@ -204,12 +246,12 @@ def shade(
     if is_floor:
         x += values[f, 3]
         y += values[f, 4]
-    grey = sample(texels, table, numbers[f, 1], x, y, ax, ay, bx, by, most_taps, area, True)
+    grey = sample(surfaces, numbers[f, 1], x, y, ax, ay, bx, by, most_taps, area, True)
     if is_floor:
-        grey *= floor_pattern(texels, table, decals, floor[0], x, y, ax, ay, bx, by, most_taps, area)
+        grey *= floor_pattern(surfaces, x, y, ax, ay, bx, by, most_taps, area)
     elif area == 1.0:  # a reflection is too blurred to show the dirt
         dirt_x, dirt_y = x + values[f, 3], y + values[f, 4]
-        grey *= sample(texels, table, floor[1], dirt_x, dirt_y, ax, ay, bx, by, 1, area, False) * (1.0 / 128.0)
+        grey *= sample(surfaces, surfaces.floor[1], dirt_x, dirt_y, ax, ay, bx, by, 1, area, False) * (1.0 / 128.0)
     columns, rows = numbers[f, 4], numbers[f, 5]
     p, q = min(max(u, 0.0), 1.0) * (columns - 1), min(max(v, 0.0), 1.0) * (rows - 1)
     i, j = min(int(p), columns - 2), min(int(q), rows - 2)
@@ -225,43 +267,27 @@ def shade(
 
 @kernel
 def shade_image(
-    samples: int,
-    shift: Float,
-    weight: float,
-    owner: Int32,
-    homographies: Float,
-    face_of: Int32,
-    mirror_owner: Int32,
-    mirror_homographies: Float,
-    mirror_face_of: Int32,
-    quads: Float,
-    values: Float,
-    numbers: Int32,
-    light: NDArray[np.float32],
-    groups: Float,
-    texels: Bytes,
-    table: Int32,
-    decals: Int32,
-    floor: Int32,
+    surfaces: Surfaces,
+    visible: Visible,
+    mirror: Visible,
+    instant: Instant,
     pinhole: Float,
     rays: NDArray[np.float32],
-    reflectance: float,
     camera_height_m: float,
     shadows: Float,
-    most_taps: int,
-    radiance: Float,
-    wants_truth: bool,
-    depth_m: NDArray[np.float32],
-    faces: Int32,
+    canvas: Canvas,
 ) -> None:
-    """Adds `weight` times the picture to `radiance` (H, W).
+    """Adds an instant's weighted picture to the canvas.
 
-    owner (H S, W S): visible polygon per sample; equal ones in a pixel are shaded once, at their mean place. rays (H,
-    W, 4): a lens' xn, yn and their change per pixel, empty for a pinhole. mirror_*: the world reflected in the floor,
-    one
-    sample per pixel of the pinhole. shadows (M, 3): x, y, 1 / radius^2 of soft contact shadows on the floor.
-    With wants_truth also depth_m (along the optical axis) and the face of each pixel (-1 nothing).
+    Samples of one polygon in a pixel are shaded once, at their mean place. mirror: the world reflected in the floor,
+    one sample per pixel of the pinhole. rays (H, W, 4): a lens' xn, yn and their change per pixel, empty for a pinhole.
+    shadows (M, 3): x, y, 1 / radius^2 of soft contact shadows on the floor.
     """
+    samples, shift, weight, most_taps, reflectance, wants_truth = instant
+    radiance, depth_m, faces = canvas
+    owner, face_of, mirror_owner = visible.owner, visible.face_of, mirror.owner
+    quads, numbers, floor = surfaces.quads, surfaces.numbers, surfaces.floor
+    texels, table = surfaces.texels, surfaces.table
     height, width = radiance.shape
     mirror_height, mirror_width = mirror_owner.shape
     has_lens = rays.shape[0] > 0
@@ -310,10 +336,7 @@ def shade_image(
                 else:
                     xn = (x + off_x + shift[0] - pinhole[2]) * per_px_x
                     yn = (y + off_y + shift[1] - pinhole[3]) * per_px_y
-                value, u, v, w = shade(
-                    k, f, xn, yn, per_px_x, per_px_y, homographies, values, numbers, light, groups,
-                    texels, table, decals, floor, most_taps, 1.0,
-                )  # fmt: skip
+                value, u, v, w = shade(surfaces, visible, k, xn, yn, per_px_x, per_px_y, most_taps, 1.0)
                 if numbers[f, 0] == 1:
                     x_map, y_map = quads[f, 0] + u * quads[f, 3], quads[f, 1] + v * quads[f, 7]
                     for s in range(shadows.shape[0]):
@@ -335,11 +358,8 @@ def shade_image(
                         column = min(max(math.floor(px + 0.5), 0), mirror_width - 1)
                         m = mirror_owner[row, column]
                         if m >= 0:
-                            mirrored, _, _, _ = shade(
-                                m, mirror_face_of[m], (px - pinhole[2]) * wide_x, (py - pinhole[3]) * wide_y,
-                                per_px_x, per_px_y, mirror_homographies, values, numbers, light, groups,
-                                texels, table, decals, floor, 1, _GLOSS,
-                            )  # fmt: skip
+                            mx, my = (px - pinhole[2]) * wide_x, (py - pinhole[3]) * wide_y
+                            mirrored, _, _, _ = shade(surfaces, mirror, m, mx, my, per_px_x, per_px_y, 1, _GLOSS)
                             value += fresnel * 0.75 * min(mirrored, 4.0)
                 total += value * hits[n]
                 if wants_truth and n == 0:

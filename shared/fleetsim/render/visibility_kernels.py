@@ -1,4 +1,4 @@
-"""Which face is seen at which sample: projection, clipping and scan conversion with a 1/z test.
+"""Visible face of each sample: projection, clipping and scan conversion with a 1/z test.
 
 A view is the array `pinhole` = (fx, fy, cx, cy, width, height) of an undistorted image plane in pixels.
 """
@@ -102,16 +102,10 @@ def project_faces(
             scale = 1.0 / determinant
             row = homographies[count]
             row[0], row[1], row[2] = x0 * scale, x1 * scale, x2 * scale
-            row[3], row[4], row[5] = (
-                (c1 * a2 - c2 * a1) * scale,
-                (c2 * a0 - c0 * a2) * scale,
-                (c0 * a1 - c1 * a0) * scale,
-            )
-            row[6], row[7], row[8] = (
-                (a1 * b2 - a2 * b1) * scale,
-                (a2 * b0 - a0 * b2) * scale,
-                (a0 * b1 - a1 * b0) * scale,
-            )
+            y0, y1, y2 = c1 * a2 - c2 * a1, c2 * a0 - c0 * a2, c0 * a1 - c1 * a0
+            row[3], row[4], row[5] = y0 * scale, y1 * scale, y2 * scale
+            z0, z1, z2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+            row[6], row[7], row[8] = z0 * scale, z1 * scale, z2 * scale
             corner_counts[count] = clip_near(corner, behind > 0, pinhole, polygons[count])
             face_of[count] = f
             count += 1

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from fleetsim.scene.faces import MATERIAL_FLOOR, MATERIAL_LAMP, NO_BOTTOM, FaceBuilder
+from fleetsim.scene.faces import MATERIAL_FLOOR, MATERIAL_LAMP, NO_BOTTOM, FaceBuilder, Surface
 from fleetsim.scene.layout import Layout, Rectangle
 from fleetsim.scene.stock import mix
 from fleetsim.textures.atlas import TEXEL_M
@@ -76,10 +76,9 @@ class HallMaker:
 
     def _add_floor_quad(self, builder: FaceBuilder, rectangle: Rectangle, z_m: float, texture: int, row: int) -> None:
         x_min, y_min, x_max, y_max = rectangle
-        builder.add_quad(
-            (x_min, y_max, z_m), (x_max - x_min, 0, 0), (0, y_min - y_max, 0), texture,
-            material=MATERIAL_FLOOR, offset_texels=self._offset_texels(x_min, y_max, row),
-        )  # fmt: skip
+        offset_texels = self._offset_texels(x_min, y_max, row)
+        surface = Surface(texture, material=MATERIAL_FLOOR, offset_texels=offset_texels)
+        builder.add_quad((x_min, y_max, z_m), (x_max - x_min, 0, 0), (0, y_min - y_max, 0), surface)
 
     def _add_floor(self, builder: FaceBuilder, column: int, row: int) -> None:
         self._add_floor_quad(builder, self.rectangle(column, row), 0.0, self._textures.concrete, row)
@@ -112,10 +111,8 @@ class HallMaker:
         if column == columns - 1:
             spans.append(((layout.length_m, y_max), (0.0, y_min - y_max)))
         for number, ((x, y), (along_x, along_y)) in enumerate(spans):
-            scramble = self._scramble(column, row, number)
-            builder.add_quad(
-                (x, y, top), (along_x, along_y, 0), (0, 0, -top), self._textures.wall, tint=0.9, scramble=scramble
-            )
+            surface = Surface(self._textures.wall, 0.9, self._scramble(column, row, number))
+            builder.add_quad((x, y, top), (along_x, along_y, 0), (0, 0, -top), surface)
 
     def _add_roof(self, builder: FaceBuilder, column: int, row: int) -> None:
         layout, textures = self._layout, self._textures
@@ -123,29 +120,16 @@ class HallMaker:
         top, middle_x, middle_y = layout.ceiling_m, (x_min + x_max) / 2, (y_min + y_max) / 2
         length, width = x_max - x_min, y_max - y_min
         scramble = self._scramble(column, row, 10)
-        builder.add_quad((x_min, y_min, top), (length, 0, 0), (0, width, 0), textures.dark, scramble=scramble)
+        roof = Surface(textures.dark, scramble=scramble)
+        builder.add_quad((x_min, y_min, top), (length, 0, 0), (0, width, 0), roof)
+        beam = Surface(textures.grey, 0.8, scramble + 1)
         for x in (x_min + length / 4, x_max - length / 4):
-            builder.add_box(
-                (x, middle_y, top - 0.25),
-                (0.1, width / 2, 0.2),
-                textures.grey,
-                sides="xXz",
-                tint=0.8,
-                scramble=scramble + 1,
-            )
-        builder.add_box(
-            (middle_x, y_min + 0.6, top - 0.45),
-            (length / 2, 0.12, 0.1),
-            textures.grey,
-            sides="yYz",
-            tint=1.1,
-            scramble=scramble,
-        )
+            builder.add_box((x, middle_y, top - 0.25), (0.1, width / 2, 0.2), beam, sides="xXz")
+        duct = Surface(textures.grey, 1.1, scramble)
+        builder.add_box((middle_x, y_min + 0.6, top - 0.45), (length / 2, 0.12, 0.1), duct, sides="yYz")
         sky_y = layout.aisle_y_m(row) + 0.3 * layout.pitch_m
-        builder.add_quad(
-            (middle_x - 1, sky_y - 0.6, top - 0.01), (2, 0, 0), (0, 1.2, 0), textures.lamp,
-            material=MATERIAL_LAMP, emission=14.0, group=GROUP_SKY,
-        )  # fmt: skip
+        skylight = Surface(textures.lamp, material=MATERIAL_LAMP, emission=14.0, group=GROUP_SKY)
+        builder.add_quad((middle_x - 1, sky_y - 0.6, top - 0.01), (2, 0, 0), (0, 1.2, 0), skylight)
 
     def _lamp_places(self, column: int, row: int) -> list[tuple[float, int]]:
         x_min, _, x_max, _ = self.rectangle(column, row)
@@ -161,11 +145,10 @@ class HallMaker:
         y, z = self._layout.aisle_y_m(row), self._layout.ceiling_m
         textures = self._textures
         for x, group in self._lamp_places(column, row):
-            builder.add_box(
-                (x, y, z - 0.75), (0.75, 0.12, 0.05), textures.lamp,
-                sides="z", material=MATERIAL_LAMP, emission=9.0, group=group, is_solid=False,
-            )  # fmt: skip
-            builder.add_box((x, y, z - 0.74), (0.77, 0.14, 0.06), textures.grey, sides="xXyY", is_solid=False)
+            lamp = Surface(textures.lamp, material=MATERIAL_LAMP, emission=9.0, group=group)
+            builder.add_box((x, y, z - 0.75), (0.75, 0.12, 0.05), lamp, sides="z", is_solid=False)
+            housing = Surface(textures.grey)
+            builder.add_box((x, y, z - 0.74), (0.77, 0.14, 0.06), housing, sides="xXyY", is_solid=False)
 
     def _has_dock(self, column: int, row: int) -> bool:
         return column == 0 and row % 2 == 0
@@ -177,14 +160,12 @@ class HallMaker:
         """A dock door in the wall at x = 0: open ones glow by day. Hazard-striped posts beside it."""
         y, textures = self._layout.aisle_y_m(row), self._textures
         half = _DOCK_HALF_WIDTH_M
-        builder.add_quad(
-            (0.02, y - half, _DOCK_HEIGHT_M), (0, 2 * half, 0), (0, 0, -_DOCK_HEIGHT_M), textures.lamp,
-            material=MATERIAL_LAMP, emission=6.0 if self._is_dock_open(row) else 0.9, group=GROUP_SKY,
-        )  # fmt: skip
+        emission = 6.0 if self._is_dock_open(row) else 0.9
+        door = Surface(textures.lamp, material=MATERIAL_LAMP, emission=emission, group=GROUP_SKY)
+        builder.add_quad((0.02, y - half, _DOCK_HEIGHT_M), (0, 2 * half, 0), (0, 0, -_DOCK_HEIGHT_M), door)
         for number, side in enumerate((-half - 0.2, half + 0.2)):
-            post = (0.1, y + side, _DOCK_HEIGHT_M / 2)
-            scramble = self._scramble(0, row, 20 + number)
-            builder.add_box(post, (0.1, 0.15, _DOCK_HEIGHT_M / 2), textures.hazard, sides="XyYZ", scramble=scramble)
+            post = Surface(textures.hazard, scramble=self._scramble(0, row, 20 + number))
+            builder.add_box((0.1, y + side, _DOCK_HEIGHT_M / 2), (0.1, 0.15, _DOCK_HEIGHT_M / 2), post, sides="XyYZ")
 
     def _add_posters(self, builder: FaceBuilder, column: int, row: int) -> None:
         """Notices on the outer walls, 15 mm in front, all placed by the seed."""
@@ -196,18 +177,16 @@ class HallMaker:
             side = 0.5 + 0.12 * ((bits >> 32) & 0xFF) / 0xFF
             x = x_min + 0.4 + along * (x_max - x_min - side - 0.8)
             y = y_min + 0.4 + along * (y_max - y_min - side - 0.8)
-            poster = self._textures.posters[(bits >> 40) % len(self._textures.posters)]
-            down = (0.0, 0.0, -side)
+            texture = self._textures.posters[(bits >> 40) % len(self._textures.posters)]
+            poster, down = Surface(texture, scramble=bits >> 44), (0.0, 0.0, -side)
             if number % 4 == 0 and row == 0:
-                builder.add_quad((x + side, 0.015, up), (-side, 0, 0), down, poster, scramble=bits >> 44)
+                builder.add_quad((x + side, 0.015, up), (-side, 0, 0), down, poster)
             elif number % 4 == 1 and row == rows - 1:
-                builder.add_quad((x, layout.width_m - 0.015, up), (side, 0, 0), down, poster, scramble=bits >> 44)
+                builder.add_quad((x, layout.width_m - 0.015, up), (side, 0, 0), down, poster)
             elif number % 4 == 2 and column == columns - 1:
-                builder.add_quad(
-                    (layout.length_m - 0.015, y + side, up), (0, -side, 0), down, poster, scramble=bits >> 44
-                )
+                builder.add_quad((layout.length_m - 0.015, y + side, up), (0, -side, 0), down, poster)
             elif number % 4 == 3 and column == 0 and not self._has_dock(column, row):
-                builder.add_quad((0.015, y, up), (0, side, 0), down, poster, scramble=bits >> 44)
+                builder.add_quad((0.015, y, up), (0, side, 0), down, poster)
 
     def _add_columns(self, builder: FaceBuilder, column: int, row: int) -> None:
         layout, textures = self._layout, self._textures
@@ -216,17 +195,18 @@ class HallMaker:
                 continue
             scramble = self._scramble(column, row, 30)
             half = layout.ceiling_m / 2
-            builder.add_box((x, y, half), (0.18, 0.18, half), textures.grey, sides="xXyY", tint=1.2, scramble=scramble)
-            builder.add_box((x, y, 0.45), (0.2, 0.2, 0.45), textures.hazard, sides=NO_BOTTOM, scramble=scramble)
+            shaft, guard = Surface(textures.grey, 1.2, scramble), Surface(textures.hazard, scramble=scramble)
+            builder.add_box((x, y, half), (0.18, 0.18, half), shaft, sides="xXyY")
+            builder.add_box((x, y, 0.45), (0.2, 0.2, 0.45), guard, sides=NO_BOTTOM)
             if layout.has_landmarks:
                 plates = ((0.185, -0.2, 0.4, 2.2, 3 * number + 1), (-0.185, 0.2, -0.4, 1.9, 3 * number + 2))
                 for dx, dy, span, height, poster in plates:
-                    texture = textures.posters[poster % len(textures.posters)]
-                    builder.add_quad((x + dx, y + dy, height), (0, span, 0), (0, 0, -0.4), texture, scramble=scramble)
+                    plate = Surface(textures.posters[poster % len(textures.posters)], scramble=scramble)
+                    builder.add_quad((x + dx, y + dy, height), (0, span, 0), (0, 0, -0.4), plate)
 
     def _add_signs(self, builder: FaceBuilder, column: int, row: int) -> None:
         """The aisle's number, hanging over both of its mouths."""
-        layout = self._layout
+        layout, sign = self._layout, Surface(self._textures.signs[row])
         for x in (layout.end_m - 0.6, layout.bay_x_m(layout.bays) + 0.6):
             if layout.chunk_at(x, layout.aisle_y_m(row))[0] == column:
-                builder.add_box((x, layout.aisle_y_m(row), 4.6), (0.03, 0.32, 0.32), self._textures.signs[row])
+                builder.add_box((x, layout.aisle_y_m(row), 4.6), (0.03, 0.32, 0.32), sign)

@@ -4,6 +4,7 @@ A face is its origin O (top left seen from outside), edge U (to the right), edge
 """
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ MATERIAL_PLAIN, MATERIAL_FLOOR, MATERIAL_LAMP = 0, 1, 2
 FACE_NAMES = "xXyYzZ"  # lower case: the negative side
 ALL_SIDES, NO_TOP, NO_BOTTOM = "xXyYzZ", "xXyYz", "xXyYZ"
 LIGHT_GRID_M = 0.6
+Vector = tuple[float, float, float]
 
 # One row per face of a box: factors of (hx, hy, hz) along the box axes for O, U and V.
 _CORNERS = {
@@ -34,10 +36,8 @@ class Faces:
 
     quads (F, 9): O, U, V in map, metres. values (F, 6): texels along U and V, tint, offset of the dirt (for floors: of
     the concrete) in texels x2, emission. numbers (F, 6): material, texture, lamp group, first light sample, light
-    samples
-    along U and V. owners (F, 2): box and side (index in FACE_NAMES), -1 without a box. boxes (B, 8): centre, half
-    sizes, cos
-    and sin of yaw.
+    samples along U and V. owners (F, 2): box and side (index in FACE_NAMES), -1 without a box. boxes (B, 8): centre,
+    half sizes, cos and sin of yaw.
     """
 
     quads: Array
@@ -57,6 +57,22 @@ class Faces:
         return np.concatenate([corners.min(0), corners.max(0)])
 
 
+class Surface(NamedTuple):
+    """The look of a face or box. texture: of all sides of a box, or by the side's name.
+
+    scramble chooses the face's window of the dirt texture; offset_texels replaces the offset that follows from it
+    (floor tiles meet through it).
+    """
+
+    texture: int | dict[str, int]
+    tint: float = 1.0
+    scramble: int = 0
+    material: int = MATERIAL_PLAIN
+    emission: float = 0.0
+    group: int = 0
+    offset_texels: tuple[float, float] = (-1.0, -1.0)
+
+
 @dataclass(slots=True)
 class FaceBuilder:
     """Collects boxes and single faces, then makes `Faces` of them all at once.
@@ -74,46 +90,28 @@ class FaceBuilder:
 
     def add_box(
         self,
-        centre_map: tuple[float, float, float],
-        half_m: tuple[float, float, float],
-        texture: int | dict[str, int],
+        centre_map: Vector,
+        half_m: Vector,
+        surface: Surface,
         *,
         yaw_rad: float = 0.0,
         sides: str = ALL_SIDES,
-        tint: float = 1.0,
-        scramble: int = 0,
-        material: int = MATERIAL_PLAIN,
-        emission: float = 0.0,
-        group: int = 0,
         is_solid: bool = True,
     ) -> None:
-        """A box turned by yaw.
-
-        `texture` for all sides or per side; `scramble` chooses its window of the dirt texture.
-        """
+        """A box turned by yaw; only the given sides are seen, only solid boxes stop rays."""
+        texture, tint, scramble, material, emission, group, _ = surface
         textures = [texture] * 6 if isinstance(texture, int) else [texture.get(name, 0) for name in FACE_NAMES]
         mask = sum(1 << FACE_NAMES.index(name) for name in sides)
         turn = (1.0, 0.0) if yaw_rad == 0.0 else (float(np.cos(yaw_rad)), float(np.sin(yaw_rad)))
         self._boxes.append((*centre_map, *half_m, *turn, tint, emission))
         self._box_numbers.append((*textures, mask, material, group, scramble, int(is_solid)))
 
-    def add_quad(
-        self,
-        origin_map: tuple[float, float, float],
-        edge_u: tuple[float, float, float],
-        edge_v: tuple[float, float, float],
-        texture: int,
-        *,
-        tint: float = 1.0,
-        scramble: int = 0,
-        material: int = MATERIAL_PLAIN,
-        emission: float = 0.0,
-        group: int = 0,
-        offset_texels: tuple[float, float] | None = None,
-    ) -> None:
-        """A single face. `offset_texels` replaces the offset that `scramble` gives (floor tiles meet through it)."""
+    def add_quad(self, origin_map: Vector, edge_u: Vector, edge_v: Vector, surface: Surface) -> None:
+        """A single face."""
+        texture, tint, scramble, material, emission, group, offset_texels = surface
+        assert isinstance(texture, int)
         self._quads.append((*origin_map, *edge_u, *edge_v))
-        self._quad_values.append((tint, emission, *(offset_texels or (-1.0, -1.0))))
+        self._quad_values.append((tint, emission, *offset_texels))
         self._quad_numbers.append((texture, material, group, scramble))
 
     def finish(self) -> Faces:

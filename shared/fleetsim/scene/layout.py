@@ -1,4 +1,4 @@
-"""The plan of a warehouse: sizes, counts and rates, and where things stand."""
+"""The plan of a warehouse: sizes, counts, rates and positions."""
 
 from typing import ClassVar
 
@@ -12,8 +12,7 @@ class Layout(Section, frozen=True):
 
     has_landmarks: posters, columns with signs, marked docks, all different. are_aisles_identical: stock, labels and
     floor repeat from aisle to aisle (until a slot is restocked), so that only geometry and context tell them apart.
-    restock_per_day:
-    share of slots.
+    restock_per_day: share of slots.
     """
 
     aisles: int = 3

@@ -6,13 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fleetmap.geometry import Array
-from fleetsim.scene.faces import FaceBuilder, Faces
+from fleetsim.scene.faces import FaceBuilder, Faces, Surface, Vector
 from fleetsim.textures.texture_set import Textures
 
-Part = tuple[
-    tuple[float, float, float], tuple[float, float, float], str
-]  # centre and half sizes in the mover's axes, material
-# How much of the floor's light the sides xXyYzZ get.
+Part = tuple[Vector, Vector, str]  # centre and half sizes in the mover's axes, material
+# Share of the floor's light on the sides xXyYzZ.
 SIDE_LIGHT = np.array([0.55, 0.7, 0.5, 0.65, 0.3, 1.0])
 
 
@@ -119,7 +117,7 @@ def add_movers(builder: FaceBuilder, movers: tuple[AnyMover, ...], textures: Tex
         cosine, sine = float(np.cos(yaw)), float(np.sin(yaw))
         for (px, py, pz), half, material in MOVER_KINDS[mover.kind].parts(t_s):
             centre = (x + cosine * px - sine * py, y + sine * px + cosine * py, pz)
-            builder.add_box(centre, half, materials[material], yaw_rad=yaw)
+            builder.add_box(centre, half, Surface(materials[material]), yaw_rad=yaw)
         shadows[number] = x, y, 1.0 / MOVER_KINDS[mover.kind].shadow_m ** 2
     return shadows
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleetsim.scene.faces import NO_BOTTOM, FaceBuilder
+from fleetsim.scene.faces import NO_BOTTOM, FaceBuilder, Surface
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.stock import Slot, mix, slot_generator
 from fleetsim.textures.texture_set import RACK_LABELS, Sku, Textures
@@ -32,32 +32,20 @@ class RackMaker:
         x, y = layout.bay_x_m(bay), layout.row_y_m(row)
         depth = layout.rack_depth_m / 2
         post = (0.05, depth, layout.rack_top_m / 2)
-        builder.add_box((x, y, layout.rack_top_m / 2), post, textures.uprights[0], sides="yY", is_solid=False)
+        surface = Surface(textures.uprights[0])
+        builder.add_box((x, y, layout.rack_top_m / 2), post, surface, sides="yY", is_solid=False)
         for level, height in enumerate(layout.shelf_heights_m[: layout.levels]):
             rng = slot_generator(layout, self._seed, self._day, Slot(row, bay, level))
             if level:
                 beam = (layout.bay_m / 2, depth - 0.03, 0.06)
-                builder.add_box(
-                    (x + layout.bay_m / 2, y, height - 0.07),
-                    beam,
-                    textures.beams[0],
-                    sides="yYZ",
-                    tint=0.75,
-                    is_solid=False,
-                )
+                centre, surface = (x + layout.bay_m / 2, y, height - 0.07), Surface(textures.beams[0], 0.75)
+                builder.add_box(centre, beam, surface, sides="yYZ", is_solid=False)
             if rng.random() < layout.empty_share:
                 continue
             sku = textures.skus[int(rng.integers(0, len(textures.skus)))]
-            half = (layout.bay_m / 2 - 0.1, 0.4, 0.45)
-            scramble = mix(self._seed, row, bay, level) >> 40
-            builder.add_box(
-                (x + layout.bay_m / 2, y, height + 0.47),
-                half,
-                sku.front,
-                scramble=scramble,
-                sides=NO_BOTTOM,
-                is_solid=False,
-            )
+            centre, half = (x + layout.bay_m / 2, y, height + 0.47), (layout.bay_m / 2 - 0.1, 0.4, 0.45)
+            surface = Surface(sku.front, scramble=mix(self._seed, row, bay, level) >> 40)
+            builder.add_box(centre, half, surface, sides=NO_BOTTOM, is_solid=False)
 
     def add_end_guards(self, builder: FaceBuilder, row: int, *, is_far_end: bool) -> None:
         """The hazard-striped guard at a row's end, with a poster on the frame where the site has landmarks."""
@@ -65,20 +53,20 @@ class RackMaker:
         x = layout.bay_x_m(layout.bays) + 0.12 if is_far_end else layout.end_m - 0.12
         y, half = layout.row_y_m(row), layout.rack_depth_m / 2
         scramble = self._scramble(_TAG_RACK, row, 900 + is_far_end)
-        builder.add_box((x, y, 0.25), (0.06, half, 0.25), textures.hazard, sides=NO_BOTTOM, scramble=scramble)
+        guard = Surface(textures.hazard, scramble=scramble)
+        builder.add_box((x, y, 0.25), (0.06, half, 0.25), guard, sides=NO_BOTTOM)
         if layout.has_landmarks:
             side, plate = 0.275, x + (0.095 if is_far_end else -0.095)
             sign = 1.0 if is_far_end else -1.0
-            poster = textures.posters[(row * 2 + is_far_end) % len(textures.posters)]
-            builder.add_quad(
-                (plate, y - sign * side, 2.0), (0, sign * 2 * side, 0), (0, 0, -2 * side), poster, scramble=scramble
-            )
+            poster = Surface(textures.posters[(row * 2 + is_far_end) % len(textures.posters)], scramble=scramble)
+            builder.add_quad((plate, y - sign * side, 2.0), (0, sign * 2 * side, 0), (0, 0, -2 * side), poster)
 
     def add_parked_pallet(self, builder: FaceBuilder, number: int, x_m: float, y_m: float) -> None:
         """A pallet with a stack of cartons on the floor by an end wall; changes as often as a slot does."""
         layout, textures = self._layout, self._textures
         rng = slot_generator(layout, self._seed, self._day, Slot(layout.rows + number, 0, 0))
-        builder.add_box((x_m, y_m, 0.07), (0.4, 0.6, 0.07), textures.wood, scramble=int(rng.integers(0, 1 << 24)))
+        pallet = Surface(textures.wood, scramble=int(rng.integers(0, 1 << 24)))
+        builder.add_box((x_m, y_m, 0.07), (0.4, 0.6, 0.07), pallet)
         sku = textures.skus[int(rng.integers(0, len(textures.skus)))]
         sides = {"x": sku.front, "X": sku.front, "y": sku.side, "Y": sku.side, "z": sku.top, "Z": sku.top}
         for floor in range(int(rng.integers(1, 5))):
@@ -87,7 +75,8 @@ class RackMaker:
                 centre = (x_m + rng.uniform(-0.03, 0.03), y_m + side * (sku.width_m / 2 + 0.01), z)
                 half = (0.36, sku.width_m / 2, sku.height_m / 2)
                 yaw, scramble = rng.normal(0, 0.015), int(rng.integers(0, 1 << 24))
-                builder.add_box(centre, half, sides, yaw_rad=yaw, tint=rng.uniform(0.8, 1.2), scramble=scramble)
+                surface = Surface(sides, rng.uniform(0.8, 1.2), scramble)
+                builder.add_box(centre, half, surface, yaw_rad=yaw)
 
     def _scramble(self, tag: int, row: int, *rest: int) -> int:
         """Bits for the dirt of a fixed thing; the same in every aisle where aisles are identical."""
@@ -99,12 +88,12 @@ class RackMaker:
         depth = layout.rack_depth_m / 2
         post = textures.uprights[(bay + row % 2) % len(textures.uprights)]
         for number, offset in enumerate((depth - 0.05, 0.05 - depth)):
-            scramble = self._scramble(_TAG_RACK, row, bay, number)
-            builder.add_box((x, y + offset, top / 2), (0.05, 0.05, top / 2), post, sides="xXyY", scramble=scramble)
+            surface = Surface(post, scramble=self._scramble(_TAG_RACK, row, bay, number))
+            builder.add_box((x, y + offset, top / 2), (0.05, 0.05, top / 2), surface, sides="xXyY")
         for number in range(int((top - 0.3) / 0.75) + 1):
             half, height = (0.015, depth - 0.1, 0.025), 0.3 + 0.75 * number
-            scramble = self._scramble(_TAG_RACK, row, bay, 10 + number)
-            builder.add_box((x, y, height), half, textures.grey, sides="xXzZ", scramble=scramble, is_solid=False)
+            surface = Surface(textures.grey, scramble=self._scramble(_TAG_RACK, row, bay, 10 + number))
+            builder.add_box((x, y, height), half, surface, sides="xXzZ", is_solid=False)
 
     def _add_shelf(self, builder: FaceBuilder, row: int, bay: int, level: int) -> None:
         layout, textures = self._layout, self._textures
@@ -112,21 +101,18 @@ class RackMaker:
         depth = layout.rack_depth_m / 2
         beam, span = textures.beams[(bay + level) % 3], layout.bay_m / 2 - 0.05
         for number, offset in enumerate((depth - 0.03, 0.03 - depth)):
-            scramble = self._scramble(_TAG_RACK, row, bay, 100 + 2 * level + number)
-            builder.add_box(
-                (x, y + offset, z - 0.07), (span, 0.03, 0.06), beam, sides="yYzZ", tint=0.75, scramble=scramble
-            )
-        deck_scramble = self._scramble(_TAG_RACK, row, bay, 200 + level)
-        builder.add_box((x, y, z - 0.012), (span, depth - 0.06, 0.01), textures.grey, tint=0.8, scramble=deck_scramble)
+            surface = Surface(beam, 0.75, self._scramble(_TAG_RACK, row, bay, 100 + 2 * level + number))
+            builder.add_box((x, y + offset, z - 0.07), (span, 0.03, 0.06), surface, sides="yYzZ")
+        deck = Surface(textures.grey, 0.8, self._scramble(_TAG_RACK, row, bay, 200 + level))
+        builder.add_box((x, y, z - 0.012), (span, depth - 0.06, 0.01), deck)
         toward_aisle = 1.0 if row % 2 else -1.0
-        number = Slot(row, bay, level).number(layout) % RACK_LABELS
+        label = Surface(textures.rack_labels[Slot(row, bay, level).number(layout) % RACK_LABELS])
         for half_bay in range(2):
             shift = (self._scramble(_TAG_LABEL, row, bay, level, half_bay) & 255) * 0.3 / 255
             left = layout.bay_x_m(bay) + 0.36 + half_bay * 1.3 + shift
             start = left + 0.26 if row % 2 else left
             front = y + toward_aisle * (depth + 0.003)
-            edge = (-0.26 * toward_aisle, 0.0, 0.0)
-            builder.add_quad((start, front, z - 0.03), edge, (0, 0, -0.08), textures.rack_labels[number])
+            builder.add_quad((start, front, z - 0.03), (-0.26 * toward_aisle, 0.0, 0.0), (0, 0, -0.08), label)
 
     def _add_goods(self, builder: FaceBuilder, slot: Slot) -> None:
         layout, textures = self._layout, self._textures
@@ -138,11 +124,9 @@ class RackMaker:
         above = slot.level + 1 < layout.levels
         ceiling = layout.shelf_heights_m[slot.level + 1] - 0.2 if above else base + 1.25
         if rng.random() < 0.55:
-            for pallet in range(2):
-                scramble = int(rng.integers(0, 1 << 24))
-                builder.add_box(
-                    (x + 0.66 + 1.28 * pallet, y, base + 0.07), (0.6, 0.5, 0.07), textures.wood, scramble=scramble
-                )
+            for number in range(2):
+                pallet = Surface(textures.wood, scramble=int(rng.integers(0, 1 << 24)))
+                builder.add_box((x + 0.66 + 1.28 * number, y, base + 0.07), (0.6, 0.5, 0.07), pallet)
             base += 0.14
         end = layout.bay_x_m(slot.bay + 1) - 0.08
         while True:
@@ -168,34 +152,19 @@ class RackMaker:
         centre_y = y + toward_aisle * (self._layout.rack_depth_m / 2 - setback - half_depth)
         front, back = ("Y", "y") if row % 2 else ("y", "Y")
         textures = {front: sku.front, back: sku.side, "x": sku.side, "X": sku.side, "z": sku.top, "Z": sku.top}
-        builder.add_box(
-            (centre_x, centre_y, bottom + sku.height_m / 2),
-            (sku.width_m / 2, half_depth, sku.height_m / 2),
-            textures,
-            yaw_rad=yaw,
-            tint=rng.uniform(0.8, 1.2),
-            scramble=int(rng.integers(0, 1 << 24)),
-        )
+        centre, half = (centre_x, centre_y, bottom + sku.height_m / 2), (sku.width_m / 2, half_depth, sku.height_m / 2)
+        surface = Surface(textures, rng.uniform(0.8, 1.2), int(rng.integers(0, 1 << 24)))
+        builder.add_box(centre, half, surface, yaw_rad=yaw)
         if rng.random() < 0.5:
-            side = 0.12
+            side, reach = 0.12, half_depth + 0.003
             along = rng.uniform(-0.4, 0.4) * (sku.width_m - side)
             up = rng.uniform(0.3, 0.9) * (sku.height_m - side)
             cosine, sine = float(np.cos(yaw)), float(np.sin(yaw))
-            outward, right = (
-                (-sine * toward_aisle, cosine * toward_aisle),
-                (-cosine * toward_aisle, -sine * toward_aisle),
-            )
-            reach = half_depth + 0.003
-            origin = (
-                centre_x + outward[0] * reach + right[0] * (along - side / 2),
-                centre_y + outward[1] * reach + right[1] * (along - side / 2),
-                bottom + up + side,
-            )
-            label = self._textures.labels[int(rng.integers(0, len(self._textures.labels)))]
-            builder.add_quad(
-                origin,
-                (right[0] * side, right[1] * side, 0.0),
-                (0, 0, -side),
-                label,
-                scramble=int(rng.integers(0, 1 << 24)),
-            )
+            outward = (-sine * toward_aisle, cosine * toward_aisle)
+            right = (-cosine * toward_aisle, -sine * toward_aisle)
+            origin_x = centre_x + outward[0] * reach + right[0] * (along - side / 2)
+            origin_y = centre_y + outward[1] * reach + right[1] * (along - side / 2)
+            texture = self._textures.labels[int(rng.integers(0, len(self._textures.labels)))]
+            label = Surface(texture, scramble=int(rng.integers(0, 1 << 24)))
+            edge = (right[0] * side, right[1] * side, 0.0)
+            builder.add_quad((origin_x, origin_y, bottom + up + side), edge, (0, 0, -side), label)

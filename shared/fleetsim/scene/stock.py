@@ -1,4 +1,4 @@
-"""What stands in each slot on each day."""
+"""Stock: the content of each slot on each day."""
 
 from dataclasses import dataclass
 

@@ -4,7 +4,6 @@ A chunk is one aisle wide and about four bays long. Near the camera chunks are d
 plain. What a chunk looks like depends on site, seed and day alone, never on the order in which chunks were visited.
 """
 
-import itertools
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -41,10 +40,9 @@ class LitFaces:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What is painted around one place: all chunks, near ones detailed. Columns as in `Faces`.
+    """All chunks as painted around one place, near ones detailed. Columns as in `Faces`.
 
-    ranges (C, 2), bounds_m (C, 6): faces of each chunk and their bounding box. owners: number of the chunk, box in it,
-    side.
+    ranges (C, 2), bounds_m (C, 6): faces of each chunk and their bounding box.
     """
 
     quads: Array
@@ -146,52 +144,37 @@ class World:
 
     def _light_detailed(self, key: tuple[int, int]) -> LitFaces:
         """Light with shadows from the boxes of the chunk and the eight around it; further lamps are not counted."""
-        neighbours = self._neighbours(key, 1, 1)
-        parts = [self.detailed_faces(*other) for other in neighbours]
-        shift = sum(
-            len(part.boxes) for part, other in zip(parts, neighbours, strict=True) if other < key and other != key
-        )
-        order = sorted(zip(neighbours, parts, strict=True), key=lambda pair: pair[0])
-        boxes = np.concatenate([part.boxes for _, part in order])
+        parts = {other: self.detailed_faces(*other) for other in sorted(self._neighbours(key, 1, 1))}
+        shift = sum(len(part.boxes) for other, part in parts.items() if other < key)
+        boxes = np.concatenate([part.boxes for part in parts.values()])
         return self._bake(self.detailed_faces(*key), key, boxes, shift, has_shadows=True)
 
     def _bake(self, faces: Faces, key: tuple[int, int], boxes: Array, shift: int, *, has_shadows: bool) -> LitFaces:
-        low, counts = self._grid_of(key)
-        starts, items = ray_kernels.fill_grid(boxes, low, _CELL_M, counts)
+        rectangles = np.array([self._hall.rectangle(*other) for other in self._neighbours(key, 1, 1)])
+        low = np.array([rectangles[:, 0].min(), rectangles[:, 1].min(), 0.0]) - 0.5
+        high = np.array([rectangles[:, 2].max(), rectangles[:, 3].max(), self.layout.ceiling_m]) + 0.5
+        grid = ray_kernels.box_grid(boxes, low, high, _CELL_M)
         light = np.zeros((LAMP_GROUPS, faces.light_samples), np.float32)
         lamps = self._lamps_near(key)
 
         def bake(first: int, last: int) -> None:
-            ray_kernels.bake_faces(
-                first, last, faces.quads, faces.numbers, faces.owners, shift, boxes, starts, items,
-                low, _CELL_M, counts, lamps, LAMP_REACH_M, has_shadows, light,
-            )  # fmt: skip
+            columns = (faces.quads[first:last], faces.numbers[first:last], faces.owners[first:last])
+            ray_kernels.bake_faces(*columns, shift, grid, lamps, LAMP_REACH_M, has_shadows, light)
 
         cuts = np.searchsorted(faces.numbers[:, 3], faces.light_samples * np.arange(1, 4) / 4)
         edges = [0, *(int(cut) for cut in cuts), len(faces)]
-        spans = list(itertools.pairwise(edges))
-        if self._workers is None:
-            for first, last in spans:
-                bake(first, last)
-        else:
-            list(self._workers.map(lambda span: bake(*span), spans))
+        starts, ends = edges[:-1], edges[1:]
+        list(self._workers.map(bake, starts, ends) if self._workers else map(bake, starts, ends))
         if not has_shadows:
             light *= _PLAIN_LIGHT
         return LitFaces(faces, light, faces.bounds_m())
-
-    def _grid_of(self, key: tuple[int, int]) -> tuple[Array, NDArray[np.int64]]:
-        rectangles = np.array([self._hall.rectangle(*other) for other in self._neighbours(key, 1, 1)])
-        low = np.array([rectangles[:, 0].min(), rectangles[:, 1].min(), 0.0]) - 0.5
-        high = np.array([rectangles[:, 2].max(), rectangles[:, 3].max(), self.layout.ceiling_m]) + 0.5
-        return low, np.ceil((high - low) / _CELL_M).astype(np.int64)
 
     def _part(self, key: tuple[int, int], centre: tuple[int, int]) -> LitFaces:
         is_near = abs(key[0] - centre[0]) <= NEAR_COLUMNS and abs(key[1] - centre[1]) <= NEAR_ROWS
         if not is_near:
             if key not in self._plain:
-                self._plain[key] = self._bake(
-                    self._build(key, is_plain=True), key, np.zeros((0, 8)), 0, has_shadows=False
-                )
+                faces = self._build(key, is_plain=True)
+                self._plain[key] = self._bake(faces, key, np.zeros((0, 8)), 0, has_shadows=False)
             return self._plain[key]
         if key not in self._lit:
             self._lit[key] = self._light_detailed(key)

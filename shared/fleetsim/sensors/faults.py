@@ -44,9 +44,8 @@ def parse_fault(text: str) -> Fault:
     try:
         start_s, duration_s = float(start), float(duration or 1.0)
     except ValueError as error:
-        raise UsageError(
-            f"fault {text!r} should read NAME@START+DURATION in seconds, such as camera-dark@8+2"
-        ) from error
+        wanted = "NAME@START+DURATION in seconds, such as camera-dark@8+2"
+        raise UsageError(f"fault {text!r} should read {wanted}") from error
     if start_s < 0 or duration_s <= 0:
         raise UsageError(f"fault {text!r} has a negative start or no duration")
     return Fault(name, start_s, start_s + duration_s)

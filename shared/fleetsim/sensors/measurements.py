@@ -1,4 +1,4 @@
-"""What IMU, wheels and coarse position sources report, from the exact motion."""
+"""Measurements of IMU, wheels and coarse position sources, from the exact motion."""
 
 import numpy as np
 

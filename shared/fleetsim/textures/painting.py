@@ -101,14 +101,8 @@ def poster(rng: np.random.Generator, side: int = 256) -> Texture:
         if rng.random() < 0.5:
             image[top : top + int(rng.integers(8, 36)), left : left + int(rng.integers(8, 56))] = rng.uniform(20, 240)
         else:
-            write_text(
-                image,
-                left,
-                top,
-                random_word(rng, int(rng.integers(3, 8))),
-                int(rng.integers(1, 4)),
-                rng.uniform(10, 120),
-            )
+            word, dot = random_word(rng, int(rng.integers(3, 8))), int(rng.integers(1, 4))
+            write_text(image, left, top, word, dot, rng.uniform(10, 120))
     return image
 
 

@@ -92,6 +92,26 @@ def paint_textures(seed: int, aisles: int, *, are_aisles_identical: bool = False
         rack_labels = tuple(atlas.add(painting.rack_label(rng, f"{slot:04d}")) for slot in range(RACK_LABELS))
     stretched = frozenset((*posters, *signs, *labels, *rack_labels, vest, *cloth))
     return Textures(
-        atlas.finish(), dirt, concrete, coarse, decals, uprights, beams, grey, dark, hazard, wall, wood, paint, cloth,
-        vest, lamp, skus, labels, posters, signs, rack_labels, stretched,
-    )  # fmt: skip
+        atlas=atlas.finish(),
+        dirt=dirt,
+        concrete=concrete,
+        concrete_coarse=coarse,
+        decals=decals,
+        uprights=uprights,
+        beams=beams,
+        grey=grey,
+        dark=dark,
+        hazard=hazard,
+        wall=wall,
+        wood=wood,
+        paint=paint,
+        cloth=cloth,
+        vest=vest,
+        lamp=lamp,
+        skus=skus,
+        labels=labels,
+        posters=posters,
+        signs=signs,
+        rack_labels=rack_labels,
+        stretched=stretched,
+    )
