@@ -1,30 +1,27 @@
 """The command `fleetsim`: lists scenarios, records them, draws contact sheets of them."""
 
-import inspect
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated
 
 import typer
 
 from fleetmap.cli_exit import run
+from fleetmap.cli_options import expand_options
 from fleetmap.errors import UsageError
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, help="The warehouse simulator: recordings with exact truth."
 )
-T = TypeVar("T")
 Option = typer.Option
 
 
-@dataclass(kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """A run of a scenario, as the command line names it."""
 
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A name that `fleetsim scenarios` lists.")]
-    out: Annotated[Path, Option(help="PNG to write.")]
     seed: Annotated[int, Option(help="Everything random follows from it: the site, its stock, noise, motion.")] = 0
     day: Annotated[int, Option(help="Day of the site's life: stock moves from day to day.")] = 0
     light: Annotated[str, Option(help="day, evening or night.")] = "day"
@@ -34,11 +31,10 @@ class RunOptions:
     ] = None
 
 
-@dataclass(kw_only=True)
-class RecordOptions(RunOptions):
-    """Options of `record`."""
+@dataclass(frozen=True, kw_only=True)
+class RecordOptions:
+    """Sensors, faults and file of a recording."""
 
-    out: Annotated[Path, Option(help="File to write (.mcap), or folder for --format euroc.")]
     size: Annotated[str | None, Option(metavar="WxH", help="Picture size in pixels, 640x480 unless given.")] = None
     frames: Annotated[int | None, Option(min=1, help="At most so many frames.")] = None
     fault: Annotated[list[str] | None, Option("--fault", metavar="NAME@START+SECONDS", help="A fault; repeatable.")] = (
@@ -58,27 +54,6 @@ class RecordOptions(RunOptions):
     force: Annotated[bool, Option("--force", help="Write over an existing file.")] = False
 
 
-@dataclass(kw_only=True)
-class ShowOptions(RunOptions):
-    """Options of `show`."""
-
-    pictures: Annotated[int, Option(min=1, max=64, help="How many moments of the run.")] = 12
-
-
-def _command(options: type[T]) -> Callable[[Callable[[T], None]], None]:
-    """Makes a command of a function of one dataclass, whose fields become the arguments and options."""
-
-    def register(command: Callable[[T], None]) -> None:
-        def run_command(**values: object) -> None:
-            command(options(**values))
-
-        run_command.__doc__, run_command.__annotations__ = command.__doc__, get_type_hints(options, include_extras=True)
-        run_command.__signature__ = inspect.signature(options)  # type: ignore[attr-defined]
-        app.command(command.__name__)(run_command)
-
-    return register
-
-
 @app.command()
 def scenarios() -> None:
     """One line per scenario, smallest first: its name, its robots, what it is."""
@@ -89,10 +64,15 @@ def scenarios() -> None:
         typer.echo(f"{name}  [{' '.join(scenario.runs)}]  {scenario.description}")
 
 
-@_command(RecordOptions)
-def record(given: RecordOptions) -> None:
+@app.command()
+@expand_options
+def record(
+    out: Annotated[Path, Option(help="File to write (.mcap), or folder for --format euroc.")],
+    run_options: RunOptions,
+    given: RecordOptions,
+) -> None:
     """Records one robot's run: pictures, IMU, wheels, position priors, exact ground truth."""
-    out, format_, images = given.out, given.format_, given.images
+    format_, images = given.format_, given.images
     if format_ not in ("mcap", "euroc"):
         raise UsageError(f"unknown format {format_!r}; there are mcap and euroc")
     if images not in ("png", "jpeg", "raw") or (format_ == "euroc" and images != "png"):
@@ -105,7 +85,7 @@ def record(given: RecordOptions) -> None:
 
     turn_rad = math.radians(given.camera_turn_deg)
     order = Order(
-        **_run_of(given),
+        **asdict(run_options),
         frames=given.frames,
         faults=tuple(parse_fault(text) for text in given.fault or []),
         size_px=_size_px(given.size),
@@ -116,19 +96,20 @@ def record(given: RecordOptions) -> None:
     typer.echo(record_order(order, out, format_, images))
 
 
-@_command(ShowOptions)
-def show(given: ShowOptions) -> None:
+@app.command()
+@expand_options
+def show(
+    out: Annotated[Path, Option(help="PNG to write.")],
+    run_options: RunOptions,
+    pictures: Annotated[int, Option(min=1, max=64, help="How many moments of the run.")] = 12,
+) -> None:
     """A contact sheet: moments of a run, evenly spread, and the plan of the site with the route."""
-    if given.out.suffix.lower() != ".png":
-        raise UsageError(f"{given.out} should end in .png")
+    if out.suffix.lower() != ".png":
+        raise UsageError(f"{out} should end in .png")
     from fleetsim.commands import show_order
     from fleetsim.recorder import Order
 
-    typer.echo(show_order(Order(**_run_of(given)), given.out, given.pictures))
-
-
-def _run_of(given: RunOptions) -> dict[str, Any]:
-    return {name: getattr(given, name) for name in ("scenario", "seed", "day", "light", "robot", "lens")}
+    typer.echo(show_order(Order(**asdict(run_options)), out, pictures))
 
 
 def _size_px(text: str | None) -> tuple[int, int] | None:

@@ -13,7 +13,17 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SOURCES = os.pathsep.join(str(REPOSITORY / folder) for folder in ("shared", "mapserver", "locclient"))
-NOT_ON_ROBOTS = ("fastapi", "gtsam", "matplotlib", "prometheus_client", "scipy", "sqlite_utils", "starlette", "uvicorn")
+NOT_ON_ROBOTS = (
+    "fastapi",
+    "gtsam",
+    "matplotlib",
+    "mcap_ros2",
+    "prometheus_client",
+    "scipy",
+    "sqlite_utils",
+    "starlette",
+    "uvicorn",
+)
 PACKAGES = {"fleetmap", "fleetsim", "mapserver", "locclient"}
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]

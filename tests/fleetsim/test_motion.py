@@ -126,5 +126,5 @@ def test_a_path_through_a_rack_is_refused() -> None:
 def test_no_scenario_drives_through_anything(name: str) -> None:
     scenario = SCENARIOS[name]()
     for run in scenario.runs.values():
-        motion = drive(run, scenario.layout, np.random.default_rng(0))
+        motion = drive(run, run.kind, scenario.layout, np.random.default_rng(0))
         assert motion.duration_s > 2.0
