@@ -1,1 +1,46 @@
-"""The map server: surveys in, immutable map versions out."""
+"""The map server: maps from recordings, kept as versions, served to robots.
+
+As a library:
+
+    from mapserver import build_map, open_map
+
+    draft = build_map(["drive.mcap"], "maps", "hall")
+    draft.publish()
+    print(open_map("maps", "hall").points_map.shape)
+
+The names are imported when they are first used, so that `import mapserver` and `mapserver --help` stay light.
+"""
+
+import importlib
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
+
+from fleetmap.errors import FleetmapError
+
+if TYPE_CHECKING:
+    from mapserver.library import BuildOptions, BuiltMap, MapArrays, MapStore, build_map, open_map, open_store
+
+__all__ = ["BuildOptions", "BuiltMap", "MapArrays", "MapStore", "__version__", "build_map", "open_map", "open_store"]
+
+try:
+    __version__ = metadata.version("fleetmap")
+except metadata.PackageNotFoundError:  # a source tree that is not installed
+    __version__ = "0+unknown"
+
+
+def __getattr__(name: str) -> Any:
+    """The library's names, PEP 562; FleetmapError where the server's libraries are not installed."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        return getattr(importlib.import_module("mapserver.library"), name)
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] in ("fleetmap", "mapserver"):
+            raise
+        raise FleetmapError(
+            f"mapserver.{name} needs {error.name}, which is not installed; pip install 'fleetmap[server]'"
+        ) from error
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -24,13 +24,13 @@ from fleetmap.recordings.calibration_files import read_euroc_camera
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
-from mapserver.survey.keyframes.keyframes import Keyframe, make_keyframe
-from mapserver.survey.loops.loops import LoopCloser, Loops, Verdict
-from mapserver.survey.loops.zones import Zones
+from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, make_keyframe
+from mapserver.survey.loops.loops import LoopCloser, Loops, LoopVerdict
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import LoopSettings, SurveySettings
-from mapserver.survey.tracks.pairs import PairMatch, match_pair
+from mapserver.survey.survey_inputs import SurveyConfig
+from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotion, match_pair
 from support.recordings.realdata import real_data
 
 REVISITS = [(0, 1), (1, 0), (2, 3), (3, 2)]
@@ -81,7 +81,8 @@ def _truth(excerpt: Path, recording: Path) -> Array:
 
 def matched(i: int, j: int, predicted: Array | None, sigma_rad: float | None) -> PairMatch | None:
     given = pairs()
-    return match_pair(i, j, given.keyframes, given.rectifier.camera, predicted, sigma_rad, SurveySettings().pairs)
+    inputs = MatchInputs(given.keyframes, given.rectifier.camera, SurveySettings().pairs)
+    return match_pair(i, j, inputs, None if predicted is None else PredictedMotion(predicted, sigma_rad))
 
 
 def disturbed(j_from_i: Array, seed: int) -> Array:
@@ -135,11 +136,8 @@ def closed(rotation_sigma_rad: float) -> Loops:
     descriptors = np.concatenate([k.features.descriptors for k in given.keyframes])
     images = np.repeat(np.arange(4), [len(k.features) for k in given.keyframes])
     vocabulary = train_vocabulary(descriptors, 8, 3, np.random.default_rng(1), images)
-    vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in given.keyframes]
-    closer = LoopCloser(
-        given.keyframes, vectors, vocabulary.word_count, given.rectifier.camera, given.rectifier.body_from_cam,
-        map_from_body, GraphMarginals(map_from_body, chain), set(), settings, Zones(),
-    )  # fmt: skip
+    posed = PosedKeyframes(given.keyframes, map_from_body, given.rectifier.body_from_cam, given.rectifier.camera)
+    closer = LoopCloser(posed, SurveyConfig(settings, vocabulary), GraphMarginals(map_from_body, chain), set())
     for k in range(4):
         closer.close(k)
     return closer.loops
@@ -149,7 +147,7 @@ def closed(rotation_sigma_rad: float) -> Loops:
 def test_the_loop_closer_accepts_the_revisits_and_nothing_else(rotation_sigma_rad: float) -> None:
     loops = closed(rotation_sigma_rad)
     assert {(e.i, e.j) for e in loops.edges} == {(1, 0), (3, 2)}
-    assert {(r.i, r.j) for r in loops.records if r.verdict is Verdict.REJECTED} == {(2, 0), (2, 1), (3, 0), (3, 1)}
+    assert {(r.i, r.j) for r in loops.records if r.verdict is LoopVerdict.REJECTED} == {(2, 0), (2, 1), (3, 0), (3, 1)}
     world_from_body = pairs().world_from_body
     for edge in loops.edges:
         error_m, error_deg = errors(edge.i_from_j, se3_inverse(world_from_body[edge.i]) @ world_from_body[edge.j])

@@ -21,10 +21,10 @@ from fleetmap.sensors.rectification import Rectifier
 from mapserver.cli import app
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
-from mapserver.survey.loops.zones import Zones
 from mapserver.survey.merge.pipeline import Extension, NotJoined, extend
 from mapserver.survey.pipeline import survey
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
 from support.recordings.recording_samples import Sample, make_sample, write_euroc
 from support.worlds import box_room
 from support.worlds.box_room import out_and_back, ride_sample
@@ -238,10 +238,12 @@ def test_a_prior_joins_what_sees_nothing_of_the_map(nights: Nights, tmp_path: Pa
     assert archive is not None
     base, settings = decode_archive(archive), SurveySettings()
     with open_recording(write_euroc(tmp_path / "foreign", make_sample(20))) as recording:
-        foreign = survey(
-            (recording.read_frame(n) for n in range(20)), 20, recording.imu, recording.calibration,
-            Rectifier(recording.calibration, pinhole=base.camera), default_vocabulary(), settings, Zones(), lambda *_: None,
-        )  # fmt: skip
+        frames, rectifier = (
+            (recording.read_frame(n) for n in range(20)),
+            Rectifier(recording.calibration, pinhole=base.camera),
+        )
+        inputs = SurveyInputs(frames, 20, recording.imu, recording.calibration, rectifier)
+        foreign = survey(inputs, SurveyConfig(settings, default_vocabulary()))
     assert isinstance(extend(base, foreign, settings, anchored=True), NotJoined)
     there = se3(np.eye(3), np.array([30.0, 20.0, 0.0]))
     both = extend(base, foreign, settings, anchored=True, map_from_survey=there)

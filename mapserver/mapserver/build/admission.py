@@ -1,18 +1,16 @@
-"""What a build asks the doctor before it begins: refuses what could only make a wrong map, corrects a clock that is off."""
+"""Checks before a survey: a recording that could only make a wrong map is refused, a clock offset is corrected."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording
-from mapserver.doctor import Finding, Verdict, examine
+from mapserver.doctor import Finding, Verdict, run_checks
 from mapserver.survey.executor import SERIAL, Executor
 
-# Wrong units, axes, cameras or partners: a survey would not fail on them but be wrong. Gaps, blur and damage are its daily bread.
-DECISIVE = (
-    "camera-imu overlap", "gravity magnitude", "left and right", "epipolar error", "stereo against motion", "gyro scale",
-    "gyro axes",
-)  # fmt: skip
+# Wrong units, axes or cameras: a survey would not fail on them but be wrong. Gaps, blur and damage it can cope with.
+DECISIVE = {"camera-imu overlap", "gravity magnitude", "left and right", "epipolar error", "stereo against motion"}
+DECISIVE |= {"gyro scale", "gyro axes"}
 SAMPLED_FRAMES, TURN_FRAMES = 20, 120
 _CORRECTED_FROM_S = 0.004  # two of the odometry's own sigmas: below, it finds the rest itself
 
@@ -36,20 +34,20 @@ class CheckedRecording:
 
 
 def checked(
-    recording: Recording, on_frame: Callable[[], None] = lambda: None, worker: Executor = SERIAL
+    recording: Recording, on_frame: Callable[[], None] = lambda: None, executor: Executor = SERIAL
 ) -> CheckedRecording:
     """The recording with what was found in it. RecordingError where a check that decides failed."""
-    examination = examine(recording, on_frame, sampled=SAMPLED_FRAMES, turn_frames=TURN_FRAMES, worker=worker)
-    for finding in examination.findings:
+    checks = run_checks(recording, on_frame, sampled=SAMPLED_FRAMES, turn_frames=TURN_FRAMES, executor=executor)
+    for finding in checks.findings:
         if finding.verdict is Verdict.FAIL and finding.name in DECISIVE:
             raise RecordingError(
                 f"{recording.path}: {finding.name}: {finding.sentence}; a map of it would be wrong. "
                 "`mapserver doctor` shows every check"
             )
-    offset_s = examination.measured_offset_s
+    offset_s = checks.measured_offset_s
     if offset_s is None or abs(offset_s) < _CORRECTED_FROM_S:
-        return CheckedRecording(recording, examination.findings)
-    return CheckedRecording(with_clock(recording, offset_s), examination.findings, offset_s)
+        return CheckedRecording(recording, checks.findings)
+    return CheckedRecording(with_clock(recording, offset_s), checks.findings, offset_s)
 
 
 def with_clock(recording: Recording, correction_s: float) -> Recording:

@@ -1,4 +1,4 @@
-"""The rim around a build: surveys the recordings, joins them to the site's map, writes draft, report and pictures."""
+"""A build: surveys recordings, joins them to the site's map, stores the draft, writes report and pictures."""
 
 import resource
 import time
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from fleetmap.bow import Vocabulary, encode_vocabulary
-from fleetmap.config import to_dict
+from fleetmap.bow import encode_vocabulary
+from fleetmap.config import Section, load_toml, to_dict
 from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError
 from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.recordings.tum import write_tum
@@ -26,21 +26,27 @@ from mapserver.build.image_spill import ImageSpill
 from mapserver.build.job_record import Job, recorded_job
 from mapserver.build.loop_overlay import loop_places
 from mapserver.build.progress import ProgressView, StageTimes
-from mapserver.build.report import Accuracy, BuildReport, accuracy, full_report, make_report, sessions_report
-from mapserver.build.survey_recordings import Admission, Surveyed, admit_recordings, survey_all, survey_recording
+from mapserver.build.report import Accuracy, BuildCost, BuildReport, accuracy, make_report, report_details, sentence
+from mapserver.build.survey_recordings import (
+    Admission,
+    RecordingOptions,
+    Surveyed,
+    admit_recordings,
+    survey_all,
+    survey_recording,
+)
 from mapserver.build.vocabulary_selection import ChosenVocabulary, choose_vocabulary, judged
-from mapserver.build.worker import open_worker
-from mapserver.build.zones_file import read_zones
-from mapserver.quality.directions import one_way_words
+from mapserver.build.worker import open_executor
 from mapserver.quality.figures import Evidence
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
-from mapserver.survey.finish.map_transform import moved
+from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
-from mapserver.survey.loops.zones import Zones
+from mapserver.survey.loops.zones import Zones, zones_of
 from mapserver.survey.merge.initial_history import history_of
 from mapserver.survey.merge.multi_session import Joined, Session, chained, join_sessions
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.landmark_budget import choose_landmarks
 from mapserver.tiles.tiling import TILE_SIZE_M, tiles_from_survey
@@ -50,16 +56,15 @@ _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fle
 
 
 @dataclass(frozen=True, slots=True)
-class BuildRequest:
-    """What `mapserver build` was asked for; frames is an A:B:C slice of each recording, absent files are not written.
+class BuildOptions:
+    """Choices of a build. Files that are not named are not written.
 
-    replay: earlier recordings of the current version, of which frames are looked for in the draft. threads, scheduler: who does
-    the work, see worker.py. job: the number of the job that builds, for its draft.
+    frames: an A:B:C slice of each recording. use: only the sensors of a poorer set. replay: earlier recordings of the current
+    version, of which frames are looked for in the draft. threads, scheduler: see worker.py. settings: those of the survey; for None
+    the preset of the first recording's sensors with the [survey] section of the file `config` over it. job: the
+    number of the job that builds, for its draft.
     """
 
-    recordings: tuple[Path, ...]
-    site: str
-    store: Path
     frames: str = "::"
     calibration: Path | None = None
     zones: Path | None = None
@@ -74,19 +79,51 @@ class BuildRequest:
     threads: int | None = None
     scheduler: str | None = None
     job: int | None = None
+    config: Path | None = None
+    settings: SurveySettings | None = None
+
+    @property
+    def reading(self) -> RecordingOptions:
+        """How the recordings are read."""
+        return RecordingOptions(self.frames, self.calibration, self.use)
+
+
+@dataclass(frozen=True, slots=True)
+class BuildRequest:
+    """Recordings that become a draft of a site in a store."""
+
+    recordings: tuple[Path, ...]
+    site: str
+    store: Path
+    options: BuildOptions = BuildOptions()
 
 
 @dataclass(frozen=True)
-class _Built:
-    """The surveys and what became of them: the map in its final frame, and how good it is."""
+class _Run:
+    """One build under way, with what all of its steps need."""
+
+    request: BuildRequest
+    settings: SurveySettings
+    zones: Zones
+    unusable: dict[Path, str] | None
+    console: Console
+    times: StageTimes
+    started_s: float
+
+    @property
+    def options(self) -> BuildOptions:
+        return self.request.options
+
+
+@dataclass(frozen=True)
+class Built:
+    """The surveys and their outcomes: the map in its final frame, its accuracy, and whether it is the site's first."""
 
     surveyed: list[Surveyed]
     joined: Joined
     accuracy: Accuracy
     vocabulary: ChosenVocabulary
-    zones: Zones
-    times: StageTimes
-    started_s: float
+    is_first: bool
 
     @property
     def taken(self) -> list[Surveyed]:
@@ -96,7 +133,7 @@ class _Built:
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """A stored draft, what the build says about it, and by content hash why recordings are not in it."""
+    """A stored draft: its version, a sentence about it, its report, and by content hash why recordings were left out."""
 
     version: int
     sentence: str
@@ -104,121 +141,117 @@ class Draft:
     left_out: dict[str, str]
 
 
-def run_build(order: BuildRequest, settings: SurveySettings) -> str:
-    """Does it; the sentence says what there is now. Raises FleetmapErrors, before the survey where possible."""
-    return build_draft(order, settings, noted=True).sentence
-
-
 def build_draft(
-    order: BuildRequest, settings: SurveySettings, unusable: dict[Path, str] | None = None, *, noted: bool = False
-) -> Draft:
-    """As `run_build`; noted: as a job of the store.
+    request: BuildRequest, settings: SurveySettings, unusable: dict[Path, str] | None = None, *, recorded: bool = False
+) -> tuple[Draft, Built]:
+    """Builds a draft; raises FleetmapErrors, before the survey where possible.
 
-    With `unusable` a recording that cannot be surveyed goes in there with its reason, and the others are taken.
+    With `unusable` a recording that cannot be surveyed goes in there with its reason, and the others are taken. recorded: as
+    a job of the store.
     """
-    started_s = time.perf_counter()
-    console = Console(stderr=True)
-    zones = Zones() if order.zones is None else read_zones(order.zones)
+    options, started_s = request.options, time.perf_counter()
+    zones = Zones() if options.zones is None else read_zones(options.zones)
     times = StageTimes(time.perf_counter)
+    run = _Run(request, settings, zones, unusable, Console(stderr=True), times, started_s)
     times.begin("examination")
-    with open_worker(order.threads, None) as worker:
+    with open_executor(options.threads, None) as executor:
         admitted = admit_recordings(
-            order.recordings, order.frames, order.calibration, order.use, console,
-            needs_truth=order.frame_from_ground_truth, unusable=unusable, worker=worker,
-        )  # fmt: skip
+            request.recordings,
+            options.reading,
+            run.console,
+            needs_truth=options.frame_from_ground_truth,
+            unusable=unusable,
+            executor=executor,
+        )
     with (
-        MapStore.open(order.store, create=True) as maps,
-        recorded_job(maps, order.site, "build") if noted else nullcontext(Job()) as job,
+        MapStore.open(request.store, create=True) as maps,
+        recorded_job(maps, request.site, "build") if recorded else nullcontext(Job()) as job,
     ):
-        parent = _parent(order, maps)
-        base = None if parent is None else parent.survey
-        chosen = choose_vocabulary(maps, order.site, order.vocabulary)
-        built = _survey(order, admitted, zones, base, chosen, settings, console, times, started_s, unusable)
-        draft = _keep(order, built, parent, settings, maps)
+        parent = _parent(request, maps)
+        chosen = choose_vocabulary(maps, request.site, options.vocabulary)
+        built = _survey(run, admitted, None if parent is None else parent.survey, chosen)
+        draft = _keep(run, built, parent, maps)
         places = loop_places([s.entry.name for s in built.taken], [s.survey for s in built.taken], built.joined)
         draft = replace(draft, report=draft.report | {"loop_places": places})
         job.message, job.report = draft.sentence, draft.report | {"version": draft.version}
-        return draft
+        return draft, built
 
 
-def _parent(order: BuildRequest, maps: MapStore) -> Before | None:
+def read_zones(path: Path) -> Zones:
+    """The zones of a site from a TOML file: a table [zones] with name = [[x, y], ...] in metres; UsageError for anything else."""
+    return zones_of(load_toml(path, _ZonesFile).zones, str(path))
+
+
+class _ZonesFile(Section, frozen=True):
+    zones: dict[str, object]
+
+
+def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
     """The site's current version, to build on; None for a site without one."""
-    current = maps.current(order.site) if order.site in {info.site for info in maps.sites()} else None
+    site = request.site
+    current = maps.current(site) if site in {info.site for info in maps.sites()} else None
     if current is None:
         return None
-    if order.frame_from_ground_truth:
+    if request.options.frame_from_ground_truth:
         raise UsageError(
-            f"site {order.site} has version {current.version}, whose frame stays; build without --frame-from-ground-truth, "
+            f"site {site} has version {current.version}, whose frame stays; build without --frame-from-ground-truth, "
             "or name another --site"
         )
-    archive = maps.archive(order.site, current.version)
+    archive = maps.archive(site, current.version)
     if archive is None:
         raise StoreError(
-            f"version {current.version} of site {order.site} has no archive to build on; survey the site anew under another name"
+            f"version {current.version} of site {site} has no archive to build on; survey the site anew under another name"
         )
-    return Before.of(maps, maps.manifest(order.site, current.version), decode_archive(archive))
+    return Before.of(maps, maps.manifest(site, current.version), decode_archive(archive))
 
 
-def _survey(
-    order: BuildRequest, admitted: dict[Path, Admission], zones: Zones, base: SurveyMap | None, chosen: ChosenVocabulary,
-    settings: SurveySettings, console: Console, times: StageTimes, started_s: float, unusable: dict[Path, str] | None,
-) -> _Built:  # fmt: skip
+def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, chosen: ChosenVocabulary) -> Built:
+    """Surveys all recordings and joins them to the current map."""
+    options, settings = run.options, run.settings
     with (
-        ProgressView(console) as view,
-        ImageSpill(order.store) as shelf,
-        open_worker(order.threads, order.scheduler) as worker,
+        ProgressView(run.console) as view,
+        ImageSpill(run.request.store) as images,
+        open_executor(options.threads, options.scheduler) as executor,
     ):
 
         def progress(stage: str, done: int, total: int) -> None:
-            times(stage, done, total)
+            run.times(stage, done, total)
             view(stage, done, total)
 
-        def survey_one(path: Path, pinhole: StereoCamera | None, words: Vocabulary) -> Surveyed:
-            return survey_recording(
-                path,
-                admitted[path],
-                order.frames,
-                order.calibration,
-                order.use,
-                pinhole,
-                words,
-                settings,
-                zones,
-                progress,
-                shelf,
-                worker,
-            )
+        survey_options = SurveyConfig(settings, chosen.vocabulary, run.zones)
+        tools = SurveyTools(progress, images, executor)
 
-        surveyed = survey_all(
-            list(admitted), survey_one, None if base is None else base.camera,
-            chosen.vocabulary, unusable,
-        )  # fmt: skip
+        def survey_one(path: Path, pinhole: StereoCamera | None) -> Surveyed:
+            return survey_recording(path, admitted[path], options.reading, pinhole, survey_options, tools)
+
+        pinhole = None if base is None else base.camera
+        surveyed = survey_all(list(admitted), survey_one, pinhole, run.unusable)
         progress("joining", 0, 1)
-        joined = join_sessions(base, [Session(s.survey, s.placed) for s in surveyed], settings)
-    times.begin("vocabulary")
+        joined = join_sessions(base, [Session(s.survey, s.map_from_survey) for s in surveyed], settings)
+    run.times.begin("vocabulary")
     chosen = judged(chosen, surveyed[0].survey, settings)
-    times.begin("storing")
-    _say_left_out(order, surveyed, joined, console)
+    run.times.begin("storing")
+    _say_left_out(run, surveyed, joined)
     found = accuracy(joined.map, _truth(surveyed, joined))
-    if order.frame_from_ground_truth:
+    if options.frame_from_ground_truth:
         if found.rigid is None:
             raise RecordingError(
-                f"{order.recordings[0]}: too few estimated frames have a ground truth; build without "
+                f"{run.request.recordings[0]}: too few estimated frames have a ground truth; build without "
                 "--frame-from-ground-truth"
             )
-        joined = replace(joined, map=moved(joined.map, found.rigid.frame_from_estimate))
-    return _Built(surveyed, joined, found, chosen, zones, times, started_s)
+        joined = replace(joined, map=transform_map(joined.map, found.rigid.frame_from_estimate))
+    return Built(surveyed, joined, found, chosen, is_first=base is None)
 
 
-def _say_left_out(order: BuildRequest, surveyed: list[Surveyed], joined: Joined, console: Console) -> None:
+def _say_left_out(run: _Run, surveyed: list[Surveyed], joined: Joined) -> None:
     """Names the recordings that could not be joined; raises SurveyError where none could."""
     left = [(s, o) for s, o in zip(surveyed, joined.outcomes, strict=True) if not o.joined]
     for recording, outcome in left:
-        console.print(f"left out: {recording.entry.name}: {outcome.reason}", markup=False)
+        run.console.print(f"left out: {recording.entry.name}: {outcome.reason}", markup=False)
     if len(left) == len(surveyed):
         reasons = "; ".join(f"{s.entry.name}: {o.reason}" for s, o in left)
         raise SurveyError(
-            f"nothing could be joined to the current version of site {order.site} ({reasons}); drive through places that are "
+            f"nothing could be joined to the current version of site {run.request.site} ({reasons}); drive through places that are "
             "in the map, pass its docks, or survey the area as another --site"
         )
 
@@ -230,59 +263,59 @@ def _truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
     return chained(known, joined.trajectories) if len(known) == len(truths) else None
 
 
-def _keep(order: BuildRequest, built: _Built, parent: Before | None, settings: SurveySettings, maps: MapStore) -> Draft:
-    survey_map = built.joined.map
-    for_robots = choose_landmarks(survey_map, settings.budget, TILE_SIZE_M, _wanted_ids(parent, survey_map))
+def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Draft:
+    """Cuts the map into tiles, measures them, stores the draft and writes the files that were asked for."""
+    site, survey_map, camera = run.request.site, built.joined.map, built.joined.map.camera
+    wanted = _wanted_ids(parent, survey_map)
+    for_robots = choose_landmarks(survey_map, run.settings.budget, TILE_SIZE_M, wanted)
     tiles = tiles_from_survey(survey_map, chosen=for_robots)
-    built.times.begin("examining")
-    evidence = _examined(order, built, tiles, parent)
-    built.times.begin("storing")
+    run.times.begin("examining")
+    evidence = _evidence(run, built, tiles, parent)
+    run.times.begin("storing")
     archive = encode_archive(survey_map)
     vocabulary = encode_vocabulary(built.vocabulary.vocabulary)
-    report = make_report(
-        [s.entry.name for s in built.taken], built.joined, [s.survey for s in built.taken], built.accuracy,
-        built.vocabulary.download_bytes(len(vocabulary)),
-        time.perf_counter() - built.started_s, _peak_rss_mb(),
-    )  # fmt: skip
-    report = msgspec.structs.replace(
-        report,
-        findings={s.entry.name: s.remarks() for s in built.surveyed},
-        sessions=sessions_report([s.entry.name for s in built.surveyed], built.joined),
-        directions=evidence.directions or [],
+    cost = BuildCost(
+        vocabulary_bytes=built.vocabulary.download_bytes(len(vocabulary)),
+        seconds=time.perf_counter() - run.started_s,
+        peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
     )
+    report = make_report(built.surveyed, built.joined, built.accuracy, cost, evidence.directions or [])
     details = DraftDetails(
         created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
         tile_size_m=TILE_SIZE_M,
-        camera=_camera_entry(survey_map.camera),
+        camera=CameraEntry(**{name: getattr(camera, name) for name in CameraEntry.__struct_fields__}),
         recordings=tuple(s.entry for s in built.taken),
-        configuration=_configuration(order, parent, built.zones, settings),
+        configuration=_configuration(run, parent),
         libraries=_library_versions(),
         # A robot downloads the manifest: what it says about the build is short.
         report={key: value for key, value in msgspec.to_builtins(report).items() if key not in _NOT_FOR_ROBOTS},
     )
     content = DraftContent(
-        tiles=tiles, vocabulary=vocabulary, details=details, archive=archive, evidence=evidence, job=order.job
+        tiles=tiles, vocabulary=vocabulary, details=details, archive=archive, evidence=evidence, job=run.options.job
     )
-    version = maps.save_draft(order.site, content, actor=order.actor)
-    info = maps.version(order.site, version)
-    report = msgspec.structs.replace(report, map_bytes=info.map_bytes)
-    built.times.begin("writing")
-    _write_files(order, built, parent, report, version)
-    outcomes = zip(built.surveyed, built.joined.outcomes, strict=True)
-    return Draft(
+    version = maps.save_draft(site, content, actor=run.options.actor)
+    report = msgspec.structs.replace(report, map_bytes=maps.version(site, version).map_bytes)
+    run.times.begin("writing")
+    draft = Draft(
         version,
-        _sentence(order.site, version, parent, report),
+        sentence(site, version, None if parent is None else parent.manifest.version, report),
         msgspec.to_builtins(report),
-        {s.entry.sha256: outcome.reason for s, outcome in outcomes if not outcome.joined},
+        {
+            s.entry.sha256: outcome.reason
+            for s, outcome in zip(built.surveyed, built.joined.outcomes, strict=True)
+            if not outcome.joined
+        },
     )
+    _write_files(run, built, draft)
+    return draft
 
 
-def _examined(order: BuildRequest, built: _Built, tiles: list[Tile], before: Before | None) -> Evidence:
-    camera = built.joined.map.camera
+def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None) -> Evidence:
+    options, camera = run.options, built.joined.map.camera
     replayed = []
     if before is not None:
-        options = (order.frames, order.calibration, order.use)
-        replayed = replayed_probes(order.replay, before, *options, camera)
+        reading = options.frames, options.calibration, options.use
+        replayed = replayed_probes(options.replay, before, *reading, camera)
     trajectories = _map_trajectories(built.joined)
     sessions = [JudgedSession(t, s.held_out, s.survey) for t, s in zip(trajectories, built.taken, strict=True)]
     return examine_draft(tiles, camera, built.vocabulary.vocabulary, before, sessions, replayed)
@@ -306,26 +339,19 @@ def _wanted_ids(parent: Before | None, survey_map: SurveyMap) -> NDArray[np.uint
     return np.unique(np.concatenate([new, *(tile.landmark_ids for tile in parent.tiles)])).astype(np.uint32)
 
 
-def _configuration(
-    order: BuildRequest, parent: Before | None, zones: Zones, settings: SurveySettings
-) -> dict[str, Any]:
+def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
     """What the map depends on besides the recordings; no paths, which mean nothing elsewhere."""
+    options = run.options
     kept = parent is not None and bool(parent.manifest.configuration.get("frame_from_ground_truth"))
     return {
-        "frames": order.frames,
-        "own_vocabulary": order.vocabulary is not None,
-        "frame_from_ground_truth": order.frame_from_ground_truth or kept,
-        "own_calibration": order.calibration is not None,
-        "use": None if order.use is None else order.use.value,
-        "zones": {name: polygon.tolist() for name, polygon in zones.polygons.items()},
-        "survey": to_dict(settings),
+        "frames": options.frames,
+        "own_vocabulary": options.vocabulary is not None,
+        "frame_from_ground_truth": options.frame_from_ground_truth or kept,
+        "own_calibration": options.calibration is not None,
+        "use": None if options.use is None else options.use.value,
+        "zones": {name: polygon.tolist() for name, polygon in run.zones.polygons.items()},
+        "survey": to_dict(run.settings),
     }
-
-
-def _camera_entry(camera: StereoCamera) -> CameraEntry:
-    return CameraEntry(
-        focal_px=camera.focal_px, width_px=camera.width_px, height_px=camera.height_px, baseline_m=camera.baseline_m
-    )
 
 
 def _library_versions() -> dict[str, str]:
@@ -338,49 +364,34 @@ def _library_versions() -> dict[str, str]:
     return versions
 
 
-def _peak_rss_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+def picture_png(site: str, draft: Draft, built: Built) -> bytes:
+    """The map from above as a PNG."""
+    from mapserver.build.plots import draw_survey
+
+    # Loops name keyframes of their own survey, which are the map's only where nothing was joined or culled.
+    alone = built.is_first and len(built.taken) == 1
+    loops = built.taken[0].survey.loops if alone else Loops()
+    report = msgspec.convert(draft.report, BuildReport)
+    return draw_survey(f"{site}, version {draft.version}", built.joined.map, loops, built.accuracy, report)
 
 
-def _write_files(order: BuildRequest, built: _Built, parent: Before | None, report: BuildReport, version: int) -> None:
-    if order.trajectory is not None:
-        write_tum(order.trajectory, built.joined.map.trajectory)
-    if order.picture is not None:
-        from mapserver.build.plots import draw_survey
-
-        title = f"{order.site}, version {version}"
-        # Loops name keyframes of their own survey, which are the map's only where nothing was joined or culled.
-        alone = parent is None and len(built.taken) == 1
-        loops = built.taken[0].survey.loops if alone else Loops()
-        _write(order.picture, draw_survey(title, built.joined.map, loops, built.accuracy, report))
-    if order.report is not None:
-        full = full_report(report, order.site, version, built.taken, built.joined, built.accuracy, built.times.seconds)
+def _write_files(run: _Run, built: Built, draft: Draft) -> None:
+    options, site = run.options, run.request.site
+    if options.trajectory is not None:
+        write_tum(options.trajectory, built.joined.map.trajectory)
+    if options.picture is not None:
+        write_file(options.picture, picture_png(site, draft, built))
+    if options.report is not None:
+        full: dict[str, Any] = {"site": site, "version": draft.version}
+        full = draft.report | full | report_details(built.taken, built.joined, built.accuracy, run.times.seconds)
         full["vocabulary"] = {"source": built.vocabulary.source, "sha256": built.vocabulary.sha256()}
         full["vocabulary"]["trial"] = msgspec.to_builtins(built.vocabulary.trial)
-        _write(order.report, msgspec.json.format(msgspec.json.encode(full), indent=2) + b"\n")
+        write_file(options.report, msgspec.json.format(msgspec.json.encode(full), indent=2) + b"\n")
 
 
-def _write(path: Path, data: bytes) -> None:
+def write_file(path: Path, data: bytes) -> None:
+    """Writes a result of a build; StoreError where the disk refuses."""
     try:
         path.write_bytes(data)
     except OSError as error:
         raise StoreError(f"{path} cannot be written ({error.strerror}); the draft is stored all the same") from error
-
-
-def _sentence(site: str, version: int, parent: Before | None, report: BuildReport) -> str:
-    ate = "" if report.ate_rmse_m is None else f", ATE {report.ate_rmse_m:.4f} m"
-    sizes = f"{report.map_bytes} bytes, {report.loops['accepted']} loops{ate}, in {report.seconds:.1f} s"
-    built_on = "" if parent is None else f" on version {parent.manifest.version}"
-    left = [s["recording"] for s in report.sessions if not s["joined"]]
-    left_out = f"; left out, they could not be joined: {', '.join(left)}" if left else ""
-    one_way = one_way_words(report.directions)
-    warned = f"; {one_way}" if one_way else ""
-    if report.scale == "unknown":
-        return (
-            f"site {site}: draft {version} of {report.keyframes} keyframes and {report.landmarks} landmarks, {sizes}; its scale is "
-            "unknown, so it can be inspected but not published"
-        )
-    return (
-        f"site {site}: draft {version}{built_on} of {report.keyframes} keyframes and {report.landmarks} landmarks over "
-        f"{report.path_m:.1f} m, {sizes}{left_out}{warned}; make it current with `mapserver publish --site {site}`"
-    )

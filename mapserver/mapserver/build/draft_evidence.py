@@ -54,7 +54,7 @@ class JudgedSession(NamedTuple):
 
 def held_out_of(recording: Recording, selected: Sequence[int], rectifier: Rectifier, survey: Survey) -> list[HeldOut]:
     """Frames of a surveyed recording that did not become keyframes, read again. Damaged ones are left out."""
-    keyframes = [k.frame_index for k in survey.first_guess.keyframes]
+    keyframes = [k.frame_index for k in survey.odometry.keyframes]
     numbers = held_out_frames(keyframes, survey.map.trajectory_estimated, PROBES)
     return _read(recording, selected, numbers, rectifier)
 
@@ -151,7 +151,7 @@ def _breaks(sessions: Sequence[JudgedSession]) -> TrajectoryBreaks | None:
     found = []
     for trajectory, _, survey in sessions:
         if survey.state.camera.baseline_m > 0:
-            guess = survey.first_guess
+            guess = survey.odometry
             odometry = (guess.odom_from_body, guess.covariances, guess.tracked.astype(bool))
             found.append(trajectory_breaks(trajectory.stamps_ns, trajectory.frame_from_body, *odometry))
     known = [breaks for breaks in found if breaks is not None]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from fleetmap.geometry import Array
-from mapserver.survey.loops.loops import LoopRecord, Verdict
+from mapserver.survey.loops.loops import LoopRecord, LoopVerdict
 from mapserver.survey.merge.multi_session import Joined
 from mapserver.survey.pipeline import Survey
 
@@ -23,11 +23,11 @@ def loop_places(names: Sequence[str], surveys: Sequence[Survey], joined: Joined)
     accepted: list[dict[str, Any]] = []
     refused: list[dict[str, Any]] = []
     for name, survey, map_from_body in zip(names, surveys, parts, strict=True):
-        frames = [keyframe.frame_index for keyframe in survey.first_guess.keyframes]
+        frames = [keyframe.frame_index for keyframe in survey.odometry.keyframes]
         # Records keep the numbers that keyframes had before parts of the survey were left out: then no places are known.
-        for record in survey.loops.records if all(part.kept for part in survey.parts) else ():
+        for record in survey.loops.records if all(part.kept for part in survey.components) else ():
             place = _place(name, record, map_from_body[:, :2, 3], frames)
-            (accepted if record.verdict is Verdict.ACCEPTED else refused).append(place)
+            (accepted if record.verdict is LoopVerdict.ACCEPTED else refused).append(place)
     refused.sort(key=lambda place: (-place["score"], place["recording"], place["from_map_m"], place["to_map_m"]))
     return accepted + refused[:MAX_REFUSED]
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from fleetmap.geometry import Array
 from mapserver.build.report import Accuracy, BuildReport
-from mapserver.survey.loops.loops import Loops, Verdict
+from mapserver.survey.loops.loops import Loops, LoopVerdict
 from mapserver.survey.survey_map import SurveyMap
 
 if TYPE_CHECKING:
@@ -146,9 +146,9 @@ def _draw_map(axes: "Axes", plan: _Plan, loops: Loops) -> None:
 
 def _draw_loops(axes: "Axes", plan: _Plan, loops: Loops) -> None:
     """Accepted ones, and of the refused ones those that looked most alike."""
-    accepted = [r for r in loops.records if r.verdict is Verdict.ACCEPTED]
+    accepted = [r for r in loops.records if r.verdict is LoopVerdict.ACCEPTED]
     refused = sorted(
-        (r for r in loops.records if r.verdict is not Verdict.ACCEPTED), key=lambda r: (-r.score, r.i, r.j)
+        (r for r in loops.records if r.verdict is not LoopVerdict.ACCEPTED), key=lambda r: (-r.score, r.i, r.j)
     )
     for records, colour, width, alpha, order, label in (
         (refused[:_MAX_REFUSED], _BAD, 0.5, 0.35, 2, "loop refused"),

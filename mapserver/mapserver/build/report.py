@@ -1,4 +1,4 @@
-"""What a build says about itself. Pure; the keys of `BuildReport` are stable, the README lists their meanings."""
+"""The report of a build. Pure; the keys of `BuildReport` are stable, docs/reports.md lists their meanings."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -10,9 +10,9 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.sensors.samples import Trajectory
 from mapserver.evaluation.trajectory_error import AteResult, absolute_trajectory_error, paired
+from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import TileDirections
 from mapserver.survey.merge.multi_session import Joined
-from mapserver.survey.pipeline import Survey
 from mapserver.survey.survey_map import SurveyMap
 
 if TYPE_CHECKING:
@@ -103,36 +103,48 @@ def path_length_m(trajectory: Trajectory) -> float:
     return float(np.linalg.norm(np.diff(trajectory.positions_m, axis=0), axis=1).sum())
 
 
+class BuildCost(msgspec.Struct, frozen=True):
+    """What a build cost: bytes of the vocabulary for a robot, wall seconds, most memory in 10^6 bytes."""
+
+    vocabulary_bytes: int
+    seconds: float
+    peak_rss_mb: float
+
+
 def make_report(
-    names: list[str], joined: Joined, surveys: Sequence[Survey], found: Accuracy, vocabulary_bytes: int, seconds: float,
-    peak_rss_mb: float,
-) -> BuildReport:  # fmt: skip
-    """The report of finished surveys (those that were joined), map_bytes and sessions still unknown."""
+    recordings: "Sequence[Surveyed]",
+    joined: Joined,
+    found: Accuracy,
+    cost: BuildCost,
+    directions: list[TileDirections],
+) -> BuildReport:
+    """The report of surveyed recordings, map_bytes still unknown."""
     survey_map = joined.map
+    taken = [s for s, outcome in zip(recordings, joined.outcomes, strict=True) if outcome.joined]
     duration_s = sum(float(t.stamps_ns[-1] - t.stamps_ns[0]) * 1e-9 for t in joined.trajectories)
-    loops = [survey.loops.counts() for survey in surveys]
-    culled = [asdict(survey.culled) for survey in surveys]
+    loops = [s.survey.loops.counts() for s in taken]
+    culled = [asdict(s.survey.culled) for s in taken]
     return BuildReport(
-        recordings=names,
+        recordings=[s.entry.name for s in taken],
         duration_s=round(duration_s, 6),
-        seconds=round(seconds, 3),
-        realtime_factor=round(duration_s / max(seconds, 1e-9), 4),
+        seconds=round(cost.seconds, 3),
+        realtime_factor=round(duration_s / max(cost.seconds, 1e-9), 4),
         path_m=round(sum(path_length_m(t) for t in joined.trajectories), 4),
         keyframes=len(survey_map.keyframe_stamps_ns),
         landmarks=len(survey_map.landmark_ids),
         map_bytes=None,
-        vocabulary_bytes=vocabulary_bytes,
+        vocabulary_bytes=cost.vocabulary_bytes,
         loops={key: sum(count[key] for count in loops) for key in loops[0]},
         ate_rmse_m=None if found.rigid is None else found.rigid.rmse_m,
         ate_sim3_rmse_m=None if found.similarity is None else found.similarity.rmse_m,
         evaluated_share=found.evaluated_share,
         scale="metric" if survey_map.scale_known else "unknown",
         scale_error=None if found.similarity is None else 1.0 / found.similarity.scale - 1.0,
-        peak_rss_mb=round(peak_rss_mb, 1),
+        peak_rss_mb=round(cost.peak_rss_mb, 1),
         culled={key: sum(count[key] for count in culled) for key in culled[0]},
-        findings={},
-        sessions=[],
-        directions=[],
+        findings={s.entry.name: s.remarks() for s in recordings},
+        sessions=sessions_report([s.entry.name for s in recordings], joined),
+        directions=directions,
     )
 
 
@@ -145,24 +157,20 @@ def sessions_report(names: list[str], joined: Joined) -> list[dict[str, Any]]:
     ]
 
 
-def full_report(
-    report: BuildReport, site: str, version: int, surveyed: "Sequence[Surveyed]", joined: Joined, found: Accuracy,
-    stage_s: dict[str, float],
-) -> dict[str, Any]:  # fmt: skip
-    """The stable keys, and with them what helps to understand them; those may change.
+def report_details(
+    surveyed: "Sequence[Surveyed]", joined: Joined, found: Accuracy, stage_s: dict[str, float]
+) -> dict[str, Any]:
+    """Keys of the full report beside the stable ones, which help to understand those; they may change.
 
     loop_records: every candidate, keyframe i against the older j of one recording. stage_s: wall seconds of each stage; reading
-    and decoding images are part of odometry. pair_turn: see survey/pair_turn.py. parts: of each survey, of which the kept one
-    is in the map.
+    and decoding images are part of odometry. pair_turn: see survey/bundle/stereo_yaw_check.py. parts: the connected
+    components of each survey, of which the kept one is in the map.
     """
     survey_map, first = joined.map, surveyed[0]
-    stable: dict[str, Any] = msgspec.to_builtins(report)
-    return stable | {
-        "site": site,
-        "version": version,
+    return {
         "format": first.format,
         "sensor_set": first.sensor_set.value,
-        "inertial": all(s.survey.first_guess.inertial for s in surveyed),
+        "inertial": all(s.survey.odometry.inertial for s in surveyed),
         "losses": [{"what": issue.what, "detail": issue.detail} for s in surveyed for issue in s.issues],
         "frames": len(survey_map.trajectory),
         "estimated_frames": int(survey_map.trajectory_estimated.sum()),
@@ -170,12 +178,32 @@ def full_report(
         "point_sigma_median_m": float(np.median(survey_map.point_sigma_m)),
         "ate_max_m": None if found.rigid is None else found.rigid.max_m,
         "sim3_scale": None if found.similarity is None else found.similarity.scale,
-        "pair_turn": [msgspec.to_builtins(s.survey.pair_turn) for s in surveyed],
+        "pair_turn": [msgspec.to_builtins(s.survey.stereo_yaw) for s in surveyed],
         "stage_s": {stage: round(seconds, 3) for stage, seconds in stage_s.items()},
-        "parts": [msgspec.to_builtins(s.survey.parts) for s in surveyed],
+        "parts": [msgspec.to_builtins(s.survey.components) for s in surveyed],
         "loop_records": [
             {"recording": s.entry.name} | record
             for s in surveyed
             for record in msgspec.to_builtins(s.survey.loops.records)
         ],
     }
+
+
+def sentence(site: str, version: int, parent: int | None, report: BuildReport) -> str:
+    """A stored draft in words; parent: the version that it was built on."""
+    ate = "" if report.ate_rmse_m is None else f", ATE {report.ate_rmse_m:.4f} m"
+    sizes = f"{report.map_bytes} bytes, {report.loops['accepted']} loops{ate}, in {report.seconds:.1f} s"
+    built_on = "" if parent is None else f" on version {parent}"
+    left = [s["recording"] for s in report.sessions if not s["joined"]]
+    left_out = f"; left out, they could not be joined: {', '.join(left)}" if left else ""
+    one_way = one_way_words(report.directions)
+    warned = f"; {one_way}" if one_way else ""
+    if report.scale == "unknown":
+        return (
+            f"site {site}: draft {version} of {report.keyframes} keyframes and {report.landmarks} landmarks, {sizes}; its scale is "
+            "unknown, so it can be inspected but not published"
+        )
+    return (
+        f"site {site}: draft {version}{built_on} of {report.keyframes} keyframes and {report.landmarks} landmarks over "
+        f"{report.path_m:.1f} m, {sizes}{left_out}{warned}; make it current with `mapserver publish --site {site}`"
+    )

@@ -1,6 +1,7 @@
-"""The rim around surveys: opens recordings one after the other and surveys each."""
+"""Surveys of recordings: each is opened, checked, surveyed and closed, one after the other."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,31 +9,30 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from fleetmap.bow import Vocabulary
 from fleetmap.errors import RecordingError, SurveyError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
-from fleetmap.sensors.samples import DataIssue, PositionPrior, SensorSet, Trajectory
+from fleetmap.sensors.samples import DataIssue, SensorSet, Trajectory
 from mapserver.build.admission import checked, with_clock
 from mapserver.build.draft_evidence import HeldOut, held_out_of
 from mapserver.build.report import check_truth
 from mapserver.build.sensor_subset import reduced
 from mapserver.build.worker import read_ahead
 from mapserver.survey.executor import SERIAL, Executor
-from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey
+from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey_by_priors
 from mapserver.survey.finish.map_transform import scaled, scaled_state
-from mapserver.survey.keyframes.keyframes import ImageStore
-from mapserver.survey.loops.zones import Zones
-from mapserver.survey.pipeline import Progress, Survey, survey
-from mapserver.survey.settings import SurveySettings
+from mapserver.survey.pipeline import Survey, survey
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
 
 
 @dataclass(frozen=True)
 class Surveyed:
-    """One recording and its survey. placed: map_from_survey (4, 4) by its position priors, None without any.
-    findings: what the doctor remarked. held_out: frames that the survey did not use.
+    """One recording and its survey.
+
+    map_from_survey (4, 4): by its position priors, None without any. findings: the doctor's remarks. held_out: frames that
+    the survey did not use.
     """
 
     entry: RecordingEntry
@@ -41,35 +41,56 @@ class Surveyed:
     issues: tuple[DataIssue, ...]
     truth: Trajectory | None
     survey: Survey
-    placed: Array | None
+    map_from_survey: Array | None
     findings: tuple[str, ...]
     held_out: list[HeldOut]
 
     def remarks(self) -> list[str]:
         """What was wanting in the recording, what was corrected and what was left out, in words."""
-        return [*self.findings, *(part.remark() for part in self.survey.parts if not part.kept)]
+        return [*self.findings, *(c.remark() for c in self.survey.components if not c.kept)]
 
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """A recording that may be surveyed: its issues and the doctor's remarks, in words; the correction of its clocks."""
+    """A recording fit to be surveyed: the doctor's remarks in words, and the correction of its clocks."""
 
     remarks: tuple[str, ...]
     correction_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class RecordingOptions:
+    """How recordings are read: frames A:B:C, another calibration file, only the sensors of a poorer set."""
+
+    frames: str = "::"
+    calibration: Path | None = None
+    use: SensorSet | None = None
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
+        """The recording at `path` and the indices of its selected frames."""
+        with open_recording(path, OpenOptions(calibration_file=self.calibration)) as opened:
+            recording = reduced(opened, self.use)
+            yield recording, FrameSelection.parse(self.frames).apply(recording)
+
+
 def admit_recordings(
-    paths: Sequence[Path], frames: str, calibration: Path | None, use: SensorSet | None, console: Console, *,
-    needs_truth: bool, unusable: dict[Path, str] | None = None, worker: Executor = SERIAL,
-) -> dict[Path, Admission]:  # fmt: skip
-    """Examines all of them, and refuses before the work what could not end well.
+    paths: Sequence[Path],
+    options: RecordingOptions,
+    console: Console,
+    *,
+    needs_truth: bool,
+    unusable: dict[Path, str] | None = None,
+    executor: Executor = SERIAL,
+) -> dict[Path, Admission]:
+    """Checks all recordings, so that a hopeless one is refused before the work begins.
 
     unusable: takes those that are refused, with the reason; without it, or where all are, that is an error.
     """
     admitted: dict[Path, Admission] = {}
     for path in paths:
         try:
-            admitted[path] = _admission(path, frames, calibration, use, console, needs_truth, worker)
+            admitted[path] = _admission(path, options, console, needs_truth, executor)
         except RecordingError as error:
             if unusable is None:
                 raise
@@ -80,86 +101,73 @@ def admit_recordings(
 
 
 def _admission(
-    path: Path,
-    frames: str,
-    calibration: Path | None,
-    use: SensorSet | None,
-    console: Console,
-    needs_truth: bool,
-    worker: Executor,
+    path: Path, options: RecordingOptions, console: Console, needs_truth: bool, executor: Executor
 ) -> Admission:
-    with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
-        recording = reduced(opened, use)
+    with options.open(path) as (recording, indices):
         for issue in recording.issues:
             console.print(f"issue: {issue.what}: {issue.detail}", markup=False)
-        _check(recording, FrameSelection.parse(frames).apply(recording), needs_truth)
-        examined = checked(recording, worker=worker)
-        for remark in examined.remarks():
+        if needs_truth:
+            check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
+        result = checked(recording, executor=executor)
+        for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
-        return Admission(tuple(examined.remarks()), examined.correction_s)
-
-
-def _check(recording: Recording, indices: NDArray[np.int64], needs_truth: bool) -> None:
-    if needs_truth:
-        check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
+        return Admission(tuple(result.remarks()), result.correction_s)
 
 
 def survey_recording(
-    path: Path, admission: Admission, frames: str, calibration: Path | None, use: SensorSet | None, pinhole: StereoCamera | None,
-    vocabulary: Vocabulary, settings: SurveySettings, zones: Zones, progress: Progress, shelf: ImageStore,
-    worker: Executor = SERIAL,
-) -> Surveyed:  # fmt: skip
-    """Surveys one recording by the sensors of `use` (or all it has), as if `pinhole` (or what suits it) had seen it."""
-    with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
-        recording = with_clock(reduced(opened, use), admission.correction_s)
-        indices = FrameSelection.parse(frames).apply(recording)
+    path: Path,
+    admission: Admission,
+    reading: RecordingOptions,
+    pinhole: StereoCamera | None,
+    options: SurveyConfig,
+    tools: SurveyTools,
+) -> Surveyed:
+    """Surveys one recording as if `pinhole` (or the camera that suits it) had seen it."""
+    with reading.open(path) as (opened, indices):
+        recording = with_clock(opened, admission.correction_s)
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
-        done = survey(
-            read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices), len(indices), recording.imu,
-            recording.calibration, rectifier, vocabulary, settings, zones, progress, shelf, recording.wheel, worker,
-        )  # fmt: skip
-        done, placed = _placed(done, recording.priors, recording.calibration.base_from_body)
-        entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices))
-        held_out = held_out_of(recording, indices.tolist(), rectifier, done)
+        frames = read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices)
+        inputs = SurveyInputs(frames, len(indices), recording.imu, recording.calibration, rectifier, recording.wheel)
+        done, map_from_survey = _aligned(survey(inputs, options, tools), recording)
         return Surveyed(
-            entry,
-            recording.format,
-            recording.sensor_set,
-            recording.issues,
-            recording.ground_truth,
-            done,
-            placed,
-            admission.remarks,
-            held_out,
+            entry=RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices)),
+            format=recording.format,
+            sensor_set=recording.sensor_set,
+            issues=recording.issues,
+            truth=recording.ground_truth,
+            survey=done,
+            map_from_survey=map_from_survey,
+            findings=admission.remarks,
+            held_out=held_out_of(recording, indices.tolist(), rectifier, done),
         )
 
 
-def _placed(done: Survey, priors: Sequence[PositionPrior], base_from_body: Array) -> tuple[Survey, Array | None]:
+def _aligned(done: Survey, recording: Recording) -> tuple[Survey, Array | None]:
     """The survey, in metres where its priors give a scale that was unknown, and map_from_survey (4, 4) by them, None without any."""
+    priors, base_from_body = recording.priors, recording.calibration.base_from_body
     if done.map.scale_known:
-        return done, map_from_survey(done.map, priors, base_from_body)
-    anchoring = aligned_by_priors(done.map, priors, base_from_body)
-    if anchoring is None:
+        return done, map_from_survey_by_priors(done.map, priors, base_from_body)
+    aligned = aligned_by_priors(done.map, priors, base_from_body)
+    if aligned is None:
         return done, None
-    in_metres = replace(done, map=scaled(done.map, anchoring.scale), state=scaled_state(done.state, anchoring.scale))
-    return in_metres, anchoring.map_from_survey
+    in_metres = replace(done, map=scaled(done.map, aligned.scale), state=scaled_state(done.state, aligned.scale))
+    return in_metres, aligned.map_from_survey
 
 
 def survey_all(
     paths: Sequence[Path],
-    survey_one: Callable[[Path, StereoCamera | None, Vocabulary], Surveyed],
+    survey_one: Callable[[Path, StereoCamera | None], Surveyed],
     pinhole: StereoCamera | None,
-    vocabulary: Vocabulary,
     unusable: dict[Path, str] | None = None,
 ) -> list[Surveyed]:
-    """Surveys of all recordings through one camera and with one vocabulary.
+    """Surveys of all recordings, resampled to one camera: `pinhole`, or that of the first one.
 
     unusable: takes those that cannot be surveyed, with the reason; without it, or where none can be, that is an error.
     """
     done: list[Surveyed] = []
     for path in paths:
         try:
-            done.append(survey_one(path, pinhole, vocabulary))
+            done.append(survey_one(path, pinhole))
         except (RecordingError, SurveyError) as error:
             if unusable is None:
                 raise

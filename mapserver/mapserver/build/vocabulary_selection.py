@@ -51,7 +51,7 @@ def judged(chosen: ChosenVocabulary, done: Survey, settings: SurveySettings) -> 
     if chosen.source != "default":
         return chosen
     stamps = set(done.map.keyframe_stamps_ns.tolist())
-    descriptors = [k.features.descriptors for k in done.first_guess.keyframes if k.stamp_ns in stamps]
+    descriptors = [k.features.descriptors for k in done.odometry.keyframes if k.stamp_ns in stamps]
     trial, own = try_own_vocabulary(
         done.map, descriptors, chosen.vocabulary, settings.vocabulary, settings.loops.min_gap_keyframes, settings.seed
     )

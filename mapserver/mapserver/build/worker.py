@@ -1,4 +1,4 @@
-"""Workers for surveys: threads of this process, or processes of a dask cluster, embedded or elsewhere.
+"""Executors for surveys: threads of this process, or processes of a dask cluster, embedded or elsewhere.
 
 Two cores are served best by threads: the kernels run without the interpreter's lock, and nothing is copied. Processes take over
 where there are many cores, or several machines.
@@ -91,7 +91,7 @@ def _in_order(
 
 
 @contextmanager
-def open_worker(threads: int | None, scheduler: str | None) -> Iterator[Executor]:
+def open_executor(threads: int | None, scheduler: str | None) -> Iterator[Executor]:
     """Threads (as many as there are cores, without a number), or the cluster of a scheduler; `local` makes one of processes here.
 
     Raises UsageError where the scheduler does not answer.

@@ -12,7 +12,7 @@ from mapserver.commands.options import SurveyOptions, check_output
 
 
 @dataclass(frozen=True, kw_only=True)
-class BuildOptions(SurveyOptions):
+class BuildCommandOptions(SurveyOptions):
     """Options of `build` beside those of `nightly`."""
 
     vocabulary: Annotated[
@@ -38,7 +38,7 @@ class BuildOptions(SurveyOptions):
 def build(
     context: typer.Context,
     recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folder or .mcap file to survey.")],
-    options: BuildOptions,
+    options: BuildCommandOptions,
     config: ConfigFile = None,
 ) -> None:
     """Survey the recordings, join them to the site's current version, and store the map as a draft."""
@@ -47,12 +47,10 @@ def build(
     if options.picture is not None and options.picture.suffix.lower() != ".png":
         raise UsageError(f"--picture {options.picture} must end in .png")
     options.check()
-    from mapserver.build.build import BuildRequest, run_build
-    from mapserver.build.sensor_subset import named_sensor_set, sensor_set_of
-    from mapserver.config import survey_settings
+    from mapserver import BuildOptions, build_map
+    from mapserver.build.sensor_subset import named_sensor_set
 
-    sensors = None if options.use is None else named_sensor_set(options.use)
-    asked = vars(options) | {"use": sensors, "replay": tuple(options.replay or ())}
-    request = BuildRequest(tuple(recordings), **asked)
-    settings = survey_settings(config_path(context), sensors or sensor_set_of(recordings[0], options.calibration))
-    typer.echo(run_build(request, settings))
+    use = None if options.use is None else named_sensor_set(options.use)
+    asked = vars(options) | {"use": use, "replay": tuple(options.replay or ()), "config": config_path(context)}
+    site, store = asked.pop("site"), asked.pop("store")
+    typer.echo(build_map(recordings, store, site, BuildOptions(**asked)).sentence)

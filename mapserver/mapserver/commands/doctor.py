@@ -17,7 +17,7 @@ EXIT_STATUS_BAD_RECORDING = 3
 
 
 def doctor(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Folder or .mcap file to examine.")],
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Folder or .mcap file to run_checks.")],
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the findings here as JSON too.")
     ] = None,
@@ -35,7 +35,7 @@ def doctor(
     from rich.progress import Progress
 
     from fleetmap.recordings import OpenOptions, open_recording
-    from mapserver.doctor import Verdict, examine
+    from mapserver.doctor import Verdict, run_checks
     from mapserver.doctor.findings import worst
     from mapserver.doctor.run_checks import SAMPLED_FRAMES, TURN_FRAMES
 
@@ -43,7 +43,7 @@ def doctor(
         with Progress(console=Console(stderr=True), transient=True) as progress:
             wanted = 2 * min(SAMPLED_FRAMES, len(source)) + (min(TURN_FRAMES, len(source)) if len(source.imu) else 0)
             task = progress.add_task("frames", total=wanted)
-            findings = examine(source, lambda: progress.advance(task)).findings
+            findings = run_checks(source, lambda: progress.advance(task)).findings
         _print(Console(), source, findings)
         if json_file is not None:
             json_file.write_text(_as_json(source, findings), encoding="utf-8")

@@ -1,9 +1,6 @@
-"""What is wrong with a recording, found before a survey fails on it. Analyses are pure.
-
-`examination` reads the frames.
-"""
+"""Checks of a recording before it is surveyed. The analyses are pure; `run_checks` reads the frames."""
 
 from mapserver.doctor.findings import Finding, Verdict
-from mapserver.doctor.run_checks import Examination, examine
+from mapserver.doctor.run_checks import CheckResults, run_checks
 
-__all__ = ["Examination", "Finding", "Verdict", "examine"]
+__all__ = ["CheckResults", "Finding", "Verdict", "run_checks"]

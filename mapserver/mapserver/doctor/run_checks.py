@@ -25,7 +25,7 @@ _MOTION_NS, _LONGEST_MOTION_NS = 250_000_000, 350_000_000  # between the two mom
 
 
 @dataclass(frozen=True, slots=True)
-class Examination:
+class CheckResults:
     """All findings, in a fixed order, and the time offset that gyro and images show beyond the calibration's.
 
     measured_offset_s is None where it was not measured, or hardly.
@@ -53,14 +53,14 @@ class _Frames:
             return None
 
 
-def examine(
+def run_checks(
     recording: Recording,
     on_frame: Callable[[], None] = lambda: None,
     *,
     sampled: int = SAMPLED_FRAMES,
     turn_frames: int = TURN_FRAMES,
-    worker: Executor = SERIAL,
-) -> Examination:
+    executor: Executor = SERIAL,
+) -> CheckResults:
     """Everything the checks say about a recording.
 
     Reads at most twice `sampled` frames, spread over the recording, and a run of `turn_frames`; `on_frame` is called after each.
@@ -78,14 +78,14 @@ def examine(
         inertial.gravity_magnitude(imu),
     ]
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
-    seen = _sampled(recording, frames, rectifier, sampled, worker)
+    seen = _sampled(recording, frames, rectifier, sampled, executor)
     if recording.sensor_set in (SensorSet.STEREO, SensorSet.STEREO_INERTIAL):
         findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
         findings += [stereo_against_motion(seen.zeros, rectifier.camera)]
-    turns = _camera_turns(recording, frames, rectifier, turn_frames, worker)
+    turns = _camera_turns(recording, frames, rectifier, turn_frames, executor)
     checked, measured_offset_s = gyro_check(turns, imu, shift_s)
     findings += [*checked, sharpness(seen.variances), _readable(frames)]
-    return Examination(findings + timing.other_issues(recording.issues), measured_offset_s)
+    return CheckResults(findings + timing.other_issues(recording.issues), measured_offset_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,10 +97,10 @@ class _Seen:
     variances: list[float]
 
 
-def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, worker: Executor) -> _Seen:
+def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, executor: Executor) -> _Seen:
     seen = _Seen([], [], [])
     moments = _moments(recording, frames, rectifier, count)
-    for variance, pair, zero in worker.map(_look, rectifier.camera, moments):
+    for variance, pair, zero in executor.map(_look, rectifier.camera, moments):
         seen.variances.append(variance)
         seen.pairs.extend([] if pair is None else [pair])
         seen.zeros.extend([] if zero is None else [zero])
@@ -135,11 +135,11 @@ def _look(camera: StereoCamera, moment: _Moment) -> tuple[float, StereoMatches |
 
 
 def _camera_turns(
-    recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, worker: Executor
+    recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, executor: Executor
 ) -> CameraTurns:
     starts, ends, rates = [], [], []
     pairs = _consecutive(recording, frames, rectifier, count)
-    for start_ns, end_ns, rate in worker.map(_turn, (rectifier.camera, rectifier.body_from_cam[:3, :3]), pairs):
+    for start_ns, end_ns, rate in executor.map(_turn, (rectifier.camera, rectifier.body_from_cam[:3, :3]), pairs):
         if rate is not None:
             starts.append(start_ns)
             ends.append(end_ns)

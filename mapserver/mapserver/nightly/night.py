@@ -15,7 +15,7 @@ from rich.console import Console
 
 from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, SurveyError
 from mapserver import releases
-from mapserver.build.build import BuildRequest, build_draft
+from mapserver.build.build import BuildOptions, BuildRequest, build_draft
 from mapserver.build.job_lock import INTERRUPTED, end_interrupted, held
 from mapserver.nightly import inbox as boxes
 from mapserver.nightly.lock import only_one
@@ -189,13 +189,19 @@ class _Conductor:
         order = self._order
         by_hash = {recorded.sha256: recorded for recorded in recordings}
         unusable: dict[Path, str] = {}
-        build = BuildRequest(
-            tuple(r.path for r in recordings), order.site, order.store, order.frames, order.calibration, order.zones,
-            replay=tuple(self._replayed()), actor=Actor(JOB, _reason(self._night.job)),
-            threads=order.threads, scheduler=order.scheduler, job=self._night.job,
-        )  # fmt: skip
+        options = BuildOptions(
+            frames=order.frames,
+            calibration=order.calibration,
+            zones=order.zones,
+            replay=tuple(self._replayed()),
+            actor=Actor(JOB, _reason(self._night.job)),
+            threads=order.threads,
+            scheduler=order.scheduler,
+            job=self._night.job,
+        )
+        build = BuildRequest(tuple(r.path for r in recordings), order.site, order.store, options)
         try:
-            draft = build_draft(build, self._survey, unusable)
+            draft, _ = build_draft(build, self._survey, unusable)
         except (RecordingError, SurveyError) as error:
             self._put_all_away(recordings, unusable, str(error))
             raise

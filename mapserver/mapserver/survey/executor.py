@@ -1,4 +1,4 @@
-"""Who does the parts of a survey that do not depend on each other. What comes out is the same whoever does them."""
+"""Executors of independent batches of a survey. The result does not depend on the executor."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Protocol, TypeVar
@@ -9,7 +9,7 @@ Shared = TypeVar("Shared")
 
 
 class Executor(Protocol):
-    """Does batches, in any order and anywhere; function and arguments can be pickled."""
+    """Computes batches, in any order and anywhere; function and arguments can be pickled."""
 
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
@@ -18,7 +18,7 @@ class Executor(Protocol):
 
 
 class SerialExecutor:
-    """Does everything itself, one batch after the other, each when its result is asked for."""
+    """Computes one batch after the other in the calling thread, each when its result is asked for."""
 
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]

@@ -1,234 +1,253 @@
-"""The survey from end to end: the list of its stages."""
+"""The survey from end to end: the list of its stages, each a function from a state to a new one."""
 
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
 from fleetmap.errors import SurveyError
-from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, WheelSample
-from mapserver.survey.bundle.bundle_rounds import Motion, SurveyState, adjust, adjust_windows
-from mapserver.survey.bundle.odometry_factors import blackout_factors, chain_edges, odometry_terms
-from mapserver.survey.bundle.stereo_yaw_check import NO_TURN, StereoYaw, estimate_stereo_yaw, without_stereo_yaw
-from mapserver.survey.executor import SERIAL, Executor
+from fleetmap.geometry import Array
+from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState, bundle_rounds, local_windows
+from mapserver.survey.bundle.odometry_factors import blackout_factors, chain_edges, odometry_factors
+from mapserver.survey.bundle.stereo_yaw_check import NO_YAW, StereoYaw, estimate_stereo_yaw, without_stereo_yaw
 from mapserver.survey.finish.culling import Culled
-from mapserver.survey.finish.map_assembly import summarise
+from mapserver.survey.finish.map_assembly import assemble
 from mapserver.survey.keyframes.connected_components import (
-    Part,
+    Component,
     SigmaBetween,
-    beside,
+    between_kept,
+    covisibility_of,
     find_components,
     only_kept,
-    seen_by,
 )
-from mapserver.survey.keyframes.keyframes import ImageStore
+from mapserver.survey.keyframes.keyframes import PosedKeyframes
 from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.loops.loops import LoopCloser, Loops
 from mapserver.survey.loops.sim3_loops import Sim3LoopCloser, gate_covariances, rigid, solve_scaled
-from mapserver.survey.loops.zones import Zones
 from mapserver.survey.odometry_pass import OdometryPass, run_odometry
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import optimize_pose_graph
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.survey.tracks.matching import PairFinder, drift_allowance_m, fixed_allowance_m
-from mapserver.survey.tracks.mono_depths import ViewDepths, survey_camera
+from mapserver.survey.tracks.mono_depths import MonoDepths, survey_camera
 from mapserver.survey.tracks.pairs import PairMatch
-from mapserver.survey.tracks.tracks import build_landmarks, landmarks_of, observed_again, tracks_of
+from mapserver.survey.tracks.tracks import build_landmarks, no_landmarks, refine_observations, tracks_of
 
-Progress = Callable[[str, int, int], None]  # stage, done, total
 _MIN_KEYFRAMES = 2
 _MIN_LANDMARKS = 30
+_ADJUSTED_SIGMA_RAD = 0.02  # of the rotation between adjusted keyframes, and between neighbours with an IMU
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What a survey gives: the map, the vocabulary it used, the loops with their reasons, the first guess it began with, the
-    adjusted state, which still knows which feature each observation is, what was culled, what was found out about the pair of
-    cameras, and the parts that hang together, of which one is the map."""
+    """The result of a survey.
+
+    odometry: the initial trajectory. state: the adjusted variables, which still name the feature of each observation.
+    components: the connected components, of which one is the map. stereo_yaw: the extrinsic yaw error of the pair.
+    """
 
     map: SurveyMap
     vocabulary: Vocabulary
     loops: Loops
-    first_guess: OdometryPass
+    odometry: OdometryPass
     state: SurveyState
     culled: Culled
-    pair_turn: StereoYaw
-    parts: list[Part]
+    stereo_yaw: StereoYaw
+    components: list[Component]
 
 
-def survey(
-    frames: Iterable[CameraFrame | RectifiedFrame], frame_count: int, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier,
-    vocabulary: Vocabulary, settings: SurveySettings, zones: Zones, progress: Progress,
-    shelf: ImageStore | None = None, wheel: Sequence[WheelSample] = (), worker: Executor = SERIAL,
-) -> Survey:  # fmt: skip
-    """Maps one recording, its keyframes' pictures on `shelf`. Raises SurveyError where it holds too little to map."""
-    guess = run_odometry(
-        frames, imu, calibration, rectifier, settings, lambda n: progress("odometry", n + 1, frame_count), shelf, wheel,
-        worker,
-    )  # fmt: skip
-    return survey_from(guess, imu, calibration, rectifier, vocabulary, settings, zones, progress, worker)
+def survey(inputs: SurveyInputs, options: SurveyConfig, tools: SurveyTools | None = None) -> Survey:
+    """Maps one recording. Raises SurveyError where it holds too little to map."""
+    tools = tools or SurveyTools()
+    return survey_from(run_odometry(inputs, options.settings, tools), inputs, options, tools)
 
 
 def survey_from(
-    guess: OdometryPass, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, vocabulary: Vocabulary,
-    settings: SurveySettings, zones: Zones, progress: Progress, worker: Executor = SERIAL,
-) -> Survey:  # fmt: skip
-    """All stages after the first guess."""
-    if len(guess.keyframes) < _MIN_KEYFRAMES:
+    odometry: OdometryPass, inputs: SurveyInputs, options: SurveyConfig, tools: SurveyTools | None = None
+) -> Survey:
+    """All stages after the initial trajectory."""
+    settings, tools = options.settings, tools or SurveyTools()
+    if len(odometry.keyframes) < _MIN_KEYFRAMES:
         raise SurveyError(
-            f"{len(guess.estimates)} frames gave {len(guess.keyframes)} keyframe(s) that belong together; a map needs motion, "
-            f"at least {_MIN_KEYFRAMES}"
+            f"{len(odometry.estimates)} frames gave {len(odometry.keyframes)} keyframe(s) that belong together; a map needs "
+            f"motion, at least {_MIN_KEYFRAMES}"
         )
-    state = _first_state(guess, imu, calibration, rectifier, settings)
-    depths = ViewDepths(guess.keyframes, state.camera, settings) if rectifier.camera.baseline_m == 0 else None
-    guess = _with_depths(guess, state, depths)
-    keyframes = guess.keyframes
-    finder = PairFinder(keyframes, state.camera, rectifier.body_from_cam, settings, worker)
-    pairs = _match_neighbours(guess, state, finder, settings, progress)
-    state.landmarks = build_landmarks(
-        keyframes, pairs, state.map_from_body, state.body_from_cam, state.camera, settings, worker
-    )
-    if guess.inertial:
-        state.motion = replace(state.motion, relative=blackout_factors(guess, state))
-    if len(state.landmarks.points_map) < _MIN_LANDMARKS:
-        raise SurveyError(
-            f"{len(keyframes)} keyframes share only {len(state.landmarks.points_map)} landmarks; look at the recording with "
-            "`mapserver doctor`: dark, blurred, or the wrong calibration?"
-        )
+    state = _initial_state(odometry, inputs)
+    depths = None
+    if inputs.rectifier.camera.baseline_m == 0:
+        depths = MonoDepths(odometry.keyframes, state.camera, settings)
+    odometry = _with_depths(odometry, state, depths)
+    pairs = _match_neighbours(odometry, state, settings, tools)
+    state = _first_landmarks(odometry, state, pairs, settings, tools)
     matched = {(p.i, p.j) for p in pairs}
     del pairs  # as large as all else in a long survey
-    progress("local adjustment", 0, 1)
-    adjust_windows(state, settings)
+    tools.progress("local adjustment", 0, 1)
+    state = local_windows(state, settings)
     if state.motion.inertial:
-        adjust(state, settings, rounds=2)
-    guess = _with_depths(guess, state, depths)
-    loops = _close_loops(guess, state, matched, vocabulary, settings, zones, progress, worker)
-    guess, turn = _adjust_globally(guess, state, finder, depths, settings, progress, worker)
-    progress("global adjustment", 2, 2)
-    frames_of = np.array([k.frame_index for k in guess.keyframes], np.int64)
-    parts = find_components(seen_by(state), SigmaBetween(guess.covariances[frames_of]), settings.join_sigma_m)
-    state, guess, loops = only_kept(state, guess, loops, parts.kept)
-    survey_map, culled = summarise(state, guess, settings)
-    between = beside(len(survey_map.trajectory), frames_of, parts.kept)
+        state = bundle_rounds(state, settings, rounds=2)
+    odometry = _with_depths(odometry, state, depths)
+    state, loops = _close_loops(odometry, state, matched, options, tools)
+    odometry, state, stereo_yaw = _adjust_globally(odometry, state, depths, settings, tools)
+    tools.progress("global adjustment", 2, 2)
+    frames_of = np.array([k.frame_index for k in odometry.keyframes], np.int64)
+    sigmas_m = SigmaBetween(odometry.covariances[frames_of])
+    components = find_components(covisibility_of(state), sigmas_m, settings.join_sigma_m)
+    state, odometry, loops = only_kept(state, odometry, loops, components.kept)
+    survey_map, culled = assemble(state, odometry, settings)
+    between = between_kept(len(survey_map.trajectory), frames_of, components.kept)
     survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
-    return Survey(survey_map, vocabulary, loops, guess, state, culled, turn, [*parts.parts, *parts.stray])
+    every = [*components.components, *components.stray]
+    return Survey(survey_map, options.vocabulary, loops, odometry, state, culled, stereo_yaw, every)
 
 
-def _adjust_globally(
-    guess: OdometryPass, state: SurveyState, finder: PairFinder, depths: ViewDepths | None, settings: SurveySettings,
-    progress: Progress, worker: Executor,
-) -> tuple[OdometryPass, StereoYaw]:  # fmt: skip
-    """Matches all views where the loops put them and adjusts them together, twice: the first result shows how the pair is turned."""
-    turn, spare = NO_TURN, np.zeros(len(guess.keyframes), bool)
-    for round_number in range(2):
-        progress("global adjustment", round_number, 2)
-        if depths is not None:
-            guess = _with_depths(guess, state, depths)
-            finder = PairFinder(guess.keyframes, state.camera, state.body_from_cam, settings, worker)
-        keyframes = guess.keyframes
-        if round_number == 0 or depths is not None:
-            tracks = tracks_of(_match_all(state, finder, settings, progress))
-            spare = redundant_keyframes(tracks, keyframes, settings)
-            state.landmarks = landmarks_of(
-                keyframes, tracks, spare, state.map_from_body, state.body_from_cam, state.camera, settings, worker
-            )
-            del tracks
-        else:  # a second search finds hardly a match more; its coordinates are finer
-            state.landmarks = observed_again(
-                state.landmarks, keyframes, state.map_from_body, state.body_from_cam, state.camera, settings, worker
-            )
-        state.landmarks = without_stereo_yaw(state.landmarks, state.camera, turn.correction_px)
-        adjust_visits(state, settings, spare, rounds=3 if round_number == 0 or depths is not None else 2)
-        if round_number == 0:
-            turn = estimate_stereo_yaw(without_redundant(state, spare), settings)
-    return guess, turn
-
-
-def _with_depths(guess: OdometryPass, state: SurveyState, depths: ViewDepths | None) -> OdometryPass:
-    """One camera's keyframes with depths by where they are now; the same guess for rigs that measure depth."""
-    if depths is None:
-        return guess
-    return replace(guess, keyframes=depths.placed(state.map_from_body, state.body_from_cam))
-
-
-def _first_state(
-    guess: OdometryPass, imu: ImuSamples, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings
-) -> SurveyState:
+def _initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
     """Keyframes where odometry put them, no landmarks yet."""
-    numbers = [k.frame_index for k in guess.keyframes]
-    estimates = [guess.estimates[n] for n in numbers]
-    map_from_body = guess.odom_from_body[numbers]
-    motion = Motion(
-        guess.inertial, imu, calibration.imu, rectifier.imu_minus_cam_s,
-        np.array([e.velocity_odom_mps for e in estimates]), np.array([e.gyro_bias_radps for e in estimates]),
-        np.array([e.accel_bias_mps2 for e in estimates]), [] if guess.inertial else odometry_terms(guess, map_from_body),
-    )  # fmt: skip
-    camera = survey_camera(rectifier.camera)
-    nothing = build_landmarks([], [], map_from_body, rectifier.body_from_cam, camera, settings)
-    stamps = np.array([k.stamp_ns for k in guess.keyframes], np.int64)
-    return SurveyState(
-        stamps, map_from_body.copy(), rectifier.body_from_cam, camera, motion, nothing, rectifier.has_depth
+    rectifier, numbers = inputs.rectifier, [k.frame_index for k in odometry.keyframes]
+    estimates = [odometry.estimates[n] for n in numbers]
+    map_from_body = odometry.odom_from_body[numbers]
+    motion = KeyframeMotion(
+        inertial=odometry.inertial,
+        imu=inputs.imu,
+        noise=inputs.calibration.imu,
+        imu_minus_cam_s=rectifier.imu_minus_cam_s,
+        velocities_mps=np.array([e.velocity_odom_mps for e in estimates]),
+        gyro_bias_radps=np.array([e.gyro_bias_radps for e in estimates]),
+        accel_bias_mps2=np.array([e.accel_bias_mps2 for e in estimates]),
+        relative=[] if odometry.inertial else odometry_factors(odometry, map_from_body),
     )
+    return SurveyState(
+        stamps_ns=np.array([k.stamp_ns for k in odometry.keyframes], np.int64),
+        map_from_body=map_from_body.copy(),
+        body_from_cam=rectifier.body_from_cam,
+        camera=survey_camera(rectifier.camera),
+        motion=motion,
+        landmarks=no_landmarks(),
+        is_depth_camera=rectifier.has_depth,
+    )
+
+
+def _with_depths(odometry: OdometryPass, state: SurveyState, depths: MonoDepths | None) -> OdometryPass:
+    """The keyframes of one camera with depths by where they are now; unchanged for rigs that measure depth."""
+    if depths is None:
+        return odometry
+    return replace(odometry, keyframes=depths.keyframes_at(state.map_from_body, state.body_from_cam))
+
+
+def _finder(odometry: OdometryPass, state: SurveyState, settings: SurveySettings, tools: SurveyTools) -> PairFinder:
+    return PairFinder(odometry.keyframes, state.camera, state.body_from_cam, settings.pairs, tools.executor)
 
 
 def _match_neighbours(
-    guess: OdometryPass, state: SurveyState, finder: PairFinder, settings: SurveySettings, progress: Progress
+    odometry: OdometryPass, state: SurveyState, settings: SurveySettings, tools: SurveyTools
 ) -> list[PairMatch]:
-    candidates = finder.candidates(
-        state.map_from_body,
-        previous=settings.pairs.previous,
-        only_near=max(settings.loops.min_gap_keyframes, settings.pairs.previous),
-    )
-    covariances = guess.covariances[[k.frame_index for k in guess.keyframes]]
+    finder, previous = _finder(odometry, state, settings, tools), settings.pairs.previous
+    near = max(settings.loops.min_gap_keyframes, previous)
+    candidates = finder.candidates(state.map_from_body, previous=previous, only_near=near)
+    covariances = odometry.covariances[[k.frame_index for k in odometry.keyframes]]
     return finder.match(
-        candidates, state.map_from_body, drift_allowance_m(covariances, state.map_from_body[:, :3, 3]),
-        rotation_sigma_rad=0.02 if guess.inertial else None, is_known=True,
-        progress=lambda n: progress("matching", n + 1, len(candidates)),
-    )  # fmt: skip
+        candidates,
+        state.map_from_body,
+        drift_allowance_m(covariances, state.map_from_body[:, :3, 3]),
+        rotation_sigma_rad=_ADJUSTED_SIGMA_RAD if odometry.inertial else None,
+        is_known=True,
+        progress=lambda n: tools.progress("matching", n + 1, len(candidates)),
+    )
 
 
-def _match_all(state: SurveyState, finder: PairFinder, settings: SurveySettings, progress: Progress) -> list[PairMatch]:
+def _match_all(state: SurveyState, finder: PairFinder, settings: SurveySettings, tools: SurveyTools) -> list[PairMatch]:
     candidates = finder.candidates(state.map_from_body, previous=settings.pairs.previous)
     return finder.match(
-        candidates, state.map_from_body, fixed_allowance_m(state.map_from_body), rotation_sigma_rad=0.02, is_known=True,
-        progress=lambda n: progress("matching again", n + 1, len(candidates)),
-    )  # fmt: skip
+        candidates,
+        state.map_from_body,
+        fixed_allowance_m(state.map_from_body),
+        rotation_sigma_rad=_ADJUSTED_SIGMA_RAD,
+        is_known=True,
+        progress=lambda n: tools.progress("matching again", n + 1, len(candidates)),
+    )
+
+
+def _first_landmarks(
+    odometry: OdometryPass, state: SurveyState, pairs: list[PairMatch], settings: SurveySettings, tools: SurveyTools
+) -> SurveyState:
+    """The landmarks of neighbouring keyframes; SurveyError where they are too few."""
+    landmarks = build_landmarks(_posed(odometry, state), tracks_of(pairs), settings, tools.executor)
+    state = replace(state, landmarks=landmarks)
+    if odometry.inertial:
+        state = replace(state, motion=replace(state.motion, relative=blackout_factors(odometry, state)))
+    if len(landmarks.points_map) < _MIN_LANDMARKS:
+        raise SurveyError(
+            f"{len(odometry.keyframes)} keyframes share only {len(landmarks.points_map)} landmarks; look at the recording with "
+            "`mapserver doctor`: dark, blurred, or the wrong calibration?"
+        )
+    return state
+
+
+def _posed(odometry: OdometryPass, state: SurveyState) -> PosedKeyframes:
+    return PosedKeyframes(odometry.keyframes, state.map_from_body, state.body_from_cam, state.camera)
 
 
 def _close_loops(
-    guess: OdometryPass, state: SurveyState, matched: set[tuple[int, int]], vocabulary: Vocabulary, settings: SurveySettings,
-    zones: Zones, progress: Progress, worker: Executor,
-) -> Loops:  # fmt: skip
-    """Finds loops, and moves the keyframes to where the pose graph with them says."""
-    keyframes = guess.keyframes
-    chain, walk = chain_edges(guess, state), settings.monocular.scale_walk
-    vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in keyframes]
-    kind, known = (LoopCloser, chain) if guess.scale_known else (Sim3LoopCloser, gate_covariances(chain, walk))
-    closer = kind(
-        keyframes, vectors, vocabulary.word_count, state.camera, state.body_from_cam, state.map_from_body,
-        GraphMarginals(state.map_from_body, known), matched, settings, zones, worker,
-    )  # fmt: skip
-    for i in range(len(keyframes)):
+    odometry: OdometryPass,
+    state: SurveyState,
+    matched: set[tuple[int, int]],
+    options: SurveyConfig,
+    tools: SurveyTools,
+) -> tuple[SurveyState, Loops]:
+    """Finds loops; the keyframes are then where the pose graph with them says."""
+    chain, scale_walk = chain_edges(odometry, state), options.settings.monocular.scale_walk
+    kind, known = LoopCloser, chain
+    if not odometry.scale_known:
+        kind, known = Sim3LoopCloser, gate_covariances(chain, scale_walk)
+    marginals = GraphMarginals(state.map_from_body, known)
+    closer = kind(_posed(odometry, state), options, marginals, matched, tools.executor)
+    for i in range(len(odometry.keyframes)):
         closer.close(i)
-        progress("loops", i + 1, len(keyframes))
-    if closer.loops.edges and isinstance(closer, Sim3LoopCloser):
-        scaled = solve_scaled(state.map_from_body, chain, closer.loops.edges, closer.scales, walk)
-        closer.loops.disbelieve(scaled.loop_weights)
-        _move(state, rigid(scaled))
-        state.motion = replace(state.motion, relative=odometry_terms(guess, state.map_from_body))
-    elif closer.loops.edges:
-        solved = optimize_pose_graph(state.map_from_body, [*chain, *closer.loops.edges])
-        closer.loops.disbelieve(solved.loop_weights)
-        _move(state, solved.map_from_body)
-    return closer.loops
+        tools.progress("loops", i + 1, len(odometry.keyframes))
+    loops = closer.loops
+    if loops.edges and isinstance(closer, Sim3LoopCloser):
+        scaled = solve_scaled(state.map_from_body, chain, loops.edges, closer.scales, scale_walk)
+        state = _at(state, rigid(scaled))
+        factors = odometry_factors(odometry, state.map_from_body)
+        return replace(state, motion=replace(state.motion, relative=factors)), loops.without_outliers(
+            scaled.loop_weights
+        )
+    if loops.edges:
+        solved = optimize_pose_graph(state.map_from_body, [*chain, *loops.edges])
+        return _at(state, solved.map_from_body), loops.without_outliers(solved.loop_weights)
+    return state, loops
 
 
-def _move(state: SurveyState, map_from_body: NDArray[np.float64]) -> None:
-    turns = map_from_body[:, :3, :3] @ state.map_from_body[:, :3, :3].transpose(0, 2, 1)
-    state.motion = replace(state.motion, velocities_mps=np.einsum("kij,kj->ki", turns, state.motion.velocities_mps))
-    state.map_from_body = map_from_body
+def _at(state: SurveyState, map_from_body: Array) -> SurveyState:
+    """The state with its keyframes, and their velocities with them, at map_from_body (K, 4, 4)."""
+    rotations = map_from_body[:, :3, :3] @ state.map_from_body[:, :3, :3].transpose(0, 2, 1)
+    velocities = np.einsum("kij,kj->ki", rotations, state.motion.velocities_mps)
+    return replace(state, map_from_body=map_from_body, motion=replace(state.motion, velocities_mps=velocities))
+
+
+def _adjust_globally(
+    odometry: OdometryPass, state: SurveyState, depths: MonoDepths | None, settings: SurveySettings, tools: SurveyTools
+) -> tuple[OdometryPass, SurveyState, StereoYaw]:
+    """Matches all views where the loops put them and adjusts them together, twice: the first result gives the stereo yaw error."""
+    yaw, redundant = NO_YAW, np.zeros(len(odometry.keyframes), bool)
+    finder = _finder(odometry, state, settings, tools)
+    for round_number in range(2):
+        tools.progress("global adjustment", round_number, 2)
+        search = round_number == 0 or depths is not None
+        if depths is not None:
+            odometry = _with_depths(odometry, state, depths)
+            finder = _finder(odometry, state, settings, tools)
+        posed = _posed(odometry, state)
+        if search:
+            tracks = tracks_of(_match_all(state, finder, settings, tools))
+            redundant = redundant_keyframes(tracks, odometry.keyframes, settings)
+            landmarks = build_landmarks(posed, tracks, settings, tools.executor, redundant)
+            del tracks
+        else:  # a second search finds hardly a match more; its coordinates are finer
+            landmarks = refine_observations(posed, state.landmarks, settings, tools.executor)
+        state = replace(state, landmarks=without_stereo_yaw(landmarks, state.camera, yaw.correction_px))
+        state = adjust_visits(state, settings, redundant, rounds=3 if search else 2)
+        if round_number == 0:
+            yaw = estimate_stereo_yaw(without_redundant(state, redundant), settings)
+    return odometry, state, yaw

@@ -26,10 +26,10 @@ from fleetsim.recorder import Order
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout
 from mapserver.build.report import accuracy
-from mapserver.survey.loops.loops import Verdict
-from mapserver.survey.loops.zones import Zones
+from mapserver.survey.loops.loops import LoopVerdict
 from mapserver.survey.pipeline import survey
 from mapserver.survey.settings import LoopSettings, SurveySettings
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
 
 NAME = "identical-aisles-118m"
 MAX_ATE_M = 0.025
@@ -91,23 +91,14 @@ def build(recording: Recording, settings: SurveySettings) -> Closed:
     begun = time.perf_counter()
     rectifier, count = Rectifier(recording.calibration), len(recording.frame_stamps_ns)
     frames = (recording.read_frame(index) for index in range(count))
-    done = survey(
-        frames,
-        count,
-        recording.imu,
-        recording.calibration,
-        rectifier,
-        default_vocabulary(),
-        settings,
-        Zones(),
-        lambda *_: None,
-    )
+    inputs = SurveyInputs(frames, count, recording.imu, recording.calibration, rectifier)
+    done = survey(inputs, SurveyConfig(settings, default_vocabulary()))
     seconds = time.perf_counter() - begun
     truth = recording.ground_truth
     assert truth is not None
     found = accuracy(done.map, truth).rigid
     assert found is not None
-    at = np.searchsorted(truth.stamps_ns, [k.stamp_ns for k in done.first_guess.keyframes])
+    at = np.searchsorted(truth.stamps_ns, [k.stamp_ns for k in done.odometry.keyframes])
     true_map_from_body = truth.frame_from_body[np.minimum(at, len(truth.stamps_ns) - 1)]
     places = true_map_from_body[:, :3, 3]
     off = [e.i_from_j @ se3_inverse(true_map_from_body[e.j]) @ true_map_from_body[e.i] for e in done.loops.edges]
@@ -116,7 +107,7 @@ def build(recording: Recording, settings: SurveySettings) -> Closed:
     closed = {edge.i for edge, good in zip(done.loops.edges, right, strict=True) if good}
     return Closed(
         found.rmse_m, float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()), len(places), len(done.loops.records),
-        sum(right), len(right) - sum(right), sum(r.verdict is Verdict.AMBIGUOUS for r in done.loops.records),
+        sum(right), len(right) - sum(right), sum(r.verdict is LoopVerdict.AMBIGUOUS for r in done.loops.records),
         len(revisits), len(closed & revisits), seconds,
     )  # fmt: skip
 

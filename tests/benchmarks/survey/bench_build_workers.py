@@ -17,7 +17,7 @@ from pathlib import Path
 
 import msgspec
 
-from mapserver.build.build import BuildRequest, build_draft
+from mapserver.build.build import BuildOptions, BuildRequest, build_draft
 from mapserver.store import MapStore
 from mapserver.survey.settings import SurveySettings
 
@@ -25,13 +25,13 @@ from mapserver.survey.settings import SurveySettings
 def measure(recording: Path, frames: str, threads: int, store: Path) -> list[dict[str, object]]:
     """One row for each worker."""
     ways = (("one thread", 1, None), (f"{threads} threads", threads, None), (f"{threads} processes", threads, "local"))
-    build_draft(BuildRequest((recording,), "warm", store, ":60", threads=1), SurveySettings())
+    build_draft(BuildRequest((recording,), "warm", store, BuildOptions(":60", threads=1)), SurveySettings())
     rows: list[dict[str, object]] = []
     for number, (name, count, scheduler) in enumerate(ways):
         site, report = f"site{number}", store / "report.json"
         begun_s, cpu_s = time.perf_counter(), time.process_time()
-        order = BuildRequest((recording,), site, store, frames, report=report, threads=count, scheduler=scheduler)
-        draft = build_draft(order, SurveySettings())
+        options = BuildOptions(frames, report=report, threads=count, scheduler=scheduler)
+        draft, _ = build_draft(BuildRequest((recording,), site, store, options), SurveySettings())
         rows.append(
             {
                 "worker": name,

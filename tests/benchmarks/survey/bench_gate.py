@@ -30,12 +30,12 @@ from fleetsim.motion.routes import Route
 from fleetsim.recorder import Order, Session, prepare
 from fleetsim.scenarios import SCENARIOS, Run, Scenario, find_scenario
 from fleetsim.scene.layout import Layout
-from mapserver.survey.keyframes.keyframes import Keyframe, MemoryImageStore
-from mapserver.survey.loops.loops import LoopCloser, Verdict
-from mapserver.survey.loops.zones import Zones
+from mapserver.survey.keyframes.keyframes import Keyframe, MemoryImageStore, PosedKeyframes
+from mapserver.survey.loops.loops import LoopCloser, LoopVerdict
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import LoopSettings, SurveySettings
+from mapserver.survey.survey_inputs import SurveyConfig
 
 NAME = "site-identical"
 END_M = 2.7
@@ -186,14 +186,11 @@ def bench(bays: int, every_m: float, per_place: int = 2, seed: int = 0, drift_sc
         if n % 500 == 499:
             print(f"{n + 1} of {len(frames)} keyframes made", flush=True)
     vocabulary = site_vocabulary(keyframes)
-    vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in keyframes]
     believed, edges = drifted(truth, np.random.default_rng(seed), drift_scale)
     marginals = GraphMarginals(believed, edges)
     matched = {(k, k + step) for step in (1, 2) for k in range(len(keyframes) - step)}
-    closer = LoopCloser(
-        keyframes, vectors, vocabulary.word_count, session.camera, session.body_from_cam, believed, marginals, matched,
-        settings, Zones(),
-    )  # fmt: skip
+    posed = PosedKeyframes(keyframes, believed, session.body_from_cam, session.camera)
+    closer = LoopCloser(posed, SurveyConfig(settings, vocabulary), marginals, matched)
     sure: dict[int, bool] = {}
     spent_s = 0.0
     for i in range(len(keyframes)):
@@ -222,7 +219,7 @@ def judged(
     apart = np.abs(truth[pairs[:, 0], :3, 3] - truth[pairs[:, 1], :3, 3])
     facing = np.einsum("na,na->n", truth[pairs[:, 0], :3, 0], truth[pairs[:, 1], :3, 0])
     aliased = (apart[:, 1] > 0.5 * layout.pitch_m) & (apart[:, 0] < ALIAS_X_M) & (facing > np.cos(REVISIT_RAD))
-    ambiguous = {r.i for r in closer.loops.records if r.verdict is Verdict.AMBIGUOUS}
+    ambiguous = {r.i for r in closer.loops.records if r.verdict is LoopVerdict.AMBIGUOUS}
     surely, unsurely = ({i for i, is_sure in sure.items() if is_sure is wanted} for wanted in (True, False))
     path_m = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
     return Gated(

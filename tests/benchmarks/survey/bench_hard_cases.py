@@ -21,7 +21,7 @@ import numpy as np
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings.export_mcap import copy_to_mcap
-from mapserver.build.build import BuildRequest, run_build
+from mapserver.build.build import BuildOptions, BuildRequest, build_draft
 from mapserver.config import MapserverConfig
 from support.recordings.spoiled_recording import (
     swapped,
@@ -75,9 +75,10 @@ def outcome(case: str, recording: Recording, frames: str) -> Outcome:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         copy_to_mcap(recording, folder / "case.mcap")
-        order = BuildRequest((folder / "case.mcap",), "hall", folder / "store", frames, report=folder / "r.json")
+        options = BuildOptions(frames, report=folder / "r.json")
+        request = BuildRequest((folder / "case.mcap",), "hall", folder / "store", options)
         try:
-            run_build(order, MapserverConfig().survey)
+            build_draft(request, MapserverConfig().survey)
         except FleetmapError as error:
             words = str(error).replace(f"{folder / 'case.mcap'}: ", "")
             return Outcome(case, words, None, None, None, [], round(time.monotonic() - started, 1))

@@ -28,10 +28,10 @@ from mapserver.build.sensor_subset import reduced
 from mapserver.config import survey_settings
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey.keyframes.keyframes import make_keyframe
-from mapserver.survey.loops.zones import Zones
 from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.pipeline import Survey, survey, survey_from
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
 from mapserver.survey.survey_map import SurveyMap
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -90,13 +90,9 @@ def scale_along(estimate: Trajectory, truth: Trajectory) -> tuple[float, float]:
     return float(slope), float(np.abs(logs - offset - slope * middles).max())
 
 
-def quiet(stage: str, done: int, total: int) -> None:
-    """No progress."""
-
-
 def judged(name: str, sensors: str, recording: Recording, done: Survey, seconds: float) -> Row:
     """The row of a finished survey."""
-    guess, truth = done.first_guess, recording.ground_truth
+    guess, truth = done.odometry, recording.ground_truth
     assert truth is not None
     found = accuracy(done.map, truth)
     assert found.rigid is not None
@@ -123,17 +119,8 @@ def one(path: Path, use: SensorSet) -> Row:
         settings, rectifier = survey_settings(None, use), Rectifier(recording.calibration)
         frames = (recording.read_frame(k) for k in range(len(recording)))
         try:
-            done = survey(
-                frames,
-                len(recording),
-                recording.imu,
-                recording.calibration,
-                rectifier,
-                default_vocabulary(),
-                settings,
-                Zones(),
-                quiet,
-            )
+            inputs = SurveyInputs(frames, len(recording), recording.imu, recording.calibration, rectifier)
+            done = survey(inputs, SurveyConfig(settings, default_vocabulary()))
         except SurveyError as error:
             return Row(path.stem, use.value, refused=str(error), seconds=time.perf_counter() - began_s)
         return judged(path.stem, use.value, recording, done, time.perf_counter() - began_s)
@@ -146,9 +133,8 @@ def drifting(path: Path, drift: float, seed: int = 0) -> Row:
         recording = reduced(opened, SensorSet.MONO)
         settings, rectifier = survey_settings(None, SensorSet.MONO), Rectifier(recording.calibration)
         guess = drifting_guess(recording, rectifier, settings, drift, np.random.default_rng(seed))
-        done = survey_from(
-            guess, recording.imu, recording.calibration, rectifier, default_vocabulary(), settings, Zones(), quiet
-        )
+        inputs = SurveyInputs((), len(recording), recording.imu, recording.calibration, rectifier)
+        done = survey_from(guess, inputs, SurveyConfig(settings, default_vocabulary()))
         return judged(path.stem, f"mono, {drift:.0%} drift injected", recording, done, time.perf_counter() - began_s)
 
 

@@ -11,10 +11,10 @@ from rich.console import Console
 from fleetmap.errors import RecordingError, UsageError
 from fleetmap.geometry import se3_exp, se3_inverse, transform_points
 from fleetmap.sensors.samples import Trajectory
+from mapserver.build.build import read_zones
 from mapserver.build.progress import ProgressView, StageTimes
 from mapserver.build.report import accuracy, check_truth, path_length_m
-from mapserver.build.zones_file import read_zones
-from mapserver.survey.finish.map_transform import moved
+from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.survey_map import SurveyMap
 from support.storage.map_samples import random_survey
 
@@ -28,11 +28,11 @@ def seen(survey: SurveyMap) -> np.ndarray:
 
 def test_moving_a_survey_changes_nothing_that_was_measured() -> None:
     survey = random_survey(np.random.default_rng(1))
-    there = moved(survey, NEW_FROM_MAP)
+    there = transform_map(survey, NEW_FROM_MAP)
     np.testing.assert_allclose(seen(there), seen(survey), atol=1e-9)
     np.testing.assert_allclose(there.map_from_body[0], NEW_FROM_MAP @ survey.map_from_body[0], atol=1e-12)
     np.testing.assert_allclose(there.trajectory.frame_from_body, there.map_from_body, atol=1e-12)
-    back = moved(there, se3_inverse(NEW_FROM_MAP))
+    back = transform_map(there, se3_inverse(NEW_FROM_MAP))
     np.testing.assert_allclose(back.points_map, survey.points_map, atol=1e-9)
     assert there.descriptors is survey.descriptors
 

@@ -15,12 +15,12 @@ from fleetmap.mapformat import encode_tile
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples
 from mapserver.build import worker as workers
-from mapserver.build.worker import Threads, open_worker, read_ahead
+from mapserver.build.worker import Threads, open_executor, read_ahead
 from mapserver.store.archive import encode_archive
 from mapserver.survey.executor import SERIAL, Executor, in_batches
-from mapserver.survey.loops.zones import Zones
 from mapserver.survey.pipeline import survey
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
 from mapserver.tiles.tiling import tiles_from_survey
 from support.recordings.recording_samples import calibration, make_sample
 
@@ -30,10 +30,9 @@ def surveyed_by(worker: Executor) -> tuple[bytes, ...]:
     sample, rig = make_sample(24), calibration()
     frames = [CameraFrame(int(s), a, b) for s, a, b in zip(sample.stamps_ns, sample.left, sample.right, strict=True)]
     imu = ImuSamples(sample.imu_stamps_ns, sample.gyro_radps, sample.accel_mps2)
-    done = survey(
-        iter(frames), len(frames), imu, rig, Rectifier(rig), decode_vocabulary(default_vocabulary_bytes()), SurveySettings(),
-        Zones(), lambda *_: None, worker=worker,
-    )  # fmt: skip
+    inputs = SurveyInputs(iter(frames), len(frames), imu, rig, Rectifier(rig))
+    options = SurveyConfig(SurveySettings(), decode_vocabulary(default_vocabulary_bytes()))
+    done = survey(inputs, options, SurveyTools(executor=worker))
     return (encode_archive(done.map), *(encode_tile(tile) for tile in tiles_from_survey(done.map)))
 
 
@@ -43,20 +42,20 @@ def alone() -> tuple[bytes, ...]:
 
 
 def test_threads_make_the_same_map() -> None:
-    with open_worker(3, None) as worker:
+    with open_executor(3, None) as worker:
         assert isinstance(worker, Threads)
         assert surveyed_by(worker) == alone()
 
 
 def test_processes_of_a_cluster_make_the_same_map() -> None:
-    with open_worker(2, "local") as worker:
+    with open_executor(2, "local") as worker:
         assert surveyed_by(worker) == alone()
 
 
 def test_a_scheduler_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "_CONNECT_WITHIN_S", "1s")
     for address in ("tcp://127.0.0.1:9", "nonsense"):
-        with pytest.raises(UsageError, match="does not answer"), open_worker(1, address):
+        with pytest.raises(UsageError, match="does not answer"), open_executor(1, address):
             pass
 
 

@@ -17,9 +17,11 @@ from fleetmap.geometry import se3_exp
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver import cli
+from mapserver.build.build import BuildRequest, Draft
 from mapserver.config import MapserverConfig, read_config, survey_settings
 from mapserver.quality.figures import Evidence, TileDirections
 from mapserver.store import DraftContent, MapStore
+from mapserver.survey.settings import SurveySettings
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -167,10 +169,13 @@ def test_build_takes_its_settings_from_the_file(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seen = []
-    monkeypatch.setattr(
-        "mapserver.build.build.run_build", lambda order, settings: seen.append((order, settings)) or "done"
-    )
-    monkeypatch.setattr("mapserver.build.sensor_subset.sensor_set_of", lambda path, calibration: SensorSet.STEREO)
+
+    def build(request: BuildRequest, settings: SurveySettings, *, recorded: bool) -> tuple[Draft, None]:
+        seen.append((request, settings))
+        return Draft(1, "done", {}, {}), None
+
+    monkeypatch.setattr("mapserver.library.build_draft", build)
+    monkeypatch.setattr("mapserver.library.sensor_set_of", lambda path, calibration: SensorSet.STEREO)
     file = tmp_path / "site.toml"
     file.write_text(
         f'[build]\nsite = "lab"\nstore = "{tmp_path}"\nframes = "::3"\nframe_from_ground_truth = true\n'
@@ -179,9 +184,10 @@ def test_build_takes_its_settings_from_the_file(
     assert status(monkeypatch, "build", "r", "--config", file) == 0
     assert status(monkeypatch, "--config", file, "build", "r", "--frames", "::2") == 0
     (order, settings), (second, _) = seen
-    assert (order.site, order.store, order.frames, order.frame_from_ground_truth) == ("lab", tmp_path, "::3", True)
+    assert (order.site, order.store, order.options.frames) == ("lab", tmp_path, "::3")
+    assert order.options.frame_from_ground_truth
     assert (settings.seed, settings.keyframes.min_overlap, settings.keyframes.max_interval_s) == (7, 0.5, 2.0)
-    assert (second.frames, second.site) == ("::2", "lab")
+    assert (second.options.frames, second.site) == ("::2", "lab")
     assert capsys.readouterr().out == "done\ndone\n"
 
 

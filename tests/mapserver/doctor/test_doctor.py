@@ -14,7 +14,7 @@ from fleetmap.geometry import so3_exp
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, Stamps
 from mapserver.commands.doctor import doctor
-from mapserver.doctor import Finding, Verdict, examine
+from mapserver.doctor import Finding, Verdict, run_checks
 from mapserver.doctor.gyro_images import CameraTurns, fit_gyro
 from mapserver.doctor.inertial import gravity_magnitude
 from mapserver.doctor.sharpness import sharpness
@@ -46,7 +46,7 @@ class ChangedFrames:
 
 
 def found(recording: Recording) -> dict[str, Finding]:
-    return {finding.name: finding for finding in examine(recording).findings}
+    return {finding.name: finding for finding in run_checks(recording).findings}
 
 
 def with_imu(recording: Recording, change: Callable[[ImuSamples], ImuSamples]) -> Recording:
@@ -64,7 +64,7 @@ def right_lower_by_3_px(frame: CameraFrame) -> CameraFrame:
 
 
 def test_a_good_recording_is_all_ok(good: Recording) -> None:
-    findings = examine(good).findings
+    findings = run_checks(good).findings
     assert {f.name: f.verdict for f in findings if f.verdict is not Verdict.OK} == {
         "stereo against motion": Verdict.NOT_JUDGED  # the sample turns on the spot
     }
@@ -232,7 +232,7 @@ def test_the_command_writes_json_and_ends_with_3_on_failure(tmp_path: Path) -> N
     "name", ["euroc_v101_keyframes", "kitti_stereo_51", "tumvi_room1_fisheye_8", "7scenes_redkitchen_200"]
 )
 def test_no_false_alarm_on_real_recordings(name: str) -> None:
-    findings = examine(open_recording(real_data(name))).findings
+    findings = run_checks(open_recording(real_data(name))).findings
     assert [
         f for f in findings if f.verdict is Verdict.FAIL or (f.verdict is Verdict.WARN and f.name != "lost data")
     ] == []

@@ -27,7 +27,7 @@ from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import open_recording
 from mapserver import cli, releases
 from mapserver.build.build import BuildRequest, Draft
-from mapserver.build.survey_recordings import admit_recordings
+from mapserver.build.survey_recordings import RecordingOptions, admit_recordings
 from mapserver.nightly import NightRequest, last_report, night, run_night
 from mapserver.nightly.inbox import arrivals
 from mapserver.quality.gate import GateSettings
@@ -38,7 +38,7 @@ from support.storage.faulty_disk import Disk, install
 from support.storage.map_samples import draft_details, random_tile
 
 LATER_NS = 3_600 * 10**9
-Build = Callable[..., Draft]
+Build = Callable[..., tuple[Draft, None]]
 
 
 def record(inbox: Path, name: str, number: int) -> Path:
@@ -48,10 +48,12 @@ def record(inbox: Path, name: str, number: int) -> Path:
     return write_euroc(inbox / name, sample)
 
 
-def built(order: BuildRequest, _: SurveySettings, unusable: dict[Path, str], *, landmarks: int = 60) -> Draft:
+def built(
+    request: BuildRequest, _: SurveySettings, unusable: dict[Path, str], *, landmarks: int = 60
+) -> tuple[Draft, None]:
     """A draft with what a build would say; recordings named "lost" find no place, those named "dark" cannot be surveyed."""
     entries, left_out = [], {}
-    for path in order.recordings:
+    for path in request.recordings:
         with open_recording(path) as recording:
             entry = RecordingEntry(name=path.name, sha256=recording.content_hash(), frames=len(recording))
         if "dark" in path.name:
@@ -67,13 +69,11 @@ def built(order: BuildRequest, _: SurveySettings, unusable: dict[Path, str], *, 
         **{name: getattr(details, name) for name in details.__struct_fields__} | {"recordings": tuple(entries)}
     )
     tile = random_tile(np.random.default_rng(len(entries)), landmarks=landmarks, places=2)
-    with MapStore.open(order.store) as maps:
-        version = maps.save_draft(
-            order.site,
-            DraftContent(tiles=[tile], vocabulary=b"words", details=details, job=order.job),
-            actor=order.actor,
-        )
-    return Draft(version, f"draft {version}", {"keyframes": 2}, left_out)
+    options = request.options
+    content = DraftContent(tiles=[tile], vocabulary=b"words", details=details, job=options.job)
+    with MapStore.open(request.store) as maps:
+        version = maps.save_draft(request.site, content, actor=options.actor)
+    return Draft(version, f"draft {version}", {"keyframes": 2}, left_out), None
 
 
 @pytest.fixture(autouse=True)
@@ -145,7 +145,7 @@ def test_a_recording_that_the_doctor_refuses_does_not_stop_the_others(hall: Path
 
     def admit(*paths: Path, unusable: dict[Path, str] | None) -> list[Path]:
         console = Console(file=io.StringIO())
-        return list(admit_recordings(paths, "::", None, None, console, needs_truth=False, unusable=unusable))
+        return list(admit_recordings(paths, RecordingOptions(), console, needs_truth=False, unusable=unusable))
 
     assert admit(swapped, sound, unusable=unusable) == [sound]
     assert "left and right" in unusable[swapped]

@@ -19,9 +19,9 @@ from mapserver.quality.evidence import trajectory_breaks
 from mapserver.quality.figures import Evidence
 from mapserver.quality.gate import GateSettings, Verdict, judge
 from mapserver.quality.probes import held_out_frames, probe_features
-from mapserver.survey.loops.zones import Zones
 from mapserver.survey.pipeline import Survey, survey
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.tiling import tiles_from_survey
 from support.recordings.recording_samples import calibration
@@ -48,8 +48,9 @@ def surveyed(rig: RigCalibration) -> tuple[Survey, list[HeldOut]]:
     frames = [CameraFrame(int(s), a, b) for s, a, b in zip(sample.stamps_ns, sample.left, sample.right, strict=True)]
     rectifier = Rectifier(rig)
     imu = ImuSamples(sample.imu_stamps_ns, sample.gyro_radps, sample.accel_mps2)
-    done = survey(iter(frames), FRAMES, imu, rig, rectifier, WORDS, SETTINGS, Zones(), lambda *_: None)
-    keyframes = [k.frame_index for k in done.first_guess.keyframes]
+    inputs = SurveyInputs(iter(frames), FRAMES, imu, rig, rectifier)
+    done = survey(inputs, SurveyConfig(SETTINGS, WORDS))
+    keyframes = [k.frame_index for k in done.odometry.keyframes]
     numbers = held_out_frames(keyframes, done.map.trajectory_estimated, 40)
     seen = [probe_features(rectifier.rectify(frames[n]), rectifier.camera) for n in numbers]
     camera, body_from_cam = rectifier.camera, rectifier.body_from_cam

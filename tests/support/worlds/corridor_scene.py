@@ -7,7 +7,7 @@ import numpy as np
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
-from mapserver.survey.bundle.bundle_rounds import Motion, SurveyState
+from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState
 from mapserver.survey.tracks.tracks import Landmarks
 
 CAMERA = StereoCamera(300.0, 320.0, 240.0, 0.12, 640, 480)
@@ -67,7 +67,7 @@ def scene(keyframes: int, seed: int, *, drift: float, outliers: float = 0.0) -> 
         np.tile([SIGMA_PX, SIGMA_DISPARITY_PX], (len(table), 1)),
     )  # fmt: skip
     nothing = np.zeros((keyframes, 3))
-    motion = Motion(False, ImuSamples.empty(), None, 0.0, nothing, nothing.copy(), nothing.copy(), [])
+    motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, nothing, nothing.copy(), nothing.copy(), [])
     stamps = np.arange(keyframes, dtype=np.int64) * 100_000_000
     return Scene(
         SurveyState(stamps, guessed.copy(), BODY_FROM_CAM, CAMERA, motion, marks), map_from_body, points, is_outlier

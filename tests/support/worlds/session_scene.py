@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.sensors.samples import ImuSamples, Trajectory
-from mapserver.survey.bundle.bundle_rounds import Motion, SurveyState
+from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.survey_map import History, SurveyMap
@@ -83,5 +83,5 @@ def survey_state(seed: int) -> SurveyState:
         problem.obs_pixels[order], problem.obs_sigma_px[order],
     )  # fmt: skip
     none = np.zeros((12, 3))
-    motion = Motion(False, ImuSamples.empty(), None, 0.0, none, none.copy(), none.copy(), [])
+    motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, none, none.copy(), none.copy(), [])
     return SurveyState(np.arange(12, dtype=np.int64), problem.map_from_body, BODY_FROM_CAM, CAMERA, motion, marks)

@@ -1,4 +1,4 @@
-"""What odometry says of neighbouring keyframes, as terms of an adjustment and as edges of a pose graph. Pure."""
+"""Odometry between neighbouring keyframes, as factors of an adjustment and as edges of a pose graph. Pure."""
 
 from itertools import pairwise
 
@@ -12,58 +12,57 @@ from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 
 
-def odometry_terms(guess: OdometryPass, map_from_body: Array) -> list[RelativeTerm]:
+def odometry_factors(odometry: OdometryPass, map_from_body: Array) -> list[RelativeTerm]:
     """Without an IMU, neighbours are held by odometry: weakly, so that it decides only where landmarks do not.
 
     For one camera this also holds the scale, which its landmarks leave open.
     """
-    numbers = [k.frame_index for k in guess.keyframes]
-    terms = []
+    numbers = [k.frame_index for k in odometry.keyframes]
+    factors = []
     for k, (a, b) in enumerate(pairwise(numbers)):
         i_from_j = se3_inverse(map_from_body[k]) @ map_from_body[k + 1]
-        terms.append(
-            RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(25.0 * _edge_covariance(guess, a, b)).astype(np.float64))
+        factors.append(
+            RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(25.0 * _edge_covariance(odometry, a, b)).astype(np.float64))
         )
-    return terms
+    return factors
 
 
-def blackout_factors(guess: OdometryPass, state: SurveyState) -> list[RelativeTerm]:
+def blackout_factors(odometry: OdometryPass, state: SurveyState) -> list[RelativeTerm]:
     """Odometry from and to keyframes that see next to nothing.
 
-    It knows from the wheels what the inertial terms do not; without wheels it knows nothing that those do not say better, and where
-    pictures speak, they do.
+    With wheels it adds to the inertial factors; without wheels it adds nothing, and where there are landmarks it is not needed.
     """
-    if not guess.has_wheels:
+    if not odometry.has_wheels:
         return []
     seen = np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns))
-    numbers = [k.frame_index for k in guess.keyframes]
-    terms = []
+    numbers = [k.frame_index for k in odometry.keyframes]
+    factors = []
     for k, (a, b) in enumerate(pairwise(numbers)):
         if min(seen[k], seen[k + 1]) < MIN_SEEN:
-            i_from_j = se3_inverse(guess.odom_from_body[a]) @ guess.odom_from_body[b]
-            terms.append(
-                RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(_edge_covariance(guess, a, b)).astype(np.float64))
+            i_from_j = se3_inverse(odometry.odom_from_body[a]) @ odometry.odom_from_body[b]
+            factors.append(
+                RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(_edge_covariance(odometry, a, b)).astype(np.float64))
             )
-    return terms
+    return factors
 
 
-def chain_edges(guess: OdometryPass, state: SurveyState) -> list[PoseEdge]:
-    """Each keyframe from the one before, where the adjustment put it, as surely as odometry knows."""
+def chain_edges(odometry: OdometryPass, state: SurveyState) -> list[PoseEdge]:
+    """Edges between neighbours with their adjusted motion and the covariance of the odometry."""
     edges = []
-    numbers = [k.frame_index for k in guess.keyframes]
+    numbers = [k.frame_index for k in odometry.keyframes]
     for k, (a, b) in enumerate(pairwise(numbers)):
         i_from_j = se3_inverse(state.map_from_body[k]) @ state.map_from_body[k + 1]
-        edges.append(PoseEdge(k, k + 1, i_from_j, _edge_covariance(guess, a, b), is_loop=False))
+        edges.append(PoseEdge(k, k + 1, i_from_j, _edge_covariance(odometry, a, b), is_loop=False))
     return edges
 
 
-def _edge_covariance(guess: OdometryPass, a: int, b: int) -> Array:
+def _edge_covariance(odometry: OdometryPass, a: int, b: int) -> Array:
     """(6, 6) of i_from_j between frames a and b, axes of a: what the odometry's uncertainty gained, with a floor."""
-    rotation = guess.odom_from_body[a, :3, :3].T
-    gained = guess.covariances[b] - guess.covariances[a]
+    rotation = odometry.odom_from_body[a, :3, :3].T
+    gained = odometry.covariances[b] - odometry.covariances[a]
     values, vectors = np.linalg.eigh(0.5 * (gained + gained.T))
     gained = (vectors * np.maximum(values, 0.0)) @ vectors.T
     carry = np.kron(np.eye(2), rotation)
-    distance = float(np.linalg.norm(guess.odom_from_body[b, :3, 3] - guess.odom_from_body[a, :3, 3]))
+    distance = float(np.linalg.norm(odometry.odom_from_body[b, :3, 3] - odometry.odom_from_body[a, :3, 3]))
     floor = np.diag([0.004**2] * 3 + [(0.01 + 0.02 * distance) ** 2] * 3)
     return np.asarray(carry @ gained @ carry.T + floor)

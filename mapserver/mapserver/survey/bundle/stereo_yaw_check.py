@@ -36,7 +36,7 @@ class StereoYaw:
         return self.shift_px if self.corrected else 0.0
 
 
-NO_TURN = StereoYaw(0.0, float("inf"), corrected=False)
+NO_YAW = StereoYaw(0.0, float("inf"), corrected=False)
 
 
 def disparity_shift(camera: StereoCamera, pixels: Array) -> Array:
@@ -56,12 +56,12 @@ def without_stereo_yaw(landmarks: Landmarks, camera: StereoCamera, correction_px
 def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings) -> StereoYaw:
     """The turn that the adjusted survey speaks for; corrected where it is far from zero, in sigmas.
 
-    sigma_px is the adjustment's own, and with it `noise.turn_floor_px`: what matching alone pretends. NO_TURN where too few
+    sigma_px is the adjustment's own, and with it `noise.turn_floor_px`: what matching alone pretends. NO_YAW where too few
     disparities are known or where the cost has no minimum nearby.
     """
     measured = np.isfinite(state.landmarks.obs_pixels[:, 2])
     if measured.sum() < _MIN_DISPARITIES or state.is_depth_camera:
-        return NO_TURN
+        return NO_YAW
     slope = _slope(state, 0.0, settings)
     shift, curvature = 0.0, 0.0
     step = _FIRST_TRY_PX if slope < 0 else -_FIRST_TRY_PX
@@ -69,7 +69,7 @@ def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings) -> StereoY
         moved = _slope(state, shift + step, settings)
         curvature = (moved - slope) / step
         if not curvature > 0.0:
-            return NO_TURN
+            return NO_YAW
         shift, slope = shift + step, moved
         step = -slope / curvature
         if abs(step) < 0.2 / np.sqrt(curvature):

@@ -1,4 +1,4 @@
-"""Where a site's first survey lies in `map`: at the docks and tags that it passed, where it passed any."""
+"""Alignment of a site's first survey to `map` by the docks and tags that it passed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,10 +14,12 @@ _MAX_GAP_NS = 2_000_000_000
 _YAW_KNOWN_RAD = 0.2
 
 
-def map_from_survey(survey_map: SurveyMap, priors: Sequence[PositionPrior], base_from_body: Array) -> Array | None:
+def map_from_survey_by_priors(
+    survey_map: SurveyMap, priors: Sequence[PositionPrior], base_from_body: Array
+) -> Array | None:
     """The turn about z and the shift (4, 4) that bring a survey nearest to its position priors, weighted by their covariances.
 
-    None without usable priors. One prior suffices where it knows its heading. Source: Gauss-Newton on yaw and position.
+    None without usable priors. One prior suffices where it knows its heading. Gauss-Newton on yaw and position.
     """
     usable = []
     for prior in priors:
@@ -72,7 +74,7 @@ def aligned_by_priors(
 ) -> DockAlignment | None:
     """Where a survey of unknown scale lies and how large it is, by priors that know their place and their directions.
 
-    None with fewer than two such priors, or where they leave the scale less sure than 1 %. Source: Gauss-Newton on seven unknowns.
+    None with fewer than two such priors, or where they leave the scale less sure than 1 %. Gauss-Newton on seven unknowns.
     """
     usable = []
     for prior in priors:

@@ -1,4 +1,4 @@
-"""From the adjusted state to the finished map: descriptors, patches, uncertainties, trajectory."""
+"""Assembly of the map from the adjusted state: descriptors, patches, uncertainties, trajectory."""
 
 from dataclasses import replace
 
@@ -25,16 +25,16 @@ _MIN_TIED = 8
 _CHUNK = 5000  # landmarks
 
 
-def summarise(state: SurveyState, guess: OdometryPass, settings: SurveySettings) -> tuple[SurveyMap, Culled]:
+def assemble(state: SurveyState, odometry: OdometryPass, settings: SurveySettings) -> tuple[SurveyMap, Culled]:
     """The SurveyMap of an adjusted survey, in the survey's own frame, and what was left out of it."""
     every_sigma = point_sigmas_m(state)
-    marks, kept, culled = cull(state, guess.keyframes, every_sigma, settings.cull)
-    keyframes = [k for k, keep in zip(guess.keyframes, kept, strict=True) if keep]
+    marks, kept, culled = cull(state, odometry.keyframes, every_sigma, settings.cull)
+    keyframes = [k for k, keep in zip(odometry.keyframes, kept, strict=True) if keep]
     marks = replace(marks, obs_keyframe=(np.cumsum(kept) - 1)[marks.obs_keyframe].astype(np.int32))
     octaves = of_features(marks, [k.features.octaves for k in keyframes])
-    frame_stamps = np.array([e.stamp_ns for e in guess.estimates], np.int64)
-    numbers = [k.frame_index for k in guess.keyframes]
-    map_from_body = frame_trajectory(frame_stamps, guess.odom_from_body, numbers, state.map_from_body)
+    frame_stamps = np.array([e.stamp_ns for e in odometry.estimates], np.int64)
+    numbers = [k.frame_index for k in odometry.keyframes]
+    map_from_body = frame_trajectory(frame_stamps, odometry.odom_from_body, numbers, state.map_from_body)
     handed_on = replace(
         state, stamps_ns=state.stamps_ns[kept], map_from_body=state.map_from_body[kept], landmarks=marks
     )
@@ -53,9 +53,9 @@ def summarise(state: SurveyState, guess: OdometryPass, settings: SurveySettings)
         obs_octave=octaves,
         obs_sigma_px=marks.obs_sigma_px,
         trajectory=Trajectory(frame_stamps, map_from_body),
-        trajectory_estimated=_estimated(state, guess),
+        trajectory_estimated=_estimated(state, odometry),
         patches=cut_patches(marks, keyframes),
-        scale_known=guess.scale_known,
+        scale_known=odometry.scale_known,
     )
     return survey_map, culled
 
@@ -75,19 +75,22 @@ def point_sigmas_m(state: SurveyState) -> Array:
     for start in range(0, len(weakest), _CHUNK):  # an observation's share of the work is half a kilobyte
         some = slice(start, min(start + _CHUNK, len(weakest)))
         rows = slice(*np.searchsorted(marks.obs_landmark, [some.start, some.stop]))
-        information = point_information(
-            state.camera, map_from_cam[marks.obs_keyframe[rows]], marks.points_map[some], marks.obs_landmark[rows] - start,
-            np.isfinite(marks.obs_pixels[rows, 2]), marks.obs_sigma_px[rows],
-        )  # fmt: skip
+        has_right, sigmas = np.isfinite(marks.obs_pixels[rows, 2]), marks.obs_sigma_px[rows]
+        cameras, landmarks = map_from_cam[marks.obs_keyframe[rows]], marks.obs_landmark[rows] - start
+        information = point_information(state.camera, cameras, marks.points_map[some], landmarks, has_right, sigmas)
         weakest[some] = np.linalg.eigvalsh(information)[:, 0]
     return np.asarray(1.0 / np.sqrt(np.maximum(weakest, 1e-6)))
 
 
 def point_information(
-    camera: StereoCamera, map_from_cam: Array, points_map: Array, obs_landmark: NDArray[np.int32], has_right: NDArray[np.bool_],
+    camera: StereoCamera,
+    map_from_cam: Array,
+    points_map: Array,
+    obs_landmark: NDArray[np.int32],
+    has_right: NDArray[np.bool_],
     obs_sigma_px: Array,
-) -> Array:  # fmt: skip
-    """(N, 3, 3) what M observations from known cameras map_from_cam (M, 4, 4) say about N points, in map axes."""
+) -> Array:
+    """(N, 3, 3) information of M observations by known cameras map_from_cam (M, 4, 4) on N points, in map axes: sum of J^T J."""
     cam_from_map = se3_inverse(map_from_cam)
     rotations = cam_from_map[:, :3, :3]
     seen = np.einsum("mij,mj->mi", rotations, points_map[obs_landmark]) + cam_from_map[:, :3, 3]
@@ -123,10 +126,10 @@ def cut_patches(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8
     return out
 
 
-def _estimated(state: SurveyState, guess: OdometryPass) -> NDArray[np.bool_]:
+def _estimated(state: SurveyState, odometry: OdometryPass) -> NDArray[np.bool_]:
     """(F,) frames that something measured ties to the map: landmarks, unbroken odometry, or the IMU through a gap."""
-    tied = guess.tracked.astype(bool).copy()
+    tied = odometry.tracked.astype(bool).copy()
     counts = np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns))
-    for keyframe, count in zip(guess.keyframes, counts, strict=True):
+    for keyframe, count in zip(odometry.keyframes, counts, strict=True):
         tied[keyframe.frame_index] |= bool(count >= _MIN_TIED) or state.motion.inertial
     return tied

@@ -10,7 +10,7 @@ from mapserver.survey.bundle.bundle_rounds import SurveyState
 from mapserver.survey.survey_map import SurveyMap
 
 
-def moved(survey_map: SurveyMap, new_from_map: Array) -> SurveyMap:
+def transform_map(survey_map: SurveyMap, new_from_map: Array) -> SurveyMap:
     """The same survey in the frame `new`; new_from_map (4, 4) is rigid, so nothing measured changes."""
     return replace(
         survey_map,

@@ -1,4 +1,7 @@
-"""Which keyframes hang together. What neither pictures nor a short inertial bridge tie to the rest has no place in the same map."""
+"""Connected components of a survey: keyframes joined by shared landmarks or by short bridges of odometry.
+
+Only one component can be in a map: the pose of any other relative to it is unknown.
+"""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -24,8 +27,8 @@ _APART = "nothing says for sure where it lies to the largest part; drive it agai
 _BLIND = "too little was seen to tie it to anything; drive it again, with light"
 
 
-class Sightings(Protocol):
-    """Who sees what; a SurveyMap is such a thing."""
+class Observations(Protocol):
+    """Observations of landmarks by keyframes, as a SurveyMap has them."""
 
     @property
     def keyframe_stamps_ns(self) -> NDArray[np.int64]:
@@ -46,7 +49,7 @@ class Sightings(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Covisibility:
-    """Sightings of a survey that is no map yet."""
+    """Observations of a survey that is no map yet."""
 
     keyframe_stamps_ns: NDArray[np.int64]
     landmark_ids: NDArray[np.int64]
@@ -55,8 +58,8 @@ class Covisibility:
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
-    """Keyframes that hang together, seconds of the first and last after the survey's first keyframe, and what became of them."""
+class Component:
+    """Connected keyframes: seconds of the first and last after the survey's first keyframe, and whether they are kept, and why."""
 
     start_s: float
     end_s: float
@@ -70,25 +73,25 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True)
-class Parts:
-    """labels (K,): the part of each keyframe, -1 for those that nothing ties to any, which are listed as stray, run by run."""
+class Components:
+    """labels (K,): the component of each keyframe, -1 for stray ones, which are in none and listed run by run."""
 
     labels: NDArray[np.int64]
-    parts: list[Part]
-    stray: list[Part]
+    components: list[Component]
+    stray: list[Component]
 
     @property
     def kept(self) -> NDArray[np.bool_]:
-        """(K,) keyframes that stay in the map: those of the part with most that see something."""
-        return np.asarray(self.labels == next(n for n, part in enumerate(self.parts) if part.kept))
+        """(K,) keyframes that stay in the map: those of the component with most that see something."""
+        return np.asarray(self.labels == next(n for n, component in enumerate(self.components) if component.kept))
 
 
-def find_components(survey_map: "Sightings", odometry_sigmas_m: "SigmaBetween", join_sigma_m: float) -> Parts:
-    """The parts of a finished survey; SurveyError where nothing hangs together.
+def find_components(survey_map: Observations, odometry_sigmas_m: "SigmaBetween", join_sigma_m: float) -> Components:
+    """The components of a finished survey; SurveyError where no keyframes are connected.
 
-    Keyframes belong together where they share landmarks, directly or through others, and where the one that saw something last
-    and the one that sees something next are known to `join_sigma_m` of each other by odometry. Blind ones in between belong
-    there too, others to the part before or after as far as odometry carries: until three of its sigmas are as much.
+    Keyframes are connected where they share landmarks, and where the last one that saw something and the next one that does
+    are known to `join_sigma_m` of each other by odometry. Blind ones in between are then connected too; other blind ones
+    are with the component before or after as long as three sigmas of the odometry are within that limit.
     """
     count = len(survey_map.keyframe_stamps_ns)
     seeing = np.flatnonzero(np.bincount(survey_map.obs_keyframe, minlength=count) >= MIN_SEEN)
@@ -110,36 +113,36 @@ def find_components(survey_map: "Sightings", odometry_sigmas_m: "SigmaBetween", 
 
 
 class SigmaBetween:
-    """By how much, in metres, odometry leaves open where keyframe b is seen from keyframe a."""
+    """Standard deviation, in metres, of keyframe b relative to keyframe a by odometry."""
 
     def __init__(self, covariances: Array) -> None:
         """covariances (K, 6, 6) of the odometry at the keyframes, rotation first."""
         self._variances = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2)
 
     def __call__(self, a: int, b: int) -> float:
-        """What was added between them."""
+        """The growth of the variance between them, as a standard deviation."""
         return float(np.sqrt(max(self._variances[b] - self._variances[a], 0.0)))
 
 
-def seen_by(state: SurveyState) -> "Covisibility":
-    """Who sees what in an adjusted survey."""
+def covisibility_of(state: SurveyState) -> Covisibility:
+    """The observations of an adjusted survey."""
     marks = state.landmarks
     return Covisibility(state.stamps_ns, np.arange(len(marks.points_map)), marks.obs_keyframe, marks.obs_landmark)
 
 
 def only_kept(
-    state: SurveyState, guess: OdometryPass, loops: Loops, kept: NDArray[np.bool_]
+    state: SurveyState, odometry: OdometryPass, loops: Loops, kept: NDArray[np.bool_]
 ) -> tuple[SurveyState, OdometryPass, Loops]:
     """The survey of the kept keyframes (K,) alone; the records of loops keep the old numbers."""
     if kept.all():
-        return state, guess, loops
+        return state, odometry, loops
     number = np.cumsum(kept) - 1
     edges = [replace(e, i=int(number[e.i]), j=int(number[e.j])) for e in loops.edges if kept[e.i] and kept[e.j]]
-    keyframes = [k for k, keep in zip(guess.keyframes, kept, strict=True) if keep]
-    return state_of(state, kept), replace(guess, keyframes=keyframes), replace(loops, edges=edges)
+    keyframes = [k for k, keep in zip(odometry.keyframes, kept, strict=True) if keep]
+    return state_of(state, kept), replace(odometry, keyframes=keyframes), replace(loops, edges=edges)
 
 
-def shared_landmarks(survey_map: "Sightings", at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def shared_landmarks(survey_map: Observations, at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pairs of keyframes, the older one first, that share so many landmarks."""
     ones = np.ones(len(survey_map.obs_keyframe), np.int32)
     shape = len(survey_map.keyframe_stamps_ns), len(survey_map.landmark_ids)
@@ -149,8 +152,8 @@ def shared_landmarks(survey_map: "Sightings", at_least: int) -> tuple[NDArray[np
     return shared.row[enough].astype(np.int64), shared.col[enough].astype(np.int64)
 
 
-def _named(survey_map: "Sightings", groups: NDArray[np.int64], seeing: NDArray[np.int64]) -> Parts:
-    """Parts of at least two keyframes, one of which sees something, in the order of time."""
+def _named(survey_map: Observations, groups: NDArray[np.int64], seeing: NDArray[np.int64]) -> Components:
+    """Components of at least two keyframes, one of which sees something, in the order of time."""
     sizes, seeing_sizes = np.bincount(groups), np.bincount(groups[seeing])
     real = [g for g in dict.fromkeys(groups[seeing].tolist()) if sizes[g] >= _MIN_KEYFRAMES]
     if not real:
@@ -162,17 +165,18 @@ def _named(survey_map: "Sightings", groups: NDArray[np.int64], seeing: NDArray[n
     labels = np.full(len(groups), -1, np.int64)
     for number, group in enumerate(real):
         labels[groups == group] = number
-    parts = [
-        _part(survey_map, np.flatnonzero(labels == n), group == largest, _LARGEST if group == largest else _APART)
+    components = [
+        _component(survey_map, np.flatnonzero(labels == n), group == largest, _LARGEST if group == largest else _APART)
         for n, group in enumerate(real)
     ]
-    return Parts(labels, parts, [_part(survey_map, run, False, _BLIND) for run in _runs(np.flatnonzero(labels < 0))])
+    stray = [_component(survey_map, run, False, _BLIND) for run in _runs(np.flatnonzero(labels < 0))]
+    return Components(labels, components, stray)
 
 
-def _part(survey_map: "Sightings", members: NDArray[np.int64], kept: bool, reason: str) -> Part:
+def _component(survey_map: Observations, members: NDArray[np.int64], kept: bool, reason: str) -> Component:
     stamps_ns = survey_map.keyframe_stamps_ns
     start_s, end_s = (round(float(stamps_ns[k] - stamps_ns[0]) * 1e-9, 3) for k in members[[0, -1]])
-    return Part(start_s, end_s, len(members), kept, reason)
+    return Component(start_s, end_s, len(members), kept, reason)
 
 
 def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.int64]]:
@@ -180,7 +184,7 @@ def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return [run for run in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1) if len(run)]
 
 
-def beside(frames: int, keyframe_frames: NDArray[np.int64], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def between_kept(frames: int, keyframe_frames: NDArray[np.int64], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(F,) frames whose neighbouring keyframes, the one before and the one after, are all kept."""
     after = np.searchsorted(keyframe_frames, np.arange(frames))
     exact = keyframe_frames[np.minimum(after, len(kept) - 1)] == np.arange(frames)

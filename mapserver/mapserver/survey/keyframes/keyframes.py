@@ -1,4 +1,4 @@
-"""Which frames become keyframes, and what is kept of each."""
+"""Keyframe selection, and the data that is kept of each keyframe."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -28,7 +28,7 @@ class Pictures:
 
 
 class ImageStore(Protocol):
-    """Where the pictures of keyframes wait until they are looked at again: a long survey's do not fit in memory."""
+    """Storage for the pictures of keyframes: those of a long survey do not fit in memory."""
 
     def put(self, pictures: Pictures) -> int:
         """The number under which `get` gives them back."""
@@ -55,7 +55,7 @@ class MemoryImageStore:
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """One keyframe: features (N), disparities (N, 2) with sigma, their points; its pictures wait on a shelf.
+    """One keyframe: features (N), disparities (N, 2) with sigma, their points; its pictures are in an image store.
 
     from_views: the disparities come from other keyframes, so they place points but measure nothing of their own.
     """
@@ -65,14 +65,14 @@ class Keyframe:
     features: orb.Features
     disparities: Array
     points_cam: Array
-    shelf: ImageStore
-    shelf_number: int
+    images: ImageStore
+    image_number: int
     from_views: bool = False
 
     @property
     def pictures(self) -> Pictures:
-        """What lies on the shelf."""
-        return self.shelf.get(self.shelf_number)
+        """The pictures, fetched from the image store."""
+        return self.images.get(self.image_number)
 
     @property
     def frame(self) -> RectifiedFrame:
@@ -85,19 +85,38 @@ class Keyframe:
         return self.pictures.pyramid
 
 
-def make_keyframe(
-    frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings, shelf: ImageStore | None = None
-) -> Keyframe:  # fmt: skip
-    """Detects, describes and stereo-matches one frame; its pictures go to `shelf`, into memory without one."""
-    return next(make_keyframes([(frame_index, frame)], camera, settings, shelf, SERIAL))
+@dataclass(frozen=True, slots=True)
+class PosedKeyframes:
+    """K keyframes at map_from_body (K, 4, 4), seen by one camera with the mounting body_from_cam (4, 4)."""
+
+    keyframes: list[Keyframe]
+    map_from_body: Array
+    body_from_cam: Array
+    camera: StereoCamera
+
+    @property
+    def map_from_cam(self) -> Array:
+        """(K, 4, 4)."""
+        return self.map_from_body @ self.body_from_cam
+
+
+def make_keyframe(frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings) -> Keyframe:
+    """Detects, describes and stereo-matches one frame; its pictures stay in memory."""
+    return next(make_keyframes([(frame_index, frame)], camera, settings))
 
 
 def make_keyframes(
-    frames: Iterable[tuple[int, RectifiedFrame]], camera: StereoCamera, settings: SurveySettings, shelf: ImageStore | None,
-    worker: Executor,
-) -> Iterator[Keyframe]:  # fmt: skip
-    """The same of several frames, each with its number; a worker is at some of them while the next ones are still awaited."""
-    kept = MemoryImageStore() if shelf is None else shelf
+    frames: Iterable[tuple[int, RectifiedFrame]],
+    camera: StereoCamera,
+    settings: SurveySettings,
+    images: ImageStore | None = None,
+    executor: Executor = SERIAL,
+) -> Iterator[Keyframe]:
+    """Keyframes of numbered frames; the executor extracts features while the next frames are awaited.
+
+    images: takes the pictures, memory without one.
+    """
+    kept = MemoryImageStore() if images is None else images
     waiting: deque[tuple[int, RectifiedFrame]] = deque()
 
     def batches() -> Iterator[list[RectifiedFrame]]:
@@ -106,7 +125,7 @@ def make_keyframes(
             waiting.extend(batch)
             yield [frame for _, frame in batch]
 
-    for found in worker.map(_extract, (camera, settings), batches()):
+    for found in executor.map(_extract, (camera, settings), batches()):
         for features, disparities in found:
             number, frame = waiting.popleft()
             points = camera.point_from_pixel(features.pixels, disparities[:, 0])
@@ -128,21 +147,21 @@ def _extract(
 
 def with_pictures(keyframe: Keyframe, *, whole: bool) -> Keyframe:
     """The same keyframe with its pictures in memory; unless `whole`, only the left one's pyramid."""
-    pictures, shelf = keyframe.shelf.get(keyframe.shelf_number), MemoryImageStore()
+    pictures, images = keyframe.pictures, MemoryImageStore()
     if not whole:
         frame = RectifiedFrame(keyframe.stamp_ns, pictures.pyramid[0], None, None)
         pictures = Pictures(frame, pictures.pyramid)
-    return replace(keyframe, shelf=shelf, shelf_number=shelf.put(pictures))
+    return replace(keyframe, images=images, image_number=images.put(pictures))
 
 
 def without_pictures(keyframe: Keyframe) -> Keyframe:
-    """The same keyframe with nothing on its shelf: what travels where only features are compared."""
-    return replace(keyframe, shelf=MemoryImageStore(), shelf_number=0)
+    """The same keyframe with an empty image store, cheap to send where only features are compared."""
+    return replace(keyframe, images=MemoryImageStore(), image_number=0)
 
 
 @dataclass(frozen=True, slots=True)
 class FrameSummary:
-    """What a keyframe policy looks at: where the frame is by odometry, which points it tracks, and how the picture is."""
+    """Input of the keyframe policy: odometry of one frame, its tracked points, its sharpness."""
 
     stamp_ns: int
     odom_from_body: Array

@@ -1,7 +1,7 @@
-"""Places that a survey passes again and again: some visits of each make the map, the others are only placed in it.
+"""Thinning of revisits: some visits to each place are adjusted, the others are localized in the result.
 
-What a global adjustment costs, in memory and in time, grows with the square of the visits to a place, and what it gains by one more
-does not: after some, places are known better than the calibration is.
+A global adjustment takes memory and time with the square of the visits to a place. After some visits one more gains nothing:
+places are then known better than the calibration is.
 """
 
 from dataclasses import replace
@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.survey.bundle.bundle_adjustment import optimize
-from mapserver.survey.bundle.bundle_rounds import SurveyState, adjust, bundle_problem, state_of, take
+from mapserver.survey.bundle.bundle_rounds import (
+    SurveyState,
+    apply_result,
+    bundle_problem,
+    bundle_rounds,
+    state_of,
+    with_keyframes_of,
+)
 from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.keyframes.revisit_thinning_kernels import mark_repeated
 from mapserver.survey.settings import SurveySettings
@@ -23,67 +30,63 @@ def redundant_keyframes(tracks: Tracks, keyframes: list[Keyframe], settings: Sur
     """(K,) keyframes without which `repeated_visits` other visits still see `repeated_share` of their tracks, as finely.
 
     A visit ends where no keyframe has seen a track for longer than a loop takes at least. The last keyframes go first, so that
-    whole drives are left. None are spare where no place is seen on more visits than those. What then stands alone beside them
-    is spare too: blind ones, whose neighbours know better where they are.
+    whole drives are left. None are redundant where no place is seen on more visits than those. Keyframes that then share too
+    few tracks with the others, such as blind ones, are redundant too: their neighbours are known better.
     """
-    cull, spare = settings.cull, np.zeros(len(keyframes), bool)
+    cull, redundant = settings.cull, np.zeros(len(keyframes), bool)
     first_of = np.cumsum([0, *(len(k.features) for k in keyframes)])
     octaves = np.concatenate([np.zeros(0, np.int8), *(k.features.octaves for k in keyframes)])
     starts = np.append(tracks.starts, len(tracks.keyframes))
     order = np.argsort(tracks.keyframes, kind="stable")
     track = np.repeat(np.arange(len(tracks.starts)), np.diff(starts))
-    mark_repeated(
-        order, np.searchsorted(tracks.keyframes[order], np.arange(len(keyframes) + 1)),
-        track, starts, tracks.keyframes,
-        octaves[first_of[tracks.keyframes] + tracks.features], settings.loops.min_gap_keyframes, cull.repeated_visits,
-        cull.repeated_share, settings.loops.alone_inliers, spare,
-    )  # fmt: skip
-    while (alone := _left_alone(tracks.keyframes, track, spare, settings.loops.alone_inliers)).any():
-        spare |= alone
-    return spare
+    row_starts = np.searchsorted(tracks.keyframes[order], np.arange(len(keyframes) + 1))
+    octaves = octaves[first_of[tracks.keyframes] + tracks.features]
+    gap, least = settings.loops.min_gap_keyframes, settings.loops.alone_inliers
+    limits = gap, cull.repeated_visits, cull.repeated_share, least
+    mark_repeated(order, row_starts, track, starts, tracks.keyframes, octaves, *limits, redundant)
+    while (alone := _left_alone(tracks.keyframes, track, redundant, least)).any():
+        redundant |= alone
+    return redundant
 
 
 def _left_alone(
-    keyframes: NDArray[np.int64], track: NDArray[np.int64], spare: NDArray[np.bool_], least: int
+    keyframes: NDArray[np.int64], track: NDArray[np.int64], redundant: NDArray[np.bool_], least: int
 ) -> NDArray[np.bool_]:
-    """(K,) keyframes next to spare ones that share fewer tracks than `least` with those that are not."""
-    used = ~spare[keyframes]
+    """(K,) keyframes next to redundant ones that share fewer tracks than `least` with those that are not."""
+    used = ~redundant[keyframes]
     shared = used & (np.bincount(track[used], minlength=len(track))[track] > 1)
-    beside = np.zeros(len(spare), bool)
-    beside[1:] = spare[:-1]
-    beside[1:-1] |= spare[2:]
-    return np.asarray(~spare & beside & (np.bincount(keyframes[shared], minlength=len(spare)) < least))
+    beside = np.zeros(len(redundant), bool)
+    beside[1:] = redundant[:-1]
+    beside[1:-1] |= redundant[2:]
+    return np.asarray(~redundant & beside & (np.bincount(keyframes[shared], minlength=len(redundant)) < least))
 
 
-def without_redundant(state: SurveyState, spare: NDArray[np.bool_]) -> SurveyState:
-    """The state of all other keyframes; where spare ones leave long gaps, the IMU does not carry over."""
-    if not spare.any():
+def without_redundant(state: SurveyState, redundant: NDArray[np.bool_]) -> SurveyState:
+    """The state of all other keyframes; no inertial factor joins those between which redundant ones leave a long gap."""
+    if not redundant.any():
         return state
-    part, chosen = state_of(state, ~spare), np.flatnonzero(~spare)
+    part, chosen = state_of(state, ~redundant), np.flatnonzero(~redundant)
     goes_on = (np.diff(chosen, prepend=-1) == 1) | (np.diff(part.stamps_ns, prepend=0) < int(_LONGEST_GAP_S * 1e9))
-    part.motion.goes_on = goes_on
-    return part
+    return replace(part, motion=replace(part.motion, goes_on=goes_on))
 
 
-def adjust_visits(state: SurveyState, settings: SurveySettings, spare: NDArray[np.bool_], rounds: int) -> None:
-    """Final adjustment, in place, of all keyframes but spare ones (K,), which then take their places among its landmarks."""
-    if not spare.any():
-        adjust(state, settings, rounds=rounds, final=True)
-        return
-    part = without_redundant(state, spare)
-    adjust(part, settings, rounds=rounds, final=True)
-    used, motion = ~spare, state.motion
-    state.map_from_body[used] = part.map_from_body
-    motion.velocities_mps[used] = part.motion.velocities_mps
-    motion.gyro_bias_radps[used] = part.motion.gyro_bias_radps
-    motion.accel_bias_mps2[used] = part.motion.accel_bias_mps2
-    state.landmarks = _seen_by(spare, state.landmarks, part.landmarks, np.flatnonzero(used))
-    _place(state, settings, spare)
-    state.landmarks = _together(part.landmarks, np.flatnonzero(used), state.landmarks)
+def adjust_visits(
+    state: SurveyState, settings: SurveySettings, redundant: NDArray[np.bool_], rounds: int
+) -> SurveyState:
+    """Final adjustment of all keyframes but redundant ones (K,), which are then localized among its landmarks."""
+    if not redundant.any():
+        return bundle_rounds(state, settings, rounds=rounds, final=True)
+    part = bundle_rounds(without_redundant(state, redundant), settings, rounds=rounds, final=True)
+    numbers = np.flatnonzero(~redundant)
+    seen = _seen_by(redundant, state.landmarks, part.landmarks, numbers)
+    state = _localize(replace(with_keyframes_of(state, ~redundant, part), landmarks=seen), settings, redundant)
+    return replace(state, landmarks=_together(part.landmarks, numbers, state.landmarks))
 
 
-def _seen_by(spare: NDArray[np.bool_], marks: Landmarks, adjusted: Landmarks, numbers: NDArray[np.int64]) -> Landmarks:
-    """What spare keyframes observe of `adjusted`, which is left of `marks`; numbers: those of the adjusted keyframes in `marks`."""
+def _seen_by(
+    redundant: NDArray[np.bool_], marks: Landmarks, adjusted: Landmarks, numbers: NDArray[np.int64]
+) -> Landmarks:
+    """What redundant keyframes observe of `adjusted`, which is left of `marks`; numbers: those of the adjusted keyframes in `marks`."""
     stride = int(marks.obs_feature.max(initial=0)) + 1
     codes = marks.obs_keyframe.astype(np.int64) * stride + marks.obs_feature
     first = np.searchsorted(adjusted.obs_landmark, np.arange(len(adjusted.points_map)))
@@ -92,20 +95,20 @@ def _seen_by(spare: NDArray[np.bool_], marks: Landmarks, adjusted: Landmarks, nu
     found = order[np.searchsorted(codes, sought, sorter=order)]
     number = np.full(len(marks.points_map), -1, np.int32)
     number[marks.obs_landmark[found]] = np.arange(len(found))
-    rows = np.flatnonzero(spare[marks.obs_keyframe] & (number[marks.obs_landmark] >= 0))
-    return Landmarks(
-        adjusted.points_map, marks.obs_keyframe[rows], number[marks.obs_landmark[rows]], marks.obs_feature[rows],
-        marks.obs_pixels[rows], marks.obs_sigma_px[rows],
-    )  # fmt: skip
+    rows = np.flatnonzero(redundant[marks.obs_keyframe] & (number[marks.obs_landmark] >= 0))
+    keyframe, landmark = marks.obs_keyframe[rows], number[marks.obs_landmark[rows]]
+    seen = marks.obs_feature[rows], marks.obs_pixels[rows], marks.obs_sigma_px[rows]
+    return Landmarks(adjusted.points_map, keyframe, landmark, *seen)
 
 
-def _place(state: SurveyState, settings: SurveySettings, spare: NDArray[np.bool_]) -> None:
-    """Moves the spare keyframes to where their observations of the landmarks, which stay, and the IMU say; drops outliers."""
+def _localize(state: SurveyState, settings: SurveySettings, redundant: NDArray[np.bool_]) -> SurveyState:
+    """The redundant keyframes by their observations of landmarks that are held, and by the IMU; outliers are dropped."""
     for how in (settings.rough_bundle, settings.final_bundle):
-        result = optimize(replace(bundle_problem(state, settings, spare), points_held=True), how)
-        take(state, result)
+        result = optimize(replace(bundle_problem(state, settings, redundant), points_held=True), how)
         keep = result.squared_sigmas < settings.noise.cut_sigmas**2
-        state.landmarks = state.landmarks.keep_observations(keep, 0)
+        state = apply_result(state, result)
+        state = replace(state, landmarks=state.landmarks.keep_observations(keep, 0))
+    return state
 
 
 def _together(adjusted: Landmarks, numbers: NDArray[np.int64], placed: Landmarks) -> Landmarks:

@@ -1,28 +1,24 @@
-"""Revisits: looked for by words, allowed by position, verified by geometry, and only then believed."""
+"""Loop closure: candidates by bag of words, gated by position, verified by geometry and by their neighbours."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import BowVector, PlaceIndex
+from fleetmap.bow import PlaceIndex
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
-from mapserver.survey.keyframes.keyframes import Keyframe, without_pictures
-from mapserver.survey.loops.zones import Zones
+from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, without_pictures
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
-from mapserver.survey.settings import SurveySettings
-from mapserver.survey.tracks.matching import ComparedFeatures, median_depth_m
-from mapserver.survey.tracks.pairs import PairMatch, match_pair
+from mapserver.survey.survey_inputs import SurveyConfig
+from mapserver.survey.tracks.matching import median_depth_m
+from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotion, match_pair
 
-_CORRELATION = (
-    3.0  # matched points share calibration and depth errors: a pair's own covariance is too narrow by about this
-)
-
-
+# Matched points share calibration and depth errors: a pair's own covariance is too narrow by about this factor.
+_CORRELATION = 3.0
 _CHUNK = 64  # candidates that are gated at once
 _SIDES = 16  # to which the site may repeat
 _TWIN_SCORE = 0.7  # of a candidate's score, from which on another place looks the same
@@ -33,7 +29,7 @@ _WELL_KNOWN_COV = np.diag([0.005**2] * 3 + [0.05**2] * 3)
 _LEARNED_PER_DOUBLING = 64
 
 
-class Verdict(StrEnum):
+class LoopVerdict(StrEnum):
     """What became of a candidate."""
 
     ACCEPTED = "accepted"
@@ -52,13 +48,13 @@ class LoopRecord:
     i: int
     j: int
     score: float
-    verdict: Verdict
+    verdict: LoopVerdict
     reason: str
     inliers: int = 0
     also: tuple[int, ...] = ()
 
 
-@dataclass
+@dataclass(frozen=True)
 class Loops:
     """All candidates, and the edges (i_from_j of bodies) of the accepted ones."""
 
@@ -67,78 +63,86 @@ class Loops:
 
     def counts(self) -> dict[str, int]:
         """candidates, gated_out, rejected, accepted; ambiguous ones count as rejected."""
-        tally = {verdict: sum(1 + len(r.also) for r in self.records if r.verdict is verdict) for verdict in Verdict}
+        tally = {verdict: sum(1 + len(r.also) for r in self.records if r.verdict is verdict) for verdict in LoopVerdict}
         return {
             "candidates": sum(tally.values()),
-            "gated_out": tally[Verdict.GATED_OUT],
-            "rejected": tally[Verdict.REJECTED] + tally[Verdict.AMBIGUOUS],
-            "accepted": tally[Verdict.ACCEPTED],
+            "gated_out": tally[LoopVerdict.GATED_OUT],
+            "rejected": tally[LoopVerdict.REJECTED] + tally[LoopVerdict.AMBIGUOUS],
+            "accepted": tally[LoopVerdict.ACCEPTED],
         }
 
-    def disbelieve(self, weights: Array) -> None:
-        """Turns loops with a pose-graph weight below one half into rejected ones; weights go along the edges."""
-        doubted = {(e.i, e.j) for e, weight in zip(self.edges, weights, strict=True) if weight < 0.5}
-        self.edges = [e for e in self.edges if (e.i, e.j) not in doubted]
-        self.records = [
-            LoopRecord(r.i, r.j, r.score, Verdict.REJECTED, "contradicts the other loops in the pose graph", r.inliers)
-            if (r.i, r.j) in doubted and r.verdict is Verdict.ACCEPTED
+    def without_outliers(self, weights: Array) -> "Loops":
+        """The same with every loop rejected whose pose-graph weight is below one half; one weight for each edge."""
+        outliers = {(e.i, e.j) for e, weight in zip(self.edges, weights, strict=True) if weight < 0.5}
+        reason = "contradicts the other loops in the pose graph"
+        records = [
+            replace(r, verdict=LoopVerdict.REJECTED, reason=reason)
+            if (r.i, r.j) in outliers and r.verdict is LoopVerdict.ACCEPTED
             else r
             for r in self.records
         ]
+        return Loops(records, [e for e in self.edges if (e.i, e.j) not in outliers])
 
 
 class LoopCloser:
     """Searches a finished chain of keyframes for revisits; `marginals` narrows with every loop that is accepted."""
 
     def __init__(
-        self, keyframes: list[Keyframe], vectors: list[BowVector], word_count: int, camera: StereoCamera, body_from_cam: Array,
-        map_from_body: Array, marginals: GraphMarginals, matched: set[tuple[int, int]], settings: SurveySettings, zones: Zones,
-        worker: Executor = SERIAL,
-    ) -> None:  # fmt: skip
-        self._keyframes, self._vectors, self._camera = keyframes, vectors, camera
-        self._body_from_cam, self._map_from_body = body_from_cam, map_from_body  # moved by every accepted loop
-        self._cam_from_body = se3_inverse(body_from_cam)
-        self._marginals, self._settings, self._zones = marginals, settings, zones
+        self,
+        posed: PosedKeyframes,
+        options: SurveyConfig,
+        marginals: GraphMarginals,
+        matched: set[tuple[int, int]],
+        executor: Executor = SERIAL,
+    ) -> None:
+        """matched: pairs of keyframes that were matched as neighbours, and so are no loops."""
+        self._keyframes, self._camera = posed.keyframes, posed.camera
+        self._body_from_cam, self._cam_from_body = posed.body_from_cam, se3_inverse(posed.body_from_cam)
+        self._map_from_body = posed.map_from_body  # moved by every accepted loop
+        self._marginals, self._settings, self._zones = marginals, options.settings.loops, options.zones
+        vocabulary = options.vocabulary
+        self._vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in posed.keyframes]
         self._neighbours: dict[int, list[int]] = {}
         for i, j in sorted(matched):
             self._neighbours.setdefault(i, []).append(j)
             self._neighbours.setdefault(j, []).append(i)
-        self._worker = worker
-        self._compared = ComparedFeatures([without_pictures(k) for k in keyframes], camera, settings)
-        self._depths_m = np.array([median_depth_m(keyframe) for keyframe in keyframes])
-        self._index = PlaceIndex(word_count)
+        self._executor = executor
+        bare = [without_pictures(k) for k in posed.keyframes]
+        self._inputs = MatchInputs(bare, posed.camera, options.settings.pairs)
+        self._depths_m = np.array([median_depth_m(keyframe) for keyframe in posed.keyframes])
+        self._index = PlaceIndex(vocabulary.word_count)
         self.loops = Loops()
 
     def close(self, i: int) -> None:
         """Looks for revisits of keyframe i among those before it, then adds it to the index. To be called in order."""
         ids, scores = self._alike(i)
-        believed: list[tuple[PoseEdge, LoopRecord]] = []
+        verified: list[tuple[PoseEdge, LoopRecord]] = []
         inside = self._gate(i, ids, scores)
-        matches = self._worker.map(_verify, self._compared, [self._look(i, int(ids[n])) for n in inside])
+        matches = self._executor.map(_verify, self._inputs, [self._predict(i, int(ids[n])) for n in inside])
         for n, match in zip(inside, matches, strict=True):
             j, score = int(ids[n]), float(scores[n])
-            others = np.array([edge.j for edge, _ in believed], np.int64)
+            others = np.array([edge.j for edge, _ in verified], np.int64)
             same = others[~self._are_apart(j, others)].tolist() if len(others) else []
-            if len(same) >= self._settings.loops.per_place:
+            if len(same) >= self._settings.per_place:
                 reason = f"its place is closed with keyframe {same[0]} already"
-                self.loops.records.append(LoopRecord(i, j, score, Verdict.REJECTED, reason))
+                self.loops.records.append(LoopRecord(i, j, score, LoopVerdict.REJECTED, reason))
                 continue
             outcome = self._examine(i, j, score, match, ids[scores >= _TWIN_SCORE * score])
             if isinstance(outcome, LoopRecord):
                 self.loops.records.append(outcome)
             else:
-                believed.append(outcome)
-        self._decide(i, believed)
+                verified.append(outcome)
+        self._decide(i, verified)
         self._index.add(i, self._vectors[i])
 
     def _are_apart(self, j: int, others: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(M,) whether old keyframes are other places than j: they cannot be seen from where it is."""
-        reach_m = self._settings.loops.view_range_depths * np.maximum(self._depths_m[j], self._depths_m[others])
+        reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[j], self._depths_m[others])
         return np.asarray(~self._marginals.reachable(j, others, reach_m) & (others != j))
 
     def _alike(self, i: int) -> tuple[NDArray[np.int64], Array]:
         """Ids and scores of old keyframes that share words with i and are not matched with it, the most alike first."""
-        settings = self._settings.loops
+        settings = self._settings
         ids = self._index.place_ids
         new = i - ids >= settings.min_gap_keyframes
         new &= ~np.isin(ids, self._neighbours.get(i, []))
@@ -152,7 +156,7 @@ class LoopCloser:
         Appearance alone would fill its best places with other aisles where aisles repeat, so the gate goes down the
         list, and records what it refused on the way.
         """
-        loops = self._settings.loops
+        loops = self._settings
         inside: list[int] = []
         far: list[int] = []
         zoned: list[int] = []
@@ -174,7 +178,9 @@ class LoopCloser:
             if refused:
                 first, *others = (int(ids[n]) for n in refused)
                 score = float(scores[refused[0]])
-                self.loops.records.append(LoopRecord(i, first, score, Verdict.GATED_OUT, reason, also=tuple(others)))
+                self.loops.records.append(
+                    LoopRecord(i, first, score, LoopVerdict.GATED_OUT, reason, also=tuple(others))
+                )
         return inside[: loops.top]
 
     def _examine(
@@ -182,31 +188,35 @@ class LoopCloser:
     ) -> tuple[PoseEdge, LoopRecord] | LoopRecord:
         """The edge of a candidate that passed every test alone, or why it did not."""
 
-        def refuse(verdict: Verdict, reason: str, inliers: int = 0) -> LoopRecord:
+        def refuse(verdict: LoopVerdict, reason: str, inliers: int = 0) -> LoopRecord:
             return LoopRecord(i, j, score, verdict, reason, inliers)
 
         if match is None:
-            return refuse(Verdict.REJECTED, "too few features agree on one motion")
+            return refuse(LoopVerdict.REJECTED, "too few features agree on one motion")
         count = len(match.features)
         cells = _cells(self._keyframes[i], match.features[:, 1], self._camera)
-        if count < self._settings.loops.min_inliers or cells < self._settings.loops.min_cells:
-            return refuse(Verdict.REJECTED, f"{count} matches in {cells} of 48 cells are too few or too crowded", count)
+        if count < self._settings.min_inliers or cells < self._settings.min_cells:
+            return refuse(
+                LoopVerdict.REJECTED, f"{count} matches in {cells} of 48 cells are too few or too crowded", count
+            )
         edge = self._edge(match)
         innovation = self._marginals.innovation_squared(edge)
-        if innovation > self._settings.loops.max_innovation:
+        if innovation > self._settings.max_innovation:
             return refuse(
-                Verdict.GATED_OUT, f"matches, but from where the robot cannot be (innovation {innovation:.0f})", count
+                LoopVerdict.GATED_OUT,
+                f"matches, but from where the robot cannot be (innovation {innovation:.0f})",
+                count,
             )
         supported = self._neighbours_agree(match)
-        if supported is False or (supported is None and count < self._settings.loops.alone_inliers):
-            return refuse(Verdict.REJECTED, "neighbouring keyframes do not confirm it", count)
+        if supported is False or (supported is None and count < self._settings.alone_inliers):
+            return refuse(LoopVerdict.REJECTED, "neighbouring keyframes do not confirm it", count)
         shift_m = self._unseen_twin(edge, twins)
         if shift_m is not None:
             reason = (
                 f"places {shift_m:.2f} m apart look the same here, and another such step is as possible as this one"
             )
-            return refuse(Verdict.AMBIGUOUS, reason, count)
-        return edge, LoopRecord(i, j, score, Verdict.ACCEPTED, "verified", count)
+            return refuse(LoopVerdict.AMBIGUOUS, reason, count)
+        return edge, LoopRecord(i, j, score, LoopVerdict.ACCEPTED, "verified", count)
 
     def _unseen_twin(self, edge: PoseEdge, twins: NDArray[np.int64]) -> float | None:
         """How far off the robot could be too if the site repeats as it is seen to, or said to; None where it cannot be.
@@ -218,21 +228,23 @@ class LoopCloser:
         if len(twins):
             twins = twins[self._are_apart(edge.j, twins)]
             ways = self._map_from_body[twins, :3, 3] - self._map_from_body[edge.j, :3, 3]
-        steps = np.concatenate([ways, -ways, _around(self._settings.loops.repeats_every_m)])
+        steps = np.concatenate([ways, -ways, _around(self._settings.repeats_every_m)])
         if not len(steps):
             return None
-        possible = self._marginals.innovations_squared_beside(edge, steps) <= self._settings.loops.max_innovation
+        possible = self._marginals.innovations_squared_beside(edge, steps) <= self._settings.max_innovation
         lengths_m = np.linalg.norm(steps[possible], axis=1)
         return float(lengths_m.min()) if len(lengths_m) else None
 
-    def _look(self, i: int, j: int) -> "_Look":
-        """How to match j (as reference) with i; the graph's rotation is used where it is known well enough."""
-        predicted = (
-            self._cam_from_body @ se3_inverse(self._map_from_body[i]) @ self._map_from_body[j] @ self._body_from_cam
-        )
+    def _cam_from_cam(self, j: int, i: int) -> Array:
+        map_from_body = self._map_from_body
+        cam_from_map = self._cam_from_body @ se3_inverse(map_from_body[j])
+        return np.asarray(cam_from_map @ map_from_body[i] @ self._body_from_cam)
+
+    def _predict(self, i: int, j: int) -> tuple[int, int, PredictedMotion]:
+        """The motion by which to match j (as reference) with i; the graph's rotation is used where it is known well enough."""
         sigma = float(np.sqrt(np.trace(self._marginals.relative_cov(i, j)[:3, :3])))
-        known = max(sigma, 0.02) if sigma < self._settings.loops.rotation_sigma_limit_rad else None
-        return j, i, predicted, known
+        known = max(sigma, 0.02) if sigma < self._settings.rotation_sigma_limit_rad else None
+        return j, i, PredictedMotion(self._cam_from_cam(i, j), known)
 
     def _edge(self, match: PairMatch) -> PoseEdge:
         """Body i from body j; the match has camera i (its j) from camera j (its i)."""
@@ -248,13 +260,8 @@ class LoopCloser:
         for n in sorted(self._neighbours.get(j, []), key=lambda n: abs(n - j))[:4]:
             if n == i:
                 continue
-            j_from_n = (
-                self._cam_from_body @ se3_inverse(self._map_from_body[j]) @ self._map_from_body[n] @ self._body_from_cam
-            )
-            predicted = match.j_from_i @ j_from_n
-            other = match_pair(
-                n, i, self._keyframes, self._camera, predicted, None, self._settings.pairs, is_known=True
-            )
+            predicted = match.j_from_i @ self._cam_from_cam(j, n)
+            other = match_pair(n, i, self._inputs, PredictedMotion(predicted, is_known=True))
             if other is None:
                 continue
             tried += 1
@@ -263,25 +270,17 @@ class LoopCloser:
                 return True
         return False if tried else None
 
-    def _decide(self, i: int, believed: list[tuple[PoseEdge, LoopRecord]]) -> None:
+    def _decide(self, i: int, verified: list[tuple[PoseEdge, LoopRecord]]) -> None:
         """Accepts what is left, unless the candidates exclude each other: then none is."""
-        places = [self._map_from_body[e.j] @ se3_inverse(e.i_from_j) for e, _ in believed]
+        places = [self._map_from_body[e.j] @ se3_inverse(e.i_from_j) for e, _ in verified]
         spread = max((float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a in places for b in places), default=0.0)
-        js = np.array([edge.j for edge, _ in believed], np.int64)
+        js = np.array([edge.j for edge, _ in verified], np.int64)
         between = [np.trace(self._marginals.relative_covs(j, js[js != j])[:, 3:, 3:], axis1=1, axis2=2) for j in js]
         tolerance = 0.3 + 3.0 * float(np.sqrt(max((traces.max(initial=0.0) for traces in between), default=0.0)))
-        for edge, record in believed:
+        for edge, record in verified:
             if spread > tolerance:
-                self.loops.records.append(
-                    LoopRecord(
-                        i,
-                        record.j,
-                        record.score,
-                        Verdict.AMBIGUOUS,
-                        f"candidates {spread:.2f} m apart exclude each other",
-                        record.inliers,
-                    )
-                )
+                reason = f"candidates {spread:.2f} m apart exclude each other"
+                self.loops.records.append(replace(record, verdict=LoopVerdict.AMBIGUOUS, reason=reason))
                 continue
             self.loops.records.append(record)
             self.loops.edges.append(edge)
@@ -293,14 +292,9 @@ class LoopCloser:
         return np.asarray(_WELL_KNOWN_COV * 2.0 ** (self._marginals.learned / _LEARNED_PER_DOUBLING))
 
 
-_Look = tuple[
-    int, int, Array, float | None
-]  # reference, the other, its camera from the reference's, sigma of the rotation
-
-
-def _verify(compared: ComparedFeatures, look: _Look) -> PairMatch | None:
-    j, i, predicted, known = look
-    return match_pair(j, i, compared.keyframes, compared.camera, predicted, known, compared.settings.pairs)
+def _verify(inputs: MatchInputs, pair: tuple[int, int, PredictedMotion]) -> PairMatch | None:
+    j, i, predicted = pair
+    return match_pair(j, i, inputs, predicted)
 
 
 def _around(distance_m: float) -> Array:

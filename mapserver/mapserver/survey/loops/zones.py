@@ -1,9 +1,11 @@
-"""Hard zones of a site: places in different zones never see each other, whatever the pictures say."""
+"""Hard zones of a site: cameras in different zones never see the same, whatever the pictures suggest."""
 
 from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 
+from fleetmap.errors import UsageError
 from fleetmap.geometry import Array
 
 
@@ -31,3 +33,26 @@ def _inside(polygon: Array, position_m: Array) -> bool:
         if (y0 > y) != (y1 > y) and x < x0 + (y - y0) / (y1 - y0) * (x1 - x0):
             inside = not inside
     return inside
+
+
+def zones_of(named: dict[str, object], file: str) -> Zones:
+    """Zones from lists of corners [[x, y], ...] by name.
+
+    Raises UsageError, naming the file and the zone, for anything but three or more corners of two finite numbers each.
+    """
+    if not named:
+        raise UsageError(f"{file}: the table [zones] is empty; write name = [[x, y], ...] or leave --zones out")
+    polygons = {}
+    for name, value in named.items():
+        where = f"{file}: zone {name!r}"
+        try:
+            corners = msgspec.convert(value, list[tuple[float, float]])
+        except msgspec.ValidationError as error:
+            raise UsageError(f"{where}: {error}; write it as a list of corners [x, y] in metres") from error
+        if len(corners) < 3:
+            raise UsageError(f"{where} has {len(corners)} corner(s); an area needs at least 3")
+        polygon = np.array(corners, dtype=np.float64)
+        if not np.isfinite(polygon).all():
+            raise UsageError(f"{where} has a corner that is not finite: {corners}; write metres")
+        polygons[name] = polygon
+    return Zones(polygons)

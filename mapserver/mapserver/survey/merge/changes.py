@@ -32,7 +32,7 @@ def what_changes(
     keep = ~gone
     keep[judged.rows[alone]] = False
     free = free_observations(marks, joint.sightings)
-    fresh = new_landmarks(base, survey.first_guess.keyframes, marks, joint, free, settings.sessions)
+    fresh = new_landmarks(base, survey.odometry.keyframes, marks, joint, free, settings.sessions)
     again = resighted(base, judged.rows[alone], judged.points_map[alone], joint.sightings)
     new = chosen(marks, joint.own_points_map, fresh, free)
     added = fewer_keyframes(joined(again, new), settings.sessions.min_confirmations)

@@ -16,7 +16,7 @@ from mapserver.survey.bundle.bundle_adjustment import (
     RelativeTerm,
     optimize,
 )
-from mapserver.survey.bundle.bundle_rounds import Motion, SurveyState, widened
+from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState, scaled_noise
 from mapserver.survey.merge.base_map import BaseMap, Rows
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.settings import SurveySettings
@@ -161,10 +161,10 @@ def _own(marks: Landmarks, sightings: Sequence[Sighting | None]) -> tuple[NDArra
 
 
 def _inertial(
-    motion: Motion, stamps_ns: NDArray[np.int64], turn: Array, old: int, settings: SurveySettings
+    motion: KeyframeMotion, stamps_ns: NDArray[np.int64], turn: Array, old: int, settings: SurveySettings
 ) -> InertialTerms:
     assert motion.noise is not None
-    noise, offset_ns = widened(motion.noise, settings), int(motion.imu_minus_cam_s * 1e9)
+    noise, offset_ns = scaled_noise(motion.noise, settings), int(motion.imu_minus_cam_s * 1e9)
     edges = []
     for k in range(len(stamps_ns) - 1):
         start, end = int(stamps_ns[k]) + offset_ns, int(stamps_ns[k + 1]) + offset_ns

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Trajectory
-from mapserver.survey.finish.map_transform import moved
+from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.merge.pipeline import Counts, NotJoined, extend
 from mapserver.survey.pipeline import Survey
 from mapserver.survey.settings import SurveySettings
@@ -89,7 +89,7 @@ def join_sessions(base: SurveyMap | None, sessions: Sequence[Session], settings:
 
 def _begun(session: Session) -> SurveyMap:
     survey_map = session.survey.map
-    return survey_map if session.map_from_survey is None else moved(survey_map, session.map_from_survey)
+    return survey_map if session.map_from_survey is None else transform_map(survey_map, session.map_from_survey)
 
 
 def with_trajectories(

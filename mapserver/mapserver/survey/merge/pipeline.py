@@ -62,7 +62,7 @@ def extend(
     map_from_survey: where position priors put the survey, if they do: fixes elsewhere are left out, and without enough fixes
     it is taken as it is.
     """
-    state, guess = survey.state, survey.first_guess
+    state, guess = survey.state, survey.odometry
     if not (guess.scale_known and base_map.scale_known):
         return NotJoined(
             "a survey by one camera without IMU has no metres of its own: it can begin a map, not join one"
@@ -90,14 +90,14 @@ def _look(
 ) -> list[Sighting | None]:
     return [
         sight(base, keyframe, place @ survey.state.body_from_cam, radius_px, settings)
-        for keyframe, place in zip(survey.first_guess.keyframes, map_from_body, strict=True)
+        for keyframe, place in zip(survey.odometry.keyframes, map_from_body, strict=True)
     ]
 
 
 def _compare(
     base: BaseMap, survey: Survey, joint: Joint, settings: SurveySettings, anchored: bool, fixes: tuple[int, int]
 ) -> Extension:
-    state, guess = survey.state, survey.first_guess
+    state, guess = survey.state, survey.odometry
     map_from_cam = joint.map_from_body @ state.body_from_cam
     looks = count_looks(base, guess.keyframes, map_from_cam, joint.sightings)
     gone = faded(base, looks, settings) if anchored else np.zeros(len(base.points_map), bool)

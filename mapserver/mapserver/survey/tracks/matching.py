@@ -1,7 +1,6 @@
-"""Which keyframes are matched with which, and whether a match may be believed."""
+"""Selection of keyframe pairs to match, and checks of the measured motion against the predicted one."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +9,8 @@ from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.keyframes.keyframes import Keyframe, without_pictures
-from mapserver.survey.settings import SurveySettings
-from mapserver.survey.tracks.pairs import PairMatch, match_pair, view_overlap
+from mapserver.survey.settings import PairSettings
+from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotion, match_pair, view_overlap
 
 _NEAR_CANDIDATES = 40
 _BATCH = 16  # pairs: a tenth of a second of work, so that handing it out costs nothing
@@ -22,13 +21,17 @@ class PairFinder:
     """Matches keyframes that should see the same things, given where they are."""
 
     def __init__(
-        self, keyframes: list[Keyframe], camera: StereoCamera, body_from_cam: Array, settings: SurveySettings,
-        worker: Executor = SERIAL,
-    ) -> None:  # fmt: skip
+        self,
+        keyframes: list[Keyframe],
+        camera: StereoCamera,
+        body_from_cam: Array,
+        settings: PairSettings,
+        executor: Executor = SERIAL,
+    ) -> None:
         self._keyframes, self._camera, self._body_from_cam, self._settings = keyframes, camera, body_from_cam, settings
-        self._worker = worker
-        self._shared = ComparedFeatures([without_pictures(k) for k in keyframes], camera, settings)
-        self._depths = np.array([median_depth_m(k) for k in keyframes])
+        self._executor = executor
+        self._inputs = MatchInputs([without_pictures(k) for k in keyframes], camera, settings)
+        self._depths_m = np.array([median_depth_m(k) for k in keyframes])
 
     def candidates(self, map_from_body: Array, *, previous: int, only_near: int | None = None) -> list[tuple[int, int]]:
         """Pairs (i, j), i < j: the last few in time, and the most covisible ones by predicted view.
@@ -37,14 +40,14 @@ class PairFinder:
         """
         map_from_cam = map_from_body @ self._body_from_cam
         positions, axes = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]
-        settings = self._settings.pairs
+        settings = self._settings
         found: list[tuple[int, int]] = []
         for j in range(1, len(map_from_cam)):
             first = 0 if only_near is None else max(0, j - only_near)
             chosen = set(range(max(first, j - previous), j))
             earlier = np.arange(first, max(j - previous, first))
             distance = np.linalg.norm(positions[earlier] - positions[j], axis=1)
-            near = (distance < 2.0 * np.maximum(self._depths[earlier], self._depths[j])) & (
+            near = (distance < 2.0 * np.maximum(self._depths_m[earlier], self._depths_m[j])) & (
                 axes[earlier] @ axes[j] > np.cos(np.radians(_MAX_VIEW_ANGLE_DEG))
             )
             closest = earlier[near][np.argsort(distance[near], kind="stable")][:_NEAR_CANDIDATES]
@@ -59,44 +62,37 @@ class PairFinder:
         return found
 
     def match(
-        self, candidates: list[tuple[int, int]], map_from_body: Array, allowed_m: Callable[[int, int], float], *,
-        rotation_sigma_rad: float | None, is_known: bool, progress: Callable[[int], None],
-    ) -> list[PairMatch]:  # fmt: skip
+        self,
+        candidates: list[tuple[int, int]],
+        map_from_body: Array,
+        allowed_m: Callable[[int, int], float],
+        *,
+        rotation_sigma_rad: float | None,
+        is_known: bool,
+        progress: Callable[[int], None],
+    ) -> list[PairMatch]:
         """Verified matches whose measured motion agrees with the predicted one to within allowed_m(i, j)."""
         map_from_cam = map_from_body @ self._body_from_cam
-        looks = [(i, j, se3_inverse(map_from_cam[j]) @ map_from_cam[i]) for i, j in candidates]
-        batches = [(looks_there, rotation_sigma_rad, is_known) for looks_there in in_batches(looks, _BATCH)]
+        predictions: list[_Prediction] = []
+        for i, j in candidates:
+            j_from_i = se3_inverse(map_from_cam[j]) @ map_from_cam[i]
+            predictions.append((i, j, PredictedMotion(j_from_i, rotation_sigma_rad, is_known)))
         matches, number = [], 0
-        for (looks_there, _, _), found in zip(
-            batches, self._worker.map(_match_batch, self._shared, batches), strict=True
-        ):
-            for (i, j, predicted), match in zip(looks_there, found, strict=True):
-                if match is not None and _agrees(match.j_from_i, predicted, allowed_m(i, j)):
+        batches: list[list[_Prediction]] = in_batches(predictions, _BATCH)
+        for batch, found in zip(batches, self._executor.map(_match_batch, self._inputs, batches), strict=True):
+            for (i, j, predicted), match in zip(batch, found, strict=True):
+                if match is not None and _agrees(match.j_from_i, predicted.j_from_i, allowed_m(i, j)):
                     matches.append(match)
                 progress(number)
                 number += 1
         return matches
 
 
-@dataclass(frozen=True, slots=True)
-class ComparedFeatures:
-    """What matching looks at of a survey: its keyframes without their pictures."""
-
-    keyframes: list[Keyframe]
-    camera: StereoCamera
-    settings: SurveySettings
+_Prediction = tuple[int, int, PredictedMotion]
 
 
-def _match_batch(
-    features: ComparedFeatures, batch: tuple[list[tuple[int, int, Array]], float | None, bool]
-) -> list[PairMatch | None]:
-    looks, rotation_sigma_rad, is_known = batch
-    return [
-        match_pair(
-            i, j, features.keyframes, features.camera, predicted, rotation_sigma_rad, features.settings.pairs, is_known=is_known
-        )
-        for i, j, predicted in looks
-    ]  # fmt: skip
+def _match_batch(inputs: MatchInputs, batch: list[_Prediction]) -> list[PairMatch | None]:
+    return [match_pair(i, j, inputs, predicted) for i, j, predicted in batch]
 
 
 def _agrees(measured: Array, predicted: Array, allowed_m: float) -> bool:

@@ -19,7 +19,7 @@ def survey_camera(camera: StereoCamera) -> StereoCamera:
     return camera if camera.baseline_m > 0 else replace(camera, baseline_m=RGBD_BASELINE_M)
 
 
-class ViewDepths:
+class MonoDepths:
     """Places features of single-camera keyframes by triangulation with neighbours in time; matches are looked for once."""
 
     def __init__(self, keyframes: Sequence[Keyframe], camera: StereoCamera, settings: SurveySettings) -> None:
@@ -34,7 +34,7 @@ class ViewDepths:
             for i, j in pairs
         }  # fmt: skip
 
-    def placed(self, map_from_body: Array, body_from_cam: Array) -> list[Keyframe]:
+    def keyframes_at(self, map_from_body: Array, body_from_cam: Array) -> list[Keyframe]:
         """The keyframes with disparities and points of those features that several views agree on, the others without."""
         map_from_cam = map_from_body @ body_from_cam
         found: list[list[Array]] = [[] for _ in self._keyframes]  # rows of feature, inverse depth, its sigma

@@ -1,6 +1,7 @@
-"""Which features of two keyframes show the same thing: matched by descriptor, verified by one rigid motion, completed by projection."""
+"""Feature matching of two keyframes: by descriptor, verified by one rigid motion, completed by projection."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,24 +28,35 @@ class PairMatch:
     cov_rot_trans: Array
 
 
-def match_pair(
-    i: int, j: int, keyframes: list[Keyframe], camera: StereoCamera, j_from_i: Array | None, rotation_sigma_rad: float | None,
-    settings: PairSettings, *, is_known: bool = False,
-) -> PairMatch | None:  # fmt: skip
-    """The verified match of two keyframes, None where too little agrees.
+@dataclass(frozen=True, slots=True)
+class MatchInputs:
+    """The keyframes of a survey, without their pictures, as matching reads them."""
 
-    j_from_i: predicted camera motion, or None; rotation_sigma_rad: how well its rotation is known, None where it must not be used.
-    is_known: the prediction is good to a few pixels (after bundle adjustment), so that projection alone finds the matches.
+    keyframes: list[Keyframe]
+    camera: StereoCamera
+    settings: PairSettings
+
+
+class PredictedMotion(NamedTuple):
+    """Camera motion j_from_i (4, 4) expected between two keyframes.
+
+    rotation_sigma_rad: of its rotation, None where it must not be used. is_known: good to a few pixels (after bundle
+    adjustment), so that projection alone finds the matches.
     """
-    a, b = keyframes[i], keyframes[j]
+
+    j_from_i: Array
+    rotation_sigma_rad: float | None = None
+    is_known: bool = False
+
+
+def match_pair(i: int, j: int, inputs: MatchInputs, predicted: PredictedMotion | None = None) -> PairMatch | None:
+    """The verified match of two keyframes, None where too little agrees."""
     found = None
-    if is_known and j_from_i is not None:
-        found = _from_projection(a, b, camera, j_from_i, settings, settings.search_px)
+    if predicted is not None and predicted.is_known:
+        found = _from_projection(inputs.keyframes[i], inputs.keyframes[j], inputs, predicted.j_from_i)
     if found is None:
-        found = _from_descriptors(a, b, camera, j_from_i, rotation_sigma_rad, settings)
-    if found is None:
-        return None
-    return _complete(i, j, a, b, camera, found, settings)
+        found = _from_descriptors(inputs.keyframes[i], inputs.keyframes[j], inputs, predicted)
+    return None if found is None else _complete(i, j, inputs, found)
 
 
 def _measured(keyframe: Keyframe, index: Indices) -> Array:
@@ -59,23 +71,25 @@ def _sigmas(keyframe: Keyframe, index: Indices, settings: PairSettings) -> Array
 
 
 def _from_descriptors(
-    a: Keyframe,
-    b: Keyframe,
-    camera: StereoCamera,
-    j_from_i: Array | None,
-    rotation_sigma_rad: float | None,
-    settings: PairSettings,
+    a: Keyframe, b: Keyframe, inputs: MatchInputs, predicted: PredictedMotion | None
 ) -> PnpResult | None:
+    camera, settings = inputs.camera, inputs.settings
     known = np.flatnonzero(np.isfinite(a.disparities[:, 0]))
     pairs = match_mutual(a.features.descriptors[known], b.features.descriptors, settings.max_distance, settings.ratio)
     index_a, index_b = known[pairs[:, 0]], pairs[:, 1]
     points, measured, sigmas = a.points_cam[index_a], _measured(b, index_b), _sigmas(b, index_b, settings)
-    if j_from_i is not None and rotation_sigma_rad is not None and not b.from_views:
-        threshold = max(settings.search_px, 1.5 * rotation_sigma_rad * camera.focal_px)
+    if predicted is not None and predicted.rotation_sigma_rad is not None and not b.from_views:
+        sigma_rad = predicted.rotation_sigma_rad
         return pnp_with_rotation(
-            camera, points, measured, sigmas, j_from_i[:3, :3], threshold_px=threshold, min_inliers=settings.min_inliers,
-            rotation_sigma_rad=rotation_sigma_rad,
-        )  # fmt: skip
+            camera,
+            points,
+            measured,
+            sigmas,
+            predicted.j_from_i[:3, :3],
+            threshold_px=max(settings.search_px, 1.5 * sigma_rad * camera.focal_px),
+            min_inliers=settings.min_inliers,
+            rotation_sigma_rad=sigma_rad,
+        )
     found = ransac_pnp(
         camera, points, measured, sigmas, threshold_px=4.0, min_inliers=settings.min_inliers, seed=len(pairs)
     )
@@ -83,27 +97,14 @@ def _from_descriptors(
     return found if found is not None and found.inliers.sum() >= 0.2 * len(pairs) else None
 
 
-def _project_match(
-    a: Keyframe, b: Keyframe, camera: StereoCamera, b_from_a: Array, settings: PairSettings, radius_px: float
-) -> Indices:
+def _project_match(a: Keyframe, b: Keyframe, inputs: MatchInputs, b_from_a: Array, radius_px: float) -> Indices:
     """(P, 2) matches of a's features with depth into b by projection."""
-    count = len(a.features)
-    predicted, radius, span = np.empty((count, 2)), np.empty(count), np.zeros((count, 2), np.int64)
-    predict_features(
-        b_from_a,
-        a.points_cam,
-        a.disparities[:, 0],
-        a.features.octaves,
-        _lens(camera),
-        radius_px,
-        predicted,
-        radius,
-        span,
-    )
-    found, _ = match_by_projection(
-        predicted, radius, a.features.descriptors, span, b.features.pixels, b.features.octaves, b.features.descriptors,
-        settings.guided_distance, 0.95,
-    )  # fmt: skip
+    own, other, disparities = a.features, b.features, a.disparities[:, 0]
+    predicted, radius, span = np.empty((len(own), 2)), np.empty(len(own)), np.zeros((len(own), 2), np.int64)
+    lens, output = _lens(inputs.camera), (predicted, radius, span)
+    predict_features(b_from_a, a.points_cam, disparities, own.octaves, lens, radius_px, *output)
+    sought, searched = (predicted, radius, own.descriptors, span), (other.pixels, other.octaves, other.descriptors)
+    found, _ = match_by_projection(*sought, *searched, inputs.settings.guided_distance, 0.95)
     hit = np.flatnonzero(found >= 0)
     return np.column_stack([hit, found[hit]])
 
@@ -112,40 +113,34 @@ def _lens(camera: StereoCamera) -> Array:
     return np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px], np.float64)
 
 
-def _from_projection(
-    a: Keyframe, b: Keyframe, camera: StereoCamera, b_from_a: Array, settings: PairSettings, radius_px: float
-) -> PnpResult | None:
-    pairs = _project_match(a, b, camera, b_from_a, settings, radius_px)
+def _from_projection(a: Keyframe, b: Keyframe, inputs: MatchInputs, b_from_a: Array) -> PnpResult | None:
+    settings = inputs.settings
+    pairs = _project_match(a, b, inputs, b_from_a, settings.search_px)
     if len(pairs) < settings.min_inliers:
         return None
-    found = refine_pnp(
-        camera, a.points_cam[pairs[:, 0]], _measured(b, pairs[:, 1]), _sigmas(b, pairs[:, 1], settings), b_from_a
-    )
+    found = _refine(a, b, inputs, pairs, b_from_a)
     return found if found is not None and found.inliers.sum() >= max(settings.min_inliers, 0.4 * len(pairs)) else None
 
 
-def _complete(
-    i: int, j: int, a: Keyframe, b: Keyframe, camera: StereoCamera, found: PnpResult, settings: PairSettings
-) -> PairMatch | None:
+def _refine(a: Keyframe, b: Keyframe, inputs: MatchInputs, pairs: Indices, b_from_a: Array) -> PnpResult | None:
+    points, measured = a.points_cam[pairs[:, 0]], _measured(b, pairs[:, 1])
+    return refine_pnp(inputs.camera, points, measured, _sigmas(b, pairs[:, 1], inputs.settings), b_from_a)
+
+
+def _complete(i: int, j: int, inputs: MatchInputs, found: PnpResult) -> PairMatch | None:
     """All matches that fit the motion, looked for in both directions, and the motion from all of them."""
+    a, b, settings = inputs.keyframes[i], inputs.keyframes[j], inputs.settings
     for _ in range(2):
-        forward = _project_match(a, b, camera, found.cam_from_source, settings, settings.guided_radius_px)
+        forward = _project_match(a, b, inputs, found.cam_from_source, settings.guided_radius_px)
         if len(forward) < settings.min_inliers:
             return None
-        again = refine_pnp(
-            camera,
-            a.points_cam[forward[:, 0]],
-            _measured(b, forward[:, 1]),
-            _sigmas(b, forward[:, 1], settings),
-            found.cam_from_source,
-        )
+        again = _refine(a, b, inputs, forward, found.cam_from_source)
         if again is None or again.inliers.sum() < settings.min_inliers:
             return None
         found = again
     forward = forward[found.inliers]
-    backward = _project_match(b, a, camera, se3_inverse(found.cam_from_source), settings, settings.guided_radius_px)[
-        :, ::-1
-    ]
+    j_from_i = found.cam_from_source
+    backward = _project_match(b, a, inputs, se3_inverse(j_from_i), settings.guided_radius_px)[:, ::-1]
     fresh = ~np.isin(backward[:, 0], forward[:, 0]) & ~np.isin(backward[:, 1], forward[:, 1])
     features = np.vstack([forward, backward[fresh]]).astype(np.int32)  # a long survey has ten million
     return PairMatch(i, j, features, found.cam_from_source, found.cov_rot_trans)

@@ -1,18 +1,18 @@
-"""Landmarks from verified pairs: features joined across keyframes, one per keyframe, with sub-pixel coordinates."""
+"""Landmarks from verified pairs: feature tracks across keyframes, one feature per keyframe, with sub-pixel coordinates."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.features import stereo
+from fleetmap.features.patch_align import AlignSettings
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor, in_batches
-from mapserver.survey.keyframes.keyframes import Keyframe, Pictures, with_pictures
+from mapserver.survey.keyframes.keyframes import Keyframe, Pictures, PosedKeyframes, with_pictures
 from mapserver.survey.settings import NoiseSettings, SurveySettings
 from mapserver.survey.tracks.pairs import PairMatch
 from mapserver.survey.tracks.tracks_kernels import align_observations
@@ -21,7 +21,7 @@ from mapserver.survey.tracks.tracks_kernels import join as join_kernel
 _BATCH = 16  # keyframes: their sources overlap, so that few pictures travel twice
 
 
-@dataclass
+@dataclass(frozen=True)
 class Landmarks:
     """N landmarks and their M observations, sorted by landmark; the first observation of each is its reference.
 
@@ -41,10 +41,9 @@ class Landmarks:
         lasting = counts >= min_observations
         keep = keep & lasting[self.obs_landmark]
         number = np.cumsum(lasting) - 1
-        return Landmarks(
-            self.points_map[lasting], self.obs_keyframe[keep], number[self.obs_landmark[keep]].astype(np.int32),
-            self.obs_feature[keep], self.obs_pixels[keep], self.obs_sigma_px[keep],
-        )  # fmt: skip
+        keyframes, landmarks = self.obs_keyframe[keep], number[self.obs_landmark[keep]].astype(np.int32)
+        features, pixels, sigmas = self.obs_feature[keep], self.obs_pixels[keep], self.obs_sigma_px[keep]
+        return Landmarks(self.points_map[lasting], keyframes, landmarks, features, pixels, sigmas)
 
 
 def of_features(marks: Landmarks, columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -57,14 +56,6 @@ def of_features(marks: Landmarks, columns: Sequence[NDArray[Any]]) -> NDArray[An
     return out
 
 
-def join_tracks(keyframes: list[Keyframe], pairs: list[PairMatch]) -> list[list[tuple[int, int]]]:
-    """Groups of (keyframe, feature) that pairs connect, no keyframe twice in a group; strongest pairs are joined first."""
-    groups = tracks_of(pairs)
-    members = list(zip(groups.keyframes.tolist(), groups.features.tolist(), strict=True))
-    edges = np.append(groups.starts, len(members)).tolist()
-    return [members[start:end] for start, end in pairwise(edges)]
-
-
 @dataclass(frozen=True, slots=True)
 class Tracks:
     """What pairs connect: members (M,) of G tracks, one track after the other, by rising keyframe; starts (G,) of each."""
@@ -75,7 +66,10 @@ class Tracks:
 
 
 def tracks_of(pairs: list[PairMatch]) -> Tracks:
-    """The tracks of all pairs, as `join_tracks` makes them."""
+    """Groups of features that pairs connect, no keyframe twice in a group; pairs with most matches are joined first.
+
+    Source: union-find, Tarjan 1975; tracks over unordered pairs, Moulon and Monasse 2012.
+    """
     ordered = sorted(pairs, key=lambda p: (-len(p.features), p.i, p.j))
     if not ordered:
         nothing = np.zeros(0, np.int64)
@@ -92,42 +86,40 @@ def tracks_of(pairs: list[PairMatch]) -> Tracks:
     return Tracks(nodes // stride, nodes % stride, starts)
 
 
+def no_landmarks() -> Landmarks:
+    """An empty set."""
+    none = np.zeros(0, np.int32)
+    return Landmarks(np.zeros((0, 3)), none, none, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)))
+
+
 def build_landmarks(
-    keyframes: list[Keyframe], pairs: list[PairMatch], map_from_body: Array, body_from_cam: Array, camera: StereoCamera,
-    settings: SurveySettings, worker: Executor = SERIAL,
-) -> Landmarks:  # fmt: skip
-    """Tracks of the pairs with a stereo point to start from, each observation's coordinate refined against the reference patch."""
-    none = np.zeros(len(keyframes), bool)
-    return landmarks_of(keyframes, tracks_of(pairs), none, map_from_body, body_from_cam, camera, settings, worker)
+    posed: PosedKeyframes,
+    tracks: Tracks,
+    settings: SurveySettings,
+    executor: Executor = SERIAL,
+    redundant: NDArray[np.bool_] | None = None,
+) -> Landmarks:
+    """Tracks with a stereo point to start from, each observation's coordinate refined against the reference patch.
 
-
-def landmarks_of(
-    keyframes: list[Keyframe], tracks: Tracks, spare: NDArray[np.bool_], map_from_body: Array, body_from_cam: Array,
-    camera: StereoCamera, settings: SurveySettings, worker: Executor = SERIAL,
-) -> Landmarks:  # fmt: skip
-    """The same from tracks. Those that fewer than two keyframes see which are not spare (K,) give no landmark."""
-    map_from_cam = map_from_body @ body_from_cam
-    table, points_cam = _tracks_from_reference(keyframes, tracks, spare)
+    Tracks that fewer than two keyframes see which are not redundant (K,) give no landmark.
+    """
+    redundant = np.zeros(len(posed.keyframes), bool) if redundant is None else redundant
+    table, points_cam = _tracks_from_reference(posed.keyframes, tracks, redundant)
     if not len(table):
-        nothing = np.zeros(0, np.int32)
-        return Landmarks(np.zeros((0, 3)), nothing, nothing, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)))
-    there = map_from_cam[table[_is_first(table), 0]]
-    points_map = np.einsum("nij,nj->ni", there[:, :3, :3], points_cam) + there[:, :3, 3]
-    pixels, sigmas = _observe(keyframes, table, points_map, map_from_cam, camera, settings, worker)
-    return Landmarks(
-        points_map, table[:, 0].astype(np.int32), table[:, 1].astype(np.int32), table[:, 2], pixels, sigmas
-    )
+        return no_landmarks()
+    reference = posed.map_from_cam[table[_is_first(table), 0]]
+    points_map = np.einsum("nij,nj->ni", reference[:, :3, :3], points_cam) + reference[:, :3, 3]
+    pixels, sigmas = _observe(posed, table, points_map, settings, executor)
+    keyframes, landmarks = table[:, :2].astype(np.int32).T.copy()
+    return Landmarks(points_map, keyframes, landmarks, table[:, 2], pixels, sigmas)
 
 
-def observed_again(
-    marks: Landmarks, keyframes: list[Keyframe], map_from_body: Array, body_from_cam: Array, camera: StereoCamera,
-    settings: SurveySettings, worker: Executor = SERIAL,
-) -> Landmarks:  # fmt: skip
-    """The same landmarks with their coordinates refined anew: from better places patches are warped better."""
+def refine_observations(
+    posed: PosedKeyframes, marks: Landmarks, settings: SurveySettings, executor: Executor = SERIAL
+) -> Landmarks:
+    """The same landmarks with refined coordinates: better poses warp the patches better."""
     table = np.column_stack([marks.obs_keyframe, marks.obs_landmark, marks.obs_feature]).astype(np.int64)
-    pixels, sigmas = _observe(
-        keyframes, table, marks.points_map, map_from_body @ body_from_cam, camera, settings, worker
-    )
+    pixels, sigmas = _observe(posed, table, marks.points_map, settings, executor)
     return replace(marks, obs_pixels=pixels, obs_sigma_px=sigmas)
 
 
@@ -137,11 +129,11 @@ def _is_first(table: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def _tracks_from_reference(
-    keyframes: list[Keyframe], tracks: Tracks, spare: NDArray[np.bool_]
+    keyframes: list[Keyframe], tracks: Tracks, redundant: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], Array]:
     """(M, 3) keyframe, landmark, feature of the tracks that know a depth, each one's reference first; its points_cam (N, 3).
 
-    The reference defines the landmark's patch: with depth, not spare, finest octave, nearest.
+    The reference defines the landmark's patch: with depth, not redundant, finest octave, nearest.
     """
     if not len(tracks.keyframes):
         return np.zeros((0, 3), np.int64), np.zeros((0, 3))
@@ -149,11 +141,13 @@ def _tracks_from_reference(
     at = first_of[tracks.keyframes] + tracks.features
     octaves = np.concatenate([k.features.octaves for k in keyframes])[at]
     disparities = np.concatenate([k.disparities[:, 0] for k in keyframes])[at]
-    members, is_spare = np.arange(len(at)), spare[tracks.keyframes]
+    members, is_redundant = np.arange(len(at)), redundant[tracks.keyframes]
     track = np.repeat(np.arange(len(tracks.starts)), np.diff(tracks.starts, append=len(at)))
-    best = np.lexsort((members, -disparities, octaves, is_spare, ~np.isfinite(disparities), track))[tracks.starts]
+    best = np.lexsort((members, -disparities, octaves, is_redundant, ~np.isfinite(disparities), track))[tracks.starts]
     lasting = (
-        np.isfinite(disparities[best]) & ~is_spare[best] & (np.bincount(track[~is_spare], minlength=len(best)) > 1)
+        np.isfinite(disparities[best])
+        & ~is_redundant[best]
+        & (np.bincount(track[~is_redundant], minlength=len(best)) > 1)
     )
     is_reference = np.zeros(len(at), bool)
     is_reference[best] = True
@@ -165,39 +159,33 @@ def _tracks_from_reference(
 
 
 def _observe(
-    keyframes: list[Keyframe],
-    table: NDArray[np.int64],
-    points_map: Array,
-    map_from_cam: Array,
-    camera: StereoCamera,
-    settings: SurveySettings,
-    worker: Executor,
+    posed: PosedKeyframes, table: NDArray[np.int64], points_map: Array, settings: SurveySettings, executor: Executor
 ) -> tuple[Array, Array]:
     """Pixels (M, 3) and sigmas (M, 2) of observations (keyframe, landmark, feature), references first in each landmark."""
-    is_reference = _is_first(table)
+    keyframes, map_from_cam, is_reference = posed.keyframes, posed.map_from_cam, _is_first(table)
     reference_row = np.maximum.accumulate(np.where(is_reference, np.arange(len(table)), 0))
     groups = in_batches(np.unique(table[:, 0]).tolist(), _BATCH)
     rows_of = [np.flatnonzero(np.isin(table[:, 0], group)) for group in groups]
 
-    def batches() -> Iterator[_Looks]:
+    def batches() -> Iterator[_ObservationBatch]:
         for group, rows in zip(groups, rows_of, strict=True):
             references = table[reference_row[rows]]
             sources = np.unique(references[:, 0]).tolist()
             known = {k: with_pictures(keyframes[k], whole=k in group) for k in sorted({*group, *sources})}
-            places = {k: map_from_cam[k] for k in known}
-            yield _Looks(table[rows], references, is_reference[rows], points_map[table[rows, 1]], known, places)
+            at = {k: map_from_cam[k] for k in known}
+            yield _ObservationBatch(table[rows], references, is_reference[rows], points_map[table[rows, 1]], known, at)
 
     pixels, sigmas = np.empty((len(table), 3)), np.empty((len(table), 2))
-    found = worker.map(_observe_batch, (camera, settings), batches())
+    found = executor.map(_observe_batch, (posed.camera, settings), batches())
     for rows, (batch_pixels, batch_sigmas) in zip(rows_of, found, strict=True):
         pixels[rows], sigmas[rows] = batch_pixels, batch_sigmas
     return pixels, sigmas
 
 
 @dataclass(frozen=True, slots=True)
-class _Looks:
-    """Observations (M, 3) of some keyframes, their references (M, 3), which are references themselves, where their landmarks
-    are, and all that these need."""
+class _ObservationBatch:
+    """Observations (M, 3) of some keyframes, their references (M, 3), a mask of the references among them, their landmarks,
+    and the keyframes and poses that all of these need."""
 
     table: NDArray[np.int64]
     references: NDArray[np.int64]
@@ -207,27 +195,27 @@ class _Looks:
     map_from_cam: dict[int, Array]
 
 
-def _observe_batch(shared: tuple[StereoCamera, SurveySettings], looks: _Looks) -> tuple[Array, Array]:
+def _observe_batch(shared: tuple[StereoCamera, SurveySettings], batch: _ObservationBatch) -> tuple[Array, Array]:
     """Pixels (M, 3) and sigmas (M, 2) of one batch."""
     camera, settings = shared
-    noise, keyframes = settings.noise, looks.keyframes
-    pixels, sigmas = np.empty((len(looks.table), 3)), np.empty((len(looks.table), 2))
-    for k in np.unique(looks.table[:, 0]).tolist():
-        rows = np.flatnonzero(looks.table[:, 0] == k)
+    noise, keyframes = settings.noise, batch.keyframes
+    pixels, sigmas = np.empty((len(batch.table), 3)), np.empty((len(batch.table), 2))
+    for k in np.unique(batch.table[:, 0]).tolist():
+        rows = np.flatnonzero(batch.table[:, 0] == k)
         own, pictures = keyframes[k], keyframes[k].pictures
-        features, references, is_reference = looks.table[rows, 2], looks.references[rows], looks.is_reference[rows]
-        points_map = looks.points_map[rows]
+        features, references, is_reference = batch.table[rows, 2], batch.references[rows], batch.is_reference[rows]
+        points_map = batch.points_map[rows]
         left, sigma = own.features.pixels[features].copy(), _descriptor_sigma(own, features, noise)
         sigma[is_reference] = noise.aligned_sigma_px
-        cam_from_map = se3_inverse(looks.map_from_cam[k])
+        cam_from_map = se3_inverse(batch.map_from_cam[k])
         others = np.flatnonzero(~is_reference)
         others = others[np.argsort(references[others, 0], kind="stable")]
         sources, starts = np.unique(references[others, 0], return_index=True)
         for source, inner in zip(sources.tolist(), np.split(others, starts[1:]), strict=True):
-            refined = _align(
-                keyframes[source], references[inner, 2], own, pictures, features[inner], looks.map_from_cam[source],
-                cam_from_map, points_map[inner], settings,
-            )  # fmt: skip
+            cam_from_source = cam_from_map @ batch.map_from_cam[source]
+            points_source = transform_points(se3_inverse(batch.map_from_cam[source]), points_map[inner])
+            pair = _FeaturePairs(keyframes[source], references[inner, 2], own, features[inner])
+            refined = _align(pair, pictures, points_source, cam_from_source, settings.align)
             sure = np.isfinite(refined[:, 0])
             left[inner[sure]] = refined[sure, :2]
             sigma[inner[sure]] = np.hypot(noise.aligned_sigma_px, refined[sure, 2])
@@ -241,18 +229,28 @@ def _descriptor_sigma(keyframe: Keyframe, features: NDArray[np.int64], noise: No
     return np.asarray(noise.descriptor_sigma_px * 1.2 ** keyframe.features.octaves[features].astype(np.float64))
 
 
+class _FeaturePairs(NamedTuple):
+    """Features `theirs` (N,) of a reference keyframe and `ours` (N,) of another, of the same landmarks."""
+
+    reference: Keyframe
+    theirs: NDArray[np.int64]
+    own: Keyframe
+    ours: NDArray[np.int64]
+
+
 def _align(
-    reference: Keyframe, theirs: NDArray[np.int64], own: Keyframe, pictures: Pictures, ours: NDArray[np.int64],
-    map_from_reference: Array, cam_from_map: Array, points_map: Array, settings: SurveySettings,
-) -> Array:  # fmt: skip
-    """Refined pixels (N, 3) of `ours`, NaN where the patches do not agree."""
-    refined, a, b, align = np.empty((len(ours), 3)), reference.features, own.features, settings.align
-    whole, half, quarter = reference.pyramid
-    own_whole, own_half, own_quarter = pictures.pyramid
-    align_observations(
-        whole, half, quarter, a.pixels, a.octaves, a.angles_deg, theirs,
-        transform_points(se3_inverse(map_from_reference), points_map), own_whole, own_half, own_quarter, b.pixels, b.octaves,
-        b.angles_deg, ours, cam_from_map @ map_from_reference, align.half_window_px, align.max_shift_px, align.min_correlation,
-        refined,
-    )  # fmt: skip
+    pairs: _FeaturePairs,
+    pictures: Pictures,
+    points_reference: Array,
+    own_from_reference: Array,
+    settings: AlignSettings,
+) -> Array:
+    """Refined pixels (N, 3) of `ours`, NaN where the patches do not agree; `pictures` are those of `own`."""
+    refined, a, b = np.empty((len(pairs.ours), 3)), pairs.reference.features, pairs.own.features
+    whole, half, quarter = pairs.reference.pyramid
+    theirs = whole, half, quarter, a.pixels, a.octaves, a.angles_deg, pairs.theirs, points_reference
+    whole, half, quarter = pictures.pyramid
+    ours = whole, half, quarter, b.pixels, b.octaves, b.angles_deg, pairs.ours
+    limits = settings.half_window_px, settings.max_shift_px, settings.min_correlation
+    align_observations(*theirs, *ours, own_from_reference, *limits, refined)
     return refined

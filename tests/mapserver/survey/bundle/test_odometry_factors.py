@@ -9,7 +9,7 @@ import pytest
 from fleetmap.geometry import se3, se3_exp, se3_inverse, so3_exp
 from mapserver.survey.bundle.odometry_factors import blackout_factors
 from mapserver.survey.keyframes.connected_components import SigmaBetween
-from mapserver.survey.odometry_pass import OdometryPass, carried_on
+from mapserver.survey.odometry_pass import OdometryPass, continued_covariances
 from support.worlds.corridor_scene import scene
 
 
@@ -21,7 +21,7 @@ def test_only_what_touches_the_dark_hangs_on_odometry_as_odometry_measured_it() 
     given = scene(8, 3, drift=0.0)
     state = given.state
     dark = (state.landmarks.obs_keyframe == 3) | (state.landmarks.obs_keyframe == 4)
-    state.landmarks = state.landmarks.keep_observations(~dark, 1)
+    state = replace(state, landmarks=state.landmarks.keep_observations(~dark, 1))
     truth = state.map_from_body.copy()
     odom_from_body = se3_exp(np.array([0.3, 0.1, -0.2, 4.0, 2.0, 1.0])) @ truth
     keyframes = [SimpleNamespace(frame_index=k) for k in range(8)]
@@ -44,7 +44,7 @@ def test_only_what_touches_the_dark_hangs_on_odometry_as_odometry_measured_it() 
 def test_beginning_anew_does_not_join_what_nothing_joins() -> None:
     """An odometry that begins anew takes its place for known: the doubt of before goes on, and one metre with it."""
     turn = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
-    whole = carried_on(
+    whole = continued_covariances(
         [estimate(0.0), estimate(0.01), estimate(0.04), estimate(0.0, np.eye(4), inertial=False), estimate(0.01)]
     )
     between = SigmaBetween(whole)
@@ -53,5 +53,5 @@ def test_beginning_anew_does_not_join_what_nothing_joins() -> None:
     assert between(3, 4) == pytest.approx(np.sqrt(3 * 0.01))
     first = np.diag([0.0, 0.0, 0.0, 0.04, 0.01, 0.0])
     seen = SimpleNamespace(cov_rot_trans=first, new_odom_from_old_odom=None, inertial=False)
-    begun = carried_on([seen, estimate(0.0, turn)])
+    begun = continued_covariances([seen, estimate(0.0, turn)])
     np.testing.assert_allclose(np.diag(begun[1]), [0.0, 0.0, 0.0, 0.01, 0.04, 0.0], atol=1e-12)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapserver.survey.bundle.bundle_rounds import SurveyState, adjust
-from mapserver.survey.bundle.stereo_yaw_check import NO_TURN, disparity_shift, estimate_stereo_yaw, without_stereo_yaw
+from mapserver.survey.bundle.bundle_rounds import SurveyState, bundle_rounds
+from mapserver.survey.bundle.stereo_yaw_check import NO_YAW, disparity_shift, estimate_stereo_yaw, without_stereo_yaw
 from mapserver.survey.settings import SurveySettings
 from support.worlds.corridor_scene import CAMERA, scene
 
@@ -16,9 +16,8 @@ SETTINGS = SurveySettings()
 def adjusted(seed: int, turn_px: float) -> SurveyState:
     """A made-up survey with disparities that are too large by turn_px, adjusted as they are."""
     state = scene(24, seed, drift=0.01).state
-    state.landmarks = without_stereo_yaw(state.landmarks, CAMERA, -turn_px)
-    adjust(state, SETTINGS, final=True)
-    return state
+    state = replace(state, landmarks=without_stereo_yaw(state.landmarks, CAMERA, -turn_px))
+    return bundle_rounds(state, SETTINGS, final=True)
 
 
 @pytest.mark.parametrize("turn_px", [-0.3, 0.2])
@@ -43,8 +42,8 @@ def test_taking_the_shift_out_gives_the_survey_its_scale_back() -> None:
     length_m = float(np.linalg.norm(truth[-1, :3, 3] - truth[0, :3, 3]))
     before = float(np.linalg.norm(state.map_from_body[-1, :3, 3])) / length_m
     found = estimate_stereo_yaw(state, SETTINGS)
-    state.landmarks = without_stereo_yaw(state.landmarks, CAMERA, found.correction_px)
-    adjust(state, SETTINGS, final=True)
+    state = replace(state, landmarks=without_stereo_yaw(state.landmarks, CAMERA, found.correction_px))
+    state = bundle_rounds(state, SETTINGS, final=True)
     after = float(np.linalg.norm(state.map_from_body[-1, :3, 3])) / length_m
     assert abs(before - 1.0) > 0.01
     assert abs(after - 1.0) < 0.2 * abs(before - 1.0)
@@ -60,9 +59,7 @@ def test_the_shift_grows_towards_the_rim_as_a_turn_makes_it() -> None:
 
 def test_depth_cameras_and_single_cameras_have_no_pair() -> None:
     state = adjusted(6, 0.0)
-    assert estimate_stereo_yaw(replace(state, is_depth_camera=True), SETTINGS) == NO_TURN
+    assert estimate_stereo_yaw(replace(state, is_depth_camera=True), SETTINGS) == NO_YAW
     blind = state.landmarks.obs_pixels.copy()
     blind[:, 2] = np.nan
-    assert (
-        estimate_stereo_yaw(replace(state, landmarks=replace(state.landmarks, obs_pixels=blind)), SETTINGS) == NO_TURN
-    )
+    assert estimate_stereo_yaw(replace(state, landmarks=replace(state.landmarks, obs_pixels=blind)), SETTINGS) == NO_YAW

@@ -9,8 +9,8 @@ from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, transfo
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.samples import PositionPrior, Trajectory
 from mapserver.survey.finish.dock_alignment import aligned_by_priors
-from mapserver.survey.finish.map_transform import moved, scaled
-from mapserver.survey.odometry_pass import OdometryPass, connected_part
+from mapserver.survey.finish.map_transform import scaled, transform_map
+from mapserver.survey.odometry_pass import OdometryPass, longest_run
 from mapserver.survey.survey_map import SurveyMap
 from support.storage.map_samples import random_survey
 
@@ -49,7 +49,7 @@ def test_two_docks_give_the_metres() -> None:
     assert found is not None
     assert found.scale == pytest.approx(TRUE_SCALE, rel=4 * found.scale_sigma_share)
     assert found.scale_sigma_share < 0.005
-    there = moved(scaled(survey, found.scale), found.map_from_survey)
+    there = transform_map(scaled(survey, found.scale), found.map_from_survey)
     assert there.scale_known
     assert there.trajectory.positions_m == pytest.approx(
         truth[:, :3, 3], abs=0.25
@@ -105,5 +105,5 @@ def guess_of(marks: str, *, scale_known: bool) -> OdometryPass:
     ],
 )
 def test_the_longest_part_with_one_scale_is_kept(marks: str, scale_known: bool, kept: range | list[int]) -> None:
-    part = connected_part(guess_of(marks, scale_known=scale_known), np.eye(4))
+    part = longest_run(guess_of(marks, scale_known=scale_known), np.eye(4))
     assert np.flatnonzero(part.tracked).tolist() == list(kept)

@@ -9,8 +9,14 @@ from fleetmap.errors import SurveyError
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.survey.bundle.bundle_adjustment import RelativeTerm
-from mapserver.survey.bundle.bundle_rounds import Motion, SurveyState
-from mapserver.survey.keyframes.connected_components import SigmaBetween, beside, find_components, only_kept, seen_by
+from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState
+from mapserver.survey.keyframes.connected_components import (
+    SigmaBetween,
+    between_kept,
+    covisibility_of,
+    find_components,
+    only_kept,
+)
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
@@ -38,7 +44,7 @@ def survey(seen: list[range], loops: list[tuple[int, int]] | None = None) -> Sur
     return SurveyState(
         np.arange(len(seen), dtype=np.int64) * 1_000_000_000, places, np.eye(4),
         StereoCamera(200.0, 160.0, 120.0, 0.1, 320, 240),
-        Motion(
+        KeyframeMotion(
             False, ImuSamples.empty(), None, 0.0, each, each, each,
             [RelativeTerm(k, k + 1, np.eye(4), np.eye(6)) for k in range(len(seen) - 1)],
         ),
@@ -70,20 +76,20 @@ BLIND = [range(0), range(0)]
 
 def test_an_unbroken_survey_is_one_part_and_stays_as_it_is() -> None:
     whole = survey(chain(0, 6))
-    parts = find_components(seen_by(whole), sigmas([9.0] * 5), 0.1)
-    assert [(p.kept, p.keyframes) for p in parts.parts] == [(True, 6)]
-    assert not parts.stray
-    assert only_kept(whole, guessed(whole), Loops(), parts.kept)[0] is whole
+    found = find_components(covisibility_of(whole), sigmas([9.0] * 5), 0.1)
+    assert [(p.kept, p.keyframes) for p in found.components] == [(True, 6)]
+    assert not found.stray
+    assert only_kept(whole, guessed(whole), Loops(), found.kept)[0] is whole
 
 
 def test_what_lies_beyond_a_long_darkness_is_left_out_and_named() -> None:
     dark = survey(chain(0, 4) + BLIND + chain(1000, 6))
-    parts = find_components(seen_by(dark), sigmas([0.01] * 3 + [5.0] * 3 + [0.01] * 5), 0.1)
-    assert [(p.start_s, p.end_s, p.kept) for p in parts.parts] == [(0.0, 3.0, False), (6.0, 11.0, True)]
-    assert [(p.start_s, p.end_s, p.kept) for p in parts.stray] == [(4.0, 5.0, False)]
-    assert "left out: 4 keyframes from 0.0 to 3.0 s" in parts.parts[0].remark()
+    found = find_components(covisibility_of(dark), sigmas([0.01] * 3 + [5.0] * 3 + [0.01] * 5), 0.1)
+    assert [(p.start_s, p.end_s, p.kept) for p in found.components] == [(0.0, 3.0, False), (6.0, 11.0, True)]
+    assert [(p.start_s, p.end_s, p.kept) for p in found.stray] == [(4.0, 5.0, False)]
+    assert "left out: 4 keyframes from 0.0 to 3.0 s" in found.components[0].remark()
     edges = [PoseEdge(0, 3, np.eye(4), np.eye(6), is_loop=True), PoseEdge(6, 9, np.eye(4), np.eye(6), is_loop=True)]
-    kept, guess, loops = only_kept(dark, guessed(dark), Loops(edges=edges), parts.kept)
+    kept, guess, loops = only_kept(dark, guessed(dark), Loops(edges=edges), found.kept)
     assert len(kept.stamps_ns) == len(kept.map_from_body) == len(kept.motion.velocities_mps) == 6
     assert kept.stamps_ns[0] == 6_000_000_000
     np.testing.assert_array_equal(kept.motion.gyro_bias_radps[:, 0], np.arange(6, 12))
@@ -93,44 +99,46 @@ def test_what_lies_beyond_a_long_darkness_is_left_out_and_named() -> None:
     assert kept.landmarks.points_map[:, 0].min() >= 1000
     assert (np.bincount(kept.landmarks.obs_landmark) >= 2).all()
     assert set(kept.landmarks.obs_keyframe.tolist()) == set(range(6))
-    np.testing.assert_array_equal(beside(23, np.arange(0, 23, 2), parts.kept), np.arange(23) >= 12)
+    np.testing.assert_array_equal(between_kept(23, np.arange(0, 23, 2), found.kept), np.arange(23) >= 12)
 
 
 def test_a_blink_is_bridged_by_odometry_and_takes_the_blind_along() -> None:
     blink = survey(chain(0, 4) + BLIND + chain(1000, 6))
-    parts = find_components(seen_by(blink), sigmas([0.01] * 3 + [0.05] * 3 + [0.01] * 5), 0.1)
-    assert [(p.kept, p.keyframes) for p in parts.parts] == [(True, 12)]
-    assert not parts.stray
+    found = find_components(covisibility_of(blink), sigmas([0.01] * 3 + [0.05] * 3 + [0.01] * 5), 0.1)
+    assert [(p.kept, p.keyframes) for p in found.components] == [(True, 12)]
+    assert not found.stray
 
 
 def test_what_leads_nowhere_is_taken_only_as_far_as_it_is_sure() -> None:
     """0.04 m is within the joining sigma of 0.1 m, three times that is not."""
     dark = survey(chain(0, 8) + BLIND + chain(1000, 4))
-    parts = find_components(seen_by(dark), sigmas([0.01] * 7 + [0.02, 0.05, 5.0] + [0.01] * 3), 0.1)
-    assert [(p.end_s, p.keyframes, p.kept) for p in parts.parts] == [(8.0, 9, True), (13.0, 4, False)]
-    assert [(p.start_s, p.keyframes) for p in parts.stray] == [(9.0, 1)]
+    found = find_components(covisibility_of(dark), sigmas([0.01] * 7 + [0.02, 0.05, 5.0] + [0.01] * 3), 0.1)
+    assert [(p.end_s, p.keyframes, p.kept) for p in found.components] == [(8.0, 9, True), (13.0, 4, False)]
+    assert [(p.start_s, p.keyframes) for p in found.stray] == [(9.0, 1)]
 
 
 def test_the_largest_part_is_the_one_with_most_that_see() -> None:
     dark = survey(chain(0, 4) + BLIND * 3 + chain(1000, 3))
-    parts = find_components(seen_by(dark), sigmas([0.01] * 3 + [5.0] + [0.001] * 8), 0.1)
-    assert [(p.keyframes, p.kept) for p in parts.parts] == [(4, True), (9, False)]
+    found = find_components(covisibility_of(dark), sigmas([0.01] * 3 + [5.0] + [0.001] * 8), 0.1)
+    assert [(p.keyframes, p.kept) for p in found.components] == [(4, True), (9, False)]
 
 
 def test_a_bridge_is_as_long_as_the_darkness_not_as_its_steps() -> None:
     """Each step alone would be sure enough."""
     dark = survey(chain(0, 4) + BLIND * 5 + chain(1000, 6))
-    parts = find_components(seen_by(dark), sigmas([0.01] * 3 + [0.05] * 11 + [0.01] * 5), 0.1)
-    assert [p.kept for p in parts.parts] == [False, True]
+    found = find_components(covisibility_of(dark), sigmas([0.01] * 3 + [0.05] * 11 + [0.01] * 5), 0.1)
+    assert [p.kept for p in found.components] == [False, True]
 
 
 def test_a_loop_joins_what_darkness_parted() -> None:
     dark = survey(chain(0, 4) + BLIND + chain(1000, 6), loops=[(1, 9)])
-    parts = find_components(seen_by(dark), sigmas([0.01] * 3 + [5.0] * 3 + [0.01] * 5), 0.1)
-    assert [(p.kept, p.keyframes) for p in parts.parts] == [(True, 10)]
-    assert [p.keyframes for p in parts.stray] == [2]
+    found = find_components(covisibility_of(dark), sigmas([0.01] * 3 + [5.0] * 3 + [0.01] * 5), 0.1)
+    assert [(p.kept, p.keyframes) for p in found.components] == [(True, 10)]
+    assert [p.keyframes for p in found.stray] == [2]
 
 
 def test_nothing_that_hangs_together_is_refused() -> None:
     with pytest.raises(SurveyError, match="none of 3 keyframes"):
-        find_components(seen_by(survey([range(0, 40), range(100, 140), range(200, 240)])), sigmas([1.0, 1.0]), 0.1)
+        find_components(
+            covisibility_of(survey([range(0, 40), range(100, 140), range(200, 240)])), sigmas([1.0, 1.0]), 0.1
+        )

@@ -9,7 +9,7 @@ import pytest
 from fleetmap.features.orb import Features
 from fleetmap.geometry import se3_exp
 from mapserver.survey.bundle.bundle_adjustment import BundleSettings, optimize
-from mapserver.survey.bundle.bundle_rounds import adjust
+from mapserver.survey.bundle.bundle_rounds import bundle_rounds
 from mapserver.survey.keyframes.keyframes import Keyframe, MemoryImageStore
 from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.settings import CullSettings, LoopSettings, SurveySettings
@@ -178,8 +178,8 @@ def laps_of(given: Scene, laps: int, seed: int) -> tuple[Scene, np.ndarray]:
 def test_spare_keyframes_are_placed_as_well_as_if_they_had_been_adjusted() -> None:
     given, spare = laps_of(scene(12, 3, drift=0.01, outliers=0.03), 5, 4)
     every, _ = laps_of(scene(12, 3, drift=0.01, outliers=0.03), 5, 4)
-    adjust(every.state, SurveySettings(), final=True)
-    adjust_visits(given.state, SurveySettings(), spare, rounds=3)
+    every.state = bundle_rounds(every.state, SurveySettings(), final=True)
+    given.state = adjust_visits(given.state, SurveySettings(), spare, rounds=3)
     errors = [
         np.linalg.norm(s.state.map_from_body[:, :3, 3] - s.map_from_body[:, :3, 3], axis=1) for s in (given, every)
     ]
@@ -195,9 +195,8 @@ def test_spare_keyframes_are_placed_as_well_as_if_they_had_been_adjusted() -> No
 
 def test_what_is_not_spare_is_adjusted_as_if_the_rest_were_not_there() -> None:
     given, spare = laps_of(scene(12, 5, drift=0.01), 4, 6)
-    alone = without_redundant(given.state, spare)
-    adjust(alone, SurveySettings(), final=True)
-    adjust_visits(given.state, SurveySettings(), spare, rounds=3)
+    alone = bundle_rounds(without_redundant(given.state, spare), SurveySettings(), final=True)
+    given.state = adjust_visits(given.state, SurveySettings(), spare, rounds=3)
     np.testing.assert_array_equal(given.state.map_from_body[~spare], alone.map_from_body)
     np.testing.assert_array_equal(given.state.landmarks.points_map, alone.landmarks.points_map)
 

@@ -13,12 +13,13 @@ from msgspec import structs
 from fleetmap.bow import Vocabulary, train_vocabulary
 from fleetmap.geometry import Array, se3_exp, se3_inverse
 from fleetmap.sensors.rectification import Rectifier
-from mapserver.survey.keyframes.keyframes import Keyframe, make_keyframe
-from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, Verdict
+from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, make_keyframe
+from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerdict
 from mapserver.survey.loops.zones import Zones
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import LoopSettings, SurveySettings
+from mapserver.survey.survey_inputs import SurveyConfig
 from support.recordings.recording_samples import calibration
 from support.worlds.box_room import out_and_back, stereo_pair
 
@@ -59,11 +60,12 @@ def closed(
         PoseEdge(k, k + 1, se3_inverse(map_from_body[k]) @ map_from_body[k + 1], covariance, is_loop=False)
         for k in range(steps)
     ]
-    vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in whole]
     closer = LoopCloser(
-        whole, vectors, vocabulary.word_count, rectifier.camera, rectifier.body_from_cam, map_from_body,
-        GraphMarginals(map_from_body, chain), {(k, k + 1) for k in range(steps)}, settings, zones or Zones(),
-    )  # fmt: skip
+        PosedKeyframes(whole, map_from_body, rectifier.body_from_cam, rectifier.camera),
+        SurveyConfig(settings, vocabulary, zones or Zones()),
+        GraphMarginals(map_from_body, chain),
+        {(k, k + 1) for k in range(steps)},
+    )
     for k in range(len(whole)):
         closer.close(k)
     return closer.loops, map_from_body
@@ -107,7 +109,7 @@ def test_a_place_that_looks_the_same_elsewhere_is_gated_out(shift: list[float], 
     assert loops.edges == []
     records = wall_records(loops)
     assert len(records) >= 4
-    assert {r.verdict for r in records if r.i - r.j == 10} == {Verdict.GATED_OUT}
+    assert {r.verdict for r in records if r.i - r.j == 10} == {LoopVerdict.GATED_OUT}
     assert all(why in r.reason for r in records if r.i - r.j == 10)
 
 
@@ -117,14 +119,16 @@ def test_the_gate_opens_as_far_as_the_robot_may_have_drifted() -> None:
     assert {(10 + k, k) for k in WALL} <= {(e.i, e.j) for e in loops.edges}
 
 
-@pytest.mark.parametrize(("sigma_m", "verdict"), [(0.8, Verdict.AMBIGUOUS), (0.1, Verdict.ACCEPTED)])
-def test_where_people_say_that_the_site_repeats_a_first_alias_is_not_believed(sigma_m: float, verdict: Verdict) -> None:
+@pytest.mark.parametrize(("sigma_m", "verdict"), [(0.8, LoopVerdict.AMBIGUOUS), (0.1, LoopVerdict.ACCEPTED)])
+def test_where_people_say_that_the_site_repeats_a_first_alias_is_not_believed(
+    sigma_m: float, verdict: LoopVerdict
+) -> None:
     """Nothing in the survey looks like the wall but the wall itself; the next aisle, 1.5 m aside, may not have been seen yet."""
     settings = replace_loops(SETTINGS, repeats_every_m=1.5)
     shift = np.array([0, 1.5 if sigma_m > 0.5 else 0.1, 0])
     loops, _ = closed(shift, sigma_m, settings=settings)
     assert {r.verdict for r in wall_records(loops) if r.i - r.j == 10} == {verdict}
-    assert bool(loops.edges) is (verdict is Verdict.ACCEPTED)
+    assert bool(loops.edges) is (verdict is LoopVerdict.ACCEPTED)
 
 
 def test_zones_exclude_what_position_alone_would_admit() -> None:
@@ -153,24 +157,25 @@ def test_two_places_that_exclude_each_other_are_ambiguous() -> None:
         PoseEdge(k, k + 1, se3_inverse(path[k]) @ path[k + 1], np.diag([1e-8] * 3 + [s**2] * 3), is_loop=False)
         for k, s in enumerate(sigmas)
     ]
-    vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in whole]
     closer = LoopCloser(
-        whole, vectors, vocabulary.word_count, rectifier.camera, rectifier.body_from_cam, path,
-        GraphMarginals(path, chain), {(k, k + 1) for k in range(len(chain))}, SETTINGS, Zones(),
-    )  # fmt: skip
+        PosedKeyframes(whole, path, rectifier.body_from_cam, rectifier.camera),
+        SurveyConfig(SETTINGS, vocabulary, Zones()),
+        GraphMarginals(path, chain),
+        {(k, k + 1) for k in range(len(chain))},
+    )
     for k in range(21):
         closer.close(k)
     records = [r for r in closer.loops.records if r.i == 20 and r.j in (0, 10)]
     assert {r.j for r in records} == {0, 10}
-    assert {r.verdict for r in records} == {Verdict.AMBIGUOUS}
+    assert {r.verdict for r in records} == {LoopVerdict.AMBIGUOUS}
     assert all("exclude each other" in r.reason for r in records)
     assert not [e for e in closer.loops.edges if e.i == 20]
     counts = closer.loops.counts()
     assert counts["rejected"] >= len(records)
 
 
-@pytest.mark.parametrize(("sigma_m", "verdict"), [(1.4, Verdict.AMBIGUOUS), (0.5, Verdict.ACCEPTED)])
-def test_where_the_site_repeats_a_first_visit_is_not_taken_for_a_return(sigma_m: float, verdict: Verdict) -> None:
+@pytest.mark.parametrize(("sigma_m", "verdict"), [(1.4, LoopVerdict.AMBIGUOUS), (0.5, LoopVerdict.ACCEPTED)])
+def test_where_the_site_repeats_a_first_visit_is_not_taken_for_a_return(sigma_m: float, verdict: LoopVerdict) -> None:
     """Two aisles 8 m apart, both seen; a third look, 2 m beside the first by odometry, may be of one 8 m to the other side.
 
     Only where the way there is known too well for that it is the first aisle.
@@ -186,20 +191,21 @@ def test_where_the_site_repeats_a_first_visit_is_not_taken_for_a_return(sigma_m:
         PoseEdge(k, k + 1, se3_inverse(path[k]) @ path[k + 1], np.diag([1e-8] * 3 + [s**2] * 3), is_loop=False)
         for k, s in enumerate(sigmas)
     ]
-    vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in whole]
     closer = LoopCloser(
-        whole, vectors, vocabulary.word_count, rectifier.camera, rectifier.body_from_cam, path,
-        GraphMarginals(path, chain), {(k, k + 1) for k in range(len(chain))}, SETTINGS, Zones(),
-    )  # fmt: skip
+        PosedKeyframes(whole, path, rectifier.body_from_cam, rectifier.camera),
+        SurveyConfig(SETTINGS, vocabulary, Zones()),
+        GraphMarginals(path, chain),
+        {(k, k + 1) for k in range(len(chain))},
+    )
     for k in range(21):
         closer.close(k)
     (record,) = (r for r in closer.loops.records if (r.i, r.j) == (20, 0))
     assert record.verdict is verdict
-    assert bool([e for e in closer.loops.edges if e.i == 20]) is (verdict is Verdict.ACCEPTED)
+    assert bool([e for e in closer.loops.edges if e.i == 20]) is (verdict is LoopVerdict.ACCEPTED)
 
 
 def test_candidates_refused_together_are_all_counted() -> None:
-    together = LoopRecord(20, 1, 0.5, Verdict.GATED_OUT, "because", also=(2, 3))
+    together = LoopRecord(20, 1, 0.5, LoopVerdict.GATED_OUT, "because", also=(2, 3))
     assert Loops([together]).counts() == {"candidates": 3, "gated_out": 3, "rejected": 0, "accepted": 0}
 
 
@@ -207,23 +213,29 @@ def edge(i: int, j: int) -> PoseEdge:
     return PoseEdge(i, j, se3_exp(np.zeros(6)), np.eye(6), is_loop=True)
 
 
-def record(i: int, j: int, verdict: Verdict) -> LoopRecord:
+def record(i: int, j: int, verdict: LoopVerdict) -> LoopRecord:
     return LoopRecord(i, j, 0.5, verdict, "because", 40)
 
 
 def test_counts_add_up() -> None:
-    verdicts = [Verdict.ACCEPTED] * 3 + [Verdict.GATED_OUT] * 2 + [Verdict.REJECTED] + [Verdict.AMBIGUOUS] * 4
+    verdicts = (
+        [LoopVerdict.ACCEPTED] * 3 + [LoopVerdict.GATED_OUT] * 2 + [LoopVerdict.REJECTED] + [LoopVerdict.AMBIGUOUS] * 4
+    )
     loops = Loops([record(20 + k, k, verdict) for k, verdict in enumerate(verdicts)])
     assert loops.counts() == {"candidates": 10, "gated_out": 2, "rejected": 5, "accepted": 3}
     assert Loops().counts() == {"candidates": 0, "gated_out": 0, "rejected": 0, "accepted": 0}
 
 
 def test_what_the_pose_graph_disbelieves_is_rejected_after_all() -> None:
-    records = [record(20, 1, Verdict.ACCEPTED), record(20, 2, Verdict.GATED_OUT), record(21, 1, Verdict.ACCEPTED)]
+    records = [
+        record(20, 1, LoopVerdict.ACCEPTED),
+        record(20, 2, LoopVerdict.GATED_OUT),
+        record(21, 1, LoopVerdict.ACCEPTED),
+    ]
     loops = Loops(records, [edge(20, 1), edge(21, 1)])
-    loops.disbelieve(np.array([0.49, 0.51]))
+    loops = loops.without_outliers(np.array([0.49, 0.51]))
     assert [(e.i, e.j) for e in loops.edges] == [(21, 1)]
-    assert [r.verdict for r in loops.records] == [Verdict.REJECTED, Verdict.GATED_OUT, Verdict.ACCEPTED]
+    assert [r.verdict for r in loops.records] == [LoopVerdict.REJECTED, LoopVerdict.GATED_OUT, LoopVerdict.ACCEPTED]
     assert "contradicts" in loops.records[0].reason
     assert loops.records[0].inliers == 40
     assert loops.counts()["accepted"] == len(loops.edges) == 1

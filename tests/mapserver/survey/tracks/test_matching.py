@@ -31,7 +31,7 @@ def seen() -> tuple[list[Keyframe], Array, Rectifier]:
 
 def finder() -> PairFinder:
     keyframes, _, rectifier = seen()
-    return PairFinder(keyframes, rectifier.camera, rectifier.body_from_cam, SETTINGS)
+    return PairFinder(keyframes, rectifier.camera, rectifier.body_from_cam, SETTINGS.pairs)
 
 
 def test_candidates_are_the_last_few_and_those_that_see_the_same() -> None:

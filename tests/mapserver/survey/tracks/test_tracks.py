@@ -1,16 +1,17 @@
 """Landmarks from pairs: joined as a brute-force twin joins them, observed to a fraction of a pixel."""
 
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.sensors.rectification import Rectifier
-from mapserver.survey.keyframes.keyframes import Keyframe, make_keyframe
+from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, make_keyframe
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.tracks.pairs import PairMatch, match_pair
-from mapserver.survey.tracks.tracks import Landmarks, Tracks, build_landmarks, join_tracks, landmarks_of
+from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotion, match_pair
+from mapserver.survey.tracks.tracks import Landmarks, Tracks, build_landmarks, tracks_of
 from support.recordings.recording_samples import calibration
 from support.worlds.box_room import out_and_back, points_seen, stereo_pair
 
@@ -35,6 +36,13 @@ def joined_by_hand(pairs: list[PairMatch]) -> list[list[Node]]:
     return sorted(sorted(g) for g in groups if len(g) > 1)
 
 
+def groups(pairs: list[PairMatch]) -> list[list[tuple[int, int]]]:
+    """The tracks of some pairs, (keyframe, feature) of each member."""
+    found = tracks_of(pairs)
+    members = list(zip(found.keyframes.tolist(), found.features.tolist(), strict=True))
+    return [members[start:end] for start, end in pairwise([*found.starts.tolist(), len(members)])]
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_tracks_are_those_of_the_brute_force_twin(seed: int) -> None:
     """Random matches among few features, so that conflicts abound."""
@@ -45,7 +53,7 @@ def test_tracks_are_those_of_the_brute_force_twin(seed: int) -> None:
             count = int(rng.integers(0, 7))
             chosen = (rng.choice(8, count, replace=False) for _ in range(2))
             pairs.append(pair(i, j, list(zip(*chosen, strict=True))))
-    found = join_tracks([], pairs)
+    found = groups(pairs)
     assert sorted(sorted(group) for group in found) == joined_by_hand(pairs)
     for group in found:
         assert len({k for k, _ in group}) == len(group) > 1
@@ -56,9 +64,9 @@ def test_tracks_are_those_of_the_brute_force_twin(seed: int) -> None:
 def test_a_chain_of_matches_is_one_track_and_a_contradiction_is_left_out() -> None:
     """0:1-1:5-2:7 hang together; the weaker pair 0-2 says 0:9-2:7, which would bring keyframe 0 in twice."""
     strong = [pair(0, 1, [(1, 5), (2, 6)]), pair(1, 2, [(5, 7), (6, 8)])]
-    found = join_tracks([], [pair(0, 2, [(9, 7)]), *strong])
+    found = groups([pair(0, 2, [(9, 7)]), *strong])
     assert sorted(found) == [[(0, 1), (1, 5), (2, 7)], [(0, 2), (1, 6), (2, 8)]]
-    assert join_tracks([], []) == []
+    assert groups([]) == []
 
 
 def test_the_order_of_pairs_does_not_matter() -> None:
@@ -68,9 +76,9 @@ def test_the_order_of_pairs_does_not_matter() -> None:
         for i in range(5)
         for d in (1, 2)
     ]
-    expected = join_tracks([], pairs)
+    expected = groups(pairs)
     for _ in range(3):
-        assert join_tracks([], [pairs[k] for k in rng.permutation(len(pairs))]) == expected
+        assert groups([pairs[k] for k in rng.permutation(len(pairs))]) == expected
 
 
 def test_observations_go_and_landmarks_that_are_seen_too_rarely_with_them() -> None:
@@ -102,10 +110,12 @@ def views() -> tuple[list[Keyframe], Array, Rectifier, Landmarks]:
             predicted = (
                 se3_inverse(map_from_body[j] @ rectifier.body_from_cam) @ map_from_body[i] @ rectifier.body_from_cam
             )
-            match = match_pair(i, j, keyframes, rectifier.camera, predicted, 0.02, settings.pairs)
+            inputs = MatchInputs(keyframes, rectifier.camera, settings.pairs)
+            match = match_pair(i, j, inputs, PredictedMotion(predicted, 0.02))
             assert match is not None
             pairs.append(match)
-    marks = build_landmarks(keyframes, pairs, map_from_body, rectifier.body_from_cam, rectifier.camera, settings)
+    posed = PosedKeyframes(keyframes, map_from_body, rectifier.body_from_cam, rectifier.camera)
+    marks = build_landmarks(posed, tracks_of(pairs), settings)
     return keyframes, map_from_body, rectifier, marks
 
 
@@ -167,9 +177,8 @@ def test_spare_keyframes_observe_and_define_nothing() -> None:
     starts = np.flatnonzero(np.diff(marks.obs_landmark, prepend=-1))
     tracks = Tracks(marks.obs_keyframe[order].astype(np.int64), marks.obs_feature[order], starts)
     spare = np.array([True, False, False, True])
-    left = landmarks_of(
-        keyframes, tracks, spare, map_from_body, rectifier.body_from_cam, rectifier.camera, SurveySettings()
-    )
+    posed = PosedKeyframes(keyframes, map_from_body, rectifier.body_from_cam, rectifier.camera)
+    left = build_landmarks(posed, tracks, SurveySettings(), redundant=spare)
     first = np.flatnonzero(np.diff(left.obs_landmark, prepend=-1))
     assert not spare[left.obs_keyframe[first]].any()
     members = np.bincount(marks.obs_landmark[~spare[marks.obs_keyframe]], minlength=len(marks.points_map))

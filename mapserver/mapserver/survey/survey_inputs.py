@@ -1,0 +1,49 @@
+"""Arguments that travel through all stages of a survey: its data, its options, its tools."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+from fleetmap.bow import Vocabulary
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, WheelSample
+from mapserver.survey.executor import SERIAL, Executor
+from mapserver.survey.keyframes.keyframes import ImageStore
+from mapserver.survey.loops.zones import Zones
+from mapserver.survey.settings import SurveySettings
+
+Progress = Callable[[str, int, int], None]  # stage, done, total
+
+
+def no_progress(stage: str, done: int, total: int) -> None:
+    """Reports nothing."""
+
+
+@dataclass(frozen=True)
+class SurveyInputs:
+    """One recording: frames in order, raw or rectified ahead of the survey, and how many; IMU, wheels, calibration."""
+
+    frames: Iterable[CameraFrame | RectifiedFrame]
+    frame_count: int
+    imu: ImuSamples
+    calibration: RigCalibration
+    rectifier: Rectifier
+    wheel: Sequence[WheelSample] = ()
+
+
+@dataclass(frozen=True)
+class SurveyConfig:
+    """Choices that are the same for all recordings of a site."""
+
+    settings: SurveySettings
+    vocabulary: Vocabulary
+    zones: Zones = field(default_factory=Zones)
+
+
+@dataclass(frozen=True)
+class SurveyTools:
+    """Resources that do not change the result. images: in memory for None."""
+
+    progress: Progress = no_progress
+    images: ImageStore | None = None
+    executor: Executor = SERIAL
