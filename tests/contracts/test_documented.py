@@ -22,9 +22,11 @@ from mapserver.quality import figures
 from mapserver.survey.merge.pipeline import Counts
 from support.fleet.contracts_documents import REPOSITORY, code_words, rows, section, text
 
+ROOTS = ("shared", "mapserver", "locclient", "deploy", "docs", "examples", "tests")
 COMMANDS = "docs/command_line.md"
 SERVICE = "docs/service.md"
 REPORTS = "docs/reports.md"
+DOCUMENTS = sorted(str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("docs/*.md"))
 LINKED = re.compile(r"\]\((?!https?:)([^)#]+)")
 
 
@@ -141,13 +143,25 @@ def test_fleet_measures_are_documented() -> None:
     assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Fleet"))} == keys
 
 
-@pytest.mark.parametrize("document", sorted(str(p.relative_to(REPOSITORY)) for p in REPOSITORY.glob("docs/*.md")))
+@pytest.mark.parametrize("document", DOCUMENTS)
 def test_every_document_is_reached_from_the_readme(document: str) -> None:
     assert document in text("README.md")
 
 
-@pytest.mark.parametrize("document", ["README.md", "shared/README.md", COMMANDS, SERVICE, REPORTS, "docs/settings.md"])
+@pytest.mark.parametrize(
+    "document", ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "shared/README.md", *DOCUMENTS]
+)
 def test_links_lead_somewhere(document: str) -> None:
     folder = (REPOSITORY / document).parent
     missing = [target for target in LINKED.findall(text(document)) if not (folder / target).exists()]
     assert missing == []
+
+
+@pytest.mark.parametrize("document", ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", *DOCUMENTS])
+def test_files_that_are_named_exist(document: str) -> None:
+    """A path in a document may be shortened at its left: `survey/pipeline.py`."""
+    named = set(re.findall(r"`([\w./-]+\.(?:py|toml|sh|service))`", text(document)))
+    files = [path.as_posix() for root in ROOTS for path in (REPOSITORY / root).rglob("*") if path.is_file()]
+    missing = {name for name in named if not any(f"/{path}".endswith(f"/{name}") for path in files)}
+    # A reader's own files, and files that a robot or server makes.
+    assert missing <= {"locclient.toml", "mapserver.toml", "camchain.yaml"}
