@@ -1,4 +1,4 @@
-"""Puts the parts of `locclient run` together from its configuration, and takes them apart again."""
+"""Assembly of the parts of `locclient run` from its configuration."""
 
 import logging
 import time
@@ -14,11 +14,11 @@ from fleetmap.mapformat import check_name
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
 from locclient.config import LocclientConfig
-from locclient.daemon.jit_warmup import gc_frozen, warm_up
+from locclient.daemon.jit_warmup import gc_frozen, warm_up_kernels
 from locclient.daemon.outbox import Outbox
-from locclient.daemon.publishers import Output, open_output
+from locclient.daemon.publishers import Publisher, open_publisher
 from locclient.daemon.run_settings import RunSection
-from locclient.daemon.runtime import Parts
+from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.maps.connection import cache_folder
 from locclient.maps.map_client import MapClient
@@ -52,74 +52,86 @@ def check_run(config: LocclientConfig) -> tuple[str, str]:
 
 
 @contextmanager
-def daemon_parts(config: LocclientConfig) -> Iterator[Parts]:
-    """The parts, warmed up, with the last good version chosen and nothing waited for; closed afterwards.
+def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
+    """The parts of the daemon, compiled and with the last good version chosen, without waiting for anybody; closed afterwards.
 
     Raises FleetmapError for whatever of the configuration cannot be used.
     """
     cv2.setNumThreads(1)  # the rest of the board belongs to the robot's other programs
+    run = config.run
     site, name = check_run(config)
     with ExitStack() as stack:
-        prior = parse_prior(config.run.prior)
+        prior = parse_prior(run.prior)
         source = open_source(config.source, config.topics)
         stack.callback(source.close)
         calibration = source.calibration
         rectifier = Rectifier(calibration, has_depth=source.has_depth)
-        bus = None if config.run.server is None else ZenohBus.connect(config.run.server)
+        bus = None if run.server is None else ZenohBus.connect(run.server)
         if bus is not None:
             stack.callback(bus.close)
-        output = _output(config, bus, site, name, stack)
-        spool = Outbox(spool_path(config.run, site, name), max_bytes=config.run.spool_bytes)
-        if spool.set_aside is not None:
-            _log.warning("the spool was damaged; it lies in %s now, and a new one was begun", spool.set_aside)
+        publisher = _publisher(config, bus, site, name, stack)
+        outbox = Outbox(spool_path(run, site, name), max_bytes=run.spool_bytes)
+        if outbox.set_aside is not None:
+            _log.warning("the spool was damaged; it lies in %s now, and a new one was begun", outbox.set_aside)
         begun_s = time.monotonic()
-        warm_up(calibration, rectifier, config.localizer)
+        warm_up_kernels(calibration, rectifier, config.localizer)
         stack.enter_context(gc_frozen())
         _log.info("warm after %.1f s", time.monotonic() - begun_s)
-        link, maps, first, caches = _maps(config.run, bus, site, name)
-        robot = Robot(calibration, rectifier, config.localizer, config.run.trial, time.thread_time)
+        caches: tuple[TileCache, ...] = ()
+        server: ServerSync | None = None
+        maps: MapSource
+        first: WantedVersion | None
+        if bus is None:
+            maps, first = _local_map(run, site)
+        else:
+            # Two views of the same folder, because a cache is not for two threads; the second only reads.
+            caches = tuple(TileCache(cache_folder(run.cache), max_bytes=run.cache_bytes) for _ in range(2))
+            client = MapClient(bus, caches[0], site, name, patience_s=_PATIENCE_S)
+            maps, first = CachedMap(caches[1], site), client.active()
+            server = ServerSync(client, outbox, retry_s=run.trial.retry_s)
+        robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time)
         if prior is not None:
             robot.localizer.handle_prior(prior)
-        intake = Intake(
-            frames=config.run.frame_queue, imu_minus_cam_s=rectifier.imu_minus_cam_s, has_imu=calibration.imu is not None,
-            imu_wait_s=config.run.imu_wait_s,
-        )  # fmt: skip
-        talk = None if link is None else ServerSync(link, spool, retry_s=config.run.trial.retry_s)
-        yield Parts(
-            site=site, robot_name=name, source=source, intake=intake, robot=robot, room=TileLoader(maps, config.run.window),
-            spool=spool, camera=rectifier.camera, settings=config.localizer, output=output, link=link, talk=talk, first=first,
-            failures_folder=None if config.run.failures is None else Path(config.run.failures),
+        yield RuntimeParts(
+            site=site,
+            robot_name=name,
+            source=source,
+            intake=Intake(
+                frames=run.frame_queue,
+                imu_minus_cam_s=rectifier.imu_minus_cam_s,
+                has_imu=calibration.imu is not None,
+                imu_wait_s=run.imu_wait_s,
+            ),
+            robot=robot,
+            tile_loader=TileLoader(maps, run.window),
+            outbox=outbox,
+            camera=rectifier.camera,
+            settings=config.localizer,
+            publisher=publisher,
+            server=server,
+            first=first,
+            failures_folder=None if run.failures is None else Path(run.failures),
             caches=caches,
-        )  # fmt: skip
+        )
 
 
 def spool_path(run: RunSection, site: str, robot: str) -> Path:
-    """Where the spool lies: as set, else beside the cache, one for each robot of the machine."""
+    """The file of the spool: as set, else beside the cache, one for each robot of the machine."""
     if run.spool is not None:
         return Path(run.spool)
     return cache_folder().parent / "spool" / f"{site}.{robot}.sqlite3"
 
 
-def _output(config: LocclientConfig, bus: Bus | None, site: str, name: str, stack: ExitStack) -> Output | None:
+def _publisher(config: LocclientConfig, bus: Bus | None, site: str, name: str, stack: ExitStack) -> Publisher | None:
     if config.output.endpoint is not None:
         bus = ZenohBus.connect(config.output.endpoint)
         stack.callback(bus.close)
-    return None if bus is None else open_output(bus, site, name, config.output)
+    return None if bus is None else open_publisher(bus, site, name, config.output)
 
 
-def _maps(
-    run: RunSection, bus: Bus | None, site: str, name: str
-) -> tuple[MapClient | None, MapSource, WantedVersion | None, tuple[TileCache, ...]]:
-    """The link to a server, what maps are read from, and the version to begin with; from the disk alone, without waiting."""
-    if bus is None:
-        folder = LocalMapSource(Path(run.store or ""), site)
-        wanted = folder.wanted()
-        if wanted.version is None:
-            raise LinkError(
-                f"site {site} has no published version in {run.store}; publish one with `mapserver publish`"
-            )
-        return None, folder, wanted, ()
-    # Two views of the same folder, because a cache is not for two threads; the second only reads.
-    caches = tuple(TileCache(cache_folder(run.cache), max_bytes=run.cache_bytes) for _ in range(2))
-    link = MapClient(bus, caches[0], site, name, patience_s=_PATIENCE_S)
-    return link, CachedMap(caches[1], site), link.active(), caches
+def _local_map(run: RunSection, site: str) -> tuple[LocalMapSource, WantedVersion]:
+    source = LocalMapSource(Path(run.store or ""), site)
+    wanted = source.wanted()
+    if wanted.version is None:
+        raise LinkError(f"site {site} has no published version in {run.store}; publish one with `mapserver publish`")
+    return source, wanted

@@ -1,9 +1,8 @@
-"""Makes the kernels ready before the first frame: a throwaway localizer drives past a painted wall and finds itself in a map of it."""
+"""Compilation of the kernels before the first frame: a throwaway localizer drives past a painted wall and is localized in its map."""
 
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import cv2
 import numpy as np
@@ -28,8 +27,8 @@ _WORDS = 10
 _MAP_FROM_CAM = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([1.0, 1.0, 1.0]))
 
 
-def warm_up(calibration: RigCalibration, rectifier: Rectifier, settings: LocalizerSettings) -> int:
-    """Runs everything that a frame may need once; returns how many of its frames found their place in the map."""
+def warm_up_kernels(calibration: RigCalibration, rectifier: Rectifier, settings: LocalizerSettings) -> int:
+    """Runs everything that a frame may need; returns for how many of its frames there was a fix."""
     camera = rectifier.camera
     localizer = Localizer(calibration, camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s, settings)
     wall = _wall(camera)
@@ -56,8 +55,8 @@ def warm_up(calibration: RigCalibration, rectifier: Rectifier, settings: Localiz
 
 @contextmanager
 def gc_frozen() -> Iterator[None]:
-    """While it lasts, the garbage collector leaves alone what lives now: libraries hold some hundred thousand objects that nobody
-    drops, and now and then a frame would have to wait until all of them were looked at."""
+    """Exempts present objects from garbage collection while it lasts: libraries hold some hundred thousand that are never dropped,
+    and now and then a frame would have to wait until all of them were traversed."""
     gc.collect()
     gc.freeze()
     try:
@@ -103,17 +102,21 @@ def _tile_of(left: NDArray[np.uint8], camera: StereoCamera, settings: LocalizerS
     towards = -points_cam @ _MAP_FROM_CAM[:3, :3].T
     distance_m = np.linalg.norm(towards, axis=1)
     ids = np.arange(count, dtype=np.uint32)
-    rest: dict[str, Any] = {
-        "view_directions_map": (towards / distance_m[:, None]).astype(np.float32),
-        "view_half_angle_rad": np.full(count, 0.5, np.float32),
-        "max_distance_m": (distance_m * orb.SCALE_FACTOR ** features.octaves.astype(float)).astype(np.float32),
-        "sigma_m": np.full(count, 0.01, np.float32),
-    }
     return Tile(
-        tile_x=0, tile_y=0, size_m=16.0, landmark_ids=ids, points_map=points_cam @ _MAP_FROM_CAM[:3, :3].T + _MAP_FROM_CAM[:3, 3],
-        descriptors=features.descriptors, place_ids=np.zeros(1, np.uint32), map_from_cam=_MAP_FROM_CAM[None],
-        place_landmark_ids=(ids,), **rest,
-    )  # fmt: skip
+        tile_x=0,
+        tile_y=0,
+        size_m=16.0,
+        landmark_ids=ids,
+        points_map=points_cam @ _MAP_FROM_CAM[:3, :3].T + _MAP_FROM_CAM[:3, 3],
+        descriptors=features.descriptors,
+        view_directions_map=(towards / distance_m[:, None]).astype(np.float32),
+        view_half_angle_rad=np.full(count, 0.5, np.float32),
+        max_distance_m=(distance_m * orb.SCALE_FACTOR ** features.octaves.astype(float)).astype(np.float32),
+        sigma_m=np.full(count, 0.01, np.float32),
+        place_ids=np.zeros(1, np.uint32),
+        map_from_cam=_MAP_FROM_CAM[None],
+        place_landmark_ids=(ids,),
+    )
 
 
 def _vocabulary() -> Vocabulary:

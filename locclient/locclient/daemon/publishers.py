@@ -1,4 +1,4 @@
-"""How a running robot tells its own programs where it is. To add a form: a class and a line in OUTPUTS."""
+"""Publishers of estimates to the robot's own programs. To add one: a class and a line in PUBLISHERS."""
 
 import secrets
 from collections.abc import Callable
@@ -21,7 +21,7 @@ _MAX_HYPOTHESES = 16
 
 
 class OutputSection(Section, frozen=True):
-    """In which form, and where to. Without an endpoint: to the map server's, or nowhere where there is none."""
+    """Format and endpoint of estimates. Without an endpoint they go to the map server's, or nowhere where there is none."""
 
     format: str = "messagepack"
     endpoint: str | None = None
@@ -35,34 +35,38 @@ class OutputSection(Section, frozen=True):
     publish_odom: bool = True
 
 
-class Output(Protocol):
-    """Tells one estimate; what cannot be sent at once is lost, because the next one is worth more."""
+class Publisher(Protocol):
+    """Sends estimates. One that cannot be sent at once is dropped: the next one replaces it."""
 
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
-        """Tells this estimate."""
+        """Sends this estimate."""
 
 
-class MessagePackOutput:
+class MessagePackPublisher:
     """EstimateMessage under the robot's key `estimate`."""
 
     def __init__(self, bus: Bus, site: str, robot: str, _: OutputSection) -> None:
         self._bus, self._key = bus, robot_key(site, robot, "estimate")
 
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
-        """See Output."""
+        """See Publisher."""
         covariance = estimate.cov_rot_trans if published.map_from_odom is not None else None
         body_from_base = se3_inverse(base_from_body)
+        hypotheses = estimate.hypotheses[:_MAX_HYPOTHESES]
         message = EstimateMessage(
-            stamp_ns=estimate.stamp_ns, status=estimate.status.value, cause=estimate.cause.value, map_version=estimate.map_version,
+            stamp_ns=estimate.stamp_ns,
+            status=estimate.status.value,
+            cause=estimate.cause.value,
+            map_version=estimate.map_version,
             odom_from_base=Placement.of(published.odom_from_base),
             map_from_odom=None if published.map_from_odom is None else Placement.of(published.map_from_odom),
             cov_rot_trans=None if covariance is None else tuple(float(v) for v in covariance.ravel()),
-            hypotheses=tuple(Placement.of(h.map_from_body @ body_from_base) for h in estimate.hypotheses[:_MAX_HYPOTHESES]),
-        )  # fmt: skip
+            hypotheses=tuple(Placement.of(h.map_from_body @ body_from_base) for h in hypotheses),
+        )
         self._bus.publish(self._key, encode_message(message), may_drop=True)
 
 
-class Ros2Output:
+class Ros2Publisher:
     """PoseWithCovarianceStamped, TFMessage (map -> odom, odom -> base) and the status as String, as rmw_zenoh carries them."""
 
     def __init__(self, bus: Bus, _site: str, _robot: str, section: OutputSection) -> None:
@@ -75,7 +79,7 @@ class Ros2Output:
         }
 
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
-        """See Output. A pose is told only with a covariance, and covers the base, in the axes of the map."""
+        """See Publisher. A pose is sent only with its covariance, and is that of the base in the map."""
         section, stamp_ns = self._section, estimate.stamp_ns
         links = []
         if published.map_from_odom is not None:
@@ -90,20 +94,20 @@ class Ros2Output:
             self._send("tf", stamp_ns, encode_frame_links(stamp_ns, links))
         self._send("status", stamp_ns, encode_text(estimate.status.value))
 
-    def _send(self, what: str, stamp_ns: int, payload: bytes) -> None:
+    def _send(self, topic: str, stamp_ns: int, payload: bytes) -> None:
         self._sequence += 1
         note = attachment(self._sequence, stamp_ns, self._gid)
-        self._bus.publish(self._keys[what], payload, may_drop=True, attachment=note)
+        self._bus.publish(self._keys[topic], payload, may_drop=True, attachment=note)
 
 
-OUTPUTS: dict[str, Callable[[Bus, str, str, OutputSection], Output]] = {
-    "messagepack": MessagePackOutput,
-    "ros2": Ros2Output,
+PUBLISHERS: dict[str, Callable[[Bus, str, str, OutputSection], Publisher]] = {
+    "messagepack": MessagePackPublisher,
+    "ros2": Ros2Publisher,
 }
 
 
-def open_output(bus: Bus, site: str, robot: str, section: OutputSection) -> Output:
-    """The output that the section asks for; UsageError for an unknown format or a topic that is none."""
-    if section.format not in OUTPUTS:
-        raise UsageError(f"[output] format = {section.format!r}; known are {', '.join(OUTPUTS)}")
-    return OUTPUTS[section.format](bus, site, robot, section)
+def open_publisher(bus: Bus, site: str, robot: str, section: OutputSection) -> Publisher:
+    """The publisher that the section asks for; UsageError for an unknown format or a topic that is none."""
+    if section.format not in PUBLISHERS:
+        raise UsageError(f"[output] format = {section.format!r}; known are {', '.join(PUBLISHERS)}")
+    return PUBLISHERS[section.format](bus, site, robot, section)

@@ -1,4 +1,4 @@
-"""The daemon's threads: sensors, disk, network, and the calling one that localizes. Whatever one of them dies of ends all."""
+"""Threads of the daemon: sensors, disk, network, and the calling one that localizes. An error in one of them ends all."""
 
 import logging
 import threading
@@ -7,19 +7,19 @@ import uuid
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from fleetmap.errors import FleetmapError, RecordingError
-from fleetmap.messages import WantedVersion, encode_message
+from fleetmap.messages import RobotHealth, WantedVersion, encode_message
 from fleetmap.sensors.rectification import StereoCamera
 from locclient.daemon.failure_files import write_failure
 from locclient.daemon.outbox import Outbox, QueuedReport
-from locclient.daemon.publishers import Output
+from locclient.daemon.publishers import Publisher
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.systemd_notify import ServiceManager
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap
-from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
 from locclient.maps.tile_selection import Cell, PositionBound, PositionBoundTracker
@@ -38,21 +38,20 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Parts:
-    """All that a daemon is made of; talk and link are None for a robot that reads a store's folder."""
+class RuntimeParts:
+    """All that a daemon is made of. server: None for a robot that reads a store's folder. first: the version to begin with."""
 
     site: str
     robot_name: str
     source: Source
     intake: Intake
     robot: Robot
-    room: TileLoader
-    spool: Outbox
+    tile_loader: TileLoader
+    outbox: Outbox
     camera: StereoCamera
     settings: LocalizerSettings
-    output: Output | None
-    link: MapClient | None
-    talk: ServerSync | None
+    publisher: Publisher | None
+    server: ServerSync | None
     first: WantedVersion | None
     failures_folder: Path | None = None
     caches: tuple[TileCache, ...] = ()
@@ -60,36 +59,33 @@ class Parts:
 
 @dataclass
 class _Shared:
-    """What threads leave for each other; deques and plain values, which need no lock."""
+    """Values that threads exchange; deques and plain values, which need no lock."""
 
-    place: PositionBound = field(default_factory=PositionBound)
+    bound: PositionBound = field(default_factory=PositionBound)
     held: list[WantedVersion] = field(default_factory=list)
     loaded: deque[LoadedMap] = field(default_factory=deque)
     failures: deque[tuple[FailureContext, int]] = field(default_factory=lambda: deque(maxlen=_MAX_PENDING))
-    died: list[BaseException] = field(default_factory=list)
+    errors: list[BaseException] = field(default_factory=list)
 
 
 class Runtime:
     """Runs until `stop` is called, the source has ended, or a thread has died, which `run` raises again."""
 
-    def __init__(self, parts: Parts, manager: ServiceManager, *, wall_ns: Callable[[], int] = time.time_ns) -> None:
+    def __init__(
+        self, parts: RuntimeParts, manager: ServiceManager, *, wall_ns: Callable[[], int] = time.time_ns
+    ) -> None:
         self._parts, self._manager, self._wall_ns = parts, manager, wall_ns
         self._stop = threading.Event()
         self._sensors_stop = threading.Event()
         self._shared = _Shared()
         self._figures = HealthFigures()
-        self._whereabouts = PositionBoundTracker(parts.room.settings)
+        self._bound_tracker = PositionBoundTracker(parts.tile_loader.settings)
         self._last_frame_s: float | None = None
         self._health_s, self._pose_ns = 0.0, -(2**62)
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
         self._cache_faults = 0
         self._fetched_again: set[str] = set()
         self._refused_tiles: dict[str, dict[Cell, str]] = {}
-
-    @property
-    def figures(self) -> HealthFigures:
-        """What was counted so far."""
-        return self._figures
 
     def stop(self) -> None:
         """Ends `run` soon; may be called from a signal's handler."""
@@ -98,31 +94,27 @@ class Runtime:
 
     def run(self) -> None:
         """Localizes on the calling thread until it is over; threads are joined, and what they held is on the disk."""
-        begun = [self._begin("sensors", self._sense)]
-        begun.append(self._begin("disk", self._keep))
-        if self._parts.talk is not None:
-            begun.append(self._begin("network", self._talk))
+        threads = [self._start("sensors", self._run_sensors), self._start("disk", self._run_disk)]
+        if self._parts.server is not None:
+            threads.append(self._start("network", partial(self._run_network, self._parts.server)))
         self._manager.ready()
         self._last_frame_s = time.monotonic()
         try:
             while not self._stop.is_set() and not self._parts.intake.exhausted:
-                self._turn()
+                self._step()
         finally:
             self._manager.stopping()
             self.stop()
-            for thread in begun:
+            for thread in threads:
                 thread.join(_DRAIN_S)
             self._spool_failures()
-            _log.info(
-                "stopped: %s",
-                self._figures.report(self._parts.site, self._parts.robot_name, self._wall_ns(), self._more(), False),
-            )
-        if self._shared.died:
-            raise self._shared.died[0]
+            _log.info("stopped: %s", self._health(is_silent=False))
+        if self._shared.errors:
+            raise self._shared.errors[0]
 
     # --- the thread that localizes ------------------------------------------------------------------------------------
 
-    def _turn(self) -> None:
+    def _step(self) -> None:
         robot, shared = self._parts.robot, self._shared
         bundle = self._parts.intake.take(_TAKE_S)
         while shared.loaded:
@@ -131,9 +123,8 @@ class Runtime:
         try:
             outcome = robot.handle(bundle)
         except RecordingError as error:
-            # A picture that cannot be read costs itself.
             self._parts.intake.count_unreadable()
-            _log.warning("a frame is left out: %s", error)
+            _log.warning("a frame is skipped: %s", error)
         now_s = time.monotonic()
         if outcome is not None:
             self._last_frame_s = now_s
@@ -141,27 +132,21 @@ class Runtime:
         elif self._last_frame_s is not None:
             self._note_failure(robot.handle_silence(now_s - self._last_frame_s), now_s - self._last_frame_s)
         shared.held = [loaded.wanted for loaded in robot.held]
-        if self._parts.talk is not None:
-            self._parts.talk.changes.extend(robot.take_changes())
+        if self._parts.server is not None:
+            self._parts.server.changes.extend(robot.take_changes())
         self._report(now_s)
 
     def _after_frame(self, outcome: Outcome) -> None:
         parts, estimate = self._parts, outcome.estimate
-        if parts.output is not None:
-            self._tell(lambda: parts.output.publish(estimate, outcome.published, parts.robot.base_from_body))  # type: ignore[union-attr]
+        if parts.publisher is not None:
+            _send(partial(parts.publisher.publish, estimate, outcome.published, parts.robot.base_from_body))
         self._figures.handle(outcome)
-        self._shared.place = self._whereabouts.handle(estimate)
+        self._shared.bound = self._bound_tracker.handle(estimate)
         self._note_failure(outcome.failure, 0.0)
         message = outcome.pose_message()
-        if parts.link is not None and message is not None and estimate.stamp_ns - self._pose_ns >= _POSE_EVERY_NS:
+        if parts.server is not None and message is not None and estimate.stamp_ns - self._pose_ns >= _POSE_EVERY_NS:
             self._pose_ns = estimate.stamp_ns
-            self._tell(lambda: parts.link.publish_pose(message))  # type: ignore[union-attr]
-
-    def _tell(self, publish: Callable[[], None]) -> None:
-        try:
-            publish()
-        except FleetmapError as error:
-            _log.warning("an estimate was not sent: %s", error)
+            _send(partial(parts.server.client.publish_pose, message))
 
     def _note_failure(self, context: FailureContext | None, silent_s: float) -> None:
         if context is not None:
@@ -174,25 +159,23 @@ class Runtime:
         if now_s - self._health_s < _HEALTH_EVERY_S:
             return
         self._health_s = now_s
-        silent = self._last_frame_s is not None and now_s - self._last_frame_s > _SILENT_S
-        if self._parts.talk is not None:
-            report = self._figures.report(
-                self._parts.site, self._parts.robot_name, self._wall_ns(), self._more(), silent
-            )
-            self._parts.talk.health.append(report)
+        is_silent = self._last_frame_s is not None and now_s - self._last_frame_s > _SILENT_S
+        if self._parts.server is not None:
+            self._parts.server.health.append(self._health(is_silent))
         last = self._figures.last
-        said = "no frame yet" if last is None else last.estimate.status.value
-        self._manager.alive("no frames come" if silent else said)
+        status = "no frame yet" if last is None else last.estimate.status.value
+        self._manager.alive("no frames come" if is_silent else status)
 
-    def _more(self) -> dict[str, Figure]:
+    def _health(self, is_silent: bool) -> RobotHealth:
         counts: dict[str, Figure] = dict(asdict(self._parts.intake.counts))
-        spool = {f"spool_{name}": value for name, value in self._parts.spool.counts().items()}
+        spool = {f"spool_{name}": value for name, value in self._parts.outbox.counts().items()}
         tiles = {
             "tiles_held": sum(len(loaded.tiles) for loaded in self._parts.robot.held),
             "tiles_refused": sum(map(len, self._refused_tiles.values())),
             "cache_faults": self._count_cache_faults(),
         }
-        return {**counts, **spool, **tiles}
+        more = {**counts, **spool, **tiles}
+        return self._figures.report(self._parts.site, self._parts.robot_name, self._wall_ns(), more, is_silent)
 
     def _count_cache_faults(self) -> int:
         for cache in self._parts.caches:
@@ -203,92 +186,103 @@ class Runtime:
 
     # --- the other threads --------------------------------------------------------------------------------------------
 
-    def _begin(self, name: str, work: Callable[[], None]) -> threading.Thread:
+    def _start(self, name: str, work: Callable[[], None]) -> threading.Thread:
         def guarded() -> None:
             try:
                 work()
             except BaseException as error:
                 _log.exception("the thread %s died", name)
-                self._shared.died.append(error)
+                self._shared.errors.append(error)
                 self.stop()
 
         thread = threading.Thread(target=guarded, name=name, daemon=True)
         thread.start()
         return thread
 
-    def _sense(self) -> None:
+    def _run_sensors(self) -> None:
         try:
             self._parts.source.run(self._parts.intake, self._sensors_stop.wait)
         finally:
             self._parts.intake.finish()
 
-    def _keep(self) -> None:
+    def _run_disk(self) -> None:
         while not self._stop.wait(_IDLE_S):
             self._load_maps()
             self._spool_failures()
 
     def _load_maps(self) -> None:
-        room, talk, shared = self._parts.room, self._parts.talk, self._shared
-        place = shared.place
-        while talk is not None and talk.fetched:
-            version = talk.fetched.popleft()
+        loader, server, shared = self._parts.tile_loader, self._parts.server, self._shared
+        bound = shared.bound
+        while server is not None and server.fetched:
+            version = server.fetched.popleft()
             self._offers[version.manifest_sha256 or ""] = version
-            room.retry_refused(version)
+            loader.retry_refused(version)
         held = list(shared.held)
         for version in held:
             self._offers.pop(version.manifest_sha256 or "", None)
         wanted = [*held, *self._offers.values()]
         for version in wanted:
             try:
-                loaded = room.load(version, place)
+                loaded = loader.load(version, bound)
             except FleetmapError as error:
                 self._note_unusable(version, str(error))
                 continue
             if loaded is not None:
                 shared.loaded.append(replace(loaded, is_offer=version not in held))
             self._note_refused_tiles(version)
-        room.keep_only(wanted)
+        loader.keep_only(wanted)
         known = {version.manifest_sha256 or "" for version in wanted}
         self._refused_tiles = {sha256: cells for sha256, cells in self._refused_tiles.items() if sha256 in known}
 
     def _note_unusable(self, version: WantedVersion, reason: str) -> None:
-        """Not even its manifest or one tile: without a server nothing is left to try, with one it is fetched again."""
+        """A version without manifest or any tile is fetched again, once, and dropped where there is no server."""
         _log.warning("version %s cannot be loaded: %s", version.version, reason)
         self._offers.pop(version.manifest_sha256 or "", None)
-        if self._parts.talk is not None and version.manifest_sha256 not in self._fetched_again:
+        if self._parts.server is not None and version.manifest_sha256 not in self._fetched_again:
             self._fetched_again.add(version.manifest_sha256 or "")
-            self._parts.talk.refetch.append(version)
+            self._parts.server.refetch.append(version)
 
     def _note_refused_tiles(self, version: WantedVersion) -> None:
-        """Logs once what cannot be used, and asks for it again."""
-        refused, sha256 = self._parts.room.refused(version), version.manifest_sha256 or ""
+        """Logs refused tiles once, and has them fetched again."""
+        refused, sha256 = self._parts.tile_loader.refused(version), version.manifest_sha256 or ""
         if refused == self._refused_tiles.get(sha256, {}):
             return
         self._refused_tiles[sha256] = refused
         for cell, reason in refused.items():
             _log.warning("tile %s of version %s is refused: %s", cell, version.version, reason)
-        if refused and self._parts.talk is not None:
-            self._parts.talk.refetch.append(version)
+        if refused and self._parts.server is not None:
+            self._parts.server.refetch.append(version)
 
     def _spool_failures(self) -> None:
         parts = self._parts
         while self._shared.failures:
             context, wall_ns = self._shared.failures.popleft()
             report = failure_report(
-                context, site=parts.site, robot=parts.robot_name, report_id=uuid.uuid4().hex, wall_ns=wall_ns,
-                base_from_body=parts.robot.base_from_body, camera=parts.camera, settings=parts.settings,
-            )  # fmt: skip
+                context,
+                site=parts.site,
+                robot=parts.robot_name,
+                report_id=uuid.uuid4().hex,
+                wall_ns=wall_ns,
+                base_from_body=parts.robot.base_from_body,
+                camera=parts.camera,
+                settings=parts.settings,
+            )
             try:
-                parts.spool.put(QueuedReport(report.id, encode_message(report)))
+                parts.outbox.put(QueuedReport(report.id, encode_message(report)))
                 if parts.failures_folder is not None:
                     write_failure(parts.failures_folder, report)
             except FleetmapError as error:
                 _log.error("failure %s is lost: %s", report.id, error)
 
-    def _talk(self) -> None:
-        assert self._parts.talk is not None
+    def _run_network(self, server: ServerSync) -> None:
         while not self._stop.wait(_IDLE_S):
-            self._parts.talk.step()
-        # One last word: what became of versions and failures since, if somebody listens.
-        self._parts.talk.step()
-        self._parts.talk.close()
+            server.step()
+        server.step()  # a last time: changes of versions and failures since, if the server is there
+        server.close()
+
+
+def _send(publish: Callable[[], None]) -> None:
+    try:
+        publish()
+    except FleetmapError as error:
+        _log.warning("an estimate was not sent: %s", error)

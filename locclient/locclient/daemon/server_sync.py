@@ -1,4 +1,4 @@
-"""All that a running robot says to its map server and hears from it. May block on the network: it has a thread of its own."""
+"""Synchronization with the map server: versions, acknowledgements, failures, health. May block: it has a thread of its own."""
 
 import logging
 import time
@@ -12,44 +12,49 @@ from locclient.maps.map_client import MapClient
 from locclient.robot.robot import Change, VersionChange
 
 _ASK_EVERY_S = 60.0
-_QUIET_S, _MAX_QUIET_S = 1.0, 30.0
-_DELIVER_AT_ONCE = 20
+_BACKOFF_S, _MAX_BACKOFF_S = 1.0, 30.0
+_DELIVERED_PER_STEP = 20
 _log = logging.getLogger(__name__)
 
 
 class ServerSync:
-    """One `step` after another: asks for the wanted version and fetches it, delivers failures, acknowledges, reports health.
+    """In each `step`: fetches the wanted version, delivers failures, acknowledges, reports health.
 
-    The main thread leaves what is to be said in `health` and `changes` and finds fetched versions in `fetched`. A server that is
-    away costs nothing but patience; reports wait in the spool. refetch: a held version whose pieces on the disk are damaged.
+    Other threads append to `health`, `changes` and `refetch` (a held version with damaged pieces on the disk), and take fetched
+    versions from `fetched`. While the server is away, reports wait in the outbox.
     """
 
     def __init__(
-        self, link: MapClient, spool: Outbox, *, retry_s: float, clock_s: Callable[[], float] = time.monotonic,
+        self,
+        client: MapClient,
+        outbox: Outbox,
+        *,
+        retry_s: float,
+        clock_s: Callable[[], float] = time.monotonic,
         wall_ns: Callable[[], int] = time.time_ns,
-    ) -> None:  # fmt: skip
-        """retry_s: when a version that was put off is offered again."""
-        self._link, self._spool, self._retry_s = link, spool, retry_s
+    ) -> None:
+        """retry_s: when a postponed version is offered again."""
+        self.client, self._outbox, self._retry_s = client, outbox, retry_s
         self._clock_s, self._wall_ns = clock_s, wall_ns
         self.health: deque[RobotHealth] = deque(maxlen=1)  # only the last one is worth sending
         self.changes: deque[VersionChange] = deque()
         self.fetched: deque[WantedVersion] = deque()
         self.refetch: deque[WantedVersion] = deque(maxlen=1)
         self._offered: set[str] = set()
-        self._running = link.active()
+        self._running = client.active()
         if self._running is not None:
             self._offered.add(self._running.manifest_sha256 or "")
         self._not_before_s: dict[str, float] = {}
-        self._ask_at_s, self._quiet_until_s, self._quiet_s = 0.0, 0.0, _QUIET_S
+        self._ask_at_s, self._silent_until_s, self._backoff_s = 0.0, 0.0, _BACKOFF_S
         self._announced: deque[WantedVersion] = deque(maxlen=1)
-        self._told: tuple[int | None, str] | None = None
-        self._handles = [link.announce_presence(), link.on_wanted(self._announced.append)]
+        self._last_ack: tuple[int | None, str] | None = None
+        self._handles = [client.announce_presence(), client.on_wanted(self._announced.append)]
 
     def step(self) -> None:
-        """What is due now; returns early where nobody answers, and then leaves the network alone for a while."""
-        self._settle_changes()
+        """Does what is due. Returns early where nobody answers, and then waits with an exponential backoff."""
+        self._handle_changes()
         now_s = self._clock_s()
-        if now_s < self._quiet_until_s or not self._link.connected():
+        if now_s < self._silent_until_s or not self.client.connected():
             return
         try:
             self._publish_health()
@@ -59,13 +64,13 @@ class ServerSync:
                 self._ask(now_s)
         except UnreachableError as error:
             _log.info("the map server is away: %s", error)
-            self._quiet_until_s = self._clock_s() + self._quiet_s
-            self._quiet_s = min(2 * self._quiet_s, _MAX_QUIET_S)
+            self._silent_until_s = self._clock_s() + self._backoff_s
+            self._backoff_s = min(2 * self._backoff_s, _MAX_BACKOFF_S)
         except FleetmapError as error:
             _log.warning("the map server refused: %s", error)
-            self._ask_at_s = max(self._ask_at_s, now_s + _MAX_QUIET_S)
+            self._ask_at_s = max(self._ask_at_s, now_s + _MAX_BACKOFF_S)
         else:
-            self._quiet_s = _QUIET_S
+            self._backoff_s = _BACKOFF_S
 
     def close(self) -> None:
         """Takes back the robot's presence."""
@@ -76,7 +81,7 @@ class ServerSync:
 
     def _ask(self, now_s: float) -> None:
         self._announced.clear()
-        wanted = self._link.wanted()
+        wanted = self.client.wanted()
         self._ask_at_s = now_s + _ASK_EVERY_S
         sha256 = wanted.manifest_sha256
         if sha256 is None:
@@ -84,7 +89,7 @@ class ServerSync:
         if sha256 in self._offered or now_s < self._not_before_s.get(sha256, 0.0):
             return self._acknowledge_again()
         try:
-            self._link.fetch(wanted)
+            self.client.fetch(wanted)
         except (LinkError, MapFormatError, StoreError) as error:
             if isinstance(error, UnreachableError):
                 self._ask_at_s = 0.0
@@ -93,19 +98,19 @@ class ServerSync:
             self._refuse(wanted, str(error))
             if self._running is not None:
                 return None
-        # Of a first version what came is better than nothing; of any other the last good one is.
+        # An incomplete first version is better than none; otherwise the last good one goes on.
         self._offered.add(sha256)
         self.fetched.append(wanted)
         return None
 
     def _fetch_again(self) -> None:
-        """Of a version that the robot holds, what its disk has lost meanwhile."""
+        """Fetches damaged or missing pieces of a version that the robot holds."""
         if self.refetch:
-            self._link.fetch(self.refetch[0])
+            self.client.fetch(self.refetch[0])
             self.fetched.append(self.refetch.popleft())
 
-    def _settle_changes(self) -> None:
-        """Makes adopted versions the active ones on the disk, and remembers what to tell."""
+    def _handle_changes(self) -> None:
+        """Makes adopted versions the active ones on the disk, and acknowledges all changes."""
         while self.changes:
             change = self.changes.popleft()
             sha256 = change.wanted.manifest_sha256 or ""
@@ -119,30 +124,33 @@ class ServerSync:
 
     def _adopt(self, wanted: WantedVersion) -> None:
         self._running = wanted
-        self._told = (wanted.version, "")
+        self._last_ack = (wanted.version, "")
         try:
-            self._link.activate(self._link.manifest(wanted), wanted)
+            self.client.activate(self.client.manifest(wanted), wanted)
         except FleetmapError as error:
-            # It runs from memory and from what is in the cache; it is only not there whole for the next start.
-            self._told = (wanted.version, str(error))
+            # It runs from memory and from the cache, but the next start will not find it whole.
+            self._last_ack = (wanted.version, str(error))
             _log.warning("version %s runs but is not kept: %s", wanted.version, error)
-        self._tell()
+        self._acknowledge()
 
     def _refuse(self, wanted: WantedVersion, reason: str) -> None:
         _log.warning("version %s is refused: %s", wanted.version, reason)
-        self._told = (None if self._running is None else self._running.version, f"version {wanted.version}: {reason}")
-        self._tell()
+        self._last_ack = (
+            None if self._running is None else self._running.version,
+            f"version {wanted.version}: {reason}",
+        )
+        self._acknowledge()
 
     def _acknowledge_again(self) -> None:
-        """A server that restarted has forgotten, and an acknowledgement may have been lost."""
-        if self._told is None and self._running is not None:
-            self._told = (self._running.version, "")
-        self._tell()
+        """For a server that restarted, or an acknowledgement that was lost."""
+        if self._last_ack is None and self._running is not None:
+            self._last_ack = (self._running.version, "")
+        self._acknowledge()
 
-    def _tell(self) -> None:
-        if self._told is not None:
+    def _acknowledge(self) -> None:
+        if self._last_ack is not None:
             try:
-                self._link.ack(self._told[0], stamp_ns=self._wall_ns(), refused=self._told[1])
+                self.client.ack(self._last_ack[0], stamp_ns=self._wall_ns(), refused=self._last_ack[1])
             except LinkError as error:
                 _log.info("the acknowledgement was not sent: %s", error)
 
@@ -150,41 +158,38 @@ class ServerSync:
 
     def _publish_health(self) -> None:
         while self.health:
-            self._link.publish_health(self.health.popleft())
+            self.client.publish_health(self.health.popleft())
 
     def _deliver(self) -> None:
-        """Failures, oldest first. One that the server refuses for now does not hold up those behind it.
-
-        One that the disk has damaged is let go: nobody will ever be able to read it, and it would be told for ever.
-        """
-        for report in self._spool.waiting(_DELIVER_AT_ONCE):
+        """Failures, oldest first. One that the server refuses for now does not hold up those behind it; a damaged one is dropped."""
+        for report in self._outbox.waiting(_DELIVERED_PER_STEP):
             if not _is_whole(report):
-                self._spool.refused(report.id)
+                self._outbox.refused(report.id)
                 continue
             try:
-                ack = self._link.report_failure(report.payload)
+                ack = self.client.report_failure(report.payload)
             except UnreachableError:
                 raise
             except LinkError as error:
                 _log.warning("the report of failure %s waits: %s", report.id, error)
-                self._quiet_until_s = self._clock_s() + _MAX_QUIET_S
+                self._silent_until_s = self._clock_s() + _MAX_BACKOFF_S
                 continue
             if ack.id != report.id:
-                _log.warning("the server acknowledged failure %s for %s; it is told again", ack.id, report.id)
+                _log.warning("the server acknowledged failure %s for %s; it is sent again", ack.id, report.id)
             elif ack.refused:
                 _log.warning("the server will not keep failure %s: %s", report.id, ack.refused)
-                self._spool.refused(report.id)
+                self._outbox.refused(report.id)
             else:
-                self._spool.done(report.id)
+                self._outbox.done(report.id)
 
 
 def _is_whole(report: QueuedReport) -> bool:
-    """Whether what lies in the spool is still the report that was put there; says so where it is not."""
+    """Whether a report is still the one that was put into the outbox; logs where it is not."""
     try:
-        told = decode_message(report.payload, FailureReport).id
+        decoded_id = decode_message(report.payload, FailureReport).id
     except LinkError as error:
         _log.warning("the report of failure %s is damaged and dropped: %s", report.id, error)
         return False
-    if told != report.id:
-        _log.warning("the report of failure %s is damaged and dropped: it tells of %s", report.id, told)
-    return told == report.id
+    if decoded_id != report.id:
+        _log.warning("the report of failure %s is damaged and dropped: it tells of %s", report.id, decoded_id)
+    return decoded_id == report.id

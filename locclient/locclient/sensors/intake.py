@@ -1,12 +1,10 @@
-"""What sensors deliver, in order and bounded, between the threads that bring it and the one that localizes.
+"""Bounded queue of sensor samples between the threads that receive them and the one that localizes.
 
 Stereo frames may drop, the oldest first, and are counted; inertial samples never do.
 """
 
 import threading
-import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,13 +14,13 @@ from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Whe
 from locclient.robot.sensor_bundle import SensorBundle
 
 _IMU_LEAD_NS = 10_000_000  # a frame is handled when the IMU has come a little past it
-_STALE_NS = 60_000_000_000  # integrated over longer than this without a picture, inertial samples say nothing
+_STALE_NS = 60_000_000_000  # inertial samples integrated for longer without an image are useless
 _ABSURD = 1e5
 
 
 @dataclass
 class IntakeCounts:
-    """What came, and what did not get through. imu_late: frames that were handled without all of their IMU."""
+    """Samples received, and those dropped or refused. imu_late: frames that were handled without all of their IMU samples."""
 
     frames: int = 0
     frames_dropped: int = 0
@@ -35,7 +33,7 @@ class IntakeCounts:
 
 
 @dataclass
-class _Inertial:
+class _ImuQueue:
     stamps_ns: list[int] = field(default_factory=list)
     rows: list[tuple[float, ...]] = field(default_factory=list)
 
@@ -49,18 +47,15 @@ class _Inertial:
 class Intake:
     """Put to from any thread; taken from by one."""
 
-    def __init__(
-        self, *, frames: int, imu_minus_cam_s: float, has_imu: bool, imu_wait_s: float, clock_s: Callable[[], float] = time.monotonic
-    ) -> None:  # fmt: skip
+    def __init__(self, *, frames: int, imu_minus_cam_s: float, has_imu: bool, imu_wait_s: float) -> None:
         """frames: how many may wait. imu_wait_s: how long a frame waits for the inertial samples up to it."""
         self.counts = IntakeCounts()
         self._frames: deque[CameraFrame | StoredFrame] = deque()
         self._limit = frames
         self._offset_ns = int(imu_minus_cam_s * 1e9)
         self._has_imu, self._imu_wait_s = has_imu, imu_wait_s
-        self._clock_s = clock_s
         self._changed = threading.Condition()
-        self._imu, self._last_imu_ns, self._last_frame_ns = _Inertial(), -(2**62), -(2**62)
+        self._imu, self._last_imu_ns, self._last_frame_ns = _ImuQueue(), -(2**62), -(2**62)
         self._wheel: list[WheelSample] = []
         self._priors: list[PositionPrior] = []
         self._finished = False
@@ -114,14 +109,14 @@ class Intake:
             self.counts.unreadable += 1
 
     def finish(self) -> None:
-        """Nothing will come any more."""
+        """Ends the stream: no more samples will come."""
         with self._changed:
             self._finished = True
             self._changed.notify_all()
 
     @property
     def exhausted(self) -> bool:
-        """Whether nothing will come any more and everything was taken."""
+        """Whether the stream has ended and everything was taken."""
         with self._changed:
             return self._finished and not self._frames
 
@@ -131,7 +126,7 @@ class Intake:
             return self._changed.wait_for(lambda: len(self._frames) < self._limit, timeout_s)
 
     def take(self, timeout_s: float) -> SensorBundle:
-        """The oldest frame with all that goes before it, once its inertial samples are there or have been waited for."""
+        """The oldest frame with the samples before it, once its inertial samples are there or have been waited for."""
         with self._changed:
             if not self._changed.wait_for(lambda: self._frames or self._finished, timeout_s) or not self._frames:
                 return SensorBundle()

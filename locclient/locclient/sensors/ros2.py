@@ -18,21 +18,21 @@ Take = Callable[[Intake, str, bytes], None]
 
 
 class Ros2Source:
-    """Subscribes to the topics; an image topic also with `/compressed` behind it. The type tells how a message is read."""
+    """Subscribes to the topics, to image topics also with `/compressed` appended; the key names the type of a message."""
 
     def __init__(
         self, bus: Bus, domain: int, topics: Topics, calibration: RigCalibration, *, images: bool = True
     ) -> None:
-        """images: False takes everything but pictures, for a camera that comes another way."""
+        """images: False takes everything but images, which come from another source."""
         self._bus, self._domain = bus, domain
         self.calibration, self.has_depth = calibration, False
         self._pairs = StereoPairs()
-        self._wanted: list[tuple[str, Take]] = [(topics.wheel, _take_wheel), (topics.prior, _take_prior)]
+        self._topics: list[tuple[str, Take]] = [(topics.wheel, _take_wheel), (topics.prior, _take_prior)]
         if calibration.imu is not None:
-            self._wanted.append((topics.imu, _take_imu))
+            self._topics.append((topics.imu, _take_imu))
         if images:
             for side, topic in (("left", topics.left), ("right", topics.right)):
-                self._wanted += [(name, partial(self._take_image, side)) for name in (topic, f"{topic}/compressed")]
+                self._topics += [(name, partial(self._take_image, side)) for name in (topic, f"{topic}/compressed")]
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
         """See Source."""
@@ -45,10 +45,10 @@ class Ros2Source:
                 handle.close()
 
     def subscribe(self, intake: Intake) -> list[Handle]:
-        """Subscriptions that put what comes into the intake, until they are closed."""
+        """Subscriptions that put samples into the intake, until they are closed."""
         return [
-            self._bus.subscribe(ros_key_expr(self._domain, topic), partial(self._hear, intake, take))
-            for topic, take in self._wanted
+            self._bus.subscribe(ros_key_expr(self._domain, topic), partial(self._handle, intake, take))
+            for topic, take in self._topics
             if topic
         ]
 
@@ -56,11 +56,11 @@ class Ros2Source:
         """See Source."""
         self._bus.close()
 
-    def _hear(self, intake: Intake, take: Take, key: str, payload: bytes) -> None:
+    def _handle(self, intake: Intake, take: Take, key: str, payload: bytes) -> None:
         try:
             take(intake, type_of_key(key), payload)
         except (ValueError, FleetmapError):
-            # A message that cannot be read costs itself: it is counted and told in the health report.
+            # An unreadable message is skipped; the health report has their number.
             intake.count_unreadable()
 
     def _take_image(self, side: str, intake: Intake, type_name: str, payload: bytes) -> None:

@@ -1,4 +1,4 @@
-"""Where a running robot's samples come from. To add a source: a file and a line in SOURCES."""
+"""Sensor sources of a running robot. To add one: a file and a line in SOURCES."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,11 +14,11 @@ from fleetmap.sensors.calibration import RigCalibration
 from locclient.sensors.intake import Intake
 from locclient.sensors.playback import RecordingSource
 from locclient.sensors.ros2 import Ros2Source
-from locclient.sensors.uvc import UvcSource
+from locclient.sensors.uvc import UvcSource, VideoMode
 
 
 class SourceSection(Section, frozen=True):
-    """Which sensors a robot has, and where. What a kind does not need is not looked at."""
+    """Kind of the sensor source, and its options; a kind ignores those of others."""
 
     kind: str = "ros2"
     calibration: str | None = None
@@ -43,7 +43,7 @@ class Source(Protocol):
         """Puts samples into the intake until there are no more or `wait`, which sleeps for so many seconds, says to stop."""
 
     def close(self) -> None:
-        """Lets go of files and connections."""
+        """Closes files and connections."""
 
 
 def _recording(section: SourceSection, topics: Topics) -> Source:
@@ -62,9 +62,9 @@ def _ros2(section: SourceSection, topics: Topics) -> Source:
 def _uvc(section: SourceSection, topics: Topics) -> Source:
     calibration = _calibration(section)
     device: int | str = int(section.device) if section.device.isdecimal() else section.device
-    rest = Ros2Source(ZenohBus.connect(section.endpoint), section.domain, topics, calibration, images=False)
-    size_px = (section.width_px, section.height_px)
-    return UvcSource(lambda: cv2.VideoCapture(device), calibration, size_px, section.rate_hz, section.delay_s, rest)
+    topic_source = Ros2Source(ZenohBus.connect(section.endpoint), section.domain, topics, calibration, images=False)
+    mode = VideoMode(section.width_px, section.height_px, section.rate_hz, section.delay_s)
+    return UvcSource(lambda: cv2.VideoCapture(device), calibration, mode, topic_source)
 
 
 def _calibration(section: SourceSection) -> RigCalibration:

@@ -1,4 +1,4 @@
-"""Left and right pictures that arrive one by one, put together by their stamps. Pure."""
+"""Pairing of left and right images that arrive one by one, by their stamps. Pure."""
 
 from collections import deque
 

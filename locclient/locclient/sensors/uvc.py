@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ _CLOCKS_AGREE_S = 1.0
 
 
 class Capture(Protocol):
-    """What is used of cv2.VideoCapture."""
+    """The methods used of cv2.VideoCapture."""
 
     def isOpened(self) -> bool:  # noqa: N802
         """Whether the device is open."""
@@ -36,6 +36,25 @@ class Capture(Protocol):
         """Closes the device."""
 
 
+class VideoMode(NamedTuple):
+    """What is asked of a camera, and its latency. width_px, height_px: of both pictures together. delay_s: as in UvcSource."""
+
+    width_px: int
+    height_px: int
+    rate_hz: float
+    delay_s: float
+
+
+class Clocks(NamedTuple):
+    """The clocks that stamp frames: the monotonic one of drivers, and the system's."""
+
+    monotonic_s: Callable[[], float] = time.monotonic
+    wall_ns: Callable[[], int] = time.time_ns
+
+
+_SYSTEM_CLOCKS = Clocks()
+
+
 class UvcSource:
     """Frames of a side-by-side camera, stamped on the clock of the topics.
 
@@ -45,12 +64,15 @@ class UvcSource:
     """
 
     def __init__(
-        self, open_capture: Callable[[], Capture], calibration: RigCalibration, size_px: tuple[int, int], rate_hz: float, delay_s: float,
-        topics: Ros2Source | None, *, monotonic_s: Callable[[], float] = time.monotonic, wall_ns: Callable[[], int] = time.time_ns,
-    ) -> None:  # fmt: skip
-        """size_px: width and height of both pictures together. topics: where the other sensors come from, None for none."""
-        self._open, self._size_px, self._rate_hz, self._delay_s = open_capture, size_px, rate_hz, delay_s
-        self._topics, self._monotonic_s, self._wall_ns = topics, monotonic_s, wall_ns
+        self,
+        open_capture: Callable[[], Capture],
+        calibration: RigCalibration,
+        mode: VideoMode,
+        topics: Ros2Source | None,
+        clocks: Clocks = _SYSTEM_CLOCKS,
+    ) -> None:
+        """topics: where the other sensors come from, None for none."""
+        self._open, self._mode, self._topics, self._clocks = open_capture, mode, topics, clocks
         self.calibration, self.has_depth = calibration, False
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
@@ -60,7 +82,7 @@ class UvcSource:
             while not wait(0.0):
                 capture = self._open()
                 try:
-                    self._play(capture, intake, wait)
+                    self._read_frames(capture, intake, wait)
                 finally:
                     capture.release()
                 if wait(_REOPEN_S):
@@ -74,20 +96,20 @@ class UvcSource:
         if self._topics is not None:
             self._topics.close()
 
-    def _play(self, capture: Capture, intake: Intake, wait: Callable[[float], bool]) -> None:
+    def _read_frames(self, capture: Capture, intake: Intake, wait: Callable[[float], bool]) -> None:
         """Until the camera is gone or it is time to stop."""
         if not capture.isOpened():
             return
         for prop, value in (
-            (cv2.CAP_PROP_FRAME_WIDTH, self._size_px[0]),
-            (cv2.CAP_PROP_FRAME_HEIGHT, self._size_px[1]),
-            (cv2.CAP_PROP_FPS, self._rate_hz),
+            (cv2.CAP_PROP_FRAME_WIDTH, self._mode.width_px),
+            (cv2.CAP_PROP_FRAME_HEIGHT, self._mode.height_px),
+            (cv2.CAP_PROP_FPS, self._mode.rate_hz),
             (cv2.CAP_PROP_BUFFERSIZE, 1),  # of several, the oldest would come first
         ):
             capture.set(prop, value)
         while not wait(0.0):
-            there, picture = capture.read()
-            if not there:
+            is_open, picture = capture.read()
+            if not is_open:
                 return
             try:
                 intake.put_frame(split_frame(np.asarray(picture), self._stamp_ns(capture)))
@@ -95,10 +117,10 @@ class UvcSource:
                 intake.count_unreadable()
 
     def _stamp_ns(self, capture: Capture) -> int:
-        now_s, wall_ns = self._monotonic_s(), self._wall_ns()
+        now_s, wall_ns = self._clocks.monotonic_s(), self._clocks.wall_ns()
         driver_s = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
         age_s = now_s - driver_s if abs(now_s - driver_s) < _CLOCKS_AGREE_S else 0.0
-        return wall_ns - round((max(age_s, 0.0) + self._delay_s) * 1e9)
+        return wall_ns - round((max(age_s, 0.0) + self._mode.delay_s) * 1e9)
 
 
 def split_frame(picture: np.ndarray, stamp_ns: int) -> CameraFrame:

@@ -1,4 +1,4 @@
-"""What a running robot tells its own programs, and the frame odom in which nothing jumps."""
+"""Estimates that a running robot publishes, and the frame odom in which nothing jumps."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.messages import Cause, EstimateMessage, Status, decode_message
 from fleetmap.recordings.ros2.keys import ros_key
 from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior, decode_text
-from locclient.daemon.publishers import OutputSection, open_output
+from locclient.daemon.publishers import OutputSection, open_publisher
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
 
@@ -23,9 +23,9 @@ def published(section: OutputSection, *estimates: object) -> dict[str, list[byte
     hub, heard = MemoryHub(), {}  # type: ignore[var-annotated]
     with MemoryBus(hub) as bus, MemoryBus(hub) as other:
         other.subscribe("**", lambda key, payload: heard.setdefault(key, []).append(payload))
-        output, odom = open_output(bus, "hall", "r1", section), ContinuousOdom(BASE_FROM_BODY)
+        publisher, odom = open_publisher(bus, "hall", "r1", section), ContinuousOdom(BASE_FROM_BODY)
         for one in estimates:
-            output.publish(one, odom.handle(one), BASE_FROM_BODY)  # type: ignore[arg-type]
+            publisher.publish(one, odom.handle(one), BASE_FROM_BODY)  # type: ignore[arg-type]
     return heard
 
 
@@ -67,7 +67,7 @@ def test_ros_topics_hold_the_same() -> None:
 )
 def test_what_cannot_be_told_is_refused_at_once(section: dict[str, str], said: str) -> None:
     with MemoryBus(MemoryHub()) as bus, pytest.raises(UsageError, match=said):
-        open_output(bus, "hall", "r1", OutputSection(**section))
+        open_publisher(bus, "hall", "r1", OutputSection(**section))
 
 
 def test_odom_is_continuous_once_a_place_was_named() -> None:

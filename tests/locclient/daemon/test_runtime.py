@@ -13,7 +13,7 @@ from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import RecordingError
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
 from locclient.daemon.outbox import Outbox
-from locclient.daemon.runtime import Parts, Runtime
+from locclient.daemon.runtime import Runtime, RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.systemd_notify import ServiceManager
 from locclient.localization.estimate import Estimate
@@ -77,16 +77,16 @@ class World:
     folder: Path
     table: list[str] = field(default_factory=list)
 
-    def parts(self, source: ScriptedSource, robot: Robot, listener: Listener) -> Parts:
+    def parts(self, source: ScriptedSource, robot: Robot, listener: Listener) -> RuntimeParts:
         caches = tuple(TileCache(self.folder / "cache") for _ in range(2))
-        link = MapClient(self.bus, caches[0], "room", "r1")
-        spool = Outbox(self.folder / "spool", max_bytes=10**7)
+        client = MapClient(self.bus, caches[0], "room", "r1")
+        outbox = Outbox(self.folder / "spool", max_bytes=10**7)
         intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=True, imu_wait_s=1.0)
-        return Parts(
+        return RuntimeParts(
             site="room", robot_name="r1", source=source, intake=intake, robot=robot,
-            room=TileLoader(CachedMap(caches[1], "room"), TileSelectionSettings()), spool=spool,
-            camera=robot_world.rectifier().camera, settings=robot_world.SETTINGS, output=listener, link=link,
-            talk=ServerSync(link, spool, retry_s=600.0), first=link.active(), caches=caches,
+            tile_loader=TileLoader(CachedMap(caches[1], "room"), TileSelectionSettings()), outbox=outbox,
+            camera=robot_world.rectifier().camera, settings=robot_world.SETTINGS, publisher=listener,
+            server=ServerSync(client, outbox, retry_s=600.0), first=client.active(), caches=caches,
         )  # fmt: skip
 
 
@@ -135,10 +135,10 @@ def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world:
             np.testing.assert_array_equal(got.map_from_body, wanted.map_from_body)
     assert parts.intake.counts.frames_dropped == 0
     assert delivered_while_away == [0]
-    waiting = [report.id for report in parts.spool.waiting(10)]
+    waiting = [report.id for report in parts.outbox.waiting(10)]
     world.hub.reachable = True
-    assert parts.talk is not None
-    last = ServerSync(parts.link, parts.spool, retry_s=600.0)  # the next start delivers what was not yet
+    assert parts.server is not None
+    last = ServerSync(parts.server.client, parts.outbox, retry_s=600.0)  # the next start delivers what was not yet
     last.step()
     assert len(world.table) == len(set(world.table)) == 1
     assert waiting in ([], world.table)
@@ -164,8 +164,8 @@ def test_a_new_version_is_taken_while_driving(world: World) -> None:
     runtime.run()
     assert listener.estimates[-1].map_version == 2
     assert [e.cause for e in listener.estimates[60:] if e.status != "TRACKING"] == []
-    assert parts.link is not None
-    active = parts.link.active()
+    assert parts.server is not None
+    active = parts.server.client.active()
     assert active is not None
     assert active.version == 2
     assert world.fleet.robots("room")[0].version == 2

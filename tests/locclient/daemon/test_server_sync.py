@@ -32,15 +32,15 @@ from support.storage.map_samples import save_sample_draft
 
 @dataclass
 class World:
-    """A server, one robot's talk with it, and the table of failures that the server keeps."""
+    """A server, the robot's synchronization with it, and the table of failures that the server keeps."""
 
     hub: MemoryHub
     store: MapStore
     folder: Path
     fleet: Fleet
-    talk: ServerSync
-    link: MapClient
-    spool: Outbox
+    sync: ServerSync
+    client: MapClient
+    outbox: Outbox
     clock: dict[str, float]
     table: list[str] = field(default_factory=list)
     lose_answers: bool = False
@@ -60,7 +60,7 @@ class World:
 
     def step(self, seconds: float = 0.1) -> None:
         self.clock["s"] += seconds
-        self.talk.step()
+        self.sync.step()
 
     def ack(self) -> dict[str, object]:
         return self.fleet.robots("lab")[0].last_ack or {}
@@ -85,13 +85,13 @@ def world(tmp_path: Path) -> Iterator[World]:
 
         bus.queryable(robot_key("*", "*", "failures"), take)
         service = BusService(store, fleet, bus, lambda *_: None)
-        link = MapClient(robot_bus, TileCache(tmp_path / "cache"), "lab", "r1")
-        spool = Outbox(tmp_path / "spool", max_bytes=10**6)
-        talk = ServerSync(link, spool, retry_s=600.0, clock_s=lambda: clock["s"])
-        made = World(hub, store, tmp_path / "store", fleet, talk, link, spool, clock)
+        client = MapClient(robot_bus, TileCache(tmp_path / "cache"), "lab", "r1")
+        outbox = Outbox(tmp_path / "outbox", max_bytes=10**6)
+        sync = ServerSync(client, outbox, retry_s=600.0, clock_s=lambda: clock["s"])
+        made = World(hub, store, tmp_path / "store", fleet, sync, client, outbox, clock)
         made_late.append(made)
         yield made
-        talk.close()
+        sync.close()
         service.close()
 
 
@@ -104,30 +104,30 @@ def report(name: str) -> QueuedReport:
 
 def adopt(world: World) -> WantedVersion:
     """What the main thread does with a fetched version."""
-    wanted = world.talk.fetched.popleft()
-    world.talk.changes.append(VersionChange(wanted, Change.ADOPTED))
+    wanted = world.sync.fetched.popleft()
+    world.sync.changes.append(VersionChange(wanted, Change.ADOPTED))
     world.step()
     return wanted
 
 
 def test_a_version_is_active_only_once_it_was_adopted(world: World) -> None:
     world.step()
-    assert [wanted.version for wanted in world.talk.fetched] == [1]
-    assert world.link.active() is None
+    assert [wanted.version for wanted in world.sync.fetched] == [1]
+    assert world.client.active() is None
     assert adopt(world).version == 1
-    assert world.link.active() == world.link.wanted()
+    assert world.client.active() == world.client.wanted()
     assert world.ack()["version"] == 1
     world.publish(seed=1)
     world.step(61.0)
-    assert [wanted.version for wanted in world.talk.fetched] == [2]
-    assert world.link.active().version == 1
-    wanted = world.talk.fetched.popleft()
-    world.talk.changes.append(VersionChange(wanted, Change.REFUSED, "it puts the robot 2 m away"))
+    assert [wanted.version for wanted in world.sync.fetched] == [2]
+    assert world.client.active().version == 1
+    wanted = world.sync.fetched.popleft()
+    world.sync.changes.append(VersionChange(wanted, Change.REFUSED, "it puts the robot 2 m away"))
     world.step()
-    assert world.link.active().version == 1
+    assert world.client.active().version == 1
     assert (world.ack()["version"], world.ack()["refused"]) == (1, "version 2: it puts the robot 2 m away")
     world.step(61.0)
-    assert not world.talk.fetched, "refused is refused"
+    assert not world.sync.fetched, "refused is refused"
 
 
 def test_what_was_put_off_is_offered_again_later(world: World) -> None:
@@ -135,11 +135,11 @@ def test_what_was_put_off_is_offered_again_later(world: World) -> None:
     adopt(world)
     world.publish(seed=1)
     world.step(61.0)
-    world.talk.changes.append(VersionChange(world.talk.fetched.popleft(), Change.POSTPONED, "dark"))
+    world.sync.changes.append(VersionChange(world.sync.fetched.popleft(), Change.POSTPONED, "dark"))
     world.step(61.0)
-    assert not world.talk.fetched
+    assert not world.sync.fetched
     world.step(600.0)
-    assert [wanted.version for wanted in world.talk.fetched] == [2]
+    assert [wanted.version for wanted in world.sync.fetched] == [2]
 
 
 def test_an_announcement_is_heard_at_once(world: World) -> None:
@@ -151,7 +151,7 @@ def test_an_announcement_is_heard_at_once(world: World) -> None:
     with MemoryBus(world.hub) as server:
         server.publish(robot_key("lab", "r1", "wanted"), encode_message(told))
     world.step()
-    assert [wanted.version for wanted in world.talk.fetched] == [2]
+    assert [wanted.version for wanted in world.sync.fetched] == [2]
 
 
 @pytest.mark.parametrize("damage", ["flipped", "truncated", "missing", "hostile"])
@@ -169,8 +169,8 @@ def test_a_version_with_a_bad_tile_is_refused_and_the_good_one_goes_on(world: Wo
         content = {"flipped": bytes(data), "truncated": bytes(data[:-9]), "hostile": b"\xff" * len(data)}
         victim.write_bytes(content[damage])
     world.step(61.0)
-    assert not world.talk.fetched
-    assert world.link.active().version == 1
+    assert not world.sync.fetched
+    assert world.client.active().version == 1
     said = world.ack()
     assert said["version"] == 1
     assert str(said["refused"]).startswith(f"version {number}: ")
@@ -190,8 +190,8 @@ def test_a_manifest_of_another_site_is_refused(world: World) -> None:
         world.hub.queryables.insert(0, ("fleetmap/lab/manifests/7", _parts(world.store.blob(foreign.manifest_sha256))))
         assert not server.closed()
     world.step(61.0)
-    assert not world.talk.fetched
-    assert world.link.active().version == 1
+    assert not world.sync.fetched
+    assert world.client.active().version == 1
     assert "manifest is of elsewhere" in str(world.ack()["refused"])
 
 
@@ -207,46 +207,46 @@ def test_of_a_first_version_what_came_is_used(world: World) -> None:
     victim.chmod(0o644)
     victim.write_bytes(b"x" * entry.bytes)
     world.step()
-    assert [wanted.version for wanted in world.talk.fetched] == [1]
+    assert [wanted.version for wanted in world.sync.fetched] == [1]
     assert adopt(world).version == 1
-    assert world.link.active() is None, "it is not whole"
+    assert world.client.active() is None, "it is not whole"
 
 
 def test_ten_minutes_without_a_network_cost_no_report_and_double_none(world: World) -> None:
     """Every report is in the server's table once, in order, though answers were lost and the robot was started again."""
     world.step()
     adopt(world)
-    world.spool.put(report("before"))
+    world.outbox.put(report("before"))
     world.step()
     world.hub.reachable = False
     for minute in range(10):
-        world.spool.put(report(f"away {minute}"))
+        world.outbox.put(report(f"away {minute}"))
         for _ in range(60):
             world.step(1.0)
     assert world.table == ["before"]
-    assert world.spool.counts()["waiting"] == 10
+    assert world.outbox.counts()["waiting"] == 10
     # The program dies, and begins anew with what its disk holds.
-    world.talk.close()
-    world.talk = ServerSync(world.link, world.spool, retry_s=600.0, clock_s=lambda: world.clock["s"])
+    world.sync.close()
+    world.sync = ServerSync(world.client, world.outbox, retry_s=600.0, clock_s=lambda: world.clock["s"])
     world.hub.reachable, world.lose_answers = True, True
     world.step()
     world.hub.reachable, world.lose_answers = True, False
-    world.spool.put(report("after"))
+    world.outbox.put(report("after"))
     for _ in range(40):
         world.step(1.0)
     assert world.table == ["before", *(f"away {minute}" for minute in range(10)), "after"]
-    assert world.spool.counts() == {"waiting": 0, "delivered": 12, "dropped": 0, "refused": 0}
+    assert world.outbox.counts() == {"waiting": 0, "delivered": 12, "dropped": 0, "refused": 0}
 
 
 def test_a_report_that_the_server_refuses_does_not_hold_up_the_others(world: World) -> None:
     world.refuse = "the disk is full"
-    world.spool.put(report("a"))
+    world.outbox.put(report("a"))
     world.step()
-    assert world.spool.counts()["waiting"] == 1
+    assert world.outbox.counts()["waiting"] == 1
     world.refuse = ""
     world.step(60.0)
     assert world.table == ["a"]
-    assert world.spool.counts()["delivered"] == 1
+    assert world.outbox.counts()["delivered"] == 1
 
 
 @pytest.mark.parametrize(
@@ -256,27 +256,27 @@ def test_a_report_that_the_server_refuses_does_not_hold_up_the_others(world: Wor
 )
 def test_a_report_that_the_disk_has_damaged_is_dropped_and_counted(world: World, payload: bytes) -> None:
     """It is told neither once nor for ever, and those before and behind it arrive."""
-    world.spool.put(report("before"))
-    world.spool.put(QueuedReport("damaged", payload))
-    world.spool.put(report("behind"))
+    world.outbox.put(report("before"))
+    world.outbox.put(QueuedReport("damaged", payload))
+    world.outbox.put(report("behind"))
     world.step()
     assert world.table == ["before", "behind"]
-    assert world.spool.counts() == {"waiting": 0, "delivered": 2, "dropped": 0, "refused": 1}
+    assert world.outbox.counts() == {"waiting": 0, "delivered": 2, "dropped": 0, "refused": 1}
 
 
 def test_health_is_the_last_one_only(world: World) -> None:
     for stamp_ns in (1, 2, 3):
-        world.talk.health.append(
+        world.sync.health.append(
             RobotHealth(site="lab", robot="r1", stamp_ns=stamp_ns, version=1, status="TRACKING", wall_ns=5)
         )
     world.step()
     assert world.fleet.robots("lab")[0].last_health["stamp_ns"] == 3
-    assert not world.talk.health
+    assert not world.sync.health
 
 
 def test_tiles_that_a_robot_cannot_read_are_fetched_again(world: World) -> None:
     world.step()
     wanted = adopt(world)
-    world.talk.refetch.append(wanted)
+    world.sync.refetch.append(wanted)
     world.step()
-    assert list(world.talk.fetched) == [wanted]
+    assert list(world.sync.fetched) == [wanted]

@@ -12,7 +12,7 @@ from fleetmap.messages import MAX_MESSAGE_BYTES, MAX_THUMBNAIL_BYTES, encode_mes
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame
 from locclient.daemon.failure_files import write_failure
-from locclient.daemon.jit_warmup import warm_up
+from locclient.daemon.jit_warmup import warm_up_kernels
 from locclient.robot.match_view import match_view, small_jpeg
 from mapserver.store import MapStore
 from support.recordings.recording_samples import calibration
@@ -82,7 +82,7 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
 
 
 def test_warming_up_runs_the_whole_way() -> None:
-    assert warm_up(calibration(), robot_world.rectifier(), robot_world.SETTINGS) >= 3
+    assert warm_up_kernels(calibration(), robot_world.rectifier(), robot_world.SETTINGS) >= 3
 
 
 @pytest.mark.parametrize("has_imu", [False])
@@ -90,4 +90,4 @@ def test_warming_up_needs_no_imu(has_imu: bool) -> None:
     from fleetmap.sensors.rectification import Rectifier
 
     rig = calibration(has_imu=has_imu)
-    assert warm_up(rig, Rectifier(rig), robot_world.SETTINGS) >= 3
+    assert warm_up_kernels(rig, Rectifier(rig), robot_world.SETTINGS) >= 3
