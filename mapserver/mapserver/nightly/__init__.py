@@ -1,4 +1,4 @@
-"""What a site's map does every night: take what came in, check it, build on the current version, and publish if the gate agrees."""
+"""The nightly job of a site: take what came in, check it, build on the current version, publish if the gate agrees."""
 
 from mapserver.nightly.night import NightRequest, last_report, run_night
 

@@ -1,4 +1,4 @@
-"""The folder into which recordings are copied, and where each goes from there. Nothing is ever deleted.
+"""The folder into which recordings are copied, and the folders where each goes from there. Nothing is ever deleted.
 
     INBOX/NAME             a recording: an .mcap file, or a folder
     INBOX/done/HASH-NAME   it is in a version
@@ -10,12 +10,13 @@ Beside what is held or bad lies NAME.reason.txt.
 
 import fcntl
 import os
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 
-from fleetmap.errors import StoreError, UsageError
+from fleetmap.errors import RecordingError, StoreError, UsageError
+from fleetmap.recordings import OpenOptions, open_recording
 from mapserver.store.files import make_folder, sync_folder, write_atomically
 
 DONE, HELD, BAD = "done", "held", "bad"
@@ -32,8 +33,25 @@ class Arrivals:
     waiting: tuple[tuple[Path, str], ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A recording that can be read."""
+
+    path: Path
+    sha256: str
+
+
+def identify(path: Path, calibration: Path | None) -> Recorded | str:
+    """A recording with its hash, or why it cannot be read."""
+    try:
+        with open_recording(path, OpenOptions(calibration_file=calibration)) as recording:
+            return Recorded(path, recording.content_hash())
+    except RecordingError as error:
+        return str(error)
+
+
 def arrivals(inbox: Path, settle_s: float, now_ns: int) -> Arrivals:
-    """What is in the inbox now. Hidden names and files that are no .mcap are nobody's.
+    """What is in the inbox now. Hidden names and other files than .mcap are ignored.
 
     A recording is whole when nothing in it changed for `settle_s`, no file in it bears the name of a half copied one, and
     nobody has one open for writing, as far as the system tells. Raises UsageError where there is no such folder.
@@ -45,11 +63,10 @@ def arrivals(inbox: Path, settle_s: float, now_ns: int) -> Arrivals:
         if path.name.startswith(".") or path.name in (DONE, HELD, BAD):
             continue
         if path.suffix in _UNFINISHED or path.is_dir() or path.suffix == ".mcap":
-            reason = _unfinished(path, settle_s, now_ns)
-            if reason is None:
-                complete.append(path)
-            else:
+            if reason := _unfinished(path, settle_s, now_ns):
                 waiting.append((path, reason))
+            else:
+                complete.append(path)
     return Arrivals(tuple(complete), tuple(waiting))
 
 
@@ -57,7 +74,7 @@ def _unfinished(path: Path, settle_s: float, now_ns: int) -> str | None:
     """Why a recording is not whole yet; None if it is."""
     newest_ns = 0
     try:
-        for part in (path, *_parts(path)):
+        for part in (path, *(path.rglob("*") if path.is_dir() else ())):
             if part.suffix in _UNFINISHED:
                 return f"{part.name} is half copied"
             # Not mtime: copying tools set it back. Nobody can set this one.
@@ -68,10 +85,6 @@ def _unfinished(path: Path, settle_s: float, now_ns: int) -> str | None:
         return "it changes right now"
     quiet_s = (now_ns - newest_ns) * 1e-9
     return f"it changed {quiet_s:.0f} s ago, {settle_s:.0f} s are waited" if quiet_s < settle_s else None
-
-
-def _parts(path: Path) -> Iterator[Path]:
-    return path.rglob("*") if path.is_dir() else iter(())
 
 
 def _is_being_written(path: Path) -> bool:
@@ -98,14 +111,10 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
     Raises StoreError where the disk refuses; the recording is then where it was.
     """
     folder = path.parent / where
-    name = (
-        path.name
-        if sha256 is None or path.name.startswith(sha256[:_HASH_SIGNS])
-        else f"{sha256[:_HASH_SIGNS]}-{path.name}"
-    )
+    prefix = "" if sha256 is None or path.name.startswith(sha256[:_HASH_SIGNS]) else f"{sha256[:_HASH_SIGNS]}-"
     try:
         make_folder(folder)
-        target = _free(folder, name)
+        target = _free(folder, prefix + path.name)
         if reason is not None:
             write_atomically(folder / f"{target.name}{_REASON}", [f"{reason}\n".encode()])
         os.replace(path, target)  # noqa: PTH105
@@ -120,12 +129,8 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
 
 def _free(folder: Path, name: str) -> Path:
     """The first name that no recording has yet."""
-    number = 1
-    while True:
-        target = folder / (name if number == 1 else f"{number}-{name}")
-        if not target.exists():
-            return target
-        number += 1
+    names = chain([name], (f"{number}-{name}" for number in count(2)))
+    return next(folder / free for free in names if not (folder / free).exists())
 
 
 def kept(inbox: Path, sha256s: list[str]) -> list[Path]:
