@@ -17,7 +17,7 @@ from fleetmap.messages import Cause
 from locclient.replay.run_metrics import METRICS
 from mapserver.build.report import BuildReport
 from mapserver.fleet_statistics.kpis import Kpis
-from mapserver.nightly.night import Night
+from mapserver.nightly.night import NightReport
 from mapserver.quality import figures
 from mapserver.survey.merge.pipeline import Counts
 from support.fleet.contracts_documents import REPOSITORY, code_words, rows, section, text
@@ -129,7 +129,7 @@ def test_evidence_keys_are_documented() -> None:
 
 
 def test_nightly_report_keys_are_documented() -> None:
-    keys = {"state", "message"} | set(Night(1).report())
+    keys = {"state", "message"} | set(dataclasses.asdict(NightReport(1)))
     assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Nightly"))} == keys
 
 

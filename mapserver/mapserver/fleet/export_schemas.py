@@ -1,6 +1,9 @@
 """JSON schemas of what is exported: Foxglove's messages, field by field as its documentation fixes them, and our own."""
 
-from typing import Any
+from types import NoneType
+from typing import Any, get_args, get_type_hints
+
+from mapserver.store import FailureRow
 
 
 def _object(title: str, **properties: dict[str, Any]) -> dict[str, Any]:
@@ -8,14 +11,17 @@ def _object(title: str, **properties: dict[str, Any]) -> dict[str, Any]:
 
 
 _NUMBER, _INTEGER, _STRING = {"type": "number"}, {"type": "integer"}, {"type": "string"}
-_MAYBE_NUMBER = {"type": ["number", "null"]}
-_MAYBE_STRING = {"type": ["string", "null"]}
-_TIME = {
-    "type": "object",
-    "title": "time",
-    "properties": {"sec": {"type": "integer", "minimum": 0}, "nsec": {"type": "integer", "minimum": 0, "maximum": 999999999}},
-    "required": ["sec", "nsec"],
-}  # fmt: skip
+_SECONDS, _NANOSECONDS = {"type": "integer", "minimum": 0}, {"type": "integer", "minimum": 0, "maximum": 999999999}
+_TIME = _object("time", sec=_SECONDS, nsec=_NANOSECONDS)
+_NAMES = {int: "integer", float: "number", str: "string", NoneType: "null"}
+
+
+def _schema(hint: Any) -> dict[str, Any]:
+    """Of a type, or of a type and None."""
+    names = [_NAMES[kind] for kind in get_args(hint) or (hint,)]
+    return {"type": names if len(names) > 1 else names[0]}
+
+
 _VECTOR = _object("foxglove.Vector3", x=_NUMBER, y=_NUMBER, z=_NUMBER)
 _QUATERNION = _object("foxglove.Quaternion", x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
 
@@ -38,20 +44,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     ),
     "fleetmap.Failure": _object(
         "fleetmap.Failure",
-        number=_INTEGER,
-        site=_STRING,
-        robot=_STRING,
-        failure_id=_STRING,
-        received_ns=_INTEGER,
-        happened_ns=_INTEGER,
-        duration_s=_NUMBER,
-        kind=_STRING,
-        cause=_STRING,
-        status=_STRING,
-        version={"type": ["integer", "null"]},
-        tile=_MAYBE_STRING,
-        x_map_m=_MAYBE_NUMBER,
-        y_map_m=_MAYBE_NUMBER,
+        **{name: _schema(hint) for name, hint in get_type_hints(FailureRow).items()},
         report={"type": "object"},
         pictures={"type": "array", "items": {"type": "object"}},
     ),

@@ -3,6 +3,8 @@
 import base64
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -32,9 +34,8 @@ def as_plain(found: FailureDetail) -> dict[str, Any]:
     """A failure as plain values; pictures by kind and place, without their bytes."""
     report = report_dict(found.report)
     report.pop("thumbnails")
-    row = {name: getattr(found.failure, name) for name in found.failure.__slots__}
-    pictures = [{"place": p.place, "kind": p.kind, "stamp_ns": p.stamp_ns, "bytes": p.bytes} for p in found.pictures]
-    plain: dict[str, Any] = finite({**row, "report": report, "pictures": pictures})
+    pictures = [asdict(picture) for picture in found.pictures]
+    plain: dict[str, Any] = finite({**asdict(found.failure), "report": report, "pictures": pictures})
     return plain
 
 
@@ -100,22 +101,18 @@ def _messages(store: MapStore, found: FailureDetail) -> Iterator[tuple[str, dict
     yield "/failures/report", as_plain(found)
 
 
-class _appearing:  # noqa: N801 - used as a function
+@contextmanager
+def _appearing(path: Path) -> Iterator[BinaryIO]:
     """The file at a path, which appears there when the block ends well. Raises StoreError where the disk refuses."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._part = path, path.with_name(path.name + ".part")
-
-    def __enter__(self) -> BinaryIO:
-        try:
-            self._file = self._part.open("wb")
-        except OSError as error:
-            raise StoreError(f"{self._part} cannot be written ({error.strerror}); choose another place") from error
-        return self._file
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        self._file.close()
-        if kind is None:
-            self._part.replace(self._path)
-        else:
-            self._part.unlink(missing_ok=True)
+    part = path.with_name(path.name + ".part")
+    try:
+        file = part.open("wb")
+    except OSError as error:
+        raise StoreError(f"{part} cannot be written ({error.strerror}); choose another place") from error
+    try:
+        with file:
+            yield file
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise

@@ -31,7 +31,7 @@ class GateSettings(Section, frozen=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class GateVerdict:
     """What the gate says. reasons: against publishing, none if accepted; hard ones stand even against --force.
 
     report: the figures that were looked at, and under `not_judged` those for which evidence is missing.
@@ -50,7 +50,7 @@ class Verdict:
 def judge(
     draft: Manifest, current: Manifest | None, site_vocabulary: str | None, settings: GateSettings,
     evidence: Evidence | None = None,
-) -> Verdict:  # fmt: skip
+) -> GateVerdict:  # fmt: skip
     """The verdict on a draft; `current` is None for a site's first version, `evidence` for a draft that nobody examined.
 
     What cannot be judged, for want of frames or of a version to compare with, is named and refuses nothing.
@@ -79,7 +79,7 @@ def judge(
         report |= {"compared_with": current.version, **shares}
         found.reasons.extend(_size_reasons(shares, current.version, settings))
     report |= {"evidence": msgspec.to_builtins(examined), "not_judged": found.not_judged}
-    return Verdict(tuple(found.reasons), _hard_reasons(draft, site_vocabulary), report)
+    return GateVerdict(tuple(found.reasons), _hard_reasons(draft, site_vocabulary), report)
 
 
 @dataclass(frozen=True, slots=True)

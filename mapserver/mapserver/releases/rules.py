@@ -5,7 +5,7 @@ published -> retired by `gc`, once newer ones are enough; published or retired -
 """
 
 from fleetmap.errors import GateRefusedError, StateError, UsageError
-from mapserver.quality.gate import Verdict
+from mapserver.quality.gate import GateVerdict
 from mapserver.store.rows import (
     Actor,
     CanaryEnd,
@@ -30,12 +30,12 @@ def chosen_draft(rows: SiteReleases, number: int | None) -> VersionInfo:
     return drafts[-1]
 
 
-def is_forced(verdict: Verdict, *, force: bool) -> bool:
+def is_forced(verdict: GateVerdict, *, force: bool) -> bool:
     """Whether a draft that the gate refuses is published all the same: only where no hard reason stands against it."""
     return force and bool(verdict.reasons) and not verdict.hard_reasons
 
 
-def refusal(draft: VersionInfo, verdict: Verdict) -> GateRefusedError:
+def refusal(draft: VersionInfo, verdict: GateVerdict) -> GateRefusedError:
     """The error for a draft that the gate refuses."""
     reasons = "; ".join((*verdict.hard_reasons, *verdict.reasons))
     way_out = (

@@ -17,7 +17,7 @@ from fleetmap.sensors.samples import CameraFrame, ImuSamples, Trajectory
 from mapserver.build.draft_evidence import Before, HeldOut, JudgedSession, examine_draft
 from mapserver.quality.evidence import trajectory_breaks
 from mapserver.quality.figures import Evidence
-from mapserver.quality.gate import GateSettings, Verdict, judge
+from mapserver.quality.gate import GateSettings, GateVerdict, judge
 from mapserver.quality.probes import held_out_frames, probe_features
 from mapserver.survey.pipeline import Survey, survey
 from mapserver.survey.settings import SurveySettings
@@ -78,7 +78,7 @@ def manifest(tiles: Sequence[Tile], version: int) -> Manifest:
 def verdict(
     survey_map: SurveyMap, *, has_current: bool = True, held_out: list[HeldOut] | None = None,
     trajectory: Trajectory | None = None,
-) -> tuple[Verdict, Evidence]:  # fmt: skip
+) -> tuple[GateVerdict, Evidence]:  # fmt: skip
     """Of a draft with this map, built by the sound ride; the current version is the sound map."""
     done, own = sound()
     tiles, current = tiles_from_survey(survey_map), tiles_from_survey(done.map)
