@@ -33,13 +33,14 @@ def report(
     import time
 
     from fleetmap.errors import StoreError
-    from mapserver.fleet.shift_page import html_page
-    from mapserver.fleet.shift_summary import summarise
+    from mapserver.dashboard.pages.shift_page import html_page
+    from mapserver.fleet.shift_summary import SummarySettings, summarise
     from mapserver.store import MapStore
 
     settings = settings_of(context)
+    judged_by = SummarySettings(settings.canary, settings.resurvey)
     with MapStore.open(store) as maps:
-        page = html_page(summarise(maps, site, hours, time.time_ns(), settings.canary, settings.resurvey))
+        page = html_page(summarise(maps, site, hours, time.time_ns(), judged_by))
     try:
         out.write_text(page, "utf-8")
     except OSError as error:

@@ -1,4 +1,4 @@
-"""What the pages read and do, of maps and surveys: the one way from them to the store."""
+"""Maps and surveys for the pages: all that they read from the store and change in it."""
 
 import threading
 from collections import OrderedDict
@@ -12,14 +12,14 @@ from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
 from mapserver.store import Actor, CanaryRow, Event, JobInfo, MapStore, SiteInfo, VerdictRow, VersionInfo
 
-_KEPT_PLANS = 8
+_CACHED_PLANS = 8
 _EVENTS_SHOWN = 50
 _JOBS_SHOWN = 100
 
 
 @dataclass(frozen=True, slots=True)
 class VersionQuality:
-    """What is known about a version: its manifest with the build's report, what the gate said, oldest first."""
+    """A version with its manifest, the build's report in it, and the gate's verdicts, oldest first."""
 
     info: VersionInfo
     manifest: Manifest
@@ -30,7 +30,7 @@ class VersionQuality:
 class SiteHistory:
     """Versions and events of a site, newest first.
 
-    before: the version that rolling back would make current, if any; trial: the version that some robots try now, if any.
+    before: target of a rollback, if any; trial: the version on trial, if any.
     """
 
     site: SiteInfo
@@ -41,7 +41,7 @@ class SiteHistory:
 
     @property
     def fingerprint(self) -> tuple[object, ...]:
-        """Changes whenever the page that shows this would."""
+        """Changes with everything that the page shows."""
         newest = self.events[0].id if self.events else 0
         trial = None if self.trial is None else self.trial.id
         return newest, trial, tuple((info.version, info.state) for info in self.versions)
@@ -62,10 +62,10 @@ class MapData:
         return [info.site for info in self._store.sites()]
 
     def chosen_site(self, site: str | None) -> str:
-        """`site`, or the first one where none is named; raises UsageError where it is not there."""
+        """`site`, or the first site if none is named; UsageError for an unknown one."""
         known = self.sites()
         if not known:
-            raise UsageError("the store has no site yet; `mapserver build` makes one of a recording")
+            raise UsageError("the store has no site yet; `mapserver build` makes one from a recording")
         if site is not None and site not in known:
             raise UsageError(f"the store has no site {site[:64]}; it has: {', '.join(known)}")
         return site or known[0]
@@ -92,23 +92,23 @@ class MapData:
     def plan(self, site: str, version: int) -> Plan:
         """The plan of a version; the last ones are kept, since versions do not change."""
         sha256 = self._store.version(site, version).manifest_sha256
-        with self._lock:  # one at a time: a second browser waits for the first one's picture instead of making it too
+        with self._lock:  # a second browser waits for the first one's picture instead of making it again
             plan = self._plans.get(sha256)
             if plan is None:
                 manifest = self._store.manifest(site, version)
                 plan = make_plan(manifest, lambda entry: decode_tile(self._store.blob(entry.sha256)))
                 self._plans[sha256] = plan
             self._plans.move_to_end(sha256)
-            while len(self._plans) > _KEPT_PLANS:
+            while len(self._plans) > _CACHED_PLANS:
                 self._plans.popitem(last=False)
         return plan
 
     def difference(self, site: str, before: int, after: int) -> Difference:
-        """What changed between two versions."""
+        """The difference between two versions."""
         return releases.difference(self._store, site, before, after)
 
     def changed_tiles(self, site: str, before: int, after: int) -> dict[tuple[int, int], str]:
-        """Cells that are not the same in both: added, removed or changed."""
+        """Cells that differ between two versions: added, removed or changed."""
         old, new = (
             {(tile.x, tile.y): tile.sha256 for tile in self._store.manifest(site, version).tiles}
             for version in (before, after)
@@ -139,19 +139,19 @@ class MapData:
         return f"Version {version} is current."
 
     def start_trial(self, site: str, version: int, actor: Actor) -> str:
-        """Gives a version to some robots first."""
+        """Starts a trial of a version."""
         releases.start_canary(self._store, site, version, self.trial_share, actor=actor, gate=self._gate)
         return f"Version {version} is tried by {self.trial_share:.0%} of the robots."
 
     def stop_trial(self, site: str, trial: CanaryRow, actor: Actor) -> str:
-        """Takes the version back that some robots try; raises StateError where it is not tried any more."""
+        """Ends a trial and retires its version; StateError if it is no longer on trial."""
         outcome = f"taken back by hand: {actor.reason or 'no reason given'}"
         releases.end_canary(self._store, trial, promote=False, outcome=outcome, actor=actor)
-        return f"Version {trial.version} of {site} is taken back."
+        return f"Version {trial.version} of {site} is rolled back."
 
     def roll_back(self, site: str, version: int, actor: Actor) -> str:
-        """Makes the version current that was so before; raises StateError where that is not `version` any more."""
+        """Makes the previous version current; StateError if that is no longer `version`."""
         rows = self._store.releases(site)
         if rows.rollback_target != version or rows.canary is not None:
-            raise StateError(f"rolling back does not lead to version {version} any more; load the page again")
+            raise StateError(f"a rollback no longer leads to version {version}; reload the page")
         return f"Version {releases.roll_back(self._store, site, actor=actor)} is current."

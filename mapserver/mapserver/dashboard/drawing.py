@@ -1,4 +1,4 @@
-"""Plans as SVG: the picture of a version with tiles, robots, failures and loops upon it. Pure."""
+"""Plans as SVG: the picture of a version with tiles, robots, failures and loops on it; and bar charts. Pure."""
 
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
@@ -29,7 +29,7 @@ class Line(NamedTuple):
     words: str
 
 
-_SHAPES = {
+SHAPES = {
     "circle": '<circle r="1"/>',
     "square": '<rect x="-1" y="-1" width="2" height="2"/>',
     "triangle": '<path d="M0-1.2L1.15.9H-1.15Z"/>',
@@ -44,6 +44,11 @@ def svg(plan: Plan, name: str, layers: Iterable[Markup], *, css: str = "plan") -
     return Markup(
         '<svg class="{}" viewBox="{:.3f} {:.3f} {:.3f} {:.3f}" role="img" aria-label="{}" style="aspect-ratio:{:.4f}">{}</svg>'
     ).format(css, plan.low_m[0], -plan.high_m[1], width, height, name, width / height, joined(layers))
+
+
+def site_map(plan: Plan, name: str, picture_address: str, *over: Markup, below: Markup | None = None) -> Markup:
+    """A plan with its picture and a scale bar, and layers over or below the picture."""
+    return svg(plan, name, [below or Markup(""), ground(plan, picture_address), *over, scale_bar(plan)])
 
 
 def ground(plan: Plan, picture_address: str) -> Markup:
@@ -98,7 +103,7 @@ def marks(plan: Plan, found: Iterable[Mark]) -> Markup:
 def _mark(mark: Mark, radius: float) -> Markup:
     drawn = Markup(
         '<g class="mark {}" transform="translate({:.3f} {:.3f}) scale({:.4f})"><title>{}</title>{}</g>'
-    ).format(mark.tone, mark.x_m, -mark.y_m, radius, mark.words, Markup(_SHAPES[mark.shape]))
+    ).format(mark.tone, mark.x_m, -mark.y_m, radius, mark.words, Markup(SHAPES[mark.shape]))
     if mark.address is None:
         return drawn
     return Markup('<a href="{}" aria-label="{}">{}</a>').format(mark.address, mark.words, drawn)

@@ -1,4 +1,4 @@
-"""What the pages read of the fleet's health: rates with their intervals, failures, versions that are tried."""
+"""Fleet health for the pages: rates with their intervals, failures, versions on trial."""
 
 import threading
 from collections.abc import Callable, Mapping
@@ -6,27 +6,20 @@ from dataclasses import dataclass
 
 from scipy.special import bdtr
 
+from mapserver.dashboard.fleet_parts import Trial
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet.resurvey_list import resurvey_list
 from mapserver.fleet_statistics.canary_test import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, hour_of, kpis, rate
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings, TileConcern
-from mapserver.store import CanaryRow, FailureDetail, FailureFilter, FailureRow, MapStore
+from mapserver.store import FailureDetail, FailureFilter, FailureRow, MapStore
 
 DAY_H = 24
 DAYS_SHOWN = 14
 FAILURES_SHOWN = 50
-_KEPT_NS = 5_000_000_000
+_CACHED_NS = 5_000_000_000
 _ENDED_SHOWN_NS = 7 * DAY_H * HOUR_NS
-_SURE = 0.05
-
-
-@dataclass(frozen=True, slots=True)
-class Trial:
-    """A version that some robots try, or tried in the last days, and what is known of it by now."""
-
-    canary: CanaryRow
-    finding: str
+_SIGNIFICANCE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +39,8 @@ class SiteHealth:
 
 
 @dataclass(frozen=True, slots=True)
-class Choices:
-    """What failures can be filtered by: keys under which any were counted."""
+class FilterChoices:
+    """Filters of the failures: keys with any counts."""
 
     robots: list[str]
     versions: list[str]
@@ -56,35 +49,35 @@ class Choices:
 
 
 class HealthData:
-    """Reads the fleet's health out of an open store. Methods may be called from any thread; errors are the store's."""
+    """Reads fleet health from an open store. Thread-safe; errors are the store's."""
 
     def __init__(
         self, store: MapStore, canary: CanarySettings, resurvey: ResurveySettings, clock_ns: Callable[[], int]
     ) -> None:
         self._store, self._canary, self._resurvey, self._clock_ns = store, canary, resurvey, clock_ns
         self._lock = threading.Lock()
-        self._kept: dict[str, tuple[int, SiteHealth]] = {}
+        self._cached: dict[str, tuple[int, SiteHealth]] = {}
 
     def site(self, site: str) -> SiteHealth:
-        """A site's figures, some seconds old at most, put together once for all pages that are open."""
+        """A site's figures, a few seconds old at most, computed once for all open pages."""
         with self._lock:
-            known = self._kept.get(site)
-            if known is not None and self._clock_ns() - known[0] < _KEPT_NS:
-                return known[1]
+            cached = self._cached.get(site)
+            if cached is not None and self._clock_ns() - cached[0] < _CACHED_NS:
+                return cached[1]
             found = self._site(site)
-            self._kept[site] = (self._clock_ns(), found)
+            self._cached[site] = (self._clock_ns(), found)
         return found
 
     def failures(self, wanted: FailureFilter, before: int | None) -> list[FailureRow]:
-        """Failures, the last to arrive first; one more than is shown where there are more."""
+        """Failures, latest arrival first; one more than is shown if there are more."""
         return self._store.fleet.failures(wanted, before=before, limit=FAILURES_SHOWN + 1)
 
     def failure(self, number: int) -> FailureDetail:
         """One failure."""
         return self._store.fleet.failure(number)
 
-    def choices(self, site: str) -> Choices:
-        """What the site's failures can be filtered by."""
+    def choices(self, site: str) -> FilterChoices:
+        """Filters of the site's failures."""
 
         def keys(axis: str) -> list[str]:
             found = self._store.fleet.counters(site, axis)
@@ -93,7 +86,7 @@ class HealthData:
         def numbers_first(key: str) -> tuple[int, str]:
             return (int(key), "") if key.isdecimal() else (1 << 40, key)
 
-        return Choices(keys("robot"), sorted(keys("version"), key=numbers_first), keys("tile"), keys("cause"))
+        return FilterChoices(keys("robot"), sorted(keys("version"), key=numbers_first), keys("tile"), keys("cause"))
 
     def _site(self, site: str) -> SiteHealth:
         now_ns = self._clock_ns()
@@ -141,8 +134,8 @@ def trend_words(day: Counters, week: Counters) -> str:
     if total == 0:
         return "none in the week before either"
     share = day.robot_days / (day.robot_days + week.robot_days)
-    if 2 * (1 - float(bdtr(day.failures - 1, total, share)) if day.failures else 1.0) < _SURE:
+    if 2 * (1 - float(bdtr(day.failures - 1, total, share)) if day.failures else 1.0) < _SIGNIFICANCE:
         return "more than in the week before"
-    if 2 * float(bdtr(day.failures, total, share)) < _SURE:
+    if 2 * float(bdtr(day.failures, total, share)) < _SIGNIFICANCE:
         return "fewer than in the week before"
     return "no clear change from the week before"

@@ -1,4 +1,4 @@
-"""The dashboard in the server that has the API: pages under /dashboard, and the pictures that they show."""
+"""Installation of the dashboard in the API's server: pages under /dashboard, and their pictures."""
 
 import time
 
@@ -8,40 +8,34 @@ from nicegui import app as pages
 from nicegui import ui
 
 from fleetmap.errors import FleetmapError
-from mapserver.api.writers import Writers
-from mapserver.dashboard import failure_page, fleet_page, map_page, survey_page
+from mapserver.api.version_routes import ApiSettings
 from mapserver.dashboard.compression_cache import CompressionCache
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
-from mapserver.dashboard.layout import Rooms
+from mapserver.dashboard.layout import Services
 from mapserver.dashboard.live import LiveRobots
+from mapserver.dashboard.pages import failure_page, fleet_page, map_page, survey_page
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet_statistics.canary_test import CanarySettings
-from mapserver.fleet_statistics.resurvey_test import ResurveySettings
-from mapserver.quality.gate import GateSettings
 from mapserver.store import MapStore
 
 PATH = "/dashboard"
 
 
-def install_dashboard(
-    app: FastAPI, store: MapStore, fleet: Fleet, writers: Writers, gate: GateSettings, canary: CanarySettings,
-    resurvey: ResurveySettings,
-) -> None:  # fmt: skip
+def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings) -> None:
     """Adds the pages to `app`. Once in a process: NiceGUI keeps its pages in the module."""
-    rooms = Rooms(
-        MapData(store, gate, canary.share),
-        HealthData(store, canary, resurvey, time.time_ns),
+    services = Services(
+        MapData(store, settings.gate, settings.canary.share),
+        HealthData(store, settings.canary, settings.resurvey, time.time_ns),
         LiveRobots(fleet, time.monotonic),
-        writers,
+        settings.writers,
     )
-    for room in (fleet_page, map_page, failure_page, survey_page):
-        room.install(rooms)
-    _install_pictures(rooms, store)
+    for page in (fleet_page, map_page, failure_page, survey_page):
+        page.install(services)
+    _install_pictures(services, store)
 
     @app.get("/", include_in_schema=False)
     def to_dashboard(request: Request) -> RedirectResponse:
-        """Where people who type the bare address want to go."""
+        """Redirects the bare address to the dashboard."""
         return RedirectResponse(f"{request.scope.get('root_path', '')}{PATH}/")
 
     ui.run_with(
@@ -58,12 +52,12 @@ def install_dashboard(
     )
 
 
-def _install_pictures(rooms: Rooms, store: MapStore) -> None:
+def _install_pictures(services: Services, store: MapStore) -> None:
     @pages.get("/plans/{site}/{version}.png", include_in_schema=False)
     def plan(site: str, version: int) -> Response:
         """The picture of a version's plan; versions do not change."""
         try:
-            return _picture(rooms.maps.plan(site, version).png, "image/png", "private, max-age=31536000, immutable")
+            return _picture(services.maps.plan(site, version).png, "image/png", "private, max-age=31536000, immutable")
         except FleetmapError as error:
             return Response(str(error), 404, media_type="text/plain")
 
@@ -76,6 +70,8 @@ def _install_pictures(rooms: Rooms, store: MapStore) -> None:
             return Response(str(error), 404, media_type="text/plain")
 
 
-def _picture(data: bytes, media_type: str, kept: str) -> Response:
+def _picture(data: bytes, media_type: str, cache_control: str) -> Response:
     # Robots send the bytes: a browser must not take them for anything but a picture.
-    return Response(data, media_type=media_type, headers={"Cache-Control": kept, "X-Content-Type-Options": "nosniff"})
+    return Response(
+        data, media_type=media_type, headers={"Cache-Control": cache_control, "X-Content-Type-Options": "nosniff"}
+    )

@@ -1,4 +1,4 @@
-"""What all pages have in common: the head with its links, the look, and errors in words instead of a broken page."""
+"""The common layout of all pages: navigation, light or dark look, and errors as sentences instead of a broken page."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
@@ -13,10 +13,12 @@ from nicegui import ui
 
 from fleetmap.errors import FleetmapError, UsageError
 from mapserver.api.writers import Writers
+from mapserver.dashboard import drawing
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
 from mapserver.dashboard.markup import address, joined, link
+from mapserver.dashboard.plan import Plan
 
 T = TypeVar("T")
 
@@ -31,8 +33,8 @@ _SWITCH_LOOK = (
 
 
 @dataclass(frozen=True, slots=True)
-class Rooms:
-    """What pages work with: maps and surveys, the fleet's health, the robots now, and who may change something."""
+class Services:
+    """Services of the pages: maps and surveys, fleet health, the robots now, and permission to change something."""
 
     maps: MapData
     health: HealthData
@@ -41,8 +43,8 @@ class Rooms:
 
 
 @dataclass(frozen=True, slots=True)
-class Where:
-    """Which page of which site is looked at; root: what the addresses of all pages begin with."""
+class PageContext:
+    """The page and the site that are shown; root: prefix of all addresses."""
 
     root: str
     page: str
@@ -52,6 +54,10 @@ class Where:
         """The address of a page of the same site."""
         return address(f"{self.root}/{path}", site=self.site, **query)
 
+    def plan_picture(self, version: int) -> str:
+        """The address of the picture of a version's plan."""
+        return f"{self.root}/plans/{self.site}/{version}.png"
+
 
 def html(content: Markup | str, *, classes: str = "") -> ui.html:
     """Markup on the page. It is not sanitized: `Markup` is made by escaping everything that comes from elsewhere."""
@@ -60,28 +66,35 @@ def html(content: Markup | str, *, classes: str = "") -> ui.html:
 
 
 async def load(function: Callable[..., T], *arguments: object) -> T:
-    """What a function of the data gives, without holding up the other pages and the robots' messages."""
+    """Result of a blocking function, computed on another thread."""
     return await asyncio.to_thread(function, *arguments)
 
 
 async def show(
-    rooms: Rooms, request: Request, page: str, site: str | None, build: Callable[[Where], Awaitable[None]]
+    services: Services, request: Request, page: str, site: str | None, build: Callable[[PageContext], Awaitable[None]]
 ) -> None:
-    """The frame of a page and what `build` puts into it; a FleetmapError is told in its place."""
+    """The layout of a page with the content of `build`; a FleetmapError becomes a notice in its place."""
     root = str(request.scope.get("root_path", ""))
     _set_look(request)
     try:
-        sites = await load(rooms.maps.sites)
-        where = Where(root, page, await load(rooms.maps.chosen_site, site))
+        sites = await load(services.maps.sites)
+        context = PageContext(root, page, await load(services.maps.chosen_site, site))
     except FleetmapError as error:
         _head(root, page, None, [])
         html(notice("bad", str(error)))
         return
-    _head(root, page, where.site, sites)
+    _head(root, page, context.site, sites)
     try:
-        await build(where)
+        await build(context)
     except FleetmapError as error:
         html(notice("bad", str(error)))
+
+
+def show_map(context: PageContext, plan: Plan, version: int, layer: Markup) -> ui.html:
+    """A version's map with a layer over it; returns the layer, whose content may change."""
+    with ui.element("div"), ui.element("div").classes("planbox"):
+        html(drawing.site_map(plan, f"Map of {context.site}, version {version}", context.plan_picture(version)))
+        return html(layer, classes="over")
 
 
 def notice(tone: str, words: object) -> Markup:
@@ -90,7 +103,7 @@ def notice(tone: str, words: object) -> Markup:
 
 
 def number(text: str | None, name: str) -> int | None:
-    """The number of a question in the address; raises UsageError for another text."""
+    """A number of the query string, None if it is empty; UsageError for other text."""
     if text is None or text == "":
         return None
     if not text.isascii() or not text.isdecimal() or len(text) > 12:
@@ -104,7 +117,7 @@ def _style() -> str:
 
 
 def _set_look(request: Request) -> None:
-    """As the person chose with the button, else as their machine has it."""
+    """The look that was chosen with the button, else that of the browser."""
     ui.add_head_html(_style())
     look = request.cookies.get(_LOOK_COOKIE)
     if look in {"dark", "light"}:
@@ -133,6 +146,6 @@ def _head(root: str, page: str, site: str | None, sites: list[str]) -> None:
     )
 
 
-def back_link(where: Where, path: str, words: str) -> Markup:
+def back_link(context: PageContext, path: str, words: str) -> Markup:
     """A link to the page above."""
-    return Markup("<p>{}</p>").format(link(where.to(path), words))
+    return Markup("<p>{}</p>").format(link(context.to(path), words))

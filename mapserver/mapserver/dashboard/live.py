@@ -1,4 +1,4 @@
-"""The robots now, put together once for all pages that are open. Pure but for the clock that it is given."""
+"""Current state of the robots, computed once for all open pages. Pure but for the clock that it is given."""
 
 import threading
 from collections.abc import Callable
@@ -8,10 +8,10 @@ from fleetmap.messages import Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
 
 SILENT_S = 10.0  # robots report every second
-_GONE_S = 3.0
-_KEPT_S = 0.9
+_LEFT_S = 3.0
+_CACHED_S = 0.9
 
-# What a status means to people, and its tone. Robots may send others, which are shown as they are.
+# Words and tone of a status. Robots may send others, which are shown as they are.
 STATUSES: dict[str, tuple[str, str]] = {
     Status.TRACKING: ("localised", "good"),
     Status.DEGRADED: ("unsure", "warn"),
@@ -59,34 +59,34 @@ _ORDER = {"bad": 0, "warn": 1, "quiet": 2, "good": 3}
 
 
 class LiveRobots:
-    """Looks at the fleet at most about every second, however many pages ask."""
+    """Reads the fleet at most about once a second, for any number of pages."""
 
     def __init__(self, fleet: Fleet, clock_s: Callable[[], float]) -> None:
         self._fleet = fleet
         self._clock_s = clock_s
         self._lock = threading.Lock()
-        self._kept: dict[str, tuple[float, LiveSite]] = {}
+        self._cached: dict[str, tuple[float, LiveSite]] = {}
 
     def look(self, site: str) -> LiveSite:
         """The site's robots as of now."""
         with self._lock:
-            known = self._kept.get(site)
-            if known is not None and self._clock_s() - known[0] < _KEPT_S:
-                return known[1]
+            cached = self._cached.get(site)
+            if cached is not None and self._clock_s() - cached[0] < _CACHED_S:
+                return cached[1]
             robots = [live_robot(status) for status in self._fleet.robots(site)]
             robots.sort(key=lambda robot: (_ORDER.get(robot.tone, 1), robot.name))
             found = LiveSite(tuple(robots))
-            self._kept[site] = (self._clock_s(), found)
+            self._cached[site] = (self._clock_s(), found)
         return found
 
 
 def live_robot(status: RobotStatus) -> LiveRobot:
-    """What a page shows of a robot."""
+    """A robot as a page shows it."""
     estimate, health = status.last_pose or {}, status.last_health or {}
-    said = health.get("status") or estimate.get("status")
-    words, tone = STATUSES.get(str(said), (str(said).lower(), "warn")) if said else ("not started", "quiet")
-    # A robot that takes its token back says goodbye; one that never shows a token is believed by its messages.
-    if status.seconds_since > (SILENT_S if status.is_present is not False else _GONE_S):
+    sent = health.get("status") or estimate.get("status")
+    words, tone = STATUSES.get(str(sent), (str(sent).lower(), "warn")) if sent else ("not started", "quiet")
+    # A robot that withdraws its liveliness token has left; one without a token is judged by its messages.
+    if status.seconds_since > (SILENT_S if status.is_present is not False else _LEFT_S):
         words, tone = SILENT
     place = estimate.get("position_map_m")
     is_somewhere = place is not None and None not in place

@@ -1,4 +1,4 @@
-"""Pieces of HTML. Everything that comes from elsewhere goes through `escape`: robots choose their words themselves. Pure."""
+"""Pieces of HTML. All text from outside is escaped, because robots choose their words themselves. Pure."""
 
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
@@ -10,7 +10,7 @@ NOTHING = Markup('<span class="quiet">–</span>')
 
 
 def joined(parts: Iterable[object], between: str = "") -> Markup:
-    """All parts one after the other, each escaped unless it is markup."""
+    """All parts in order, each escaped unless it is markup."""
     return Markup(between).join(escape(part) for part in parts)
 
 
@@ -20,7 +20,7 @@ def cell(value: object) -> Markup:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]], *, empty: str, name: str) -> Markup:
-    """A table with a head; the sentence `empty` where there are no rows. name: what screen readers call it."""
+    """A table with a head; the sentence `empty` where there are no rows. name: for screen readers."""
     body = [joined([Markup("<td>{}</td>").format(cell(value)) for value in row]) for row in rows]
     if not body:
         return Markup('<p class="quiet">{}</p>').format(empty)
@@ -33,14 +33,14 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]], *, empty: str, 
 
 
 def facts(pairs: Iterable[tuple[str, object]]) -> Markup:
-    """Names and values under each other."""
+    """Names and values as a list."""
     return Markup('<dl class="facts">{}</dl>').format(
         joined(Markup("<dt>{}</dt><dd>{}</dd>").format(name, cell(value)) for name, value in pairs)
     )
 
 
 def badge(tone: str, words: object) -> Markup:
-    """A short state. tone: good, warn, bad or quiet; the words alone say it too."""
+    """A short state. tone: good, warn, bad or quiet."""
     return Markup('<span class="badge {}">{}</span>').format(tone, words)
 
 
@@ -50,15 +50,15 @@ def link(address: str, words: object) -> Markup:
 
 
 def address(path: str, **query: object) -> str:
-    """`path` with the questions that are not None."""
-    asked = {name: value for name, value in query.items() if value is not None and value != ""}
-    return f"{path}?{urlencode(asked)}" if asked else path
+    """`path` with the query parameters that are not empty."""
+    given = {name: value for name, value in query.items() if value is not None and value != ""}
+    return f"{path}?{urlencode(given)}" if given else path
 
 
 def choices(
     name: str, label: str, values: Sequence[str], chosen: str | None, *, any_word: str | None = "any"
 ) -> Markup:
-    """A labelled list to choose from; any_word names the choice of none of them."""
+    """A labelled list to choose from; any_word: label of the empty choice."""
     options = [(value, value) for value in values]
     if any_word is not None:
         options.insert(0, ("", any_word))
@@ -74,12 +74,12 @@ def choices(
 
 
 def moment(stamp_ns: int | None) -> str | None:
-    """A stamp of the server's clock as people read it, in UTC."""
+    """A stamp of the server's clock as UTC text."""
     return None if stamp_ns is None else f"{datetime.fromtimestamp(stamp_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def size(number: int | None) -> str | None:
-    """Bytes as people read them."""
+    """Bytes with a unit."""
     if number is None:
         return None
     value = float(number)

@@ -1,4 +1,4 @@
-"""The plan of a version: its landmarks and places from above as one picture, and its tiles. Pure."""
+"""The floor plan of a version: its landmarks and places from above as a picture, and its tiles. Pure."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from mapserver.quality.figures import TileDirections
 
 _LONG_SIDE_PX = 1600
 _FINEST_M = 0.04  # metres per pixel: below, single landmarks are dots far apart
-_BEYOND_M = 12.0  # what is shown around where robots were; landmarks of far walls would shrink everything else
+_BEYOND_M = 12.0  # margin around the robots' path; landmarks of far walls would shrink everything else
 _LANDMARK_BGR, _PLACE_BGR = (140, 128, 118), (235, 120, 50)  # middle tones, to be seen on white and on black
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """low, high: corners in `map`, metres. png: transparent where nothing is. places: keyframes that robots may recognise.
+    """low, high: corners in `map`, metres. png: transparent where nothing is. places: number of places.
 
-    directions: which way the places of each tile look.
+    directions: viewing directions of each tile's places.
     """
 
     low_m: tuple[float, float]

@@ -1,6 +1,7 @@
-"""What a shift leader's page shows, read from the store."""
+"""Figures of the shift leader's page, read from the store."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
@@ -27,18 +28,22 @@ class FleetSummary:
     causes: list[tuple[str, Kpis]]
     by_hour: list[tuple[int, Kpis]]
     failures: list[FailureRow]
-    canary: tuple[CanaryRow, CanaryFinding] | None
+    trials: list[tuple[CanaryRow, CanaryFinding]]
     resurvey: ResurveyList
 
 
-def summarise(
-    store: MapStore, site: str, hours: int, now_ns: int, canary: CanarySettings, resurvey: ResurveySettings
-) -> FleetSummary:
+class SummarySettings(NamedTuple):
+    """Settings by which trials and tiles are judged."""
+
+    canary: CanarySettings = CanarySettings()
+    resurvey: ResurveySettings = ResurveySettings()
+
+
+def summarise(store: MapStore, site: str, hours: int, now_ns: int, settings: SummarySettings) -> FleetSummary:
     """The last `hours` of a site beside as many before; raises UsageError for an unknown site."""
     current = store.current(site)
     until = hour_of(now_ns) + 1
     since = until - hours
-    tried = store.canaries(site)
     wanted = FailureFilter(site=site, since_ns=since * HOUR_NS)
     return FleetSummary(
         site=site,
@@ -52,8 +57,8 @@ def summarise(
         causes=_table(store, site, "cause", since),
         by_hour=[(hour, kpis(counts)) for hour, counts in store.fleet.hours(site, "site", since_hour=since).items()],
         failures=store.fleet.failures(wanted, limit=_SHOWN_FAILURES),
-        canary=(tried[0], find(store, tried[0], canary, now_ns)) if tried else None,
-        resurvey=resurvey_list(store, site, resurvey, now_ns),
+        trials=[(row, find(store, row, settings.canary, now_ns)) for row in store.canaries(site)[:1]],
+        resurvey=resurvey_list(store, site, settings.resurvey, now_ns),
     )
 
 

@@ -59,7 +59,7 @@ def test_what_may_change_is_asked_for_every_time(client: TestClient, path: str, 
 
 
 def test_memory_is_bounded(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mapserver.dashboard.compression_cache._MOST_BYTES", len(gzip.compress(TEXT.encode())) // 2)
+    monkeypatch.setattr("mapserver.dashboard.compression_cache._MAX_BYTES", len(gzip.compress(TEXT.encode())) // 2)
     for _ in range(2):
         client.get("/_nicegui/3/static/quasar.js")
     assert asked["/_nicegui/3/static/quasar.js"] == 2

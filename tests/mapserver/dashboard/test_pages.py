@@ -267,7 +267,7 @@ def change(page: Page, words: str, *, name: str = "ada", token: str | None = Non
     page.get_by_role("button", name=words, exact=True).click()
     dialog = page.locator(".q-dialog")
     dialog.get_by_label("Your name").fill(name)
-    dialog.get_by_label("Why").fill("robots lose themselves in aisle 3")
+    dialog.get_by_label("Reason").fill("robots lose themselves in aisle 3")
     if token is not None:
         dialog.get_by_label("token").fill(token)
     dialog.get_by_role("button", name=f"Yes: {words}").click()
@@ -298,21 +298,21 @@ def test_publish_promote_and_roll_back_ask_first(page: Page, tmp_path: Path) -> 
 
         opened(page, served, "map")
         change(page, "Roll back to version 1", token=TOKEN)
-        expect(page.locator(".nicegui-content")).to_contain_text("Robots are to use version 1.")
+        expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 1.")
         assert current(served) == 1
         history = page.get_by_role("region", name="History")
         expect(history).to_contain_text("robots lose themselves in aisle 3")
         change(page, "Promote version 2", token=TOKEN)
-        expect(page.locator(".nicegui-content")).to_contain_text("Robots are to use version 2.")
+        expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 2.")
         change(page, "Publish draft 3", token=TOKEN)
-        expect(page.locator(".nicegui-content")).to_contain_text("Robots are to use version 3.")
+        expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 3.")
         assert current(served) == 3
         assert seen.faults == []
 
         # Somebody else acts: the page follows.
         with MapStore.open(served.folder) as store:
             releases.roll_back(store, SITE)
-        expect(page.locator(".nicegui-content")).to_contain_text("Robots are to use version 2.", timeout=10_000)
+        expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 2.", timeout=10_000)
 
 
 def test_without_a_token_only_the_machine_itself_changes_something(page: Page, served: Served) -> None:
@@ -335,6 +335,6 @@ def test_a_version_taken_back_by_the_server_is_told_with_its_reason(page: Page, 
         opened(page, served, "")
         expect(page.locator(".notice")).to_contain_text("Version 1 is tried by 5.0 % of the robots")
         releases.end_canary(store, canary, promote=False, outcome="it fails more often than the margin allows")
-    expect(page.locator(".notice")).to_contain_text("taken back", timeout=10_000)
+    expect(page.locator(".notice")).to_contain_text("rolled back", timeout=10_000)
     expect(page.locator(".notice")).to_contain_text("it fails more often than the margin allows")
     assert seen.faults == []

@@ -17,8 +17,8 @@ from mapserver.dashboard import drawing
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData, trend_words
 from mapserver.dashboard.live import LiveRobots, live_robot
-from mapserver.dashboard.map_page import one_way
 from mapserver.dashboard.markup import address, age, choices, facts, link, size, table
+from mapserver.dashboard.pages.map_page import one_way
 from mapserver.dashboard.plan import make_plan
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.canary_test import CanarySettings
@@ -91,7 +91,7 @@ def test_the_map_page_names_the_way_that_nobody_drove(store: MapStore) -> None:
         assert f"<td>{found.tile[0]},{found.tile[1]}</td><td>E</td><td>W</td>" in made
     both = replace(plan, directions=tuple(msgspec.structs.replace(found, missing={}) for found in plan.directions))
     assert "<td>" not in one_way(both)
-    assert "seen from both sides" in one_way(both)
+    assert "surveyed in both directions" in one_way(both)
 
 
 def test_a_plan_without_tiles_and_one_without_places(store: MapStore) -> None:
@@ -122,7 +122,7 @@ def test_changes_of_tiles_and_sites(store: MapStore) -> None:
     assert set(data.changed_tiles(SITE, 3, 1).values()) == {"removed", "changed"}
     assert data.history(SITE).before == 1
     before = data.history(SITE).fingerprint
-    with pytest.raises(StateError, match="load the page again"):
+    with pytest.raises(StateError, match="reload the page"):
         data.roll_back(SITE, 2, Actor("ada"))
     data.roll_back(SITE, 1, Actor("ada"))
     assert data.history(SITE).fingerprint != before

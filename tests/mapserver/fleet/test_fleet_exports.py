@@ -16,11 +16,10 @@ from typer.testing import CliRunner
 from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
 from mapserver import releases
 from mapserver.cli import app
+from mapserver.dashboard.pages.shift_page import html_page
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet.shift_page import html_page
-from mapserver.fleet.shift_summary import summarise
-from mapserver.fleet_statistics.canary_test import CanarySettings
-from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+from mapserver.fleet.shift_summary import SummarySettings, summarise
+from mapserver.fleet_statistics.rate_format import driven_words
 from mapserver.store import FailureFilter, MapStore
 from support.fleet.made_fleet import NS, Known, MadeRobot, drive
 from support.storage.map_samples import save_sample_draft
@@ -88,7 +87,7 @@ def test_the_page_stands_alone_and_shows_the_count(folder: tuple[Path, Known]) -
 
     path, known = folder
     with MapStore.open(path) as store:
-        summary = summarise(store, "hall", 24, time.time_ns(), CanarySettings(), ResurveySettings())
+        summary = summarise(store, "hall", 24, time.time_ns(), SummarySettings())
         page = html_page(summary)
     assert summary.total.failures.events == known.failures["site", ""] > 0
     tags = _Tags()
@@ -97,16 +96,16 @@ def test_the_page_stands_alone_and_shows_the_count(folder: tuple[Path, Known]) -
     assert not {"script", "link", "img", "b "} & tags.tags
     assert "http" not in page and "url(" not in page
     assert "&lt;b&gt;dark &amp; dusty" in page and "<b>dark" not in page
-    assert f"{known.failures['site', '']} in all" in page
-    assert "Version 2 is tried by 30% of the robots" in page
+    assert f"{known.failures['site', '']} in {driven_words(summary.total.failures.robot_days)}" in page
+    assert "Version 2 is tried by 30.0 % of the robots" in page
     assert "prefers-color-scheme: dark" in page
 
 
 def test_an_idle_site_has_a_page_too(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         save_sample_draft(store)
-        page = html_page(summarise(store, "lab", 24, 10**18, CanarySettings(), ResurveySettings()))
-    assert "not known" in page and "None was reported" in page
+        page = html_page(summarise(store, "lab", 24, 10**18, SummarySettings()))
+    assert "not known" in page and "No failures were reported" in page
 
 
 def test_commands(folder: tuple[Path, Known], tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The map page: versions, coverage, what is known of a version, what changed between two, promote and roll back."""
+"""The map page: versions, coverage, quality, differences between two versions, promote and roll back."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -8,18 +8,18 @@ from markupsafe import Markup
 from nicegui import ui
 
 from mapserver.dashboard import drawing
-from mapserver.dashboard.confirm import change_button
 from mapserver.dashboard.data import MapData, SiteHistory, VersionQuality
-from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, Rooms, Where, html, load, number, show
+from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, number, show
 from mapserver.dashboard.markup import badge, choices, facts, joined, link, moment, share, size, table
+from mapserver.dashboard.pages.confirm import change_button
 from mapserver.dashboard.plan import Plan
 from mapserver.quality.directions import missing_words
 from mapserver.releases import Difference
 from mapserver.store import CanaryRow, VersionInfo
 
-_LOOK_AGAIN_S = 5.0
+_REFRESH_S = 5.0
 _STATE_TONES = {"current": "good", "draft": "warn", "published": "quiet", "retired": "quiet"}
-# Figures of a build in the words of the people who look at them.
+# Figures of a build's report with their labels.
 _FIGURES = {
     "path_m": ("Driven", "{:.1f} m"),
     "duration_s": ("Recorded", "{:.0f} s"),
@@ -30,7 +30,7 @@ _FIGURES = {
 }
 
 
-def install(rooms: Rooms) -> None:
+def install(services: Services) -> None:
     """Adds the page."""
 
     @ui.page("/map", title="Map – fleetmap", response_timeout=RESPONSE_TIMEOUT_S)
@@ -41,22 +41,22 @@ def install(rooms: Rooms) -> None:
         before: str | None = None,
         after: str | None = None,
     ) -> None:
-        async def build(where: Where) -> None:
-            history = await load(rooms.maps.history, where.site)
-            html(Markup("<h1>Map of {}</h1>").format(where.site))
-            _changes(rooms, where, history)
-            html(_versions(where, history.versions, number(version, "version") or _usual(history)))
-            shown = number(version, "version") or _usual(history)
+        async def build(context: PageContext) -> None:
+            history = await load(services.maps.history, context.site)
+            html(Markup("<h1>Map of {}</h1>").format(context.site))
+            _changes(services, context, history)
+            shown = number(version, "version") or _default_version(history)
+            html(_versions(context, history.versions, shown))
             if shown is not None:
-                await _one_version(rooms.maps, where, shown)
-            await _difference(rooms.maps, where, history, number(before, "version"), number(after, "version"))
+                await _one_version(services.maps, context, shown)
+            await _difference(services.maps, context, history, number(before, "version"), number(after, "version"))
             html(_events(history))
-            _follow(rooms, where, history)
+            _follow(services, context, history)
 
-        await show(rooms, request, "map", site, build)
+        await show(services, request, "map", site, build)
 
 
-def _usual(history: SiteHistory) -> int | None:
+def _default_version(history: SiteHistory) -> int | None:
     """The version to show where none is named: the current one, else the newest."""
     if history.site.current_version is not None:
         return history.site.current_version
@@ -68,74 +68,74 @@ def _trial_words(history: SiteHistory) -> str:
     return "" if trial is None else f" Version {trial.version} is tried by {share(trial.share)} of them."
 
 
-def _changes(rooms: Rooms, where: Where, history: SiteHistory) -> None:
-    """What a person may do to the versions."""
+def _changes(services: Services, context: PageContext, history: SiteHistory) -> None:
+    """Buttons that change the versions."""
     current = history.site.current_version
     html(
         Markup("<p>{}</p>").format(
             "No version is published yet."
             if current is None
-            else f"Robots are to use version {current}." + _trial_words(history)
+            else f"Robots should use version {current}." + _trial_words(history)
         )
     )
     with ui.row().classes("actions"):
         if history.trial is not None:
-            _stop_button(rooms, where, history.trial)
+            _stop_button(services, context, history.trial)
         elif (before := history.before) is not None:
             change_button(
-                rooms,
+                services,
                 f"Roll back to version {history.before}",
-                f"All robots of {where.site} go from version {current} back to version {history.before}. Version {current} "
+                f"All robots of {context.site} go from version {current} back to version {history.before}. Version {current} "
                 "is retired; it can be made current again later.",
-                lambda actor: rooms.maps.roll_back(where.site, before, actor),
+                lambda actor: services.maps.roll_back(context.site, before, actor),
             )
         for info in history.versions:
             if info.state != "current":
-                _version_buttons(rooms, where, history, info)
+                _version_buttons(services, context, history, info)
 
 
-def _stop_button(rooms: Rooms, where: Where, trial: CanaryRow) -> None:
+def _stop_button(services: Services, context: PageContext, trial: CanaryRow) -> None:
     change_button(
-        rooms,
+        services,
         f"Stop trying version {trial.version}",
-        f"The robots that try version {trial.version} go back to version {trial.base_version}. Version {trial.version} is retired; "
+        f"Robots with version {trial.version} go back to version {trial.base_version}. Version {trial.version} is retired; "
         "it can be made current again later.",
-        lambda actor: rooms.maps.stop_trial(where.site, trial, actor),
+        lambda actor: services.maps.stop_trial(context.site, trial, actor),
     )
 
 
-def _version_buttons(rooms: Rooms, where: Where, history: SiteHistory, info: VersionInfo) -> None:
+def _version_buttons(services: Services, context: PageContext, history: SiteHistory, info: VersionInfo) -> None:
     """Buttons that give a version to all robots, or to some of them first."""
-    version, current, share_words = info.version, history.site.current_version, f"{rooms.maps.trial_share:.0%}"
+    version, current, share_words = info.version, history.site.current_version, f"{services.maps.trial_share:.0%}"
     through_gate = f"Draft {version} goes through the gate. If the gate accepts it, " if info.state == "draft" else ""
     if info.state == "draft":
         change_button(
-            rooms,
+            services,
             f"Publish draft {version}",
-            f"{through_gate}all robots of {where.site} get it.",
-            lambda actor: rooms.maps.publish(where.site, version, actor),
+            f"{through_gate}all robots of {context.site} get it.",
+            lambda actor: services.maps.publish(context.site, version, actor),
         )
     elif version != history.before or history.trial is not None:
         change_button(
-            rooms,
+            services,
             f"Promote version {version}",
-            f"All robots of {where.site} go from version {current} to version {version}.",
-            lambda actor: rooms.maps.promote(where.site, version, actor),
+            f"All robots of {context.site} go from version {current} to version {version}.",
+            lambda actor: services.maps.promote(context.site, version, actor),
         )
     if current is not None and history.trial is None and version > current:
         change_button(
-            rooms,
+            services,
             f"Try version {version} on {share_words} of the robots",
-            f"{through_gate}{share_words} of the robots get version {version}. Where they fail more often than the others, it is taken "
-            "back without anybody doing anything; where they do not, all get it.",
-            lambda actor: rooms.maps.start_trial(where.site, version, actor),
+            f"{through_gate}{share_words} of the robots get version {version}. If they fail more often than the others, it is rolled back "
+            "automatically; otherwise all robots get it.",
+            lambda actor: services.maps.start_trial(context.site, version, actor),
         )
 
 
-def _versions(where: Where, versions: list[VersionInfo], shown: int | None) -> Markup:
+def _versions(context: PageContext, versions: list[VersionInfo], shown: int | None) -> Markup:
     rows = [
         (
-            link(where.to("map", version=info.version), f"Version {info.version}"),
+            link(context.to("map", version=info.version), f"Version {info.version}"),
             joined([badge(_STATE_TONES[info.state], info.state), " (shown below)" if info.version == shown else ""]),
             info.parent,
             info.created.replace("T", " ").replace("Z", " UTC"),
@@ -148,21 +148,18 @@ def _versions(where: Where, versions: list[VersionInfo], shown: int | None) -> M
     ]
     head = ("Version", "State", "Built on", "Built", "Published", "Tiles", "Landmarks", "Size")
     return Markup("<h2>Versions</h2>{}").format(
-        table(head, rows, empty="No version yet; `mapserver build` makes one of a recording.", name="Versions")
+        table(head, rows, empty="No version yet; `mapserver build` makes one from a recording.", name="Versions")
     )
 
 
-async def _one_version(maps: MapData, where: Where, version: int) -> None:
-    quality = await load(maps.quality, where.site, version)
-    plan = await load(maps.plan, where.site, version)
-    picture = drawing.svg(
-        plan,
-        f"Tiles, landmarks and places of version {version}",
-        [drawing.coverage(plan), drawing.ground(plan, picture_address(where, version)), drawing.scale_bar(plan)],
-    )
+async def _one_version(maps: MapData, context: PageContext, version: int) -> None:
+    quality = await load(maps.quality, context.site, version)
+    plan = await load(maps.plan, context.site, version)
+    name, address = f"Tiles, landmarks and places of version {version}", context.plan_picture(version)
+    picture = drawing.site_map(plan, name, address, below=drawing.coverage(plan))
     left = Markup(
-        '<div><h2>Coverage of version {}</h2><div class="planbox">{}</div><p class="quiet">Grey: landmarks. Blue dots: places where '
-        "robots can find themselves. Squares: tiles, the fuller the stronger.</p></div>"
+        '<div><h2>Coverage of version {}</h2><div class="planbox">{}</div><p class="quiet">Grey: landmarks. Blue dots: places that robots '
+        "recognise. Squares: tiles, darker with more landmarks.</p></div>"
     ).format(version, picture)
     right = Markup("<div><h2>Quality of version {}</h2>{}{}</div>").format(
         version, _quality_facts(quality, plan), _verdicts(quality)
@@ -172,20 +169,17 @@ async def _one_version(maps: MapData, where: Where, version: int) -> None:
 
 
 def one_way(plan: Plan) -> Markup:
-    """The tiles where robots that come from the other side will not find themselves."""
+    """Tiles in which robots coming from the other side will not localize."""
     rows = [
         (f"{found.tile[0]},{found.tile[1]}", ", ".join(found.seen), ", ".join(found.missing), missing_words(found))
         for found in plan.directions
         if found.missing
     ]
-    head = ("Tile", "Seen facing", "Missing", "In detail")
-    empty = "Every place was seen from both sides."
-    return Markup("<h2>Seen one way only</h2>{}").format(table(head, rows, empty=empty, name="Seen one way only"))
-
-
-def picture_address(where: Where, version: int) -> str:
-    """Where a browser gets the picture of a version's plan."""
-    return f"{where.root}/plans/{where.site}/{version}.png"
+    head = ("Tile", "Surveyed facing", "Missing", "Details")
+    empty = "Every place was surveyed in both directions."
+    return Markup("<h2>Surveyed in one direction only</h2>{}").format(
+        table(head, rows, empty=empty, name="Surveyed in one direction only")
+    )
 
 
 def _quality_facts(quality: VersionQuality, plan: Plan) -> Markup:
@@ -204,11 +198,11 @@ def _quality_facts(quality: VersionQuality, plan: Plan) -> Markup:
     ]
     loops = report.get("loops")
     if isinstance(loops, dict):
-        pairs.append(("Loops", f"{loops.get('accepted', 0)} accepted of {loops.get('candidates', 0)} looked at"))
+        pairs.append(("Loops", f"{loops.get('accepted', 0)} accepted of {loops.get('candidates', 0)} candidates"))
     pairs.append(
         ("Recordings", ", ".join(f"{entry.name} ({entry.frames} frames)" for entry in quality.manifest.recordings))
     )
-    pairs += [(f"Doctor: {name}", "; ".join(words) or "nothing wrong") for name, words in _findings(report)]
+    pairs += [(f"Doctor: {name}", "; ".join(words) or "no findings") for name, words in _findings(report)]
     return facts(pairs)
 
 
@@ -218,9 +212,9 @@ def _findings(report: dict[str, Any]) -> Iterable[tuple[str, list[str]]]:
 
 
 def _verdicts(quality: VersionQuality) -> Markup:
-    """What the gate said, the last word first."""
+    """Verdicts of the gate, latest first."""
     if not quality.verdicts:
-        return Markup('<p class="quiet">The gate has not judged this version yet; publishing asks it.</p>')
+        return Markup('<p class="quiet">The gate has not judged this version yet; publishing it will.</p>')
     parts = []
     for verdict in reversed(quality.verdicts):
         tone, words = ("good", "accepted") if verdict.accepted else ("bad", "refused")
@@ -233,7 +227,7 @@ def _verdicts(quality: VersionQuality) -> Markup:
                 moment(verdict.stamp_ns),
                 badge(tone, words),
                 reasons,
-                Markup('<p class="quiet">Could not be judged: {}.</p>').format(", ".join(missing).replace("_", " "))
+                Markup('<p class="quiet">Not judged: {}.</p>').format(", ".join(missing).replace("_", " "))
                 if missing
                 else "",
             )
@@ -241,39 +235,38 @@ def _verdicts(quality: VersionQuality) -> Markup:
     return joined(parts)
 
 
-async def _difference(maps: MapData, where: Where, history: SiteHistory, before: int | None, after: int | None) -> None:
-    """A choice of two versions, and what changed between them."""
+async def _difference(
+    maps: MapData, context: PageContext, history: SiteHistory, before: int | None, after: int | None
+) -> None:
+    """Two versions to choose, and the differences between them."""
     numbers = [str(info.version) for info in history.versions]
     if len(numbers) < 2:
         return
     if after is None:
-        after = _usual(history) or int(numbers[0])
+        after = _default_version(history) or int(numbers[0])
     if before is None:
         earlier = [int(text) for text in numbers if int(text) < after]
         before = earlier[0] if earlier else int(numbers[0])
-    asked = Markup(
-        '<h2 id="changes">What changed between two versions</h2><form class="ask" method="get" action="{}#changes">'
+    form = Markup(
+        '<h2 id="changes">Differences between two versions</h2><form class="ask" method="get" action="{}#changes">'
         '<input type="hidden" name="site" value="{}">{}{}<button type="submit">Compare</button></form>'
     ).format(
-        f"{where.root}/map",
-        where.site,
+        f"{context.root}/map",
+        context.site,
         choices("before", "From version", numbers, str(before), any_word=None),
         choices("after", "To version", numbers, str(after), any_word=None),
     )
-    html(asked)
-    found = await load(maps.difference, where.site, before, after)
-    kinds = await load(maps.changed_tiles, where.site, before, after)
-    plan = await load(maps.plan, where.site, after)
-    picture = drawing.svg(
-        plan,
-        f"Tiles that changed from version {before} to {after}",
-        [drawing.ground(plan, picture_address(where, after)), drawing.cells(plan, kinds), drawing.scale_bar(plan)],
-    )
+    html(form)
+    found = await load(maps.difference, context.site, before, after)
+    kinds = await load(maps.changed_tiles, context.site, before, after)
+    plan = await load(maps.plan, context.site, after)
+    name, address = f"Tiles that changed from version {before} to {after}", context.plan_picture(after)
+    picture = drawing.site_map(plan, name, address, drawing.cells(plan, kinds))
     html(
         Markup(
             '<div class="pair"><div><div class="planbox">{}</div><p class="quiet">Tiles <span class="good">added</span> '
-            '(whole line), <span class="warn">changed</span> (dashes), '
-            '<span class="bad">removed</span> (dots).</p></div><div>{}</div></div>'
+            '(solid line), <span class="warn">changed</span> (dashed), '
+            '<span class="bad">removed</span> (dotted).</p></div><div>{}</div></div>'
         ).format(picture, _difference_facts(found))
     )
 
@@ -281,16 +274,17 @@ async def _difference(maps: MapData, where: Where, history: SiteHistory, before:
 def _difference_facts(found: Difference) -> Markup:
     moved = "none"
     if found.landmarks_moved and found.moved_median_m is not None and found.moved_max_m is not None:
-        moved = (
-            f"{found.landmarks_moved}, by {found.moved_median_m:.3f} m in the middle, {found.moved_max_m:.3f} m at most"
-        )
-    tiles = f"{found.tiles_added} added, {found.tiles_changed} changed, {found.tiles_removed} removed, {found.tiles_kept} the same"
+        moved = f"{found.landmarks_moved}, by {found.moved_median_m:.3f} m (median), at most {found.moved_max_m:.3f} m"
+    tiles = f"{found.tiles_added} added, {found.tiles_changed} changed, {found.tiles_removed} removed, {found.tiles_kept} unchanged"
     pairs: list[tuple[str, object]] = [
         ("Tiles", tiles),
-        ("Landmarks", f"{found.landmarks_added} new, {found.landmarks_removed} gone, {found.landmarks_kept} the same"),
+        (
+            "Landmarks",
+            f"{found.landmarks_added} new, {found.landmarks_removed} removed, {found.landmarks_kept} unchanged",
+        ),
         ("Landmarks that moved", moved),
         ("A robot downloads", f"{size(found.fetch_bytes)} of {size(found.full_bytes)}"),
-        ("Vocabulary", "another one" if found.vocabulary_changed else "the same"),
+        ("Vocabulary", "changed" if found.vocabulary_changed else "unchanged"),
     ]
     for name, (words, pattern) in _FIGURES.items():
         both = found.quality.get(name)
@@ -299,27 +293,25 @@ def _difference_facts(found: Difference) -> Markup:
             pairs.append((words, f"{texts[0]} before, {texts[1]} after"))
     if found.landmarks_kept + found.landmarks_moved + found.landmarks_removed:
         before = found.landmarks_kept + found.landmarks_moved + found.landmarks_removed
-        pairs.append(
-            ("Of the landmarks before", f"{share((before - found.landmarks_removed) / before)} are still there")
-        )
+        pairs.append(("Landmarks kept", share((before - found.landmarks_removed) / before)))
     return facts(pairs)
 
 
 def _events(history: SiteHistory) -> Markup:
     rows = [
-        (moment(event.stamp_ns), event.kind.replace("_", " "), event.detail, event.actor or "the program", event.reason)
+        (moment(event.stamp_ns), event.kind.replace("_", " "), event.detail, event.actor or "mapserver", event.reason)
         for event in history.events
     ]
     return Markup("<h2>History</h2>{}").format(
-        table(("When", "What", "In detail", "Who", "Why"), rows, empty="Nothing happened yet.", name="History")
+        table(("When", "What", "Details", "Who", "Why"), rows, empty="No events yet.", name="History")
     )
 
 
-def _follow(rooms: Rooms, where: Where, history: SiteHistory) -> None:
-    """Loads the page anew when somebody or the server itself changed versions, unless a dialog is open."""
+def _follow(services: Services, context: PageContext, history: SiteHistory) -> None:
+    """Reloads the page after a change of versions, unless a dialog is open."""
 
-    async def look() -> None:
-        if (await load(rooms.maps.history, where.site)).fingerprint != history.fingerprint:
+    async def refresh() -> None:
+        if (await load(services.maps.history, context.site)).fingerprint != history.fingerprint:
             ui.run_javascript("if (!document.querySelector('.q-dialog')) location.reload()")
 
-    ui.timer(_LOOK_AGAIN_S, look, immediate=False)
+    ui.timer(_REFRESH_S, refresh, immediate=False)

@@ -1,0 +1,101 @@
+"""Parts of the fleet page and of the shift leader's page: figures, trials, failure rates, tiles to survey again."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+from markupsafe import Markup
+
+from mapserver.dashboard import drawing
+from mapserver.dashboard.drawing import Bar
+from mapserver.dashboard.markup import badge, joined, link, moment, share, table
+from mapserver.fleet_statistics.kpis import Rate
+from mapserver.fleet_statistics.rate_format import driven_words, figure, is_telling, rate_words
+from mapserver.fleet_statistics.resurvey_test import TileConcern
+from mapserver.store import CanaryRow
+
+_TRIAL_WORDS = {
+    "running": ("warn", "is tried by {share} of the robots since {when}"),
+    "promoted": ("good", "was tried by {share} of the robots and promoted at {when}"),
+    "rolled_back": ("bad", "was tried by {share} of the robots and rolled back at {when}"),
+    "stopped": ("warn", "was tried by {share} of the robots until the trial was stopped at {when}"),
+}
+
+
+class Figure(NamedTuple):
+    """A large value with a remark below. tone: as of a badge, or empty."""
+
+    name: str
+    value: object
+    remark: str
+    tone: str = ""
+
+
+class Trial(NamedTuple):
+    """A version that some robots try, or tried in the last days, and what is known about it so far."""
+
+    canary: CanaryRow
+    finding: str
+
+
+def figures(found: Iterable[Figure]) -> Markup:
+    """Figures side by side."""
+    box = Markup('<div><div class="name">{}</div><div class="value {}">{}</div><div class="more">{}</div></div>')
+    return Markup('<div class="figures">{}</div>').format(
+        joined(box.format(figure.name, figure.tone, figure.value, figure.remark) for figure in found)
+    )
+
+
+def rate_figure(name: str, found: Rate, more: str) -> Figure:
+    """A rate with its interval; a dash where too little was driven."""
+    if found.low is None:
+        return Figure(name, "–", f"nothing was driven{more}")
+    counted = f"{found.events} in {driven_words(found.robot_days)}"
+    if not is_telling(found):
+        return Figure(name, "–", f"{counted}: too little for a rate{more}")
+    interval = f"{figure(found.low)} to {figure(found.high)} with 95 %"
+    return Figure(name, figure(found.per_robot_day), f"{counted}: {interval}{more}")
+
+
+def trial_notices(trials: Iterable[Trial]) -> Markup:
+    """The running trial of a version, and how those before it ended."""
+    notice = Markup('<div class="notice {}" role="status"><strong>Version {} {}.</strong><br>{}</div>')
+    parts = []
+    for canary, finding in trials:
+        tone, sentence = _TRIAL_WORDS[canary.state]
+        when = moment(canary.started_ns if canary.ended_ns is None else canary.ended_ns)
+        words = sentence.format(share=share(canary.share), when=when)
+        parts.append(notice.format(tone, canary.version, words, finding))
+    return joined(parts)
+
+
+def rate_bar(label: str, found: Rate) -> Bar:
+    """A bar of failures per robot-day; none where too little was driven."""
+    words = f"{found.events} in {driven_words(found.robot_days)}: {rate_words(found)} per robot-day"
+    if not is_telling(found):
+        return Bar(label, None, None, None, words)
+    return Bar(label, found.per_robot_day, found.low, found.high, words)
+
+
+def rates(found: list[Bar], remark: str) -> Markup:
+    """Failure rates side by side."""
+    return Markup(
+        '<h2>Failures per robot-day</h2>{}<p class="quiet">A robot-day is 16 hours of driving. The thin line is the 95 % interval of '
+        "the true rate; periods with little driving have no bar. {}</p>"
+    ).format(drawing.bars(found, "Failures per robot-day"), remark)
+
+
+def resurvey(concerns: Sequence[TileConcern], tile_address: Callable[[str], str] | None = None) -> Markup:
+    """Tiles to survey again, with links to their failures where the page has any."""
+    if not concerns:
+        return Markup("<h2>Survey again</h2><p>{} No tile stands out.</p>").format(badge("good", "nothing"))
+    rows = [
+        (
+            concern.tile if tile_address is None else link(tile_address(concern.tile), f"Tile {concern.tile}"),
+            "; ".join(concern.reasons),
+            rate_words(concern.failures),
+            rate_words(concern.failures_before),
+        )
+        for concern in concerns
+    ]
+    head = ("Tile", "Why", "Recent failures per robot-day", "Before")
+    return Markup("<h2>Survey again</h2>{}").format(table(head, rows, empty="", name="Tiles to survey again"))

@@ -1,0 +1,267 @@
+"""The failure pages: the list by robot, version, tile and cause, and one failure with its whole report."""
+
+from fastapi import Request
+from markupsafe import Markup
+from nicegui import ui
+
+from fleetmap.errors import FleetmapError
+from fleetmap.messages import FailureKind, FailureReport
+from mapserver.dashboard import drawing
+from mapserver.dashboard.drawing import Mark
+from mapserver.dashboard.fleet_health import FAILURES_SHOWN, FilterChoices
+from mapserver.dashboard.layout import (
+    RESPONSE_TIMEOUT_S,
+    PageContext,
+    Services,
+    back_link,
+    html,
+    load,
+    notice,
+    number,
+    show,
+    show_map,
+)
+from mapserver.dashboard.live import STATUSES
+from mapserver.dashboard.markup import badge, choices, facts, joined, link, moment, table
+from mapserver.dashboard.plan import Plan
+from mapserver.store import FailureDetail, FailureFilter, FailureRow
+
+_REFRESH_S = 3.0
+_PICTURES = {
+    "frame": "Left camera image",
+    "matches": "Matches: the image and the landmarks expected in it",
+}
+
+
+def install(services: Services) -> None:
+    """Adds the pages."""
+
+    @ui.page("/failures", title="Failures – fleetmap", response_timeout=RESPONSE_TIMEOUT_S)
+    async def failures_page(request: Request, site: str | None = None) -> None:
+        async def build(context: PageContext) -> None:
+            query = request.query_params
+            wanted = FailureFilter(
+                site=context.site,
+                robot=query.get("robot") or None,
+                version=number(query.get("version"), "version"),
+                tile=query.get("tile") or None,
+                cause=query.get("cause") or None,
+            )
+            html(Markup("<h1>Failures of {}</h1>").format(context.site))
+            html(_filters(context, wanted, await load(services.health.choices, context.site)))
+            await _list(services, context, wanted, number(query.get("before"), "failure"))
+
+        await show(services, request, "failures", site, build)
+
+    @ui.page("/failures/{failure}", title="Failure – fleetmap", response_timeout=RESPONSE_TIMEOUT_S)
+    async def failure_page(request: Request, failure: str, site: str | None = None) -> None:
+        found = await load(_site_of, services, failure, site)
+
+        async def build(context: PageContext) -> None:
+            detail = await load(services.health.failure, number(failure, "failure") or 0)
+            html(back_link(context, "failures", "All failures"))
+            html(Markup("<h1>Failure {} of {}</h1>").format(detail.failure.number, detail.failure.robot))
+            html(
+                Markup('<div class="pair">{}{}</div>').format(
+                    _summary(context, detail), await _position(services, context, detail)
+                )
+            )
+            html(_pictures(context, detail))
+            html(_fixes(detail.report))
+
+        await show(services, request, "failures", found, build)
+
+
+def _site_of(services: Services, failure: str, site: str | None) -> str | None:
+    """The site of a failure, for the navigation; the named one if there is no such failure."""
+    try:
+        return services.health.failure(number(failure, "failure") or 0).failure.site
+    except FleetmapError:
+        return site
+
+
+def _filters(context: PageContext, wanted: FailureFilter, known: FilterChoices) -> Markup:
+    return Markup(
+        '<form class="ask" method="get" action="{}"><input type="hidden" name="site" value="{}">{}{}{}{}'
+        '<button type="submit">Show</button> <a href="{}">Show all</a></form>'
+    ).format(
+        f"{context.root}/failures",
+        context.site,
+        choices("robot", "Robot", known.robots, wanted.robot),
+        choices("version", "Map version", known.versions, None if wanted.version is None else str(wanted.version)),
+        choices("tile", "Tile", known.tiles, wanted.tile),
+        choices("cause", "Cause", known.causes, wanted.cause),
+        context.to("failures"),
+    )
+
+
+async def _list(services: Services, context: PageContext, wanted: FailureFilter, before: int | None) -> None:
+    """The map and the table; the newest page is refreshed when failures arrive."""
+    shown = await load(services.health.failures, wanted, before)
+    version = wanted.version or await load(services.maps.current_version, context.site)
+    plan = None if version is None else await load(services.maps.plan, context.site, version)
+    layer = None
+    if plan is not None and version is not None:
+        layer = show_map(context, plan, version, _layer(context, plan, shown))
+    listed = html(_rows(context, wanted, shown))
+
+    async def refresh() -> None:
+        nonlocal shown
+        found = await load(services.health.failures, wanted, None)
+        if found != shown:
+            shown = found
+            listed.set_content(str(_rows(context, wanted, found)))
+            if layer is not None and plan is not None:
+                layer.set_content(str(_layer(context, plan, found)))
+
+    if before is None:
+        ui.timer(_REFRESH_S, refresh, immediate=False)
+
+
+def _layer(context: PageContext, plan: Plan, shown: list[FailureRow]) -> Markup:
+    """Crosses at the failures that have a position."""
+    found = []
+    for row in reversed(shown):
+        if row.x_map_m is not None and row.y_map_m is not None:
+            words, to_failure = f"failure {row.number}: {row.robot}, {row.cause}", context.to(f"failures/{row.number}")
+            found.append(Mark(row.x_map_m, row.y_map_m, _tone(row), "cross", words, to_failure))
+    return drawing.svg(plan, "Failures on the map", [drawing.marks(plan, found)])
+
+
+def _tone(row: FailureRow) -> str:
+    return "warn" if row.kind == FailureKind.SUSPECTED else "bad"
+
+
+def _kind(row: FailureRow) -> Markup:
+    return badge(_tone(row), "suspected" if row.kind == FailureKind.SUSPECTED else row.kind)
+
+
+def _rows(context: PageContext, wanted: FailureFilter, found: list[FailureRow]) -> Markup:
+    shown = found[:FAILURES_SHOWN]
+    rows = [
+        (
+            link(context.to(f"failures/{row.number}"), f"Failure {row.number}"),
+            moment(row.happened_ns),
+            row.robot,
+            row.cause.replace("_", " "),
+            _kind(row),
+            row.version,
+            row.tile,
+            f"{row.duration_s:.0f} s",
+        )
+        for row in shown
+    ]
+    head = ("Failure", "When", "Robot", "Cause", "Kind", "Map version", "Tile", "Duration")
+    listed = table(head, rows, empty="No failures match these filters.", name="Failures")
+    if len(found) <= FAILURES_SHOWN:
+        return listed
+    older = context.to(
+        "failures",
+        robot=wanted.robot,
+        version=wanted.version,
+        tile=wanted.tile,
+        cause=wanted.cause,
+        before=shown[-1].number,
+    )
+    return Markup("{}<p>{}</p>").format(listed, link(older, "Older failures"))
+
+
+def _summary(context: PageContext, detail: FailureDetail) -> Markup:
+    row, report = detail.failure, detail.report
+
+    def figure(value: float | None, unit: str = "") -> str | None:
+        return None if value is None else f"{value:.3g}{unit}"
+
+    suspected = row.kind == FailureKind.SUSPECTED
+    return Markup("<div><h2>What happened</h2>{}{}</div>").format(
+        notice(
+            "warn",
+            "The robot suspects a failure because its fixes contradict its position. Suspected failures are an estimate.",
+        )
+        if suspected
+        else "",
+        facts(
+            [
+                ("Began", moment(row.happened_ns)),
+                ("Duration when reported", f"{row.duration_s:.1f} s"),
+                ("Cause", row.cause.replace("_", " ")),
+                ("State of the robot", STATUSES.get(row.status, (row.status,))[0]),
+                ("Robot", link(context.to("failures", robot=row.robot), row.robot)),
+                (
+                    "Map version",
+                    None
+                    if row.version is None
+                    else link(context.to("failures", version=row.version), str(row.version)),
+                ),
+                ("Tile", None if row.tile is None else link(context.to("failures", tile=row.tile), row.tile)),
+                ("Position uncertainty (95 % radius)", figure(report.radius_95_m, " m")),
+                ("Last fix against prediction (squared Mahalanobis distance)", figure(report.innovation)),
+                ("Matches in the last fix", report.inliers),
+                ("Brightness of the image (0 to 1)", figure(report.exposure)),
+                ("Sharpness (1 is usual)", figure(report.sharpness)),
+                ("Received", moment(row.received_ns)),
+            ]
+        ),
+    )
+
+
+async def _position(services: Services, context: PageContext, detail: FailureDetail) -> Markup:
+    """The position on the map, and the fixes before the failure."""
+    row = detail.failure
+    version = row.version or await load(services.maps.current_version, context.site)
+    known = {info.version for info in (await load(services.maps.history, context.site)).versions}
+    if version is None or version not in known:
+        return notice("warn", "The map version is no longer in the store; the position cannot be shown.")
+    plan = await load(services.maps.plan, context.site, version)
+    found = [
+        Mark(fix.position_map_m[0], fix.position_map_m[1], "accent", "circle", f"fix, {fix.refused or 'used'}")
+        for fix in detail.report.fixes
+        if fix.position_map_m is not None
+    ]
+    if row.x_map_m is not None and row.y_map_m is not None:
+        found.append(Mark(row.x_map_m, row.y_map_m, _tone(row), "cross", "last estimate"))
+    address, marks = context.plan_picture(version), drawing.marks(plan, found)
+    picture = drawing.site_map(plan, f"Position of failure {row.number}", address, marks)
+    return Markup(
+        '<div><h2>Position</h2><div class="planbox">{}</div><p class="quiet">Cross: the last estimate. Dots: fixes before it. Map '
+        "version {}.</p></div>"
+    ).format(picture, version)
+
+
+def _pictures(context: PageContext, detail: FailureDetail) -> Markup:
+    if not detail.pictures:
+        return Markup(
+            '<h2>Pictures</h2><p class="quiet">None: the robot sent none, or they were deleted to save space.</p>'
+        )
+    shown = joined(
+        Markup(
+            '<figure><img src="{}" alt="{}" loading="lazy"><figcaption>{}, {:.1f} s {} the beginning</figcaption></figure>'
+        ).format(
+            f"{context.root}/pictures/{detail.failure.number}/{picture.place}.jpg",
+            _PICTURES.get(picture.kind, picture.kind),
+            _PICTURES.get(picture.kind, picture.kind),
+            abs(picture.stamp_ns - detail.report.stamp_ns) * 1e-9,
+            "after" if picture.stamp_ns >= detail.report.stamp_ns else "before",
+        )
+        for picture in detail.pictures
+    )
+    return Markup('<h2>Pictures</h2><div class="pictures">{}</div>').format(shown)
+
+
+def _fixes(report: FailureReport) -> Markup:
+    rows = [
+        (
+            f"{(fix.stamp_ns - report.stamp_ns) * 1e-9:+.1f} s",
+            STATUSES.get(fix.status, (fix.status,))[0],
+            fix.inliers,
+            None if fix.innovation is None else f"{fix.innovation:.3g}",
+            None if fix.position_map_m is None else f"{fix.position_map_m[0]:.2f}, {fix.position_map_m[1]:.2f} m",
+            fix.refused or "used" if fix.position_map_m is not None else fix.refused,
+        )
+        for fix in report.fixes
+    ]
+    head = ("When", "State", "Matches", "Against prediction", "Position (x, y)", "Result")
+    empty = "The report contains no fixes."
+    return Markup("<h2>Fixes before the failure</h2>{}").format(
+        table(head, rows, empty=empty, name="Fixes before the failure")
+    )

@@ -1,0 +1,170 @@
+"""The fleet page: the robots now, on the map and one by one, and their failure rates."""
+
+from typing import Any
+
+from fastapi import Request
+from markupsafe import Markup
+from nicegui import ui
+
+from mapserver.dashboard import drawing, fleet_parts
+from mapserver.dashboard.drawing import Mark
+from mapserver.dashboard.fleet_health import SiteHealth
+from mapserver.dashboard.fleet_parts import Figure
+from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, show, show_map
+from mapserver.dashboard.live import LiveRobot, LiveSite
+from mapserver.dashboard.markup import age, joined, share
+from mapserver.dashboard.plan import Plan
+from mapserver.fleet_statistics.rate_format import driven_words
+
+_MOVE_EVERY_S, _TABLE_EVERY_S = 1.0, 2.0
+_SHAPES = {"good": "circle", "warn": "triangle", "bad": "square", "quiet": "circle"}
+_TONE_WORDS = {"good": "localised", "warn": "unsure or starting", "bad": "lost", "quiet": "silent, last position"}
+_COLUMNS = {
+    "robot": "Robot",
+    "state": "State",
+    "version": "Map version",
+    "rate": "Failures in 24 h",
+    "localised": "Localised",
+    "since": "Last heard",
+    "remarks": "Remarks",
+}
+
+
+def install(services: Services) -> None:
+    """Adds the page."""
+
+    @ui.page("/", title="Fleet – fleetmap", response_timeout=RESPONSE_TIMEOUT_S)
+    async def fleet_page(request: Request, site: str | None = None) -> None:
+        async def build(context: PageContext) -> None:
+            live = await load(services.robots.look, context.site)
+            health = await load(services.health.site, context.site)
+            html(Markup("<h1>Robots of {}</h1>").format(context.site))
+            trials = html(fleet_parts.trial_notices(health.trials))
+            figures = html(_figures(live, health))
+            over = await _plan(services, context, live)
+            html(_legend())
+            chart = html(_rates(health))
+            robots = _table(context, live, health)
+            html(fleet_parts.resurvey(health.resurvey, lambda tile: context.to("failures", tile=tile)))
+
+            async def move() -> None:
+                live = await load(services.robots.look, context.site)
+                health = await load(services.health.site, context.site)
+                figures.set_content(str(_figures(live, health)))
+                trials.set_content(str(fleet_parts.trial_notices(health.trials)))
+                if over is not None:
+                    plan, layer = over
+                    layer.set_content(str(_robots(plan, context, live)))
+
+            async def refresh_table() -> None:
+                live = await load(services.robots.look, context.site)
+                health = await load(services.health.site, context.site)
+                rows = _rows(context, live, health)
+                if rows != robots.rows:
+                    robots.rows = rows
+                chart.set_content(str(_rates(health)))
+
+            ui.timer(_MOVE_EVERY_S, move, immediate=False)
+            ui.timer(_TABLE_EVERY_S, refresh_table, immediate=False)
+
+        await show(services, request, "", site, build)
+
+
+def _figures(live: LiveSite, health: SiteHealth) -> Markup:
+    heard = len(live.robots) - live.count("quiet")
+    lost = live.count("bad")
+    day = health.day
+    return fleet_parts.figures(
+        [
+            Figure("Robots heard now", f"{heard} of {len(live.robots)}", "reported within 10 s"),
+            Figure("Localised now", live.count("good"), f"{live.count('warn')} unsure or starting", "good"),
+            Figure("Lost now", lost, "position unknown", "bad" if lost else ""),
+            fleet_parts.rate_figure("Failures per robot-day, last 24 h", day.failures, f"; {health.trend}"),
+            fleet_parts.rate_figure("Silent failures per robot-day, an estimate", day.silent_estimated, ""),
+            Figure("Time with a usable position", share(day.availability) or "–", "of the last 24 h"),
+        ]
+    )
+
+
+async def _plan(services: Services, context: PageContext, live: LiveSite) -> tuple[Plan, ui.html] | None:
+    """The site map and the layer of the robots upon it, which moves; None without a version."""
+    version = await load(services.maps.current_version, context.site)
+    if version is None:
+        html(Markup('<p class="notice">No map is published yet: robots cannot be shown on it.</p>'))
+        return None
+    plan = await load(services.maps.plan, context.site, version)
+    return plan, show_map(context, plan, version, _robots(plan, context, live))
+
+
+def _robots(plan: Plan, context: PageContext, live: LiveSite) -> Markup:
+    found = []
+    for robot in reversed(live.robots):
+        if robot.place_m is not None:
+            shape, words = _SHAPES.get(robot.tone, "circle"), f"{robot.name}: {robot.words}"
+            to_failures = context.to("failures", robot=robot.name)
+            found.append(Mark(*robot.place_m, robot.tone, shape, words, to_failures))
+    return drawing.svg(plan, "Robots on the map", [drawing.marks(plan, found)])
+
+
+def _legend() -> Markup:
+    entry = Markup('<span><svg viewBox="-1.5 -1.5 3 3" aria-hidden="true"><g class="mark {}">{}</g></svg>{}</span>')
+    return Markup('<div class="legend">{}</div>').format(
+        joined(entry.format(tone, Markup(drawing.SHAPES[_SHAPES[tone]]), words) for tone, words in _TONE_WORDS.items())
+    )
+
+
+def _rates(health: SiteHealth) -> Markup:
+    """Failures per robot-day of the last days."""
+    last = len(health.days) - 1
+    bars = [fleet_parts.rate_bar("24 h" if n == last else f"-{last - n} d", day) for n, day in enumerate(health.days)]
+    day = health.day.failures
+    remark = f"A bar for each 24 hours. Last 24 hours: {day.events} in {driven_words(day.robot_days)}, {health.trend}."
+    return fleet_parts.rates(bars, remark)
+
+
+def _table(context: PageContext, live: LiveSite, health: SiteHealth) -> ui.table:
+    html(Markup("<h2>Robots, problems first</h2>"))
+    columns = [
+        {"name": name, "label": label, "field": name, "sortable": True, "align": "left"}
+        for name, label in _COLUMNS.items()
+    ]
+    with ui.element("div"):
+        look_for = ui.input("Find a robot, state or version").props("outlined dense clearable").style("width:320px")
+    shown = ui.table(columns=columns, rows=_rows(context, live, health), row_key="robot", pagination=25)
+    shown.props('flat wrap-cells color=ink :rows-per-page-options="[25, 100, 0]"')
+    look_for.bind_value_to(shown, "filter")
+    shown.add_slot(
+        "body-cell-state",
+        '<q-td :props="props"><span :class="\'badge \' + props.row.tone">{{ props.value }}</span></q-td>',
+    )
+    shown.add_slot("body-cell-robot", '<q-td :props="props"><a :href="props.row.to">{{ props.value }}</a></q-td>')
+    return shown
+
+
+def _rows(context: PageContext, live: LiveSite, health: SiteHealth) -> list[dict[str, Any]]:
+    return [_row(context, robot, health) for robot in live.robots]
+
+
+def _row(context: PageContext, robot: LiveRobot, health: SiteHealth) -> dict[str, Any]:
+    own = health.robots.get(robot.name)
+    version = "none" if robot.version is None else str(robot.version)
+    if robot.is_behind and robot.wanted_version is not None:
+        version += f", should be {robot.wanted_version}"
+    remarks = [*robot.flags]
+    if robot.is_canary:
+        remarks.append("tries a new version")
+    if robot.refused:
+        remarks.append(f"refuses: {robot.refused}")
+    if robot.clock_ahead_s is not None and abs(robot.clock_ahead_s) >= 1:
+        remarks.append(f"clock wrong by {robot.clock_ahead_s:+.0f} s")
+    return {
+        "robot": robot.name,
+        "state": robot.words,
+        "tone": robot.tone,
+        "version": version,
+        "rate": 0 if own is None else own.failures.events,
+        "localised": "–" if own is None else share(own.localised_share) or "–",
+        "since": "now" if robot.seconds_since < 3 else f"{age(robot.seconds_since)} ago",
+        "remarks": ", ".join(remarks),
+        "to": context.to("failures", robot=robot.name),
+    }
