@@ -73,10 +73,10 @@ def _run(path: Path, options: dict[str, Any], config: Any) -> None:
     from fleetmap.recordings import FrameSelection, OpenOptions, open_recording
     from fleetmap.recordings.tum import write_tum
     from locclient.maps.connection import connected
-    from locclient.replay.prior_option import parse_prior
+    from locclient.prior_option import parse_prior
     from locclient.replay.replay import ReplayOptions
     from locclient.replay.replay import replay as play
-    from locclient.replay.replay_sources import ReplaySource
+    from locclient.sensors.replay_source import ReplaySource
 
     prior = parse_prior(options["prior"], "--prior")
     calibration = None if options["calibration"] is None else Path(options["calibration"])

@@ -14,7 +14,6 @@ from fleetmap.mapformat import check_name
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
 from locclient.config import LocclientConfig
-from locclient.daemon.jit_warmup import gc_frozen, warm_up_kernels
 from locclient.daemon.outbox import Outbox
 from locclient.daemon.publishers import Publisher, open_publisher
 from locclient.daemon.run_settings import RunSection
@@ -25,7 +24,8 @@ from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
-from locclient.replay.prior_option import parse_prior
+from locclient.prior_option import parse_prior
+from locclient.robot.jit_warmup import gc_frozen, warm_up_kernels
 from locclient.robot.robot import Robot
 from locclient.sensors.intake import Intake
 from locclient.sensors.source import open_source

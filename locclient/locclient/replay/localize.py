@@ -13,8 +13,8 @@ from locclient.maps.connection import connected
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
 from locclient.replay.replay import ReplayOptions, load_map, replay
-from locclient.replay.replay_sources import ReplaySource
 from locclient.replay.run_result import ReplayResult
+from locclient.sensors.replay_source import ReplaySource
 
 _ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws|unixsock-stream)/")
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import FrameSelection, Recording
 from fleetmap.sensors.samples import SensorSet
-from locclient.replay.replay_sources import ReplaySource
 from locclient.sensors.intake import Intake
+from locclient.sensors.replay_source import ReplaySource
 
 _ROOM_WAIT_S = 0.1
 

@@ -17,8 +17,8 @@ from fleetmap.recordings import FrameSelection, open_recording
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import connected
 from locclient.replay.replay import ReplayOptions, replay
-from locclient.replay.replay_sources import ReplaySource
 from locclient.replay.run_result import ReplayResult
+from locclient.sensors.replay_source import ReplaySource
 
 SITE = "hall"
 LIBRARIES = ("numpy", "numba", "opencv-python-headless")

@@ -27,7 +27,7 @@ from fleetmap.recordings import FrameSelection, open_recording
 from locclient.maps.connection import MapConnection
 from locclient.maps.map_source import FetchedTiles, ReadyVersion
 from locclient.replay.replay import ReplayOptions, replay
-from locclient.replay.replay_sources import ReplaySource
+from locclient.sensors.replay_source import ReplaySource
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
 from mapserver.survey.settings import BudgetSettings

@@ -34,8 +34,8 @@ from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
-from locclient.replay.replay_sources import ReplaySource
 from locclient.replay.run_result import ReplayResult
+from locclient.sensors.replay_source import ReplaySource
 
 
 @dataclass(frozen=True, slots=True)

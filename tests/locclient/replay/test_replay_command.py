@@ -8,7 +8,7 @@ import pytest
 
 from fleetmap.errors import UsageError
 from locclient import cli
-from locclient.replay.prior_option import parse_prior
+from locclient.prior_option import parse_prior
 from mapserver import releases
 from mapserver.store import MapStore
 from support.recordings.recording_samples import make_sample, write_euroc

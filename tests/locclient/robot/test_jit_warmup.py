@@ -3,7 +3,7 @@
 import gc
 import weakref
 
-from locclient.daemon.jit_warmup import gc_frozen
+from locclient.robot.jit_warmup import gc_frozen
 
 
 class Ring:
