@@ -138,10 +138,8 @@ def _draw_map(axes: "Axes", plan: _Plan, loops: Loops) -> None:
     bar.set_label("seconds since the start", color=_QUIET)
     bar.ax.tick_params(colors=_QUIET, length=0)
     bar.ax.spines[:].set_visible(False)
-    axes.legend(
-        loc="lower left", bbox_to_anchor=(0, 1), ncols=6, frameon=False, fontsize=8, columnspacing=1.2,
-        handlelength=1.4, borderaxespad=0.2,
-    )  # fmt: skip
+    spacing = {"columnspacing": 1.2, "handlelength": 1.4, "borderaxespad": 0.2}
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=6, frameon=False, fontsize=8, **spacing)
 
 
 def _draw_loops(axes: "Axes", plan: _Plan, loops: Loops) -> None:

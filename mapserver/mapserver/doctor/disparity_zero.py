@@ -1,4 +1,4 @@
-"""Stereo against motion: do the depths of a pair of cameras explain how the picture moves when the robot does?
+"""Stereo against motion: whether the depths of a pair of cameras explain the motion of the picture.
 
 A right camera that is turned a little towards the left one, unlike its calibration, keeps its rows and adds the same to every
 disparity: nothing in a single pair tells, and every depth is wrong. Motion tells: points move by their true inverse depth.
@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from fleetmap.geometry import AnyArray, Array, so3_exp
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from mapserver.doctor.camera_rotation import followed
-from mapserver.doctor.findings import Finding, judge, not_judged
+from mapserver.doctor.findings import Finding, Limits, judge, not_judged
 
 _NAME = "stereo against motion"
 _MIN_POINTS, _MIN_PAIRS = 40, 5
@@ -76,11 +76,9 @@ def stereo_against_motion(zeros: Sequence[DisparityZero], camera: StereoCamera) 
     angle_deg = float(np.degrees(np.arctan2(offset_px, camera.focal_px)))
     sure_deg = float(np.degrees(np.arctan2(max(abs(offset_px) - 3.0 * spread_px, 0.0), camera.focal_px)))
     words = f"disparities are {offset_px:+.2f} px from what motion says: the cameras' angle is off by {angle_deg:+.2f} degrees"
-    return judge(
-        _NAME, sure_deg, 0.15, 0.4, "degrees for sure", words,
-        f"{words}, and with it every depth; calibrate the cameras again, or name the matching calibration with "
-        "--calibration FILE",
-    )  # fmt: skip
+    advice = "calibrate the cameras again, or name the matching calibration with --calibration FILE"
+    bad = f"{words}, and with it every depth; {advice}"
+    return judge(_NAME, sure_deg, Limits(0.15, 0.4, "degrees for sure"), words, bad)
 
 
 def _start(rays: Array, tracked: AnyArray, disparities: Array, camera: StereoCamera) -> Array | None:

@@ -1,8 +1,9 @@
-"""What a check says."""
+"""Findings of the checks, and their limits."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 
 class Verdict(StrEnum):
@@ -25,11 +26,20 @@ class Finding:
     sentence: str
 
 
-def judge(name: str, value: float, warn_above: float, fail_above: float, unit: str, good: str, bad: str) -> Finding:
+class Limits(NamedTuple):
+    """Above which values a check warns and fails, and their unit in words."""
+
+    warn_above: float
+    fail_above: float
+    unit: str
+
+
+def judge(name: str, value: float, limits: Limits, good: str, bad: str) -> Finding:
     """A finding about a value that should be small.
 
     `good` is its sentence when it is, `bad` (with the next step) when not.
     """
+    warn_above, fail_above, unit = limits
     verdict = Verdict.FAIL if value > fail_above else Verdict.WARN if value > warn_above else Verdict.OK
     limit = f"warn above {warn_above:g} {unit}, fail above {fail_above:g} {unit}".replace(" ,", ",").strip()
     return Finding(name, verdict, value, limit, good if verdict is Verdict.OK else bad)

@@ -6,7 +6,7 @@ import numpy as np
 
 from fleetmap.geometry import Array, rotation_angle_rad, rotation_between_vectors
 from fleetmap.sensors.samples import ImuSamples, Stamps
-from mapserver.doctor.findings import Finding, Verdict, judge, not_judged
+from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
 
 _MIN_PAIRS = 20
 _SEARCH_S, _STEP_S = 0.2, 0.002
@@ -138,7 +138,7 @@ def _peak(offsets_s: Array, scores: Array, index: int) -> float:
 def _offset_finding(fit: GyroFit, imu_minus_cam_s: float) -> Finding:
     words = f"the IMU's stamps are {fit.offset_s * 1e3:+.1f} ms from what the calibration says"
     advice = f"set timeshift_cam_imu to {imu_minus_cam_s + fit.offset_s:+.4f} s, or stamp both by one clock"
-    return judge(_NAMES[0], abs(fit.offset_s) * 1e3, 6.0, 25.0, "ms", words, f"{words}; {advice}")
+    return judge(_NAMES[0], abs(fit.offset_s) * 1e3, Limits(6.0, 25.0, "ms"), words, f"{words}; {advice}")
 
 
 def _scale_finding(fit: GyroFit) -> Finding:
@@ -160,15 +160,14 @@ def _axes_finding(fit: GyroFit) -> Finding:
         return Finding(_NAMES[2], Verdict.FAIL, None, limit, words)
     angle_deg = float(np.degrees(rotation_angle_rad(fit.body_from_gyro)))
     about = f"judged about {fit.axes_seen} of 3 axes"
+    words = f"the gyro's axes are {angle_deg:.1f} degrees from the calibration, {about}"
+    advice = "check body_from_cam (T_cam_imu) and how the IMU is mounted"
     return judge(
         _NAMES[2],
         angle_deg,
-        4.0,
-        15.0,
-        "degrees",
-        f"the gyro's axes are {angle_deg:.1f} degrees from the calibration, {about}",
-        f"the gyro's axes are {angle_deg:.1f} degrees from the calibration, {about} ({_in_axes(fit.body_from_gyro)}); "
-        "check body_from_cam (T_cam_imu) and how the IMU is mounted",
+        Limits(4.0, 15.0, "degrees"),
+        words,
+        f"{words} ({_in_axes(fit.body_from_gyro)}); {advice}",
     )
 
 

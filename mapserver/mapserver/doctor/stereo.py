@@ -11,7 +11,7 @@ import numpy as np
 
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame
-from mapserver.doctor.findings import Finding, judge, not_judged
+from mapserver.doctor.findings import Finding, Limits, judge, not_judged
 
 _MIN_MATCHES = 40
 _SEARCH_ROWS_PX = 25.0
@@ -69,9 +69,7 @@ def swapped_cameras(pairs: Sequence[StereoMatches]) -> Finding:
     return judge(
         name,
         wrong_share,
-        0.2,
-        0.5,
-        "of the matches with negative disparity",
+        Limits(0.2, 0.5, "of the matches with negative disparity"),
         "the left image is the left one",
         f"{wrong_share:.0%} of the matches have negative disparity; left and right are swapped, exchange the folders "
         f"or topics",
@@ -94,9 +92,7 @@ def epipolar_error(pairs: Sequence[StereoMatches], focal_px: float) -> Finding:
     return judge(
         name,
         median,
-        0.5,
-        1.2,
-        "px (median)",
+        Limits(0.5, 1.2, "px (median)"),
         words,
         f"{words}: {angles}; calibrate the cameras again, or check their time",
     )

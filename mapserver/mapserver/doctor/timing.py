@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fleetmap.sensors.samples import DataIssue, Stamps
-from mapserver.doctor.findings import Finding, Verdict, judge, not_judged
+from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
 
 SPARSE_S = 0.35  # frames further apart than this are keyframes, not a video
 _SLOWEST_CAMERA_HZ, _SLOWEST_IMU_HZ = 5.0, 90.0
@@ -85,9 +85,7 @@ def camera_imu_overlap(frame_stamps_ns: Stamps, imu_stamps_ns: Stamps, imu_minus
     return judge(
         "camera-imu overlap",
         outside_share,
-        0.01,
-        0.5,
-        "of the frames without IMU",
+        Limits(0.01, 0.5, "of the frames without IMU"),
         "the IMU ran while the camera did",
         f"{outside_share:.0%} of the frames have no IMU at their time, which starts {start_s:+.3f} s after them; "
         "stamp both sensors by one clock",
@@ -108,9 +106,7 @@ def _gaps(name: str, stamps_ns: Stamps, warn_s: float, fail_s: float, what: str)
     return judge(
         name,
         float(steps_s[longest]),
-        round(warn_s, 4),
-        max(fail_s, round(warn_s, 4)),
-        "s",
+        Limits(round(warn_s, 4), max(fail_s, round(warn_s, 4)), "s"),
         f"the longest step is {steps_s[longest]:.3f} s",
         f"{count} gaps without {what}, the longest {steps_s[longest]:.3f} s, {at_s:.1f} s after the start; "
         "look at the recorder's disk and the driver's queue",

@@ -57,10 +57,8 @@ def consistency(
     errors = np.array([_error(t, m) for t, m in zip(true.frame_from_body, mine.frame_from_body, strict=True)])
     both = _squared(errors, covs)
     rotation, position = _squared(errors[:, :3], covs[:, :3, :3]), _squared(errors[:, 3:], covs[:, 3:, 3:])
-    return Consistency(
-        float(position.mean() / 3), float(rotation.mean() / 3), float(both.mean() / 6), float((both < _BOUND).mean()),
-        float((position < _POSITION_BOUND).mean()), len(mine),
-    )  # fmt: skip
+    means = float(position.mean() / 3), float(rotation.mean() / 3), float(both.mean() / 6)
+    return Consistency(*means, float((both < _BOUND).mean()), float((position < _POSITION_BOUND).mean()), len(mine))
 
 
 def _error(true: Array, mine: Array) -> Array:

@@ -5,7 +5,7 @@ import numpy as np
 from fleetmap.recordings.covariances import StampedCovariances
 from fleetmap.sensors.samples import Trajectory
 from mapserver.evaluation.nees import at_first_stamp, consistency
-from mapserver.evaluation.trajectory_error import (  # fmt: skip
+from mapserver.evaluation.trajectory_error import (
     absolute_trajectory_error,
     best_clock_shift,
     drift,

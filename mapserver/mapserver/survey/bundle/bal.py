@@ -15,8 +15,8 @@ from mapserver.survey.bundle import bal_kernels
 from mapserver.survey.bundle.bal_kernels import CAMERA_UNKNOWNS
 from mapserver.survey.bundle.problem import BundleSettings
 from mapserver.survey.bundle.reduced_system import ReducedSystem, build_chains, solve_dense, solve_sparse
-from mapserver.survey.bundle.schur_kernels import count_row_blocks, invert_landmarks
-from mapserver.survey.bundle.sparsity import Structure
+from mapserver.survey.bundle.schur_kernels import invert_landmarks
+from mapserver.survey.bundle.sparsity import ObservationTable, Structure, block_pattern
 
 _LAMBDA_MIN, _LAMBDA_MAX = 1e-12, 1e12
 _FLOOR = 1e-12
@@ -30,6 +30,11 @@ class BalState:
     shifts_m: Array
     lenses: Array
     points_map: Array
+
+    @property
+    def arrays(self) -> tuple[Array, Array, Array, Array]:
+        """As the kernels take them."""
+        return self.rotations, self.shifts_m, self.lenses, self.points_map
 
 
 @dataclass(frozen=True)
@@ -70,10 +75,9 @@ def parse_bal(text: str) -> BalProblem:
     if (rows[:, :2] < 0).any() or rows[:, 0].max() >= cameras or rows[:, 1].max() >= points:
         raise SurveyError(f"BAL: an observation names a camera or point beyond {cameras} and {points}; fetch it again")
     rows = rows[np.argsort(rows[:, 1], kind="stable")]
-    start = BalState(
-        np.array([so3_exp(turn) for turn in placed[:, :3]]), placed[:, 3:6].copy(), placed[:, 6:].copy(),
-        numbers[len(numbers) - 3 * points :].reshape(-1, 3).copy(),
-    )  # fmt: skip
+    rotations = np.array([so3_exp(rotvec) for rotvec in placed[:, :3]])
+    points_map = numbers[len(numbers) - 3 * points :].reshape(-1, 3).copy()
+    start = BalState(rotations, placed[:, 3:6].copy(), placed[:, 6:].copy(), points_map)
     return BalProblem(start, rows[:, 0].astype(np.int32), rows[:, 1].astype(np.int32), rows[:, 2:].copy())
 
 
@@ -100,15 +104,7 @@ def optimize_bal(problem: BalProblem, settings: BundleSettings) -> BalResult:
 
 
 def _cost(problem: BalProblem, state: BalState) -> float:
-    return bal_kernels.evaluate(
-        state.rotations,
-        state.shifts_m,
-        state.lenses,
-        state.points_map,
-        problem.cameras,
-        problem.landmarks,
-        problem.pixels,
-    )
+    return bal_kernels.evaluate(*state.arrays, problem.cameras, problem.landmarks, problem.pixels)
 
 
 class _Normal:
@@ -121,10 +117,8 @@ class _Normal:
         self._camera_info = np.zeros((cameras, CAMERA_UNKNOWNS, CAMERA_UNKNOWNS))
         self._camera_rhs = np.zeros((cameras, CAMERA_UNKNOWNS))
         self._couplings = np.empty((len(problem.cameras), CAMERA_UNKNOWNS, 3))
-        bal_kernels.linearise(
-            state.rotations, state.shifts_m, state.lenses, state.points_map, problem.cameras, problem.landmarks,
-            problem.pixels, self._point_info, self._point_rhs, self._camera_info, self._camera_rhs, self._couplings,
-        )  # fmt: skip
+        normal = self._point_info, self._point_rhs, self._camera_info, self._camera_rhs, self._couplings
+        bal_kernels.linearise(*state.arrays, problem.cameras, problem.landmarks, problem.pixels, *normal)
 
     def step(
         self, structure: Structure, landmark_ptr: AnyArray, damping: float, settings: BundleSettings
@@ -136,20 +130,15 @@ class _Normal:
         diagonal = np.einsum("caa->ca", self._camera_info)
         inverse = np.zeros_like(self._point_info)
         invert_landmarks(self._point_info, damping, inverse)
-        bal_kernels.reduce_to_cameras(
-            problem.cameras, landmark_ptr, self._couplings, inverse, self._point_rhs, structure.row_ptr, structure.cols,
-            blocks, rhs,
-        )  # fmt: skip
+        landmarks, pattern = (self._couplings, inverse, self._point_rhs), (structure.row_ptr, structure.cols)
+        bal_kernels.reduce_to_cameras(problem.cameras, landmark_ptr, *landmarks, *pattern, blocks, rhs)
         chains = build_chains(np.zeros((0, 2), np.int64), len(rhs))
         system = ReducedSystem(structure, chains, blocks, np.zeros((0, 30, 30)), damping * diagonal + _FLOOR, rhs)
         moves = solve_dense(system) if rhs.size <= settings.dense_unknowns else solve_sparse(system)
         if moves is None:
             return None
-        moved = BalState(*(np.empty_like(a) for a in (state.rotations, state.shifts_m, state.lenses, state.points_map)))
-        bal_kernels.step(
-            state.rotations, state.shifts_m, state.lenses, state.points_map, problem.cameras, problem.landmarks,
-            self._couplings, inverse, self._point_rhs, moves, moved.rotations, moved.shifts_m, moved.lenses, moved.points_map,
-        )  # fmt: skip
+        moved = BalState(*(np.empty_like(a) for a in state.arrays))
+        bal_kernels.step(*state.arrays, problem.cameras, problem.landmarks, *landmarks, moves, *moved.arrays)
         return moved
 
 
@@ -160,24 +149,21 @@ def _structure(problem: BalProblem) -> tuple[Structure, AnyArray]:
     slots = np.arange(count, dtype=np.int32)
     slot_obs = np.argsort(cameras, kind="stable").astype(np.int32)
     slot_ptr = np.searchsorted(cameras[slot_obs], np.arange(count + 1))
-    row_ptr, cols, none = np.zeros(count + 1, np.int64), np.zeros(0, np.int32), np.zeros(0, np.int32)
-    shared = (
-        slot_ptr,
-        slot_obs,
-        problem.landmarks,
-        cameras,
-        landmark_ptr,
-        slots,
-        np.zeros(count + 1, np.int64),
-        none,
-        row_ptr,
-    )
-    count_row_blocks(*shared, cols)
-    cols = np.empty(int(row_ptr[-1]), np.int32)
-    count_row_blocks(*shared, cols)
-    free = np.ones((count, CAMERA_UNKNOWNS), np.bool_)
+    table = ObservationTable(slot_ptr, slot_obs, problem.landmarks, cameras, landmark_ptr, slots)
+    row_ptr, cols = block_pattern(table, np.zeros(count + 1, np.int64), np.zeros(0, np.int32))
     structure = Structure(
-        np.arange(len(cameras)), cameras, problem.landmarks, landmark_ptr, problem.pixels, np.ones((len(cameras), 2)), slots,
-        slots, slot_ptr, slot_obs, free, row_ptr, cols,
-    )  # fmt: skip
+        order=np.arange(len(cameras)),
+        keyframes=cameras,
+        landmarks=problem.landmarks,
+        landmark_ptr=landmark_ptr,
+        pixels=problem.pixels,
+        weights=np.ones((len(cameras), 2)),
+        slots=slots,
+        slot_keyframes=slots,
+        slot_ptr=slot_ptr,
+        slot_obs=slot_obs,
+        free=np.ones((count, CAMERA_UNKNOWNS), np.bool_),
+        row_ptr=row_ptr,
+        cols=cols,
+    )
     return structure, landmark_ptr

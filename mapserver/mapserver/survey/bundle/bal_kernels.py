@@ -14,8 +14,14 @@ CAMERA_UNKNOWNS = 9
 
 @kernel
 def evaluate(
-    rotations: Array, shifts: Array, lenses: Array, points_map: Array, cameras: AnyArray, landmarks: AnyArray, pixels: Array
-) -> float:  # fmt: skip
+    rotations: Array,
+    shifts: Array,
+    lenses: Array,
+    points_map: Array,
+    cameras: AnyArray,
+    landmarks: AnyArray,
+    pixels: Array,
+) -> float:
     """Half the sum of squared pixel errors. rotations (C, 3, 3), shifts (C, 3), lenses (C, 3): focal, k1, k2."""
     cost = 0.0
     for n in range(len(cameras)):
@@ -38,9 +44,19 @@ def evaluate(
 
 @kernel
 def linearise(
-    rotations: Array, shifts: Array, lenses: Array, points_map: Array, cameras: AnyArray, landmarks: AnyArray, pixels: Array,
-    point_info: Array, point_rhs: Array, camera_info: Array, camera_rhs: Array, couplings: Array,
-) -> None:  # fmt: skip
+    rotations: Array,
+    shifts: Array,
+    lenses: Array,
+    points_map: Array,
+    cameras: AnyArray,
+    landmarks: AnyArray,
+    pixels: Array,
+    point_info: Array,
+    point_rhs: Array,
+    camera_info: Array,
+    camera_rhs: Array,
+    couplings: Array,
+) -> None:
     """Normal equations; the right-hand sides point downhill.
 
     Adds to point_info (N, 6), point_rhs (N, 3), camera_info (C, 9, 9), camera_rhs (C, 9); fills couplings (M, 9, 3).
@@ -74,8 +90,15 @@ def linearise(
 
 @kernel
 def _derive(
-    rot: Array, shift: Array, lens: Array, point: Array, pixel: Array, by_camera: Array, by_point: Array, residual: Array
-) -> None:  # fmt: skip
+    rot: Array,
+    shift: Array,
+    lens: Array,
+    point: Array,
+    pixel: Array,
+    by_camera: Array,
+    by_point: Array,
+    residual: Array,
+) -> None:
     """Residual (2,) of one observation, and its derivatives by the camera (2, 9) and the point (2, 3)."""
     tx = rot[0, 0] * point[0] + rot[0, 1] * point[1] + rot[0, 2] * point[2]
     ty = rot[1, 0] * point[0] + rot[1, 1] * point[1] + rot[1, 2] * point[2]
@@ -105,9 +128,16 @@ def _derive(
 
 @kernel
 def reduce_to_cameras(
-    cameras: AnyArray, landmark_ptr: AnyArray, couplings: Array, inverse: Array, point_rhs: Array, row_ptr: AnyArray,
-    cols: AnyArray, blocks: Array, rhs: Array,
-) -> None:  # fmt: skip
+    cameras: AnyArray,
+    landmark_ptr: AnyArray,
+    couplings: Array,
+    inverse: Array,
+    point_rhs: Array,
+    row_ptr: AnyArray,
+    cols: AnyArray,
+    blocks: Array,
+    rhs: Array,
+) -> None:
     """Subtracts the landmarks' Schur complement from blocks (B, 9, 9) and rhs (C, 9); observations sorted by landmark."""
     part, v = np.empty((9, 3)), np.empty((3, 3))
     for landmark in range(len(point_rhs)):
@@ -143,10 +173,21 @@ def reduce_to_cameras(
 
 @kernel
 def step(
-    rotations: Array, shifts: Array, lenses: Array, points_map: Array, cameras: AnyArray, landmarks: AnyArray,
-    couplings: Array, inverse: Array, point_rhs: Array, camera_step: Array, moved_rotations: Array, moved_shifts: Array,
-    moved_lenses: Array, moved_points: Array,
-) -> None:  # fmt: skip
+    rotations: Array,
+    shifts: Array,
+    lenses: Array,
+    points_map: Array,
+    cameras: AnyArray,
+    landmarks: AnyArray,
+    couplings: Array,
+    inverse: Array,
+    point_rhs: Array,
+    camera_step: Array,
+    moved_rotations: Array,
+    moved_shifts: Array,
+    moved_lenses: Array,
+    moved_points: Array,
+) -> None:
     """The state moved by camera_step (C, 9) and what follows from it for the landmarks."""
     turn = np.empty((3, 3))
     for c in range(len(rotations)):

@@ -111,16 +111,17 @@ class _Bundle:
         self.solver = "none"
         self.spare = self.state.like()
 
-    def _cam_from_map(self, state: State) -> Array:
-        return np.ascontiguousarray(self.cam_from_body @ state.rotations.transpose(0, 2, 1))
+    def _views(self, state: State) -> tuple[Array, Array, Array, Array, Array]:
+        """Lens, rotations cam_from_map, positions, the body in the camera, points: as the kernels take a state."""
+        cam_from_map = np.ascontiguousarray(self.cam_from_body @ state.rotations.transpose(0, 2, 1))
+        return self.lens, cam_from_map, state.positions_m, self.body_in_cam_m, state.points_map
 
     def cost(self, state: State) -> float:
         """Half the robust sum of squares of everything."""
         s, settings = self.structure, self.settings
-        images = evaluate(
-            self.lens, self._cam_from_map(state), state.positions_m, self.body_in_cam_m, state.points_map, s.keyframes,
-            s.landmarks, s.pixels, s.weights, settings.huber_sigmas, settings.cutoff_sigmas, self.squared,
-        )  # fmt: skip
+        observed = s.keyframes, s.landmarks, s.pixels, s.weights
+        robust = settings.huber_sigmas, settings.cutoff_sigmas
+        images = evaluate(*self._views(state), *observed, *robust, self.squared)
         return images + self.terms.linearise(state).cost
 
     def first_bad(self) -> str:
@@ -140,11 +141,10 @@ class _Bundle:
         s, settings, state = self.structure, self.settings, self.state
         self.pose_info[:] = 0.0
         self.pose_rhs[:] = 0.0
-        linearise(
-            self.lens, self._cam_from_map(state), state.positions_m, self.body_in_cam_m, state.points_map, s.keyframes,
-            s.landmark_ptr, s.pixels, s.weights, settings.huber_sigmas, settings.cutoff_sigmas, s.slots,
-            self.obs_info, self.point_info, self.point_rhs, self.pose_info, self.pose_rhs,
-        )  # fmt: skip
+        observed = s.keyframes, s.landmark_ptr, s.pixels, s.weights
+        robust = settings.huber_sigmas, settings.cutoff_sigmas
+        normal = self.obs_info, self.point_info, self.point_rhs, self.pose_info, self.pose_rhs
+        linearise(*self._views(state), *observed, *robust, s.slots, *normal)
         self.normal = self.terms.linearise(state)
 
     def reduced(self, damping: float) -> ReducedSystem:
@@ -161,21 +161,28 @@ class _Bundle:
             damp[:, 6:] += normal.motion_diagonal[s.slot_keyframes]
         if not self.problem.points_held:  # else their inverses are zero, and so are their steps
             invert_landmarks(self.point_info, damping, self.inverse)
-            reduce_to_poses(
-                state.positions_m, state.points_map, s.keyframes, s.landmarks, s.landmark_ptr, s.slots, s.slot_keyframes,
-                s.slot_ptr, s.slot_obs, self.obs_info, self.inverse, self.point_rhs, s.row_ptr, s.cols, blocks, rhs,
-            )  # fmt: skip
+            observed = s.keyframes, s.landmarks, s.landmark_ptr, s.slots, s.slot_keyframes, s.slot_ptr, s.slot_obs
+            landmarks = self.obs_info, self.inverse, self.point_rhs
+            reduce_to_poses(state.positions_m, state.points_map, *observed, *landmarks, s.row_ptr, s.cols, blocks, rhs)
         rhs[~s.free] = 0.0
         return ReducedSystem(s, self.chains, blocks, normal.edge_blocks, damp, rhs)
 
     def _add_terms(self, blocks: Array, rhs: Array, diagonal: Array) -> None:
         s, normal = self.structure, self.normal
+
+        def add(k: int, block: Array, pull: Array) -> None:
+            slot = int(s.slots[k])
+            if slot >= 0:
+                blocks[s.row_ptr[slot + 1] - 1] += block
+                rhs[slot, :6] += pull
+                diagonal[slot, :6] += np.diag(block)
+
         for n, prior in enumerate(self.terms.priors):
-            _add_pose_block(s, prior.k, normal.prior_blocks[n], normal.prior_rhs[n], blocks, rhs, diagonal)
+            add(prior.k, normal.prior_blocks[n], normal.prior_rhs[n])
         for n, term in enumerate(self.terms.relative):
             whole, pull = normal.relative_blocks[n], normal.relative_rhs[n]
-            _add_pose_block(s, term.i, whole[:6, :6], pull[:6], blocks, rhs, diagonal)
-            _add_pose_block(s, term.j, whole[6:, 6:], pull[6:], blocks, rhs, diagonal)
+            add(term.i, whole[:6, :6], pull[:6])
+            add(term.j, whole[6:, 6:], pull[6:])
             p, q = int(s.slots[term.i]), int(s.slots[term.j])
             if p >= 0 and q >= 0:
                 blocks[s.block_of(max(p, q), min(p, q))] += whole[6:, :6] if q > p else whole[:6, 6:]
@@ -198,10 +205,9 @@ class _Bundle:
         step, self.solver = solve_reduced(self.reduced(damping), self.settings, self.solver)
         if step is None:
             return None
-        step_landmarks(
-            state.positions_m, state.points_map, s.keyframes, s.landmark_ptr, s.slots, self.obs_info, self.inverse,
-            self.point_rhs, step, moved.points_map,
-        )  # fmt: skip
+        landmarks = self.obs_info, self.inverse, self.point_rhs
+        observed = s.keyframes, s.landmark_ptr, s.slots
+        step_landmarks(state.positions_m, state.points_map, *observed, *landmarks, step, moved.points_map)
         step_poses(state.rotations, state.positions_m, s.slots, step, moved.rotations, moved.positions_m)
         moved.motions[:] = state.motions
         moved.motions[s.slot_keyframes] += step[:, 6:]
@@ -231,16 +237,6 @@ class _Bundle:
             converged=converged,
             solver=self.solver,
         )
-
-
-def _add_pose_block(
-    s: Structure, k: int, block: Array, pull: Array, blocks: Array, rhs: Array, diagonal: Array
-) -> None:
-    slot = int(s.slots[k])
-    if slot >= 0:
-        blocks[s.row_ptr[slot + 1] - 1] += block
-        rhs[slot, :6] += pull
-        diagonal[slot, :6] += np.diag(block)
 
 
 def _initial_state(problem: BundleProblem) -> State:

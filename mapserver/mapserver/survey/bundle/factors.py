@@ -62,27 +62,19 @@ class Terms:
         cost = 0.0
         for n, term in enumerate(self.relative):
             rotation, translation = _split(term.i_from_j)
-            cost += linearise_relative(
-                state.rotations, state.positions_m, term.i, term.j, rotation, translation, term.information,
-                relative_blocks[n], relative_rhs[n],
-            )  # fmt: skip
+            measured, output = (rotation, translation, term.information), (relative_blocks[n], relative_rhs[n])
+            cost += linearise_relative(state.rotations, state.positions_m, term.i, term.j, *measured, *output)
         for n, prior in enumerate(self.priors):
             rotation, translation = _split(prior.map_from_body)
-            cost += linearise_prior(
-                state.rotations[prior.k], state.positions_m[prior.k], rotation, translation, prior.information,
-                prior_blocks[n], prior_rhs[n],
-            )  # fmt: skip
+            measured, output = (rotation, translation, prior.information), (prior_blocks[n], prior_rhs[n])
+            cost += linearise_prior(state.rotations[prior.k], state.positions_m[prior.k], *measured, *output)
         if len(self.ends):
-            cost += linearise_inertial(
-                state.rotations, state.positions_m, state.motions, GRAVITY_MAP, self.ends, self.increments,
-                self.informations, edge_blocks, edge_rhs,
-            )  # fmt: skip
+            variables, edges = (state.rotations, state.positions_m, state.motions), (self.ends, self.increments)
+            cost += linearise_inertial(*variables, GRAVITY_MAP, *edges, self.informations, edge_blocks, edge_rhs)
         off = state.motions - self.motion_mean
         cost += 0.5 * float((self.motion_weight * off**2).sum())
-        return Normal(
-            cost, relative_blocks, relative_rhs, prior_blocks, prior_rhs, edge_blocks, edge_rhs,
-            self.motion_weight, -self.motion_weight * off,
-        )  # fmt: skip
+        blocks = relative_blocks, relative_rhs, prior_blocks, prior_rhs, edge_blocks, edge_rhs
+        return Normal(cost, *blocks, self.motion_weight, -self.motion_weight * off)
 
 
 def pack_terms(problem: BundleProblem) -> Terms:

@@ -108,17 +108,14 @@ def solve_pcg(system: ReducedSystem, settings: BundleSettings) -> Array | None:
     count, size = system.rhs.shape
     s, chains = system.structure, system.chains
     inverses, couplings, step = np.empty((count, size, size)), np.empty((count, size, size)), np.empty((count, size))
+    edges = chains.edge_slots, system.edge_blocks, system.damp, s.free
+    chain = chains.sequence, chains.link, inverses, couplings
     try:
-        factor_chains(
-            system.blocks, s.row_ptr, chains.edge_slots, system.edge_blocks, system.damp, s.free, chains.sequence,
-            chains.link, inverses, couplings,
-        )  # fmt: skip
+        factor_chains(system.blocks, s.row_ptr, *edges, *chain)
     except np.linalg.LinAlgError:
         return None
-    iterations = conjugate_gradients(
-        system.blocks, s.row_ptr, s.cols, chains.edge_slots, system.edge_blocks, system.damp, s.free, chains.sequence,
-        chains.link, inverses, couplings, system.rhs, settings.pcg_tolerance, settings.pcg_max_iterations, step,
-    )  # fmt: skip
+    limits = settings.pcg_tolerance, settings.pcg_max_iterations
+    iterations = conjugate_gradients(system.blocks, s.row_ptr, s.cols, *edges, *chain, system.rhs, *limits, step)
     return step if iterations >= 0 else None
 
 

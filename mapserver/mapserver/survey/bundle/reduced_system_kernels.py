@@ -98,9 +98,17 @@ def multiply(
 
 @kernel
 def factor_chains(
-    blocks: Array, row_ptr: AnyArray, edge_slots: AnyArray, edge_blocks: Array, damp: Array, free: Mask,
-    sequence: AnyArray, link: AnyArray, inverses: Array, couplings: Array,
-) -> None:  # fmt: skip
+    blocks: Array,
+    row_ptr: AnyArray,
+    edge_slots: AnyArray,
+    edge_blocks: Array,
+    damp: Array,
+    free: Mask,
+    sequence: AnyArray,
+    link: AnyArray,
+    inverses: Array,
+    couplings: Array,
+) -> None:
     """Factors S without its off-diagonal image blocks: block-diagonal but for the inertial chains.
 
     sequence (P,): slots, each after its predecessor. link (P,): the edge to the predecessor, -1 for none. Fills
@@ -170,10 +178,22 @@ def solve_chains(
 
 @kernel
 def conjugate_gradients(
-    blocks: Array, row_ptr: AnyArray, cols: AnyArray, edge_slots: AnyArray, edge_blocks: Array, damp: Array, free: Mask,
-    sequence: AnyArray, link: AnyArray, inverses: Array, couplings: Array, rhs: Array, tolerance: float,
-    max_iterations: int, x: Array,
-) -> int:  # fmt: skip
+    blocks: Array,
+    row_ptr: AnyArray,
+    cols: AnyArray,
+    edge_slots: AnyArray,
+    edge_blocks: Array,
+    damp: Array,
+    free: Mask,
+    sequence: AnyArray,
+    link: AnyArray,
+    inverses: Array,
+    couplings: Array,
+    rhs: Array,
+    tolerance: float,
+    max_iterations: int,
+    x: Array,
+) -> int:
     """Solves S x = rhs from zero; returns the iterations, -1 where the preconditioned residual stays too large.
 
     Source: Saad, Iterative Methods for Sparse Linear Systems, algorithm 9.1.

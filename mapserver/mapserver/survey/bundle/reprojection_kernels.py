@@ -145,9 +145,24 @@ def _add_pose(info: Array, slope: Array, qx: float, qy: float, qz: float, block:
     rhs[4] += slope[1]
     rhs[5] += slope[2]
     add_lifted(
-        info[0], info[1], info[2], info[1], info[3], info[4], info[2], info[4], info[5],
-        qx, qy, qz, qx, qy, qz, 1.0, block,
-    )  # fmt: skip
+        info[0],
+        info[1],
+        info[2],
+        info[1],
+        info[3],
+        info[4],
+        info[2],
+        info[4],
+        info[5],
+        qx,
+        qy,
+        qz,
+        qx,
+        qy,
+        qz,
+        1.0,
+        block,
+    )
 
 
 @kernel

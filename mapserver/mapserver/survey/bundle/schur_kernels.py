@@ -10,9 +10,17 @@ LANDMARK_FLOOR = 1e-9  # relative to the trace: a point seen once by one camera 
 
 @kernel
 def count_row_blocks(
-    slot_ptr: AnyArray, slot_obs: AnyArray, landmarks: AnyArray, keyframes: AnyArray, landmark_ptr: AnyArray,
-    slots: AnyArray, pair_ptr: AnyArray, pair_cols: AnyArray, row_ptr: AnyArray, cols: AnyArray,
-) -> None:  # fmt: skip
+    slot_ptr: AnyArray,
+    slot_obs: AnyArray,
+    landmarks: AnyArray,
+    keyframes: AnyArray,
+    landmark_ptr: AnyArray,
+    slots: AnyArray,
+    pair_ptr: AnyArray,
+    pair_cols: AnyArray,
+    row_ptr: AnyArray,
+    cols: AnyArray,
+) -> None:
     """Fills row_ptr (P + 1,) and, if `cols` is not empty, the columns <= row of the reduced system's blocks, ascending.
 
     A row couples to every slot that shares a landmark, and to pair_cols[pair_ptr[p]:pair_ptr[p + 1]]. Call once with an
@@ -129,9 +137,24 @@ def reduce_to_poses(
                     m[a, 1] = y[a, 0] * other[1] + y[a, 1] * other[3] + y[a, 2] * other[4]
                     m[a, 2] = y[a, 0] * other[2] + y[a, 1] * other[4] + y[a, 2] * other[5]
                 add_lifted(
-                    m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2], m[2, 0], m[2, 1], m[2, 2],
-                    ax, ay, az, point[0] - there[0], point[1] - there[1], point[2] - there[2], -1.0, blocks[place[q]],
-                )  # fmt: skip
+                    m[0, 0],
+                    m[0, 1],
+                    m[0, 2],
+                    m[1, 0],
+                    m[1, 1],
+                    m[1, 2],
+                    m[2, 0],
+                    m[2, 1],
+                    m[2, 2],
+                    ax,
+                    ay,
+                    az,
+                    point[0] - there[0],
+                    point[1] - there[1],
+                    point[2] - there[2],
+                    -1.0,
+                    blocks[place[q]],
+                )
 
 
 @inline_kernel
@@ -148,9 +171,24 @@ def _symmetric_product(left: Array, right: Array, out: Array) -> None:
 
 @inline_kernel
 def add_lifted(
-    m00: float, m01: float, m02: float, m10: float, m11: float, m12: float, m20: float, m21: float, m22: float,
-    ax: float, ay: float, az: float, bx: float, by: float, bz: float, sign: float, block: Array,
-) -> None:  # fmt: skip
+    m00: float,
+    m01: float,
+    m02: float,
+    m10: float,
+    m11: float,
+    m12: float,
+    m20: float,
+    m21: float,
+    m22: float,
+    ax: float,
+    ay: float,
+    az: float,
+    bx: float,
+    by: float,
+    bz: float,
+    sign: float,
+    block: Array,
+) -> None:
     """block += sign [skew(a); I] M [skew(b); I]^T for a (3, 3) M."""
     # right half first: M skew(b)^T, row r is b x M[r]
     r00, r01, r02 = by * m02 - bz * m01, bz * m00 - bx * m02, bx * m01 - by * m00

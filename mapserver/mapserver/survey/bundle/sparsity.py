@@ -1,6 +1,7 @@
 """Which unknown sits where: observations sorted by landmark, keyframes to slots, the reduced system's block pattern."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +56,8 @@ def build_structure(problem: BundleProblem) -> Structure:
     slots = np.full(len(moves), -1, np.int32)
     slots[slot_keyframes] = np.arange(len(slot_keyframes))
     slot_ptr, slot_obs = _observations_by_slot(slots, keyframes, len(slot_keyframes))
-    row_ptr, cols = _pattern(problem, slots, keyframes, landmarks, landmark_ptr, slot_ptr, slot_obs)
+    table = ObservationTable(slot_ptr, slot_obs, landmarks, keyframes, landmark_ptr, slots)
+    row_ptr, cols = _pattern(problem, table)
     return Structure(
         order=order,
         keyframes=keyframes,
@@ -126,32 +128,33 @@ def _observations_by_slot(slots: Indices, keyframes: Indices, count: int) -> tup
     return np.searchsorted(obs_slots[by_slot[held:]], np.arange(count + 1)), by_slot[held:].astype(np.int32)
 
 
-def _pattern(
-    problem: BundleProblem,
-    slots: Indices,
-    keyframes: Indices,
-    landmarks: Indices,
-    landmark_ptr: AnyArray,
-    slot_ptr: AnyArray,
-    slot_obs: Indices,
-) -> tuple[AnyArray, Indices]:
-    pairs = np.array([sorted((slots[t.i], slots[t.j])) for t in problem.relative], np.int32).reshape(-1, 2)
-    pairs = pairs[pairs[:, 0] >= 0]
-    pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
-    pair_ptr = np.searchsorted(pairs[:, 1], np.arange(len(slot_ptr)))
-    row_ptr, cols = np.zeros(len(slot_ptr), np.int64), np.zeros(0, np.int32)
-    shared = (
-        np.zeros_like(slot_ptr) if problem.points_held else slot_ptr,
-        slot_obs,
-        landmarks,
-        keyframes,
-        landmark_ptr,
-        slots,
-        pair_ptr,
-        np.ascontiguousarray(pairs[:, 0]),
-        row_ptr,
-    )
+def block_pattern(table: "ObservationTable", pair_ptr: AnyArray, pair_first: Indices) -> tuple[AnyArray, Indices]:
+    """Row pointers and columns of the reduced system's blocks: slots that share a landmark or a pair."""
+    row_ptr, cols = np.zeros(len(table.slot_ptr), np.int64), np.zeros(0, np.int32)
+    shared = (*table, pair_ptr, pair_first, row_ptr)
     count_row_blocks(*shared, cols)
     cols = np.empty(int(row_ptr[-1]), np.int32)
     count_row_blocks(*shared, cols)
     return row_ptr, cols
+
+
+class ObservationTable(NamedTuple):
+    """M observations, sorted by landmark, by slot and by landmark; slots (K,) of the keyframes, -1 for held ones."""
+
+    slot_ptr: AnyArray
+    slot_obs: Indices
+    landmarks: Indices
+    keyframes: Indices
+    landmark_ptr: AnyArray
+    slots: Indices
+
+
+def _pattern(problem: BundleProblem, table: ObservationTable) -> tuple[AnyArray, Indices]:
+    slots = table.slots
+    pairs = np.array([sorted((slots[t.i], slots[t.j])) for t in problem.relative], np.int32).reshape(-1, 2)
+    pairs = pairs[pairs[:, 0] >= 0]
+    pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
+    pair_ptr = np.searchsorted(pairs[:, 1], np.arange(len(table.slot_ptr)))
+    if problem.points_held:
+        table = table._replace(slot_ptr=np.zeros_like(table.slot_ptr))
+    return block_pattern(table, pair_ptr, np.ascontiguousarray(pairs[:, 0]))

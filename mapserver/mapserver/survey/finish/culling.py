@@ -1,4 +1,4 @@
-"""What a finished survey does not hand on: duplicates, landmarks that are badly known, keyframes that others make superfluous."""
+"""Culling of a finished survey: duplicate landmarks, badly known ones, redundant keyframes."""
 
 from dataclasses import dataclass, replace
 
@@ -68,10 +68,10 @@ def _duplicates(
         return double
     starts = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map) + 1))
     first = replace(marks, obs_keyframe=marks.obs_keyframe[starts[:-1]], obs_feature=marks.obs_feature[starts[:-1]])
-    mark_duplicates(
-        near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.int64), marks.points_map, sigmas_m, starts, marks.obs_keyframe,
-        packed(of_features(first, [k.features.descriptors for k in keyframes])), settings.duplicate_distance, double,
-    )  # fmt: skip
+    near = near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.int64)
+    descriptors = packed(of_features(first, [k.features.descriptors for k in keyframes]))
+    landmarks = marks.points_map, sigmas_m, starts, marks.obs_keyframe, descriptors
+    mark_duplicates(near, *landmarks, settings.duplicate_distance, double)
     return double
 
 
@@ -89,8 +89,7 @@ def redundant(
     seen = np.bincount(own, minlength=count)
     starts = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map) + 1))
     order = np.array(sorted(range(1, count - 1), key=lambda k: (seen[k], k)), np.int64)
-    mark_redundant(
-        order, usable[np.argsort(own, kind="stable")], np.concatenate([[0], np.cumsum(seen)]), marks.obs_landmark,
-        marks.obs_keyframe, octaves, starts, settings.redundant_observers, settings.redundant_share, gone,
-    )  # fmt: skip
+    rows, row_starts = usable[np.argsort(own, kind="stable")], np.concatenate([[0], np.cumsum(seen)])
+    observed = marks.obs_landmark, marks.obs_keyframe, octaves, starts
+    mark_redundant(order, rows, row_starts, *observed, settings.redundant_observers, settings.redundant_share, gone)
     return gone

@@ -23,9 +23,15 @@ def _seen_together(keyframes: NDArray[np.int32], starts: Indices, a: int, b: int
 
 @kernel
 def mark_duplicates(
-    near: Indices, points_map: Array, sigmas_m: Array, starts: Indices, obs_keyframe: NDArray[np.int32], descriptors: Packed,
-    most_bits: int, double: Mask,
-) -> None:  # fmt: skip
+    near: Indices,
+    points_map: Array,
+    sigmas_m: Array,
+    starts: Indices,
+    obs_keyframe: NDArray[np.int32],
+    descriptors: Packed,
+    most_bits: int,
+    double: Mask,
+) -> None:
     """Sets double (N,) for the less observed landmark of every near pair (P, 2), in their order, that could be one landmark.
 
     starts (N + 1,) delimits each landmark's obs_keyframe (M,); descriptors (N, 4) of their first observations.
@@ -46,9 +52,17 @@ def mark_duplicates(
 
 @kernel
 def mark_redundant(
-    order: Indices, rows: Indices, row_starts: Indices, obs_landmark: NDArray[np.int32], obs_keyframe: NDArray[np.int32],
-    octaves: Indices, starts: Indices, observers: int, share: float, gone: Mask,
-) -> None:  # fmt: skip
+    order: Indices,
+    rows: Indices,
+    row_starts: Indices,
+    obs_landmark: NDArray[np.int32],
+    obs_keyframe: NDArray[np.int32],
+    octaves: Indices,
+    starts: Indices,
+    observers: int,
+    share: float,
+    gone: Mask,
+) -> None:
     """Sets gone (K,) for keyframes, looked at in `order`, of whose observations others repeat a share.
 
     rows[row_starts[k] : row_starts[k + 1]] are keyframe k's observations that count; starts (N + 1,) delimits each landmark's.

@@ -27,9 +27,18 @@ def _other_visits(
 
 @kernel
 def mark_repeated(
-    rows: Indices, row_starts: Indices, tracks: Indices, starts: Indices, keyframes: Indices, octaves: Octaves, gap: int,
-    visits: int, share: float, least: int, spare: NDArray[np.bool_],
-) -> None:  # fmt: skip
+    rows: Indices,
+    row_starts: Indices,
+    tracks: Indices,
+    starts: Indices,
+    keyframes: Indices,
+    octaves: Octaves,
+    gap: int,
+    visits: int,
+    share: float,
+    least: int,
+    spare: NDArray[np.bool_],
+) -> None:
     """Sets spare (K,), from the last keyframe to the second, where a share of its tracks and `least` of them have so many other visits.
 
     rows[row_starts[k] : row_starts[k + 1]] are keyframe k's members of tracks; tracks (M,) and octaves (M,) of each member,

@@ -64,9 +64,12 @@ def gate_covariances(chain: list[PoseEdge], scale_walk: float) -> list[PoseEdge]
 
 
 def solve_scaled(
-    map_from_body: Array, chain: list[PoseEdge], loops: list[PoseEdge], scales: dict[tuple[int, int], tuple[float, float]],
+    map_from_body: Array,
+    chain: list[PoseEdge],
+    loops: list[PoseEdge],
+    scales: dict[tuple[int, int], tuple[float, float]],
     scale_walk: float,
-) -> SimilarityResult:  # fmt: skip
+) -> SimilarityResult:
     """The similarities (K,) of the bodies that agree best with chain and loops, each loop with its measured change of scale.
 
     `scales` says for loop (i, j) the logarithm of i's lengths per length of j, with sigma. The result's translations are the places.

@@ -1,4 +1,4 @@
-"""Which loops to disbelieve: graduated non-convexity over the loops of a pose graph whose other edges are true."""
+"""Graduated non-convexity (GNC): outlying loops of a pose graph whose other edges are true. Source: Yang et al. 2020."""
 
 import gtsam
 import numpy as np
@@ -42,8 +42,12 @@ def loop_weights(
 
 
 def _anneal(
-    certain: gtsam.NonlinearFactorGraph, loops: list[gtsam.NoiseModelFactor], start: gtsam.Values, bound: float, control: float
-) -> tuple[float, Array, gtsam.Values]:  # fmt: skip
+    certain: gtsam.NonlinearFactorGraph,
+    loops: list[gtsam.NoiseModelFactor],
+    start: gtsam.Values,
+    bound: float,
+    control: float,
+) -> tuple[float, Array, gtsam.Values]:
     """Truncated cost, weights and places, annealed from a control parameter."""
     values = start
     for _ in range(_MAX_UPDATES):

@@ -1,4 +1,4 @@
-"""Keyframes held together by measured relative transforms: the best places for them, and which loops to disbelieve."""
+"""Pose graph optimization over SE(3): the poses that fit measured relative transforms best, and the outlying loops."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +13,8 @@ from fleetmap.geometry import Array, se3_inverse, skew
 from mapserver.survey.pose_graph.gnc import loop_weights, squared_residuals
 
 _FIXED_SIGMA = 1e-6
+_INLIER_PROBABILITY = 0.999
+_MAX_ITERATIONS = 100
 _FIRST_ITERATIONS = 15  # before another start is considered
 _SCALE_ROUNDS = 6
 _RIGHT_SHARE = 0.7  # of the loops, taken for right where the noise is estimated
@@ -62,16 +64,15 @@ def optimize_pose_graph(
     map_from_body: Array,
     edges: Sequence[PoseEdge],
     fixed: int = 0,
+    *,
     robust: bool = True,
-    inlier_probability: float = 0.999,
-    max_iterations: int = 100,
     noise: Literal["given", "estimated"] = "given",
 ) -> PoseGraphResult:
     """The places of K keyframes that fit the edges best, from a start map_from_body (K, 4, 4); `fixed` stays.
 
     robust: loops that contradict the rest are disbelieved, by graduated non-convexity with truncated least squares in
     which all other edges are known to be true; a loop counts as consistent while its squared residual stays within the
-    `inlier_probability` of chi-square. noise "estimated": within a bound that goes by the better 0.7 of the
+    0.999 of chi-square. noise "estimated": within a bound that goes by the better 0.7 of the
     loops, for graphs whose covariances are right only up to a common factor. Where the result is less likely than its edges'
     covariances allow, a second start without any guess (chordal relaxation of the rotations) is tried, and the better
     result taken. Raises SurveyError for edges that leave a keyframe without connection, point outside or carry no
@@ -84,11 +85,11 @@ def optimize_pose_graph(
     try:
         if robust and loops:
             graph = _graph(map_from_body, edges, fixed)
-            weights, begin = _believed(graph, loops, start, float(chi2.ppf(inlier_probability, 6)), noise)
+            weights, begin = _believed(graph, loops, start, float(chi2.ppf(_INLIER_PROBABILITY, 6)), noise)
         believed = dict(zip(loops, weights >= 0.5, strict=True))
         kept = [edge for index, edge in enumerate(edges) if believed.get(index, True)]
         graph = _graph(map_from_body, kept, fixed)
-        optimum, iterations = _optimum(graph, begin, 6 * (len(kept) - len(map_from_body) + 1), max_iterations)
+        optimum, iterations = _optimum(graph, begin, 6 * (len(kept) - len(map_from_body) + 1))
     except RuntimeError as error:
         raise SurveyError(
             f"the pose graph of {len(map_from_body)} keyframes and {len(edges)} edges cannot be solved "
@@ -161,18 +162,16 @@ def _graph(map_from_body: Array, edges: Sequence[PoseEdge], fixed: int) -> gtsam
     return graph
 
 
-def _optimum(
-    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, freedom: int, max_iterations: int
-) -> tuple[gtsam.Values, int]:
+def _optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, freedom: int) -> tuple[gtsam.Values, int]:
     """The lowest minimum found, and the iterations that led there from the start that reached it."""
-    best, spent = _descend(graph, start, min(max_iterations, _FIRST_ITERATIONS))
+    best, spent = _descend(graph, start, _FIRST_ITERATIONS)
     if 2.0 * graph.error(best) > freedom + 5.0 * np.sqrt(2.0 * max(freedom, 1)):
-        other, other_spent = _without_guess(graph, min(max_iterations, _FIRST_ITERATIONS))
+        other, other_spent = _without_guess(graph, _FIRST_ITERATIONS)
         if other is not None and graph.error(other) < graph.error(best):
             best, spent = other, other_spent
-    if spent < _FIRST_ITERATIONS or spent >= max_iterations:
+    if spent < _FIRST_ITERATIONS:
         return best, spent
-    best, more = _descend(graph, best, max_iterations - spent)
+    best, more = _descend(graph, best, _MAX_ITERATIONS - spent)
     return best, spent + more
 
 

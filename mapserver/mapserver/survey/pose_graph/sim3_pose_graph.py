@@ -1,4 +1,4 @@
-"""Keyframes whose scale drifts, held together by measured similarities: the best places and scales for them.
+"""Pose graph optimization over Sim(3): poses and scales of keyframes whose scale drifts. Source: Strasdat et al. 2010.
 
 A similarity maps x to scale * R x + t; keyframe k has map_from_k. Perturbations (7,) are on the right, in the keyframe's own axes:
 rotation, translation in its own lengths, logarithm of the scale.
@@ -18,6 +18,8 @@ from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
 
 _MAX_DAMPING = 1e8
+_INLIER_PROBABILITY = 0.999
+_MAX_ITERATIONS = 50
 _ROUND_ITERATIONS = 4  # while the loops' weights still change
 
 
@@ -91,10 +93,9 @@ def residuals(edges: Sequence[SimilarityEdge], state: Similarities) -> tuple[Arr
 def _pack(edges: Sequence[SimilarityEdge]) -> _Packed:
     measured = np.array([e.i_from_j for e in edges]).reshape(-1, 4, 4)
     covariances = np.array([e.cov for e in edges]).reshape(-1, 7, 7)
-    return _Packed(
-        np.array([e.i for e in edges], np.int64), np.array([e.j for e in edges], np.int64), measured[:, :3, :3], measured[:, :3, 3],
-        np.array([e.scale for e in edges]), np.linalg.inv(np.linalg.cholesky(covariances)),
-    )  # fmt: skip
+    i, j = np.array([(e.i, e.j) for e in edges], np.int64).reshape(-1, 2).T
+    scales, roots = np.array([e.scale for e in edges]), np.linalg.inv(np.linalg.cholesky(covariances))
+    return _Packed(i, j, measured[:, :3, :3], measured[:, :3, 3], scales, roots)
 
 
 def _errors(edges: _Packed, state: Similarities) -> tuple[Array, Array, Array]:
@@ -141,14 +142,11 @@ def _inverse_left_jacobians(turns: Array) -> Array:
     return np.asarray(np.eye(3) - 0.5 * cross + factor[:, None, None] * (cross @ cross))
 
 
-def optimize_similarities(
-    start: Similarities, edges: Sequence[SimilarityEdge], fixed: int = 0, inlier_probability: float = 0.999,
-    max_iterations: int = 50,
-) -> SimilarityResult:  # fmt: skip
+def optimize_similarities(start: Similarities, edges: Sequence[SimilarityEdge], fixed: int = 0) -> SimilarityResult:
     """The similarities that fit the edges best; keyframe `fixed` stays, and with it the scale.
 
     Loops that contradict the rest are disbelieved, all other edges taken for true: by graduated non-convexity with Geman and McClure's
-    cost, which believes all loops at first; one whose square then stays within `inlier_probability` of chi-square counts in full.
+    cost, which believes all loops at first; one whose square then stays within 0.999 of chi-square counts in full.
     Raises SurveyError where a keyframe hangs on nothing. Sources: Strasdat et al. 2010 (Sim(3) graphs), Yang et al. 2020 (GNC).
     """
     packed = _pack(edges)
@@ -156,8 +154,8 @@ def optimize_similarities(
     weights = np.ones(len(edges))
     before = _cost(start, packed, weights)
     if is_loop.any():
-        limit = float(chi2.ppf(inlier_probability, 7))
-        state = _solve(start, packed, weights, fixed, max_iterations)
+        limit = float(chi2.ppf(_INLIER_PROBABILITY, 7))
+        state = _solve(start, packed, weights, fixed, _MAX_ITERATIONS)
         squares = _squares(state, packed)[is_loop]
         control = max(2.0 * float(squares.max()) / limit, 1.0)
         while True:
@@ -169,9 +167,9 @@ def optimize_similarities(
             control = max(control / 1.6, 1.0)
         for _ in range(2):
             weights[is_loop] = squares <= limit
-            state = _solve(state, packed, weights, fixed, max_iterations)
+            state = _solve(state, packed, weights, fixed, _MAX_ITERATIONS)
             squares = _squares(state, packed)[is_loop]
-    solved = _solve(start if not is_loop.any() else state, packed, weights, fixed, max_iterations)
+    solved = _solve(start if not is_loop.any() else state, packed, weights, fixed, _MAX_ITERATIONS)
     return SimilarityResult(solved, weights[is_loop], before, _cost(solved, packed, weights))
 
 

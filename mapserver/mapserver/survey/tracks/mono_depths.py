@@ -24,15 +24,12 @@ class MonoDepths:
 
     def __init__(self, keyframes: Sequence[Keyframe], camera: StereoCamera, settings: SurveySettings) -> None:
         self._keyframes, self._camera, self._settings = keyframes, camera, settings
-        reach = settings.monocular.depth_views
+        reach, descriptors = settings.monocular.depth_views, [k.features.descriptors for k in keyframes]
         pairs = [(i, j) for j in range(len(keyframes)) for i in range(max(0, j - reach), j)]
         self._matches = {
-            (i, j): match_mutual(
-                keyframes[i].features.descriptors, keyframes[j].features.descriptors, settings.pairs.max_distance,
-                settings.pairs.ratio,
-            )
+            (i, j): match_mutual(descriptors[i], descriptors[j], settings.pairs.max_distance, settings.pairs.ratio)
             for i, j in pairs
-        }  # fmt: skip
+        }
 
     def keyframes_at(self, map_from_body: Array, body_from_cam: Array) -> list[Keyframe]:
         """The keyframes with disparities and points of those features that several views agree on, the others without."""

@@ -11,9 +11,16 @@ _LOG_SCALE = np.log(1.2)
 
 @kernel
 def predict_features(
-    b_from_a: Array, points_a: Array, disparities_a: Array, octaves_a: NDArray[np.int8], lens: Array, radius_px: float,
-    predicted: Array, radius: Array, span: NDArray[np.int64],
-) -> None:  # fmt: skip
+    b_from_a: Array,
+    points_a: Array,
+    disparities_a: Array,
+    octaves_a: NDArray[np.int8],
+    lens: Array,
+    radius_px: float,
+    predicted: Array,
+    radius: Array,
+    span: NDArray[np.int64],
+) -> None:
     """Fills predicted (N, 2) pixels in b, radius (N,) and the octaves span (N, 2) to search; NaN pixels where a feature has no
     disparity (N,) or b cannot see it.
 

@@ -102,12 +102,27 @@ def _warp_of_motion(x: float, y: float, z: float, own_from_reference: Array, war
 
 @kernel
 def align_observations(
-    whole: Picture, half: Picture, quarter: Picture, pixels: Array, octaves: Octaves, angles_deg: NDArray[np.float32],
-    theirs: Indices, points_reference: Array,
-    own_whole: Picture, own_half: Picture, own_quarter: Picture, own_pixels: Array, own_octaves: Octaves,
-    own_angles_deg: NDArray[np.float32], ours: Indices,
-    own_from_reference: Array, half_window: int, max_shift_px: float, min_correlation: float, out: Array,
-) -> None:  # fmt: skip
+    whole: Picture,
+    half: Picture,
+    quarter: Picture,
+    pixels: Array,
+    octaves: Octaves,
+    angles_deg: NDArray[np.float32],
+    theirs: Indices,
+    points_reference: Array,
+    own_whole: Picture,
+    own_half: Picture,
+    own_quarter: Picture,
+    own_pixels: Array,
+    own_octaves: Octaves,
+    own_angles_deg: NDArray[np.float32],
+    ours: Indices,
+    own_from_reference: Array,
+    half_window: int,
+    max_shift_px: float,
+    min_correlation: float,
+    out: Array,
+) -> None:
     """Refined pixels of one keyframe's features `ours` (N,) against features `theirs` (N,) of a reference keyframe.
 
     Pyramids, pixels, octaves, angles of both; points_reference (N, 3) as the reference's camera sees them. The warp comes
@@ -136,9 +151,18 @@ def align_observations(
             for b in range(2):
                 warp[a, b] *= own_size / size
         align_patch(
-            _of_level(level, whole, half, quarter), _of_level(own_level, own_whole, own_half, own_quarter),
-            pixels[i, 0] / size, pixels[i, 1] / size, own_pixels[j, 0] / own_size, own_pixels[j, 1] / own_size, warp,
-            half_window, max_shift_px, template, window, found,
-        )  # fmt: skip
+            _of_level(level, whole, half, quarter),
+            _of_level(own_level, own_whole, own_half, own_quarter),
+            pixels[i, 0] / size,
+            pixels[i, 1] / size,
+            own_pixels[j, 0] / own_size,
+            own_pixels[j, 1] / own_size,
+            warp,
+            half_window,
+            max_shift_px,
+            template,
+            window,
+            found,
+        )
         for a in range(3):
             out[n, a] = found[a] * own_size if found[3] >= min_correlation else np.nan
