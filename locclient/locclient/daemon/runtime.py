@@ -23,7 +23,7 @@ from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
 from locclient.maps.tile_selection import Cell, PositionBound, PositionBoundTracker
-from locclient.robot.failure_report import failure_report
+from locclient.robot.failure_report import RobotProfile, failure_report
 from locclient.robot.health_report import Figure, HealthFigures
 from locclient.robot.robot import FailureContext, Outcome, Robot
 from locclient.sensors.intake import Intake
@@ -257,16 +257,10 @@ class Runtime:
         parts = self._parts
         while self._shared.failures:
             context, wall_ns = self._shared.failures.popleft()
-            report = failure_report(
-                context,
-                site=parts.site,
-                robot=parts.robot_name,
-                report_id=uuid.uuid4().hex,
-                wall_ns=wall_ns,
-                base_from_body=parts.robot.base_from_body,
-                camera=parts.camera,
-                settings=parts.settings,
+            profile = RobotProfile(
+                parts.site, parts.robot_name, parts.robot.base_from_body, parts.camera, parts.settings
             )
+            report = failure_report(context, profile, report_id=uuid.uuid4().hex, wall_ns=wall_ns)
             try:
                 parts.outbox.put(QueuedReport(report.id, encode_message(report)))
                 if parts.failures_folder is not None:

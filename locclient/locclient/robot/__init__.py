@@ -1,1 +1,1 @@
-"""One robot frame by frame: localization, failures, trials of new versions. Pure."""
+"""One robot, frame by frame: localization, failures, trials of new versions. Pure."""

@@ -1,4 +1,4 @@
-"""The figures of a running robot's health report, gathered frame by frame. Pure."""
+"""Figures of a robot's health report, gathered frame by frame. Pure."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from fleetmap.failure_definition import is_blind, radius_95_m
-from fleetmap.messages import RobotHealth, Status
+from fleetmap.messages import Cause, RobotHealth, Status
 from locclient.localization.estimate import Estimate
 from locclient.robot.robot import Outcome
 
@@ -15,10 +15,10 @@ Figure = float | int | str | bool | None
 
 
 class FixFigures:
-    """What looks at the map, docks and odometry tell of a run, of those in HEALTH_FIGURES; the largest since the report before.
+    """Those of HEALTH_FIGURES that come from fixes, docks and odometry; the largest since the report before.
 
-    Metres count where the robot had claimed to know its place: who says that he is lost, and is found elsewhere, was not wrong.
-    So does a place that was said with a covariance in which the robot was not, as those fixes showed that named another.
+    Metres count only where the robot was TRACKING: one that says it is lost, and is found elsewhere, was not wrong. A claimed pose
+    that later fixes disproved beyond its covariance counts too.
     """
 
     def __init__(self) -> None:
@@ -39,7 +39,7 @@ class FixFigures:
             self._seen += estimate.fix.seen
 
     def take(self) -> dict[str, Figure]:
-        """The figures of a report; what was largest begins anew."""
+        """The figures of a report; the largest values are reset."""
         figures: dict[str, Figure] = {
             name: self._largest.get(name) for name in ("fix_innovation", "fix_innovation_m", "dock_error_m")
         }
@@ -88,23 +88,13 @@ class HealthFigures:
         self._fixes.handle(estimate, outcome.dock_error_m)
 
     def count_failure(self) -> None:
-        """A failure was told."""
+        """Counts a detected failure."""
         self._failures += 1
 
     def report(self, site: str, robot: str, wall_ns: int, more: Mapping[str, Figure], silent: bool) -> RobotHealth:
-        """The message; more: figures of the parts around. silent: whether the source has stopped sending frames."""
-        last = self._last
-        status = Status.INITIALISING.value if last is None else last.estimate.status.value
-        flags = [
-            name
-            for name, raised in (
-                ("no_frames", silent),
-                ("blind", last is not None and is_blind(status, radius_95_m(last.estimate.cov_rot_trans))),
-            )
-            if raised
-        ]
-        if last is not None and last.estimate.image.cause:
-            flags.append(last.estimate.image.cause)
+        """The message; more: figures of other parts. silent: whether the source has stopped sending frames."""
+        last = None if self._last is None else self._last.estimate
+        flags: list[str] = [Cause.NO_FRAMES] if silent else []
         figures: dict[str, Figure] = {
             "localised_share": self._localised / self._frames if self._frames else None,
             "first_fix_s": self._first_fix_s,
@@ -115,9 +105,16 @@ class HealthFigures:
             **self._fixes.take(),
         }
         if last is not None:
-            figures["exposure"], figures["sharpness"] = last.estimate.image.exposure, last.estimate.image.sharpness
+            figures["exposure"], figures["sharpness"] = last.image.exposure, last.image.sharpness
+            flags += ["blind"] if is_blind(last.status, radius_95_m(last.cov_rot_trans)) else []
+            flags += [last.image.cause] if last.image.cause else []
         return RobotHealth(
-            site=site, robot=robot, stamp_ns=0 if last is None else last.estimate.stamp_ns, wall_ns=wall_ns,
-            version=None if last is None else last.estimate.map_version, status=status, flags=tuple(flags),
+            site=site,
+            robot=robot,
+            stamp_ns=0 if last is None else last.stamp_ns,
+            wall_ns=wall_ns,
+            version=None if last is None else last.map_version,
+            status=Status.INITIALISING if last is None else last.status,
+            flags=tuple(flags),
             metrics={**figures, **more},
-        )  # fmt: skip
+        )

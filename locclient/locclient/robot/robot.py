@@ -1,4 +1,4 @@
-"""One robot's life, frame by frame: localizes, watches for failures, tries new versions. No thread, file or socket of its own."""
+"""One robot, frame by frame: localization, detection of failures, trials of new map versions. Pure."""
 
 from collections import deque
 from collections.abc import Callable
@@ -19,14 +19,15 @@ from locclient.robot.continuous_odom import ContinuousOdom, PublishedPose
 from locclient.robot.dock_check import DockCheck
 from locclient.robot.failure_monitor import Failure, FailureMonitor
 from locclient.robot.sensor_bundle import SensorBundle
-from locclient.robot.version_trial import TrialSettings, Verdict, VersionTrial
+from locclient.robot.version_trial import TrialSettings, TrialVerdict, VersionTrial
 
 _THUMBNAIL_EVERY_NS = 1_000_000_000
 _THUMBNAILS = 2
+Clock = Callable[[], float]  # seconds
 
 
 class Change(StrEnum):
-    """What became of a version."""
+    """Result of a version's trial."""
 
     ADOPTED = "adopted"
     REFUSED = "refused"
@@ -35,7 +36,7 @@ class Change(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class VersionChange:
-    """A version that was adopted for good, refused for good, or put off because nothing could be seen; reason in words."""
+    """A version that was adopted, refused for good, or postponed because nothing could be seen; reason in words."""
 
     wanted: WantedVersion
     change: Change
@@ -44,10 +45,10 @@ class VersionChange:
 
 @dataclass(frozen=True, slots=True)
 class FailureContext:
-    """A failure with what a report of it shows: small earlier pictures, and all for the match view."""
+    """A failure with what its report shows: earlier left images with their stamps, and the input of the match view."""
 
     failure: Failure
-    pictures: tuple[tuple[int, Image], ...]
+    images: tuple[tuple[int, Image], ...]
     left: Image | None
     map_from_cam: Array | None
     running: LoadedMap | None
@@ -55,7 +56,11 @@ class FailureContext:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one frame brought. cpu_s: from encoded images to estimate. dock_error_m: as `DockCheck` says, None without an arrival."""
+    """Results of one frame.
+
+    cpu_s: from the images as they came to the estimate; stage_s: the same by stage. dock_error_m: from `DockCheck`, None without
+    an arrival.
+    """
 
     estimate: Estimate
     published: PublishedPose
@@ -79,14 +84,14 @@ class Outcome:
 class _Versions:
     """good: the version whose fixes were confirmed; candidate: the one on trial.
 
-    is_doubt: the good one is looked at again, because of what was said.
+    is_recheck: the candidate failed for candidate_reason, and the good version is tried again at the same place.
     """
 
     good: LoadedMap | None = None
     candidate: LoadedMap | None = None
     trial: VersionTrial | None = None
-    is_doubt: bool = False
-    said: str = ""
+    is_recheck: bool = False
+    candidate_reason: str = ""
     changes: deque[VersionChange] = field(default_factory=deque)
 
 
@@ -94,9 +99,13 @@ class Robot:
     """Feeds sensor bundles and maps to the localizer and keeps two versions while one of them is on trial."""
 
     def __init__(
-        self, calibration: RigCalibration, rectifier: Rectifier, settings: LocalizerSettings, trial: TrialSettings,
-        clock_s: Callable[[], float] = lambda: 0.0,
-    ) -> None:  # fmt: skip
+        self,
+        calibration: RigCalibration,
+        rectifier: Rectifier,
+        settings: LocalizerSettings,
+        trial: TrialSettings,
+        clock_s: Clock = lambda: 0.0,
+    ) -> None:
         """clock_s measures CPU; the default measures nothing."""
         self._rectifier, self._clock_s = rectifier, clock_s
         self.base_from_body = calibration.base_from_body
@@ -108,7 +117,7 @@ class Robot:
         self._odom = ContinuousOdom(calibration.base_from_body)
         self.monitor = FailureMonitor()
         self._docks = DockCheck(calibration.base_from_body)
-        self._pictures: deque[tuple[int, Image]] = deque(maxlen=_THUMBNAILS)
+        self._images: deque[tuple[int, Image]] = deque(maxlen=_THUMBNAILS)
         self._last: tuple[RectifiedFrame, Estimate] | None = None
 
     @property
@@ -118,18 +127,18 @@ class Robot:
 
     @property
     def running(self) -> LoadedMap | None:
-        """The version that the localizer looks at."""
+        """The version that the localizer uses."""
         versions = self._versions
-        return versions.good if versions.candidate is None or versions.is_doubt else versions.candidate
+        return versions.good if versions.candidate is None or versions.is_recheck else versions.candidate
 
     def take_changes(self) -> list[VersionChange]:
-        """What became of versions since the last call."""
+        """Changes of versions since the last call."""
         taken = list(self._versions.changes)
         self._versions.changes.clear()
         return taken
 
     def use(self, loaded: LoadedMap) -> None:
-        """Other tiles of a version that is held, or a new version: the first is taken as it is, any other is tried."""
+        """Takes other tiles of a held version, or a new version: the first one is adopted at once, any other is put on trial."""
         versions = self._versions
         for name in ("good", "candidate"):
             held = getattr(versions, name)
@@ -139,16 +148,16 @@ class Robot:
                     self._show(loaded)
                 return
         if not loaded.is_offer:
-            return  # of a version that was given up while its tiles were read
+            return  # the version was given up while its tiles were read
         if versions.good is None:
             versions.good = loaded
             versions.changes.append(VersionChange(loaded.wanted, Change.ADOPTED))
         else:
-            versions.candidate, versions.trial, versions.is_doubt = loaded, self._new_trial(), False
+            versions.candidate, versions.trial, versions.is_recheck = loaded, self._new_trial(), False
         self._show(loaded)
 
     def handle(self, bundle: SensorBundle) -> Outcome | None:
-        """What a bundle with a frame brought; None without one. RecordingError for pictures that cannot be read."""
+        """Results of a bundle with a frame; None without one. RecordingError for images that cannot be read."""
         self.localizer.handle_imu(bundle.imu)
         self.localizer.handle_wheel(bundle.wheel)
         for prior in bundle.priors:
@@ -166,13 +175,13 @@ class Robot:
         self._try(estimate, frame)
         failure = self.monitor.handle(estimate)
         context = None if failure is None else self._context(failure)
-        if not self._pictures or estimate.stamp_ns - self._pictures[-1][0] >= _THUMBNAIL_EVERY_NS:
-            self._pictures.append((estimate.stamp_ns, frame.left))
+        if not self._images or estimate.stamp_ns - self._images[-1][0] >= _THUMBNAIL_EVERY_NS:
+            self._images.append((estimate.stamp_ns, frame.left))
         dock_error_m = self._docks.handle(bundle.priors, estimate)
         return Outcome(estimate, self._odom.handle(estimate), cpu_s, stage_s, context, dock_error_m)
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
-        """The failure that a source which sends no frames is."""
+        """The failure of a source that has sent no frame for so long."""
         failure = self.monitor.handle_silence(for_s)
         return None if failure is None else self._context(failure)
 
@@ -181,18 +190,18 @@ class Robot:
         frame, estimate = self._last
         map_from_body = estimate.map_from_body
         map_from_cam = None if map_from_body is None else map_from_body @ self._rectifier.body_from_cam
-        return FailureContext(failure, tuple(self._pictures), frame.left, map_from_cam, self.running)
+        return FailureContext(failure, tuple(self._images), frame.left, map_from_cam, self.running)
 
     def _show(self, loaded: LoadedMap) -> None:
         focal_px = loaded.manifest.camera.focal_px
         self.localizer.handle_version(loaded.version, loaded.tiles.values(), loaded.vocabulary, focal_px)
 
     def _new_trial(self) -> VersionTrial | None:
-        """From the last frame that was looked at with the version before; without any, from the first one to come."""
+        """Begins at the last frame of the version before; None without one, then at the next frame."""
         return None if self._last is None else VersionTrial(self._trial_settings, self._last[1])
 
     def _try(self, estimate: Estimate, frame: RectifiedFrame) -> None:
-        """Counts the frame for the trial that is on, if any."""
+        """Counts the frame for the running trial, if any."""
         self._last = (frame, estimate)
         versions = self._versions
         if versions.candidate is None:
@@ -200,28 +209,30 @@ class Robot:
         if versions.trial is None:
             versions.trial = VersionTrial(self._trial_settings, estimate)
         verdict = versions.trial.handle(estimate)
-        if verdict is Verdict.UNDECIDED:
+        if verdict is TrialVerdict.UNDECIDED:
             return
-        if versions.is_doubt:
-            self._end_doubt(verdict)
-        elif verdict is Verdict.CONFIRMED:
+        if versions.is_recheck:
+            self._end_recheck(verdict)
+        elif verdict is TrialVerdict.CONFIRMED:
             versions.changes.append(VersionChange(versions.candidate.wanted, Change.ADOPTED))
             self._versions = replace(versions, good=versions.candidate, candidate=None, trial=None)
         else:
             assert versions.good is not None
             self._show(versions.good)
-            self._versions = replace(versions, trial=self._new_trial(), is_doubt=True, said=versions.trial.said)
+            self._versions = replace(
+                versions, trial=self._new_trial(), is_recheck=True, candidate_reason=versions.trial.reason
+            )
 
-    def _end_doubt(self, verdict: Verdict) -> None:
-        """The old version gave fixes where the new one gave none, or it did not either."""
+    def _end_recheck(self, verdict: TrialVerdict) -> None:
+        """The candidate is refused where the good version gives fixes, else postponed: nothing could be seen."""
         versions = self._versions
         assert versions.candidate is not None
         assert versions.good is not None
-        said = f"of version {versions.candidate.version} {versions.said}"
-        if verdict is Verdict.CONFIRMED:
-            reason = f"{said}, where version {versions.good.version} gives fixes"
+        failed = f"of version {versions.candidate.version} {versions.candidate_reason}"
+        if verdict is TrialVerdict.CONFIRMED:
+            reason = f"{failed}, where version {versions.good.version} gives fixes"
             versions.changes.append(VersionChange(versions.candidate.wanted, Change.REFUSED, reason))
         else:
-            reason = f"{said}, and version {versions.good.version} gives no fixes either; it is tried again later"
+            reason = f"{failed}, and version {versions.good.version} gives no fixes either; it is tried again later"
             versions.changes.append(VersionChange(versions.candidate.wanted, Change.POSTPONED, reason))
-        self._versions = replace(versions, candidate=None, trial=None, is_doubt=False)
+        self._versions = replace(versions, candidate=None, trial=None, is_recheck=False)

@@ -52,7 +52,7 @@ def test_pictures_are_small() -> None:
 
 def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
     """Expected: blind, dark, DEGRADED or LOST, the tile it was last in, pictures from before and from that moment."""
-    from locclient.robot.failure_report import failure_report
+    from locclient.robot.failure_report import RobotProfile, failure_report
 
     robot = robot_world.new_robot()
     with MapStore.open(tmp_path / "store", create=True) as store:
@@ -65,10 +65,8 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
             told.append(outcome.failure)
     assert len(told) == 1
     assert told[0].failure.estimate.cause is told[0].failure.estimate.image.cause is told[0].failure.cause
-    report = failure_report(
-        told[0], site="room", robot="r1", report_id="ab" * 16, wall_ns=7, base_from_body=np.eye(4),
-        camera=robot_world.rectifier().camera, settings=robot_world.SETTINGS,
-    )  # fmt: skip
+    profile = RobotProfile("room", "r1", np.eye(4), robot_world.rectifier().camera, robot_world.SETTINGS)
+    report = failure_report(told[0], profile, report_id="ab" * 16, wall_ns=7)
     assert (report.kind, report.cause, report.version) == ("blind", "dark", 1)
     assert report.status in {"DEGRADED", "LOST"}
     assert report.tile in {(-1, 0), (0, 0)}
