@@ -1,4 +1,4 @@
-"""The OpenAPI document: FastAPI's own, with problem documents instead of its validation errors, and examples."""
+"""The OpenAPI document: FastAPI's own, with problem documents for its validation errors, and with examples."""
 
 from dataclasses import asdict
 from typing import Any

@@ -1,4 +1,4 @@
-"""Reading the fleet's health: figures by what they are counted by, failures with their pictures, tiles to survey again."""
+"""Endpoints of the fleet's health: figures by site, robot, version, tile or cause, failures with their pictures, tiles to survey again."""
 
 import time
 from typing import Annotated, Any
@@ -65,7 +65,7 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
 
     @app.get("/v1/failures/{number}")
     def failure(number: Number) -> FailureView:
-        """One failure with what the robot told about it."""
+        """One failure with the robot's report."""
         found = store.fleet.failure(number)
         return FailureView(found.failure, finite(report_dict(found.report)), found.pictures)
 

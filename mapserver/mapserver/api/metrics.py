@@ -155,5 +155,5 @@ def _seen(robots: list[RobotStatus]) -> list[RobotStatus]:
 
 
 def _status(robot: RobotStatus) -> str:
-    told = (robot.last_health or {}).get("status")
-    return told if told in tuple(Status) else "other"
+    status = (robot.last_health or {}).get("status")
+    return status if status in tuple(Status) else "other"

@@ -1,4 +1,4 @@
-"""Judging and releasing versions: compare, publish, promote, roll back, try with some robots first."""
+"""Endpoints of releases: quality, differences, publishing, promoting, rolling back, canaries."""
 
 import time
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Answers of the API, and what is asked of it when something is to be changed."""
+"""Answers of the API, and the bodies of requests that change something."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, Self
@@ -123,7 +123,7 @@ class FailureList:
 
 @dataclass(frozen=True, slots=True)
 class FailureView:
-    """One failure. report: all that the robot told, without pictures; pictures: those that are still kept."""
+    """One failure. report: the robot's report without pictures; pictures: those that are still kept."""
 
     failure: FailureRow
     report: dict[str, Any]

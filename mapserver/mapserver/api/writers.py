@@ -1,4 +1,4 @@
-"""Who may change something over HTTP: everybody on the server's own machine, elsewhere whoever shows the token."""
+"""Permission to change something over HTTP: on the server's own machine for everybody, elsewhere with the token."""
 
 import hmac
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class Writers:
     is_loopback: bool = True
 
     def check(self, request: Request) -> None:
-        """Raises HTTPException 401 for a missing or wrong token, 403 where nobody may write."""
+        """Raises HTTPException 401 for a missing or wrong token, 403 where writing is off."""
         self.check_shown(request, request.headers.get("authorization", ""))
 
     def check_shown(self, request: Request, authorization: str) -> None:

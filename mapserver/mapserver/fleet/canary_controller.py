@@ -1,4 +1,4 @@
-"""Looks at the canaries of a store and acts: promotes what is proven, takes back what is worse than the margin."""
+"""Decides running canaries: promotes proven versions, takes back versions that are worse than the margin."""
 
 import logging
 
@@ -23,7 +23,7 @@ def find(store: MapStore, canary: CanaryRow, settings: CanarySettings, now_ns: i
 
 
 def review(store: MapStore, settings: CanarySettings, now_ns: int) -> list[CanaryFinding]:
-    """Ends every canary of which enough is known; returns why. One that cannot be ended stays, and is said in the log."""
+    """Ends every canary that can be decided and returns the findings. One that cannot be ended stays and is logged."""
     done = []
     for canary in store.canaries(running=True):
         finding = find(store, canary, settings, now_ns)

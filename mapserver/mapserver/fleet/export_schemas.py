@@ -1,4 +1,4 @@
-"""JSON schemas of what is exported: Foxglove's messages, field by field as its documentation fixes them, and our own."""
+"""JSON schemas of exports: Foxglove's messages, as its documentation fixes them, and our own."""
 
 from types import NoneType
 from typing import Any, get_args, get_type_hints

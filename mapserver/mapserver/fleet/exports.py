@@ -1,4 +1,4 @@
-"""Failures for other programs: JSON lines, and MCAP with Foxglove's own schemas as JSON, which Foxglove opens as it is."""
+"""Failures for other programs: JSON lines, and MCAP with Foxglove's schemas, which Foxglove opens."""
 
 import base64
 import json

@@ -1,4 +1,4 @@
-"""What the server knows about its robots: which version each should run, which it runs, what it said last."""
+"""State of the robots: the version that each should run, the one that it runs, its last messages."""
 
 import math
 import threading
@@ -35,7 +35,7 @@ class RobotStatus:
     """One robot. version: what it runs, None before it said so; seconds_since: since it said anything.
 
     is_canary: whether it tries a version before the others. is_present: its liveliness token, None before the first look.
-    clock_ahead_s: by how much its wall clock is ahead of the server's, None before it told. last_ack, last_health and last_pose are
+    clock_ahead_s: by how much its wall clock is ahead of the server's, None before it reported. last_ack, last_health and last_pose are
     its last messages as plain values, None before the first.
     """
 
@@ -67,7 +67,7 @@ class Fleet:
 
     Acknowledgements and failures are on the disk when the method returns, health with the next `flush`; of poses the last one
     is in memory. Messages for sites that the store does not have are refused, as are more than MAX_ROBOTS robots, so that
-    nobody can fill the disk by inventing names.
+    invented names cannot fill the disk.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Fleet:
         return {robot: assignment.wanted(robot) for robot in self.known_robots(site)}
 
     def take_question(self, site: str, robot: str) -> WantedVersion:
-        """As `wanted_version`, asked by the robot itself: from then on it is known, and told of the next version."""
+        """As `wanted_version`, asked by the robot itself: from then on it is known, and hears of the next version."""
         wanted = self.wanted_version(site, robot)
         with self._lock:
             if (site, robot) in self._robots or len(self._robots) < MAX_ROBOTS:
@@ -106,7 +106,7 @@ class Fleet:
         return wanted
 
     def take_ack(self, site: str, robot: str, ack: RobotAck) -> None:
-        """Keeps an acknowledgement; raises LinkError for one that speaks for another robot."""
+        """Keeps an acknowledgement; raises LinkError for one in another robot's name."""
         _check_sender(site, robot, ack)
         now_ns = self._clock_ns()
         with self._lock:
@@ -116,7 +116,7 @@ class Fleet:
         self._store.record_robot_report(site, robot, report, version)
 
     def take_health(self, site: str, robot: str, health: RobotHealth) -> None:
-        """Counts a report and keeps it until the next `flush`; raises LinkError for one that speaks for another robot."""
+        """Counts a report and keeps it until the next `flush`; raises LinkError for one in another robot's name."""
         _check_sender(site, robot, health)
         now_ns = self._clock_ns()
         with self._lock:

@@ -1,4 +1,4 @@
-"""What robots report, counted by the hour for the site, each robot, version, tile, cause, and arm of a canary."""
+"""Ingestion of robots' reports: counters by the hour for site, robot, version, tile, cause and arm of a canary."""
 
 import math
 import threading

@@ -1,4 +1,4 @@
-"""Failure reports that cannot be kept as such: set aside as they came, so that somebody can find out why."""
+"""Dead letters: failure reports that cannot be stored are kept as they came, with the reason."""
 
 import logging
 from pathlib import Path
@@ -28,13 +28,13 @@ def rejection(payload: bytes, reason: str) -> FailureAck:
 
 
 class RejectedReports:
-    """A folder of the last of them, the bytes of each beside its reason. A disk that refuses costs only these."""
+    """A folder of the last rejected reports, each beside its reason. A full disk loses only these."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def keep(self, site: str, robot: str, payload: bytes, reason: str, now_ns: int) -> None:
-        """Sets one aside."""
+        """Keeps one."""
         _log.warning("a failure of robot %r of site %r is refused for good: %s", robot[:80], site[:80], reason)
         try:
             self._folder.mkdir(exist_ok=True)
@@ -45,7 +45,7 @@ class RejectedReports:
                 old.unlink()
                 old.with_suffix(".reason.txt").unlink(missing_ok=True)
         except OSError as error:
-            _log.warning("it could not be set aside in %s: %s", self._folder, error)
+            _log.warning("it could not be kept in %s: %s", self._folder, error)
 
 
 def _sender(site: str, robot: str) -> str:

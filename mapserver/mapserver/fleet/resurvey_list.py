@@ -1,4 +1,4 @@
-"""The re-survey list of a site out of its store, and the places in the current map through which a route can lead."""
+"""The re-survey list of a site, from the store's counters, and a route through the current map."""
 
 import math
 from dataclasses import dataclass

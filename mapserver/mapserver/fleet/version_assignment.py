@@ -1,4 +1,4 @@
-"""Which version each robot of a site should run."""
+"""Assignment of versions to the robots of a site."""
 
 from dataclasses import dataclass
 

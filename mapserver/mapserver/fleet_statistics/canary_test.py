@@ -1,10 +1,7 @@
-"""A version tried by some robots first: which robots, and whether they fail more often than the others. Pure.
+"""Canaries: the choice of the robots that try a version first, and the test of their failures against the others'. Pure.
 
-Two questions are asked of the same counts. Harm: may the canary's failures still come from a rate within the margin? They are
-weighed as they come, by an e-value (a mixture of likelihood ratios given the number of all failures): by Ville's inequality one
-that ever reaches 1/alpha is an error in at most a share alpha of harmless canaries, however often it is looked at, as long as
-the arms' shares of driving stay as they are. Proof: is the canary's rate within the margin, with so much confidence, by the
-posterior of both rates (Jeffreys' prior)?
+Two tests use the same counts. Harm: a sequential test, by an e-value, of whether the canary's rate exceeds the margin. Proof: the
+posterior probability that the rate is within the margin.
 """
 
 import hashlib
@@ -81,19 +78,24 @@ def judge_canary(canary: Counters, others: Counters, age_days: float, settings: 
     elif ours.robot_days >= settings.min_robot_days and within >= settings.confidence:
         action, why = "promote", f"its rate is within the margin with {within:.1%}"
     elif age_days >= settings.max_days:
-        action, why = (
-            "roll_back",
-            f"after {age_days:.1f} days it is still not shown to be within the margin ({within:.1%})",
-        )
+        why = f"after {age_days:.1f} days it is still not shown to be within the margin ({within:.1%})"
+        action = "roll_back"
     else:
         action, why = "wait", _why_wait(ours, theirs, within, evidence)
     margin = f"{settings.margin_ratio:g} times the others' rate + {settings.margin_per_robot_day:g} per robot-day"
-    reason = f"{why}; canary {_told(ours)}, others {_told(theirs)}, margin {margin}"
+    reason = f"{why}; canary {_rate_text(ours)}, others {_rate_text(theirs)}, margin {margin}"
     return CanaryFinding(action, reason, ours, theirs, evidence, within)
 
 
 def evidence_of_harm(canary: Rate, others: Rate, margin_ratio: float) -> float:
-    """The e-value against "the canary's rate is at most margin_ratio times the others'"; 1 where nothing was driven."""
+    """The e-value against "the canary's rate is at most margin_ratio times the others'"; 1 where nothing was driven.
+
+    A mixture of binomial likelihood ratios, given the number of all failures. An e-value that ever reaches 1/alpha is an error in
+    at most a share alpha of harmless canaries, however often it is looked at (Ville's inequality), as long as the arms' shares of
+    driving stay as they are.
+
+    Source: Ville 1939; Wald 1945, sequential tests of statistical hypotheses, for the mixture of likelihood ratios.
+    """
     if canary.robot_days <= 0 or others.robot_days <= 0:
         return 1.0
     odds = margin_ratio * canary.robot_days / others.robot_days
@@ -105,7 +107,10 @@ def evidence_of_harm(canary: Rate, others: Rate, margin_ratio: float) -> float:
 
 
 def within_margin(canary: Rate, others: Rate, margin_ratio: float, margin_per_robot_day: float) -> float:
-    """The probability that the canary's rate is within the margin; 0.5 where nothing was driven."""
+    """The posterior probability that the canary's rate is within the margin; 0.5 where nothing was driven.
+
+    Source: Jeffreys 1946, for the prior of a Poisson rate: Gamma(n + 1/2).
+    """
     if canary.robot_days <= 0 or others.robot_days <= 0:
         return 0.5
     other_rates = gammaincinv(others.events + 0.5, _QUANTILES) / others.robot_days
@@ -121,7 +126,7 @@ def _why_wait(canary: Rate, others: Rate, within: float, evidence: float) -> str
     return f"too early to tell: within the margin with {within:.1%}, evidence of harm {evidence:.2g} to 1"
 
 
-def _told(found: Rate) -> str:
+def _rate_text(found: Rate) -> str:
     if found.per_robot_day is None:
         return f"{found.events} failures before anything was driven"
     return (

@@ -1,12 +1,12 @@
-"""How far a robot's wall clock is ahead of the server's, from the stamps of its messages. Pure."""
+"""Estimate of how far a robot's wall clock is ahead of the server's, from the stamps of its messages. Pure."""
 
 _WINDOW_NS = 60_000_000_000
 
 
 class ClockSkew:
-    """The largest of (robot's stamp - server's clock) over the last one to two minutes: the message that travelled fastest.
+    """The largest of (robot's stamp - server's clock) over the last one to two minutes: the message with the least delay.
 
-    What remains is that message's way, some milliseconds on a local network.
+    The remaining error is that delay, some milliseconds on a local network.
     """
 
     def __init__(self, ahead_s: float | None = None) -> None:

@@ -1,4 +1,4 @@
-"""What one robot's stream of messages adds to the fleet's sums. Pure: time comes with the messages."""
+"""Counters of one robot's stream of messages. Pure: time comes with the messages."""
 
 import math
 
@@ -110,7 +110,7 @@ class HealthStream:
         A stretch lasts until the next report that is better, and a failure until 5 s of good tracking.
         """
         if dt_ms == 0:
-            self._blind_since_ns = self._good_since_ns = None  # nobody knows what was in between
+            self._blind_since_ns = self._good_since_ns = None  # what was in between is unknown
         began = self._blind_since_ns is not None and watched_ns - self._blind_since_ns > BLIND_S * 1e9
         if not is_blind_now:
             self._blind_since_ns = None
@@ -154,7 +154,7 @@ class HealthStream:
 
 
 def _figures(health: RobotHealth) -> dict[str, float]:
-    """The metrics that are numbers; what is absurd or none was not told."""
+    """The metrics that are plausible numbers."""
     return {
         name: float(value)
         for name, value in health.metrics.items()

@@ -1,7 +1,6 @@
-"""What a fleet's reports say: sums that can be added up (Counters), and the rates, shares and intervals made of them. Pure.
+"""Key performance indicators of a fleet: counters that add up, and rates, shares and intervals of them. Pure.
 
-A robot-day is 16 h of driving. Intervals hold the true rate with 95 %: exact for a Poisson count (Garwood 1936); where nothing
-was seen, one-sided, which is the rule of three. Shares of counts have the exact interval of Clopper and Pearson (1934).
+A robot-day is 16 h of driving. Intervals hold the true value with 95 %.
 """
 
 from dataclasses import astuple, dataclass, fields
@@ -165,14 +164,20 @@ def rate(events: int, robot_days: float) -> Rate:
 
 
 def poisson_interval(events: int) -> tuple[float, float]:
-    """The means of a Poisson count that `events` does not refute with 95 %; one-sided (0 to 3.0) where none was seen."""
+    """The exact 95 % interval of the mean of a Poisson count; one-sided (0 to 3.0, the rule of three) where none was seen.
+
+    Source: Garwood 1936, by quantiles of the gamma distribution.
+    """
     if events == 0:
         return 0.0, float(gammaincinv(1, 1 - _TAIL))
     return float(gammaincinv(events, _TAIL / 2)), float(gammaincinv(events + 1, 1 - _TAIL / 2))
 
 
 def share(hits: int, tries: int) -> Share:
-    """A share with its interval; one-sided where no try or every try hit."""
+    """A share with its exact interval; one-sided where no try or every try hit.
+
+    Source: Clopper and Pearson 1934, by quantiles of the beta distribution.
+    """
     if tries <= 0:
         return Share(hits, tries, None, None, None)
     one_sided = hits in {0, tries}

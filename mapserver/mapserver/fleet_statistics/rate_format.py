@@ -1,9 +1,9 @@
-"""Rates of failures in words that a shift leader can act on: none where too little was driven to speak of one. Pure."""
+"""Failure rates as text; none where too little was driven for a rate. Pure."""
 
 from mapserver.fleet_statistics.kpis import ROBOT_DAY_S, Rate
 
 LEAST_ROBOT_DAYS = 0.1
-"""Below it (96 minutes of driving) one failure would read as ten or more per robot-day: counts are told, no rate."""
+"""Below it (96 minutes of driving) one failure would read as ten or more per robot-day: counts are shown, no rate."""
 
 
 def is_telling(found: Rate) -> bool:

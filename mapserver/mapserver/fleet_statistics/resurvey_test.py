@@ -1,4 +1,4 @@
-"""Which tiles should be surveyed again, and a route through them. Pure.
+"""Tiles that should be surveyed again, and a route through them. Pure.
 
 A tile is listed where robots fail clearly more often than before (or, without a before, than elsewhere on the site), or where they
 find clearly fewer of the landmarks that they look for.
@@ -111,14 +111,15 @@ def route_geojson(site: str, version: int, way: Sequence[Waypoint]) -> dict[str,
     ]
     line = [point["geometry"]["coordinates"] for point in points]
     lines = [{"type": "Feature", "geometry": {"type": "LineString", "coordinates": line}, "properties": {}}]
-    return {
-        "type": "FeatureCollection", "site": site, "version": version, "units": "metres in map",
-        "features": points + (lines if len(line) > 1 else []),
-    }  # fmt: skip
+    about = {"type": "FeatureCollection", "site": site, "version": version, "units": "metres in map"}
+    return about | {"features": points + (lines if len(line) > 1 else [])}
 
 
 def _rising(now: Counters, then: Counters, total: Counters, settings: ResurveySettings, tests: int) -> list[str]:
-    """The exact conditional test of two Poisson rates (Przyborowski and Wilenski 1940), Bonferroni over the site's tiles."""
+    """The exact conditional test of two Poisson rates, with Bonferroni's correction over the site's tiles.
+
+    Source: Przyborowski and Wilenski 1940.
+    """
     if now.events < settings.min_failures:
         return []
     elsewhere_days = total.robot_days - now.robot_days
@@ -132,8 +133,9 @@ def _rising(now: Counters, then: Counters, total: Counters, settings: ResurveySe
     chance = float(betainc(now.events, events + 1, odds / (1 + odds)))
     if chance * tests > settings.alpha:
         return []
-    told = f"{now.events} failures in {now.driving_ms / 3.6e6:.1f} h of driving, {events} in {days * 16:.1f} h {words}"
-    return [told]
+    return [
+        f"{now.events} failures in {now.driving_ms / 3.6e6:.1f} h of driving, {events} in {days * 16:.1f} h {words}"
+    ]
 
 
 def _fading(now: Counters, then: Counters, settings: ResurveySettings) -> list[str]:

@@ -54,7 +54,7 @@ def arrivals(inbox: Path, settle_s: float, now_ns: int) -> Arrivals:
     """What is in the inbox now. Hidden names and other files than .mcap are ignored.
 
     A recording is whole when nothing in it changed for `settle_s`, no file in it bears the name of a half copied one, and
-    nobody has one open for writing, as far as the system tells. Raises UsageError where there is no such folder.
+    no process has one open for writing, as far as the system tells. Raises UsageError where there is no such folder.
     """
     if not inbox.is_dir():
         raise UsageError(f"--inbox {inbox} is no folder; create it, or name the one that recordings are copied into")

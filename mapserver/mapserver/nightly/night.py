@@ -157,7 +157,7 @@ class _Night:
         return list(found.values())
 
     def _left_draft(self) -> VersionInfo | None:
-        """The draft that a killed night saved and that still fits: nobody published anything since."""
+        """The draft that a killed night saved and that is still based on the current version."""
         site = self._request.site
         if not _has_site(self._maps, site):
             return None

@@ -9,7 +9,7 @@ from mapserver.releases.version_diff import Difference, manifest_difference
 from mapserver.store import NOBODY, Actor, CanaryRow, MapStore, NewCanary, VerdictRow, VersionInfo
 
 _USUAL_GATE = GateSettings()
-_RECENT_NS = 2 * 86_400_000_000_000  # robots silent for longer do not count as somebody to try a version
+_RECENT_NS = 2 * 86_400_000_000_000  # robots that are silent for longer are not chosen to try a version
 
 
 def publish(

@@ -1,4 +1,4 @@
-"""What changed from one version to another: tiles, landmarks, bytes, quality. Pure."""
+"""Differences between two versions: tiles, landmarks, bytes, quality. Pure."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What the store said lately of addresses: whether, and as what, robots of a site may fetch them."""
+"""Recent answers of the store on which addresses robots of a site may fetch, and as what."""
 
 import threading
 import time
@@ -9,7 +9,7 @@ _MAX_KEPT = 20_000
 
 
 class AuthorizationCache:
-    """For several threads. A whole fleet asks for the parts of the same things: the store is asked once in some seconds.
+    """Thread-safe. A whole fleet asks for parts of the same blobs: the store is asked once in some seconds.
 
     Only what may be fetched is remembered, so that a version is served as soon as it is published; what `gc` took away is
     refused after these seconds, if its bytes were still in memory.

@@ -1,4 +1,4 @@
-"""What the server does by itself beside answering: announce versions, bring counts to the disk, look at canaries."""
+"""Periodic work of the server: announce versions, write counters to the disk, decide canaries."""
 
 import asyncio
 import logging
@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class BackgroundTask:
-    """Something to do again and again."""
+    """A function that is called every `every_s` seconds."""
 
     name: str
     every_s: float
@@ -52,7 +52,7 @@ def server_tasks(
 
 
 async def run_background_tasks(tasks: list[BackgroundTask]) -> None:
-    """Does them in turn, in a thread, until it is cancelled. One that fails is tried again at its next time."""
+    """Runs them in turn, in a thread, until it is cancelled. One that fails is tried again at its next time."""
     while True:
         for task in tasks:
             if time.monotonic() < task.due_s:

@@ -1,4 +1,4 @@
-"""The server's side of the bus: answers for versions, manifests, bytes and patches, hears the robots, announces versions."""
+"""The server's side of the bus: answers for versions, manifests, bytes and patches; takes the robots' messages; announces versions."""
 
 import logging
 import threading
@@ -67,8 +67,8 @@ class BusService:
     def announce_changes(self) -> list[str]:
         """Tells every known robot whose wanted version changed since the last call; returns the sites where somebody was told.
 
-        The first call tells all of them, because they may have missed what happened while no server ran. The patches that they will
-        ask for, all at once, are made before they are told, as far as `_PREPARE_S` goes.
+        The first call tells all of them, because they may have missed what happened while no server ran. Patches are made before
+        the announcement, for at most `_PREPARE_S`, because all robots ask for them at once.
         """
         changed, until_s = [], time.monotonic() + _PREPARE_S
         for info in self._store.sites():
@@ -159,7 +159,7 @@ class BusService:
         pairs = [(base, result), *((known.get((tile.x, tile.y)), tile.sha256) for tile in new.tiles)]
         for before, after in pairs:
             if before is not None and before != after and time.monotonic() < until_s:
-                with suppress(FleetmapError):  # not worth it, or not to be had: whoever asks is told
+                with suppress(FleetmapError):  # not worth it or not available: the answer to a request says so
                     self._patch(patch_key(site, before, after))
 
     def _made_patch(self, base: str, result: str) -> bytes:
@@ -191,7 +191,7 @@ class BusService:
             else:
                 self._fleet.take_pose(site, robot, decode_message(payload, PoseMessage))
         except FleetmapError as error:
-            # Nobody waits for an answer to what was published: the log and the metric are where it can be seen.
+            # Published messages have no answer: the log and the metric show the refusal.
             _log.warning("message under %s refused: %s", key, error)
             self._count(what, "refused", 0)
         else:

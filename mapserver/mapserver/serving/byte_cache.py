@@ -1,4 +1,4 @@
-"""Bytes that were used last, up to a number of them."""
+"""A cache of bytes, bounded in size: the least recently used go first."""
 
 import threading
 from collections import OrderedDict
@@ -8,7 +8,7 @@ _ENTRY_BYTES = 200  # what an entry takes beside its bytes, so that empty ones a
 
 
 class ByteCache:
-    """For several threads. Holds at most `max_bytes`; the least recently used go first."""
+    """Thread-safe. Holds at most `max_bytes`."""
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes

@@ -1,4 +1,4 @@
-"""The SQLite file of a store: opening, numbered migrations, transactions. It alone decides how SQLite behaves."""
+"""The SQLite file of a store: opening, numbered migrations, transactions. All settings of SQLite are here."""
 
 import sqlite3
 from collections.abc import Iterator

@@ -100,7 +100,7 @@ def _export_chunks(head: ExportHead, blobs: BlobFolder) -> Iterator[bytes]:
 
 
 class ExportReader:
-    """An open export file. Nothing in it is believed before it was checked."""
+    """An open export file. Its content is used only after it was checked."""
 
     def __init__(self, descriptor: int, path: Path) -> None:
         self._descriptor = descriptor

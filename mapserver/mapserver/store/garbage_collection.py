@@ -1,4 +1,4 @@
-"""Removing what nobody needs: versions beyond retention, bytes that nothing mentions, what killed processes left."""
+"""Garbage collection: versions beyond retention, bytes that no version mentions, files that killed processes left."""
 
 import sqlite3
 from dataclasses import dataclass, field

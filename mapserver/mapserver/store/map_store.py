@@ -150,7 +150,7 @@ class MapStore(StoreQueries):
 
     def verify(self) -> StoreFindings:
         """What is wrong with the store; reads all of it."""
-        with self._disk_told():
+        with self._disk_errors():
             return verify(self._root, self._transactions, self._blobs)
 
     def collect_garbage(
@@ -258,11 +258,11 @@ class MapStore(StoreQueries):
 
     @contextmanager
     def _locked(self, *, shared: bool) -> Iterator[None]:
-        with self._disk_told(), locked(self._root / "lock", shared=shared):
+        with self._disk_errors(), locked(self._root / "lock", shared=shared):
             yield
 
     @contextmanager
-    def _disk_told(self) -> Iterator[None]:
+    def _disk_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:

@@ -1,4 +1,4 @@
-"""SQL over versions, canaries and the record of what was current. What to change is decided in `releases`."""
+"""SQL over versions, canaries and the record of what was current. `releases` decides what changes."""
 
 import json
 import sqlite3
