@@ -1,4 +1,6 @@
-"""Points followed from one picture to the next by what their surroundings look like."""
+"""Optical flow: points followed from one image to the next by their neighbourhoods."""
+
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -9,30 +11,35 @@ from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Image
 
 _STEPS, _SETTLED_PX = 20, 0.01
-# The way back begins at its end: steps that still move it by more than any check allows show soon.
+# The way back begins near its end, so that failures show after few steps.
 _STEPS_BACK, _SETTLED_BACK_PX = 8, 0.03
 
 
 class Pyramid:
-    """A picture, and its halves as they are asked for."""
+    """An image and its halvings, made on demand."""
 
     def __init__(self, image: Image) -> None:
         self._levels = [image]
 
     def level(self, number: int) -> Image:
-        """The picture halved so often, smoothed; pixel (x, y) there is (2x, 2y) on the level before."""
+        """The image halved so often, smoothed; pixel (x, y) there is (2x, 2y) on the level before."""
         while len(self._levels) <= number:
             self._levels.append(np.asarray(cv2.pyrDown(self._levels[-1]), np.uint8))
         return self._levels[number]
 
 
-def follow(
-    before: Pyramid, now: Pyramid, pixels: Array, predicted: Array, *, window_px: int, levels: int
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Where pixels (N, 2) of one picture are in the next, (N, 2), and which were found.
+class Flow(NamedTuple):
+    """Pixels (N, 2) of one image, their places (N, 2) in the next one, and which were found (N,)."""
 
-    predicted (N, 2): where they are looked for first, from so many levels above the picture down. The source is named in the
-    kernels.
+    pixels: Array
+    places: Array
+    found: NDArray[np.bool_]
+
+
+def follow(before: Pyramid, now: Pyramid, pixels: Array, predicted: Array, *, window_px: int, levels: int) -> Flow:
+    """Follows pixels (N, 2) of one image into the next by pyramidal Lucas-Kanade; the source is named in the kernels.
+
+    predicted (N, 2): where they are looked for first, from so many levels above the image down.
     """
     places, found = np.array(predicted, np.float64), np.ones(len(pixels), bool)
     start, half = np.ascontiguousarray(pixels, np.float64), window_px // 2
@@ -41,16 +48,20 @@ def follow(
             before.level(level), now.level(level), 0.5**level, half, _STEPS, _SETTLED_PX, start, places, found.copy()
         )
     flow_kernels.follow(before.level(0), now.level(0), 1.0, half, _STEPS, _SETTLED_PX, start, places, found)
-    return places, found
+    return Flow(pixels, places, found)
 
 
 def forward_backward_check(
-    before: Pyramid, now: Pyramid, pixels: Array, places: Array, found: NDArray[np.bool_], *, window_px: int, within_px: float
-) -> NDArray[np.bool_]:  # fmt: skip
-    """Which (N,) of the found places (N, 2) lead back to the pixels (N, 2) that they were found from, as nearly as is asked."""
-    back, held = np.array(pixels, np.float64), found.copy()
+    before: Pyramid, now: Pyramid, flow: Flow, *, window_px: int, within_px: float
+) -> NDArray[np.bool_]:
+    """(N,) which of the found places lead back to within so many pixels of where they were followed from.
+
+    Source: Kalal et al. 2010.
+    """
+    back, held = np.array(flow.pixels, np.float64), flow.found.copy()
+    half = window_px // 2
     flow_kernels.follow(
-        now.level(0), before.level(0), 1.0, window_px // 2, _STEPS_BACK, _SETTLED_BACK_PX, places, back, held
+        now.level(0), before.level(0), 1.0, half, _STEPS_BACK, _SETTLED_BACK_PX, flow.places, back, held
     )
-    off = back - pixels
+    off = back - flow.pixels
     return np.asarray(held & (off[:, 0] ** 2 + off[:, 1] ** 2 < within_px**2))

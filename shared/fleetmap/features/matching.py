@@ -1,15 +1,18 @@
-"""Which binary descriptors belong together: exhaustive, mutual, or near a predicted pixel."""
+"""Matching of binary descriptors: exhaustive, mutual, or near a predicted pixel."""
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.features import matching_kernels
 from fleetmap.features.matching_kernels import FAR, Distances, Indices, Packed
+from fleetmap.features.orb import Features
 from fleetmap.geometry import Array
 
 Descriptors = NDArray[np.uint8]
 
-__all__ = ["FAR", "hamming_knn2", "match_by_projection", "match_mutual", "packed"]
+__all__ = ["FAR", "Projected", "hamming_knn2", "match_by_projection", "match_mutual", "packed"]
 
 
 def packed(descriptors: Descriptors) -> Packed:
@@ -40,22 +43,33 @@ def match_mutual(descriptors_a: Descriptors, descriptors_b: Descriptors, max_dis
     return matching_kernels.mutual(packed(descriptors_a), packed(descriptors_b), max_distance, float(ratio))
 
 
-def match_by_projection(
-    pixels_predicted: Array, radius_px: Array, descriptors_a: Descriptors, octave_range_a: NDArray[np.integer],
-    pixels_b: Array, octaves_b: NDArray[np.integer], descriptors_b: Descriptors, max_distance: int, ratio: float,
-) -> tuple[Indices, Distances]:  # fmt: skip
-    """For every a its feature of b (index, -1 none) and their distance (FAR none), looked for around a predicted pixel.
+class Projected(NamedTuple):
+    """Where A landmarks or features should appear in an image, and how they look.
 
-    pixels_predicted (A, 2), NaN where a is not to be matched; radius_px (A,); octave_range_a (A, 2) lowest and highest
-    octave, both included; pixels_b (B, 2); octaves_b (B,) within int8. The distance is at most `max_distance` and below
-    `ratio` times that of its nearest rival of the same octave: a corner found again on the next octave is no rival.
-    Each feature of b goes to the nearest a that chose it, the others go without; ties to the lower index.
+    pixels (A, 2), NaN where one is not to be matched; radius_px (A,); descriptors (A, 32); octave_range (A, 2) lowest and
+    highest octave, both included.
     """
-    assert len(pixels_predicted) == len(radius_px) == len(descriptors_a) == len(octave_range_a)
-    assert len(pixels_b) == len(octaves_b) == len(descriptors_b)
+
+    pixels: Array
+    radius_px: Array
+    descriptors: Descriptors
+    octave_range: NDArray[np.integer]
+
+
+def match_by_projection(
+    projected: Projected, features: Features, max_distance: int, ratio: float
+) -> tuple[Indices, Distances]:
+    """(A,) index of the feature that shows each, -1 none, and (A,) their distance, FAR none.
+
+    The distance is at most `max_distance` and below `ratio` times that of its nearest rival of the same octave: a corner
+    found again on the next octave is no rival. Each feature goes to the nearest that chose it, the others go without; ties
+    to the lower index.
+    """
+    assert len(projected.pixels) == len(projected.radius_px) == len(projected.octave_range)
+    wanted = np.ascontiguousarray(projected.pixels, np.float64), np.ascontiguousarray(projected.radius_px, np.float64)
+    octave_range = np.ascontiguousarray(projected.octave_range, np.int64)
+    pixels, octaves = np.ascontiguousarray(features.pixels, np.float64), np.ascontiguousarray(features.octaves, np.int8)
+    ours, theirs = packed(projected.descriptors), packed(features.descriptors)
     return matching_kernels.by_projection(
-        np.ascontiguousarray(pixels_predicted, np.float64), np.ascontiguousarray(radius_px, np.float64),
-        packed(descriptors_a), np.ascontiguousarray(octave_range_a, np.int64),
-        np.ascontiguousarray(pixels_b, np.float64), np.ascontiguousarray(octaves_b, np.int8),
-        packed(descriptors_b), max_distance, float(ratio),
-    )  # fmt: skip
+        *wanted, ours, octave_range, pixels, octaves, theirs, max_distance, float(ratio)
+    )

@@ -1,5 +1,7 @@
 """Sub-pixel positions of matched features: the match finds the correspondence, the patch gives the coordinate."""
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -70,27 +72,37 @@ def similarity_from_motion(camera: StereoCamera, points_reference: Array, curren
     return out
 
 
-def refine_matches(
-    reference: Pyramid, current: Pyramid, reference_pixels: Array, reference_octaves: NDArray[np.int8],
-    current_pixels: Array, current_octaves: NDArray[np.int8], reference_from_current: Array, settings: AlignSettings,
-) -> Array:  # fmt: skip
-    """(N, 3) x, y, sigma_px in level-0 pixels of the current picture; NaN where the patches do not agree.
+class Patches(NamedTuple):
+    """Features of an image: its `half_pyramid`, pixels (N, 2) at level 0, octaves (N,)."""
 
-    Each feature is aligned on the halving of the pyramid nearest to the scale at which it was found.
+    pyramid: Pyramid
+    pixels: Array
+    octaves: NDArray[np.int8]
+
+
+def refine_matches(
+    reference: Patches, current: Patches, reference_from_current: Array, settings: AlignSettings
+) -> Array:
+    """(N, 3) x, y, sigma_px in level-0 pixels of the current image; NaN where the patches do not agree.
+
+    reference_from_current (N, 2, 2) warps offsets. Each feature is aligned on the halving of the pyramid nearest to the
+    scale at which it was found.
     """
-    out = np.full((len(reference_pixels), 3), np.nan)
-    level_ref, level_cur = halvings(reference_octaves), halvings(current_octaves)
+    out = np.full((len(reference.pixels), 3), np.nan)
+    level_ref, level_cur = halvings(reference.octaves), halvings(current.octaves)
     for a in range(_LEVELS):
         for b in range(_LEVELS):
             index = np.flatnonzero((level_ref == a) & (level_cur == b))
             if not len(index):
                 continue
-            found = np.empty((len(index), 4))
-            align_patches(
-                reference[a], current[b], np.ascontiguousarray(reference_pixels[index] / 2.0**a),
-                np.ascontiguousarray(current_pixels[index] / 2.0**b), reference_from_current[index] * 2.0 ** (b - a),
-                settings.half_window_px, settings.max_shift_px, found,
-            )  # fmt: skip
+            found, warp = np.empty((len(index), 4)), reference_from_current[index] * 2.0 ** (b - a)
+            pixels_a = np.ascontiguousarray(reference.pixels[index] / 2.0**a)
+            pixels_b = np.ascontiguousarray(current.pixels[index] / 2.0**b)
+            images, limits = (
+                (reference.pyramid[a], current.pyramid[b]),
+                (settings.half_window_px, settings.max_shift_px),
+            )
+            align_patches(*images, pixels_a, pixels_b, warp, *limits, found)
             found[~(found[:, 3] >= settings.min_correlation)] = np.nan
             out[index] = found[:, :3] * 2.0**b
     return out

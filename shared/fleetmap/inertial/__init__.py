@@ -3,11 +3,9 @@
 from fleetmap.inertial.preintegration import (
     GRAVITY_MAP,
     GRAVITY_MPS2,
-    NavTrack,
     Preintegrated,
     imu_intervals,
     preintegrate,
-    propagate_nav,
 )
 
-__all__ = ["GRAVITY_MAP", "GRAVITY_MPS2", "NavTrack", "Preintegrated", "imu_intervals", "preintegrate", "propagate_nav"]
+__all__ = ["GRAVITY_MAP", "GRAVITY_MPS2", "Preintegrated", "imu_intervals", "preintegrate"]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, so3_exp
-from fleetmap.inertial.preintegration_kernels import integrate_samples, propagate_samples
+from fleetmap.inertial.preintegration_kernels import integrate_samples
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples, Stamps
 
@@ -78,15 +78,6 @@ class Preintegrated:
         return se3(map_from_start @ rotation, moved), np.asarray(after)
 
 
-@dataclass(frozen=True)
-class NavTrack:
-    """Dead reckoning: stamps_ns (N,), frame_from_body (N, 4, 4), velocities_mps (N, 3) in the frame."""
-
-    stamps_ns: Stamps
-    frame_from_body: Array
-    velocities_mps: Array
-
-
 def preintegrate(
     imu: ImuSamples, start_ns: int, end_ns: int, gyro_bias: Array, accel_bias: Array, noise: ImuNoise
 ) -> Preintegrated:
@@ -123,31 +114,6 @@ def preintegrate(
         accel_bias_mps2=np.array(accel_bias, dtype=np.float64),
         max_gap_s=float(holes_s.max(initial=0.0)),
     )
-
-
-def propagate_nav(
-    imu: ImuSamples,
-    start_ns: int,
-    end_ns: int,
-    frame_from_body: Array,
-    velocity_mps: Array,
-    gyro_bias: Array,
-    accel_bias: Array,
-) -> NavTrack:
-    """Dead reckoning from the state at `start_ns` through the samples to `end_ns`, one row per sample and both ends.
-
-    frame_from_body (4, 4) and velocity_mps (3,) are given in any gravity-aligned frame. Beyond the data samples are
-    held; without any, the body keeps its velocity.
-    """
-    stamps, gyro, accel, _, _ = _cut(imu, start_ns, end_ns)
-    frame_from_bodies, velocities = np.empty((len(stamps), 4, 4)), np.empty((len(stamps), 3))
-    frame_from_bodies[0], velocities[0] = frame_from_body, velocity_mps
-    blind = len(imu) == 0
-    gravity = np.zeros(3) if blind else GRAVITY_MAP
-    if not blind:
-        gyro, accel = gyro - gyro_bias, accel - accel_bias
-    propagate_samples(_seconds(stamps, start_ns), gyro, accel, gravity, frame_from_bodies, velocities)
-    return NavTrack(stamps, frame_from_bodies, velocities)
 
 
 def _seconds(stamps: Stamps, start_ns: int) -> Array:

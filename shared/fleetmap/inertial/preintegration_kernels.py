@@ -191,32 +191,3 @@ def integrate_samples(
             velocity_mps[a] += 0.5 * dt_s * (force_a[a] + force_b[a])
             for b in range(3):
                 rotation[a, b] = rot_b[a, b]
-
-
-@kernel
-def propagate_samples(
-    times_s: Array,
-    gyro_radps: Array,
-    accel_mps2: Array,
-    gravity_mps2: Array,
-    frame_from_body: Array,
-    velocities_mps: Array,
-) -> None:
-    """Fills frame_from_body (N, 4, 4) and velocities (N, 3) from their first rows through N bias-free samples."""
-    theta, step = np.empty(3), np.empty((3, 3))
-    force_a, force_b = np.empty(3), np.empty(3)
-    for n in range(len(times_s) - 1):
-        dt_s = times_s[n + 1] - times_s[n]
-        now, after = frame_from_body[n], frame_from_body[n + 1]
-        step_rotvec(gyro_radps[n], gyro_radps[n + 1], dt_s, theta)
-        exp_into(theta, step)
-        matmul3(now, step, after)
-        matvec3(now, accel_mps2[n], force_a)
-        matvec3(after, accel_mps2[n + 1], force_b)
-        for a in range(3):
-            velocity = velocities_mps[n, a]
-            change = dt_s * dt_s * (force_a[a] / 3.0 + force_b[a] / 6.0 + 0.5 * gravity_mps2[a])
-            after[a, 3] = now[a, 3] + dt_s * velocity + change
-            velocities_mps[n + 1, a] = velocity + dt_s * (0.5 * (force_a[a] + force_b[a]) + gravity_mps2[a])
-            after[3, a] = 0.0
-        after[3, 3] = 1.0

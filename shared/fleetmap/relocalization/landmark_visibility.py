@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features.matching import match_by_projection
+from fleetmap.features.matching import Projected, match_by_projection
 from fleetmap.features.orb import SCALE_FACTOR, Features
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.mapformat import Tile
@@ -34,8 +34,7 @@ def visible_landmarks(
     cones: ViewingCones, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float
 ) -> VisibleLandmarks:
     """The landmarks in a camera's image widened by margin_px, seen at most max_view_angle_rad outside their cones."""
-    lens = (camera.focal_px, camera.cx_px, camera.cy_px, camera.focal_px * camera.baseline_m)
-    pinhole = np.array([*lens, camera.width_px, camera.height_px])
+    pinhole = np.array([*camera.lens, camera.width_px, camera.height_px])
     place = np.ascontiguousarray(map_from_cam)
     rows, pixels, distances_m = visible(cones, place, pinhole, margin_px, max_view_angle_rad)
     octaves = np.log(np.maximum(cones.max_distances_m[rows] / distances_m, 0.5)) / np.log(SCALE_FACTOR)
@@ -51,9 +50,8 @@ def match_visible(
 ) -> Rows:
     """(V,) the feature that shows each expected landmark with descriptors (V, 32), -1 for none, within windows_px (V,) of its pixel."""
     octaves = np.column_stack([np.floor(expected.octaves) - 2, np.ceil(expected.octaves) + 2]).astype(np.int64)
-    theirs = (features.pixels, features.octaves, features.descriptors)
-    limits = (settings.guided_distance, settings.guided_ratio)
-    found, _ = match_by_projection(expected.pixels[:, :2], windows_px, descriptors, octaves, *theirs, *limits)
+    projected = Projected(expected.pixels[:, :2], windows_px, descriptors, octaves)
+    found, _ = match_by_projection(projected, features, settings.guided_distance, settings.guided_ratio)
     return found
 
 

@@ -10,7 +10,7 @@ from fleetmap.features import orb
 from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.numerics.time_sliced import TimeSliced
-from fleetmap.pnp.pnp import PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
+from fleetmap.pnp.pnp import Correspondences, PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
 from fleetmap.relocalization.alias_search import AliasCandidate, LandmarkSet, find_aliases
 from fleetmap.relocalization.frame_features import FrameFeatures, extract_features
 from fleetmap.relocalization.landmark_visibility import Rows, image_coverage, match_visible, places_around
@@ -127,7 +127,8 @@ class Relocalizer:
             points = self.view.points_map[rows[kept]]
             sigmas = doubt * self._sigmas(query, hit[kept], rows[kept], map_from_cam)
             measured = self._measured(query, hit[kept], pixels[kept, 0] - pixels[kept, 2])
-            found = refine_pnp(self._camera, points, measured, sigmas, se3_inverse(map_from_cam))
+            matched = Correspondences(self._camera, points, measured, sigmas)
+            found = refine_pnp(matched, se3_inverse(map_from_cam))
             if found is None or found.inliers.sum() < settings.min_inliers:
                 return None
             map_from_cam = se3_inverse(found.cam_from_source)
@@ -148,7 +149,7 @@ class Relocalizer:
         found = None if rotation is None else self._with_rotation(matched, rotation, min_inliers)
         if found is None:
             threshold_px, seed = settings.ransac_px, self._settings.seed
-            found = ransac_pnp(self._camera, *matched, threshold_px=threshold_px, min_inliers=min_inliers, seed=seed)
+            found = ransac_pnp(matched, threshold_px=threshold_px, min_inliers=min_inliers, seed=seed)
             if found is None or found.inliers.sum() < _MIN_RANSAC_SHARE * len(pairs):
                 return None
         return self.by_projection(query, se3_inverse(found.cam_from_source), settings.guided_radius_px)
@@ -182,12 +183,11 @@ class Relocalizer:
         return self.by_projection(query, se3_inverse(found.cam_from_source), settings.guided_radius_px)
 
     def _with_rotation(
-        self, matched: tuple[Array, Array, Array], map_from_cam_rotation: Array, min_inliers: int
+        self, matched: Correspondences, map_from_cam_rotation: Array, min_inliers: int
     ) -> PnpResult | None:
         sigma_rad = self._settings.fix.rotation_sigma_rad
         return pnp_with_rotation(
-            self._camera,
-            *matched,
+            matched,
             map_from_cam_rotation.T,
             threshold_px=2 * self._settings.fix.ransac_px + sigma_rad * self._camera.focal_px,
             min_inliers=min_inliers,
@@ -222,10 +222,11 @@ class Relocalizer:
             covisible=self.view.judged(rows, is_found) if is_passed else None,
         )
 
-    def _matched(self, query: FrameFeatures, features: NDArray[np.int64], rows: Rows) -> tuple[Array, Array, Array]:
-        """Points (P, 3) of landmarks, pixels (P, 3) and sigmas (P, 2) of the features that show them."""
+    def _matched(self, query: FrameFeatures, features: NDArray[np.int64], rows: Rows) -> Correspondences:
+        """Points (P, 3) of landmarks and the features that show them."""
         measured = self._measured(query, features)
-        return self.view.points_map[rows], measured, self._sigmas(query, features, rows, None)
+        sigmas = self._sigmas(query, features, rows, None)
+        return Correspondences(self._camera, self.view.points_map[rows], measured, sigmas)
 
     def _measured(self, query: FrameFeatures, features: NDArray[np.int64], prior_px: Array | None = None) -> Array:
         return query.measured(features, self._camera, self._settings.stereo, prior_px)

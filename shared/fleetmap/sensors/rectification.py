@@ -32,6 +32,11 @@ class StereoCamera:
     height_px: int
 
     @property
+    def lens(self) -> Array:
+        """(4,) as kernels take it: focal, cx, cy, focal * baseline."""
+        return np.array([self.focal_px, self.cx_px, self.cy_px, self.focal_px * self.baseline_m])
+
+    @property
     def matrix(self) -> Array:
         """(3, 3) camera matrix."""
         return np.array([[self.focal_px, 0, self.cx_px], [0, self.focal_px, self.cy_px], [0, 0, 1.0]])

@@ -9,7 +9,7 @@ from benchmarks.common.estimator_loop import Observed, is_new_place, tile_of
 from benchmarks.simulator.measure_statistics import View, take_views
 from fleetmap.bow import Vocabulary
 from fleetmap.features import orb
-from fleetmap.features.matching import match_by_projection
+from fleetmap.features.matching import Projected, match_by_projection
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
@@ -41,11 +41,10 @@ class _Growing:
         distances = np.linalg.norm(points - view.map_from_cam[:3, 3], axis=1)
         octaves = np.log(np.array([e.reaches_m[-1] for e in held]) / distances) / np.log(orb.SCALE_FACTOR)
         span = np.column_stack([np.floor(octaves) - 1, np.ceil(octaves) + 1]).astype(np.int64)
-        hit, _ = match_by_projection(
-            view.expected(points, camera)[:, :2], _RADIUS_PX * orb.SCALE_FACTOR ** np.clip(octaves, 0, 5),
-            np.array([e.descriptors[-1] for e in held]), span, features.pixels, features.octaves, features.descriptors,
-            _BITS, _RATIO,
-        )  # fmt: skip
+        radius_px = _RADIUS_PX * orb.SCALE_FACTOR ** np.clip(octaves, 0, 5)
+        descriptors = np.array([e.descriptors[-1] for e in held])
+        projected = Projected(view.expected(points, camera)[:, :2], radius_px, descriptors, span)
+        hit, _ = match_by_projection(projected, features, _BITS, _RATIO)
         result[hit[hit >= 0]] = recent[hit >= 0]
         return result
 

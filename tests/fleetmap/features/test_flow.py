@@ -39,7 +39,7 @@ def test_as_opencv_does(levels: int) -> None:
         before, now, pixels.astype(np.float32)[:, None], pixels.astype(np.float32)[:, None].copy(), winSize=(15, 15),
         maxLevel=levels, criteria=CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
-    places, found = flow.follow(flow.Pyramid(before), flow.Pyramid(now), pixels, pixels, window_px=15, levels=levels)
+    _, places, found = flow.follow(flow.Pyramid(before), flow.Pyramid(now), pixels, pixels, window_px=15, levels=levels)
     both = found & (found_too.ravel() > 0)
     assert both.mean() > 0.95
     off = np.linalg.norm(places - reference[:, 0], axis=1)[both]
@@ -51,7 +51,7 @@ def test_as_opencv_does(levels: int) -> None:
 @pytest.mark.parametrize(("window_px", "within_px"), [(5, 0.1), (9, 0.04), (15, 0.02)])
 def test_fractions_of_a_pixel(window_px: int, within_px: float) -> None:
     pixels = grid(25.0, 9.0)
-    places, found = flow.follow(
+    _, places, found = flow.follow(
         flow.Pyramid(painted()), flow.Pyramid(painted((0.37, 0.61))), pixels, pixels, window_px=window_px, levels=0
     )
     assert found.mean() > 0.95
@@ -60,7 +60,7 @@ def test_fractions_of_a_pixel(window_px: int, within_px: float) -> None:
 
 def test_at_the_edge_only_what_is_in_the_picture_counts() -> None:
     pixels = np.array([[3.0, 60.0], [156.0, 60.0], [80.0, 2.5], [80.0, 117.0], [2.0, 2.0]])
-    places, found = flow.follow(
+    _, places, found = flow.follow(
         flow.Pyramid(painted()), flow.Pyramid(painted((0.3, -0.4))), pixels, pixels, window_px=15, levels=0
     )
     assert found.all()
@@ -69,24 +69,26 @@ def test_at_the_edge_only_what_is_in_the_picture_counts() -> None:
 
 def test_nothing_is_found_without_texture_or_outside() -> None:
     plain, pixels = np.full((120, 160), 90, np.uint8), np.array([[80.0, 60.0], [20.0, 20.0]])
-    _, found = flow.follow(flow.Pyramid(plain), flow.Pyramid(painted()), pixels, pixels, window_px=15, levels=1)
+    *_, found = flow.follow(flow.Pyramid(plain), flow.Pyramid(painted()), pixels, pixels, window_px=15, levels=1)
     assert not found.any()
     far = np.array([[500.0, 60.0], [20.0, -90.0]])
-    _, found = flow.follow(flow.Pyramid(painted()), flow.Pyramid(painted()), pixels, far, window_px=15, levels=1)
+    *_, found = flow.follow(flow.Pyramid(painted()), flow.Pyramid(painted()), pixels, far, window_px=15, levels=1)
     assert not found.any()
 
 
 def test_what_went_wrong_does_not_lead_back() -> None:
     """A place two pixels off shows what was two pixels off before, and that is where its way back ends."""
     pyramids, pixels = (flow.Pyramid(painted()), flow.Pyramid(painted((2.0, 0.0)))), grid(30.0, 20.0)
-    places, found = flow.follow(*pyramids, pixels, pixels, window_px=15, levels=1)
+    _, places, found = flow.follow(*pyramids, pixels, pixels, window_px=15, levels=1)
     wrong = np.arange(len(pixels)) % 3 == 0
     places[wrong] += (0.0, 2.0)
-    held = flow.forward_backward_check(*pyramids, pixels, places, found, window_px=15, within_px=0.5)
+    held = flow.forward_backward_check(*pyramids, flow.Flow(pixels, places, found), window_px=15, within_px=0.5)
     assert found.all()
     np.testing.assert_array_equal(held, ~wrong)
     nothing = np.zeros(len(pixels), bool)
-    assert not flow.forward_backward_check(*pyramids, pixels, places, nothing, window_px=15, within_px=0.5).any()
+    assert not flow.forward_backward_check(
+        *pyramids, flow.Flow(pixels, places, nothing), window_px=15, within_px=0.5
+    ).any()
 
 
 def test_a_pyramid_is_made_once() -> None:

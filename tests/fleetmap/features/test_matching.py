@@ -2,9 +2,15 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from fleetmap.features.matching import FAR, hamming_knn2, match_by_projection, match_mutual, packed
+from fleetmap.features.matching import FAR, Projected, hamming_knn2, match_by_projection, match_mutual, packed
+from fleetmap.features.orb import Features
 from fleetmap.geometry import Array
+
+
+def features_of(pixels: Array, octaves: NDArray[np.int8], descriptors: NDArray[np.uint8]) -> Features:
+    return Features(pixels, octaves, np.zeros(len(pixels), np.float32), descriptors)
 
 
 def _descriptors(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -99,7 +105,9 @@ def test_projection_is_brute_force(seed: int) -> None:
     span = np.column_stack([low, low + rng.integers(0, 5, len(a))])
     pixels = rng.uniform(0.0, [320.0, 240.0], (len(b), 2))
     octaves = rng.integers(0, 8, len(b)).astype(np.int8)
-    index, distance = match_by_projection(predicted, radius, a, span, pixels, octaves, b, 90, 0.9)
+    index, distance = match_by_projection(
+        Projected(predicted, radius, a, span), features_of(pixels, octaves, b), 90, 0.9
+    )
     wanted = _projection_twin(predicted, radius, a, span, pixels, octaves, b, 90, 0.9)
     np.testing.assert_array_equal(index, wanted)
     matched = index >= 0
@@ -115,10 +123,10 @@ def test_projection_survives_wild_coordinates() -> None:
     span, octaves = np.tile([0, 7], (4, 1)), np.zeros(4, np.int8)
     pixels = np.array([[10.0, 10.0], [np.nan, 5.0], [1e12, -1e12], [20.0, 20.0]])
     predicted = np.array([[10.0, 10.0], [10.0, 5.0], [1e12, -1e12], [1e300, 20.0]])
-    index, _ = match_by_projection(predicted, np.full(4, 5.0), a, span, pixels, octaves, a, 64, 0.9)
+    projected = Projected(predicted, np.full(4, 5.0), a, span)
+    index, _ = match_by_projection(projected, features_of(pixels, octaves, a), 64, 0.9)
     np.testing.assert_array_equal(index, [0, -1, 2, -1])
-    nothing = np.zeros((0, 2)), np.zeros(0, np.int8), np.zeros((0, 32), np.uint8)
-    index, _ = match_by_projection(predicted, np.full(4, 5.0), a, span, *nothing, 64, 0.9)
+    index, _ = match_by_projection(projected, Features.empty(), 64, 0.9)
     assert (index == -1).all()
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from fleetmap.features import orb, patch_align
 from fleetmap.features.corners import spread_corners
+from fleetmap.features.patch_align import Patches, half_pyramid
 from fleetmap.geometry import Array, se3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from support.worlds.synthetic_texture import Texture, picture, pixel_grid, smooth_texture
@@ -46,12 +47,8 @@ def test_known_warps_are_recovered(texture: Texture, current_from_reference: Arr
     level0 = np.zeros(len(pixels), np.int8)
     warp = np.repeat(np.linalg.inv(current_from_reference)[None], len(pixels), axis=0)
     found = patch_align.refine_matches(
-        patch_align.half_pyramid(reference),
-        patch_align.half_pyramid(current),
-        pixels,
-        level0,
-        start,
-        level0,
+        Patches(half_pyramid(reference), pixels, level0),
+        Patches(half_pyramid(current), start, level0),
         warp,
         SETTINGS,
     )
@@ -71,9 +68,11 @@ def test_features_of_different_octaves_meet_across_scales() -> None:
     count = len(pixels)
     warp = np.repeat(similarity(1 / 1.9, 0.0)[None], count, axis=0)
     found = patch_align.refine_matches(
-        patch_align.half_pyramid(reference), patch_align.half_pyramid(current), pixels, np.zeros(count, np.int8),
-        expected + 0.7, np.full(count, 4, np.int8), warp, SETTINGS,
-    )  # fmt: skip
+        Patches(half_pyramid(reference), pixels, np.zeros(count, np.int8)),
+        Patches(half_pyramid(current), expected + 0.7, np.full(count, 4, np.int8)),
+        warp,
+        SETTINGS,
+    )
     error = np.linalg.norm(found[:, :2] - expected, axis=1)
     assert np.isfinite(error).mean() > 0.5
     assert np.nanmedian(error) < 0.15
@@ -86,12 +85,8 @@ def test_patches_that_do_not_agree_are_refused(texture: Texture) -> None:
     level0, warp = np.zeros(len(pixels), np.int8), np.repeat(np.eye(2)[None], len(pixels), axis=0)
     for current in (other, np.full_like(reference, 90)):
         found = patch_align.refine_matches(
-            patch_align.half_pyramid(reference),
-            patch_align.half_pyramid(current),
-            pixels,
-            level0,
-            pixels,
-            level0,
+            Patches(half_pyramid(reference), pixels, level0),
+            Patches(half_pyramid(current), pixels, level0),
             warp,
             SETTINGS,
         )
@@ -102,8 +97,10 @@ def test_border_pixels_are_refused(texture: Texture) -> None:
     reference, _ = warped_pair(texture, np.eye(2))
     pixels = np.array([[0.0, 0.0], [2.0, 100.0], [WIDTH - 1.0, 50.0], [100.0, HEIGHT - 2.0]])
     level0, warp = np.zeros(4, np.int8), np.repeat(np.eye(2)[None], 4, axis=0)
-    pyramid = patch_align.half_pyramid(reference)
-    found = patch_align.refine_matches(pyramid, pyramid, pixels, level0, pixels, level0, warp, SETTINGS)
+    pyramid = half_pyramid(reference)
+    found = patch_align.refine_matches(
+        Patches(pyramid, pixels, level0), Patches(pyramid, pixels, level0), warp, SETTINGS
+    )
     assert np.isnan(found).all()
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3_exp, se3_inverse, se3_log, transform_points
-from fleetmap.pnp.pnp import pnp_with_rotation, ransac_pnp, refine_pnp
+from fleetmap.pnp.pnp import Correspondences, pnp_with_rotation, ransac_pnp, refine_pnp
 from fleetmap.pnp.pnp_kernels import linearize
 from fleetmap.sensors.rectification import StereoCamera
 
@@ -32,7 +32,7 @@ def error(cam_from_map: Array) -> Array:
 def test_clean_data_gives_the_camera_and_agrees_with_opencv() -> None:
     points, pixels, sigmas = seen(np.random.default_rng(1), 40)
     start = se3_exp(np.array([0.1, -0.1, 0.08, 0.2, -0.3, 0.2])) @ CAM_FROM_MAP
-    found = refine_pnp(CAMERA, points, pixels, sigmas, start)
+    found = refine_pnp(Correspondences(CAMERA, points, pixels, sigmas), start)
     assert found is not None
     assert found.inliers.all()
     np.testing.assert_allclose(error(found.cam_from_source), 0, atol=1e-6)
@@ -45,7 +45,7 @@ def test_clean_data_gives_the_camera_and_agrees_with_opencv() -> None:
 def test_without_disparities_it_still_solves() -> None:
     points, pixels, sigmas = seen(np.random.default_rng(2), 30)
     pixels[:, 2] = np.nan
-    found = refine_pnp(CAMERA, points, pixels, sigmas, se3_exp(np.full(6, 0.05)) @ CAM_FROM_MAP)
+    found = refine_pnp(Correspondences(CAMERA, points, pixels, sigmas), se3_exp(np.full(6, 0.05)) @ CAM_FROM_MAP)
     assert found is not None
     np.testing.assert_allclose(error(found.cam_from_source), 0, atol=1e-6)
 
@@ -84,7 +84,7 @@ def test_covariance_is_the_scatter_of_many_solutions() -> None:
     nees = []
     for _ in range(150):
         points, pixels, sigmas = seen(rng, 40, noise=1.0)
-        found = refine_pnp(CAMERA, points, pixels, sigmas, CAM_FROM_MAP)
+        found = refine_pnp(Correspondences(CAMERA, points, pixels, sigmas), CAM_FROM_MAP)
         assert found is not None
         off = error(found.cam_from_source)
         nees.append(off @ np.linalg.solve(found.cov_rot_trans, off) / 6)
@@ -95,7 +95,7 @@ def test_gross_outliers_do_not_pull() -> None:
     rng = np.random.default_rng(5)
     points, pixels, sigmas = seen(rng, 60, noise=1.0)
     pixels[:18, :2] += rng.uniform(20, 60, (18, 2))
-    found = refine_pnp(CAMERA, points, pixels, sigmas, se3_exp(np.full(6, 0.01)) @ CAM_FROM_MAP)
+    found = refine_pnp(Correspondences(CAMERA, points, pixels, sigmas), se3_exp(np.full(6, 0.01)) @ CAM_FROM_MAP)
     assert found is not None
     assert not found.inliers[:18].any()
     assert found.inliers[18:].mean() > 0.9
@@ -106,11 +106,11 @@ def test_ransac_needs_no_start() -> None:
     rng = np.random.default_rng(6)
     points, pixels, sigmas = seen(rng, 60, noise=1.0)
     points[:24] = rng.permutation(points[:24])
-    found = ransac_pnp(CAMERA, points, pixels, sigmas, threshold_px=2.0, min_inliers=12, seed=1)
+    found = ransac_pnp(Correspondences(CAMERA, points, pixels, sigmas), threshold_px=2.0, min_inliers=12, seed=1)
     assert found is not None
     assert found.inliers[24:].mean() > 0.9
     assert np.linalg.norm(error(found.cam_from_source)[3:]) < 0.03
-    again = ransac_pnp(CAMERA, points, pixels, sigmas, threshold_px=2.0, min_inliers=12, seed=1)
+    again = ransac_pnp(Correspondences(CAMERA, points, pixels, sigmas), threshold_px=2.0, min_inliers=12, seed=1)
     assert again is not None
     np.testing.assert_array_equal(again.cam_from_source, found.cam_from_source)
 
@@ -123,7 +123,11 @@ def test_known_rotation_survives_70_percent_outliers() -> None:
     pixels[:wrong, 2] = pixels[:wrong, 0] - rng.uniform(5, 40, wrong)
     nearly = se3_exp(np.array([0.004, -0.003, 0.005, 0, 0, 0]))[:3, :3] @ CAM_FROM_MAP[:3, :3]
     found = pnp_with_rotation(
-        CAMERA, points, pixels, sigmas, nearly, threshold_px=8.0, min_inliers=8, rotation_sigma_rad=0.01
+        Correspondences(CAMERA, points, pixels, sigmas),
+        nearly,
+        threshold_px=8.0,
+        min_inliers=8,
+        rotation_sigma_rad=0.01,
     )
     assert found is not None
     assert found.inliers[wrong:].mean() > 0.85
@@ -137,7 +141,11 @@ def test_known_rotation_is_held_as_firmly_as_it_says(sigma_rad: float) -> None:
     points, pixels, sigmas = seen(np.random.default_rng(11), 30)
     given = se3_exp(np.array([0.004, 0, 0, 0, 0, 0]))[:3, :3] @ CAM_FROM_MAP[:3, :3]
     found = pnp_with_rotation(
-        CAMERA, points, pixels, sigmas, given, threshold_px=8.0, min_inliers=8, rotation_sigma_rad=sigma_rad
+        Correspondences(CAMERA, points, pixels, sigmas),
+        given,
+        threshold_px=8.0,
+        min_inliers=8,
+        rotation_sigma_rad=sigma_rad,
     )
     assert found is not None
     turned = rotation_angle_rad(found.cam_from_source[:3, :3] @ given.T)
@@ -149,17 +157,21 @@ def test_nothing_that_agrees_gives_nothing() -> None:
     points, pixels, sigmas = seen(rng, 40)
     points = rng.uniform(-3, 3, points.shape)
     rotation = CAM_FROM_MAP[:3, :3]
-    assert ransac_pnp(CAMERA, points, pixels, sigmas, threshold_px=2.0, min_inliers=12, seed=1) is None
+    assert ransac_pnp(Correspondences(CAMERA, points, pixels, sigmas), threshold_px=2.0, min_inliers=12, seed=1) is None
     assert (
         pnp_with_rotation(
-            CAMERA, points, pixels, sigmas, rotation, threshold_px=4.0, min_inliers=12, rotation_sigma_rad=0.01
+            Correspondences(CAMERA, points, pixels, sigmas),
+            rotation,
+            threshold_px=4.0,
+            min_inliers=12,
+            rotation_sigma_rad=0.01,
         )
         is None
     )
     empty = np.zeros((0, 3))
-    assert refine_pnp(CAMERA, empty, empty, np.zeros((0, 2)), CAM_FROM_MAP) is None
+    assert refine_pnp(Correspondences(CAMERA, empty, empty, np.zeros((0, 2))), CAM_FROM_MAP) is None
     behind = transform_points(se3_inverse(CAM_FROM_MAP), np.array([[0.0, 0.0, -2.0]] * 5))
-    found = refine_pnp(CAMERA, behind, np.ones((5, 3)), np.ones((5, 2)), CAM_FROM_MAP)
+    found = refine_pnp(Correspondences(CAMERA, behind, np.ones((5, 3)), np.ones((5, 2))), CAM_FROM_MAP)
     assert found is None
 
 
@@ -169,7 +181,7 @@ def test_prior_holds_the_start_as_firmly_as_it_says(sigma_rad: float) -> None:
     start = se3_exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0])) @ CAM_FROM_MAP
     prior = np.zeros((6, 6))
     prior[:3, :3] = np.eye(3) / sigma_rad**2
-    found = refine_pnp(CAMERA, points, pixels, sigmas, start, prior)
+    found = refine_pnp(Correspondences(CAMERA, points, pixels, sigmas), start, prior)
     assert found is not None
     turned = np.linalg.norm(se3_log(found.cam_from_source @ se3_inverse(start))[:3])
     assert turned < 0.01 if sigma_rad < 1 else turned == pytest.approx(0.02, abs=1e-4)

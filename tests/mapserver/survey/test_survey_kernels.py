@@ -68,9 +68,9 @@ def test_patches_are_aligned_as_one_by_one() -> None:
     unknown = ~np.isfinite(warp).all(axis=(1, 2))
     assert 0 < unknown.sum() < count
     warp[unknown] = patch_align.similarity_from_features(octaves, angles, own_octaves, own_angles)[unknown]
-    expected = patch_align.refine_matches(
-        pyramid, pyramid, pixels, octaves, own_pixels, own_octaves, warp, patch_align.AlignSettings()
-    )
+    reference = patch_align.Patches(pyramid, pixels, octaves)
+    current = patch_align.Patches(pyramid, own_pixels, own_octaves)
+    expected = patch_align.refine_matches(reference, current, warp, patch_align.AlignSettings())
     assert np.isfinite(expected[:, 0]).sum() > count // 3
     np.testing.assert_allclose(found, expected, atol=1e-6)
 

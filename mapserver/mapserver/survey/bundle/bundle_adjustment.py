@@ -96,7 +96,7 @@ class _Bundle:
         self.structure: Structure = build_structure(problem)
         self.terms: Terms = pack_terms(problem)
         camera = problem.camera
-        self.lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.focal_px * camera.baseline_m])
+        self.lens = camera.lens
         cam_from_body = problem.body_from_cam[:3, :3].T
         self.cam_from_body = np.ascontiguousarray(cam_from_body)
         self.body_in_cam_m = np.ascontiguousarray(-cam_from_body @ problem.body_from_cam[:3, 3])

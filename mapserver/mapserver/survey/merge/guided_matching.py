@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.features import patch_align, stereo
-from fleetmap.features.matching import match_by_projection
+from fleetmap.features.matching import Projected, match_by_projection
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.features.patch_align_kernels import align_patches
 from fleetmap.geometry import Array, se3_inverse, transform_points
-from fleetmap.pnp.pnp import PnpResult, refine_pnp
+from fleetmap.pnp.pnp import Correspondences, PnpResult, refine_pnp
 from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.merge.base_map import BaseMap, Rows
 from mapserver.survey.settings import SurveySettings
@@ -42,9 +42,9 @@ def locate(
     measured = np.column_stack([pixels, pixels[:, 0] - keyframe.disparities[features, 0]])
     scale = SCALE_FACTOR ** np.minimum(keyframe.features.octaves[features], 4).astype(np.float64)
     rough = settings.pairs.match_sigma_px * scale
-    solved = refine_pnp(
-        base.camera, base.points_map[rows], measured, np.column_stack([rough, np.maximum(rough, 1.0)]), se3_inverse(map_from_cam)
-    )  # fmt: skip
+    sigmas = np.column_stack([rough, np.maximum(rough, 1.0)])
+    matches = Correspondences(base.camera, base.points_map[rows], measured, sigmas)
+    solved = refine_pnp(matches, se3_inverse(map_from_cam))
     if solved is None or solved.inliers.sum() < s.min_inliers or solved.inliers.mean() < 0.35:
         return None
     rows, features = rows[solved.inliers], features[solved.inliers]
@@ -67,10 +67,8 @@ def _match(
     )
     span = np.column_stack([np.floor(octaves) - 2, np.ceil(octaves) + 2]).astype(np.int64)
     window = radius_px * SCALE_FACTOR ** np.clip(octaves, 0, 3)
-    hit, _ = match_by_projection(
-        predicted[:, :2], window, base.descriptors[rows], span, keyframe.features.pixels, keyframe.features.octaves,
-        keyframe.features.descriptors, settings.pairs.guided_distance, 0.95,
-    )  # fmt: skip
+    projected = Projected(predicted[:, :2], window, base.descriptors[rows], span)
+    hit, _ = match_by_projection(projected, keyframe.features, settings.pairs.guided_distance, 0.95)
     kept = np.flatnonzero(hit >= 0)
     return rows[kept], hit[kept].astype(np.int64)
 

@@ -8,7 +8,7 @@ import numpy as np
 from fleetmap.bow import PlaceIndex, Vocabulary
 from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
-from fleetmap.pnp.pnp import PnpResult, ransac_pnp
+from fleetmap.pnp.pnp import Correspondences, PnpResult, ransac_pnp
 from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import locate
@@ -88,10 +88,9 @@ def _fix_at(base: BaseMap, keyframe: Keyframe, place: int, settings: SurveySetti
     pixels = keyframe.features.pixels[pairs[:, 1]]
     measured = np.column_stack([pixels, pixels[:, 0] - keyframe.disparities[pairs[:, 1], 0]])
     sigmas = np.full((len(pairs), 2), settings.pairs.match_sigma_px)
-    found = ransac_pnp(
-        base.camera, base.points_map[rows[pairs[:, 0]]], measured, sigmas, threshold_px=_RANSAC_PX,
-        min_inliers=settings.sessions.min_inliers // 2, seed=settings.seed,
-    )  # fmt: skip
+    matches = Correspondences(base.camera, base.points_map[rows[pairs[:, 0]]], measured, sigmas)
+    least = settings.sessions.min_inliers // 2
+    found = ransac_pnp(matches, threshold_px=_RANSAC_PX, min_inliers=least, seed=settings.seed)
     if found is None or found.inliers.sum() < 0.15 * len(pairs):
         return None
     seen = locate(base, keyframe, se3_inverse(found.cam_from_source), settings.sessions.search_px, settings)

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features.matching import match_by_projection, match_mutual
+from fleetmap.features.matching import Projected, match_by_projection, match_mutual
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.pnp.pnp import PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
+from fleetmap.pnp.pnp import Correspondences, PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.settings import PairSettings
@@ -70,6 +70,12 @@ def _sigmas(keyframe: Keyframe, index: Indices, settings: PairSettings) -> Array
     return np.column_stack([settings.match_sigma_px * scale, np.maximum(settings.match_sigma_px, scale)])
 
 
+def _correspondences(a: Keyframe, b: Keyframe, inputs: MatchInputs, pairs: Indices) -> Correspondences:
+    """Points of a, which are features pairs[:, 0], as b sees them."""
+    measured, sigmas = _measured(b, pairs[:, 1]), _sigmas(b, pairs[:, 1], inputs.settings)
+    return Correspondences(inputs.camera, a.points_cam[pairs[:, 0]], measured, sigmas)
+
+
 def _from_descriptors(
     a: Keyframe, b: Keyframe, inputs: MatchInputs, predicted: PredictedMotion | None
 ) -> PnpResult | None:
@@ -77,34 +83,28 @@ def _from_descriptors(
     known = np.flatnonzero(np.isfinite(a.disparities[:, 0]))
     pairs = match_mutual(a.features.descriptors[known], b.features.descriptors, settings.max_distance, settings.ratio)
     index_a, index_b = known[pairs[:, 0]], pairs[:, 1]
-    points, measured, sigmas = a.points_cam[index_a], _measured(b, index_b), _sigmas(b, index_b, settings)
+    matches = _correspondences(a, b, inputs, np.column_stack([index_a, index_b]))
+    least = settings.min_inliers
     if predicted is not None and predicted.rotation_sigma_rad is not None and not b.from_views:
         sigma_rad = predicted.rotation_sigma_rad
+        threshold_px = max(settings.search_px, 1.5 * sigma_rad * camera.focal_px)
+        rotation = predicted.j_from_i[:3, :3]
         return pnp_with_rotation(
-            camera,
-            points,
-            measured,
-            sigmas,
-            predicted.j_from_i[:3, :3],
-            threshold_px=max(settings.search_px, 1.5 * sigma_rad * camera.focal_px),
-            min_inliers=settings.min_inliers,
-            rotation_sigma_rad=sigma_rad,
+            matches, rotation, threshold_px=threshold_px, min_inliers=least, rotation_sigma_rad=sigma_rad
         )
-    found = ransac_pnp(
-        camera, points, measured, sigmas, threshold_px=4.0, min_inliers=settings.min_inliers, seed=len(pairs)
-    )
+    found = ransac_pnp(matches, threshold_px=4.0, min_inliers=least, seed=len(pairs))
     # without a known rotation a few matches agree with something by chance: ask for a share of them too
     return found if found is not None and found.inliers.sum() >= 0.2 * len(pairs) else None
 
 
 def _project_match(a: Keyframe, b: Keyframe, inputs: MatchInputs, b_from_a: Array, radius_px: float) -> Indices:
     """(P, 2) matches of a's features with depth into b by projection."""
-    own, other, disparities = a.features, b.features, a.disparities[:, 0]
+    own, disparities = a.features, a.disparities[:, 0]
     predicted, radius, span = np.empty((len(own), 2)), np.empty(len(own)), np.zeros((len(own), 2), np.int64)
     lens, output = _lens(inputs.camera), (predicted, radius, span)
     predict_features(b_from_a, a.points_cam, disparities, own.octaves, lens, radius_px, *output)
-    sought, searched = (predicted, radius, own.descriptors, span), (other.pixels, other.octaves, other.descriptors)
-    found, _ = match_by_projection(*sought, *searched, inputs.settings.guided_distance, 0.95)
+    projected = Projected(predicted, radius, own.descriptors, span)
+    found, _ = match_by_projection(projected, b.features, inputs.settings.guided_distance, 0.95)
     hit = np.flatnonzero(found >= 0)
     return np.column_stack([hit, found[hit]])
 
@@ -118,13 +118,8 @@ def _from_projection(a: Keyframe, b: Keyframe, inputs: MatchInputs, b_from_a: Ar
     pairs = _project_match(a, b, inputs, b_from_a, settings.search_px)
     if len(pairs) < settings.min_inliers:
         return None
-    found = _refine(a, b, inputs, pairs, b_from_a)
+    found = refine_pnp(_correspondences(a, b, inputs, pairs), b_from_a)
     return found if found is not None and found.inliers.sum() >= max(settings.min_inliers, 0.4 * len(pairs)) else None
-
-
-def _refine(a: Keyframe, b: Keyframe, inputs: MatchInputs, pairs: Indices, b_from_a: Array) -> PnpResult | None:
-    points, measured = a.points_cam[pairs[:, 0]], _measured(b, pairs[:, 1])
-    return refine_pnp(inputs.camera, points, measured, _sigmas(b, pairs[:, 1], inputs.settings), b_from_a)
 
 
 def _complete(i: int, j: int, inputs: MatchInputs, found: PnpResult) -> PairMatch | None:
@@ -134,7 +129,7 @@ def _complete(i: int, j: int, inputs: MatchInputs, found: PnpResult) -> PairMatc
         forward = _project_match(a, b, inputs, found.cam_from_source, settings.guided_radius_px)
         if len(forward) < settings.min_inliers:
             return None
-        again = _refine(a, b, inputs, forward, found.cam_from_source)
+        again = refine_pnp(_correspondences(a, b, inputs, forward), found.cam_from_source)
         if again is None or again.inliers.sum() < settings.min_inliers:
             return None
         found = again

@@ -51,7 +51,7 @@ class InvariantFilter:
         self.clone_ids: list[int] = []
         self._rotations, self._positions = np.zeros((0, 3, 3)), np.zeros((0, 3))
         self._settings = settings
-        self._camera = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.focal_px * camera.baseline_m])
+        self._camera = camera.lens
         self._weights = np.array([1 / settings.pixel_sigma_px, 1 / settings.disparity_sigma_px])
         self._body_from_cam = np.ascontiguousarray(body_from_cam)
         self._noise = np.array(

@@ -58,7 +58,7 @@ class MonocularWindow(SlidingWindow):
         if not held:
             return out
         camera, settings = self.rig.camera, self.rig.settings
-        lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, 0.0])
+        lens = camera.lens
         odom_from_cam = np.array([self.filter.odom_from_clone(c) for c in held]) @ self.rig.body_from_cam
         rotations = np.ascontiguousarray(odom_from_cam[:, :3, :3])
         positions = np.ascontiguousarray(odom_from_cam[:, :3, 3])

@@ -9,7 +9,7 @@ from fleetmap.geometry import Array, se3, se3_inverse, transform_points
 from fleetmap.odometry.mono.mono_ba_kernels import adjust_window
 from fleetmap.odometry.mono.two_view import rays_from_pixels, two_view_motion
 from fleetmap.odometry.settings import MonocularSettings
-from fleetmap.pnp.pnp import ransac_pnp, refine_pnp
+from fleetmap.pnp.pnp import Correspondences, ransac_pnp, refine_pnp
 from fleetmap.sensors.rectification import StereoCamera
 
 Ids = NDArray[np.int64]
@@ -60,7 +60,7 @@ class VisualOdometry:
 
     def __init__(self, camera: StereoCamera, settings: MonocularSettings) -> None:
         self._camera, self._settings = camera, settings
-        self._lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, 0.0])
+        self._lens = camera.lens
         self._world = _World()
         self._waiting: list[tuple[int, Ids, Array]] = []
         self._last = np.eye(4)  # vision_from_cam of the frame before
@@ -224,17 +224,10 @@ class VisualOdometry:
         points = np.array([self._world.points[i] for i in ids[rows].tolist()])
         measured = np.column_stack([pixels[rows], np.full(len(rows), np.nan)])
         sigmas = np.full((len(rows), 2), s.sigma_px)
-        found = refine_pnp(self._camera, points, measured, sigmas, se3_inverse(guess))
+        matches = Correspondences(self._camera, points, measured, sigmas)
+        found = refine_pnp(matches, se3_inverse(guess))
         if found is None or found.inliers.sum() < max(s.min_points, 0.6 * len(rows)):
-            again = ransac_pnp(
-                self._camera,
-                points,
-                measured,
-                sigmas,
-                threshold_px=s.max_error_px,
-                min_inliers=s.min_points,
-                seed=len(rows),
-            )
+            again = ransac_pnp(matches, threshold_px=s.max_error_px, min_inliers=s.min_points, seed=len(rows))
             found = again if again is not None and again.inliers.sum() >= 0.4 * len(rows) else None
         return None if found is None else (_orthonormal(se3_inverse(found.cam_from_source)), found.cov_rot_trans)
 

@@ -12,14 +12,12 @@ from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, transform_points
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracking import tracker_kernels
-from fleetmap.pnp.pnp import PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
+from fleetmap.pnp.pnp import Correspondences, PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 
 _LEVELS_WHEN_SURE, _HELD_WHEN_SURE = 1, 0.6
 Ids = NDArray[np.int64]
-_FLOW_ITERATIONS = (
-    200  # finds a motion that a third of the points share; with fewer the flow has failed, and a live robot must go on
-)
+_FLOW_ITERATIONS = 200  # finds a motion that a third of the points share; with fewer the flow has failed
 MotionSince = Callable[[int], Array | None]
 
 
@@ -90,7 +88,7 @@ class Tracker:
         self._previous: RectifiedFrame | None = None
         nothing = flow.Pyramid(np.zeros((0, 0), np.uint8))
         self._pyramids = [nothing, nothing]  # of the previous frame and of this one
-        self._lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.focal_px * camera.baseline_m])
+        self._lens = camera.lens
         self._points = _Points(np.zeros(0, np.int64), np.zeros((0, 3)))
         self._next_id = 0
         self._frame_index = -1
@@ -149,16 +147,8 @@ class Tracker:
         before = int(kept.sum())
         carried = np.empty((len(pixels), 3))  # the old disparity is the prior of the new one
         if resection is not None:
-            tracker_kernels.carry(
-                points_cam,
-                pixels,
-                flowed,
-                resection.cam_from_source,
-                self._lens,
-                self._settings.ransac_px,
-                kept,
-                carried,
-            )
+            motion, limit_px = resection.cam_from_source, self._settings.ransac_px
+            tracker_kernels.carry(points_cam, pixels, flowed, motion, self._lens, limit_px, kept, carried)
         else:
             carried[:, :2], carried[:, 2] = flowed, np.nan
         share = float(kept.sum()) / max(before, 1)
@@ -180,12 +170,11 @@ class Tracker:
     def _flow_from(self, frame: RectifiedFrame, predicted: Array, levels: int) -> tuple[Array, NDArray[np.bool_]]:
         s = self._settings
         before, now, old = self._pyramids[0], self._pyramids[1], np.ascontiguousarray(self._points.pixels[:, :2])
-        new, found = flow.follow(before, now, old, predicted, window_px=s.window_px, levels=levels)
-        height, width = frame.left.shape
-        found &= (new[:, 0] > 6) & (new[:, 1] > 6) & (new[:, 0] < width - 7) & (new[:, 1] < height - 7)
-        return new, flow.forward_backward_check(
-            before, now, old, new, found, window_px=s.window_px, within_px=s.back_check_px
-        )
+        flowed = flow.follow(before, now, old, predicted, window_px=s.window_px, levels=levels)
+        new, (height, width) = flowed.places, frame.left.shape
+        inside = (new[:, 0] > 6) & (new[:, 1] > 6) & (new[:, 0] < width - 7) & (new[:, 1] < height - 7)
+        flowed = flowed._replace(found=flowed.found & inside)
+        return new, flow.forward_backward_check(before, now, flowed, window_px=s.window_px, within_px=s.back_check_px)
 
     def _motion(self, points_cam: Array, flowed: Array, kept: NDArray[np.bool_], guess: Array) -> PnpResult | None:
         """cam_from_previous from points with depth.
@@ -198,13 +187,17 @@ class Tracker:
             return None
         measured = np.column_stack([flowed[usable], np.full(count, np.nan)])
         sigmas = np.full((count, 2), 1.0)
-        result = refine_pnp(self._camera, points_cam[usable], measured, sigmas, guess)
+        matches = Correspondences(self._camera, points_cam[usable], measured, sigmas)
+        result = refine_pnp(matches, guess)
         if result is not None and result.inliers.sum() > 0.6 * count:
             return result
         again = ransac_pnp(
-            self._camera, points_cam[usable], measured, sigmas, threshold_px=self._settings.ransac_px,
-            min_inliers=self._settings.min_inliers, seed=count, iterations=_FLOW_ITERATIONS,
-        )  # fmt: skip
+            matches,
+            threshold_px=self._settings.ransac_px,
+            min_inliers=self._settings.min_inliers,
+            seed=count,
+            iterations=_FLOW_ITERATIONS,
+        )
         if again is None or (result is not None and result.inliers.sum() >= again.inliers.sum()):
             again = result
         return again if again is not None and again.inliers.sum() >= self._settings.min_inliers else None
@@ -260,16 +253,9 @@ class Tracker:
         a, b = a[found.inliers], b[found.inliers]
         before, now = old.features.take(a), current.features.take(b)
         warp = patch_align.similarity_from_features(before.octaves, before.angles_deg, now.octaves, now.angles_deg)
-        refined = patch_align.refine_matches(
-            old.pyramid,
-            current.pyramid,
-            before.pixels,
-            before.octaves,
-            now.pixels,
-            now.octaves,
-            warp,
-            patch_align.AlignSettings(),
-        )
+        reference = patch_align.Patches(old.pyramid, before.pixels, before.octaves)
+        patches = patch_align.Patches(current.pyramid, now.pixels, now.octaves)
+        refined = patch_align.refine_matches(reference, patches, warp, patch_align.AlignSettings())
         sure = np.isfinite(refined[:, 0])
         a, b = a[sure], b[sure]
         if len(a) < self._settings.min_inliers_known_rotation:
@@ -288,24 +274,19 @@ class Tracker:
         self, points_cam: Array, measured: Array, guess: Array, rotation_sigma_rad: float | None
     ) -> PnpResult | None:
         """cam_from_previous from raw descriptor matches: with a known rotation first, without any guess else."""
-        sigmas = np.full((len(points_cam), 2), 1.5)
-        least = self._settings.min_inliers
+        settings, least = self._settings, self._settings.min_inliers
+        matches = Correspondences(self._camera, points_cam, measured, np.full((len(points_cam), 2), 1.5))
         if rotation_sigma_rad is not None:
             found = pnp_with_rotation(
-                self._camera, points_cam, measured, sigmas, guess[:3, :3], threshold_px=4 * self._settings.ransac_px,
-                min_inliers=self._settings.min_inliers_known_rotation, rotation_sigma_rad=rotation_sigma_rad,
-            )  # fmt: skip
+                matches,
+                guess[:3, :3],
+                threshold_px=4 * settings.ransac_px,
+                min_inliers=settings.min_inliers_known_rotation,
+                rotation_sigma_rad=rotation_sigma_rad,
+            )
             if found is not None:
                 return found
-        found = ransac_pnp(
-            self._camera,
-            points_cam,
-            measured,
-            sigmas,
-            threshold_px=2 * self._settings.ransac_px,
-            min_inliers=least,
-            seed=len(measured),
-        )
+        found = ransac_pnp(matches, threshold_px=2 * settings.ransac_px, min_inliers=least, seed=len(measured))
         if found is None or found.inliers.sum() < max(least, 0.25 * len(points_cam)):
             return None
         return found

@@ -86,12 +86,10 @@ class Observations:
         size = len(order)
         stays, rows, starts, anchors = np.zeros(size, bool), *np.empty((3, size + 1), np.int64)
         points_cam = np.empty((size, 3))
-        focal_base = camera.focal_px * camera.baseline_m
-        count = tracks_kernels.take(
-            self._ids, self._frames, self._pixels, order, alive, due, np.asarray(held, np.int64),
-            np.array([camera.focal_px, camera.cx_px, camera.cy_px, focal_base]),
-            camera.focal_px * max(camera.baseline_m, 0.01) / _FAR_DEPTH_M, stays, rows, starts, anchors, points_cam,
-        )  # fmt: skip
+        far_px = camera.focal_px * max(camera.baseline_m, 0.01) / _FAR_DEPTH_M
+        seen = self._ids, self._frames, self._pixels, order, alive, due, np.asarray(held, np.int64)
+        out = stays, rows, starts, anchors, points_cam
+        count = tracks_kernels.take(*seen, camera.lens, far_px, *out)
         used = rows[: starts[count]]
         batch = TrackBatch(
             starts[: count + 1], self._frames[used], self._pixels[used], anchors[:count], points_cam[:count]
