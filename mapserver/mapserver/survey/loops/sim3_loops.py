@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.geometry import Array, transform_points
 from mapserver.survey.loops.loops import LoopCloser
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.pose_graph.sim3_pose_graph import (
@@ -98,11 +98,3 @@ def rigid(result: SimilarityResult) -> Array:
     placed = np.tile(np.eye(4), (len(found.scales), 1, 1))
     placed[:, :3, :3], placed[:, :3, 3] = found.rotations, found.translations
     return placed
-
-
-def scale_drift(map_from_body: Array, other_map_from_body: Array) -> Array:
-    """(K - 1,) by how much each step of the first chain is longer than that of the other."""
-    first, second = (
-        np.linalg.norm((se3_inverse(m[:-1]) @ m[1:])[:, :3, 3], axis=1) for m in (map_from_body, other_map_from_body)
-    )
-    return np.asarray(first / np.maximum(second, 1e-12))

@@ -8,8 +8,8 @@ import pytest
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_exp
-from mapserver.survey.pose_graph.g2o import parse_g2o
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
+from support.problems.g2o import parse_g2o
 from support.recordings.realdata import real_data
 from support.worlds.pose_graph_scene import Drive, make_drive
 

@@ -7,9 +7,9 @@ import pytest
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import so3_exp
-from mapserver.survey.bundle import bal_kernels
-from mapserver.survey.bundle.bal import optimize_bal, parse_bal
 from mapserver.survey.bundle.bundle_adjustment import BundleSettings
+from support.problems import bal_kernels
+from support.problems.bal import optimize_bal, parse_bal
 from support.recordings.realdata import real_data
 
 THOROUGH = BundleSettings(max_iterations=60, relative_cost_tolerance=1e-7)

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import AnyArray, Array, so3_exp
-from mapserver.survey.bundle import bal_kernels
-from mapserver.survey.bundle.bal_kernels import CAMERA_UNKNOWNS
 from mapserver.survey.bundle.problem import BundleSettings
 from mapserver.survey.bundle.reduced_system import ReducedSystem, build_chains, solve_dense, solve_sparse
 from mapserver.survey.bundle.schur_kernels import invert_landmarks
 from mapserver.survey.bundle.sparsity import ObservationTable, Structure, block_pattern
+from support.problems import bal_kernels
+from support.problems.bal_kernels import CAMERA_UNKNOWNS
 
 _LAMBDA_MIN, _LAMBDA_MAX = 1e-12, 1e12
 _FLOOR = 1e-12
