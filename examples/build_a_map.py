@@ -1,0 +1,31 @@
+"""A map from a recording: python examples/build_a_map.py RECORDING STORE SITE [PICTURE.png]
+
+The same as `mapserver build` and `mapserver publish`, with the map as arrays on the way.
+"""
+
+import sys
+
+import numpy as np
+
+from mapserver import build_map, open_map
+
+
+def main(recording: str, store: str, site: str, picture: str | None = None) -> None:
+    """Builds, publishes and reads a map."""
+    # Odometry, keyframes, loops, bundle adjustment, and a draft in the store.
+    draft = build_map([recording], store, site)
+    print(draft.sentence)
+    positions_m = draft.trajectory.positions_m
+    length_m = np.linalg.norm(np.diff(positions_m, axis=0), axis=1).sum()
+    print(f"{len(positions_m)} frames over {length_m:.1f} m")
+    if picture is not None:
+        draft.save_picture(picture)
+    # The gate judges the draft; one that it refuses raises GateRefusedError with the reasons.
+    draft.publish()
+    # The published version as robots get it.
+    published = open_map(store, site)
+    print(f"version {published.version}: {len(published.points_map)} landmarks in {len(published.tiles)} tiles")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

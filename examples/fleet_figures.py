@@ -1,0 +1,42 @@
+"""Figures of the robots that report to a store: python examples/fleet_figures.py STORE SITE [HOURS]
+
+Failures per robot-day (16 h of driving) with the interval that holds the true rate with 95 %, by robot and by map version:
+the numbers behind the dashboard and `mapserver fleet report`, as Python values. Robots send them to `mapserver serve`.
+"""
+
+import sys
+import time
+
+from mapserver import open_store
+from mapserver.fleet.shift_summary import summarise
+from mapserver.fleet_statistics.canary_test import CanarySettings
+from mapserver.fleet_statistics.kpis import Kpis
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+
+
+def in_words(figures: Kpis) -> str:
+    """A line of a table."""
+    failures = figures.failures
+    if failures.per_robot_day is None:
+        return f"{figures.observed_h:7.1f} h, not driven"
+    interval = f"{failures.low:.2f} to {failures.high:.2f}"
+    localised = "-" if figures.localised_share is None else f"{figures.localised_share:.1%}"
+    return (
+        f"{figures.driving_h:7.1f} h, {failures.per_robot_day:.2f} failures a day ({interval}), localised {localised}"
+    )
+
+
+def main(store: str, site: str, hours: str = "24") -> None:
+    """Prints the tables, the worst robots and versions first."""
+    with open_store(store) as maps:
+        summary = summarise(maps, site, int(hours), time.time_ns(), CanarySettings(), ResurveySettings())
+    print(f"{site}, version {summary.current_version}, last {hours} h: {in_words(summary.total)}")
+    for title, rows in (("robot", summary.robots), ("version", summary.versions), ("cause", summary.causes)):
+        for key, figures in rows:
+            print(f"{title:8} {key or '-':16} {in_words(figures)}")
+    for tile in summary.resurvey.tiles:
+        print(f"survey again: tile {tile.tile}, {'; '.join(tile.reasons)}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
