@@ -1,7 +1,7 @@
 """Odometry over a recording, without a map: python examples/odometry_alone.py RECORDING OUT.tum
 
-Stereo, RGB-D or one camera, with or without IMU. The trajectory is written as TUM text; where evo is installed and the
-recording has ground truth, the error is printed and a plot is saved beside it.
+Any cameras, with or without IMU. The trajectory is written as TUM text; where evo is installed and the recording has
+ground truth, the error is printed and a plot is saved beside it.
 """
 
 import sys
@@ -21,8 +21,7 @@ def run_odometry(recording: Recording) -> Trajectory:
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
     camera, shift_s = rectifier.camera, rectifier.imu_minus_cam_s
     odometry = make_odometry(recording.calibration, camera, rectifier.body_from_cam, shift_s, OdometrySettings())
-    odom_from_body: list[np.ndarray] = []
-    fed_ns = -(2**62)
+    odom_from_body, fed_ns = [], -(2**62)
     for index in range(len(recording)):
         frame = recording.read_frame(index)
         # 1. The inertial samples and wheel odometry up to the frame, on the IMU's clock.
@@ -41,7 +40,7 @@ def run_odometry(recording: Recording) -> Trajectory:
     return Trajectory(recording.frame_stamps_ns, np.array(odom_from_body))
 
 
-def compare_with_evo(estimated: Path, truth: Path, picture: Path) -> None:
+def compare_with_evo(estimated: Path) -> None:
     """Prints the absolute trajectory error after alignment and saves a plot of both trajectories."""
     try:
         import matplotlib
@@ -53,29 +52,27 @@ def compare_with_evo(estimated: Path, truth: Path, picture: Path) -> None:
     except ImportError:
         print("evo is not installed: no plot (pip install evo)")
         return
-    reference, result = sync.associate_trajectories(
-        file_interface.read_tum_trajectory_file(truth), file_interface.read_tum_trajectory_file(estimated)
-    )
+    read = file_interface.read_tum_trajectory_file
+    reference, result = sync.associate_trajectories(read(estimated.with_suffix(".truth.tum")), read(estimated))
     result.align(reference)
     error = metrics.APE(metrics.PoseRelation.translation_part)
     error.process_data((reference, result))
     print(f"absolute trajectory error: {error.get_statistic(metrics.StatisticsType.rmse):.3f} m rmse")
     figure = pyplot.figure()
     plot.trajectories(figure, {"ground truth": reference, "odometry": result}, plot.PlotMode.xy)
-    figure.savefig(picture)
+    figure.savefig(estimated.with_suffix(".png"))
 
 
-def main(recording_path: str, out: str) -> None:
+def main(path: str, out: str) -> None:
     """Runs the odometry, writes the trajectory, compares it with the truth."""
-    with open_recording(recording_path) as recording:
+    with open_recording(path) as recording:
         trajectory = run_odometry(recording)
         write_tum(Path(out), trajectory)
         length_m = np.linalg.norm(np.diff(trajectory.positions_m, axis=0), axis=1).sum()
         print(f"{out}: {len(recording)} frames, {length_m:.1f} m")
         if recording.ground_truth is not None:
-            truth = Path(out).with_suffix(".truth.tum")
-            write_tum(truth, recording.ground_truth)
-            compare_with_evo(Path(out), truth, Path(out).with_suffix(".png"))
+            write_tum(Path(out).with_suffix(".truth.tum"), recording.ground_truth)
+            compare_with_evo(Path(out))
 
 
 if __name__ == "__main__":
