@@ -92,16 +92,13 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time)
         if prior is not None:
             robot.localizer.handle_prior(prior)
+        has_imu, offset_s = calibration.imu is not None, rectifier.imu_minus_cam_s
+        intake = Intake(frames=run.frame_queue, imu_minus_cam_s=offset_s, has_imu=has_imu, imu_wait_s=run.imu_wait_s)
         yield RuntimeParts(
             site=site,
             robot_name=name,
             source=source,
-            intake=Intake(
-                frames=run.frame_queue,
-                imu_minus_cam_s=rectifier.imu_minus_cam_s,
-                has_imu=calibration.imu is not None,
-                imu_wait_s=run.imu_wait_s,
-            ),
+            intake=intake,
             robot=robot,
             tile_loader=TileLoader(maps, run.window),
             outbox=outbox,

@@ -1,4 +1,4 @@
-"""Failures as files beside each other, for whoever looks into them on the robot: numbers as JSON, pictures as JPEG."""
+"""Failure reports as files on the robot: numbers as JSON, pictures as JPEG."""
 
 import json
 from pathlib import Path
@@ -12,16 +12,16 @@ from fleetmap.messages import FailureReport
 def write_failure(folder: Path, report: FailureReport) -> Path:
     """The path of `STAMP-KIND-CAUSE.json`, written with its pictures beside it; raises StoreError where the disk refuses."""
     name = f"{report.stamp_ns}-{report.kind}-{report.cause}"
-    told = msgspec.to_builtins(msgspec.structs.replace(report, thumbnails=()))
-    told["thumbnails"] = []
+    fields = msgspec.to_builtins(msgspec.structs.replace(report, thumbnails=()))
+    fields["thumbnails"] = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for number, picture in enumerate(report.thumbnails):
             path = folder / f"{name}-{number}-{picture.kind}.jpg"
             path.write_bytes(picture.jpeg)
-            told["thumbnails"].append(path.name)
+            fields["thumbnails"].append(path.name)
         target = folder / f"{name}.json"
-        target.write_text(json.dumps(told, indent=2) + "\n")
+        target.write_text(json.dumps(fields, indent=2) + "\n")
     except OSError as error:
         raise StoreError(
             f"{folder} cannot be written ({error.strerror}); choose another folder with [run] failures"

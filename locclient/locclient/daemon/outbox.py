@@ -1,4 +1,4 @@
-"""The robot's spool: reports that must reach the server, on the disk until they are acknowledged. SQL of the robot lives here alone."""
+"""The robot's outbox (spool): reports on the disk until the server acknowledges them. SQL of the robot lives here alone."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -19,17 +19,17 @@ _BUSY_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class QueuedReport:
-    """One report as it waits: payload is the encoded message."""
+    """A report that waits; payload: the encoded message."""
 
     id: str
     payload: bytes
 
 
 class Outbox:
-    """Reports in the order of their making; the oldest are dropped, and counted, where `max_bytes` is exceeded.
+    """Reports in the order in which they were put; above `max_bytes` the oldest are dropped and counted.
 
-    What `put` returned for survives the death of the process and of the power. A file that is damaged is set aside under another
-    name and begun anew: a robot that cannot report must still drive. For any thread; each call opens the file for itself.
+    Once `put` has returned, a report survives a crash and a loss of power. A damaged file is set aside under another name and begun
+    anew: a robot that cannot report must still drive. For any thread; each call opens the file for itself.
     """
 
     def __init__(self, path: Path, *, max_bytes: int) -> None:
@@ -64,16 +64,12 @@ class Outbox:
         return [QueuedReport(*row) for row in rows]
 
     def done(self, report_id: str) -> None:
-        """Lets go of a report that arrived."""
-        with self._transaction() as database:
-            self._count(
-                database, "delivered", database.execute("DELETE FROM report WHERE id = ?", (report_id,)).rowcount
-            )
+        """Removes a report that arrived."""
+        self._remove(report_id, "delivered")
 
     def refused(self, report_id: str) -> None:
-        """Lets go of a report that the server will never take, or could never read."""
-        with self._transaction() as database:
-            self._count(database, "refused", database.execute("DELETE FROM report WHERE id = ?", (report_id,)).rowcount)
+        """Removes a report that the server will never take, or could never read."""
+        self._remove(report_id, "refused")
 
     def counts(self) -> dict[str, int]:
         """`waiting` now; `delivered`, `dropped` for want of room and `refused` (damaged ones among them) since the file was made."""
@@ -82,8 +78,12 @@ class Outbox:
             waiting = database.execute("SELECT COUNT(*) FROM report").fetchone()[0]
         return {"waiting": waiting, **{name: known.get(name, 0) for name in ("delivered", "dropped", "refused")}}
 
+    def _remove(self, report_id: str, count: str) -> None:
+        with self._transaction() as database:
+            self._count(database, count, database.execute("DELETE FROM report WHERE id = ?", (report_id,)).rowcount)
+
     def _make_room(self, database: sqlite3.Connection) -> None:
-        """Never the newest: it is the one that was just asked to be kept."""
+        """Drops the oldest reports, never the newest one."""
         query = "SELECT number, LENGTH(payload) FROM report ORDER BY number"
         rows = database.execute(query).fetchall()
         total, dropped = sum(size for _, size in rows), 0

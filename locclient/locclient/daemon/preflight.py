@@ -1,4 +1,4 @@
-"""Looks over a robot before it drives: each finding is ok, warn or fail, and says what to do next."""
+"""Checks of a robot before it drives: each finding is ok, warn or fail, and names the next step."""
 
 import shutil
 import time
@@ -26,7 +26,7 @@ OK, WARN, FAIL = "ok", "warn", "fail"
 _ANSWER_S = 5.0
 _BASELINE_M = (0.03, 0.6)
 _MIN_FREE_BYTES = 200_000_000
-_OLD_NS = 1_700_000_000_000_000_000  # before this program was written no clock was right
+_OLD_NS = 1_700_000_000_000_000_000  # a clock before this program was written is wrong
 _SKEW_S = 0.5
 _MIN_FRAME_HZ, _MIN_IMU_HZ = 5.0, 90.0
 _SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
@@ -34,7 +34,7 @@ _SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """level: ok, warn or fail; text says what was found and, unless it is ok, what to do."""
+    """level: ok, warn or fail; text: what was found and, unless it is ok, what to do."""
 
     level: str
     what: str
@@ -42,7 +42,7 @@ class Finding:
 
 
 def run_preflight(config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
-    """One finding after another; never raises for what is wrong with the robot. listen_s: how long to hear its sensors."""
+    """One finding after another; never raises for a fault of the robot. listen_s: how long to listen to its sensors."""
     try:
         check_run(config)
     except FleetmapError as error:
@@ -58,9 +58,9 @@ def run_preflight(config: LocclientConfig, listen_s: float) -> Iterator[Finding]
         yield from _guarded("cache", lambda: _cache_and_server(config))
 
 
-def _guarded(what: str, look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+def _guarded(what: str, check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     try:
-        yield from look()
+        yield from check()
     except FleetmapError as error:
         yield Finding(FAIL, what, str(error))
 
@@ -70,50 +70,48 @@ def _sensors(config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
     try:
         yield _calibration(source.calibration, Rectifier(source.calibration, has_depth=source.has_depth))
         if listen_s > 0:
-            yield from _listened(source, config, listen_s)
+            yield from _streams(source, config, listen_s)
     finally:
         source.close()
 
 
 def _calibration(calibration: RigCalibration, rectifier: Rectifier) -> Finding:
     camera = rectifier.camera
-    said = f"{camera.width_px}x{camera.height_px} px, focal {camera.focal_px:.0f} px, baseline {1000 * camera.baseline_m:.0f} mm"
+    text = f"{camera.width_px}x{camera.height_px} px, focal {camera.focal_px:.0f} px, baseline {1000 * camera.baseline_m:.0f} mm"
     if len(calibration.cameras) > 1 and not _BASELINE_M[0] < stereo_baseline_m(calibration) < _BASELINE_M[1]:
-        return Finding(WARN, "calibration", f"{said}: is the baseline in metres? Calibrate again")
+        return Finding(WARN, "calibration", f"{text}: is the baseline in metres? Calibrate again")
     if calibration.imu is None:
-        return Finding(
-            WARN, "calibration", f"{said}, no IMU: darkness and fast turns will lose the robot; calibrate with its IMU"
-        )
-    return Finding(OK, "calibration", f"{said}, IMU {1e3 * rectifier.imu_minus_cam_s:+.1f} ms from the camera")
+        hint = "no IMU: darkness and fast turns will lose the robot; calibrate with its IMU"
+        return Finding(WARN, "calibration", f"{text}, {hint}")
+    return Finding(OK, "calibration", f"{text}, IMU {1e3 * rectifier.imu_minus_cam_s:+.1f} ms from the camera")
 
 
-def _listened(source: Source, config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
+def _streams(source: Source, config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
     until_s = time.monotonic() + listen_s
-    stamps: list[int] = []
-    intake = _Listening(stamps, source.calibration)
+    intake = _StampRecorder(has_imu=source.calibration.imu is not None)
 
     def wait(seconds: float) -> bool:
         time.sleep(max(0.0, min(seconds, until_s - time.monotonic())))
         return time.monotonic() >= until_s
 
     source.run(intake, wait)
-    counts = intake.counts
+    counts, stamps = intake.counts, intake.stamps_ns
+    is_live = config.source.kind != "recording"
     frame_hz = (len(stamps) - 1) / ((stamps[-1] - stamps[0]) * 1e-9) if len(stamps) > 1 else 0.0
-    said = f"{frame_hz:.1f} Hz of frames"
+    text = f"{frame_hz:.1f} Hz of frames"
     if frame_hz < _MIN_FRAME_HZ:
         hint = "check the camera, [topics] and the endpoint of [source]"
-        yield Finding(FAIL, "frames", f"{said} in {listen_s:g} s, {counts.unreadable} unreadable messages; {hint}")
+        yield Finding(FAIL, "frames", f"{text} in {listen_s:g} s, {counts.unreadable} unreadable messages; {hint}")
     else:
         bad = counts.frames_disordered + counts.unreadable
         hint = f", {bad} of them out of order or unreadable: check the driver" if bad else ""
-        yield Finding(WARN if bad else OK, "frames", said + hint)
-    if source.calibration.imu is not None:
+        yield Finding(WARN if bad else OK, "frames", text + hint)
+    if source.calibration.imu is not None and is_live:
         imu_hz = counts.imu_samples / listen_s
-        if config.source.kind != "recording":
-            level = OK if imu_hz >= _MIN_IMU_HZ else FAIL
-            hint = "" if level == OK else f"; at least {_MIN_IMU_HZ:g} Hz are needed, check [topics] imu"
-            yield Finding(level, "imu", f"{imu_hz:.0f} Hz{hint}")
-    if stamps and config.source.kind != "recording":
+        is_enough = imu_hz >= _MIN_IMU_HZ
+        hint = "" if is_enough else f"; at least {_MIN_IMU_HZ:g} Hz are needed, check [topics] imu"
+        yield Finding(OK if is_enough else FAIL, "imu", f"{imu_hz:.0f} Hz{hint}")
+    if stamps and is_live:
         skew_s = (time.time_ns() - stamps[-1]) * 1e-9
         if abs(skew_s) > _SKEW_S + 1.0 / max(frame_hz, 1.0):
             text = f"frames are stamped {skew_s:.2f} s before now; let the driver stamp with the system's clock"
@@ -122,32 +120,29 @@ def _listened(source: Source, config: LocclientConfig, listen_s: float) -> Itera
             yield Finding(OK, "stamps", f"{1e3 * skew_s:.0f} ms behind the system's clock")
 
 
-class _Listening(Intake):
-    """Keeps the stamps of frames that would be taken."""
+class _StampRecorder(Intake):
+    """Keeps the stamps of accepted frames, and no frames."""
 
-    def __init__(self, stamps: list[int], calibration: RigCalibration) -> None:
-        super().__init__(frames=1, imu_minus_cam_s=0.0, has_imu=calibration.imu is not None, imu_wait_s=0.0)
-        self._stamps = stamps
+    def __init__(self, *, has_imu: bool) -> None:
+        super().__init__(frames=1, imu_minus_cam_s=0.0, has_imu=has_imu, imu_wait_s=0.0)
+        self.stamps_ns: list[int] = []
 
     def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
         """See Intake."""
         before = self.counts.frames
         super().put_frame(frame)
         if self.counts.frames > before:
-            self._stamps.append(frame.stamp_ns)
+            self.stamps_ns.append(frame.stamp_ns)
 
     def wait_for_room(self, timeout_s: float) -> bool:
-        """See Intake; there is always room, because nothing is kept."""
+        """See Intake; there is always room."""
         return True
 
 
 def _clock(now_ns: int, synchronised: bool) -> Finding:
     if now_ns < _OLD_NS:
-        return Finding(
-            FAIL,
-            "clock",
-            f"the system's clock says {now_ns // 10**9} s since 1970; set it, and enable its synchronisation",
-        )
+        text = f"the system's clock says {now_ns // 10**9} s since 1970; set it, and enable its synchronisation"
+        return Finding(FAIL, "clock", text)
     if not synchronised:
         hint = "enable NTP or PTP (timedatectl); the server measures how far this robot's clock is off"
         return Finding(WARN, "clock", f"not known to be synchronised; {hint}")
@@ -156,22 +151,22 @@ def _clock(now_ns: int, synchronised: bool) -> Finding:
 
 def _spool(config: LocclientConfig) -> Iterator[Finding]:
     path = spool_path(config.run, str(config.run.site), str(config.run.robot))
-    spool = Outbox(path, max_bytes=config.run.spool_bytes)
-    counts = spool.counts()
-    said = f"{path}: {counts['waiting']} reports wait, {counts['delivered']} delivered, {counts['dropped']} dropped"
-    if spool.set_aside is not None:
-        yield Finding(WARN, "spool", f"was damaged and begun anew; what it held is in {spool.set_aside}")
+    outbox = Outbox(path, max_bytes=config.run.spool_bytes)
+    counts = outbox.counts()
+    text = f"{path}: {counts['waiting']} reports wait, {counts['delivered']} delivered, {counts['dropped']} dropped"
+    if outbox.set_aside is not None:
+        yield Finding(WARN, "spool", f"was damaged and begun anew; what it held is in {outbox.set_aside}")
     elif counts["dropped"]:
-        yield Finding(WARN, "spool", f"{said}; raise [run] spool_bytes or check the connection")
+        yield Finding(WARN, "spool", f"{text}; raise [run] spool_bytes or check the connection")
     else:
-        yield Finding(OK, "spool", said)
+        yield Finding(OK, "spool", text)
 
 
 def _store(config: LocclientConfig) -> Iterator[Finding]:
-    link = LocalMapSource(Path(str(config.run.store)), str(config.run.site))
-    wanted = link.wanted()
-    fetched = link.tiles(link.manifest(wanted))
-    yield _tiles("store", wanted.version, len(fetched.tiles), fetched.refused)
+    source = LocalMapSource(Path(str(config.run.store)), str(config.run.site))
+    wanted = source.wanted()
+    fetched = source.tiles(source.manifest(wanted))
+    yield _pieces("store", wanted.version, len(fetched.tiles), list(fetched.refused.values()))
 
 
 def _cache_and_server(config: LocclientConfig) -> Iterator[Finding]:
@@ -181,44 +176,34 @@ def _cache_and_server(config: LocclientConfig) -> Iterator[Finding]:
     free_bytes = shutil.disk_usage(folder).free
     if free_bytes < _MIN_FREE_BYTES:
         yield Finding(WARN, "disk", f"{free_bytes / 1e6:.0f} MB free beside {folder}; make room for new versions")
+    active = cache.active(str(run.site))
+    if active is None:
+        hint = "the robot needs its server for the first one"
+        yield Finding(WARN, "cache", f"{folder} holds no whole version yet; {hint}")
+    else:
+        damaged = sum(cache.get(sha256) is None for sha256 in active.blobs)
+        reasons = ["missing or damaged, fetched again at the next start"] * damaged
+        yield _pieces("cache", active.version, len(active.blobs) - damaged, reasons)
     bus = ZenohBus.connect(str(run.server))
     try:
-        link = MapClient(bus, cache, str(run.site), str(run.robot), timeout_s=_ANSWER_S)
-        active = link.active()
-        if active is None:
-            yield Finding(
-                WARN, "cache", f"{folder} holds no whole version yet; the robot needs its server for the first one"
-            )
-        else:
-            record = cache.active(str(run.site))
-            damaged = sum(cache.get(sha256) is None for sha256 in record.blobs) if record is not None else 0
-            reasons = {(0, n): "missing or damaged, fetched again at the next start" for n in range(damaged)}
-            yield _tiles("cache", active.version, len(record.blobs) - damaged if record else 0, reasons)
-        try:
-            wanted = link.wanted()
-        except UnreachableError as error:
-            level = FAIL if active is None else WARN
-            hint = "" if active is None else f"; version {active.version} works without it"
-            yield Finding(level, "connection", f"{error}{hint}")
-            return
-        if wanted.version is None:
-            yield Finding(
-                FAIL, "connection", f"site {run.site} has no published version; publish one with `mapserver publish`"
-            )
-        elif wanted != active:
-            hint = "it is fetched when the robot runs"
-            yield Finding(OK, "connection", f"{run.server} wants version {wanted.version}; {hint}")
-        else:
-            yield Finding(OK, "connection", f"{run.server} wants version {wanted.version}, which is here")
+        wanted = MapClient(bus, cache, str(run.site), str(run.robot), timeout_s=_ANSWER_S).wanted()
+    except UnreachableError as error:
+        hint = "" if active is None else f"; version {active.version} works without it"
+        yield Finding(FAIL if active is None else WARN, "connection", f"{error}{hint}")
+        return
     finally:
         bus.close()
+    if wanted.version is None:
+        hint = "publish one with `mapserver publish`"
+        yield Finding(FAIL, "connection", f"site {run.site} has no published version; {hint}")
+        return
+    is_here = active is not None and wanted == active.wanted(str(run.site))
+    hint = ", which is here" if is_here else "; it is fetched when the robot runs"
+    yield Finding(OK, "connection", f"{run.server} wants version {wanted.version}{hint}")
 
 
-def _tiles(what: str, version: int | None, good: int, refused: dict[tuple[int, int], str]) -> Finding:
+def _pieces(what: str, version: int | None, good: int, refused: list[str]) -> Finding:
     if not refused:
         return Finding(OK, what, f"version {version} is whole: {good} pieces verified")
-    first = next(iter(refused.values()))
-    level = WARN if good else FAIL
-    return Finding(
-        level, what, f"version {version}: {len(refused)} pieces cannot be used, {good} can; the first: {first}"
-    )
+    text = f"version {version}: {len(refused)} pieces cannot be used, {good} can; the first: {refused[0]}"
+    return Finding(WARN if good else FAIL, what, text)

@@ -153,7 +153,7 @@ def log_odds(one: ObservationHistory, other: ObservationHistory, one_shared: Fla
         for side, (points_odom, scores, skipped) in enumerate(sides):
             kernels.add_to_cells(points_odom, scores, skipped, side, (cell_m, shift), table)
         count = kernels.add_block_log_odds(table, _MODEL, _BLOCK_M, blocks, count, totals[:, lattice])
-    # Of each block the lattice that says most for either place.
+    # Of each block the strongest lattice for either place.
     strongest = np.maximum(totals.max(axis=1), 0.0) - np.maximum(-totals.min(axis=1), 0.0)
     return float(np.clip(strongest, -_MAX_BLOCK_LOG_ODDS, _MAX_BLOCK_LOG_ODDS).sum())
 

@@ -16,8 +16,8 @@ from locclient.localization.settings import TrackSettings
 
 @dataclass(frozen=True, slots=True)
 class LocalizationState:
-    """What an estimate tells of. confirmed: the pose that is tracked; candidates: competing ones while there is none. prior: the pose
-    by the prior and the motion since. has_failed: the last map query found no fix."""
+    """confirmed: the pose that is tracked; candidates: competing ones while there is none. prior: the pose by the prior and the motion
+    since. has_failed: the last map query found no fix."""
 
     confirmed: PoseHypothesis | None
     candidates: HypothesisSet
@@ -56,7 +56,7 @@ def _of_confirmed(estimate: Estimate, confirmed: PoseHypothesis, has_failed: boo
     else:
         status, cause = Status.TRACKING, Cause.NONE
     estimate = replace(estimate, status=status, cause=cause)
-    if status is not Status.TRACKING and confirmed.kidnap_hypotheses:  # either there or where fixes have said since
+    if status is not Status.TRACKING and confirmed.kidnap_hypotheses:  # it may be at either
         places = _published([confirmed, *confirmed.kidnap_hypotheses])
         return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)
     return _with_pose(estimate, confirmed, settings)

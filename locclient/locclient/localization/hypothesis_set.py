@@ -7,17 +7,8 @@ import numpy as np
 from fleetmap.geometry import Array
 from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.relocalization.relocalizer import Fix
+from locclient.localization import hypothesis_scoring as scoring
 from locclient.localization.alias_disambiguation import ViewpointGate
-from locclient.localization.hypothesis_scoring import (
-    begin_query,
-    competitors,
-    disambiguated,
-    is_supported,
-    is_unambiguous,
-    ranked,
-    recent,
-    vote,
-)
 from locclient.localization.pose_covariance import boxminus
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
@@ -55,27 +46,27 @@ class HypothesisSet:
     def observe(self, observations: Observations, hypotheses: list[PoseHypothesis], odom_from_body: Array) -> None:
         """One query: every fix votes for one of `hypotheses`, or founds one."""
         is_new = self._viewpoint_gate.is_new(odom_from_body)
-        begin_query(hypotheses, self._settings, is_new_viewpoint=is_new)
+        scoring.begin_query(hypotheses, self._settings, is_new_viewpoint=is_new)
         for fix, fresh in observations:
-            vote(hypotheses, fix, fresh, odom_from_body if is_new else None, self._settings)
+            scoring.vote(hypotheses, fix, fresh, odom_from_body if is_new else None, self._settings)
 
     def update(self, observations: Observations, odom_from_body: Array) -> TimeSliced[None]:
         """Votes, pruning and disambiguation by one query; in time slices."""
         self.observe(observations, self.hypotheses, odom_from_body)
-        self.hypotheses = recent(self.hypotheses, self._settings)
-        self._disambiguated = yield from disambiguated(self.hypotheses, self._settings)
+        self.hypotheses = scoring.recent(self.hypotheses, self._settings)
+        self._disambiguated = yield from scoring.disambiguated(self.hypotheses, self._settings)
 
     def ranking(self) -> tuple[list[PoseHypothesis], list[PoseHypothesis]]:
         """The hypotheses, the most likely first, and the competitors of that one."""
-        order, best = ranked(self.hypotheses), self._disambiguated
+        order, best = scoring.ranked(self.hypotheses), self._disambiguated
         if not any(h is best for h in order):  # it may have been pruned in a query that goes on
-            return order, competitors(self.hypotheses, self._settings)
+            return order, scoring.competitors(self.hypotheses, self._settings)
         return sorted(order, key=lambda h: h is not best), []
 
     def is_confirmed(self, hypothesis: PoseHypothesis, fixes: Sequence[Fix]) -> bool:
         """By enough fixes over enough distance, or as the only hypothesis by a single unambiguous fix."""
-        is_alone = len(self.hypotheses) == len(fixes) == 1 and is_unambiguous(fixes[0], self._settings)
-        return is_alone or is_supported(hypothesis, self._settings)
+        is_alone = len(self.hypotheses) == len(fixes) == 1 and scoring.is_unambiguous(fixes[0], self._settings)
+        return is_alone or scoring.is_supported(hypothesis, self._settings)
 
     def moved_m(self, hypothesis: PoseHypothesis) -> float | None:
         """The distance of a hypothesis from the abandoned pose; None where their covariances admit it (Mahalanobis test)."""

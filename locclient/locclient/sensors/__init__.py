@@ -1,1 +1,1 @@
-"""Where a running robot's samples come from."""
+"""Sensor sources of a running robot, and the queue between them and the localizer."""

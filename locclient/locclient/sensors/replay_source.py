@@ -1,4 +1,4 @@
-"""Where a replay's samples come from: a recording, forwards, or backwards with new stamps and without IMU."""
+"""Samples of a replay: a recording, forwards, or backwards with new stamps and without IMU."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -67,7 +67,7 @@ class ReplaySource:
             fed_ns = until_ns
 
     def priors_before(self, number: int) -> list[PositionPrior]:
-        """Coarse places that the recording tells between the frame before and frame `number`; none backwards."""
+        """Coarse places in the recording between the frame before and frame `number`; none backwards."""
         if self.reverse:
             return []
         since = self.recorded_stamp_ns(number - 1) if number else -(2**62)

@@ -45,16 +45,6 @@ class VideoMode(NamedTuple):
     delay_s: float
 
 
-class Clocks(NamedTuple):
-    """The clocks that stamp frames: the monotonic one of drivers, and the system's."""
-
-    monotonic_s: Callable[[], float] = time.monotonic
-    wall_ns: Callable[[], int] = time.time_ns
-
-
-_SYSTEM_CLOCKS = Clocks()
-
-
 class UvcSource:
     """Frames of a side-by-side camera, stamped on the clock of the topics.
 
@@ -69,10 +59,13 @@ class UvcSource:
         calibration: RigCalibration,
         mode: VideoMode,
         topics: Ros2Source | None,
-        clocks: Clocks = _SYSTEM_CLOCKS,
+        *,
+        monotonic_s: Callable[[], float] = time.monotonic,
+        wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """topics: where the other sensors come from, None for none."""
-        self._open, self._mode, self._topics, self._clocks = open_capture, mode, topics, clocks
+        self._open, self._mode, self._topics = open_capture, mode, topics
+        self._monotonic_s, self._wall_ns = monotonic_s, wall_ns
         self.calibration, self.has_depth = calibration, False
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
@@ -117,7 +110,7 @@ class UvcSource:
                 intake.count_unreadable()
 
     def _stamp_ns(self, capture: Capture) -> int:
-        now_s, wall_ns = self._clocks.monotonic_s(), self._clocks.wall_ns()
+        now_s, wall_ns = self._monotonic_s(), self._wall_ns()
         driver_s = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
         age_s = now_s - driver_s if abs(now_s - driver_s) < _CLOCKS_AGREE_S else 0.0
         return wall_ns - round((max(age_s, 0.0) + self._mode.delay_s) * 1e9)

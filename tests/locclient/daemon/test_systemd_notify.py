@@ -1,4 +1,4 @@
-"""What systemd hears."""
+"""Messages to systemd."""
 
 import socket
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a replay plays: every IMU sample once and in time; backwards, rising stamps and no IMU."""
+"""Samples of a replay: every IMU sample once and in time; backwards, rising stamps and no IMU."""
 
 from dataclasses import replace
 

@@ -9,7 +9,7 @@ import pytest
 
 from fleetmap.errors import RecordingError
 from locclient.sensors.intake import Intake
-from locclient.sensors.uvc import Clocks, UvcSource, VideoMode, split_frame
+from locclient.sensors.uvc import UvcSource, VideoMode, split_frame
 from support.recordings.recording_samples import calibration
 
 
@@ -44,8 +44,8 @@ def played(cameras: list[PlayedCamera], *, delay_s: float = 0.0) -> tuple[Intake
     waits: list[float] = []
     left = list(cameras)
     clock = iter(range(10**9, 10**12, 10**6))
-    clocks = Clocks(lambda: 50.0, lambda: next(clock))
-    source = UvcSource(lambda: left.pop(0), calibration(), VideoMode(640, 240, 30.0, delay_s), None, clocks)
+    mode, wall_ns = VideoMode(640, 240, 30.0, delay_s), lambda: next(clock)
+    source = UvcSource(lambda: left.pop(0), calibration(), mode, None, monotonic_s=lambda: 50.0, wall_ns=wall_ns)
 
     def wait(seconds: float) -> bool:
         waits.append(seconds)
