@@ -23,10 +23,11 @@ One frame alone, without odometry or history, is relocalized in three steps:
 ambiguous: racks repeat.
 """
 
-from importlib import import_module, metadata
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from fleetmap import __version__
     from fleetmap.numerics.time_sliced import finished
     from fleetmap.relocalization.map_view import MapView
     from fleetmap.relocalization.relocalizer import Fix, Relocalizer
@@ -52,26 +53,23 @@ __all__ = [
     "finished",
     "localize",
 ]
-_MODULES = {
-    "Estimate": "locclient.localization.estimate",
-    "Fix": "fleetmap.relocalization.relocalizer",
-    "LocalizeOptions": "locclient.replay.localize",
-    "Localizer": "locclient.localization.localizer",
-    "LocalizerSettings": "locclient.localization.settings",
-    "MapView": "fleetmap.relocalization.map_view",
-    "Relocalizer": "fleetmap.relocalization.relocalizer",
-    "ReplayResult": "locclient.replay.run_result",
-    "Robot": "locclient.robot.robot",
-    "fetch_map": "locclient.replay.localize",
-    "finished": "fleetmap.numerics.time_sliced",
-    "localize": "locclient.replay.localize",
+_NAMES = {
+    "fleetmap": "__version__",
+    "fleetmap.numerics.time_sliced": "finished",
+    "fleetmap.relocalization.map_view": "MapView",
+    "fleetmap.relocalization.relocalizer": "Fix Relocalizer",
+    "locclient.localization.estimate": "Estimate",
+    "locclient.localization.localizer": "Localizer",
+    "locclient.localization.settings": "LocalizerSettings",
+    "locclient.replay.localize": "LocalizeOptions fetch_map localize",
+    "locclient.replay.run_result": "ReplayResult",
+    "locclient.robot.robot": "Robot",
 }
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> object:
     """Imports a public name when it is first used, so that `import locclient` stays light (PEP 562)."""
-    if name == "__version__":
-        return metadata.version("fleetmap")
     if name not in _MODULES:
         raise AttributeError(f"module 'locclient' has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)

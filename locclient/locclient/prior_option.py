@@ -1,4 +1,4 @@
-"""A coarse place as people write it: X,Y,YAW,SIGMA_M."""
+"""A position prior as users write it: X,Y,YAW,SIGMA_M."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from fleetmap.sensors.samples import PositionPrior
 
 
 def parse_prior(text: str | None, name: str = "prior") -> PositionPrior | None:
-    """The place of the base in `map`, heading unknown to the covariance; None for None; UsageError for anything else."""
+    """The prior of the base in `map`, its heading not constrained; None for None; UsageError for anything else."""
     if text is None:
         return None
     try:

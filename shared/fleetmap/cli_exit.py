@@ -1,4 +1,4 @@
-"""What the commands `mapserver`, `locclient` and `fleetsim` share: how they end."""
+"""Exit of the commands `mapserver`, `locclient` and `fleetsim`: errors become messages and statuses."""
 
 import sys
 from collections.abc import Callable
@@ -9,12 +9,20 @@ INTERRUPTED = 130  # as a shell says it of Ctrl-C
 
 
 def run(app: Callable[[], object]) -> None:
-    """Runs a command line; a FleetmapError becomes its message on stderr and its exit status, Ctrl-C becomes 130."""
+    """Runs a command line; a FleetmapError becomes its message on stderr and its exit status, Ctrl-C becomes 130.
+
+    A library that is not installed becomes the name of the extra that brings it.
+    """
     try:
         app()
     except FleetmapError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(error.exit_status)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] in {"fleetmap", "fleetsim", "mapserver", "locclient"}:
+            raise
+        print(f"error: {error.name} is not installed; pip install 'fleetmap[server]' brings it", file=sys.stderr)
+        sys.exit(FleetmapError.exit_status)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(INTERRUPTED)

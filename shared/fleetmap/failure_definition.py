@@ -37,7 +37,10 @@ def is_usable(status: str, radius_95_m: float) -> bool:
 
 
 def is_outside_bound(error_map_m: Array, cov_rot_trans: Array) -> bool:
-    """Whether a position error (3,) leaves the 99.9 % bound of its covariance (6, 6), rotation first."""
+    """Whether a position error (3,) leaves the 99.9 % bound of its covariance (6, 6), rotation first.
+
+    Source: Bar-Shalom et al. 2001, section 5.4 (normalized estimation error squared).
+    """
     return float(error_map_m @ np.linalg.solve(cov_rot_trans[3:, 3:], error_map_m)) > CHI2_3_0999
 
 

@@ -107,9 +107,18 @@ class RobotAck(msgspec.Struct, frozen=True, kw_only=True):
 
 
 HEALTH_FIGURES = (
-    "speed_mps", "radius_95_m", "frames", "frames_dropped", "frame_ms_mean", "first_fix_s", "fix_innovation",
-    "fix_innovation_m", "dock_error_m", "landmarks_expected", "landmarks_seen",
-)  # fmt: skip
+    "speed_mps",
+    "radius_95_m",
+    "frames",
+    "frames_dropped",
+    "frame_ms_mean",
+    "first_fix_s",
+    "fix_innovation",
+    "fix_innovation_m",
+    "dock_error_m",
+    "landmarks_expected",
+    "landmarks_seen",
+)
 """Metrics of RobotHealth that the server counts with; a robot leaves out what it does not know. Since the report before:
 fix_innovation, the largest squared Mahalanobis distance (6 degrees of freedom) between a fix and its prediction,
 fix_innovation_m, the largest such distance in metres, and dock_error_m, the distance between estimate and dock at an arrival;
@@ -279,18 +288,7 @@ Message = (
     | FailureReport
     | FailureAck
 )
-M = TypeVar(
-    "M",
-    WantedVersion,
-    RobotAck,
-    RobotHealth,
-    PoseMessage,
-    ChunkRequest,
-    Part,
-    EstimateMessage,
-    FailureReport,
-    FailureAck,
-)
+M = TypeVar("M", bound=Message)
 
 
 def encode_message(message: Message) -> bytes:

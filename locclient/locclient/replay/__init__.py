@@ -1,1 +1,1 @@
-"""A recording played through the localization client."""
+"""Replay of recordings: the robot in them, measures of a run, its picture."""

@@ -1,19 +1,12 @@
-"""What a run was worth: localised share, times, errors, failures. Pure. To add a metric: a function here and a line in METRICS."""
+"""Measures of a run: localised share, times, errors, failures. Pure. To add one: a function here and a line in METRICS."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from fleetmap.failure_definition import (
-    BLIND_S,
-    GOOD_S,
-    SILENT_S,
-    is_blind,
-    is_outside_bound,
-    is_wrong,
-    radius_95_m,
-)
+from fleetmap import failure_definition
+from fleetmap.failure_definition import BLIND_S, GOOD_S, SILENT_S
 from fleetmap.geometry import Array
 from fleetmap.messages import Status
 
@@ -97,15 +90,13 @@ def stage_ms(frames: Frames) -> dict[str, float]:
 
 def error_m(frames: Frames) -> dict[str, float] | None:
     """Unaligned position errors of localised frames with a truth."""
-    values = [f.error_m for f, good in zip(frames, localised(frames), strict=True) if good and f.error_m is not None]
+    values = [f.error_m for f, good in zip(frames, localised(frames), strict=True) if good]
     return _spread([v for v in values if v is not None], ("median", "p95", "p99", "max"))
 
 
 def error_deg(frames: Frames) -> dict[str, float] | None:
     """Unaligned orientation errors of localised frames with a truth."""
-    values = [
-        f.error_rad for f, good in zip(frames, localised(frames), strict=True) if good and f.error_rad is not None
-    ]
+    values = [f.error_rad for f, good in zip(frames, localised(frames), strict=True) if good]
     return _spread([float(np.degrees(v)) for v in values if v is not None], ("median", "p99"))
 
 
@@ -122,9 +113,9 @@ def silent_failures(frames: Frames) -> int | None:
 
 
 def position_failures(frames: Frames) -> int:
-    """Silent failures, blindness after the first fix, and errors outside their own covariance; overlapping ones count once.
+    """Count of failures as `fleetmap.failure_definition` defines them; overlapping ones count once.
 
-    Without truth only blindness can be seen.
+    Without ground truth only blindness can be seen.
     """
     start = first_fix(frames)
     after = list(frames[start:]) if start is not None else []
@@ -139,19 +130,20 @@ def position_failures(frames: Frames) -> int:
 
 
 def _is_silent(frame: FrameRecord, is_localised: bool) -> bool:
-    wrong = frame.error_m is not None and is_wrong(frame.error_m, frame.error_rad)
-    return (frame.status is Status.TRACKING or is_localised) and wrong
+    is_wrong = frame.error_m is not None and failure_definition.is_wrong(frame.error_m, frame.error_rad)
+    return (frame.status is Status.TRACKING or is_localised) and is_wrong
 
 
 def _is_blind(frame: FrameRecord, is_localised: bool) -> bool:
-    return not is_localised and is_blind(frame.status, radius_95_m(frame.cov_rot_trans))
+    radius_m = failure_definition.radius_95_m(frame.cov_rot_trans)
+    return not is_localised and failure_definition.is_blind(frame.status, radius_m)
 
 
 def is_outside_its_bound(frame: FrameRecord) -> bool:
     """Whether the truth lies outside the 99.9 % bound of the position that the frame claims."""
     if frame.error_map_m is None or frame.cov_rot_trans is None:
         return False
-    return is_outside_bound(frame.error_map_m, frame.cov_rot_trans)
+    return failure_definition.is_outside_bound(frame.error_map_m, frame.cov_rot_trans)
 
 
 def _is_overconfident(frame: FrameRecord, is_localised: bool) -> bool:
@@ -163,8 +155,7 @@ def _episodes(
 ) -> list[tuple[int, int]]:
     """(begin, end) stamps of stretches that are bad for longer than so many seconds.
 
-    A stretch lasts until the next frame that is not bad: between two frames nothing better is known. It is over only after 5 s
-    of good tracking, so that one failure is not counted as many.
+    A stretch lasts until the next frame that is not bad. Stretches without 5 s of good tracking between them are one failure.
     """
     good = localised(frames)
     stretches: list[tuple[int, int]] = []
@@ -181,7 +172,7 @@ def _episodes(
 
 
 def _merged(stretches: list[tuple[int, int]], fine: list[tuple[int, bool]]) -> list[tuple[int, int]]:
-    """Stretches, sorted by begin, that are not parted by 5 s of good tracking are one. fine: stamp and goodness of each frame."""
+    """Joins stretches, sorted by begin, without 5 s of good tracking between them. fine: stamp and goodness of each frame."""
     merged: list[tuple[int, int]] = []
     for begin, end in stretches:
         if merged and _longest_fine_ns(fine, merged[-1][1], begin) < GOOD_S * 1e9:
@@ -192,7 +183,7 @@ def _merged(stretches: list[tuple[int, int]], fine: list[tuple[int, bool]]) -> l
 
 
 def _longest_fine_ns(fine: list[tuple[int, bool]], since_ns: int, until_ns: int) -> int:
-    """The longest unbroken stretch of good tracking between two moments, up to the frame that ends it."""
+    """Duration of the longest stretch of good tracking between two stamps, up to the frame that ends it."""
     longest, begin = 0, None
     for stamp, is_fine in fine:
         if since_ns <= stamp <= until_ns:
