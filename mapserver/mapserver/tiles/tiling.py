@@ -1,4 +1,4 @@
-"""From a survey to the tiles that robots download. Pure."""
+"""Cutting of a survey into the tiles that robots download. Pure."""
 
 from itertools import pairwise
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile
-from mapserver.survey.finish.landmark_visibility import Views
+from mapserver.survey.finish.landmark_visibility import viewing_cones
 from mapserver.survey.merge.initial_history import history_of
 from mapserver.survey.survey_map import SurveyMap
 
@@ -33,13 +33,14 @@ def tiles_from_survey(
     """
     map_from_cam = survey.map_from_body @ survey.body_from_cam
     _check_finite(survey, map_from_cam)
-    views = Views(survey, map_from_cam)
+    cones = viewing_cones(survey, map_from_cam)
+    counts = np.bincount(survey.obs_landmark, minlength=len(survey.landmark_ids))
     chosen = np.ones(len(survey.landmark_ids), bool) if chosen is None else chosen
-    kept = np.flatnonzero((views.counts > 0) & chosen)
+    kept = np.flatnonzero((counts > 0) & chosen)
     kept = kept[np.argsort(survey.landmark_ids[kept], kind="stable")]
     landmark_cells = _cells(survey.points_map[kept], tile_size_m)
     place_cells = _cells(map_from_cam[:, :3, 3], tile_size_m)
-    references = _place_landmarks(survey, views.counts, max_place_landmarks, chosen)
+    references = _place_landmarks(survey, counts, max_place_landmarks, chosen)
     history = history_of(survey)
     tiles = []
     for cell in sorted({(int(x), int(y)) for x, y in np.concatenate([landmark_cells, place_cells[history.is_place]])}):
@@ -54,9 +55,9 @@ def tiles_from_survey(
                 landmark_ids=survey.landmark_ids[rows],
                 points_map=survey.points_map[rows],
                 descriptors=survey.descriptors[rows],
-                view_directions_map=views.directions_map[rows].astype(np.float32),
-                view_half_angle_rad=views.half_angle_rad[rows].astype(np.float32),
-                max_distance_m=views.max_distance_m[rows].astype(np.float32),
+                view_directions_map=cones.directions_map[rows],
+                view_half_angle_rad=cones.half_angles_rad[rows],
+                max_distance_m=cones.max_distances_m[rows],
                 sigma_m=survey.point_sigma_m[rows].astype(np.float32),
                 place_ids=history.keyframe_ids[places],
                 map_from_cam=map_from_cam[places],

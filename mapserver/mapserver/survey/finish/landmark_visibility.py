@@ -1,33 +1,33 @@
-"""From where the landmarks of a survey were seen. Pure."""
+"""Directions and distances from which the landmarks of a survey were seen. Pure."""
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array
+from fleetmap.relocalization.landmark_visibility_kernels import ViewingCones
 from mapserver.survey.survey_map import SurveyMap
 
-OCTAVE_SCALE = 1.2
 
+def viewing_cones(survey: SurveyMap, map_from_cam: Array) -> ViewingCones:
+    """The cones of a survey's landmarks (N), whose keyframes' cameras are at map_from_cam (K, 4, 4).
 
-class Views:
-    """From where each of the N landmarks was seen.
-
-    counts (N,) observations; directions_map (N, 3) unit mean direction towards the cameras; half_angle_rad (N,) the
-    largest angle to it; max_distance_m (N,) median over observations of distance * scale ** octave. Zeros where counts
-    is 0, except directions.
+    Directions are the mean of those to the cameras, half angles the largest angle to it, distances the median over observations of
+    distance * scale ** octave. Half angle and distance are 0 where nothing observes a landmark.
+    Source: Mur-Artal et al. 2015 (ORB-SLAM), section III.C.
     """
-
-    def __init__(self, survey: SurveyMap, map_from_cam: Array) -> None:
-        landmark, count = survey.obs_landmark, len(survey.landmark_ids)
-        offsets_map = map_from_cam[survey.obs_keyframe, :3, 3] - survey.points_map[landmark]
-        distances_m = np.linalg.norm(offsets_map, axis=1)
-        rays_map = offsets_map / np.maximum(distances_m, 1e-9)[:, None]
-        self.counts = np.bincount(landmark, minlength=count)
-        self.directions_map = _mean_directions(landmark, rays_map, self.counts)
-        cosines = np.einsum("ij,ij->i", rays_map, self.directions_map[landmark])
-        self.half_angle_rad = np.zeros(count)
-        np.maximum.at(self.half_angle_rad, landmark, np.arccos(np.clip(cosines, -1.0, 1.0)))
-        self.max_distance_m = _medians(landmark, distances_m * OCTAVE_SCALE**survey.obs_octave, self.counts)
+    landmark, count = survey.obs_landmark, len(survey.landmark_ids)
+    offsets_map = map_from_cam[survey.obs_keyframe, :3, 3] - survey.points_map[landmark]
+    distances_m = np.linalg.norm(offsets_map, axis=1)
+    rays_map = offsets_map / np.maximum(distances_m, 1e-9)[:, None]
+    counts = np.bincount(landmark, minlength=count)
+    directions_map = _mean_directions(landmark, rays_map, counts)
+    cosines = np.einsum("ij,ij->i", rays_map, directions_map[landmark])
+    half_angles_rad = np.zeros(count)
+    np.maximum.at(half_angles_rad, landmark, np.arccos(np.clip(cosines, -1.0, 1.0)))
+    max_distances_m = _medians(landmark, distances_m * SCALE_FACTOR**survey.obs_octave, counts)
+    rounded = (values.astype(np.float32) for values in (directions_map, half_angles_rad, max_distances_m))
+    return ViewingCones(survey.points_map, *rounded)
 
 
 def _mean_directions(landmark: NDArray[np.int32], rays_map: Array, counts: NDArray[np.intp]) -> Array:

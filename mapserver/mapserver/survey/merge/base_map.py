@@ -1,19 +1,16 @@
 """The map that a survey is joined to, ready to be looked at from anywhere."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fleetmap.features.orb import SCALE_FACTOR
-from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.bow import Vocabulary
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.mapformat import Tile
+from fleetmap.relocalization.landmark_visibility import Rows, VisibleLandmarks, visible_landmarks
+from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import StereoCamera
-from mapserver.survey.finish.landmark_visibility import Views
+from mapserver.survey.finish.landmark_visibility import viewing_cones
 from mapserver.survey.merge.initial_history import history_of
 from mapserver.survey.survey_map import SurveyMap
-
-Rows = NDArray[np.int64]
-_NEAREST_M = 0.2
-_REACH_SHARE = 1.3  # of the distance up to which a landmark was found: detection does not end sharply
-_NEIGHBOURHOOD_M = 3.0
 
 
 class BaseMap:
@@ -29,7 +26,7 @@ class BaseMap:
         self.history = history_of(survey_map)
         self.map_from_cam = survey_map.map_from_body @ survey_map.body_from_cam
         self.map_from_body = self.map_from_cam @ se3_inverse(body_from_cam)
-        self.views = Views(survey_map, self.map_from_cam)
+        self.cones = viewing_cones(survey_map, self.map_from_cam)
         self.points_map, self.descriptors = survey_map.points_map, survey_map.descriptors
         own = survey_map.camera
         self.baseline_ratio = camera.baseline_m / own.baseline_m if own.baseline_m and camera.baseline_m else 1.0
@@ -40,36 +37,32 @@ class BaseMap:
         seen, first = np.unique(survey_map.obs_landmark, return_index=True)
         self.references[seen] = first
 
-    def visible(self, map_from_cam: Array, margin_px: float, max_view_angle_rad: float) -> tuple[Rows, Array, Array]:
-        """Rows (V,) of landmarks that a camera there should see, their pixels (V, 3) and expected octaves (V,)."""
-        seen = transform_points(se3_inverse(map_from_cam), self.points_map)
-        pixels = self.camera.pixel_from_point(seen)
-        distances_m = np.linalg.norm(seen, axis=1)
-        reaches_m = self.views.max_distance_m
-        towards = (map_from_cam[:3, 3] - self.points_map) / np.maximum(distances_m, 1e-9)[:, None]
-        cosines = np.einsum("ij,ij->i", towards, self.views.directions_map)
-        wide = np.minimum(self.views.half_angle_rad + max_view_angle_rad, np.pi)
-        with np.errstate(invalid="ignore"):
-            inside = (
-                (self.views.counts > 0)
-                & (distances_m > _NEAREST_M)
-                & (distances_m < _REACH_SHARE * reaches_m)
-                & (cosines > np.cos(wide))
-                & (pixels[:, 0] > -margin_px)
-                & (pixels[:, 0] < self.camera.width_px + margin_px)
-                & (pixels[:, 1] > -margin_px)
-                & (pixels[:, 1] < self.camera.height_px + margin_px)
-            )
-        rows = np.flatnonzero(inside)
-        octaves = np.log(np.maximum(reaches_m[rows] / distances_m[rows], 0.5)) / np.log(SCALE_FACTOR)
-        return rows, pixels[rows], octaves
+    def visible(self, map_from_cam: Array, margin_px: float, max_view_angle_rad: float) -> VisibleLandmarks:
+        """The landmarks that a camera there should see, in its image widened by margin_px."""
+        return visible_landmarks(self.cones, map_from_cam, self.camera, margin_px, max_view_angle_rad)
 
-    def neighbourhood(self, keyframe: int) -> Rows:
-        """Rows of all landmarks of keyframes near one keyframe that look a similar way."""
-        positions, axes = self.map_from_cam[:, :3, 3], self.map_from_cam[:, :3, 2]
-        near = np.linalg.norm(positions - positions[keyframe], axis=1) < _NEIGHBOURHOOD_M
-        near &= axes @ axes[keyframe] > 0.5
-        return np.unique(self.map.obs_landmark[near[self.map.obs_keyframe]]).astype(np.int64)
+    def view(self, vocabulary: Vocabulary) -> MapView:
+        """The whole map as robots hold one, but with all landmarks and keyframes and at the archive's precision, not cut into tiles."""
+        cones, old = self.cones, self.map
+        order = np.argsort(old.obs_keyframe, kind="stable")
+        ends = np.cumsum(np.bincount(old.obs_keyframe, minlength=len(self.map_from_cam)))
+        seen = np.split(old.landmark_ids[old.obs_landmark[order]], ends[:-1])
+        whole = Tile(
+            tile_x=0,
+            tile_y=0,
+            size_m=np.inf,
+            landmark_ids=old.landmark_ids,
+            points_map=cones.points_map,
+            descriptors=old.descriptors,
+            view_directions_map=cones.directions_map,
+            view_half_angle_rad=cones.half_angles_rad,
+            max_distance_m=cones.max_distances_m,
+            sigma_m=old.point_sigma_m.astype(np.float32),
+            place_ids=self.history.keyframe_ids,
+            map_from_cam=self.map_from_cam,
+            place_landmark_ids=tuple(seen),
+        )
+        return MapView([whole], vocabulary, self.camera.focal_px)
 
     def reference_cameras(self, rows: Rows) -> Array:
         """(V, 4, 4) map_from_cam of the keyframes that the patches of `rows` were cut from."""

@@ -1,24 +1,29 @@
-"""Landmarks of the map in keyframes of a new survey: looked for where they should be, placed to a fraction of a pixel."""
+"""Guided matching of the map's landmarks in keyframes of a new survey, to a fraction of a pixel."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.bow import Vocabulary
 from fleetmap.features import patch_align, stereo
-from fleetmap.features.matching import Projected, match_by_projection
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.features.patch_align_kernels import align_patches
 from fleetmap.geometry import Array, se3_inverse, transform_points
-from fleetmap.pnp.pnp import Correspondences, PnpResult, refine_pnp
+from fleetmap.relocalization.frame_features import FrameFeatures
+from fleetmap.relocalization.landmark_visibility import Rows
+from fleetmap.relocalization.relocalizer import Relocalizer
+from fleetmap.relocalization.settings import FixSettings, RelocalizerSettings
 from mapserver.survey.keyframes.keyframes import Keyframe
-from mapserver.survey.merge.base_map import BaseMap, Rows
+from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.settings import SurveySettings
+
+_CORRELATION = 3.0  # as of loops: what matched points share makes a fix worse than its own covariance says
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """What one keyframe sees of the map: landmarks rows (P,) as features (P,), pixels (P, 3), sigmas_px (P, 2)."""
+    """The map's landmarks in one keyframe: rows (P,) as features (P,), pixels (P, 3), sigmas_px (P, 2)."""
 
     rows: Rows
     features: Rows
@@ -30,59 +35,52 @@ class Sighting:
         return Sighting(self.rows[keep], self.features[keep], self.pixels[keep], self.sigmas_px[keep])
 
 
-def locate(
-    base: BaseMap, keyframe: Keyframe, map_from_cam: Array, radius_px: float, settings: SurveySettings
-) -> tuple[Rows, Rows, PnpResult] | None:
-    """Where a keyframe near `map_from_cam` is, by landmarks (P,) seen as features (P,); None where too few agree."""
-    s = settings.sessions
-    rows, features = _match(base, keyframe, map_from_cam, radius_px, settings)
-    if len(rows) < s.min_inliers:
-        return None
-    pixels = keyframe.features.pixels[features]
-    measured = np.column_stack([pixels, pixels[:, 0] - keyframe.disparities[features, 0]])
-    scale = SCALE_FACTOR ** np.minimum(keyframe.features.octaves[features], 4).astype(np.float64)
-    rough = settings.pairs.match_sigma_px * scale
-    sigmas = np.column_stack([rough, np.maximum(rough, 1.0)])
-    matches = Correspondences(base.camera, base.points_map[rows], measured, sigmas)
-    solved = refine_pnp(matches, se3_inverse(map_from_cam))
-    if solved is None or solved.inliers.sum() < s.min_inliers or solved.inliers.mean() < 0.35:
-        return None
-    rows, features = rows[solved.inliers], features[solved.inliers]
-    return (rows, features, solved) if _cells(base, keyframe, features) >= s.min_cells else None
+def session_relocalizer(base: BaseMap, vocabulary: Vocabulary, settings: SurveySettings) -> Relocalizer:
+    """The robots' relocalizer over the whole map at the archive's precision, with the survey's settings.
+
+    A session is joined by many fixes that must agree, and its matches become observations: they must be more and closer than a
+    robot's, and uncertain landmarks weigh as what they are to a survey's matching, not to a robot's filter.
+    """
+    sessions, pairs = settings.sessions, settings.pairs
+    fix = FixSettings(
+        min_inliers=sessions.min_inliers,
+        min_cells=sessions.min_cells,
+        top_places=sessions.top_places,
+        max_distance=pairs.max_distance,
+        ratio=pairs.ratio,
+        guided_distance=pairs.guided_distance,
+        guided_radius_px=sessions.search_px,
+        feature_sigma_px=pairs.match_sigma_px,
+        disparity_sigma_px=pairs.match_sigma_px,
+        covariance_scale=_CORRELATION**2,
+        floor_m=0.005,
+        floor_rad=0.001,
+        max_view_angle_deg=sessions.max_view_angle_deg,
+    )
+    relocalization = RelocalizerSettings(settings.seed, settings.stereo, settings.orb, fix)
+    return Relocalizer(base.view(vocabulary), base.camera, relocalization)
 
 
-def sight(
-    base: BaseMap, keyframe: Keyframe, map_from_cam: Array, radius_px: float, settings: SurveySettings
+def keyframe_features(keyframe: Keyframe) -> FrameFeatures:
+    """A keyframe's features as the relocalizer takes them."""
+    pixels = keyframe.features.pixels
+    return FrameFeatures(keyframe.features, np.column_stack([pixels, pixels[:, 0] - keyframe.disparities[:, 0]]))
+
+
+def match_keyframe(
+    base: BaseMap,
+    relocalizer: Relocalizer,
+    keyframe: Keyframe,
+    map_from_cam: Array,
+    radius_px: float,
+    settings: SurveySettings,
 ) -> Sighting | None:
     """The landmarks that a keyframe near `map_from_cam` sees, to a fraction of a pixel; None where too few agree."""
-    found = locate(base, keyframe, map_from_cam, radius_px, settings)
-    return None if found is None else _refined(base, keyframe, found[0], found[1], found[2].cam_from_source, settings)
-
-
-def _match(
-    base: BaseMap, keyframe: Keyframe, map_from_cam: Array, radius_px: float, settings: SurveySettings
-) -> tuple[Rows, Rows]:
-    rows, predicted, octaves = base.visible(
-        map_from_cam, radius_px, float(np.radians(settings.sessions.max_view_angle_deg))
-    )
-    span = np.column_stack([np.floor(octaves) - 2, np.ceil(octaves) + 2]).astype(np.int64)
-    window = radius_px * SCALE_FACTOR ** np.clip(octaves, 0, 3)
-    projected = Projected(predicted[:, :2], window, base.descriptors[rows], span)
-    hit, _ = match_by_projection(projected, keyframe.features, settings.pairs.guided_distance, 0.95)
-    kept = np.flatnonzero(hit >= 0)
-    return rows[kept], hit[kept].astype(np.int64)
-
-
-def _cells(base: BaseMap, keyframe: Keyframe, features: Rows) -> int:
-    cells = image_cells(keyframe.features.pixels[features], base)
-    return len(np.unique(cells))
-
-
-def image_cells(pixels: Array, base: BaseMap) -> Rows:
-    """(P,) which of 8 x 6 parts of the picture each pixel (P, 2) lies in."""
-    column = np.clip(pixels[:, 0] / base.camera.width_px * 8, 0, 7).astype(np.int64)
-    row = np.clip(pixels[:, 1] / base.camera.height_px * 6, 0, 5).astype(np.int64)
-    return np.asarray(column * 6 + row)
+    fix = relocalizer.by_projection(keyframe_features(keyframe), map_from_cam, radius_px)
+    if fix is None or fix.matches is None:
+        return None
+    features, rows = np.ascontiguousarray(fix.matches.T)
+    return _refined(base, keyframe, rows, features, se3_inverse(fix.map_from_cam), settings)
 
 
 def _refined(
@@ -112,9 +110,8 @@ def _aligned(
     side = base.map.patches.shape[1]
     mosaic = np.ascontiguousarray(base.map.patches[rows].reshape(-1, side))
     centres = exact - np.rint(exact) + side // 2
-    centres[:, 1] += side * np.arange(
-        len(rows)
-    )  # a window that leaves its patch sideways would leave it up or down too
+    # Patches lie below each other: a window that leaves its patch sideways would leave it up or down too.
+    centres[:, 1] += side * np.arange(len(rows))
     warps = _warps(base, rows, cam_from_map)
     out = np.full((len(rows), 3), np.nan)
     current_levels = patch_align.halvings(keyframe.features.octaves[features])
@@ -122,12 +119,10 @@ def _aligned(
     for level in np.unique(current_levels):
         index = np.flatnonzero((current_levels == level) & np.isfinite(warps).all(axis=(1, 2)))
         found = np.empty((len(index), 4))
-        align_patches(
-            mosaic, pyramid[level], np.ascontiguousarray(centres[index]),
-            np.ascontiguousarray(keyframe.features.pixels[features[index]] / 2.0**level),
-            warps[index] * 2.0 ** (level - levels[index])[:, None, None], settings.align.half_window_px,
-            settings.align.max_shift_px, found,
-        )  # fmt: skip
+        start = np.ascontiguousarray(keyframe.features.pixels[features[index]] / 2.0**level)
+        warp = warps[index] * 2.0 ** (level - levels[index])[:, None, None]
+        window, max_shift_px = settings.align.half_window_px, settings.align.max_shift_px
+        align_patches(mosaic, pyramid[level], centres[index], start, warp, window, max_shift_px, found)
         found[~(found[:, 3] >= settings.align.min_correlation)] = np.nan
         out[index] = found[:, :3] * 2.0**level
     return out

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.inertial import preintegrate
+from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.bundle.bundle_adjustment import (
     BundleProblem,
     BundleResult,
@@ -17,7 +18,7 @@ from mapserver.survey.bundle.bundle_adjustment import (
     optimize,
 )
 from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState, scaled_noise
-from mapserver.survey.merge.base_map import BaseMap, Rows
+from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.tracks.tracks import Landmarks

@@ -9,9 +9,10 @@ from scipy.spatial import cKDTree
 
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.pnp.pnp import GATE_SQUARED
+from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.finish.map_assembly import point_information
 from mapserver.survey.keyframes.keyframes import Keyframe
-from mapserver.survey.merge.base_map import BaseMap, Rows
+from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.settings import SurveySettings
 

@@ -5,14 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.relocalization.landmark_visibility import COLUMNS, ROWS, image_cells
 from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.merge.base_map import BaseMap
-from mapserver.survey.merge.guided_matching import image_cells
 from mapserver.survey.merge.joint_adjustment import Joint
 from mapserver.survey.settings import SessionSettings
 from mapserver.survey.tracks.tracks import Landmarks
 
-_CELLS = 48
+_CELLS = COLUMNS * ROWS
 _MIN_IN_CELL = 3  # fewer confirmed landmarks do not show that the map lacks something there
 _LACKING_SHARE = 0.6
 
@@ -31,11 +31,11 @@ def new_landmarks(
     lacking = np.zeros(len(chosen), bool)
     for k, (_, sighting) in enumerate(zip(keyframes, joint.sightings, strict=True)):
         own = np.flatnonzero(chosen & (marks.obs_keyframe == k))
-        cells = image_cells(marks.obs_pixels[own, :2], base)
+        cells = image_cells(marks.obs_pixels[own, :2], base.camera)
         fresh = np.bincount(cells, minlength=_CELLS)
         known = np.zeros(_CELLS, np.int64)
         if sighting is not None:
-            known = np.bincount(image_cells(sighting.pixels[:, :2], base), minlength=_CELLS)
+            known = np.bincount(image_cells(sighting.pixels[:, :2], base.camera), minlength=_CELLS)
         bare = (fresh >= _MIN_IN_CELL) & (known <= settings.covered_share * fresh)
         lacking[own] = bare[cells] if sighting is not None else True
     share = np.bincount(marks.obs_landmark[lacking], minlength=len(counts)) / np.maximum(counts, 1)

@@ -10,7 +10,7 @@ from mapserver.survey.bundle.odometry_factors import chain_edges
 from mapserver.survey.finish.trajectory import frame_trajectory
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
-from mapserver.survey.merge.guided_matching import Sighting, sight
+from mapserver.survey.merge.guided_matching import Sighting, match_keyframe, session_relocalizer
 from mapserver.survey.merge.joint_adjustment import Joint, adjust_jointly
 from mapserver.survey.merge.landmark_persistence import count_looks, faded
 from mapserver.survey.merge.merge import merged
@@ -68,7 +68,8 @@ def extend(
             "a survey by one camera without IMU has no metres of its own: it can begin a map, not join one"
         )
     base = BaseMap(base_map, state.camera, state.body_from_cam)
-    fixes = find_fixes(base, guess.keyframes, state.body_from_cam, survey.vocabulary, settings)
+    relocalizer = session_relocalizer(base, survey.vocabulary, settings)
+    fixes = find_fixes(relocalizer, guess.keyframes, state.body_from_cam, settings.sessions.fix_keyframes)
     survey_from_body = state.map_from_body  # the survey's own frame, named `map` before there was another
     placed = place_survey(fixes, survey_from_body, map_from_survey, settings.sessions)
     if isinstance(placed, str):
@@ -78,20 +79,18 @@ def extend(
     else:
         chain = [*chain_edges(guess, state), *survey.loops.edges]
         map_from_body, believed = follow_fixes(placed, survey_from_body, chain)
-    sightings = _look(base, survey, map_from_body, settings.sessions.search_px, settings)
-    joint = adjust_jointly(base, state, map_from_body, sightings, settings, anchored=anchored)
-    sightings = _look(base, survey, joint.map_from_body, settings.sessions.guided_px, settings)
-    joint = adjust_jointly(base, state, joint.map_from_body, sightings, settings, anchored=anchored)
+
+    def sightings(places_map_from_body: Array, radius_px: float) -> list[Sighting | None]:
+        return [
+            match_keyframe(base, relocalizer, keyframe, place @ state.body_from_cam, radius_px, settings)
+            for keyframe, place in zip(guess.keyframes, places_map_from_body, strict=True)
+        ]
+
+    found = sightings(map_from_body, settings.sessions.search_px)
+    joint = adjust_jointly(base, state, map_from_body, found, settings, anchored=anchored)
+    found = sightings(joint.map_from_body, settings.sessions.guided_px)
+    joint = adjust_jointly(base, state, joint.map_from_body, found, settings, anchored=anchored)
     return _compare(base, survey, joint, settings, anchored, (len(fixes), believed))
-
-
-def _look(
-    base: BaseMap, survey: Survey, map_from_body: Array, radius_px: float, settings: SurveySettings
-) -> list[Sighting | None]:
-    return [
-        sight(base, keyframe, place @ survey.state.body_from_cam, radius_px, settings)
-        for keyframe, place in zip(survey.odometry.keyframes, map_from_body, strict=True)
-    ]
 
 
 def _compare(

@@ -1,22 +1,16 @@
-"""Where a survey lies in the map: many fixes, of which the largest set that agrees is believed if no other comes near it."""
+"""Alignment of a survey to the map: many fixes, of which the largest set that agrees is believed if no other comes near it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from fleetmap.bow import PlaceIndex, Vocabulary
-from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
-from fleetmap.pnp.pnp import Correspondences, PnpResult, ransac_pnp
+from fleetmap.relocalization.relocalizer import Fix, Relocalizer, finished
 from mapserver.survey.keyframes.keyframes import Keyframe
-from mapserver.survey.merge.base_map import BaseMap
-from mapserver.survey.merge.guided_matching import locate
+from mapserver.survey.merge.guided_matching import keyframe_features
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
-from mapserver.survey.settings import SessionSettings, SurveySettings
-
-_CORRELATION = 3.0  # as of loops: what matched points share makes a fix worse than its own covariance says
-_RANSAC_PX = 5.0
+from mapserver.survey.settings import SessionSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,63 +32,25 @@ class Placed:
 
 
 def find_fixes(
-    base: BaseMap, keyframes: Sequence[Keyframe], body_from_cam: Array, vocabulary: Vocabulary, settings: SurveySettings
+    relocalizer: Relocalizer, keyframes: Sequence[Keyframe], body_from_cam: Array, max_keyframes: int
 ) -> list[SessionFix]:
-    """All verified fixes of up to `fix_keyframes` keyframes, several for one keyframe where the map looks alike in several places."""
-    words = vocabulary.words(base.descriptors) if len(base.descriptors) else np.zeros(0, np.int32)
-    index = PlaceIndex(vocabulary.word_count)
-    order = np.argsort(base.map.obs_keyframe, kind="stable")
-    bounds = np.searchsorted(base.map.obs_keyframe[order], np.arange(len(base.map_from_cam) + 1))
-    for place in range(len(base.map_from_cam)):
-        own = np.unique(base.map.obs_landmark[order[bounds[place] : bounds[place + 1]]])
-        index.add(place, vocabulary.bow_vector(words[own]))
-    step = max(1, -(-len(keyframes) // settings.sessions.fix_keyframes))
-    fixes: list[SessionFix] = []
-    for k in range(0, len(keyframes), step):
-        descriptors = keyframes[k].features.descriptors
-        places, _ = index.query(
-            vocabulary.bow_vector(vocabulary.words(descriptors)), None, settings.sessions.top_places
-        )
-        fixes += _fixes_of(k, base, keyframes[k], body_from_cam, places.tolist(), settings)
-    return fixes
+    """All fixes of at most `max_keyframes` keyframes, several for one keyframe where the map looks alike in several places."""
+    step = max(1, -(-len(keyframes) // max_keyframes))
+    return [
+        _at_body(k, fix, body_from_cam)
+        for k in range(0, len(keyframes), step)
+        for fix in finished(relocalizer.anywhere(keyframe_features(keyframes[k])))
+    ]
 
 
-def _fixes_of(
-    k: int, base: BaseMap, keyframe: Keyframe, body_from_cam: Array, places: list[int], settings: SurveySettings
-) -> list[SessionFix]:
-    found: list[SessionFix] = []
-    for place in places:
-        there = base.map_from_body[place]
-        if any(np.linalg.norm(fix.map_from_body[:3, 3] - there[:3, 3]) < 1.0 for fix in found):
-            continue
-        solved = _fix_at(base, keyframe, place, settings)
-        if solved is None:
-            continue
-        carry = adjoint(body_from_cam)
-        covariance = _CORRELATION**2 * carry @ solved.cov_rot_trans @ carry.T + np.diag([1e-6] * 3 + [2.5e-5] * 3)
-        map_from_body = se3_inverse(body_from_cam @ solved.cam_from_source)
-        if all(np.linalg.norm(fix.map_from_body[:3, 3] - map_from_body[:3, 3]) > 0.5 for fix in found):
-            found.append(SessionFix(k, map_from_body, covariance, int(solved.inliers.sum())))
-    return found
-
-
-def _fix_at(base: BaseMap, keyframe: Keyframe, place: int, settings: SurveySettings) -> PnpResult | None:
-    rows = base.neighbourhood(place)
-    pairs = match_mutual(
-        base.descriptors[rows], keyframe.features.descriptors, settings.pairs.max_distance, settings.pairs.ratio
+def _at_body(k: int, fix: Fix, body_from_cam: Array) -> SessionFix:
+    """The fix of keyframe k, its covariance turned from map axes to the camera's and carried to the body."""
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = fix.map_from_cam[:3, :3].T
+    carry = adjoint(body_from_cam) @ turn
+    return SessionFix(
+        k, fix.map_from_cam @ se3_inverse(body_from_cam), carry @ fix.cov_rot_trans @ carry.T, fix.inliers
     )
-    if len(pairs) < settings.sessions.min_inliers // 2:
-        return None
-    pixels = keyframe.features.pixels[pairs[:, 1]]
-    measured = np.column_stack([pixels, pixels[:, 0] - keyframe.disparities[pairs[:, 1], 0]])
-    sigmas = np.full((len(pairs), 2), settings.pairs.match_sigma_px)
-    matches = Correspondences(base.camera, base.points_map[rows[pairs[:, 0]]], measured, sigmas)
-    least = settings.sessions.min_inliers // 2
-    found = ransac_pnp(matches, threshold_px=_RANSAC_PX, min_inliers=least, seed=settings.seed)
-    if found is None or found.inliers.sum() < 0.15 * len(pairs):
-        return None
-    seen = locate(base, keyframe, se3_inverse(found.cam_from_source), settings.sessions.search_px, settings)
-    return None if seen is None else seen[2]
 
 
 def place_survey(
