@@ -1,7 +1,8 @@
-"""The gate before publishing: what speaks against a draft, compared with the version that robots use now. Pure."""
+"""Gate before publishing: reasons against a draft, by itself and beside the version that robots use now. Pure."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from enum import StrEnum
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 
@@ -32,7 +33,7 @@ class GateSettings(Section, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class GateVerdict:
-    """What the gate says. reasons: against publishing, none if accepted; hard ones stand even against --force.
+    """The gate's answer. reasons: against publishing, none if accepted; hard ones stand even against --force.
 
     report: the figures that were looked at, and under `not_judged` those for which evidence is missing.
     """
@@ -43,7 +44,7 @@ class GateVerdict:
 
     @property
     def accepted(self) -> bool:
-        """Whether nothing speaks against the draft."""
+        """Whether there is no reason against the draft."""
         return not self.reasons and not self.hard_reasons
 
 
@@ -84,10 +85,32 @@ def judge(
 
 @dataclass(frozen=True, slots=True)
 class _Findings:
-    """What speaks against a draft so far, and what could not be judged."""
+    """Reasons against a draft so far, and what could not be judged."""
 
     reasons: list[str]
     not_judged: list[str]
+
+
+class _Bound(StrEnum):
+    """A limit's kind, as the word for a figure that breaks it."""
+
+    MIN = "below"
+    MAX = "above"
+
+    def is_broken(self, value: float, limit: float) -> bool:
+        """Whether the value lies on the wrong side; the limit itself is allowed."""
+        return value < limit if self is _Bound.MIN else value > limit
+
+
+class _Check(NamedTuple):
+    """A figure, None where unknown, and its limit with the name that people read."""
+
+    figure: str
+    value: float | None
+    bound: _Bound
+    limit: float
+    limit_name: str
+    relative_to: str = ""
 
 
 def _compare(name: str, compared: Compared | None, settings: GateSettings, found: _Findings) -> None:
@@ -95,24 +118,32 @@ def _compare(name: str, compared: Compared | None, settings: GateSettings, found
     if compared is None or compared.draft.frames < settings.min_frames:
         found.not_judged.append(name)
         return
+    for check in _checks(compared, settings):
+        if check.value is not None and check.bound.is_broken(check.value, check.limit):
+            words = f"{check.relative_to}{check.bound} {check.limit_name} ({check.limit:.3f})"
+            over = f"over {compared.draft.frames} frames"
+            found.reasons.append(f"{name}: {check.figure} {check.value:.3f} is {words}, {over}")
+
+
+def _checks(compared: Compared, settings: GateSettings) -> list[_Check]:
     draft, before = compared.draft, compared.before
-    checks = [
-        ("localised_share", draft.localised_share, settings.min_localised_share, "below min_localised_share"),
-        ("wrong_share", draft.wrong_share, settings.max_wrong_share, "above max_wrong_share"),
-        ("median_error_m", draft.median_error_m, settings.max_median_error_m, "above max_median_error_m"),
-        ("residual_px", draft.residual_px, settings.max_residual_px, "above max_residual_px"),
-    ]
-    if before is not None:
-        least = before.localised_share - settings.margin_localised_share
-        checks.append(("localised_share", draft.localised_share, least, "below the current version's less its margin"))
-        if before.median_error_m is not None:
-            most = before.median_error_m + settings.margin_error_m
-            checks.append(("median_error_m", draft.median_error_m, most, "above the current version's and its margin"))
-        shares = (compared.inliers_share, settings.min_inliers_share)
-        checks.append(("inliers_share", *shares, "of the current version below min_inliers_share"))
-    for figure, value, limit, words in checks:
-        if value is not None and (value < limit if "below" in words else value > limit):
-            found.reasons.append(f"{name}: {figure} {value:.3f} is {words} ({limit:.3f}), over {draft.frames} frames")
+    absolute = (
+        ("localised_share", _Bound.MIN, "min_localised_share"),
+        ("wrong_share", _Bound.MAX, "max_wrong_share"),
+        ("median_error_m", _Bound.MAX, "max_median_error_m"),
+        ("residual_px", _Bound.MAX, "max_residual_px"),
+    )
+    checks = [_Check(name, getattr(draft, name), kind, getattr(settings, key), key) for name, kind, key in absolute]
+    if before is None:
+        return checks
+    least = before.localised_share - settings.margin_localised_share
+    limit_name = "the current version's less its margin"
+    checks.append(_Check("localised_share", draft.localised_share, _Bound.MIN, least, limit_name))
+    if before.median_error_m is not None:
+        most, limit_name = before.median_error_m + settings.margin_error_m, "the current version's and its margin"
+        checks.append(_Check("median_error_m", draft.median_error_m, _Bound.MAX, most, limit_name))
+    limit = (_Bound.MIN, settings.min_inliers_share, "min_inliers_share")
+    return [*checks, _Check("inliers_share", compared.inliers_share, *limit, relative_to="of the current version ")]
 
 
 def _judge_aliasing(
@@ -130,17 +161,16 @@ def _judge_aliasing(
 
 
 def _size_reasons(shares: dict[str, float], version: int, settings: GateSettings) -> list[str]:
-    reasons = []
-    for name, limit, is_low in (
-        ("landmarks_share", settings.min_landmarks_share, True),
-        ("coverage_share", settings.min_coverage_share, True),
-        ("bytes_share", settings.max_bytes_share, False),
-    ):
-        share = shares[name]
-        if share < limit if is_low else share > limit:
-            word = "below" if is_low else "above"
-            reasons.append(f"{name} {share:.2f} of version {version} is {word} {limit:g}")
-    return reasons
+    limits = (
+        ("landmarks_share", _Bound.MIN, settings.min_landmarks_share),
+        ("coverage_share", _Bound.MIN, settings.min_coverage_share),
+        ("bytes_share", _Bound.MAX, settings.max_bytes_share),
+    )
+    return [
+        f"{name} {shares[name]:.2f} of version {version} is {bound} {limit:g}"
+        for name, bound, limit in limits
+        if bound.is_broken(shares[name], limit)
+    ]
 
 
 def _hard_reasons(draft: Manifest, site_vocabulary: str | None) -> tuple[str, ...]:
