@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
-from fleetmap.relocalization.relocalizer import Fix, Relocalizer, finished
+from fleetmap.numerics.time_sliced import finished
+from fleetmap.relocalization.relocalizer import Fix, Relocalizer
 from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.merge.guided_matching import keyframe_features
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
