@@ -24,7 +24,7 @@ def locclient() -> None:
 def _read_config(path: Path | None) -> "tuple[LocclientConfig, Options]":
     from locclient.config import read_config
 
-    return read_config(path), {}
+    return read_config(path, {"replay": replay})  # [run] holds settings, not options
 
 
 app = make_app(COMMANDS, locclient, _read_config)

@@ -1,22 +1,21 @@
-"""Configuration file of `locclient`: the robot, its sensors and outputs, the localizer, and the options of `replay`."""
+"""Configuration file of `locclient`: the robot, its sensors and outputs, and the localizer."""
 
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from fleetmap.cli_options import Commands, Options, command_defaults, file_type
 from fleetmap.config import Section, read_given, refuse_internal
 from fleetmap.recordings import Topics
 from locclient.daemon.publishers import OutputSection
 from locclient.daemon.run_settings import RunSection
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
 from locclient.sensors.source import SourceSection
 
 TIERS = {
     "user": {
         "": "site store server",
-        "replay": "*",
         "run": "server store site robot prior cache cache_bytes spool failures",
         "source": "kind calibration endpoint recording device",
         "output": "format endpoint",
@@ -40,32 +39,12 @@ TIERS = {
 }
 
 
-class ReplaySection(Section, frozen=True):
-    """Options of `locclient replay`; the command line goes before them."""
-
-    server: str | None = None
-    store: str | None = None
-    site: str | None = None
-    robot: str = "replay"
-    frames: str = ":"
-    calibration: str | None = None
-    prior: str | None = None
-    reverse: bool = False
-    realtime: bool = False
-    report: str | None = None
-    trajectory: str | None = None
-    picture: str | None = None
-    cache: str | None = None
-    cache_bytes: int = DEFAULT_MAX_BYTES
-
-
 class LocclientConfig(Section, frozen=True):
     """The whole file. `site`, and either `store` or `server`, at its top go for [run] and [replay]."""
 
     site: str | None = None
     store: str | None = None
     server: str | None = None
-    replay: ReplaySection = ReplaySection()
     run: RunSection = RunSection()
     source: SourceSection = SourceSection()
     output: OutputSection = OutputSection()
@@ -73,13 +52,17 @@ class LocclientConfig(Section, frozen=True):
     localizer: LocalizerSettings = LocalizerSettings()
 
 
-def read_config(path: Path | None) -> LocclientConfig:
-    """Settings of the file at `path`, the defaults without one; UsageError as `load_toml`, and for internal constants."""
+def read_config(path: Path | None, commands: Commands) -> tuple[LocclientConfig, Options]:
+    """Settings of the file at `path` and the options that it sets for `commands`, the defaults without one.
+
+    UsageError as `load_toml`, and for keys that are internal constants.
+    """
     if path is None:
-        return LocclientConfig()
-    given = read_given(path, LocclientConfig)
+        return LocclientConfig(), {}
+    given = with_common(read_given(path, file_type(LocclientConfig, commands)))
     refuse_internal(path, given, LocclientConfig(), TIERS)
-    return msgspec.convert(with_common(given), LocclientConfig)
+    settings = {key: given[key] for key in LocclientConfig.__struct_fields__ if key in given}
+    return msgspec.convert(settings, LocclientConfig), command_defaults(given, commands)
 
 
 def with_common(given: dict[str, Any]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from itertools import groupby
 from typing import Any, NamedTuple
 
+from fleetmap.cli_options import Command, options_of
 from fleetmap.config import Section, Setting, Tiers, settings_in, tier_of
 
 
@@ -29,6 +30,15 @@ def setting_line(setting: Setting, origin: str) -> str:
     if setting.value is None:
         return f"# {setting.key} is not set"
     return f"{setting.key} = {toml_value(setting.value)}  # {origin}"
+
+
+def command_options(section: str, command: Command, given: Mapping[str, Any], origin: str) -> Iterator[str]:
+    """Lines for the options of a command, of which `given` are set by the origin."""
+    yield f"\n[{section}]"
+    for key, parameter in options_of(command).items():
+        default = None if parameter.default is parameter.empty else parameter.default
+        value = given.get(parameter.name, default)
+        yield setting_line(Setting(section, key, value), origin if parameter.name in given else "default")
 
 
 def _origin(setting: Setting, layers: tuple[Layer, ...]) -> str:

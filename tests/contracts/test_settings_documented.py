@@ -59,7 +59,7 @@ def _documented() -> dict[tuple[str, str, str], dict[str, str]]:
 
 def _settings(program: str) -> list[Setting]:
     """All but the options of commands, which docs/command_line.md lists."""
-    return [setting for setting in settings_in(PROGRAMS[program][0]) if setting.section != "replay"]
+    return list(settings_in(PROGRAMS[program][0]))
 
 
 def test_the_settings_are_found() -> None:

@@ -7,13 +7,12 @@ import typer
 
 
 def check(
+    context: typer.Context,
     config: Annotated[Path, typer.Option(help="The TOML file of `locclient run`.")],
-    seconds: Annotated[float, typer.Option(min=0.0, help="How long to listen to the sensors; 0 does not.")] = 3.0,
+    seconds: Annotated[float, typer.Option(min=0.0, help="Seconds to listen to the sensors; 0: not at all.")] = 3.0,
 ) -> None:
-    """Look over a robot before it drives; status 3 where something must be mended first."""
-    from locclient.config import read_config
-
-    settings = read_config(config)
+    """Check a robot before it drives; status 3 if something must be repaired first."""
+    settings = context.obj.read_config(config)[0]
     from locclient.daemon.preflight import FAIL, run_preflight
 
     failed = False

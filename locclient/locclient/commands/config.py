@@ -1,23 +1,23 @@
 """`locclient config show`: the effective configuration file."""
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
-from fleetmap.cli_options import Group
+from fleetmap.cli_options import ConfigFile, Group, config_path
 
 
-def show(config: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file with settings.")] = None) -> None:
+def show(context: typer.Context, config: ConfigFile = None) -> None:
     """Print the effective configuration as TOML, with the origin of every value."""
     import msgspec
 
-    from fleetmap.config_show import Layer, effective_settings
-    from locclient.config import TIERS, read_config, with_common
+    from fleetmap.config_show import Layer, command_options, effective_settings
+    from locclient.config import TIERS, with_common
 
-    settings = read_config(config)
-    given = {} if config is None else msgspec.toml.decode(config.read_bytes())
-    typer.echo("\n".join(effective_settings(settings, TIERS, (Layer(str(config), with_common(given)),))))
+    path = config_path(context)
+    settings, defaults = context.obj.read_config(path)
+    given = {} if path is None else with_common(msgspec.toml.decode(path.read_bytes()))
+    lines = [*effective_settings(settings, TIERS, (Layer(str(path), given),))]
+    lines += command_options("replay", context.obj.commands["replay"], defaults.get("replay", {}), str(path))
+    typer.echo("\n".join(lines))
 
 
 CONFIG = Group("The configuration file.", {"show": show})

@@ -6,68 +6,84 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fleetmap.cli_options import expand_options
+from fleetmap.cli_options import ConfigFile, expand_options, settings_of
 from fleetmap.errors import UsageError
 
 if TYPE_CHECKING:
-    from locclient.config import LocclientConfig, ReplaySection
+    from locclient.config import LocclientConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayArguments:
-    """Options on the command line, which go before those of the file's [replay]."""
+class MapOptions:
+    """The map and the robot that asks for it."""
 
     server: Annotated[str | None, typer.Option(help="zenoh endpoint of the map server, tcp/HOST:PORT.")] = None
-    store: Annotated[Path | None, typer.Option(help="A store's folder, instead of a server.")] = None
+    store: Annotated[Path | None, typer.Option(help="Folder of a map store, instead of a server.")] = None
     site: Annotated[str | None, typer.Option(help="Name of the site.")] = None
-    robot: Annotated[str | None, typer.Option(help="Name under which the robot reports.")] = None
-    frames: Annotated[str | None, typer.Option(help="Which frames, as a Python slice A:B:C.")] = None
-    calibration: Annotated[Path | None, typer.Option(help="Calibration file that goes before the recording's own.")] = (
-        None
-    )
-    prior: Annotated[str | None, typer.Option(help="Where the robot starts: X,Y,YAW,SIGMA_M (metres, radians).")] = None
-    reverse: Annotated[
-        bool | None, typer.Option("--reverse", help="Play backwards, with new stamps and without IMU.")
+    robot: Annotated[str, typer.Option(help="Name under which the robot reports.")] = "replay"
+    cache: Annotated[Path | None, typer.Option(help="Folder of the tile cache; default: the user's cache.")] = None
+    # As tile_cache.DEFAULT_MAX_BYTES, which is not imported, so that --help stays fast.
+    cache_bytes: Annotated[int, typer.Option(min=0, help="Largest size of the tile cache.")] = 2_000_000_000
+
+    def check(self) -> None:
+        """Raises UsageError unless the options name one map."""
+        if self.site is None:
+            raise UsageError("--site NAME is missing")
+        if (self.server is None) == (self.store is None):
+            raise UsageError("give either --server tcp/HOST:PORT or --store DIR")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaybackOptions:
+    """The frames of a recording that are played, and how."""
+
+    frames: Annotated[str, typer.Option(help="Frames to play, as a Python slice A:B:C.")] = ":"
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration file to use instead of the recording's own.")
     ] = None
+    prior: Annotated[str | None, typer.Option(help="Start of the robot: X,Y,YAW,SIGMA_M (metres, radians).")] = None
+    reverse: Annotated[bool, typer.Option("--reverse", help="Play backwards, with new stamps and without IMU.")] = False
     realtime: Annotated[
-        bool | None, typer.Option("--realtime", help="As fast as it was recorded, not as fast as possible.")
-    ] = None
-    report: Annotated[Path | None, typer.Option(help="Write the report here, JSON.")] = None
-    trajectory: Annotated[Path | None, typer.Option(help="Write the localised frames here, TUM format.")] = None
-    picture: Annotated[Path | None, typer.Option(help="Write a top-down picture here, PNG.")] = None
-    cache: Annotated[Path | None, typer.Option(help="Folder of the tile cache (default: the user's cache).")] = None
+        bool, typer.Option("--realtime", help="Play at the recorded speed; default: as fast as possible.")
+    ] = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultFiles:
+    """Files to write."""
+
+    report: Annotated[Path | None, typer.Option(help="Write the report to this JSON file.")] = None
+    trajectory: Annotated[Path | None, typer.Option(help="Write the localised frames to this TUM file.")] = None
+    picture: Annotated[Path | None, typer.Option(help="Draw the run from above into this PNG file.")] = None
+
+    def check(self) -> None:
+        """Raises UsageError for files that cannot be written."""
+        for name, path in vars(self).items():
+            if path is not None and not path.parent.is_dir():
+                raise UsageError(f"--{name} {path}: the folder {path.parent} does not exist; make it first")
+        if self.picture is not None and self.picture.suffix.lower() != ".png":
+            raise UsageError(f"--picture {self.picture} must end in .png")
 
 
 @expand_options
 def replay(
+    context: typer.Context,
     recording: Annotated[Path, typer.Argument(help="A folder (the parent of mav0 for EuRoC) or an .mcap file.")],
-    arguments: ReplayArguments,
-    config: Annotated[
-        Path | None, typer.Option(help="TOML file with these options and the localizer's settings.")
-    ] = None,
+    map_options: MapOptions,
+    playback: PlaybackOptions,
+    files: ResultFiles,
+    config: ConfigFile = None,
 ) -> None:
-    """Fetches the site's map, localises every frame in it, and reports what the run was worth."""
-    import msgspec
-
-    from locclient.config import read_config
-
-    loaded = read_config(config)
-    given = {name: value for name, value in vars(arguments).items() if value is not None}
-    options = msgspec.structs.replace(loaded.replay, **given)
-    if options.site is None:
-        raise UsageError("--site NAME is missing: which site's map?")
-    if (options.server is None) == (options.store is None):
-        raise UsageError("give either --server tcp/HOST:PORT or --store DIR")
-    for name in ("report", "trajectory", "picture"):
-        path = getattr(options, name)
-        if path is not None and not Path(path).parent.is_dir():
-            raise UsageError(f"--{name} {path}: the folder {Path(path).parent} does not exist; make it first")
-    if options.picture is not None and Path(options.picture).suffix.lower() != ".png":
-        raise UsageError(f"--picture {options.picture} must end in .png")
-    _run(recording, options, loaded)
+    """Fetch the site's map, localize every frame of a recording in it, and report the result."""
+    settings = settings_of(context)
+    map_options.check()
+    files.check()
+    _print_table(_run(recording, map_options, playback, files, settings))
 
 
-def _run(path: Path, options: "ReplaySection", config: "LocclientConfig") -> None:
+def _run(
+    path: Path, map_options: MapOptions, playback: PlaybackOptions, files: ResultFiles, settings: "LocclientConfig"
+) -> dict[str, Any]:
     import json
 
     import msgspec
@@ -82,29 +98,29 @@ def _run(path: Path, options: "ReplaySection", config: "LocclientConfig") -> Non
     from locclient.replay.replay import replay as play
     from locclient.sensors.replay_source import ReplaySource
 
-    prior = parse_prior(options.prior, "--prior")
-    calibration = None if options.calibration is None else Path(options.calibration)
-    selection = FrameSelection.parse(options.frames)
+    prior = parse_prior(playback.prior, "--prior")
+    selection = FrameSelection.parse(playback.frames)
+    opening = OpenOptions(calibration_file=playback.calibration, topics=settings.topics)
     console = Console(stderr=True)
     with (
-        open_recording(path, OpenOptions(calibration_file=calibration, topics=config.topics)) as recording,
-        connected(msgspec.structs.asdict(options)) as connection,
+        open_recording(path, opening) as recording,
+        connected(vars(map_options)) as connection,
         Progress(console=console, disable=not console.is_terminal) as bar,
     ):
         for issue in recording.issues:
             console.print(f"note: {issue.what} {issue.detail}".rstrip())
-        source = ReplaySource.of(recording, selection, reverse=options.reverse)
+        source = ReplaySource.of(recording, selection, reverse=playback.reverse)
         task = bar.add_task("replay", total=len(source))
-        run = ReplayOptions(config.localizer, prior, options.realtime, lambda _: bar.advance(task))
-        result = play(source, connection, run)
+        options = ReplayOptions(settings.localizer, prior, playback.realtime, lambda _: bar.advance(task))
+        result = play(source, connection, options)
     report = result.report
-    if options.report is not None:
-        Path(options.report).write_text(json.dumps(msgspec.to_builtins(report), indent=2) + "\n")
-    if options.trajectory is not None:
-        write_tum(Path(options.trajectory), result.trajectory)
-    if options.picture is not None:
-        result.save_picture(options.picture)
-    _print_table(report)
+    if files.report is not None:
+        files.report.write_text(json.dumps(msgspec.to_builtins(report), indent=2) + "\n")
+    if files.trajectory is not None:
+        write_tum(files.trajectory, result.trajectory)
+    if files.picture is not None:
+        result.save_picture(files.picture)
+    return report
 
 
 def _print_table(report: dict[str, Any]) -> None:

@@ -7,19 +7,18 @@ import typer
 
 
 def run(
-    config: Annotated[Path, typer.Option(help="TOML file: who the robot is, its sensors, its map, its outputs.")],
-    verbose: Annotated[bool, typer.Option("--verbose", help="Log what goes well too.")] = False,
+    context: typer.Context,
+    config: Annotated[Path, typer.Option(help="TOML file with the robot, its sensors, map and outputs.")],
+    verbose: Annotated[bool, typer.Option("--verbose", help="Log successes too.")] = False,
 ) -> None:
-    """Localise a robot from its live sensors all day; ends with status 0 on SIGTERM or SIGINT, or with its recording."""
+    """Localize a robot from its live sensors; ends with status 0 on SIGTERM or SIGINT, or with its recording."""
     import logging
     import signal
-
-    from locclient.config import read_config
 
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
     )
-    settings = read_config(config)
+    settings = context.obj.read_config(config)[0]
     from locclient.daemon.daemon import check_run, daemon_parts
 
     check_run(settings)

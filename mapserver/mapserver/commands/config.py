@@ -1,11 +1,10 @@
 """`mapserver config show`: the effective configuration file."""
 
-from collections.abc import Iterator, Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from fleetmap.cli_options import Command, ConfigFile, Group, config_path, options_of, settings_of
+from fleetmap.cli_options import ConfigFile, Group, config_path, settings_of
 
 
 def show(
@@ -17,7 +16,7 @@ def show(
     settings = settings_of(context)
     import msgspec
 
-    from fleetmap.config_show import Layer, effective_settings
+    from fleetmap.config_show import Layer, command_options, effective_settings
     from mapserver.build.sensor_subset import named_sensor_set
     from mapserver.config import TIERS, preset, survey_settings
 
@@ -33,24 +32,11 @@ def show(
     for name, command in context.obj.commands.items():
         section = name.replace("-", "_")
         if not isinstance(command, Group):
-            lines += _options(section, command, defaults.get(name, {}), str(path))
+            lines += command_options(section, command, defaults.get(name, {}), str(path))
             continue
         for inner, member in command.commands.items():
-            lines += _options(f"{section}.{inner}", member, defaults.get(name, {}).get(inner, {}), str(path))
+            lines += command_options(f"{section}.{inner}", member, defaults.get(name, {}).get(inner, {}), str(path))
     typer.echo("\n".join(lines))
-
-
-def _options(section: str, command: Command, given: Mapping[str, Any], origin: str) -> Iterator[str]:
-    from fleetmap.config import Setting
-    from fleetmap.config_show import setting_line
-
-    options = options_of(command)
-    if options:
-        yield f"\n[{section}]"
-    for key, parameter in options.items():
-        default = None if parameter.default is parameter.empty else parameter.default
-        value = given.get(parameter.name, default)
-        yield setting_line(Setting(section, key, value), origin if parameter.name in given else "default")
 
 
 CONFIG = Group("The configuration file.", {"show": show})

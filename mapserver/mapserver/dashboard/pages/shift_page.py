@@ -21,9 +21,9 @@ _UNKNOWN = "not known"
 
 def html_page(summary: FleetSummary) -> str:
     """The page as a file's content."""
-    heading = Markup("<h1>Robots of {}</h1><p>{}, the last {} h, map version {}.</p>").format(
-        summary.site, moment(summary.until_ns), summary.hours, summary.current_version or "none"
-    )
+    heading = Markup(
+        "<h1>Robots of {}</h1><p>{}, the last {} h, map version {}. A robot-day is 16 hours of driving.</p>"
+    ).format(summary.site, moment(summary.until_ns), summary.hours, summary.current_version or "none")
     parts = (
         heading,
         _figures(summary),
@@ -32,7 +32,7 @@ def html_page(summary: FleetSummary) -> str:
         _by_hour(summary),
         _kpis_table("Robots, the worst first", "Robot", summary.robots),
         _kpis_table("Map versions", "Version", summary.versions),
-        _kpis_table("Causes", "Cause", summary.causes),
+        _causes(summary),
         fleet_parts.resurvey(summary.resurvey.tiles),
         _failures(summary),
     )
@@ -105,6 +105,13 @@ def _kpis_table(title: str, name: str, rows: Sequence[tuple[str, Kpis]]) -> Mark
     more = f"and {len(rows) - _ROWS} more" if len(rows) > _ROWS else ""
     shown = table(head, body, empty="", name=title)
     return Markup('<h2>{}</h2>{}<p class="quiet">{}</p>').format(title, shown, more)
+
+
+def _causes(summary: FleetSummary) -> Markup:
+    rows = [(key, found.failures.events, found.silent_estimated.events) for key, found in summary.causes[:_ROWS]]
+    if not rows:
+        return Markup("")
+    return Markup("<h2>Causes</h2>{}").format(table(("Cause", "Failures", "Suspected"), rows, empty="", name="Causes"))
 
 
 def _failures(summary: FleetSummary) -> Markup:
