@@ -1,13 +1,11 @@
 """Maps on the disk: content-addressed files and one SQLite database. SQL lives here alone."""
 
-from mapserver.store.fleet_queries import CounterKey, FleetBatch, FleetQueries, tile_key
-from mapserver.store.garbage_collection import Garbage, Retention
+from mapserver.store.fleet_queries import CounterKey, FleetBatch, tile_key
+from mapserver.store.garbage_collection import Retention
 from mapserver.store.map_store import MapStore
 from mapserver.store.rows import (
-    AXES,
     NOBODY,
     Actor,
-    CanaryEnd,
     CanaryRow,
     DraftContent,
     DraftDetails,
@@ -17,24 +15,17 @@ from mapserver.store.rows import (
     FailureRow,
     FleetRetention,
     JobInfo,
-    LogEntry,
     NewCanary,
     PictureRow,
-    ReleaseChanges,
-    RobotInfo,
     SiteInfo,
-    SiteReleases,
     TraceRow,
     VerdictRow,
     VersionInfo,
 )
-from mapserver.store.verification import StoreFindings
 
 __all__ = [
-    "AXES",
     "NOBODY",
     "Actor",
-    "CanaryEnd",
     "CanaryRow",
     "CounterKey",
     "DraftContent",
@@ -44,20 +35,13 @@ __all__ = [
     "FailureFilter",
     "FailureRow",
     "FleetBatch",
-    "FleetQueries",
     "FleetRetention",
-    "Garbage",
     "JobInfo",
-    "LogEntry",
     "MapStore",
     "NewCanary",
     "PictureRow",
-    "ReleaseChanges",
     "Retention",
-    "RobotInfo",
     "SiteInfo",
-    "SiteReleases",
-    "StoreFindings",
     "TraceRow",
     "VerdictRow",
     "VersionInfo",
