@@ -1,4 +1,4 @@
-"""What robots and the server say to each other, as MessagePack, and the keys of the bus under which they say it.
+"""Messages between robots and the server, as MessagePack, and the keys of the bus that carry them.
 
 fleetmap/{site}/robots/{robot}/wanted    asked by the robot; published by the server when it changes: WantedVersion
 fleetmap/{site}/robots/{robot}/ack       published by the robot: RobotAck
@@ -48,7 +48,7 @@ class Status(StrEnum):
 
 
 class Cause(StrEnum):
-    """Reason why an estimate is worth less than TRACKING, or of a failure; docs/service.md explains each."""
+    """Reason why an estimate is not TRACKING, or of a failure; docs/service.md explains each."""
 
     NONE = ""
     DARK = "dark"
@@ -97,7 +97,7 @@ class WantedVersion(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RobotAck(msgspec.Struct, frozen=True, kw_only=True):
-    """A robot says which version it runs. refused: why it does not run the wanted one, empty if it does."""
+    """The version that a robot runs. refused: why it does not run the wanted one, empty if it does."""
 
     site: Name
     robot: Name
@@ -119,18 +119,17 @@ HEALTH_FIGURES = (
     "landmarks_expected",
     "landmarks_seen",
 )
-"""Metrics of RobotHealth that the server counts with; a robot leaves out what it does not know. Since the report before:
+"""Metrics of RobotHealth that the server evaluates; a robot leaves out what it does not know. Since the report before:
 fix_innovation, the largest squared Mahalanobis distance (6 degrees of freedom) between a fix and its prediction,
 fix_innovation_m, the largest such distance in metres, and dock_error_m, the distance between estimate and dock at an arrival;
-both in metres only where the robot had claimed to know its place. Since the run's begin: frames, frames_dropped,
-landmarks_expected and landmarks_seen (looked for in pictures, and found there), first_fix_s, the time to the first fix. The
-others are of now."""
+both in metres only where the robot was TRACKING. Since the run began: frames, frames_dropped, landmarks_expected and
+landmarks_seen (searched for in images, and found), first_fix_s, the time to the first fix. The others are current."""
 
 
 class RobotHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """A robot's last report: status of the localization, flags that are raised, metrics by name.
+    """A robot's report: status of the localization, raised flags, metrics by name.
 
-    stamp_ns: sensor clock; wall_ns: the robot's wall clock when it sent this, by which the server measures how wrong that is.
+    stamp_ns: sensor clock; wall_ns: the robot's wall clock when it sent this, from which the server measures the clock's error.
     """
 
     site: Name
@@ -141,6 +140,14 @@ class RobotHealth(msgspec.Struct, frozen=True, kw_only=True):
     wall_ns: int | None = None
     flags: Flags = ()
     metrics: Metrics = {}
+
+
+def _position_and_quat(
+    target_from_source: Array,
+) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
+    x, y, z = (float(value) for value in target_from_source[:3, 3])
+    qw, qx, qy, qz = (float(value) for value in quat_wxyz_from_rotation(target_from_source[:3, :3]))
+    return (x, y, z), (qw, qx, qy, qz)
 
 
 class PoseMessage(msgspec.Struct, frozen=True, kw_only=True):
@@ -160,12 +167,11 @@ class PoseMessage(msgspec.Struct, frozen=True, kw_only=True):
         """The message of map_from_base (4, 4) with cov_rot_trans (6, 6)."""
         assert map_from_base.shape == (4, 4)
         assert cov_rot_trans.shape == (6, 6)
-        x, y, z = (float(value) for value in map_from_base[:3, 3])
-        qw, qx, qy, qz = (float(value) for value in quat_wxyz_from_rotation(map_from_base[:3, :3]))
+        position_m, quat_wxyz = _position_and_quat(map_from_base)
         return cls(
             stamp_ns=int(stamp_ns),
-            position_map_m=(x, y, z),
-            quat_wxyz=(qw, qx, qy, qz),
+            position_map_m=position_m,
+            quat_wxyz=quat_wxyz,
             cov_rot_trans=tuple(float(value) for value in cov_rot_trans.ravel()),
             status=status,
             map_version=map_version,
@@ -186,9 +192,8 @@ class Placement(msgspec.Struct, frozen=True, kw_only=True):
     @classmethod
     def of(cls, target_from_source: Array) -> Self:
         """The message part of a transform (4, 4)."""
-        x, y, z = (float(value) for value in target_from_source[:3, 3])
-        qw, qx, qy, qz = (float(value) for value in quat_wxyz_from_rotation(target_from_source[:3, :3]))
-        return cls(position_m=(x, y, z), quat_wxyz=(qw, qx, qy, qz))
+        position_m, quat_wxyz = _position_and_quat(target_from_source)
+        return cls(position_m=position_m, quat_wxyz=quat_wxyz)
 
     @property
     def target_from_source(self) -> Array:
@@ -197,11 +202,11 @@ class Placement(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
-    """What the robot's own programs navigate by, frame by frame.
+    """Estimate of one frame for the navigation of the robot itself.
 
-    cause: what stands in the way of TRACKING, in a word; docs/service.md lists them, empty for nothing.
-    odom_from_base is continuous; map_from_odom moves with every fix and is None while there is no single place to name.
-    cov_rot_trans: of map_from_base in map axes, rotation first, row by row, None with it. hypotheses: places while AMBIGUOUS.
+    cause: a `Cause`, what stands in the way of TRACKING. odom_from_base is continuous; map_from_odom moves with every fix and is None
+    while there is no single pose. cov_rot_trans: of map_from_base in map axes, rotation first, row by row, None with it.
+    hypotheses: competing poses while AMBIGUOUS.
     """
 
     stamp_ns: int
@@ -215,7 +220,7 @@ class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FixNote(msgspec.Struct, frozen=True, kw_only=True):
-    """One look at the map before a failure.
+    """One comparison of a frame with the map before a failure.
 
     position_map_m is None without a fix; refused: why it was not used. innovation: its squared Mahalanobis distance, None
     where nothing was predicted.
@@ -243,9 +248,8 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     Sent until it is acknowledged; (site, robot, id) is unique for ever, so that what arrives twice is stored once.
 
     stamp_ns: when it began, sensor clock; wall_ns: the same moment by the robot's wall clock. duration_s: how long it had lasted
-    when it was written down. kind: `blind` (no place that may be relied upon) or `suspected` (tracking, but fixes contradict it: an
-    estimate of silent failures, not a count). cause: one word or a few, such as `dark`. tile, map_from_base: by the last
-    estimate. exposure: mean brightness of the left image, 0 to 1; sharpness: variance of the steps
+    when it was detected. kind: a `FailureKind`; suspected ones estimate silent failures and are not a count. cause: a `Cause`.
+    tile, map_from_base: by the last estimate. exposure: mean brightness of the left image, 0 to 1; sharpness: variance of the steps
     between neighbouring pixels of a row, 1 is typical for the robot.
     """
 

@@ -13,7 +13,7 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import Image
 from locclient.localization import image_quality_kernels
 
-_EVERY_PX = 8  # rows and columns that are looked at
+_EVERY_PX = 8  # step of the rows and columns that are sampled
 _BRIGHT = 250
 
 

@@ -100,13 +100,13 @@ def _view(plot: RunPlot) -> tuple[Array, Array]:
 
 def _figures(plot: RunPlot) -> str:
     share, errors, times = localised_share(plot.frames), error_m(plot.frames), frame_ms(plot.frames)
-    told = [f"{len(plot.frames)} frames in {plot.seconds[-1]:.0f} s" if plot.frames else "no frames"]
-    told.append("never localised" if share is None else f"localised {100 * share:.1f} % after the first fix")
+    figures = [f"{len(plot.frames)} frames in {plot.seconds[-1]:.0f} s" if plot.frames else "no frames"]
+    figures.append("never localised" if share is None else f"localised {100 * share:.1f} % after the first fix")
     if errors is not None:
-        told.append(f"error: median {1e3 * errors['median']:.0f} mm, 99 % below {1e3 * errors['p99']:.0f} mm")
+        figures.append(f"error: median {1e3 * errors['median']:.0f} mm, 99 % below {1e3 * errors['p99']:.0f} mm")
     if times is not None:
-        told.append(f"{times['mean']:.1f} ms CPU a frame")
-    return "   |   ".join(told)
+        figures.append(f"{times['mean']:.1f} ms CPU a frame")
+    return "   |   ".join(figures)
 
 
 def _draw_plan(canvas: Canvas, axes: ChartAxes, plot: RunPlot, shares: Array) -> None:

@@ -46,7 +46,7 @@ class VersionTrial:
         self._last_m = begun.odometry.odom_from_body[:3, 3]
         self._path_m = 0.0
         self._fixes = self._contradictions = 0
-        self.reason = "nothing was looked at"
+        self.reason = "no frame was compared with it"
 
     def handle(self, estimate: Estimate) -> TrialVerdict:
         """The verdict with this frame; `reason` tells why, in words."""
