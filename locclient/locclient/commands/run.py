@@ -29,5 +29,5 @@ def run(
         runtime = Runtime(parts, ServiceManager())
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: runtime.stop())
-        typer.echo(f"ready: {parts.robot_name} at {parts.site}, source {settings.source.kind}")
+        typer.echo(f"ready: {parts.profile.robot} at {parts.profile.site}, source {settings.source.kind}")
         runtime.run()

@@ -25,6 +25,7 @@ from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
 from locclient.prior_option import parse_prior
+from locclient.robot.failure_report import RobotProfile
 from locclient.robot.jit_warmup import gc_frozen, warm_up_kernels
 from locclient.robot.robot import Robot
 from locclient.sensors.intake import Intake
@@ -95,15 +96,12 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         has_imu, offset_s = calibration.imu is not None, rectifier.imu_minus_cam_s
         intake = Intake(frames=run.frame_queue, imu_minus_cam_s=offset_s, has_imu=has_imu, imu_wait_s=run.imu_wait_s)
         yield RuntimeParts(
-            site=site,
-            robot_name=name,
+            profile=RobotProfile(site, name, robot.base_from_body, rectifier.camera, config.localizer),
             source=source,
             intake=intake,
             robot=robot,
             tile_loader=TileLoader(maps, run.window),
             outbox=outbox,
-            camera=rectifier.camera,
-            settings=config.localizer,
             publisher=publisher,
             server=server,
             first=first,

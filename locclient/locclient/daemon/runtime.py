@@ -12,13 +12,11 @@ from pathlib import Path
 
 from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.messages import RobotHealth, WantedVersion, encode_message
-from fleetmap.sensors.rectification import StereoCamera
 from locclient.daemon.failure_files import write_failure
 from locclient.daemon.outbox import Outbox, QueuedReport
 from locclient.daemon.publishers import Publisher
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.systemd_notify import ServiceManager
-from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
@@ -41,15 +39,12 @@ _log = logging.getLogger(__name__)
 class RuntimeParts:
     """All that a daemon is made of. server: None for a robot that reads a store's folder. first: the version to begin with."""
 
-    site: str
-    robot_name: str
+    profile: RobotProfile
     source: Source
     intake: Intake
     robot: Robot
     tile_loader: TileLoader
     outbox: Outbox
-    camera: StereoCamera
-    settings: LocalizerSettings
     publisher: Publisher | None
     server: ServerSync | None
     first: WantedVersion | None
@@ -174,8 +169,8 @@ class Runtime:
             "tiles_refused": sum(map(len, self._refused_tiles.values())),
             "cache_faults": self._count_cache_faults(),
         }
-        more = {**counts, **spool, **tiles}
-        return self._figures.report(self._parts.site, self._parts.robot_name, self._wall_ns(), more, is_silent)
+        profile, more = self._parts.profile, {**counts, **spool, **tiles}
+        return self._figures.report(profile.site, profile.robot, self._wall_ns(), more, is_silent)
 
     def _count_cache_faults(self) -> int:
         for cache in self._parts.caches:
@@ -257,10 +252,7 @@ class Runtime:
         parts = self._parts
         while self._shared.failures:
             context, wall_ns = self._shared.failures.popleft()
-            profile = RobotProfile(
-                parts.site, parts.robot_name, parts.robot.base_from_body, parts.camera, parts.settings
-            )
-            report = failure_report(context, profile, report_id=uuid.uuid4().hex, wall_ns=wall_ns)
+            report = failure_report(context, parts.profile, report_id=uuid.uuid4().hex, wall_ns=wall_ns)
             try:
                 parts.outbox.put(QueuedReport(report.id, encode_message(report)))
                 if parts.failures_folder is not None:

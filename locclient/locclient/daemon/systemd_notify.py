@@ -1,4 +1,4 @@
-"""Tells systemd how the service is (sd_notify): a datagram to the socket named in NOTIFY_SOCKET, nothing where there is none."""
+"""Notification of systemd (sd_notify): datagrams to the socket named in NOTIFY_SOCKET, none without it."""
 
 import os
 import socket
@@ -13,15 +13,15 @@ class ServiceManager:
         self._address = "\0" + given[1:] if given.startswith("@") else given
 
     def ready(self) -> None:
-        """The service works from now on."""
+        """The service is ready."""
         self._tell("READY=1")
 
     def alive(self, status: str) -> None:
-        """It is not stuck; status: a line for `systemctl status`."""
+        """Resets the watchdog; status: a line for `systemctl status`."""
         self._tell(f"WATCHDOG=1\nSTATUS={status}")
 
     def stopping(self) -> None:
-        """It has begun to stop."""
+        """The service is stopping."""
         self._tell("STOPPING=1")
 
     def _tell(self, text: str) -> None:

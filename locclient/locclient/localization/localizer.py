@@ -274,8 +274,11 @@ class Localizer:
     def _update_confirmed(
         self, fixes: list[Fix], map_from_body: Array, covariance: Array, *, is_near: bool
     ) -> _QueryResult:
-        """Kalman update of the confirmed pose at the frame of the query. Fixes beyond its chi-square gate are refused, unless such
-        fixes agree among themselves. So are several within it: long without the map, the gate may hold the pose's own alias."""
+        """Kalman update of the confirmed pose at the frame of the query. Fixes beyond its chi-square gate are refused, and so are
+        several within it: long without the map, the gate may hold the pose's own alias.
+
+        Sources: Bar-Shalom et al. 2001 (validation gate), Bucy and Joseph 1968 (covariance update).
+        """
         assert self._confirmed is not None
         assert self._query_frame is not None
         innovations = [(fix, *self._innovation(fix, map_from_body, covariance)) for fix in fixes]
@@ -293,7 +296,7 @@ class Localizer:
         _, cov_fix = self._at_body(fix)
         gain = np.linalg.solve(covariance + cov_fix, covariance).T  # K = P (P + R)^-1
         rest = np.eye(6) - gain
-        updated = rest @ covariance @ rest.T + gain @ cov_fix @ gain.T  # Joseph form
+        updated = rest @ covariance @ rest.T + gain @ cov_fix @ gain.T  # (I - K) P (I - K)^T + K R K^T
         support = self._confirmed.support + 1
         self._confirmed = PoseHypothesis.at_query(self._query_frame, boxplus(map_from_body, gain @ error), updated)
         self._confirmed.support = support

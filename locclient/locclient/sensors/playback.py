@@ -1,4 +1,4 @@
-"""A recording played as if it were the robot's sensors."""
+"""Playback of a recording in place of the robot's sensors."""
 
 import time
 from collections.abc import Callable

@@ -23,6 +23,7 @@ from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
 from locclient.maps.tile_selection import PositionBound, TileSelectionSettings
 from locclient.robot.continuous_odom import PublishedPose
+from locclient.robot.failure_report import RobotProfile
 from locclient.robot.robot import Robot
 from locclient.robot.sensor_bundle import SensorBundle
 from locclient.sensors.intake import Intake
@@ -82,12 +83,19 @@ class World:
         client = MapClient(self.bus, caches[0], "room", "r1")
         outbox = Outbox(self.folder / "spool", max_bytes=10**7)
         intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=True, imu_wait_s=1.0)
+        camera, settings = robot_world.rectifier().camera, robot_world.SETTINGS
         return RuntimeParts(
-            site="room", robot_name="r1", source=source, intake=intake, robot=robot,
-            tile_loader=TileLoader(CachedMap(caches[1], "room"), TileSelectionSettings()), outbox=outbox,
-            camera=robot_world.rectifier().camera, settings=robot_world.SETTINGS, publisher=listener,
-            server=ServerSync(client, outbox, retry_s=600.0), first=client.active(), caches=caches,
-        )  # fmt: skip
+            profile=RobotProfile("room", "r1", robot.base_from_body, camera, settings),
+            source=source,
+            intake=intake,
+            robot=robot,
+            tile_loader=TileLoader(CachedMap(caches[1], "room"), TileSelectionSettings()),
+            outbox=outbox,
+            publisher=listener,
+            server=ServerSync(client, outbox, retry_s=600.0),
+            first=client.active(),
+            caches=caches,
+        )
 
 
 @pytest.fixture
