@@ -14,11 +14,11 @@ def convert(
     calibration: Annotated[
         Path | None, typer.Option("--calibration", metavar="FILE", help="Kalibr camchain to use and to store.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace OUT.mcap where it exists.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace OUT.mcap if it exists.")] = False,
 ) -> None:
     """Write RECORDING as an MCAP file in the style of rosbag2, images as they were encoded."""
     if out.suffix != ".mcap":
-        raise UsageError(f"{out} does not end in .mcap; name the output so, other formats are not written")
+        raise UsageError(f"{out} must end in .mcap")
     if out.exists() and not force:
         raise UsageError(f"{out} exists; choose another name or replace it with --force")
     if out.exists() and recording.exists() and out.samefile(recording):

@@ -1,4 +1,4 @@
-"""`mapserver doctor`: what is wrong with a recording."""
+"""`mapserver doctor`: checks of a recording."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,12 +22,12 @@ def doctor(
         Path | None, typer.Option("--json", metavar="FILE", help="Write the findings here as JSON too.")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option("--calibration", metavar="FILE", help="Kalibr camchain to judge by.")
+        Path | None, typer.Option("--calibration", metavar="FILE", help="Kalibr camchain to check against.")
     ] = None,
 ) -> None:
-    """Examine RECORDING: rates, gaps, clocks, gravity, stereo and gyro against the images.
+    """Check RECORDING: rates, gaps, clocks, gravity, stereo and gyro against the images.
 
-    Ends with 3 if a check fails.
+    Status 3 if a check fails.
     """
     if json_file is not None and not json_file.parent.is_dir():
         raise UsageError(f"--json {json_file}: the folder {json_file.parent} does not exist; create it first")

@@ -1,4 +1,4 @@
-"""`mapserver fleet`: the fleet's health as a page, as files for other programs, and as a route for the next survey."""
+"""`mapserver fleet`: fleet health as a page, as files for other programs, and as a route for the next survey."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -23,13 +23,13 @@ class ExportFormat(StrEnum):
 
 def report(
     context: typer.Context,
-    out: Annotated[Path, typer.Argument(metavar="OUT.html", help="File to write; replaced where it exists.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.html", help="File to write; replaced if it exists.")],
     site: SiteName,
     store: StoreFolder,
     hours: Annotated[int, typer.Option(min=1, max=9600, help="Hours to look back.")] = 24,
     config: ConfigFile = None,
 ) -> None:
-    """Write one page for the shift leader: failures per robot-day, the worst robots, versions, causes, what to survey again."""
+    """Write one page for the shift leader: failures per robot-day, the worst robots, versions, causes, tiles to survey again."""
     import time
 
     from fleetmap.errors import StoreError
@@ -49,7 +49,7 @@ def report(
 
 
 def export(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write; replaced where it exists.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write; replaced if it exists.")],
     store: StoreFolder,
     site: Annotated[str | None, typer.Option(help="Name of the site; default: all sites.")] = None,
     hours: Annotated[int | None, typer.Option(min=1, help="Only the last N hours; default: everything.")] = None,
@@ -70,7 +70,7 @@ def export(
     since_ns = None if hours is None else time.time_ns() - hours * 3_600_000_000_000
     with MapStore.open(store) as maps:
         if site is not None:
-            maps.current(site)  # an unknown site is not an empty one
+            maps.current(site)  # raises for an unknown site
         write = write_mcap if chosen is ExportFormat.MCAP else write_json_lines
         count = write(maps, FailureFilter(site=site, since_ns=since_ns), out)
     typer.echo(f"{count} failures")
@@ -86,7 +86,7 @@ def resurvey(
     json: Json = False,
     config: ConfigFile = None,
 ) -> None:
-    """List the tiles that should be surveyed again, the worst first, and why; with --route the way through them."""
+    """List the tiles that should be surveyed again, the worst first, and why; with --route a route through them."""
     import time
 
     from mapserver.fleet.resurvey_list import resurvey_list

@@ -1,4 +1,4 @@
-"""`mapserver nightly`: new recordings become the site's next version, or the reason is told why not."""
+"""`mapserver nightly`: new recordings become the site's next version."""
 
 from contextlib import suppress
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ class NightlyOptions(SurveyOptions):
 
 @expand_options
 def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile = None) -> None:
-    """Check, build, judge and publish what came into the inbox; one run at a time for each site.
+    """Check, build, judge and publish the recordings in the inbox; one run at a time for each site.
 
-    Ends with 0 also where nothing came in, 4 where the gate refuses, 5 where another run is at work.
+    Status 0 also with an empty inbox, 4 if the gate refuses, 5 if another run is at work.
     """
     options.check()
     import time
@@ -45,7 +45,7 @@ def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile 
     except BusyError:
         raise
     except FleetmapError:
-        with suppress(FleetmapError):  # what went wrong first is what is told
+        with suppress(FleetmapError):  # the first error is the one to report
             _write(options)
         raise
     _write(options)

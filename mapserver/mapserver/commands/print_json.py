@@ -1,4 +1,4 @@
-"""How every command prints JSON."""
+"""JSON output of the commands."""
 
 import typer
 

@@ -1,4 +1,4 @@
-"""`mapserver serve`: a store on HTTP and on the bus, until it is told to stop."""
+"""`mapserver serve`: a store on HTTP and on the bus."""
 
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -48,7 +48,7 @@ def serve(
 
     writers = Writers(token, is_loopback_name(host))
     settings = settings_of(context)
-    # The sockets come before the store is read, so that a wrong address is told at once.
+    # The sockets come before the store is read, so that a wrong address is reported at once.
     with _listening(host, port) as listener, MapStore.open(store) as maps, ZenohBus.listen(zenoh) as bus:
         _run(maps, bus, listener, writers, settings)
 
@@ -124,7 +124,7 @@ def _token(path: Path) -> str:
         raise UsageError(f"--token-file {path} cannot be read ({error}); check the path and its rights") from error
     if len(token) < _MIN_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
         raise UsageError(
-            f"--token-file {path}: a token is one line of at least {_MIN_TOKEN} ASCII signs without spaces"
+            f"--token-file {path}: a token is one line of at least {_MIN_TOKEN} ASCII characters without spaces"
         )
     return token
 

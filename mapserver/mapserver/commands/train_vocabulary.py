@@ -1,4 +1,4 @@
-"""`mapserver train-vocabulary`: words of place recognition from pictures."""
+"""`mapserver train-vocabulary`: a vocabulary of place recognition."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +36,7 @@ def train_vocabulary(
     options: VocabularyOptions,
     config: ConfigFile = None,
 ) -> None:
-    """Make a vocabulary from the pictures of recordings; `build --vocabulary` uses it."""
+    """Train a vocabulary on the images of recordings, for `build --vocabulary`."""
     from fleetmap.bow import MAX_NODES
 
     if not out.parent.is_dir():

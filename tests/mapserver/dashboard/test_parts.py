@@ -147,11 +147,10 @@ def test_a_trial_is_started_and_stopped(store: MapStore) -> None:
 
 
 def status(**changed: object) -> RobotStatus:
-    usual = {
-        "site": SITE, "robot": "r", "version": 2, "wanted_version": 2, "is_canary": False, "is_present": None,
-        "clock_ahead_s": None, "seconds_since": 0.5, "last_ack": None, "last_health": {"status": "TRACKING"},
-        "last_pose": {"position_map_m": [1.0, 2.0, 0.0], "status": "TRACKING"},
-    }  # fmt: skip
+    sent = {"position_map_m": [1.0, 2.0, 0.0], "status": "TRACKING"}
+    usual = {"site": SITE, "robot": "r", "version": 2, "wanted_version": 2, "is_canary": False, "is_present": None}
+    usual |= {"clock_ahead_s": None, "seconds_since": 0.5, "last_ack": None, "last_pose": sent}
+    usual |= {"last_health": {"status": "TRACKING"}}
     return RobotStatus(**(usual | changed))  # type: ignore[arg-type]
 
 

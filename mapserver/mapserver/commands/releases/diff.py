@@ -1,4 +1,4 @@
-"""`mapserver diff`: what changed from one version to another."""
+"""`mapserver diff`: the differences between two versions."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,7 +18,7 @@ def diff(
     store: StoreFolder,
     json: Json = False,
 ) -> None:
-    """Show what changed from version A to version B: tiles, landmarks, bytes to fetch, quality side by side."""
+    """Show the differences from version A to version B: tiles, landmarks, bytes to fetch, quality side by side."""
     from mapserver import releases
     from mapserver.store import MapStore
 

@@ -1,4 +1,4 @@
-"""`mapserver inspect`: what is in a version."""
+"""`mapserver inspect`: the content of a version."""
 
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,7 +16,7 @@ def inspect(
     site: SiteName,
     store: StoreFolder,
     version: Annotated[
-        int | None, typer.Option(min=1, help="Version; the current one if left out, else the newest.")
+        int | None, typer.Option(min=1, help="Version; default: the current one, else the newest.")
     ] = None,
     json: Json = False,
 ) -> None:

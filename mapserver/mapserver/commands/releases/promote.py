@@ -15,13 +15,13 @@ def promote(
     where: SiteOptions,
     by: ActorOptions,
     canary: Annotated[
-        str | None, typer.Option(metavar="SHARE", help="Let such a share of the robots try it first, such as 5%.")
+        str | None, typer.Option(metavar="SHARE", help="Try it on this share of the robots first, such as 5%.")
     ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Make VERSION, published before, the current version of its site.
 
-    With --canary some robots run it first (a draft goes through the gate before); the server then promotes it or takes it back.
+    With --canary some robots run it first (a draft goes through the gate before); the server then promotes it or rolls it back.
     """
     from mapserver import releases
     from mapserver.store import MapStore

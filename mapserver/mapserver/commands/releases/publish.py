@@ -13,15 +13,14 @@ def publish(
     context: typer.Context,
     where: SiteOptions,
     by: ActorOptions,
-    version: Annotated[
-        int | None, typer.Option(min=1, help="The draft to publish; the newest one if left out.")
-    ] = None,
+    version: Annotated[int | None, typer.Option(min=1, help="The draft to publish; default: the newest.")] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Publish what the gate refuses, except beyond hard limits; needs --reason.")
+        bool,
+        typer.Option("--force", help="Publish although the gate refuses, except beyond hard limits; needs --reason."),
     ] = False,
     config: ConfigFile = None,
 ) -> None:
-    """Take a draft through the gate and make it the current version; ends with status 4 where the gate refuses it."""
+    """Take a draft through the gate and make it the current version; status 4 if the gate refuses it."""
     from mapserver import releases
     from mapserver.quality.directions import one_way_words
     from mapserver.store import MapStore
@@ -38,6 +37,6 @@ def publish(
     for refused in verdict.reasons:
         typer.echo(f"published by force although {refused}")
     if verdict.report.get("not_judged"):
-        typer.echo(f"not judged, for want of evidence: {', '.join(verdict.report['not_judged'])}")
+        typer.echo(f"not judged, evidence missing: {', '.join(verdict.report['not_judged'])}")
     if one_way := one_way_words(directions):
         typer.echo(one_way)

@@ -12,7 +12,7 @@ def rollback(
     store: StoreFolder,
     by: ActorOptions,
 ) -> None:
-    """Make the version current that was so before the current one, which retires."""
+    """Make the previous version current again; the current one retires."""
     from mapserver import releases
     from mapserver.store import MapStore
 

@@ -1,4 +1,4 @@
-"""`mapserver versions`: what versions a site has."""
+"""`mapserver versions`: the versions of a site."""
 
 from mapserver.commands.options import Json, SiteName, StoreFolder
 from mapserver.commands.print_json import print_json

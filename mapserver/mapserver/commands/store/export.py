@@ -10,12 +10,12 @@ from mapserver.commands.options import SiteName, StoreFolder
 
 
 def export(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write; replaced where it exists.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write; replaced if it exists.")],
     site: SiteName,
     store: StoreFolder,
-    version: Annotated[int | None, typer.Option(min=1, help="Version; the current one if left out.")] = None,
+    version: Annotated[int | None, typer.Option(min=1, help="Version; default: the current one.")] = None,
     without_archive: Annotated[
-        bool, typer.Option("--without-archive", help="Leave out what only a later survey needs.")
+        bool, typer.Option("--without-archive", help="Leave out the data that only later surveys need.")
     ] = False,
 ) -> None:
     """Write a version into FILE, which `mapserver import` takes into another store."""

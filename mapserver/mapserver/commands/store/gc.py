@@ -1,4 +1,4 @@
-"""`mapserver gc`: removes what nobody needs from a store."""
+"""`mapserver gc`: removal of unused versions and files from a store."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -30,9 +30,9 @@ def gc(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would be removed; remove nothing.")] = False,
     json: Json = False,
 ) -> None:
-    """Remove drafts and retired versions beyond retention, and files that nothing mentions.
+    """Remove drafts and retired versions beyond retention, and unreferenced files.
 
-    Current versions, what a rollback would go to and what robots run stay whatever the options say.
+    Current versions, targets of a rollback and versions that robots run are always kept.
     """
     from mapserver.store import MapStore, Retention
 

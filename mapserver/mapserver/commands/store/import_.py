@@ -1,4 +1,4 @@
-"""`mapserver import`: takes a version out of an export file."""
+"""`mapserver import`: a version from an export file."""
 
 from pathlib import Path
 from typing import Annotated

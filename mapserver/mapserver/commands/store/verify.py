@@ -1,4 +1,4 @@
-"""`mapserver verify`: whether a store is whole."""
+"""`mapserver verify`: integrity of a store."""
 
 import typer
 
@@ -12,7 +12,7 @@ def verify(
     store: StoreFolder,
     json: Json = False,
 ) -> None:
-    """Check every hash and every reference of a store, and its database; ends with status 3 where something is wrong."""
+    """Check every hash and every reference of a store, and its database; status 3 if there is a fault."""
     from mapserver.store import MapStore
 
     with MapStore.open(store) as maps:
@@ -22,7 +22,7 @@ def verify(
     else:
         typer.echo(f"{found.sites} sites, {found.versions} versions, {found.blobs} blobs of {found.blob_bytes} bytes")
         if found.orphans or found.leftovers:
-            typer.echo(f"{found.orphans + found.leftovers} files that nothing mentions; `mapserver gc` removes them")
+            typer.echo(f"{found.orphans + found.leftovers} unreferenced files; `mapserver gc` removes them")
         for fault in found.faults:
             typer.echo(f"fault: {fault}")
         typer.echo("clean" if not found.faults else f"{len(found.faults)} faults; import the versions again or restore")
