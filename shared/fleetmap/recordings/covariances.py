@@ -35,7 +35,7 @@ def format_covariances(given: StampedCovariances) -> str:
 
 
 def parse_covariances(text: str, what: str = "covariances") -> StampedCovariances:
-    """What `format_covariances` wrote.
+    """The covariances in text written by `format_covariances`.
 
     Raises RecordingError, naming `what` and the line, for anything but 22 finite numbers of a positive definite matrix, or
     stamps that do not rise.

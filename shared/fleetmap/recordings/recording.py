@@ -38,7 +38,7 @@ class Topics(Section, frozen=True):
 
 @dataclass(frozen=True)
 class OpenOptions:
-    """How to open a recording. calibration_file goes before any calibration inside the recording."""
+    """Options of opening a recording. calibration_file takes precedence over a calibration inside the recording."""
 
     calibration_file: Path | None = None
     topics: Topics = field(default_factory=Topics)

@@ -134,7 +134,7 @@ class EstimatorSession:
         return seen.ids[chosen], pixels[chosen]
 
     def features(self, frame: int) -> Found:
-        """What a detector finds in a frame's left picture, landmarks first, then clutter."""
+        """Features that a detector finds in a frame's left picture: landmarks first, then clutter."""
         seen, model = self.sighting(frame), self._features
         room = max(len(seen.ids), model.total)
         rows, words = np.full(room, -1, np.int32), np.empty((room, 4), np.uint64)

@@ -19,7 +19,7 @@ _SQUAT_RAD_PER_MPS2, _LEAN_S = 0.006, 0.004
 
 
 class Motion(Protocol):
-    """Where the body is and what it feels, exactly, at times (N,) in seconds from the start."""
+    """Exact pose, rates and forces of the body at times (N,) in seconds from the start."""
 
     @property
     def duration_s(self) -> float:

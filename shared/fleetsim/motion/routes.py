@@ -14,7 +14,7 @@ _CREEP_MPS = 0.02  # speed at which a standing start begins
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a robot's drive can do, and how wide it takes corners."""
+    """Limits of a robot's drive, and the radius of its corners."""
 
     speed_mps: float = 1.5
     accel_mps2: float = 0.8

@@ -1,1 +1,1 @@
-"""From a scene and a camera's way to a picture and its depth."""
+"""Rendering: a picture and its depth from a scene and the motion of a camera."""

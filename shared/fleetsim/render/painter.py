@@ -83,7 +83,7 @@ class Painter:
         return Shot(self._develop(canvas.radiance, exposure, noise_key), depth, faces, count)
 
     def subframes(self, path: Path, t_s: float, exposure: Exposure) -> int:
-        """How many pictures are averaged so that a thing 1.5 m away moves at most 1.2 px from one to the next."""
+        """Number of pictures to average so that a thing 1.5 m away moves at most 1.2 px from one to the next."""
         before, after = path(t_s - exposure.time_s / 2), path(t_s + exposure.time_s / 2)
         turned = float(np.linalg.norm(before[:3, :3].T @ after[:3, :3] - np.eye(3))) / np.sqrt(2.0)
         moved = float(np.linalg.norm(after[:3, 3] - before[:3, 3])) / _NEAR_THINGS_M

@@ -68,7 +68,7 @@ def fill_grid(boxes: Float, low: Float, cell_m: float, counts: Int) -> tuple[Int
 
 @kernel
 def slab_interval(origin: float, inverse: float, half: float) -> tuple[float, float]:
-    """Where a ray enters and leaves the slab |x| <= half."""
+    """Ray parameters at which a ray enters and leaves the slab |x| <= half."""
     a = (-half - origin) * inverse
     b = (half - origin) * inverse
     return min(a, b), max(a, b)

@@ -75,7 +75,7 @@ class StereoRenderer:
         return map_from_cam
 
     def exposure(self, t_s: float) -> Exposure:
-        """What the automatic exposure has settled on."""
+        """Exposure that the automatic control has chosen."""
         moments = np.maximum(t_s - 0.25 * np.arange(5), 0.0)
         map_from_cam = self._motion.map_from_body(moments) @ self._rig.cameras[0].body_from_cam
         places, forward = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]

@@ -1,4 +1,4 @@
-"""From radiance to grey levels: gain, vignetting, shot and read noise."""
+"""Development of radiance to grey levels: gain, vignetting, shot and read noise."""
 
 import math
 from typing import NamedTuple

@@ -67,7 +67,7 @@ class Layout(Section, frozen=True):
         return self.aisle_y_m(row // 2) + side * (self.aisle_width_m + self.rack_depth_m) / 2
 
     def bay_x_m(self, bay: int) -> float:
-        """Where a bay begins."""
+        """Low x of a bay."""
         return self.end_m + bay * self.bay_m
 
     @property

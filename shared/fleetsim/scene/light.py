@@ -17,7 +17,7 @@ _MEAN_REFLECTANCE = 0.32
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """How one picture is taken."""
+    """Exposure time and gain of one picture."""
 
     time_s: float
     gain: float

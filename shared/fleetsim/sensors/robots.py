@@ -42,7 +42,7 @@ class WheelErrors:
 
 @dataclass(frozen=True, slots=True)
 class HiddenErrors:
-    """What the calibration does not say.
+    """Errors that the calibration does not contain.
 
     imu_minus_cam_s: of both cameras. turn_rad, shift_m: of each camera by itself, in a direction of its own.
     """
@@ -95,7 +95,7 @@ ROBOTS = {
 
 
 def nominal_calibration(kind: RobotKind) -> RigCalibration:
-    """What the robot believes about its sensors."""
+    """Calibration as the robot knows it."""
     model, distortion, focal_share = LENSES[kind.lens]
     focal = focal_share * kind.width_px
     intrinsics = np.array([focal, focal, (kind.width_px - 1) / 2, (kind.height_px - 1) / 2])
@@ -113,7 +113,7 @@ def nominal_calibration(kind: RobotKind) -> RigCalibration:
 
 
 def true_calibration(kind: RobotKind, rng: np.random.Generator) -> RigCalibration:
-    """What the sensors really are: the nominal values with this robot's hidden errors, in directions drawn from rng."""
+    """The true calibration: the nominal values with this robot's hidden errors, in directions drawn from rng."""
     nominal, hidden = nominal_calibration(kind), kind.hidden
     cameras = []
     for camera in nominal.cameras:

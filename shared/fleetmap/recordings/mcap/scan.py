@@ -46,7 +46,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class Location:
-    """Where a message's bytes lie: in the file itself, or in a compressed chunk (chunk_at >= 0) after decompression."""
+    """Position of a message's bytes: in the file itself, or in a compressed chunk (chunk_at >= 0) after decompression."""
 
     at: int
     length: int
@@ -225,7 +225,7 @@ class McapScan:
         self.attachments[name] = data
 
     def _next_indexed_chunk(self, after: int) -> int | None:
-        """Where the first chunk behind `after` begins, by the index at the file's end; None without one."""
+        """Start of the first chunk behind `after`, by the index at the file's end; None without one."""
         self._file.seek(max(0, self.size - _FOOTER_BYTES))
         tail = self._file.read()
         if len(tail) < _FOOTER_BYTES or tail[0] != _FOOTER or not tail.endswith(MAGIC):

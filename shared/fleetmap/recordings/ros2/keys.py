@@ -40,7 +40,7 @@ def type_of_key(key: str) -> str:
 
 
 def attachment(sequence: int, source_ns: int, gid: bytes) -> bytes:
-    """What goes with every message: its number and time at this publisher, whose 16 bytes name it."""
+    """The attachment of a message: its number and time at the publisher, whose name is 16 bytes."""
     assert len(gid) == _GID_BYTES
     return struct.pack("<qqB", sequence, source_ns, _GID_BYTES) + gid
 
