@@ -111,8 +111,8 @@ def _run(
             console.print(f"note: {issue.what} {issue.detail}".rstrip())
         source = ReplaySource.of(recording, selection, reverse=playback.reverse)
         task = bar.add_task("replay", total=len(source))
-        options = ReplayOptions(settings.localizer, prior, playback.realtime, lambda _: bar.advance(task))
-        result = play(source, connection, options)
+        options = ReplayOptions(settings.localizer, playback.realtime, lambda _: bar.advance(task))
+        result = play(source, connection, options, prior)
     report = result.report
     if files.report is not None:
         files.report.write_text(json.dumps(msgspec.to_builtins(report), indent=2) + "\n")

@@ -1,14 +1,14 @@
 """Localization of a recording in a published map, as one call."""
 
 import re
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
+
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
 from fleetmap.sensors.samples import PositionPrior
-from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import connected
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
@@ -20,25 +20,20 @@ _ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws|unixsock-stream)/")
 
 
 @dataclass(frozen=True)
-class LocalizeOptions:
-    """What a run of `localize` may change.
+class LocalizeOptions(ReplayOptions):
+    """Options of `localize` beside those of every replay.
 
-    settings: of the localizer. frames: which of the recording's, as a Python slice. reverse: backwards, with new stamps and without
-    IMU. realtime: as fast as it was recorded. calibration, topics: for opening a recording by its path. robot: the name that the
-    server sees. cache, cache_bytes: folder and size of the tile cache; by default the user's. progress: called with the number of
-    each frame.
+    frames: which of the recording's, as a Python slice. reverse: backwards, with new stamps and without IMU. calibration, topics: for
+    opening a recording by its path. robot: the name that the server sees. cache, cache_bytes: folder and size of the tile cache.
     """
 
-    settings: LocalizerSettings = field(default_factory=LocalizerSettings)
     frames: str = ":"
     reverse: bool = False
-    realtime: bool = False
     calibration: Path | None = None
     topics: Topics = field(default_factory=Topics)
     robot: str = "replay"
     cache: Path | None = None
     cache_bytes: int = DEFAULT_MAX_BYTES
-    progress: Callable[[int], None] = lambda _: None
 
 
 _DEFAULTS = LocalizeOptions()
@@ -55,7 +50,7 @@ def localize(
     """Localizes every frame of a recording in the current map of a site, as a robot would.
 
     recording: its path, or one that is open. maps: folder of a store, or endpoint of a server, such as tcp/127.0.0.1:7447.
-    prior: a coarse place at the beginning. Raises FleetmapError for whatever cannot be opened, read or had.
+    prior: a coarse pose at the beginning. Raises FleetmapError for whatever cannot be opened, read or fetched.
     """
     with ExitStack() as stack:
         if not isinstance(recording, Recording):
@@ -64,7 +59,8 @@ def localize(
         selection = FrameSelection.parse(options.frames)
         connection = stack.enter_context(connected(_connection_options(maps, site, options)))
         source = ReplaySource.of(recording, selection, reverse=options.reverse)
-        return replay(source, connection, ReplayOptions(options.settings, prior, options.realtime, options.progress))
+        stack.callback(cv2.setNumThreads, cv2.getNumThreads())
+        return replay(source, connection, options, prior)
 
 
 def fetch_map(maps: str | Path, site: str, options: LocalizeOptions = _DEFAULTS) -> LoadedMap:

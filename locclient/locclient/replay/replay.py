@@ -29,10 +29,9 @@ TRUTH_FLAG = "frame_from_ground_truth"  # key of the configuration: the map lies
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """How a recording is played. prior: a coarse place at its beginning. progress: called with the number of each frame."""
+    """Settings of the localizer, whether the recording is played at its own speed, and a call with the number of each frame."""
 
     settings: LocalizerSettings = field(default_factory=LocalizerSettings)
-    prior: PositionPrior | None = None
     realtime: bool = False
     progress: Callable[[int], None] = lambda _: None
 
@@ -54,15 +53,20 @@ def load_map(source: MapSource) -> tuple[LoadedMap, FetchedTiles, str]:
 
 
 @gc_frozen()
-def replay(source: ReplaySource, connection: MapConnection, options: ReplayOptions) -> ReplayResult:
-    """Plays the source; raises LinkError where no map can be had, RecordingError for frames that cannot be read."""
+def replay(
+    source: ReplaySource, connection: MapConnection, options: ReplayOptions, prior: PositionPrior | None = None
+) -> ReplayResult:
+    """Plays the source; prior: a coarse pose at its beginning.
+
+    Raises LinkError where no map can be fetched, RecordingError for frames that cannot be read.
+    """
     cv2.setNumThreads(1)  # one robot, one thread: figures are then those of the board's core
     loaded, tiles, note = load_map(connection.source)
     rectifier = Rectifier(source.calibration, has_depth=source.recording.sensor_set is SensorSet.RGBD)
     robot = Robot(source.calibration, rectifier, options.settings, TrialSettings(), time.process_time)
     robot.use(loaded)
-    if options.prior is not None:
-        robot.localizer.handle_prior(options.prior)
+    if prior is not None:
+        robot.localizer.handle_prior(prior)
     result = ReplayResult([], [], [], loaded.manifest, tiles, [note] if note else [])
     reporter = RunReporter(connection, result)
     has_truth = bool(loaded.manifest.configuration.get(TRUTH_FLAG))
