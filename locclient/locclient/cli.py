@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fleetmap.cli_exit import run as run_program
+from fleetmap.cli_exit import run_cli
 from fleetmap.cli_options import Commands, Options, make_app
 from locclient.commands.check import check
 from locclient.commands.config import CONFIG
@@ -35,7 +35,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 def main() -> None:
     """Runs the command line."""
-    run_program(app)
+    run_cli(app)
 
 
 if __name__ == "__main__":

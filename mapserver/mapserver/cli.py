@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fleetmap.cli_exit import run
+from fleetmap.cli_exit import run_cli
 from fleetmap.cli_options import Commands, ConfigFile, Options, make_app
 from mapserver.commands.build import build
 from mapserver.commands.config import CONFIG
@@ -73,7 +73,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 def main() -> None:
     """Runs the command line."""
-    run(app)
+    run_cli(app)
 
 
 if __name__ == "__main__":

@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 from fleetmap.errors import FleetmapError
 
-INTERRUPTED = 130  # as a shell says it of Ctrl-C
+INTERRUPTED = 130  # the status that shells use for Ctrl-C
 
 
-def run(app: Callable[[], object]) -> None:
+def run_cli(app: Callable[[], object]) -> None:
     """Runs a command line; a FleetmapError becomes its message on stderr and its exit status, Ctrl-C becomes 130.
 
     A library that is not installed becomes the name of the extra that brings it.

@@ -5,7 +5,7 @@ FleetmapError                      exit status 3
 │   └── StateError                 what is asked for does not fit the state that something is in
 ├── RecordingError                 a recording that cannot be read or contradicts itself
 │   └── CalibrationError           missing or impossible calibration
-├── SurveyError                    a recording from which no honest map can be made
+├── SurveyError                    a recording from which no correct map can be made
 ├── MapFormatError                 tile, manifest or vocabulary bytes that are not what they claim
 │   └── NewerFormatError           made by a newer fleetmap; names the version that is needed
 ├── StoreError                     a store that cannot be opened, read or written
@@ -44,7 +44,7 @@ class CalibrationError(RecordingError):
 
 
 class SurveyError(FleetmapError):
-    """A recording from which no honest map can be made."""
+    """A recording from which no correct map can be made."""
 
 
 class MapFormatError(FleetmapError):

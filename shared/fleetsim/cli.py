@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fleetmap.cli_exit import run
+from fleetmap.cli_exit import run_cli
 from fleetmap.cli_options import expand_options
 from fleetmap.errors import UsageError
 
@@ -123,4 +123,4 @@ def _size_px(text: str | None) -> tuple[int, int] | None:
 
 def main() -> None:
     """Runs the command line."""
-    run(app)
+    run_cli(app)

@@ -1,4 +1,4 @@
-"""Places by their words: a vocabulary of binary descriptors and an index that says which places look alike."""
+"""Bag of binary words: a vocabulary of descriptors and an index that ranks places by appearance."""
 
 from fleetmap.bow.place_index import PlaceIndex
 from fleetmap.bow.training import train_vocabulary

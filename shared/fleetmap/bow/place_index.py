@@ -1,4 +1,4 @@
-"""Which places look like this one: an inverted file over bag-of-words vectors."""
+"""Ranking of places by appearance: an inverted file over bag-of-words vectors."""
 
 import numpy as np
 from numpy.typing import NDArray

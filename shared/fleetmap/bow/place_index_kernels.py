@@ -1,4 +1,4 @@
-"""Inner loops of the inverted file. Every place's score is summed by rising word, whichever way it is reached."""
+"""Inner loops of the inverted file. A place's score is summed by rising word in both of them."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""A vocabulary from example descriptors: hierarchical clustering, then how rare each word is."""
+"""Training of a vocabulary: hierarchical clustering of example descriptors, then inverse document frequencies."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Inner loops of the vocabulary tree: clustering of binary descriptors, and the way down."""
+"""Inner loops of the vocabulary tree: clustering of binary descriptors, and descent to the words."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,12 @@ from fleetmap.numerics.kernel import kernel
 
 @kernel
 def descend(
-    packed: Packed, centres: Packed, first_child: NDArray[np.int32], child_count: NDArray[np.int32],
+    packed: Packed,
+    centres: Packed,
+    first_child: NDArray[np.int32],
+    child_count: NDArray[np.int32],
     word_of_node: NDArray[np.int32],
-) -> NDArray[np.int32]:  # fmt: skip
+) -> NDArray[np.int32]:
     """(N,) word of each descriptor."""
     words = np.empty(len(packed), np.int32)
     for i in range(len(packed)):

@@ -1,4 +1,4 @@
-"""Inner loops of optical flow: small windows followed from picture to picture.
+"""Inner loops of optical flow: small windows followed from image to image.
 
 Windows are kept as one row of numbers: their right and lower neighbours are the same row begun elsewhere, and whole registers do
 the work. Columns beyond a window are multiplied by slopes of 0. Sums are folded in halves, in the same order on every processor.
@@ -24,7 +24,7 @@ _TURNING_PX = 0.01  # two steps that undo each other up to this: between them li
 
 @inner_kernel
 def _cut(image: Grey, x: int, y: int, rows: int, columns: int, cells: Window) -> None:
-    """Fills rows of cells with whole pixels, the first at (x, y); beyond its edges the picture is mirrored."""
+    """Fills rows of cells with whole pixels, the first at (x, y); beyond its edges the image is mirrored."""
     height, width = image.shape
     if x >= 0 and y >= 0 and x + columns <= width and y + rows <= height:
         for v in range(rows):
@@ -70,7 +70,7 @@ def _sum(terms: Window) -> float:
 def _template(
     image: Grey, x: float, y: float, half: int, cells: Window, wide: Window, grey: Window, right: Window, down: Window
 ) -> None:
-    """Fills grey values and slopes to the right and downwards of the window around (x, y). Slopes outside the picture are 0.
+    """Fills grey values and slopes to the right and downwards of the window around (x, y). Slopes outside the image are 0.
 
     Source of the filter: Scharr 2000.
     """
@@ -106,10 +106,23 @@ def _product(a: Window, b: Window, count: int, terms: Window) -> float:
 
 @inner_kernel
 def _find(
-    image: Grey, grey: Window, right: Window, down: Window, xx: float, xy: float, yy: float, x: float, y: float, half: int,
-    steps: int, settled_px: float, cells: Window, off: Window, terms: Window,
-) -> tuple[float, float, bool]:  # fmt: skip
-    """Where around (x, y) the window of `_template` is, and whether it stayed in reach of the picture on the way there."""
+    image: Grey,
+    grey: Window,
+    right: Window,
+    down: Window,
+    xx: float,
+    xy: float,
+    yy: float,
+    x: float,
+    y: float,
+    half: int,
+    steps: int,
+    settled_px: float,
+    cells: Window,
+    off: Window,
+    terms: Window,
+) -> tuple[float, float, bool]:
+    """Where around (x, y) the window of `_template` is, and whether it stayed in reach of the image on the way there."""
     height, width = image.shape
     count = (2 * half + 1) * _ROW
     scale = 1.0 / (xx * yy - xy * xy)
@@ -139,13 +152,20 @@ def _find(
 
 @kernel
 def follow(
-    before: Grey, now: Grey, scale: float, half: int, steps: int, settled_px: float, pixels: Array, places: Array,
+    before: Grey,
+    now: Grey,
+    scale: float,
+    half: int,
+    steps: int,
+    settled_px: float,
+    pixels: Array,
+    places: Array,
     found: NDArray[np.bool_],
-) -> None:  # fmt: skip
-    """Moves places (N, 2), where windows of 2 half + 1 pixels around pixels (N, 2) of one picture are thought to be in the other.
+) -> None:
+    """Moves places (N, 2), where windows of 2 half + 1 pixels around pixels (N, 2) of one image are thought to be in the other.
 
-    Both pictures are `scale` times as large as those that the coordinates are for. half: MOST_HALF at most. found (N,): others
-    are left alone, and those without texture, or that leave the picture, are no longer. Source: Lucas and Kanade 1981, with the
+    Both images are `scale` times as large as those that the coordinates are for. half: MOST_HALF at most. found (N,): others
+    are left alone, and those without texture, or that leave the image, are no longer. Source: Lucas and Kanade 1981, with the
     slopes of the window that is looked for as in Baker and Matthews 2004.
     """
     assert half <= MOST_HALF
@@ -164,9 +184,9 @@ def follow(
         if not least >= _LEAST_SLOPE * size * size:
             found[n] = False
             continue
+        start_x, start_y = places[n, 0] * scale, places[n, 1] * scale
         x, y, found[n] = _find(
-            now, grey, right, down, xx, xy, yy, places[n, 0] * scale, places[n, 1] * scale, half, steps, settled_px, cells,
-            off, terms,
-        )  # fmt: skip
+            now, grey, right, down, xx, xy, yy, start_x, start_y, half, steps, settled_px, cells, off, terms
+        )
         if found[n]:
             places[n, 0], places[n, 1] = x / scale, y / scale

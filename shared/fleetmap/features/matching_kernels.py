@@ -129,9 +129,16 @@ def _cell_of(coordinate: float, origin: float, size: float, count: int) -> int:
 
 @kernel
 def by_projection(
-    predicted: Array, radius: Array, a: Packed, octave_range: NDArray[np.int64],
-    pixels: Array, octaves: NDArray[np.int8], b: Packed, max_distance: int, ratio: float,
-) -> tuple[Indices, Distances]:  # fmt: skip
+    predicted: Array,
+    radius: Array,
+    a: Packed,
+    octave_range: NDArray[np.int64],
+    pixels: Array,
+    octaves: NDArray[np.int8],
+    b: Packed,
+    max_distance: int,
+    ratio: float,
+) -> tuple[Indices, Distances]:
     """As `matching.match_by_projection`, on packed descriptors."""
     grid, shape, starts, members = grid_cells(pixels)
     columns, rows = shape[0], shape[1]

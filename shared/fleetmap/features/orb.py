@@ -87,7 +87,7 @@ def describe(image: Image, keypoints: list[cv2.KeyPoint], levels: int) -> Featur
     if not kept:
         return Features.empty()
     octaves = np.array([k.octave for k in kept], np.int8)
-    # OpenCV scales level pixels up from their corners; where they lie in the picture is told from their centres.
+    # OpenCV scales level pixels up from their corners; where they lie in the image is told from their centres.
     middle = 0.5 * (SCALE_FACTOR ** octaves.astype(np.float64) - 1.0)
     return Features(
         np.asarray(cv2.KeyPoint.convert(kept), np.float64).reshape(-1, 2) + middle[:, None],

@@ -1,4 +1,4 @@
-"""Inner loop of patch alignment: where exactly a small window of one picture lies in another."""
+"""Inner loop of patch alignment: sub-pixel position of a small window of one image in another."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,9 +38,19 @@ def _sample_upright(image: NDArray[np.uint8], x: float, y: float, half: int, win
 
 @kernel
 def align_patch(
-    reference: NDArray[np.uint8], current: NDArray[np.uint8], rx: float, ry: float, start_x: float, start_y: float,
-    warp: Array, half: int, max_shift_px: float, template: Array, window: Array, out: Array,
-) -> None:  # fmt: skip
+    reference: NDArray[np.uint8],
+    current: NDArray[np.uint8],
+    rx: float,
+    ry: float,
+    start_x: float,
+    start_y: float,
+    warp: Array,
+    half: int,
+    max_shift_px: float,
+    template: Array,
+    window: Array,
+    out: Array,
+) -> None:
     """One patch of `align_patches`, out (4,). template (side + 2, side + 2) and window (side, side) are scratch."""
     side = 2 * half + 1
     count = side * side
@@ -109,12 +119,18 @@ def align_patch(
 
 @kernel
 def align_patches(
-    reference: NDArray[np.uint8], current: NDArray[np.uint8], reference_pixels: Array, current_pixels: Array,
-    reference_from_current: Array, half: int, max_shift_px: float, out: Array,
-) -> None:  # fmt: skip
+    reference: NDArray[np.uint8],
+    current: NDArray[np.uint8],
+    reference_pixels: Array,
+    current_pixels: Array,
+    reference_from_current: Array,
+    half: int,
+    max_shift_px: float,
+    out: Array,
+) -> None:
     """Moves each current pixel until the reference's window, warped, lies on it.
 
-    reference_from_current (N, 2, 2) maps offsets in the current picture to offsets in the reference. out (N, 4): x, y,
+    reference_from_current (N, 2, 2) maps offsets in the current image to offsets in the reference. out (N, 4): x, y,
     sigma_px (from the residual and the window's gradients, the weaker direction), correlation; NaN where alignment
     fails or leaves max_shift_px. Inverse compositional translation with free offset and gain. Source: Baker and
     Matthews 2004.
@@ -122,7 +138,5 @@ def align_patches(
     side = 2 * half + 1
     template, window = np.empty((side + 2, side + 2)), np.empty((side, side))
     for n in range(len(reference_pixels)):
-        align_patch(
-            reference, current, reference_pixels[n, 0], reference_pixels[n, 1], current_pixels[n, 0],
-            current_pixels[n, 1], reference_from_current[n], half, max_shift_px, template, window, out[n],
-        )  # fmt: skip
+        a, b, warp = reference_pixels[n], current_pixels[n], reference_from_current[n]
+        align_patch(reference, current, a[0], a[1], b[0], b[1], warp, half, max_shift_px, template, window, out[n])

@@ -47,13 +47,12 @@ def disparities(
         return np.full((count, 2), np.nan)
     max_disparity = min(camera.focal_px * camera.baseline_m / settings.min_depth_m, 0.6 * camera.width_px)
     prior = np.full(count, np.nan) if prior_px is None else np.asarray(prior_px, np.float64)
-    # whole pictures are only searched at half size
+    # whole images are only searched at half size
     halves = (frame.left, frame.right) if np.isfinite(prior).all() else (halved(frame.left), halved(frame.right))
-    matched = match_rows(
-        frame.left, frame.right, *halves, np.asarray(pixels, np.float64), prior,
-        max_disparity, settings.min_correlation, settings.uniqueness, settings.wide_half_px, settings.narrow_half_px,
-        settings.agreement_px,
-    )  # fmt: skip
+    sought = np.asarray(pixels, np.float64), prior
+    scores, windows = (settings.min_correlation, settings.uniqueness), (settings.wide_half_px, settings.narrow_half_px)
+    images = frame.left, frame.right
+    matched = match_rows(*images, *halves, *sought, max_disparity, *scores, *windows, settings.agreement_px)
     matched[~(matched[:, 0] > settings.min_disparity_px)] = np.nan
     return matched
 

@@ -1,4 +1,4 @@
-"""What the IMU says about motion between two moments."""
+"""IMU preintegration: motion between two moments from inertial samples."""
 
 from fleetmap.inertial.preintegration import (
     GRAVITY_MAP,

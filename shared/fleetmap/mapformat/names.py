@@ -1,4 +1,4 @@
-"""How things are addressed: sites and robots by name, bytes by their SHA-256."""
+"""Names that address things: sites and robots by name, bytes by their SHA-256."""
 
 import hashlib
 import re

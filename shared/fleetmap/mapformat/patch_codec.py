@@ -39,8 +39,9 @@ _SMALL_BYTES = 16_384
 _HEAD = struct.Struct("<32s32sBBHIIII")
 _NO_IDS: Ids = np.zeros(0, np.uint32)
 _LANDMARKS = (
-    "landmark_ids", "points_map", "descriptors", "view_directions_map", "view_half_angle_rad", "max_distance_m", "sigma_m",
-)  # fmt: skip
+    *("landmark_ids", "points_map", "descriptors"),
+    *("view_directions_map", "view_half_angle_rad", "max_distance_m", "sigma_m"),
+)
 
 
 def make_patch(base: bytes, result: bytes) -> bytes:

@@ -1,1 +1,1 @@
-"""How kernels are compiled, and the small dense linear algebra that they share."""
+"""Compilation of kernels, and the small dense linear algebra that they share."""

@@ -1,4 +1,4 @@
-"""The one place that says how numba compiles: cached, without the GIL, and without fast-math so that bits repeat."""
+"""Options of numba, in this one place: cached, without the GIL, and without fast-math so that bits repeat."""
 
 from collections.abc import Callable
 from typing import TypeVar, cast

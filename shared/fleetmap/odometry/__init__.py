@@ -1,4 +1,4 @@
-"""Odometry of stereo and single cameras, with and without IMU: written once, run live by the robot and as a first guess by the survey."""
+"""Odometry of stereo and single cameras, with and without IMU: run live by the robot and as initial trajectory by the survey."""
 
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.mono.monocular import MonocularOdometry, make_odometry

@@ -1,4 +1,4 @@
-"""What an odometry says of one frame."""
+"""The result of odometry for one frame."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -10,7 +10,7 @@ from fleetmap.geometry import Array
 
 
 class OdometryStatus(StrEnum):
-    """How far an estimate can be trusted."""
+    """Reliability of an estimate."""
 
     INITIALISING = "initialising"
     TRACKING = "tracking"

@@ -248,7 +248,7 @@ class StartingMode(VisualMode):
 
 
 class InertialMode(WindowMode):
-    """Stereo-inertial: the state moves by the IMU, pictures correct it, rest and wheels help."""
+    """Stereo-inertial: the state moves by the IMU, images correct it, rest and wheels help."""
 
     inertial = True
     rotation_sigma_rad = _ROTATION_SIGMA_RAD
@@ -284,7 +284,7 @@ class InertialMode(WindowMode):
         return self.window.cam_from_earlier(frame_index)
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
-        """See Mode; an IMU that contradicts the pictures is given up, a filter that diverged begins again."""
+        """See Mode; an IMU that contradicts the images is given up, a filter that diverged begins again."""
         window, monitor, seen = self.window, self._imu.monitor, tracked.cam_from_previous
         if seen is not None and monitor.is_wrong_imu(self.cam_from_earlier(frame_index - 1), seen):
             return VisualMode(window, seen).process(frame_index, tracked)
@@ -316,7 +316,7 @@ class InertialMode(WindowMode):
         window.rate_body_radps = np.zeros(3)
 
     def _update_zero_velocity(self, tracked: Tracked) -> None:
-        """Zero velocity and turn where for a while neither pictures nor IMU moved."""
+        """Zero velocity and turn where for a while neither images nor IMU moved."""
         now_ns, samples = self.window.stamp_ns, self._imu.samples.imu
         still = self._zero_velocity.since(now_ns, tracked.ids, tracked.pixels)
         if still is None:

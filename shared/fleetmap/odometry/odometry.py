@@ -73,7 +73,7 @@ class Odometry:
         """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance.
 
         None where the frame is forgotten; one that was dropped with this very frame is not yet. The covariance (6, 6) is that
-        of a left perturbation in the earlier body's axes, rotation first. Sparse pictures can revise where earlier frames were:
+        of a left perturbation in the earlier body's axes, rotation first. Sparse images can revise where earlier frames were:
         what two estimates differ by is then not the motion between them, this is.
         """
         return self._mode.motion_since(frame_index)

@@ -70,7 +70,7 @@ class FilterSettings(Section, frozen=True):
 
 
 class StartSettings(Section, frozen=True):
-    """How the filter finds gravity and biases."""
+    """Static and dynamic initialization: gravity and biases."""
 
     steady_window_s: float = 0.8  # rest that gives gravity and gyro biases at once
     steady_gyro_sigma_radps: float = 0.015  # largest spread at rest
@@ -83,7 +83,7 @@ class StartSettings(Section, frozen=True):
 
 
 class MonocularSettings(Section, frozen=True):
-    """How one camera alone finds its way, and when the IMU may say how long that way is."""
+    """Visual odometry of one camera, and the initialization of its scale by the IMU."""
 
     first_depth: float = 5.0  # the unit of length: how far away half of what the first two views share is taken to be
     first_parallax_px: float = 18.0  # median image motion between the first two views
@@ -105,7 +105,7 @@ class MonocularSettings(Section, frozen=True):
 
 
 class OdometrySettings(Section, frozen=True):
-    """All of it."""
+    """All settings of the odometry."""
 
     tracker: TrackerSettings = TrackerSettings()
     filter: FilterSettings = FilterSettings()

@@ -1,4 +1,4 @@
-"""Inner loop of the search for a camera among wrong matches: three of them propose where it is, all of them vote."""
+"""Inner loops of RANSAC with a three-point pose solver (P3P)."""
 
 import math
 
@@ -156,9 +156,15 @@ def votes(
 
 @kernel
 def search(
-    points: Array, pixels: Array, camera: Array, threshold_px: float, draws: Array, confidence: float, rotation: Array,
+    points: Array,
+    pixels: Array,
+    camera: Array,
+    threshold_px: float,
+    draws: Array,
+    confidence: float,
+    rotation: Array,
     translation: Array,
-) -> int:  # fmt: skip
+) -> int:
     """Votes of the best cam_from_source, which goes into rotation (3, 3) and translation (3,); 0 where none was found.
 
     points (N, 3) source, pixels (N, 2), N >= 3. draws (I, 3) in [0, 1): which three propose; fewer are tried once the best camera

@@ -1,4 +1,4 @@
-"""Inner loop of the camera resection: one camera's place from points that are known."""
+"""Inner loops of PnP: least squares, and the search for a translation with a known rotation."""
 
 import numpy as np
 
@@ -9,15 +9,23 @@ from fleetmap.numerics.linear_kernels import cholesky_in_place, exp_so3, solve_s
 
 @kernel
 def linearize(
-    rotation: Array, translation: Array, points: Array, pixels: Array, weights: Array, camera: Array, width: float,
-    hessian: Array, gradient: Array, squared: Array,
-) -> float:  # fmt: skip
+    rotation: Array,
+    translation: Array,
+    points: Array,
+    pixels: Array,
+    weights: Array,
+    camera: Array,
+    width: float,
+    hessian: Array,
+    gradient: Array,
+    squared: Array,
+) -> float:
     """Robust cost, normal equations (6, 6), (6,) and squared normalised residuals (N,) of a camera.
 
     cam_from_source = (rotation, translation).     points (N, 3) in the source frame; pixels (N, 3) u_left v u_right
     (NaN none); weights (N, 2) 1/sigma of u and v, of the disparity. camera: focal, cx, cy, focal * baseline. The step
     is rotation first, applied from the left in camera axes. Robust by the redescending weight of Geman and McClure,
-    `width` in sigmas: gross outliers must not pull at all.
+    `width` in sigmas: gross outliers have no weight.
     """
     cost = 0.0
     hessian[:, :] = 0.0
@@ -76,9 +84,18 @@ def linearize(
 
 @kernel
 def refine(
-    rotation: Array, translation: Array, points: Array, pixels: Array, weights: Array, camera: Array, width: float,
-    prior: Array, iterations: int, hessian: Array, squared: Array,
-) -> bool:  # fmt: skip
+    rotation: Array,
+    translation: Array,
+    points: Array,
+    pixels: Array,
+    weights: Array,
+    camera: Array,
+    width: float,
+    prior: Array,
+    iterations: int,
+    hessian: Array,
+    squared: Array,
+) -> bool:
     """Levenberg-Marquardt from a start, in place; leaves the last Hessian and squared residuals.
 
     False where it is singular.
@@ -146,7 +163,7 @@ def search_translation(
 ) -> int:
     """Best translation (3,) for a known rotation, and its inlier count.
 
-    Each correspondence with depth in both views proposes one.     points (N, 3) source, seen_points (N, 3) the same in
+    Each correspondence with depth in both views proposes one. points (N, 3) source, seen_points (N, 3) the same in
     the camera by its own stereo (NaN none), pixels (N, 2) in the camera.
     """
     count, best_score = len(points), 0

@@ -1,4 +1,4 @@
-"""What is known of a robot's sensors: lenses, mounting, noise. Values only; reading files is the recordings' job."""
+"""Calibration of a robot's sensors: lenses, mounting, noise. Values only; reading files is the recordings' job."""
 
 from dataclasses import dataclass, field, replace
 

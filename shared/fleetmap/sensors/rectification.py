@@ -1,4 +1,4 @@
-"""From a rig with lenses to the one camera that all geometry uses: a rectified pinhole pair.
+"""Rectification of a rig with lenses to the camera that all geometry uses: a rectified pinhole pair.
 
 After rectification a point at (x, y, z) in `cam0` (rectified axes) is seen at u = f x/z + cx, v = f y/z + cy on the
 left and at u - f b/z on the right, same row. An RGB-D frame becomes the same thing with a baseline chosen here, a

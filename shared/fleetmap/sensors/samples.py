@@ -1,4 +1,4 @@
-"""What sensors deliver, as values. Stamps are `stamp_ns` on the sensor clock."""
+"""Samples of sensors, as values. Stamps are `stamp_ns` on the sensor clock."""
 
 from bisect import bisect_left
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What an IMU's samples say of themselves: single absurd ones, and gaps."""
+"""Faults of an IMU that its samples show: spikes and gaps."""
 
 from collections.abc import Sequence
 
@@ -22,9 +22,9 @@ def joined(parts: Sequence[ImuSamples]) -> ImuSamples:
 
 
 def without_spikes(known: ImuSamples, new: ImuSamples) -> ImuSamples:
-    """Known samples and the new ones after them, less those of the new that stand far off both neighbours.
+    """Known samples and the new ones after them, without spikes: new samples far from both neighbours.
 
-    The last sample has one neighbour alone to be judged by; the first one of all has none and stays.
+    The last sample is judged by one neighbour alone; the very first one has none and stays.
     """
     if not len(new):
         return known

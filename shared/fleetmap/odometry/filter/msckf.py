@@ -243,8 +243,8 @@ class InvariantFilter:
     def inflate(self, clone_id: int, seen_odom_from_body: Array, gap_s: float) -> bool:
         """Inflates position and velocity where vision contradicts the prediction since `clone_id` beyond its covariance.
 
-        After seconds without pictures an IMU's error can exceed its noise figures; a filter that then rejects every
-        picture never recovers. True where it inflated. To be called before the clone of this moment is added.
+        After seconds without images an IMU's error can exceed its noise figures; a filter that then rejects every
+        image never recovers. True where it inflated. To be called before the clone of this moment is added.
         """
         at = _CLONES + 6 * self.clone_ids.index(clone_id)
         pick = np.zeros((3, len(self.covariance)))

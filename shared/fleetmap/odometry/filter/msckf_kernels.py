@@ -156,7 +156,7 @@ def linearize_track(
 
 @kernel
 def add_error_sources(pixels: Array, disparities: Array, weights: Array, columns: Array) -> None:
-    """Fills in how errors that outlive one picture enter the rows of `linearize_track`.
+    """Fills in how errors that outlive one image enter the rows of `linearize_track`.
 
     pixels (n, 3) u_left v u_right (NaN none), disparities (n,) predicted. weights (2,): 1/sigma of pixels, of
     disparities. columns (3 n, 5) by the rig's disparity offset and depth scale, then by what one track keeps for

@@ -1,4 +1,4 @@
-"""Inner loops of the search for a steady IMU: a robot that is switched on looks through seconds of it at its first frame."""
+"""Inner loops of the search for a steady IMU in the last seconds of samples."""
 
 import math
 

@@ -41,9 +41,17 @@ def project(
 
 @kernel
 def window_cost(
-    rotations: Array, positions: Array, points: Array, starts: NDArray[np.int64], views: NDArray[np.int64], pixels: Array,
-    camera: Array, sigma_px: float, width: float, squared: Array,
-) -> float:  # fmt: skip
+    rotations: Array,
+    positions: Array,
+    points: Array,
+    starts: NDArray[np.int64],
+    views: NDArray[np.int64],
+    pixels: Array,
+    camera: Array,
+    sigma_px: float,
+    width: float,
+    squared: Array,
+) -> float:
     """Half the robust (Huber, `width` sigmas) sum of squares; squared (M,) sigmas of each observation, huge behind a camera."""
     seen, by_view, by_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
     cost = 0.0
@@ -60,9 +68,19 @@ def window_cost(
 
 @kernel
 def adjust_window(
-    rotations: Array, positions: Array, held: NDArray[np.bool_], points: Array, starts: NDArray[np.int64],
-    views: NDArray[np.int64], pixels: Array, camera: Array, sigma_px: float, width: float, iterations: int, squared: Array,
-) -> float:  # fmt: skip
+    rotations: Array,
+    positions: Array,
+    held: NDArray[np.bool_],
+    points: Array,
+    starts: NDArray[np.int64],
+    views: NDArray[np.int64],
+    pixels: Array,
+    camera: Array,
+    sigma_px: float,
+    width: float,
+    iterations: int,
+    squared: Array,
+) -> float:
     """Moves views and points (in place) to the nearest optimum by Levenberg-Marquardt; returns the cost of `window_cost`.
 
     rotations (V, 3, 3) map_from_cam, positions (V, 3), held (V,); starts (N + 1,) delimits each point's rows of views (M,) and
@@ -138,9 +156,16 @@ def adjust_window(
 
 @kernel
 def _solve(
-    hessian: Array, gradient: Array, point_hessian: Array, point_gradient: Array, cross: Array, starts: NDArray[np.int64],
-    views: NDArray[np.int64], slots: NDArray[np.int64], damping: float,
-) -> tuple[Array, Array, bool]:  # fmt: skip
+    hessian: Array,
+    gradient: Array,
+    point_hessian: Array,
+    point_gradient: Array,
+    cross: Array,
+    starts: NDArray[np.int64],
+    views: NDArray[np.int64],
+    slots: NDArray[np.int64],
+    damping: float,
+) -> tuple[Array, Array, bool]:
     """The damped step of views (6 F,) and points (N, 3), points eliminated first."""
     size, count = len(gradient), len(point_gradient)
     reduced, right = hessian.copy(), gradient.copy()

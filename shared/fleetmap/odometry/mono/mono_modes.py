@@ -15,7 +15,7 @@ from fleetmap.odometry.init.initial_state import InitialState
 from fleetmap.odometry.init.mono_inertial_init import mono_inertial_initialization
 from fleetmap.odometry.init.static_initialization import static_initialization
 from fleetmap.odometry.modes import ImuInputs, InertialMode, Mode, Step
-from fleetmap.odometry.mono.mono_vo import Sight, VisualOdometry
+from fleetmap.odometry.mono.mono_vo import VisualEstimate, VisualOdometry
 from fleetmap.odometry.tracking.tracker import Tracked
 from fleetmap.odometry.tracking.tracks import Observations, TrackBatch
 from fleetmap.sensors.rectification import StereoCamera
@@ -112,7 +112,7 @@ class MonocularMode(Mode):
         self._rig, self._imu = rig, imu
         self._stamp_ns = 0
         self._visual_odometry = VisualOdometry(rig.camera, rig.settings.monocular)
-        self._sight = Sight(None, np.zeros((6, 6)))
+        self._visual = VisualEstimate(None, np.zeros((6, 6)))
         self._unscaled: list[_UnscaledFrame] = []
         self._newest_pixels: tuple[Ids, Array] = (np.zeros(0, np.int64), np.zeros((0, 2)))
         self._still_since_ns: int | None = None
@@ -151,35 +151,35 @@ class MonocularMode(Mode):
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode; switches to the filter once the scale is known, and places earlier frames anew then."""
         self._detect_standstill(tracked)
-        sight = self._sight = self._visual_odometry.add(frame_index, tracked.ids, tracked.pixels[:, :2])
+        visual = self._visual = self._visual_odometry.add(frame_index, tracked.ids, tracked.pixels[:, :2])
         if self._imu is not None:
-            self._keep_unscaled(frame_index, sight)
-            found = self._metric_start(self._imu, sight)
+            self._keep_unscaled(frame_index, visual)
+            found = self._metric_start(self._imu, visual)
             if found is not None:
                 return self._go_metric(
                     frame_index, tracked, InertialMode(self._metric_window(*found), self._imu), found[1]
                 )
-        return Step(self, _NONE_USED, revised=tuple((number, self._body(there)) for number, there in sight.revised))
+        return Step(self, _NONE_USED, revised=tuple((number, self._body(there)) for number, there in visual.revised))
 
     def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
         """See Mode; velocity and biases are zero, for they are unknown."""
-        sight = self._sight
-        there = np.eye(4) if sight.vision_from_cam is None else sight.vision_from_cam
+        visual = self._visual
+        there = np.eye(4) if visual.vision_from_cam is None else visual.vision_from_cam
         turn = np.kron(np.eye(2), self._rig.body_from_cam[:3, :3])
         status = OdometryStatus.TRACKING
-        if sight.vision_from_cam is None:
-            status = OdometryStatus.DEGRADED if sight.lost else OdometryStatus.INITIALISING
+        if visual.vision_from_cam is None:
+            status = OdometryStatus.DEGRADED if visual.lost else OdometryStatus.INITIALISING
         return OdometryEstimate(
             stamp_ns=stamp_ns,
             frame_index=frame_index,
             odom_from_body=self._body(there),
-            cov_rot_trans=turn @ sight.cov_rot_trans @ turn.T + 1e-12 * np.eye(6),
+            cov_rot_trans=turn @ visual.cov_rot_trans @ turn.T + 1e-12 * np.eye(6),
             velocity_odom_mps=np.zeros(3),
             gyro_bias_radps=np.zeros(3),
             accel_bias_mps2=np.zeros(3),
             status=status,
             track_ids=tracked.ids,
-            scene_depth_m=sight.depth,
+            scene_depth_m=visual.depth,
             inlier_share=tracked.inlier_share,
             after_gap=tracked.by_descriptors,
             inertial=False,
@@ -191,16 +191,16 @@ class MonocularMode(Mode):
     def _body(self, vision_from_cam: Array) -> Array:
         return np.asarray(self._rig.body_from_cam @ vision_from_cam @ self._rig.cam_from_body)
 
-    def _keep_unscaled(self, frame_index: int, sight: Sight) -> None:
-        if sight.lost:
+    def _keep_unscaled(self, frame_index: int, visual: VisualEstimate) -> None:
+        if visual.lost:
             self._unscaled.clear()
-        revised = dict(sight.revised)
+        revised = dict(visual.revised)
         kept = [f._replace(vision_from_cam=revised.get(f.frame_index, f.vision_from_cam)) for f in self._unscaled]
-        kept.append(_UnscaledFrame(frame_index, self._stamp_ns, sight.vision_from_cam))
+        kept.append(_UnscaledFrame(frame_index, self._stamp_ns, visual.vision_from_cam))
         self._unscaled = kept[-_UNSCALED_FRAMES:]
 
     def _detect_standstill(self, tracked: Tracked) -> None:
-        """Keeps since when the picture stands still."""
+        """Keeps since when the image stands still."""
         before, old = self._newest_pixels
         _, a, b = np.intersect1d(before, tracked.ids, return_indices=True)
         moved_px = np.linalg.norm(old[a] - tracked.pixels[b, :2], axis=1)
@@ -212,8 +212,8 @@ class MonocularMode(Mode):
             self._still_since_ns = self._stamp_ns
         self._newest_pixels = (tracked.ids, tracked.pixels[:, :2].copy())
 
-    def _metric_start(self, imu: ImuInputs, sight: Sight) -> tuple[InitialState, float | None] | None:
-        """By rest, if picture and IMU agree on it, else by motion; with the metres in one unit of vision, which rest leaves open."""
+    def _metric_start(self, imu: ImuInputs, visual: VisualEstimate) -> tuple[InitialState, float | None] | None:
+        """By rest, if image and IMU agree on it, else by motion; with the metres in one unit of vision, which rest leaves open."""
         stamp_ns, settings = self._stamp_ns, self._rig.settings
         if self._still_since_ns is not None and (stamp_ns - self._still_since_ns) * 1e-9 > _STILL_S:
             resting = static_initialization(imu.samples.imu, stamp_ns, settings)
@@ -221,7 +221,7 @@ class MonocularMode(Mode):
                 covariance = resting.covariance
                 covariance[3:6, 3:6] = _STILL_SIGMA_MPS**2 * np.eye(3)
                 return replace(resting, covariance=covariance), None
-        if not self._visual_odometry.started or sight.vision_from_cam is None:
+        if not self._visual_odometry.started or visual.vision_from_cam is None:
             return None
         if stamp_ns - self._tried_ns < settings.monocular.sample_interval_s * 1e9:
             return None
@@ -252,13 +252,13 @@ class MonocularMode(Mode):
 
     def _metric_window(self, start: InitialState, metres_per_unit: float | None) -> MonocularWindow:
         window = MonocularWindow(self._rig, start.state, start.covariance, start.stamp_ns)
-        window.scene_depth_m = self._sight.depth * (1.0 if metres_per_unit is None else metres_per_unit)
+        window.scene_depth_m = self._visual.depth * (1.0 if metres_per_unit is None else metres_per_unit)
         return window
 
     def _go_metric(self, frame_index: int, tracked: Tracked, mode: InertialMode, metres_per_unit: float | None) -> Step:
         """Switches to the filter and revises earlier frames: in metres and in the frame that gravity levels.
 
-        After motion these are all since vision began, after rest those since the picture stands still.
+        After motion these are all since vision began, after rest those since the image stands still.
         """
         mode.predict(self._stamp_ns)
         mode.window.seed(frame_index, tracked)

@@ -1,4 +1,4 @@
-"""Where one camera is by its pictures alone: up to scale, from two views on, refined over a window of views."""
+"""Visual odometry of one camera, up to scale: initialized from two views, refined over a window of views."""
 
 from dataclasses import dataclass, field
 
@@ -32,7 +32,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class VisualEstimate:
     """What one frame gave: vision_from_cam, None before the first pair of views and where tracking was lost.
 
     cov_rot_trans (6, 6) in vision axes. revised: earlier frames that are placed only now, (frame index, vision_from_cam).
@@ -47,12 +47,12 @@ class Sight:
 
 
 @dataclass
-class _World:
+class _LocalMap:
     """The window's views and the points that they made, by track id; vision_from_cam and pixel of tracks still without one."""
 
     views: list[View] = field(default_factory=list)
     points: dict[int, Array] = field(default_factory=dict)
-    births: dict[int, tuple[Array, Array]] = field(default_factory=dict)
+    first_seen: dict[int, tuple[Array, Array]] = field(default_factory=dict)
 
 
 class VisualOdometry:
@@ -61,7 +61,7 @@ class VisualOdometry:
     def __init__(self, camera: StereoCamera, settings: MonocularSettings) -> None:
         self._camera, self._settings = camera, settings
         self._lens = camera.lens
-        self._world = _World()
+        self._local_map = _LocalMap()
         self._waiting: list[tuple[int, Ids, Array]] = []
         self._last = np.eye(4)  # vision_from_cam of the frame before
         self._step = np.eye(4)  # previous camera from this one
@@ -71,34 +71,34 @@ class VisualOdometry:
     @property
     def started(self) -> bool:
         """Whether there are points to be located by."""
-        return bool(self._world.views)
+        return bool(self._local_map.views)
 
     def points_in_camera(self, ids: Ids) -> Array:
         """(N, 3) points of these tracks as the last frame's camera sees them, NaN where unknown."""
-        known = np.array([self._world.points.get(i, _NOWHERE) for i in ids.tolist()]).reshape(-1, 3)
+        known = np.array([self._local_map.points.get(i, _NOWHERE) for i in ids.tolist()]).reshape(-1, 3)
         return transform_points(se3_inverse(self._last), known)
 
     def motion_guess(self) -> Array:
         """cam_from_previous (4, 4), as if the last step went on."""
         return se3_inverse(self._step)
 
-    def add(self, frame_index: int, ids: Ids, pixels: Array) -> Sight:
-        """The sight of one frame: ids (N,) and pixels (N, 2) of what it tracks."""
+    def add(self, frame_index: int, ids: Ids, pixels: Array) -> VisualEstimate:
+        """The estimate at one frame: ids (N,) and pixels (N, 2) of what it tracks."""
         if not self.started:
             return self._first_views(frame_index, ids, pixels)
         located = self._locate(ids, pixels, self._last @ self._step)
         if located is None:
-            self._world, self._waiting = _World(), [(frame_index, ids, pixels)]
+            self._local_map, self._waiting = _LocalMap(), [(frame_index, ids, pixels)]
             self._step = np.eye(4)
-            return Sight(None, self._covariance, lost=True, depth=self.depth)
+            return VisualEstimate(None, self._covariance, lost=True, depth=self.depth)
         view = View(frame_index, located[0], ids, pixels)
         self._place_new(view)
         if self._is_new(view):
-            self._world.views.append(view)
+            self._local_map.views.append(view)
             self._grow()
-            view = self._world.views[-1]
+            view = self._local_map.views[-1]
         self._advance(view.vision_from_cam, located[1])
-        return Sight(view.vision_from_cam, self._covariance.copy(), depth=self.depth)
+        return VisualEstimate(view.vision_from_cam, self._covariance.copy(), depth=self.depth)
 
     def _advance(self, vision_from_cam: Array, cov: Array) -> None:
         self._step = se3_inverse(self._last) @ vision_from_cam
@@ -113,17 +113,17 @@ class VisualOdometry:
             self.depth = float(np.median(depths))
 
     def _seen_points(self, vision_from_cam: Array) -> Array:
-        newest = self._world.views[-1]
-        known = [self._world.points[i] for i in newest.ids.tolist() if i in self._world.points]
+        newest = self._local_map.views[-1]
+        known = [self._local_map.points[i] for i in newest.ids.tolist() if i in self._local_map.points]
         points = transform_points(se3_inverse(vision_from_cam), np.array(known).reshape(-1, 3))
         return points[points[:, 2] > 0]
 
     # --- the first pair ---
 
-    def _first_views(self, frame_index: int, ids: Ids, pixels: Array) -> Sight:
+    def _first_views(self, frame_index: int, ids: Ids, pixels: Array) -> VisualEstimate:
         s = self._settings
         self._waiting.append((frame_index, ids, pixels))
-        nothing = Sight(None, self._covariance, depth=self.depth)
+        nothing = VisualEstimate(None, self._covariance, depth=self.depth)
         while len(self._waiting) > 1:
             first = self._waiting[0]
             _, a, b = np.intersect1d(first[1], ids, return_indices=True)
@@ -135,7 +135,7 @@ class VisualOdometry:
             return self._begin(first[1][a], first[2][a], pixels[b]) or nothing
         return nothing
 
-    def _begin(self, ids: Ids, before: Array, now: Array) -> Sight | None:
+    def _begin(self, ids: Ids, before: Array, now: Array) -> VisualEstimate | None:
         s = self._settings
         found = two_view_motion(self._camera, before, now, threshold_px=1.0, seed=len(ids))
         if (
@@ -149,7 +149,7 @@ class VisualOdometry:
         vision_from_first = self._last
         now_from_first = se3(found.b_from_a[:3, :3], unit * found.b_from_a[:3, 3])
         points = transform_points(vision_from_first, unit * found.points_a[found.inliers])
-        self._world = _World(
+        self._local_map = _LocalMap(
             [
                 View(first[0], vision_from_first, first[1], first[2]),
                 View(last[0], vision_from_first @ se3_inverse(now_from_first), last[1], last[2]),
@@ -158,16 +158,19 @@ class VisualOdometry:
         )
         self._adjust(held=1)
         placed = self._place_between()
-        if placed is None or len(self._world.points) < s.first_min_points // 2:
-            self._world = _World()
+        if placed is None or len(self._local_map.points) < s.first_min_points // 2:
+            self._local_map = _LocalMap()
             return None
         self._normalise(vision_from_first, placed)
         self._waiting = []
-        located = self._locate(last[1], last[2], self._world.views[-1].vision_from_cam)
+        located = self._locate(last[1], last[2], self._local_map.views[-1].vision_from_cam)
         self._last = placed[-2][1] if len(placed) > 1 else vision_from_first
-        self._advance(self._world.views[-1].vision_from_cam, np.eye(6) * 1e-6 if located is None else located[1])
-        return Sight(
-            self._world.views[-1].vision_from_cam, self._covariance.copy(), revised=tuple(placed[:-1]), depth=self.depth
+        self._advance(self._local_map.views[-1].vision_from_cam, np.eye(6) * 1e-6 if located is None else located[1])
+        return VisualEstimate(
+            self._local_map.views[-1].vision_from_cam,
+            self._covariance.copy(),
+            revised=tuple(placed[:-1]),
+            depth=self.depth,
         )
 
     def _place_between(self) -> list[tuple[int, Array]] | None:
@@ -179,16 +182,16 @@ class VisualOdometry:
         if between is None:
             return None
         stride = max(1, -(-len(between) // (self._settings.window_views - 3)))
-        self._world.views[1:1] = between[stride // 2 :: stride]
+        self._local_map.views[1:1] = between[stride // 2 :: stride]
         self._adjust(held=1)
-        first, last = self._world.views[0], self._world.views[-1]
+        first, last = self._local_map.views[0], self._local_map.views[-1]
         between = self._located_between()
         if between is None:
             return None
         return [(v.frame_index, v.vision_from_cam) for v in (first, *between, last)]
 
     def _located_between(self) -> list[View] | None:
-        guess = self._world.views[0].vision_from_cam
+        guess = self._local_map.views[0].vision_from_cam
         found = []
         for frame_index, ids, pixels in self._waiting[1:-1]:
             located = self._locate(ids, pixels, guess)
@@ -200,7 +203,7 @@ class VisualOdometry:
 
     def _normalise(self, vision_from_first: Array, placed: list[tuple[int, Array]]) -> None:
         """Scales the new world so that half of its points lie nearer than the depth that is the unit."""
-        points = transform_points(se3_inverse(vision_from_first), np.array(list(self._world.points.values())))
+        points = transform_points(se3_inverse(vision_from_first), np.array(list(self._local_map.points.values())))
         unit = self.depth / float(np.median(points[:, 2]))
 
         def scaled(vision_from_cam: Array) -> Array:
@@ -209,8 +212,10 @@ class VisualOdometry:
             return out
 
         origin = vision_from_first[:3, 3]
-        self._world.points = {i: origin + unit * (p - origin) for i, p in self._world.points.items()}
-        self._world.views = [View(v.frame_index, scaled(v.vision_from_cam), v.ids, v.pixels) for v in self._world.views]
+        self._local_map.points = {i: origin + unit * (p - origin) for i, p in self._local_map.points.items()}
+        self._local_map.views = [
+            View(v.frame_index, scaled(v.vision_from_cam), v.ids, v.pixels) for v in self._local_map.views
+        ]
         placed[:] = [(number, scaled(there)) for number, there in placed]
 
     # --- one frame, and the window ---
@@ -218,10 +223,10 @@ class VisualOdometry:
     def _locate(self, ids: Ids, pixels: Array, guess: Array) -> tuple[Array, Array] | None:
         """vision_from_cam and covariance (6, 6, camera axes) by points that are known; None where too few agree."""
         s = self._settings
-        rows = [n for n, i in enumerate(ids.tolist()) if i in self._world.points]
+        rows = [n for n, i in enumerate(ids.tolist()) if i in self._local_map.points]
         if len(rows) < s.min_points:
             return None
-        points = np.array([self._world.points[i] for i in ids[rows].tolist()])
+        points = np.array([self._local_map.points[i] for i in ids[rows].tolist()])
         measured = np.column_stack([pixels[rows], np.full(len(rows), np.nan)])
         sigmas = np.full((len(rows), 2), s.sigma_px)
         matches = Correspondences(self._camera, points, measured, sigmas)
@@ -232,40 +237,40 @@ class VisualOdometry:
         return None if found is None else (_orthonormal(se3_inverse(found.cam_from_source)), found.cov_rot_trans)
 
     def _is_new(self, view: View) -> bool:
-        s, last = self._settings, self._world.views[-1]
+        s, last = self._settings, self._local_map.views[-1]
         shared, a, b = np.intersect1d(last.ids, view.ids, return_indices=True)
         if len(shared) < s.view_overlap * len(last.ids):
             return True
-        known = sum(i in self._world.points for i in view.ids.tolist())
+        known = sum(i in self._local_map.points for i in view.ids.tolist())
         wanted_px = s.view_parallax_px * (0.4 if known < 0.5 * len(view.ids) else 1.0)
         return bool(np.median(np.linalg.norm(last.pixels[a] - view.pixels[b], axis=1)) > wanted_px)
 
     def _grow(self) -> None:
         """The window adjusted, and what left it forgotten."""
         self._adjust(held=2)
-        self._world.views = self._world.views[-self._settings.window_views :]
-        seen = {i for v in self._world.views for i in v.ids.tolist()}
-        self._world.points = {i: p for i, p in self._world.points.items() if i in seen}
+        self._local_map.views = self._local_map.views[-self._settings.window_views :]
+        seen = {i for v in self._local_map.views for i in v.ids.tolist()}
+        self._local_map.points = {i: p for i, p in self._local_map.points.items() if i in seen}
 
     def _place_new(self, view: View) -> None:
         """Gives a point to every track that by now is seen at an angle large enough since it was first seen."""
-        points, births = self._world.points, self._world.births
+        points, first_seen = self._local_map.points, self._local_map.first_seen
         wanted = np.array([i not in points for i in view.ids.tolist()], bool)
         for track_id, pixel in zip(view.ids[wanted].tolist(), view.pixels[wanted], strict=True):
-            births.setdefault(track_id, (view.vision_from_cam, pixel))
+            first_seen.setdefault(track_id, (view.vision_from_cam, pixel))
         alive = set(view.ids.tolist())
-        for gone in [i for i in births if i not in alive]:
-            del births[gone]
+        for gone in [i for i in first_seen if i not in alive]:
+            del first_seen[gone]
         if not wanted.any():
             return
         ids, now = view.ids[wanted], view.pixels[wanted]
-        first = np.array([births[i][0] for i in ids.tolist()])
-        before = np.array([births[i][1] for i in ids.tolist()])
+        first = np.array([first_seen[i][0] for i in ids.tolist()])
+        before = np.array([first_seen[i][1] for i in ids.tolist()])
         found = self._between(first, before, view.vision_from_cam, now)
         for track_id, point in zip(ids.tolist(), found, strict=True):
             if np.isfinite(point[0]):
                 points[track_id] = point
-                del births[track_id]
+                del first_seen[track_id]
 
     def _between(self, first: Array, before: Array, last: Array, now: Array) -> Array:
         """(N, 3) points midway between rays of cameras first (N, 4, 4) and last (4, 4); NaN where angle or pixels forbid."""
@@ -291,7 +296,7 @@ class VisualOdometry:
 
     def _adjust(self, held: int) -> None:
         """Bundle adjustment of the window; its `held` oldest views stay, points that do not fit go."""
-        views, points = self._world.views, self._world.points
+        views, points = self._local_map.views, self._local_map.points
         rows = [{i: n for n, i in enumerate(v.ids.tolist())} for v in views]
         numbers: list[int] = []
         starts, obs_views = [0], list[int]()
@@ -310,10 +315,9 @@ class VisualOdometry:
         positions = np.array([v.vision_from_cam[:3, 3] for v in views])
         values = np.array([points[i] for i in numbers])
         squared, bounds = np.empty(len(obs_views)), np.array(starts, np.int64)
-        adjust_window(
-            rotations, positions, np.arange(len(views)) < held, values, bounds, np.array(obs_views, np.int64), np.array(pixels),
-            self._lens[:3].copy(), self._settings.sigma_px, _HUBER_SIGMAS, _ITERATIONS, squared,
-        )  # fmt: skip
+        fixed, observed = np.arange(len(views)) < held, (bounds, np.array(obs_views, np.int64), np.array(pixels))
+        lens, limits = self._lens[:3].copy(), (self._settings.sigma_px, _HUBER_SIGMAS, _ITERATIONS)
+        adjust_window(rotations, positions, fixed, values, *observed, lens, *limits, squared)
         worst = np.maximum.reduceat(squared, bounds[:-1])
         limit = (self._settings.max_error_px / self._settings.sigma_px) ** 2
         for track_id, value, off in zip(numbers, values, worst.tolist(), strict=True):
@@ -321,7 +325,7 @@ class VisualOdometry:
                 points[track_id] = value
             else:
                 del points[track_id]
-        self._world.views = [
+        self._local_map.views = [
             View(v.frame_index, _orthonormal(se3(rotations[k], positions[k])), v.ids, v.pixels)
             for k, v in enumerate(views)
         ]

@@ -1,4 +1,4 @@
-"""The motion of one camera between two pictures, its length unknown, and the points that both see."""
+"""Relative motion of two views of one camera up to scale, and the points that both see."""
 
 from dataclasses import dataclass
 

@@ -158,8 +158,8 @@ class Tracker:
     def _flow(self, frame: RectifiedFrame, predicted: Array, sure: bool) -> tuple[Array, NDArray[np.bool_]]:
         """Pyramidal Lucas-Kanade with back-check: pixels (N, 2) and which ones hold.
 
-        From a prediction one level above the picture is enough. Coarser ones cost as much again, and where near and far things
-        meet they lead away from a good start. Where too little holds that way, the prediction was none: again from all levels.
+        From a prediction one level above the image is enough: coarser levels cost as much again and mix near and far points.
+        Where too few points hold, the prediction was wrong, and all levels are used.
         """
         levels = self._settings.pyramid_levels
         new, kept = self._flow_from(frame, predicted, min(levels, _LEVELS_WHEN_SURE) if sure else levels)

@@ -1,4 +1,4 @@
-"""Inner loops of the tracker: where points should appear, and which of those that were followed agree with one motion."""
+"""Inner loops of the tracker: prediction of points, and their agreement with one motion."""
 
 import math
 
@@ -43,9 +43,15 @@ def predict(points_cam: Array, pixels: Array, cam_from_previous: Array, camera: 
 
 @kernel
 def carry(
-    points_cam: Array, pixels: Array, flowed: Array, cam_from_previous: Array, camera: Array, limit_px: float,
-    kept: NDArray[np.bool_], carried: Array,
-) -> None:  # fmt: skip
+    points_cam: Array,
+    pixels: Array,
+    flowed: Array,
+    cam_from_previous: Array,
+    camera: Array,
+    limit_px: float,
+    kept: NDArray[np.bool_],
+    carried: Array,
+) -> None:
     """Ends in `kept` (N,) what flowed (N, 2) further than the limit from where the motion takes it; fills carried (N, 3).
 
     That is flowed, and the right image's u by the depth that the motion leaves, NaN where unknown. Other arguments as of

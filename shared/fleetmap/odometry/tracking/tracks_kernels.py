@@ -1,4 +1,4 @@
-"""Inner loop of the observations' table: which tracks are to be used now, and where their points are looked for first."""
+"""Inner loop of the table of observations: selection of tracks to use, and the start of their triangulation."""
 
 import math
 
@@ -13,9 +13,21 @@ Ids = NDArray[np.int64]
 
 @kernel
 def take(
-    ids: Ids, frames: Ids, pixels: Array, order: Ids, alive: Ids, due: NDArray[np.bool_], held: Ids, camera: Array,
-    far_px: float, stays: NDArray[np.bool_], rows: Ids, starts: Ids, anchors: Ids, points_cam: Array,
-) -> int:  # fmt: skip
+    ids: Ids,
+    frames: Ids,
+    pixels: Array,
+    order: Ids,
+    alive: Ids,
+    due: NDArray[np.bool_],
+    held: Ids,
+    camera: Array,
+    far_px: float,
+    stays: NDArray[np.bool_],
+    rows: Ids,
+    starts: Ids,
+    anchors: Ids,
+    points_cam: Array,
+) -> int:
     """Number T of tracks with two observations or more in the clones `held` that are due, or ended: not among `alive`.
 
     ids (M,), frames (M,), pixels (M, 3) u_left v u_right; order (M,): rows by id, earlier ones first; alive (A,) ascending,
