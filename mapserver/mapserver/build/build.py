@@ -24,14 +24,23 @@ from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver.build.draft_evidence import Before, JudgedSession, examine_draft, replayed_probes
 from mapserver.build.image_spill import ImageSpill
 from mapserver.build.job_record import Job, recorded_job
-from mapserver.build.loop_overlay import loop_places
 from mapserver.build.progress import ProgressView, StageTimes
-from mapserver.build.report import Accuracy, BuildCost, BuildReport, accuracy, make_report, report_details, sentence
+from mapserver.build.report import (
+    Accuracy,
+    BuildCost,
+    BuildReport,
+    accuracy,
+    loop_places,
+    make_report,
+    report_details,
+    sentence,
+)
 from mapserver.build.survey_recordings import (
     Admission,
     RecordingOptions,
     Surveyed,
     admit_recordings,
+    joined_truth,
     survey_all,
     survey_recording,
 )
@@ -44,7 +53,7 @@ from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.loops.zones import Zones, zones_of
 from mapserver.survey.merge.initial_history import history_of
-from mapserver.survey.merge.multi_session import Joined, Session, chained, join_sessions
+from mapserver.survey.merge.multi_session import Joined, Session, join_sessions
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 from mapserver.survey.survey_map import SurveyMap
@@ -59,7 +68,8 @@ _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fle
 class BuildOptions:
     """Choices of a build. Files that are not named are not written.
 
-    frames: an A:B:C slice of each recording. use: only the sensors of a poorer set. replay: earlier recordings of the current
+    frames: an A:B:C slice of each recording. use: only the sensors of a poorer set. trajectory_source, initial_trajectory:
+    an entry of TRAJECTORY_SOURCES and its file. replay: earlier recordings of the current
     version, of which frames are looked for in the draft. threads, scheduler: see worker.py. settings: those of the survey; for None
     the preset of the first recording's sensors with the [survey] section of the file `config` over it. job: the
     number of the job that builds, for its draft.
@@ -74,6 +84,8 @@ class BuildOptions:
     picture: Path | None = None
     frame_from_ground_truth: bool = False
     use: SensorSet | None = None
+    trajectory_source: str = "odometry"
+    initial_trajectory: Path | None = None
     replay: tuple[Path, ...] = ()
     actor: Actor = NOBODY
     threads: int | None = None
@@ -85,7 +97,8 @@ class BuildOptions:
     @property
     def reading(self) -> RecordingOptions:
         """How the recordings are read."""
-        return RecordingOptions(self.frames, self.calibration, self.use)
+        source = self.trajectory_source, self.initial_trajectory
+        return RecordingOptions(self.frames, self.calibration, self.use, *source)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,10 +122,6 @@ class _Run:
     console: Console
     times: StageTimes
     started_s: float
-
-    @property
-    def options(self) -> BuildOptions:
-        return self.request.options
 
 
 @dataclass(frozen=True)
@@ -171,8 +180,7 @@ def build_draft(
         chosen = choose_vocabulary(maps, request.site, options.vocabulary)
         built = _survey(run, admitted, None if parent is None else parent.survey, chosen)
         draft = _keep(run, built, parent, maps)
-        places = loop_places([s.entry.name for s in built.taken], [s.survey for s in built.taken], built.joined)
-        draft = replace(draft, report=draft.report | {"loop_places": places})
+        draft = replace(draft, report=draft.report | {"loop_places": loop_places(built.taken, built.joined)})
         job.message, job.report = draft.sentence, draft.report | {"version": draft.version}
         return draft, built
 
@@ -189,8 +197,7 @@ class _ZonesFile(Section, frozen=True):
 def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
     """The site's current version, to build on; None for a site without one."""
     site = request.site
-    current = maps.current(site) if site in {info.site for info in maps.sites()} else None
-    if current is None:
+    if site not in {info.site for info in maps.sites()} or (current := maps.current(site)) is None:
         return None
     if request.options.frame_from_ground_truth:
         raise UsageError(
@@ -207,7 +214,7 @@ def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
 
 def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, chosen: ChosenVocabulary) -> Built:
     """Surveys all recordings and joins them to the current map."""
-    options, settings = run.options, run.settings
+    options, settings = run.request.options, run.settings
     with (
         ProgressView(run.console) as view,
         ImageSpill(run.request.store) as images,
@@ -232,7 +239,7 @@ def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, 
     chosen = judged(chosen, surveyed[0].survey, settings)
     run.times.begin("storing")
     _say_left_out(run, surveyed, joined)
-    found = accuracy(joined.map, _truth(surveyed, joined))
+    found = accuracy(joined.map, joined_truth(surveyed, joined))
     if options.frame_from_ground_truth:
         if found.rigid is None:
             raise RecordingError(
@@ -254,13 +261,6 @@ def _say_left_out(run: _Run, surveyed: list[Surveyed], joined: Joined) -> None:
             f"nothing could be joined to the current version of site {run.request.site} ({reasons}); drive through places that are "
             "in the map, pass its docks, or survey the area as another --site"
         )
-
-
-def _truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
-    """The truth of the joined recordings on one clock, None where one of them has none."""
-    truths = [s.truth for s, o in zip(surveyed, joined.outcomes, strict=True) if o.joined]
-    known = [truth for truth in truths if truth is not None]
-    return chained(known, joined.trajectories) if len(known) == len(truths) else None
 
 
 def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Draft:
@@ -291,27 +291,28 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         report={key: value for key, value in msgspec.to_builtins(report).items() if key not in _NOT_FOR_ROBOTS},
     )
     content = DraftContent(
-        tiles=tiles, vocabulary=vocabulary, details=details, archive=archive, evidence=evidence, job=run.options.job
+        tiles=tiles,
+        vocabulary=vocabulary,
+        details=details,
+        archive=archive,
+        evidence=evidence,
+        job=run.request.options.job,
     )
-    version = maps.save_draft(site, content, actor=run.options.actor)
+    version = maps.save_draft(site, content, actor=run.request.options.actor)
     report = msgspec.structs.replace(report, map_bytes=maps.version(site, version).map_bytes)
     run.times.begin("writing")
     draft = Draft(
         version,
         sentence(site, version, None if parent is None else parent.manifest.version, report),
         msgspec.to_builtins(report),
-        {
-            s.entry.sha256: outcome.reason
-            for s, outcome in zip(built.surveyed, built.joined.outcomes, strict=True)
-            if not outcome.joined
-        },
+        {s.entry.sha256: o.reason for s, o in zip(built.surveyed, built.joined.outcomes, strict=True) if not o.joined},
     )
     _write_files(run, built, draft)
     return draft
 
 
 def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None) -> Evidence:
-    options, camera = run.options, built.joined.map.camera
+    options, camera = run.request.options, built.joined.map.camera
     replayed = []
     if before is not None:
         reading = options.frames, options.calibration, options.use
@@ -341,9 +342,10 @@ def _wanted_ids(parent: Before | None, survey_map: SurveyMap) -> NDArray[np.uint
 
 def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
     """What the map depends on besides the recordings; no paths, which mean nothing elsewhere."""
-    options = run.options
+    options = run.request.options
     kept = parent is not None and bool(parent.manifest.configuration.get("frame_from_ground_truth"))
-    return {
+    source = {} if options.trajectory_source == "odometry" else {"trajectory_source": options.trajectory_source}
+    return source | {
         "frames": options.frames,
         "own_vocabulary": options.vocabulary is not None,
         "frame_from_ground_truth": options.frame_from_ground_truth or kept,
@@ -376,7 +378,7 @@ def picture_png(site: str, draft: Draft, built: Built) -> bytes:
 
 
 def _write_files(run: _Run, built: Built, draft: Draft) -> None:
-    options, site = run.options, run.request.site
+    options, site = run.request.options, run.request.site
     if options.trajectory is not None:
         write_tum(options.trajectory, built.joined.map.trajectory)
     if options.picture is not None:

@@ -8,16 +8,19 @@ import msgspec
 import numpy as np
 
 from fleetmap.errors import RecordingError
+from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Trajectory
 from mapserver.evaluation.trajectory_error import AteResult, absolute_trajectory_error, paired
 from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import TileDirections
+from mapserver.survey.loops.loops import LoopRecord, LoopVerdict
 from mapserver.survey.merge.multi_session import Joined
 from mapserver.survey.survey_map import SurveyMap
 
 if TYPE_CHECKING:
     from mapserver.build.survey_recordings import Surveyed
 
+MAX_REFUSED = 300  # loops of a build, the most alike first: they are what could have made a wrong map
 MIN_MATCHED = 3  # stamps with a truth, below which no alignment is defined
 
 
@@ -207,3 +210,37 @@ def sentence(site: str, version: int, parent: int | None, report: BuildReport) -
         f"site {site}: draft {version}{built_on} of {report.keyframes} keyframes and {report.landmarks} landmarks over "
         f"{report.path_m:.1f} m, {sizes}{left_out}{warned}; make it current with `mapserver publish --site {site}`"
     )
+
+
+def loop_places(taken: "Sequence[Surveyed]", joined: Joined) -> list[dict[str, Any]]:
+    """Loops of the recordings that are in the map, accepted ones and the refused ones that looked most alike.
+
+    Of each the recording, both ends (x, y) in `map`, verdict, reason and score.
+    """
+    ends = np.cumsum([len(trajectory) for trajectory in joined.trajectories])
+    parts = np.split(joined.map.trajectory.frame_from_body, ends[:-1])
+    accepted: list[dict[str, Any]] = []
+    refused: list[dict[str, Any]] = []
+    for recording, map_from_body in zip(taken, parts, strict=True):
+        survey = recording.survey
+        frames = [keyframe.frame_index for keyframe in survey.odometry.keyframes]
+        # Records keep the numbers of keyframes from before components were left out: then their places are unknown.
+        for record in survey.loops.records if all(c.kept for c in survey.components) else ():
+            place = _place(recording.entry.name, record, map_from_body[:, :2, 3], frames)
+            (accepted if record.verdict is LoopVerdict.ACCEPTED else refused).append(place)
+    refused.sort(key=lambda place: (-place["score"], place["recording"], place["from_map_m"], place["to_map_m"]))
+    return accepted + refused[:MAX_REFUSED]
+
+
+def _place(name: str, record: LoopRecord, places_map: Array, frames: list[int]) -> dict[str, Any]:
+    start_m, end_m = (
+        [round(float(value), 3) for value in places_map[frames[number]]] for number in (record.i, record.j)
+    )
+    return {
+        "recording": name,
+        "from_map_m": start_m,
+        "to_map_m": end_m,
+        "verdict": record.verdict.value,
+        "reason": record.reason,
+        "score": round(record.score, 4),
+    }

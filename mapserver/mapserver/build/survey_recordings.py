@@ -19,10 +19,12 @@ from mapserver.build.admission import checked, with_clock
 from mapserver.build.draft_evidence import HeldOut, held_out_of
 from mapserver.build.report import check_truth
 from mapserver.build.sensor_subset import reduced
+from mapserver.build.trajectory_sources import trajectory_source
 from mapserver.build.worker import read_ahead
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey_by_priors
 from mapserver.survey.finish.map_transform import scaled, scaled_state
+from mapserver.survey.merge.multi_session import Joined, chained
 from mapserver.survey.pipeline import Survey, survey
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
 
@@ -60,11 +62,20 @@ class Admission:
 
 @dataclass(frozen=True, slots=True)
 class RecordingOptions:
-    """How recordings are read: frames A:B:C, another calibration file, only the sensors of a poorer set."""
+    """How recordings are read: frames A:B:C, another calibration file, only the sensors of a poorer set,
+    and where their initial trajectory comes from, an entry of TRAJECTORY_SOURCES with its file.
+    """
 
     frames: str = "::"
     calibration: Path | None = None
     use: SensorSet | None = None
+    trajectory_source: str = "odometry"
+    initial_trajectory: Path | None = None
+
+    def given_trajectory(self, recording: Recording, indices: NDArray[np.int64]) -> Trajectory | None:
+        """Given poses of the selected frames, None where the odometry is to run."""
+        source = trajectory_source(self.trajectory_source)
+        return source(recording, recording.frame_stamps_ns[indices], self.initial_trajectory)
 
     @contextmanager
     def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
@@ -108,6 +119,7 @@ def _admission(
             console.print(f"issue: {issue.what}: {issue.detail}", markup=False)
         if needs_truth:
             check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
+        options.given_trajectory(recording, indices)
         result = checked(recording, executor=executor)
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
@@ -127,7 +139,10 @@ def survey_recording(
         recording = with_clock(opened, admission.correction_s)
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         frames = read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices)
-        inputs = SurveyInputs(frames, len(indices), recording.imu, recording.calibration, rectifier, recording.wheel)
+        given = reading.given_trajectory(recording, indices)
+        inputs = SurveyInputs(
+            frames, len(indices), recording.imu, recording.calibration, rectifier, recording.wheel, given
+        )
         done, map_from_survey = _aligned(survey(inputs, options, tools), recording)
         return Surveyed(
             entry=RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices)),
@@ -177,3 +192,10 @@ def survey_all(
     if not done:
         raise SurveyError(f"none of {len(paths)} recordings can be surveyed: {'; '.join((unusable or {}).values())}")
     return done
+
+
+def joined_truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
+    """The truth of the joined recordings on one clock, None where one of them has none."""
+    truths = [s.truth for s, outcome in zip(surveyed, joined.outcomes, strict=True) if outcome.joined]
+    known = [truth for truth in truths if truth is not None]
+    return chained(known, joined.trajectories) if len(known) == len(truths) else None

@@ -27,6 +27,12 @@ class BuildCommandOptions(SurveyOptions):
     frame_from_ground_truth: Annotated[
         bool, typer.Option("--frame-from-ground-truth", help="Align the finished map with the ground truth.")
     ] = False
+    trajectory_source: Annotated[
+        str, typer.Option(metavar="NAME", help="Source of the initial trajectory: `odometry`, or `tum` for a file.")
+    ] = "odometry"
+    initial_trajectory: Annotated[
+        Path | None, typer.Option(metavar="FILE.tum", help="Poses of another SLAM system to begin with.")
+    ] = None
     use: Annotated[str | None, typer.Option(metavar="SENSORS", help="Use only these sensors of the recording.")] = None
     replay: Annotated[
         list[Path] | None,

@@ -12,6 +12,7 @@ from mapserver.survey.bundle.odometry_factors import blackout_factors, chain_edg
 from mapserver.survey.bundle.stereo_yaw_check import NO_YAW, StereoYaw, estimate_stereo_yaw, without_stereo_yaw
 from mapserver.survey.finish.culling import Culled
 from mapserver.survey.finish.map_assembly import assemble
+from mapserver.survey.given_poses import poses_as_odometry
 from mapserver.survey.keyframes.connected_components import (
     Component,
     SigmaBetween,
@@ -61,7 +62,11 @@ class Survey:
 def survey(inputs: SurveyInputs, options: SurveyConfig, tools: SurveyTools | None = None) -> Survey:
     """Maps one recording. Raises SurveyError where it holds too little to map."""
     tools = tools or SurveyTools()
-    return survey_from(run_odometry(inputs, options.settings, tools), inputs, options, tools)
+    if inputs.initial_trajectory is None:
+        odometry = run_odometry(inputs, options.settings, tools)
+    else:
+        odometry = poses_as_odometry(inputs.initial_trajectory, inputs, options.settings, tools)
+    return survey_from(odometry, inputs, options, tools)
 
 
 def survey_from(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from fleetmap.bow import Vocabulary
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, WheelSample
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, Trajectory, WheelSample
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.keyframes.keyframes import ImageStore
 from mapserver.survey.loops.zones import Zones
@@ -21,7 +21,10 @@ def no_progress(stage: str, done: int, total: int) -> None:
 
 @dataclass(frozen=True)
 class SurveyInputs:
-    """One recording: frames in order, raw or rectified ahead of the survey, and how many; IMU, wheels, calibration."""
+    """One recording: frames in order, raw or rectified ahead of the survey, and how many; IMU, wheels, calibration.
+
+    initial_trajectory: frame_from_body of every frame by another system, in metres; None to run the odometry.
+    """
 
     frames: Iterable[CameraFrame | RectifiedFrame]
     frame_count: int
@@ -29,6 +32,7 @@ class SurveyInputs:
     calibration: RigCalibration
     rectifier: Rectifier
     wheel: Sequence[WheelSample] = ()
+    initial_trajectory: Trajectory | None = None
 
 
 @dataclass(frozen=True)
