@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleetmap.cli_exit import run
+from fleetmap.cli_exit import run_cli
 from fleetmap.errors import GateRefusedError
 
 
@@ -22,11 +22,11 @@ def test_errors_become_messages(
     error: BaseException, status: int, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as end:
-        run(lambda: failing(error))
+        run_cli(lambda: failing(error))
     assert end.value.code == status
     assert words in capsys.readouterr().err
 
 
 def test_a_module_of_our_own_that_is_missing_is_a_bug() -> None:
     with pytest.raises(ModuleNotFoundError):
-        run(lambda: failing(ModuleNotFoundError("No module named 'mapserver.gone'", name="mapserver.gone")))
+        run_cli(lambda: failing(ModuleNotFoundError("No module named 'mapserver.gone'", name="mapserver.gone")))
