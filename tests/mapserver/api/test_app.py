@@ -1,64 +1,27 @@
 """The HTTP API: answers, validators, ranges, problem documents."""
 
-import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
-import httpx
-import msgspec
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
-from prometheus_client.parser import text_string_to_metric_families
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.mapformat import TILE_FORMAT, blob_path, decode_manifest, decode_tile, sha256_hex
-from fleetmap.messages import FailureReport, RobotAck, RobotHealth, Thumbnail
-from mapserver import releases
+from fleetmap.messages import RobotAck, RobotHealth
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.api.version_routes import ApiSettings
 from mapserver.api.writers import Writers
-from mapserver.fleet.fleet import Fleet
-from mapserver.store import DraftContent, MapStore
+from mapserver.store import DraftContent
+from support.fleet.served_api import Server, check_problem, served_api
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
-
-
-@dataclass
-class Server:
-    client: TestClient
-    store: MapStore
-    fleet: Fleet
-    bus: MemoryBus
-    folder: Path
-
-    @property
-    def tile(self) -> str:
-        return self.store.manifest("lab", 1).tiles[0].sha256
 
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[Server]:
-    with MapStore.open(tmp_path, create=True) as store, MemoryBus(MemoryHub()) as bus:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
-        save_sample_draft(store, seed=2)
-        fleet = Fleet(store)
-        app = create_app(store, fleet, Metrics(store, fleet), bus)
-        with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
-            yield Server(client, store, fleet, bus, tmp_path)
-
-
-def check_problem(response: httpx.Response, status: int, words: str) -> None:
-    assert response.status_code == status
-    assert response.headers["content-type"] == "application/problem+json"
-    body = response.json()
-    assert body["status"] == status
-    assert body["type"] == "about:blank"
-    assert body["title"]
-    assert words in body["detail"]
-    assert body["instance"] == response.request.url.path
+    with served_api(tmp_path) as made:
+        yield made
 
 
 def test_lists(server: Server) -> None:
@@ -325,109 +288,3 @@ def test_the_document_has_examples(server: Server) -> None:
                 assert parameter["in"] != "path" or shown, f"{path}: {parameter['name']} has no example"
     for path in ("/v1/sites", "/v1/jobs", "/v1/sites/{site}/current"):
         assert "example" in paths[path]["get"]["responses"]["200"]["content"]["application/json"]
-
-
-def failure(number: int, **changes: object) -> FailureReport:
-    return msgspec.structs.replace(
-        FailureReport(
-            site="lab", robot="r1", id=f"f{number}", stamp_ns=5, wall_ns=time.time_ns(), duration_s=2.5, kind="blind",
-            status="LOST", cause="dark", version=1, tile=(0, 0),
-            thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"\xff\xd8picture"),),
-        ),
-        **changes,
-    )  # fmt: skip
-
-
-def test_failures_are_found_by_what_they_are(server: Server) -> None:
-    for number, changes in enumerate(
-        [{}, {"cause": "blur", "tile": (1, 0)}, {"kind": "suspected"}, {"version": None}], 1
-    ):
-        assert server.fleet.take_failure("lab", "r1", failure(number, **changes)).refused == ""
-    for query, wanted in (
-        ("", [4, 3, 2, 1]),
-        ("?site=lab&robot=r1&limit=2", [4, 3]),
-        ("?limit=2&cursor=3", [2, 1]),
-        ("?cause=blur", [2]),
-        ("?tile=1,0", [2]),
-        ("?version=1&kind=blind", [2, 1]),
-        ("?site=other", []),
-    ):
-        body = server.client.get(f"/v1/failures{query}").json()
-        assert [f["number"] for f in body["failures"]] == wanted, query
-    assert server.client.get("/v1/failures?limit=2").json()["next"] == "3"
-    one = server.client.get("/v1/failures/2").json()
-    assert (one["failure"]["cause"], one["report"]["id"], one["pictures"][0]["kind"]) == ("blur", "f2", "frame")
-    picture = server.client.get("/v1/failures/2/pictures/0")
-    assert (picture.content, picture.headers["content-type"]) == (b"\xff\xd8picture", "image/jpeg")
-    check_problem(server.client.get("/v1/failures/9"), 404, "no failure 9")
-    check_problem(server.client.get("/v1/failures/2/pictures/7"), 404, "no picture 7")
-
-
-def test_figures_by_what_they_are_counted_by(server: Server) -> None:
-    for number in range(3):
-        server.fleet.take_failure("lab", f"r{number}", failure(number, robot=f"r{number}"))
-    body = server.client.get("/v1/fleet/measures?by=robot&limit=2").json()
-    assert [(row["site"], row["key"], row["measures"]["failures"]["events"]) for row in body["measures"]] == [
-        ("lab", "r0", 1),
-        ("lab", "r1", 1),
-    ]
-    rest = server.client.get(f"/v1/fleet/measures?by=robot&cursor={body['next']}").json()
-    assert [row["key"] for row in rest["measures"]] == ["r2"] and rest["next"] is None
-    (hour,) = server.client.get("/v1/sites/lab/hours?by=tile&key=0,0").json()["hours"]
-    assert hour["measures"]["failures"]["events"] == 3
-    assert hour["measures"]["failures"]["per_robot_day"] is None  # nobody drove
-    check_problem(server.client.get("/v1/sites/none/hours"), 404, "no site none")
-    check_problem(server.client.get("/v1/fleet/measures?by=colour"), 422, "by")
-
-
-def test_a_canary_begins_and_ends_over_http(server: Server) -> None:
-    check_problem(server.client.get("/v1/sites/lab/canary"), 404, "never had a canary")
-    server.fleet.take_question("lab", "r1")
-    server.fleet.take_ack("lab", "r1", RobotAck(site="lab", robot="r1", stamp_ns=1, version=1))
-    begun = server.client.post("/v1/sites/lab/versions/2/canary", json={"actor": "ada", "reason": "new", "share": 0.5})
-    assert begun.status_code == 200
-    assert (begun.json()["canary"]["version"], begun.json()["canary"]["base_version"]) == (2, 1)
-    shown = server.client.get("/v1/sites/lab/canary").json()
-    assert shown["finding"]["action"] == "wait" and shown["robots"] == ["r1"]
-    (robot,) = server.client.get("/v1/robots").json()["robots"]
-    assert (robot["wanted_version"], robot["is_canary"], robot["version"]) == (2, True, 1)
-    check_problem(
-        server.client.post("/v1/sites/lab/versions/2/canary", json={"actor": "ada"}), 409, "tries version 2 already"
-    )
-    check_problem(
-        server.client.post("/v1/sites/lab/versions/2/canary", json={"actor": "ada", "share": 7}), 422, "share"
-    )
-    assert server.client.post("/v1/sites/lab/rollback", json={"actor": "ada", "reason": "no"}).json()["version"] == 1
-    assert server.client.get("/v1/sites/lab/canary").json()["canary"]["state"] == "rolled_back"
-
-
-def test_a_resurvey_list_and_its_route(server: Server) -> None:
-    assert server.client.get("/v1/sites/lab/resurvey").json() == {"site": "lab", "version": 1, "tiles": [], "route": []}
-    assert server.client.get("/v1/sites/lab/resurvey/route").json()["type"] == "FeatureCollection"
-    check_problem(server.client.get("/v1/sites/none/resurvey"), 404, "no site none")
-
-
-def test_metrics_are_what_prometheus_reads(server: Server) -> None:
-    server.fleet.take_failure("lab", "r1", failure(1))
-    server.fleet.take_failure("lab", "r1", failure(2, kind="suspected", cause='x\n"y\\'))
-    for step in range(4):
-        metrics = {"speed_mps": 1.0, "frames": 10 * step}
-        health = RobotHealth(
-            site="lab", robot="r1", stamp_ns=step * 10**9, wall_ns=time.time_ns() + (5 + step) * 10**9, version=1,
-            status="TRACKING", metrics=metrics,
-        )  # fmt: skip
-        server.fleet.take_health("lab", "r1", health)
-    server.fleet.flush()
-    found = {
-        (sample.name, *(sample.labels[name] for name in sorted(sample.labels, reverse=True))): sample.value
-        for family in text_string_to_metric_families(server.client.get("/metrics").text)
-        for sample in family.samples
-    }
-    assert found["fleetmap_site_failures_total", "lab"] == 1
-    assert found["fleetmap_site_silent_failures_estimated_total", "lab"] == 1
-    assert found["fleetmap_site_driving_seconds_total", "lab"] == pytest.approx(3, abs=0.5)
-    assert found["fleetmap_site_frames_total", "lab"] == 30
-    assert found["fleetmap_version_failures_total", "1", "lab"] == 1
-    assert found["fleetmap_site_cause_failures_total", "lab", 'x\n"y\\'] == 1
-    assert found["fleetmap_site_robots_status", "TRACKING", "lab"] == 1
-    assert found["fleetmap_site_clock_skew_max_seconds", "lab"] == pytest.approx(8.0, abs=0.5)

@@ -1,0 +1,196 @@
+"""A robot fetches whole versions: patches, damage, a server that goes away and comes back."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import LinkError, UnreachableError
+from fleetmap.mapformat import Tile, blob_path
+from fleetmap.messages import (
+    PART_BYTES,
+    part_of,
+    patch_key,
+)
+from locclient.maps.map_client import MapClient
+from locclient.maps.tile_cache import TileCache
+from support.fleet.served_world import World, served_world
+from support.storage.map_samples import random_tile
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with served_world(tmp_path) as made:
+        yield made
+
+
+def moved(tile: Tile, rows: slice) -> Tile:
+    points = tile.points_map.copy()
+    points[rows, 2] += 1.0
+    return replace(tile, points_map=points)
+
+
+def large_site(world: World, count: int = 3, landmarks: int = 9000, seed: int = 0) -> list[Tile]:
+    """Tiles that need two parts each."""
+    rng = np.random.default_rng(seed)
+    return [random_tile(rng, landmarks=landmarks, cell=(x, 0)) for x in range(count)]
+
+
+def test_a_version_is_active_when_all_of_it_is_there(world: World) -> None:
+    assert world.cache.active("lab") is None
+    ready = world.link.ready()
+    assert (ready.wanted.version, ready.note) == (1, "")
+    assert world.cache.active("lab").version == 1
+    manifest = world.link.manifest(ready.wanted)
+    world.hub.reachable = False
+    # Another process of the same robot, without a server.
+    again = MapClient(world.robot_bus, TileCache(world.folder.parent / "cache"), "lab", "r1", timeout_s=0.1)
+    later = again.ready()
+    assert later.wanted == ready.wanted
+    assert "version 1 goes on: nobody answered" in later.note
+    assert len(again.tiles(again.manifest(later.wanted)).tiles) == len(manifest.tiles)
+
+
+def test_an_empty_cache_without_a_server_is_told(world: World) -> None:
+    world.hub.reachable = False
+    with pytest.raises(UnreachableError):
+        world.link.ready()
+
+
+def test_a_damaged_version_never_becomes_active(world: World) -> None:
+    world.publish(large_site(world, seed=1))
+    world.hall.ready()
+    world.publish(large_site(world))
+    bad = world.store.manifest("hall", 2).tiles[1]
+    path = world.folder / blob_path(bad.sha256)
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    ready = world.hall.ready()
+    assert ready.wanted.version == 1
+    assert "version 1 goes on" in ready.note
+    assert bad.sha256 in ready.note
+    assert world.cache.active("hall").version == 1
+    # A robot that has nothing yet takes what there is.
+    fresh = MapClient(world.robot_bus, TileCache(world.folder.parent / "fresh"), "hall", "r2")
+    ready = fresh.ready()
+    assert ready.wanted.version == 2
+    assert bad.sha256 in ready.note
+    fetched = fresh.tiles(fresh.manifest(ready.wanted))
+    assert (sorted(fetched.tiles), list(fetched.refused)) == ([(0, 0), (2, 0)], [(1, 0)])
+
+
+def test_a_night_costs_what_changed(world: World) -> None:
+    tiles = large_site(world)
+    world.publish(tiles)
+    world.hall.ready()
+    whole = world.hall.received_bytes
+    assert whole > 900_000
+    tiles = world.current_tiles()
+    world.publish(tiles)  # nothing moved
+    world.hall.ready()
+    unmoved = world.hall.received_bytes - whole
+    assert world.cache.active("hall").version == 2
+    assert unmoved < 0.01 * whole
+    world.publish([moved(tiles[0], slice(0, 450)), *tiles[1:]])
+    world.hall.ready()
+    assert world.cache.active("hall").version == 3
+    assert world.hall.received_bytes - whole - unmoved < 0.01 * whole
+    assert "patch" in [what for what, result, _ in world.counts if result == "ok"]
+    fetched = world.hall.tiles(world.hall.manifest(world.hall.wanted()))
+    np.testing.assert_allclose(fetched.tiles[0, 0].points_map[:450, 2], tiles[0].points_map[:450, 2] + 1.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("lie", [b"", b"nonsense", "another"])
+def test_a_patch_that_does_not_lead_there_costs_the_whole(world: World, lie: bytes | str) -> None:
+    world.publish(large_site(world, 1))
+    world.hall.ready()
+    other = world.current_tiles()[0]
+    world.publish([moved(other, slice(0, 9))])
+    wrong = world.robot_bus.get
+
+    def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+        if "/patches/" not in key:
+            return wrong(key, payload, timeout_s=timeout_s)
+        if lie == "another":
+            base, _, result = key.rpartition("/")[2].partition("-")
+            return wrong(patch_key("hall", result, base), payload)
+        return part_of(lie, payload)
+
+    world.robot_bus.get = get
+    assert world.hall.ready().wanted.version == 2
+    assert world.cache.active("hall").version == 2
+
+
+def test_patches_are_for_published_things_of_one_kind(world: World) -> None:
+    one, two = (tile.sha256 for tile in world.store.manifest("lab", 1).tiles)
+    manifest = world.store.current("lab").manifest_sha256
+    archive = world.store.version("lab", 1).archive_sha256
+    for base, result, words in (
+        (one, manifest, "no published pair"),
+        (one, "0" * 64, "no published pair"),
+        (archive, archive, "no published pair"),
+        (one, two, "not much smaller"),  # another place
+        ("..", one, "not a SHA-256"),
+        (one, "", "not a SHA-256"),
+    ):
+        with pytest.raises(LinkError, match=words):
+            world.robot_bus.get(patch_key("lab", base, result))
+
+
+@pytest.mark.parametrize("died_after", range(1, 8))
+def test_a_fetch_goes_on_where_it_was(world: World, died_after: int) -> None:
+    """The server goes away after any part, the robot gives up, and takes up later: no part comes twice."""
+    wanted = world.publish(large_site(world))
+    asked: list[tuple[str, bytes]] = []
+    through = world.robot_bus.get
+
+    def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+        if len(asked) == died_after:
+            world.hub.reachable = False
+        answer = through(key, payload, timeout_s=timeout_s)
+        asked.append((key, payload))
+        return answer
+
+    world.robot_bus.get = get
+    with pytest.raises(UnreachableError):
+        world.hall.bring(wanted)
+    assert world.cache.active("hall") is None
+    world.hub.reachable = True
+    died_after = -1
+    world.hall.bring(wanted)
+    assert world.cache.active("hall").version == 1
+    assert len(asked) == len(set(asked))
+    assert world.hall.received_bytes == sum(len(world.cache.get(sha256)) for sha256 in world.cache.active("hall").blobs)
+
+
+def test_a_fetch_waits_for_a_server_that_comes_back(world: World) -> None:
+    wanted = world.publish(large_site(world))
+    link = MapClient(world.robot_bus, world.cache, "hall", "r1", timeout_s=0.05, patience_s=20)
+    through, asked = world.robot_bus.get, []
+
+    def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+        asked.append(key)
+        world.hub.reachable = len(asked) not in range(4, 7)  # away for three questions in the middle
+        return through(key, payload, timeout_s=timeout_s)
+
+    world.robot_bus.get = get
+    link.bring(wanted)
+    assert world.cache.active("hall").version == 1
+    assert len(asked) == len(set(asked)) + 3 + 3  # three tiles have a second part under the same key
+
+
+def test_no_message_of_a_large_site_exceeds_a_part(world: World) -> None:
+    wanted = world.publish(large_site(world, 1, landmarks=30_000))
+    sizes: list[int] = []
+    through = world.robot_bus.get
+
+    def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+        answer = through(key, payload, timeout_s=timeout_s)
+        sizes.append(len(answer))
+        return answer
+
+    world.robot_bus.get = get
+    world.hall.bring(wanted)
+    assert max(sizes) <= PART_BYTES + 100
+    assert sum(sizes) > 1 << 20

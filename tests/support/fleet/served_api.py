@@ -1,0 +1,53 @@
+"""The HTTP API over a small store, with a client that asks it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+from fastapi.testclient import TestClient
+
+from fleetmap.bus import MemoryBus, MemoryHub
+from mapserver import releases
+from mapserver.api.app import create_app
+from mapserver.api.metrics import Metrics
+from mapserver.fleet.fleet import Fleet
+from mapserver.store import MapStore
+from support.storage.map_samples import save_sample_draft
+
+
+@dataclass
+class Server:
+    client: TestClient
+    store: MapStore
+    fleet: Fleet
+    bus: MemoryBus
+    folder: Path
+
+    @property
+    def tile(self) -> str:
+        return self.store.manifest("lab", 1).tiles[0].sha256
+
+
+@contextmanager
+def served_api(folder: Path) -> Iterator[Server]:
+    with MapStore.open(folder, create=True) as store, MemoryBus(MemoryHub()) as bus:
+        save_sample_draft(store)
+        releases.publish(store, "lab")
+        save_sample_draft(store, seed=2)
+        fleet = Fleet(store)
+        app = create_app(store, fleet, Metrics(store, fleet), bus)
+        with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
+            yield Server(client, store, fleet, bus, folder)
+
+
+def check_problem(response: httpx.Response, status: int, words: str) -> None:
+    assert response.status_code == status
+    assert response.headers["content-type"] == "application/problem+json"
+    body = response.json()
+    assert body["status"] == status
+    assert body["type"] == "about:blank"
+    assert body["title"]
+    assert words in body["detail"]
+    assert body["instance"] == response.request.url.path
