@@ -38,13 +38,7 @@ def _print_tables(found: "Difference") -> None:
     table = Table("", "added", "changed", "removed", "kept", title=f"{found.site}: {found.before} to {found.after}")
     for name, *counts in (
         ("tiles", found.tiles_added, found.tiles_changed, found.tiles_removed, found.tiles_kept),
-        (
-            "landmarks",
-            found.landmarks_added,
-            found.landmarks_moved,
-            found.landmarks_removed,
-            found.landmarks_kept,
-        ),
+        ("landmarks", found.landmarks_added, found.landmarks_moved, found.landmarks_removed, found.landmarks_kept),
     ):
         table.add_row(name, *(str(count) for count in counts))
     console.print(table)

@@ -7,11 +7,7 @@ from mapserver.commands.options import ActorOptions, SiteName, StoreFolder
 
 
 @expand_options
-def rollback(
-    site: SiteName,
-    store: StoreFolder,
-    by: ActorOptions,
-) -> None:
+def rollback(site: SiteName, store: StoreFolder, by: ActorOptions) -> None:
     """Make the previous version current again; the current one retires."""
     from mapserver import releases
     from mapserver.store import MapStore

@@ -4,11 +4,7 @@ from mapserver.commands.options import Json, SiteName, StoreFolder
 from mapserver.commands.print_json import print_json
 
 
-def versions(
-    site: SiteName,
-    store: StoreFolder,
-    json: Json = False,
-) -> None:
+def versions(site: SiteName, store: StoreFolder, json: Json = False) -> None:
     """List the versions of a site with their states, oldest first."""
     from rich.console import Console
     from rich.table import Table

@@ -8,10 +8,7 @@ from mapserver.commands.print_json import print_json
 EXIT_STATUS_FAULTS = 3
 
 
-def verify(
-    store: StoreFolder,
-    json: Json = False,
-) -> None:
+def verify(store: StoreFolder, json: Json = False) -> None:
     """Check every hash and every reference of a store, and its database; status 3 if there is a fault."""
     from mapserver.store import MapStore
 

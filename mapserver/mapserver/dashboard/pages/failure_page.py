@@ -27,10 +27,7 @@ from mapserver.dashboard.plan import Plan
 from mapserver.store import FailureDetail, FailureFilter, FailureRow
 
 _REFRESH_S = 3.0
-_PICTURES = {
-    "frame": "Left camera image",
-    "matches": "Matches: the image and the landmarks expected in it",
-}
+_PICTURES = {"frame": "Left camera image", "matches": "Matches: the image and the landmarks expected in it"}
 
 
 def install(services: Services) -> None:
