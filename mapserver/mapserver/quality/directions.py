@@ -1,4 +1,4 @@
-"""Which way the places of a map look, and which way nothing looks: a robot that comes the other way finds nothing there. Pure."""
+"""Headings of the places of a map, and those that are missing: a robot that comes the other way finds nothing there. Pure."""
 
 from collections import Counter
 from collections.abc import Sequence

@@ -49,9 +49,12 @@ class GateVerdict:
 
 
 def judge(
-    draft: Manifest, current: Manifest | None, site_vocabulary: str | None, settings: GateSettings,
+    draft: Manifest,
+    current: Manifest | None,
+    site_vocabulary: str | None,
+    settings: GateSettings,
     evidence: Evidence | None = None,
-) -> GateVerdict:  # fmt: skip
+) -> GateVerdict:
     """The verdict on a draft; `current` is None for a site's first version, `evidence` for a draft that nobody examined.
 
     What cannot be judged, for want of frames or of a version to compare with, is named and refuses nothing.

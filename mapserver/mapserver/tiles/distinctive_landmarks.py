@@ -1,4 +1,4 @@
-"""Which landmarks of a survey look like nothing else in it: what tells an aisle from its twins. Pure."""
+"""Distinctive landmarks of a survey, which look like nothing else in it: they tell an aisle from its aliases. Pure."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Which landmarks of a survey robots get: those that localize best, within a budget per metre of path. Pure.
+"""Choice of the landmarks that robots get: those that localize best, within a budget per metre of path. Pure.
 
 A survey finds many times what a robot needs. Every keyframe stands for the robots that will look from there: its picture is
 divided into bins, and what a landmark adds to a bin shrinks with those that it holds already, so that they are spread over the
@@ -46,9 +46,8 @@ def choose_landmarks(
     per_view = _ROWS * _COLUMNS * _DEPTHS
     taken = np.zeros(len(survey.map_from_body), np.int64)
     for mask in (first, seen & ~first):
-        for part, quota in (
-            (mask & distinct, settings.view_distinct_landmarks), (mask, settings.view_landmarks), (mask, _NO_LIMIT),
-        ):  # fmt: skip
+        quotas = (settings.view_distinct_landmarks, settings.view_landmarks, _NO_LIMIT)
+        for part, quota in zip((mask & distinct, mask, mask), quotas, strict=True):
             left, needs = np.flatnonzero(part & ~chosen), quota - taken
             if len(left) and limit > 0:
                 limit -= kernels.choose(

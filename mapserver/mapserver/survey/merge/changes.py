@@ -1,4 +1,4 @@
-"""What a survey changes in a map: keyframes and landmarks that moved, landmarks that stand elsewhere or are new."""
+"""Changes of a map by a survey: keyframes and landmarks that moved, landmarks that stand elsewhere or are new."""
 
 import numpy as np
 from numpy.typing import NDArray

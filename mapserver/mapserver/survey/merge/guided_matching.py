@@ -38,8 +38,9 @@ class Sighting:
 def session_relocalizer(base: BaseMap, vocabulary: Vocabulary, settings: SurveySettings) -> Relocalizer:
     """The robots' relocalizer over the whole map at the archive's precision, with the survey's settings.
 
-    A session is joined by many fixes that must agree, and its matches become observations: they must be more and closer than a
-    robot's, and uncertain landmarks weigh as what they are to a survey's matching, not to a robot's filter.
+    Two things differ from a robot's, for a reason. The view holds all landmarks as the archive has them, not the chosen ones rounded
+    to a tile's grid: what is matched becomes observations of the adjustment. And inliers, windows and sigmas are the survey's: a
+    wrong join spoils a map for good, whereas a robot's next fix corrects a wrong one.
     """
     sessions, pairs = settings.sessions, settings.pairs
     fix = FixSettings(

@@ -1,4 +1,4 @@
-"""The memory that a first survey begins with."""
+"""History of landmarks and keyframes that a first survey begins with."""
 
 import numpy as np
 
@@ -12,6 +12,11 @@ def history_of(survey_map: SurveyMap) -> History:
     keyframes, landmarks = len(survey_map.map_from_body), len(survey_map.landmark_ids)
     never = np.zeros(landmarks, np.uint32)
     return History(
-        np.arange(keyframes, dtype=np.uint32), np.ones(keyframes, np.bool_), never, never.copy(), never.copy(), keyframes,
-        int(survey_map.landmark_ids.max(initial=0)) + 1 if landmarks else 0,
-    )  # fmt: skip
+        keyframe_ids=np.arange(keyframes, dtype=np.uint32),
+        is_place=np.ones(keyframes, np.bool_),
+        landmark_expected=never,
+        landmark_seen=never.copy(),
+        landmark_missed=never.copy(),
+        next_keyframe_id=keyframes,
+        next_landmark_id=int(survey_map.landmark_ids.max(initial=0)) + 1 if landmarks else 0,
+    )

@@ -43,9 +43,14 @@ class Joint:
 
 
 def adjust_jointly(
-    base: BaseMap, state: SurveyState, map_from_body: Array, sightings: list[Sighting | None], settings: SurveySettings, *,
+    base: BaseMap,
+    state: SurveyState,
+    map_from_body: Array,
+    sightings: list[Sighting | None],
+    settings: SurveySettings,
+    *,
     anchored: bool,
-) -> Joint:  # fmt: skip
+) -> Joint:
     """Old and new keyframes and landmarks that fit all observations best; map_from_body (K, 4, 4) is where the new ones start.
 
     anchored: the map is published, its keyframes stay within `anchor_sigma_m`; else only its first one holds it. A survey that
@@ -58,19 +63,23 @@ def adjust_jointly(
         map_from_body = result.map_from_body[problem.old :]
     points = np.full((len(state.landmarks.points_map), 3), np.nan)
     points[problem.own_used] = result.points_map[len(problem.rows) :]
-    return Joint(
-        map_from_body, problem.base_keyframes, result.map_from_body[: problem.old], problem.rows,
-        result.points_map[: len(problem.rows)], points, sightings,
-    )  # fmt: skip
+    old_map_from_body, old_points_map = result.map_from_body[: problem.old], result.points_map[: len(problem.rows)]
+    old = (problem.base_keyframes, old_map_from_body, problem.rows, old_points_map)
+    return Joint(map_from_body, *old, points, sightings)
 
 
 class _Problem:
     """The bundle problem: first the map's keyframes and landmarks, then the survey's."""
 
     def __init__(
-        self, base: BaseMap, state: SurveyState, map_from_body: Array, sightings: list[Sighting | None], settings: SurveySettings,
+        self,
+        base: BaseMap,
+        state: SurveyState,
+        map_from_body: Array,
+        sightings: list[Sighting | None],
+        settings: SurveySettings,
         anchored: bool,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.base, self.state, self.settings, self.anchored = base, state, settings, anchored
         self.start = map_from_body
         seen = [s for s in sightings if s is not None]
@@ -98,10 +107,10 @@ class _Problem:
         self.sighted = slice(len(old_obs), sum(len(part) for part in keyframes))
         keyframes.append(self.old + marks.obs_keyframe[self.own_kept])
         landmarks.append(own_number[marks.obs_landmark[self.own_kept]])
-        self.observations = (
-            np.concatenate(keyframes).astype(np.int32), np.concatenate(landmarks).astype(np.int32),
-            np.concatenate([*pixels, marks.obs_pixels[self.own_kept]]), np.concatenate([*sigmas, marks.obs_sigma_px[self.own_kept]]),
-        )  # fmt: skip
+        pixels.append(marks.obs_pixels[self.own_kept])
+        sigmas.append(marks.obs_sigma_px[self.own_kept])
+        numbers = (np.concatenate(keyframes).astype(np.int32), np.concatenate(landmarks).astype(np.int32))
+        self.observations = (*numbers, np.concatenate(pixels), np.concatenate(sigmas))
 
     def solve(self) -> BundleResult:
         """The optimum."""
@@ -115,13 +124,18 @@ class _Problem:
         fixed = np.zeros(self.old + len(self.start), bool)
         if not (self.anchored and self.old):  # the map's first keyframe, or the survey's where it sees none of the map
             fixed[0] = True
+        motion, old = state.motion, self.old
         problem = BundleProblem(
-            base.camera, state.body_from_cam, np.concatenate([base.map_from_body[self.base_keyframes], self.start]), fixed,
-            np.concatenate([base.points_map[self.rows], carried[self.own_used]]), *self.observations,
-            inertial=_inertial(state.motion, state.stamps_ns, turn, self.old, self.settings) if state.motion.inertial else None,
-            relative=[RelativeTerm(r.i + self.old, r.j + self.old, r.i_from_j, r.information) for r in state.motion.relative],
+            base.camera,
+            state.body_from_cam,
+            np.concatenate([base.map_from_body[self.base_keyframes], self.start]),
+            fixed,
+            np.concatenate([base.points_map[self.rows], carried[self.own_used]]),
+            *self.observations,
+            inertial=_inertial(motion, state.stamps_ns, turn, old, self.settings) if motion.inertial else None,
+            relative=[RelativeTerm(r.i + old, r.j + old, r.i_from_j, r.information) for r in motion.relative],
             priors=self._anchors(),
-        )  # fmt: skip
+        )
         return optimize(problem, self.settings.bundle)
 
     def _anchors(self) -> list[PriorTerm]:
@@ -174,7 +188,6 @@ def _inertial(
     none = np.zeros((old, 3))
     held = np.r_[np.ones(old, bool), np.zeros(len(stamps_ns), bool)]
     velocities = np.einsum("kij,kj->ki", turn, motion.velocities_mps)
-    return InertialTerms(
-        np.concatenate([none, velocities]), np.concatenate([none, motion.gyro_bias_radps]),
-        np.concatenate([none, motion.accel_bias_mps2]), edges, fixed=held,
-    )  # fmt: skip
+    states = (velocities, motion.gyro_bias_radps, motion.accel_bias_mps2)
+    velocities, gyro_biases, accel_biases = (np.concatenate([none, values]) for values in states)
+    return InertialTerms(velocities, gyro_biases, accel_biases, edges, fixed=held)

@@ -1,4 +1,4 @@
-"""How landmarks fare in later surveys: expected, seen, moved, faded."""
+"""Persistence of landmarks through surveys: expected, seen, moved, faded."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,30 +20,30 @@ _EDGE_PX = 12.0
 _BESIDE_PX = 25.0  # so near a measured corner, what lies far behind it is hidden by the same thing
 _WIDER_VIEW_RAD = 0.17
 _MAX_OCTAVE = 7.0
-_PRIOR_LOOKS = 4.0  # what the whole survey's rate of being seen counts for, where a landmark has no history
+_PRIOR_COUNT = 4.0  # observations that the whole survey's rate counts for, where a landmark has no history
 _AGAINST = 7.815  # 0.95 of chi-square with 3 degrees of freedom: an observation that speaks against a place
 _DOUBTED, _SETTLED = 0.5, 0.8  # shares of sightings: against the old place, in favour of the new one
 _MIN_SIGHTINGS = 3  # below which nothing is said about a landmark's place
 
 
 @dataclass(frozen=True, slots=True)
-class Looks:
-    """Of N landmarks: in how many keyframes of this survey each was expected and seen."""
+class LandmarkCounts:
+    """In how many keyframes of this survey each of N landmarks was expected and seen."""
 
     expected: NDArray[np.int64]
     seen: NDArray[np.int64]
 
     @property
     def rate(self) -> float:
-        """How often a landmark that is still there is seen when it is expected."""
+        """Share of the expected observations that were made, of landmarks that are still there."""
         there = self.seen > 0
         return float(self.seen[there].sum() / max(self.expected[there].sum(), 1))
 
 
-def count_looks(
+def count_landmarks(
     base: BaseMap, keyframes: Sequence[Keyframe], map_from_cam: Array, sightings: Sequence[Sighting | None]
-) -> Looks:  # fmt: skip
-    """Counts over keyframes (K) at map_from_cam (K, 4, 4); those without a sighting say nothing."""
+) -> LandmarkCounts:
+    """Counts over keyframes (K) at map_from_cam (K, 4, 4); those without a sighting do not count."""
     expected, seen = np.zeros(len(base.points_map), np.int64), np.zeros(len(base.points_map), np.int64)
     for keyframe, place, sighting in zip(keyframes, map_from_cam, sightings, strict=True):
         if sighting is None:
@@ -53,7 +53,7 @@ def count_looks(
         due[sighting.rows] = True
         expected += due
         seen[sighting.rows] += 1
-    return Looks(expected, seen)
+    return LandmarkCounts(expected, seen)
 
 
 def _due(base: BaseMap, keyframe: Keyframe, map_from_cam: Array) -> Rows:
@@ -70,21 +70,21 @@ def _due(base: BaseMap, keyframe: Keyframe, map_from_cam: Array) -> Rows:
     return np.asarray(rows[~hidden])
 
 
-def missed_since(base: BaseMap, looks: Looks) -> NDArray[np.int64]:
+def missed_since(base: BaseMap, counts: LandmarkCounts) -> NDArray[np.int64]:
     """(N,) how often each landmark was expected since it was seen last."""
     before = base.history.landmark_missed.astype(np.int64)
-    return np.where(looks.seen > 0, 0, before + looks.expected - looks.seen)
+    return np.where(counts.seen > 0, 0, before + counts.expected - counts.seen)
 
 
-def faded(base: BaseMap, looks: Looks, settings: SurveySettings) -> NDArray[np.bool_]:
-    """(N,) landmarks that were missed so often that, were they there, it would hardly ever happen.
+def faded(base: BaseMap, counts: LandmarkCounts, settings: SurveySettings) -> NDArray[np.bool_]:
+    """(N,) landmarks that were missed more often than is likely, were they still there.
 
-    The chance to be seen is each landmark's own from before the misses began, drawn towards the survey's where it has
-    been looked for rarely; looks of one survey are alike, so that each counts for less than one (`look_weight`).
+    The chance to be seen is each landmark's own from before the misses began, drawn towards the survey's where it was rarely
+    expected. Observations within one survey are correlated, so that each counts for less than one (`look_weight`).
     """
-    history, missed = base.history, missed_since(base, looks)
+    history, missed = base.history, missed_since(base, counts)
     before = history.landmark_expected.astype(np.float64) - history.landmark_missed
-    chance = (history.landmark_seen + _PRIOR_LOOKS * looks.rate) / (before + _PRIOR_LOOKS)
+    chance = (history.landmark_seen + _PRIOR_COUNT * counts.rate) / (before + _PRIOR_COUNT)
     chance = np.clip(chance, 0.0, 0.95)
     gone = missed * np.log1p(-settings.sessions.look_weight * chance) < np.log(settings.sessions.fade_probability)
     return np.asarray(gone & (missed > 1))
@@ -92,7 +92,7 @@ def faded(base: BaseMap, looks: Looks, settings: SurveySettings) -> NDArray[np.b
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """Landmarks of the map that were seen often enough to judge: rows (R,), where the new survey alone has them, whether that differs."""
+    """Landmarks of the map seen often enough to judge: rows (R,), their points (R, 3) by the new survey alone, whether those differ."""
 
     rows: Rows
     points_map: Array
@@ -122,10 +122,10 @@ def shifts(base: BaseMap, map_from_cam: Array, sightings: Sequence[Sighting | No
     new = _triangulated(base, points, cameras, numbers, pixels, sigmas)
     own = np.isin(base.map.obs_landmark, rows)
     old_numbers = np.searchsorted(rows, base.map.obs_landmark[own]).astype(np.int32)
+    old_cameras, has_depth = base.map_from_cam[base.map.obs_keyframe[own]], np.isfinite(base.obs_pixels[own, 2])
     old = point_information(
-        base.camera, base.map_from_cam[base.map.obs_keyframe[own]], base.points_map[rows], old_numbers,
-        np.isfinite(base.obs_pixels[own, 2]), base.obs_sigma_px[own],
-    )  # fmt: skip
+        base.camera, old_cameras, base.points_map[rows], old_numbers, has_depth, base.obs_sigma_px[own]
+    )
     info = point_information(base.camera, cameras, new, numbers, np.isfinite(pixels[:, 2]), sigmas)
     slack = 1e-6 * np.eye(3)
     spread = np.linalg.inv(old + slack) + np.linalg.inv(info + slack) + settings.sessions.still_m**2 * np.eye(3)

@@ -1,7 +1,8 @@
-"""The map and what the new survey changes in it, as one SurveyMap: all else stays to the bit."""
+"""Merging of a new survey's changes into the map, as one SurveyMap: all else stays to the bit."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +14,14 @@ from mapserver.survey.finish.map_assembly import cut_patches, medoid_descriptors
 from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.merge.base_map import BaseMap, as_recorded
 from mapserver.survey.merge.guided_matching import Sighting
-from mapserver.survey.merge.landmark_persistence import Looks, missed_since
+from mapserver.survey.merge.landmark_persistence import LandmarkCounts, missed_since
 from mapserver.survey.survey_map import History, SurveyMap
 from mapserver.survey.tracks.tracks import Landmarks
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What is to happen to a map of N landmarks and K keyframes.
+    """Changes to a map of N landmarks and K keyframes.
 
     keep (N,): landmarks that stay; points_map (N, 3) and map_from_body (K, 4, 4): where they are from now on. added: landmarks
     that come, their observations by keyframes of the new survey (sorted by landmark); added_rows: which landmark of the map each
@@ -47,33 +48,26 @@ def resighted(base: BaseMap, rows: Rows, points_map: Array, sightings: Sequence[
     keyframe = np.concatenate([np.full(own.sum(), k) for k, _, own in parts])
     landmark = np.concatenate([number[s.rows[own]] for _, s, own in parts])
     order = np.lexsort((keyframe, landmark))
-    return Landmarks(
-        points_map, keyframe[order].astype(np.int32), landmark[order].astype(np.int32),
-        np.concatenate([s.features[own] for _, s, own in parts])[order],
-        np.concatenate([s.pixels[own] for _, s, own in parts])[order],
-        np.concatenate([s.sigmas_px[own] for _, s, own in parts])[order],
-    )  # fmt: skip
+    features = np.concatenate([s.features[own] for _, s, own in parts])[order]
+    pixels = np.concatenate([s.pixels[own] for _, s, own in parts])[order]
+    sigmas_px = np.concatenate([s.sigmas_px[own] for _, s, own in parts])[order]
+    numbers = (keyframe[order].astype(np.int32), landmark[order].astype(np.int32))
+    return Landmarks(points_map, *numbers, features, pixels, sigmas_px)
 
 
 def joined(first: Landmarks, second: Landmarks) -> Landmarks:
     """Both, the first ones first."""
-    shift = len(first.points_map)
-    return Landmarks(
-        np.concatenate([first.points_map, second.points_map]), np.concatenate([first.obs_keyframe, second.obs_keyframe]),
-        np.concatenate([first.obs_landmark, second.obs_landmark + np.int32(shift)]),
-        np.concatenate([first.obs_feature, second.obs_feature]), np.concatenate([first.obs_pixels, second.obs_pixels]),
-        np.concatenate([first.obs_sigma_px, second.obs_sigma_px]),
-    )  # fmt: skip
+    renumbered = replace(second, obs_landmark=second.obs_landmark + np.int32(len(first.points_map)))
+    columns = ([getattr(part, field.name) for part in (first, renumbered)] for field in fields(Landmarks))
+    return Landmarks(*(np.concatenate(column) for column in columns))
 
 
 def chosen(marks: Landmarks, points_map: Array, keep: NDArray[np.bool_], free: NDArray[np.bool_]) -> Landmarks:
     """The landmarks `keep` (N,) of a survey at points_map (N, 3), with their observations that are `free` (M,)."""
     own = free & keep[marks.obs_landmark]
     number = (np.cumsum(keep) - 1).astype(np.int32)
-    return Landmarks(
-        points_map[keep], marks.obs_keyframe[own], number[marks.obs_landmark[own]], marks.obs_feature[own],
-        marks.obs_pixels[own], marks.obs_sigma_px[own],
-    )  # fmt: skip
+    observations = (marks.obs_feature[own], marks.obs_pixels[own], marks.obs_sigma_px[own])
+    return Landmarks(points_map[keep], marks.obs_keyframe[own], number[marks.obs_landmark[own]], *observations)
 
 
 def fewer_keyframes(marks: Landmarks, enough: int) -> Landmarks:
@@ -90,12 +84,19 @@ def fewer_keyframes(marks: Landmarks, enough: int) -> Landmarks:
     return marks.keep_observations(np.isin(marks.obs_keyframe, taken), 1)
 
 
+class SessionFrames(NamedTuple):
+    """A survey's keyframes, the trajectory of all its frames (F) in `map`, and which of them were measured (F,)."""
+
+    keyframes: list[Keyframe]
+    trajectory: Trajectory
+    estimated: NDArray[np.bool_]
+
+
 def merged(
-    base: BaseMap, change: Change, looks: Looks, keyframes: list[Keyframe], trajectory: Trajectory,
-    estimated: NDArray[np.bool_], min_place_landmarks: int,
-) -> SurveyMap:  # fmt: skip
+    base: BaseMap, change: Change, counts: LandmarkCounts, frames: SessionFrames, min_place_landmarks: int
+) -> SurveyMap:
     """The next version's map. Keyframes that nothing is seen from any more go; new ones come where they see added landmarks."""
-    old, added = base.map, change.added
+    old, added, keyframes = base.map, change.added, frames.keyframes
     keep_obs = change.keep[old.obs_landmark]
     old_used = np.bincount(old.obs_keyframe[keep_obs], minlength=len(old.map_from_body)) > 0
     per_keyframe = np.bincount(added.obs_keyframe, minlength=len(keyframes))
@@ -111,41 +112,47 @@ def merged(
     descriptors = medoid_descriptors(added, keyframes)
     descriptors[~is_new] = old.descriptors[rows[~is_new]]  # it is found by the old one, and robots have that
     cam_from_body = se3_inverse(old.body_from_cam)
-    history = _history(base, change, looks, old_used, per_keyframe[new_used] >= min_place_landmarks, int(is_new.sum()))
+    history = _history(base, change, counts, old_used, per_keyframe[new_used] >= min_place_landmarks, int(is_new.sum()))
     return SurveyMap(
         camera=old.camera,
         body_from_cam=old.body_from_cam,
-        keyframe_stamps_ns=np.r_[old.keyframe_stamps_ns[old_used], [keyframes[k].stamp_ns for k in new_used]].astype(np.int64),
+        keyframe_stamps_ns=np.r_[old.keyframe_stamps_ns[old_used], [keyframes[k].stamp_ns for k in new_used]].astype(
+            np.int64
+        ),
         map_from_body=np.concatenate([change.map_from_body[old_used], change.map_from_cam[new_used] @ cam_from_body]),
         landmark_ids=np.r_[old.landmark_ids[change.keep], ids].astype(np.uint32),
         points_map=np.concatenate([change.points_map[change.keep], added.points_map]),
         descriptors=np.concatenate([old.descriptors[change.keep], descriptors]),
         point_sigma_m=np.r_[old.point_sigma_m[change.keep], _sigmas_m(base, change)],
         obs_keyframe=np.r_[old_number[old.obs_keyframe[keep_obs]], new_number[added.obs_keyframe]].astype(np.int32),
-        obs_landmark=np.r_[
-            landmark_number[old.obs_landmark[keep_obs]], change.keep.sum() + added.obs_landmark
-        ].astype(np.int32),
+        obs_landmark=np.r_[landmark_number[old.obs_landmark[keep_obs]], change.keep.sum() + added.obs_landmark].astype(
+            np.int32
+        ),
         obs_pixels=np.concatenate([old.obs_pixels[keep_obs], pixels]),
         obs_octave=np.r_[old.obs_octave[keep_obs], np.array(octaves, np.int8)].astype(np.int8),
         obs_sigma_px=np.concatenate([old.obs_sigma_px[keep_obs], sigmas]),
-        trajectory=trajectory,
-        trajectory_estimated=estimated,
+        trajectory=frames.trajectory,
+        trajectory_estimated=frames.estimated,
         patches=np.concatenate([old.patches[change.keep], cut_patches(added, keyframes)]),
         history=history,
-    )  # fmt: skip
+    )
 
 
 def _sigmas_m(base: BaseMap, change: Change) -> Array:
     marks = change.added
-    information = point_information(
-        base.camera, change.map_from_cam[marks.obs_keyframe], marks.points_map, marks.obs_landmark,
-        np.isfinite(marks.obs_pixels[:, 2]), marks.obs_sigma_px,
-    )  # fmt: skip
+    cameras, has_depth = change.map_from_cam[marks.obs_keyframe], np.isfinite(marks.obs_pixels[:, 2])
+    observations = (marks.obs_landmark, has_depth, marks.obs_sigma_px)
+    information = point_information(base.camera, cameras, marks.points_map, *observations)
     return np.asarray(1.0 / np.sqrt(np.maximum(np.linalg.eigvalsh(information)[:, 0], 1e-6)))
 
 
 def _history(
-    base: BaseMap, change: Change, looks: Looks, old_used: NDArray[np.bool_], new_places: NDArray[np.bool_], fresh: int
+    base: BaseMap,
+    change: Change,
+    counts: LandmarkCounts,
+    old_used: NDArray[np.bool_],
+    new_places: NDArray[np.bool_],
+    fresh: int,
 ) -> History:
     before, keep = base.history, change.keep
     came = np.zeros(len(change.added.points_map), np.uint32)
@@ -153,9 +160,9 @@ def _history(
     return History(
         keyframe_ids=np.r_[before.keyframe_ids[old_used], new_ids].astype(np.uint32),
         is_place=np.r_[before.is_place[old_used], new_places],
-        landmark_expected=np.r_[(before.landmark_expected + looks.expected)[keep], came].astype(np.uint32),
-        landmark_seen=np.r_[(before.landmark_seen + looks.seen)[keep], came].astype(np.uint32),
-        landmark_missed=np.r_[missed_since(base, looks)[keep], came].astype(np.uint32),
+        landmark_expected=np.r_[(before.landmark_expected + counts.expected)[keep], came].astype(np.uint32),
+        landmark_seen=np.r_[(before.landmark_seen + counts.seen)[keep], came].astype(np.uint32),
+        landmark_missed=np.r_[missed_since(base, counts)[keep], came].astype(np.uint32),
         next_keyframe_id=before.next_keyframe_id + len(new_places),
         next_landmark_id=before.next_landmark_id + fresh,
     )

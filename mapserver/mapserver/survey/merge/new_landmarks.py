@@ -1,4 +1,4 @@
-"""Which landmarks of a new survey the map lacks: confirmed ones, where the keyframes that see them see too little of the map."""
+"""Landmarks of a new survey that the map lacks: confirmed ones, where the keyframes that see them see too little of the map."""
 
 from collections.abc import Sequence
 
@@ -18,8 +18,13 @@ _LACKING_SHARE = 0.6
 
 
 def new_landmarks(
-    base: BaseMap, keyframes: Sequence[Keyframe], marks: Landmarks, joint: Joint, free: NDArray[np.bool_], settings: SessionSettings
-) -> NDArray[np.bool_]:  # fmt: skip
+    base: BaseMap,
+    keyframes: Sequence[Keyframe],
+    marks: Landmarks,
+    joint: Joint,
+    free: NDArray[np.bool_],
+    settings: SessionSettings,
+) -> NDArray[np.bool_]:
     """(N,) of the survey's own landmarks those that the map should gain; free (M,) are observations that show none of the map's.
 
     A part of a picture (one of 48) is covered where landmarks of the map are seen in it, at least `covered_share` as many

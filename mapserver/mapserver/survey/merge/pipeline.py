@@ -1,4 +1,4 @@
-"""A survey and a map become the next map: found, adjusted together, compared, merged. The list of the stages."""
+"""Stages that make the next map of a survey and a map: found, adjusted together, compared, merged."""
 
 from dataclasses import dataclass
 
@@ -12,8 +12,8 @@ from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
 from mapserver.survey.merge.guided_matching import Sighting, match_keyframe, session_relocalizer
 from mapserver.survey.merge.joint_adjustment import Joint, adjust_jointly
-from mapserver.survey.merge.landmark_persistence import count_looks, faded
-from mapserver.survey.merge.merge import merged
+from mapserver.survey.merge.landmark_persistence import count_landmarks, faded
+from mapserver.survey.merge.merge import SessionFrames, merged
 from mapserver.survey.merge.session_alignment import find_fixes, follow_fixes, place_survey
 from mapserver.survey.pipeline import Survey
 from mapserver.survey.settings import SurveySettings
@@ -22,7 +22,7 @@ from mapserver.survey.survey_map import SurveyMap
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """What joining did: fixes tried and believed, keyframes found in the map, and how its landmarks fared."""
+    """Figures of a join: fixes tried and believed, keyframes found in the map, and the map's landmarks."""
 
     fixes: int
     believed_fixes: int
@@ -54,8 +54,13 @@ class NotJoined:
 
 
 def extend(
-    base_map: SurveyMap, survey: Survey, settings: SurveySettings, *, anchored: bool, map_from_survey: Array | None = None
-) -> Extension | NotJoined:  # fmt: skip
+    base_map: SurveyMap,
+    survey: Survey,
+    settings: SurveySettings,
+    *,
+    anchored: bool,
+    map_from_survey: Array | None = None,
+) -> Extension | NotJoined:
     """The map with a survey joined to it.
 
     anchored: base_map is published: what did not move significantly stays to the bit; else all of it takes its best place.
@@ -98,18 +103,16 @@ def _compare(
 ) -> Extension:
     state, guess = survey.state, survey.odometry
     map_from_cam = joint.map_from_body @ state.body_from_cam
-    looks = count_looks(base, guess.keyframes, map_from_cam, joint.sightings)
-    gone = faded(base, looks, settings) if anchored else np.zeros(len(base.points_map), bool)
+    seen = count_landmarks(base, guess.keyframes, map_from_cam, joint.sightings)
+    gone = faded(base, seen, settings) if anchored else np.zeros(len(base.points_map), bool)
     change, moved_keyframes, moved_landmarks = what_changes(base, survey, joint, gone, settings, anchored=anchored)
     keyframe_frames = [k.frame_index for k in guess.keyframes]
     stamps = np.array([e.stamp_ns for e in guess.estimates], np.int64)
     trajectory = Trajectory(
         stamps, frame_trajectory(stamps, guess.odom_from_body, keyframe_frames, joint.map_from_body)
     )
-    result = merged(
-        base, change, looks, guess.keyframes, trajectory, survey.map.trajectory_estimated,
-        settings.sessions.new_place_landmarks,
-    )  # fmt: skip
+    frames = SessionFrames(guess.keyframes, trajectory, survey.map.trajectory_estimated)
+    result = merged(base, change, seen, frames, settings.sessions.new_place_landmarks)
     fresh = int((change.added_rows < 0).sum())
     counts = Counts(
         fixes=fixes[0],
@@ -117,12 +120,12 @@ def _compare(
         keyframes_in_map=sum(s is not None for s in joint.sightings),
         keyframes_added=len(np.unique(change.added.obs_keyframe)),
         keyframes_moved=moved_keyframes,
-        landmarks_expected=int((looks.expected > 0).sum()),
-        landmarks_seen=int((looks.seen > 0).sum()),
+        landmarks_expected=int((seen.expected > 0).sum()),
+        landmarks_seen=int((seen.seen > 0).sum()),
         landmarks_kept=len(result.landmark_ids) - fresh - moved_landmarks,
         landmarks_moved=moved_landmarks,
         landmarks_faded=int(gone.sum()),
         landmarks_added=fresh,
-        seen_rate=round(looks.rate, 4),
+        seen_rate=round(seen.rate, 4),
     )
     return Extension(result, counts)

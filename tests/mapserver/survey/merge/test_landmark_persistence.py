@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapserver.survey.merge.landmark_persistence import Looks, faded, missed_since, shifts
+from mapserver.survey.merge.landmark_persistence import LandmarkCounts, faded, missed_since, shifts
 from mapserver.survey.settings import SessionSettings, SurveySettings
 from mapserver.survey.survey_map import History
 from support.worlds.session_scene import session_scene
@@ -41,15 +41,15 @@ def test_a_landmark_fades_when_its_misses_are_too_unlikely() -> None:
     limit = int(np.ceil(np.log(0.001) / np.log(1 - 0.7 * 0.5)))
     settings = SurveySettings(sessions=SessionSettings(fade_probability=0.001, look_weight=0.7))
     for misses, gone in ((1, False), (limit - 1, False), (limit + 1, True)):
-        looks = Looks(np.full(n, misses), np.zeros(n, np.int64))
-        assert (faded(scene.base, looks, settings) == gone).all(), misses
+        counts = LandmarkCounts(np.full(n, misses), np.zeros(n, np.int64))
+        assert (faded(scene.base, counts, settings) == gone).all(), misses
 
 
 def test_one_sighting_brings_a_landmark_back() -> None:
     count = 300
     scene = session_scene(1, landmarks=count, history=history(40, 20, 14, count))
     n = len(scene.base.points_map)
-    seen = Looks(np.full(n, 10), np.r_[np.ones(n // 2, np.int64), np.zeros(n - n // 2, np.int64)])
+    seen = LandmarkCounts(np.full(n, 10), np.r_[np.ones(n // 2, np.int64), np.zeros(n - n // 2, np.int64)])
     missed = missed_since(scene.base, seen)
     assert (missed[: n // 2] == 0).all()
     assert (missed[n // 2 :] == 24).all()
@@ -63,6 +63,6 @@ def test_a_landmark_that_is_hardly_ever_seen_may_be_missed_longer() -> None:
     often = session_scene(1, landmarks=count, history=history(100, 60, 0, count))
     rarely = session_scene(1, landmarks=count, history=history(100, 6, 0, count))
     n = len(often.base.points_map)
-    looks = Looks(np.full(n, 16), np.zeros(n, np.int64))
-    assert faded(often.base, looks, SurveySettings()).all()
-    assert not faded(rarely.base, looks, SurveySettings()).any()
+    counts = LandmarkCounts(np.full(n, 16), np.zeros(n, np.int64))
+    assert faded(often.base, counts, SurveySettings()).all()
+    assert not faded(rarely.base, counts, SurveySettings()).any()
