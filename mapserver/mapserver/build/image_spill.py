@@ -25,11 +25,11 @@ class _Place:
 
 
 class ImageSpill:
-    """A ImageStore over an unnamed file in `folder`, which the system removes with the process."""
+    """An ImageStore over an unnamed file in `folder`, which the system removes with the process."""
 
     def __init__(self, folder: Path) -> None:
         try:
-            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed with the shelf
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed with the store
         except OSError as error:
             raise StoreError(
                 f"{folder} takes no temporary file ({error.strerror}); check its rights and space"

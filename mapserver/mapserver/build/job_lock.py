@@ -1,4 +1,4 @@
-"""Who runs a job holds a lock that its death lets go: a job that stands as running without one was killed."""
+"""Locks of running jobs. The operating system releases the lock when the process dies: a running job without one was killed."""
 
 import fcntl
 import os

@@ -1,4 +1,4 @@
-"""A job stands in the store from its begin to its end, so that people see what runs, what was made and what failed."""
+"""Records of jobs in the store, from begin to end, so that people see what runs, what was built and what failed."""
 
 import time
 from collections.abc import Iterator

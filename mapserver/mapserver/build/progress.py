@@ -1,4 +1,4 @@
-"""How far a build has come: bars on a terminal, one line for each stage elsewhere; and the seconds of each stage."""
+"""Progress of a build: bars on a terminal, one line for each stage elsewhere; and the seconds of each stage."""
 
 from collections.abc import Callable
 from types import TracebackType

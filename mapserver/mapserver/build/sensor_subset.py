@@ -1,4 +1,4 @@
-"""A recording as a poorer set of sensors would have made it, so that one recording can show what each set is worth."""
+"""Recordings reduced to a subset of their sensors, to compare sensor sets on the same drive."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

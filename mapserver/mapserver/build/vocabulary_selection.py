@@ -1,4 +1,4 @@
-"""Which words a map speaks: its site's, those of a file, those that ship with fleetmap, or, where measured to be better, its own."""
+"""Selection of a map's vocabulary: the site's, that of a file, the shipped one, or its own where that is measurably better."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,16 +21,16 @@ class ChosenVocabulary:
     trial: VocabularyEvaluation | None = None
 
     def sha256(self) -> str:
-        """What maps name it by."""
+        """Its hash, by which maps name it."""
         return vocabulary_hash(self.vocabulary)
 
     def download_bytes(self, encoded_bytes: int) -> int:
-        """What a robot downloads of it: nothing where it has it."""
+        """Bytes that a robot downloads of it: none of the shipped one."""
         return 0 if self.sha256() == DEFAULT_VOCABULARY_SHA256 else encoded_bytes
 
 
 def choose_vocabulary(maps: MapStore, site: str, file: Path | None) -> ChosenVocabulary:
-    """What a new survey of the site is to use. UsageError where the file's words are not those that the site has published."""
+    """The vocabulary for a new survey of the site. UsageError where the file's is not the one that the site has published."""
     kept = maps.site_vocabulary(site)
     if file is None:
         if kept is None:

@@ -1,4 +1,4 @@
-"""How much the camera turned between two frames, by the images alone."""
+"""Rotation of the camera between two frames, by the images alone."""
 
 import cv2
 import numpy as np

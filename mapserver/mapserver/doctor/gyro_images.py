@@ -1,4 +1,4 @@
-"""The gyro against the images: do they turn at the same time, by the same amount, about the same axes?"""
+"""The gyro against the images: time offset, scale and axes of their rotation rates."""
 
 from dataclasses import dataclass
 

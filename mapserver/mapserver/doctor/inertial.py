@@ -1,4 +1,4 @@
-"""Is what the accelerometer measures at rest gravity?"""
+"""Check of the accelerometer: at rest it measures gravity."""
 
 import numpy as np
 

@@ -16,7 +16,7 @@ from mapserver.doctor.disparity_zero import DisparityZero, disparity_zero, stere
 from mapserver.doctor.findings import Finding, Verdict
 from mapserver.doctor.gyro_images import CameraTurns, gyro_check
 from mapserver.doctor.sharpness import laplacian_variance, sharpness
-from mapserver.doctor.stereo import StereoMatches, epipolar_error, match_pair, swapped_cameras
+from mapserver.doctor.stereo import StereoMatches, epipolar_error, match_stereo, swapped_cameras
 from mapserver.survey.executor import SERIAL, Executor
 
 SAMPLED_FRAMES = 40
@@ -131,7 +131,7 @@ def _moments(recording: Recording, frames: _Frames, rectifier: Rectifier, count:
 def _look(camera: StereoCamera, moment: _Moment) -> tuple[float, StereoMatches | None, DisparityZero | None]:
     left, pair, after = moment
     zero = None if pair is None or after is None else disparity_zero(pair, after, camera)
-    return laplacian_variance(left), None if pair is None else match_pair(pair), zero
+    return laplacian_variance(left), None if pair is None else match_stereo(pair), zero
 
 
 def _camera_turns(

@@ -1,4 +1,4 @@
-"""How sharp the images are: the variance of their Laplacian (Pech-Pacheco et al. 2000)."""
+"""Sharpness of the images: the variance of their Laplacian. Source: Pech-Pacheco et al. 2000."""
 
 from collections.abc import Sequence
 

@@ -34,7 +34,7 @@ class StereoMatches:
 _NOTHING = StereoMatches(np.zeros(0), np.zeros(0), np.zeros(0))
 
 
-def match_pair(frame: RectifiedFrame) -> StereoMatches:
+def match_stereo(frame: RectifiedFrame) -> StereoMatches:
     """Matches that do not presume the calibration.
 
     ORB both ways, refined by Lucas-Kanade, any sign of disparity, rows within 25 px.

@@ -1,4 +1,4 @@
-"""Whether an estimate is as good as it says: normalised errors against their own covariances. Pure."""
+"""Consistency of an estimate: errors normalised by their own covariances (NEES). Pure."""
 
 from dataclasses import dataclass
 

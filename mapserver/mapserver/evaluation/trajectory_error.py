@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from the truth, at the estimate's stamps. Both are of the same body."""
+"""Errors of an estimated trajectory against the truth, at the estimate's stamps. Both are of the same body."""
 
 from dataclasses import dataclass
 

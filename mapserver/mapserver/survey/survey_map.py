@@ -1,4 +1,4 @@
-"""What a survey hands on: keyframes, landmarks, what saw what, and where every frame was."""
+"""The map of a survey: keyframes, landmarks, observations, and the trajectory of all frames."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from fleetmap.sensors.samples import Stamps, Trajectory
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """What a site's versions remember of K keyframes and N landmarks. An id is never given twice.
+    """History of K keyframes and N landmarks over the versions of a site. An id is never used twice.
 
     keyframe_ids (K,); is_place (K,): robots are offered the keyframe as a place. landmark_expected, landmark_seen (N,): in
     how many keyframes of later surveys a landmark should have been seen, and was; landmark_missed (N,): how often it was not

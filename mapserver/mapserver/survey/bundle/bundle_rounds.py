@@ -75,7 +75,7 @@ def bundle_rounds(
 ) -> SurveyState:
     """The adjusted state; outlying observations are dropped between rounds. `free` (K,) limits it to a window.
 
-    final: near the optimum; the last round takes the redescending cost of `final_bundle`.
+    final: near the optimum; the last round takes the redescending cost of `final_bundle`. Inertial factors: Forster et al. 2017.
     """
     for round_number in range(rounds):
         last = round_number + 1 == rounds

@@ -1,4 +1,4 @@
-"""Linearisation of pose priors, relative poses and inertial edges. Conventions: bundle_problem.py."""
+"""Linearisation of pose priors, relative poses and inertial edges (Forster et al. 2017). Conventions: problem.py."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What bundle adjustment is asked and what it answers, as values.
+"""Values of bundle adjustment: the problem, its settings and its result.
 
 Perturbations, here and in every information and covariance: rotation first, in the axes of the target frame, about the
 source's origin. For map_from_body that is R <- Exp(rot) R, p <- p + trans, both in map axes; for i_from_j in the axes

@@ -1,4 +1,4 @@
-"""Eliminating the landmarks: the reduced system's pattern and its blocks. Layout and conventions: bundle_kernels.py."""
+"""Elimination of the landmarks by the Schur complement. Layout: reprojection_kernels.py. Source: Triggs et al. 2000, section 6.1."""
 
 import numpy as np
 

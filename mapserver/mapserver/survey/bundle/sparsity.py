@@ -1,4 +1,4 @@
-"""Which unknown sits where: observations sorted by landmark, keyframes to slots, the reduced system's block pattern."""
+"""Sparsity of a bundle problem: observations sorted by landmark, slots of the free keyframes, block pattern of the reduced system."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

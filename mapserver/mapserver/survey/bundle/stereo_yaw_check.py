@@ -1,4 +1,4 @@
-"""Whether the cameras of a pair stand to each other as the calibration says, told by the survey itself.
+"""Check of the extrinsic yaw between the cameras of a pair, by the survey itself.
 
 A right camera that is turned about its vertical axis by a small angle shifts all disparities by nearly the same amount, which
 bends depth and so sets the scale of the map. Motion tells: only with the true shift do the points that the pair measures lie
@@ -54,7 +54,7 @@ def without_stereo_yaw(landmarks: Landmarks, camera: StereoCamera, correction_px
 
 
 def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings) -> StereoYaw:
-    """The turn that the adjusted survey speaks for; corrected where it is far from zero, in sigmas.
+    """The yaw error that fits the adjusted survey best; corrected where it is far from zero, in sigmas.
 
     sigma_px is the adjustment's own, and with it `noise.turn_floor_px`: what matching alone pretends. NO_YAW where too few
     disparities are known or where the cost has no minimum nearby.

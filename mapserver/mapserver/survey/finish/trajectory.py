@@ -1,4 +1,4 @@
-"""Where every frame was, from the adjusted keyframes and the odometry between them."""
+"""Trajectory of all frames from the adjusted keyframes and the odometry between them."""
 
 import numpy as np
 

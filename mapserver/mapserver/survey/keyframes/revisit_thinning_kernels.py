@@ -1,4 +1,4 @@
-"""Which keyframes see only what enough other visits see too."""
+"""Inner loop of revisit thinning: keyframes whose tracks enough other visits see too."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Whether a site's own words would find its places better than the given ones: measured on revisits, never guessed."""
+"""Evaluation of a site's own vocabulary against the given one, measured on revisits."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

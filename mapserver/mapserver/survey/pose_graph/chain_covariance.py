@@ -11,9 +11,9 @@ _FIRST_CAPACITY = 16
 class ChainCovariance:
     """Joint covariance of x_0 = 0, x_1, ..., each a step on from the one before, after measurements of x_j - x_i.
 
-    Only the ends of measurements are kept in full, as anchors. Between two of them a place is the share of the way that its
-    steps' covariance has in the whole way's, plus a bridge which no measurement has touched: a Gauss-Markov chain, so
-    nothing is approximated. Memory and a measurement cost go with the square of the anchors, an answer with their number;
+    Only the ends of measurements are kept in full, as anchors. Between two of them a place is interpolated by the share of
+    its steps' covariance in that of the whole way, plus a bridge that no measurement has touched: the chain is
+    Gauss-Markov, so nothing is approximated. Memory and a measurement cost go with the square of the anchors, an answer with their number;
     how long the chain is does not matter.
     """
 

@@ -1,4 +1,4 @@
-"""How well the pose graph knows where one keyframe is seen from another: what the loop gate asks, very often.
+"""Marginal covariances of relative transforms in a pose graph, as the loop gate needs them very often.
 
 Perturbing every keyframe in map axes (map_from_body -> Exp(x_k) @ map_from_body) makes each edge a measurement of the
 plain difference x_j - x_i: odometry a chain of independent steps, every other edge a rank-6 update of it (recursive least
