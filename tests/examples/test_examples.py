@@ -8,9 +8,11 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from fleetmap import open_recording, read_tum
+from fleetmap import Trajectory, open_recording, read_tum, write_tum
+from fleetmap.geometry import se3, so3_exp
 from fleetmap.recordings import format_calibration
 from fleetsim import Order, record_order
 from mapserver import open_store
@@ -93,6 +95,19 @@ def test_fleet_figures(site: Path, tmp_path: Path) -> None:
     said = run("fleet_figures", tmp_path, "maps", "lab")
     assert "lab, version 1, last 24 h:    16.0 h, 2.00 failures a day" in said
     assert "robot    tug-7" in said
+
+
+def test_other_trajectory(site: Path, tmp_path: Path) -> None:
+    """The true poses of the camera, in a frame that is turned and moved."""
+    with open_recording(site / "survey.mcap") as recording:
+        truth, body_from_cam = recording.ground_truth, recording.calibration.cameras[0].body_from_cam
+    assert truth is not None
+    other_from_map = se3(so3_exp(np.array([0.0, 0.0, 1.0])), np.array([5.0, -3.0, 1.0]))
+    camera = Trajectory(truth.stamps_ns, other_from_map @ truth.frame_from_body @ body_from_cam)
+    write_tum(tmp_path / "poses.tum", camera)
+    said = run("other_trajectory", tmp_path, site / "survey.mcap", "poses.tum", "maps", "lab")
+    assert "site lab: draft 1 of " in said
+    assert float(said.partition("ATE ")[2].split()[0]) < 0.02
 
 
 def test_first_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
