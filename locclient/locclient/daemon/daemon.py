@@ -71,7 +71,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         if bus is not None:
             stack.callback(bus.close)
         publisher = _publisher(config, bus, site, name, stack)
-        outbox = Outbox(spool_path(run, site, name), max_bytes=run.spool_bytes)
+        outbox = Outbox(outbox_path(run, site, name), max_bytes=run.spool_bytes)
         if outbox.set_aside is not None:
             _log.warning("the spool was damaged; it lies in %s now, and a new one was begun", outbox.set_aside)
         begun_s = time.monotonic()
@@ -110,7 +110,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         )
 
 
-def spool_path(run: RunSection, site: str, robot: str) -> Path:
+def outbox_path(run: RunSection, site: str, robot: str) -> Path:
     """The file of the spool: as set, else beside the cache, one for each robot of the machine."""
     if run.spool is not None:
         return Path(run.spool)

@@ -13,7 +13,7 @@ from fleetmap.sensors.calibration import RigCalibration, stereo_baseline_m
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from locclient.config import LocclientConfig
-from locclient.daemon.daemon import check_run, spool_path
+from locclient.daemon.daemon import check_run, outbox_path
 from locclient.daemon.outbox import Outbox
 from locclient.maps.connection import cache_folder
 from locclient.maps.map_client import MapClient
@@ -51,7 +51,7 @@ def run_preflight(config: LocclientConfig, listen_s: float) -> Iterator[Finding]
     yield Finding(OK, "configuration", f"{config.run.robot} at {config.run.site}, source {config.source.kind}")
     yield from _guarded("calibration", lambda: _sensors(config, listen_s))
     yield _clock(time.time_ns(), _SYNCHRONISED.exists())
-    yield from _guarded("spool", lambda: _spool(config))
+    yield from _guarded("spool", lambda: _outbox(config))
     if config.run.store is not None:
         yield from _guarded("store", lambda: _store(config))
     else:
@@ -149,8 +149,8 @@ def _clock(now_ns: int, synchronised: bool) -> Finding:
     return Finding(OK, "clock", "synchronised")
 
 
-def _spool(config: LocclientConfig) -> Iterator[Finding]:
-    path = spool_path(config.run, str(config.run.site), str(config.run.robot))
+def _outbox(config: LocclientConfig) -> Iterator[Finding]:
+    path = outbox_path(config.run, str(config.run.site), str(config.run.robot))
     outbox = Outbox(path, max_bytes=config.run.spool_bytes)
     counts = outbox.counts()
     text = f"{path}: {counts['waiting']} reports wait, {counts['delivered']} delivered, {counts['dropped']} dropped"

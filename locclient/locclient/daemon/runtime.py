@@ -102,7 +102,7 @@ class Runtime:
             self.stop()
             for thread in threads:
                 thread.join(_DRAIN_S)
-            self._spool_failures()
+            self._queue_failures()
             _log.info("stopped: %s", self._health(is_silent=False))
         if self._shared.errors:
             raise self._shared.errors[0]
@@ -203,7 +203,7 @@ class Runtime:
     def _run_disk(self) -> None:
         while not self._stop.wait(_IDLE_S):
             self._load_maps()
-            self._spool_failures()
+            self._queue_failures()
 
     def _load_maps(self) -> None:
         loader, server, shared = self._parts.tile_loader, self._parts.server, self._shared
@@ -248,7 +248,7 @@ class Runtime:
         if refused and self._parts.server is not None:
             self._parts.server.refetch.append(version)
 
-    def _spool_failures(self) -> None:
+    def _queue_failures(self) -> None:
         parts = self._parts
         while self._shared.failures:
             context, wall_ns = self._shared.failures.popleft()

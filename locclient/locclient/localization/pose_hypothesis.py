@@ -11,7 +11,7 @@ from locclient.localization.pose_covariance import compose_cov, compose_end_cov
 from locclient.localization.settings import TrackSettings
 
 # Sigmas of one step: radians, metres, share of the distance.
-_STANDING, _RESTARTED = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
+_MEASURED_DRIFT, _RESTARTED = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
 _VISION_ONLY = (0.005, 0.02, 0.1)  # without an IMU a few wrong points can turn the motion
 
 
@@ -95,7 +95,7 @@ class PoseHypothesis:
         if motion is None:
             # The robot stood so long that its frame was forgotten, or the odometry restarted: one step by its estimates alone.
             is_sure = odometry.new_odom_from_old_odom is None and odometry.status is not OdometryStatus.DEGRADED
-            cov_step = _step_cov(_STANDING if is_sure else _RESTARTED, step_m)
+            cov_step = _step_cov(_MEASURED_DRIFT if is_sure else _RESTARTED, step_m)
             self.now_map_from_body, self.now_cov = compose_cov(self.now_map_from_body, self.now_cov, step, cov_step)
         else:
             body_from_now, cov_motion = motion

@@ -43,7 +43,7 @@ class FailureMonitor:
         self._had_fix = False
         self._blind_ns: int | None = None
         self._doubted_ns: int | None = None
-        self._doubts = 0
+        self._contradicting_looks = 0
         self._good_ns: int | None = None
         self._running = False
         self._last: Estimate | None = None
@@ -59,7 +59,7 @@ class FailureMonitor:
         self._note_fix(estimate)
         self._had_fix |= estimate.fix is not None
         blind = self._had_fix and is_blind(estimate.status, radius_95_m(estimate.cov_rot_trans))
-        self._follow(now_ns, blind, self._doubts >= CONTRADICTING_LOOKS)
+        self._follow(now_ns, blind, self._contradicting_looks >= CONTRADICTING_LOOKS)
         if blind:
             self._causes[failure_cause(estimate)] += 1
         if self._running:
@@ -95,7 +95,7 @@ class FailureMonitor:
         )
         self._fixes.append(note)
         contradicts = fix is None and estimate.innovation is not None and estimate.status is Status.TRACKING
-        self._doubts = self._doubts + 1 if contradicts else 0
+        self._contradicting_looks = self._contradicting_looks + 1 if contradicts else 0
 
     def _follow(self, now_ns: int, blind: bool, doubted: bool) -> None:
         if not blind:
@@ -103,7 +103,7 @@ class FailureMonitor:
             self._causes.clear()
         elif self._blind_ns is None:
             self._blind_ns = now_ns
-        if not self._doubts:
+        if not self._contradicting_looks:
             self._doubted_ns = None
         elif doubted and self._doubted_ns is None:
             self._doubted_ns = now_ns

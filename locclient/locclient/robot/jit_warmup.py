@@ -20,7 +20,7 @@ from locclient.localization.alias_disambiguation import ObservationHistory, log_
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
 
-_FRAMES, _STANDING = 40, 20
+_FRAMES, _STATIONARY = 40, 20
 _FRAME_NS, _IMU_NS = 50_000_000, 5_000_000
 _DISPARITY_PX, _STEP_PX = 12, 3
 _WORDS = 10
@@ -88,7 +88,7 @@ def _wall(camera: StereoCamera) -> NDArray[np.uint8]:
 
 def _view(wall: NDArray[np.uint8], camera: StereoCamera, number: int) -> RectifiedFrame:
     """A frame that stands in front of the wall and then glides along it."""
-    left = max(0, number - _STANDING) * _STEP_PX
+    left = max(0, number - _STATIONARY) * _STEP_PX
     right = left + _DISPARITY_PX
     seen, beside = (np.ascontiguousarray(wall[:, begin : begin + camera.width_px]) for begin in (left, right))
     return RectifiedFrame((number + 1) * _FRAME_NS, seen, beside, None)

@@ -9,7 +9,7 @@ from mapserver.dashboard import drawing
 from mapserver.dashboard.drawing import Bar
 from mapserver.dashboard.markup import badge, joined, link, moment, share, table
 from mapserver.fleet_statistics.kpis import Rate
-from mapserver.fleet_statistics.rate_format import driven_words, figure, is_telling, rate_words
+from mapserver.fleet_statistics.rate_format import driven_words, figure, format_rate, is_telling
 from mapserver.fleet_statistics.resurvey_test import TileConcern
 from mapserver.store import CanaryRow
 
@@ -70,7 +70,7 @@ def trial_notices(trials: Iterable[Trial]) -> Markup:
 
 def rate_bar(label: str, found: Rate) -> Bar:
     """A bar of failures per robot-day; none where too little was driven."""
-    words = f"{found.events} in {driven_words(found.robot_days)}: {rate_words(found)} per robot-day"
+    words = f"{found.events} in {driven_words(found.robot_days)}: {format_rate(found)} per robot-day"
     if not is_telling(found):
         return Bar(label, None, None, None, words)
     return Bar(label, found.per_robot_day, found.low, found.high, words)
@@ -92,8 +92,8 @@ def resurvey(concerns: Sequence[TileConcern], tile_address: Callable[[str], str]
         (
             concern.tile if tile_address is None else link(tile_address(concern.tile), f"Tile {concern.tile}"),
             "; ".join(concern.reasons),
-            rate_words(concern.failures),
-            rate_words(concern.failures_before),
+            format_rate(concern.failures),
+            format_rate(concern.failures_before),
         )
         for concern in concerns
     ]

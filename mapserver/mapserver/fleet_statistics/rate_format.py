@@ -18,7 +18,7 @@ def figure(value: float | None) -> str:
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
-def rate_words(found: Rate) -> str:
+def format_rate(found: Rate) -> str:
     """A rate with the interval that holds the true one with 95 %; a dash where too little was driven."""
     if not is_telling(found):
         return "–"

@@ -32,7 +32,7 @@ Count = Callable[[str, str, int], None]
 """Counts for metrics: (what, "ok" or "refused", bytes sent)."""
 
 _log = logging.getLogger(__name__)
-_RECENT_BYTES = 64_000_000
+_CACHED_BYTES = 64_000_000
 _RECENT_PATCHES_BYTES = 32_000_000
 _PATCH_SHARE = 0.7  # of the whole, above which a patch is not worth its work
 _PATCHED_KINDS = {"tile", "manifest"}
@@ -51,7 +51,7 @@ class BusService:
         self._bus = bus
         self._count = count
         self._announced: dict[tuple[str, str], str | None] = {}
-        self._recent = ByteCache(_RECENT_BYTES)
+        self._recent = ByteCache(_CACHED_BYTES)
         self._patches = ByteCache(_RECENT_PATCHES_BYTES)
         self._patching = threading.Lock()
         self._kinds = AuthorizationCache(store.served_kind)

@@ -61,7 +61,7 @@ class BlobFolder:
         """The addresses of all files, whatever they hold."""
         return {path.name for path in self._files() if _is_address(path)}
 
-    def strangers(self) -> list[Path]:
+    def unreferenced(self) -> list[Path]:
         """Files that are no blobs, such as what a killed process left behind."""
         return sorted(path for path in self._files() if not _is_address(path))
 

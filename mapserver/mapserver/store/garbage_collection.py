@@ -54,7 +54,7 @@ def collect(
         path = blobs.path(sha256)
         garbage.freed_bytes += path.stat().st_size if dry_run else blobs.remove_file(path)
         garbage.files += 1
-    for path in blobs.strangers():
+    for path in blobs.unreferenced():
         garbage.freed_bytes += path.stat().st_size if dry_run else blobs.remove_file(path)
         garbage.files += 1
     return garbage

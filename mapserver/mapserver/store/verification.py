@@ -58,7 +58,7 @@ def _check_blobs(transactions: Transactions, blobs: BlobFolder, found: StoreFind
     )
     mentioned, present = {row["sha256"] for row in rows}, blobs.addresses()
     found.orphans = len(present - mentioned)
-    found.leftovers = len(blobs.strangers())
+    found.leftovers = len(blobs.unreferenced())
     found.blobs = len(present)
     found.blob_bytes = sum(blobs.path(sha256).stat().st_size for sha256 in present)
     found.faults += [f"{blobs.path(sha256)} is missing" for sha256 in sorted(mentioned - present)]

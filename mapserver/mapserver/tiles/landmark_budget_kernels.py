@@ -69,7 +69,9 @@ def mark_repeated_near(
     for a in range(len(order)):
         for b in range(a + 1, min(a + 1 + reach, len(order))):
             i, j = order[a], order[b]
-            if not (repeated[i] and repeated[j]) and _is_twin(i, j, descriptors, points_map, max_bits, height_m, own_m):
+            if not (repeated[i] and repeated[j]) and _looks_alike(
+                i, j, descriptors, points_map, max_bits, height_m, own_m
+            ):
                 repeated[i] = repeated[j] = True
 
 
@@ -97,12 +99,12 @@ def mark_repeated(
         for j in range(low + i % step, high, step):
             if repeated[i]:
                 break
-            if _is_twin(i, j, descriptors, points_map, max_bits, height_m, own_m):
+            if _looks_alike(i, j, descriptors, points_map, max_bits, height_m, own_m):
                 repeated[i] = repeated[j] = True
 
 
 @inner_kernel
-def _is_twin(
+def _looks_alike(
     i: int, j: int, descriptors: Packed, points_map: Array, max_bits: int, height_m: float, own_m: float
 ) -> bool:
     off_x, off_y = points_map[i, 0] - points_map[j, 0], points_map[i, 1] - points_map[j, 1]

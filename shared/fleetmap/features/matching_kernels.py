@@ -145,7 +145,7 @@ def by_projection(
     index = np.full(len(a), -1, np.int64)
     distances = np.full(len(a), FAR, np.int32)
     owner = np.full(len(b), -1, np.int64)
-    rivals = np.full(256, FAR, np.int32)  # per octave: the smallest distance of a feature that was not the best
+    competitors = np.full(256, FAR, np.int32)  # per octave: the smallest distance of a feature that was not the best
     touched, untouched = 256, -1
     for i in range(len(a)):
         x, y, reach = predicted[i, 0], predicted[i, 1], radius[i]
@@ -157,7 +157,7 @@ def by_projection(
         last_row = min(_cell_of(y + reach, grid[1], grid[2], rows), rows - 1)
         best, found = FAR, -1
         for k in range(touched, untouched + 1):
-            rivals[k] = FAR
+            competitors[k] = FAR
         touched, untouched = 256, -1
         for row in range(first_row, last_row + 1):
             for slot in range(starts[row * columns + first_column], starts[row * columns + last_column + 1]):
@@ -170,13 +170,13 @@ def by_projection(
                 if distance < best or (distance == best and j < found):
                     if found >= 0:
                         before = int(octaves[found]) + 128
-                        rivals[before] = min(rivals[before], best)
+                        competitors[before] = min(competitors[before], best)
                         touched, untouched = min(touched, before), max(untouched, before)
                     best, found = distance, j
                 else:
-                    rivals[octave + 128] = min(rivals[octave + 128], distance)
+                    competitors[octave + 128] = min(competitors[octave + 128], distance)
                     touched, untouched = min(touched, octave + 128), max(untouched, octave + 128)
-        if found < 0 or best > max_distance or not best < ratio * rivals[int(octaves[found]) + 128]:
+        if found < 0 or best > max_distance or not best < ratio * competitors[int(octaves[found]) + 128]:
             continue
         holder = owner[found]
         if holder >= 0 and distances[holder] <= best:

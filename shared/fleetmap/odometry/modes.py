@@ -327,8 +327,8 @@ class InertialMode(WindowMode):
         duration_s = (now_ns - still[1]) * 1e-9
         sigma_radps = self._imu.noise.gyro_noise_radps_rthz / np.sqrt(duration_s)
         state, gyro_radps = self.window.filter.state, since.gyro_radps.mean(axis=0)
-        standing = zero_velocity(state, gyro_radps, float(sigma_radps), self._rig.settings.filter)
-        self.window.filter.correct_with(standing, gate=_GATE_6)
+        at_rest = zero_velocity(state, gyro_radps, float(sigma_radps), self._rig.settings.filter)
+        self.window.filter.correct_with(at_rest, gate=_GATE_6)
 
     def _begin_again(self, frame_index: int, tracked: Tracked) -> Mode:
         """Vision alone from where the last frame was, until gravity is known anew.

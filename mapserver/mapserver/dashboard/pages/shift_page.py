@@ -11,7 +11,7 @@ from mapserver.dashboard.fleet_parts import Figure, Trial
 from mapserver.dashboard.markup import joined, moment, share, table
 from mapserver.fleet.shift_summary import FleetSummary
 from mapserver.fleet_statistics.kpis import HOUR_NS, Kpis, Rate
-from mapserver.fleet_statistics.rate_format import is_telling, rate_words
+from mapserver.fleet_statistics.rate_format import format_rate, is_telling
 
 _STYLE = Path(__file__).parents[1] / "style.css"
 _ROWS = 15
@@ -135,7 +135,7 @@ def _failures(summary: FleetSummary) -> Markup:
 def _rate(found: Rate) -> str:
     if found.robot_days <= 0:
         return _UNKNOWN
-    return rate_words(found) if is_telling(found) else "too little driven"
+    return format_rate(found) if is_telling(found) else "too little driven"
 
 
 def _share(value: float | None) -> str:

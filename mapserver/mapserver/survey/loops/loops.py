@@ -21,7 +21,7 @@ from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotio
 _CORRELATION = 3.0
 _CHUNK = 64  # candidates that are gated at once
 _SIDES = 16  # to which the site may repeat
-_TWIN_SCORE = 0.7  # of a candidate's score, from which on another place looks the same
+_ALIAS_SCORE = 0.7  # of a candidate's score, from which on another place looks the same
 _WORTH_LEARNING = 1.0  # variance against the measurement's: below, a loop changes what the gate knows by less than half
 # Known so well, no place can be taken for another: the gate need not learn more. Doubled with every so many loops that it has
 # learned, as they cost memory with their square; what it does not learn leaves it wider, and the next loop can still be learned.
@@ -127,7 +127,7 @@ class LoopCloser:
                 reason = f"its place is closed with keyframe {same[0]} already"
                 self.loops.records.append(LoopRecord(i, j, score, LoopVerdict.REJECTED, reason))
                 continue
-            outcome = self._examine(i, j, score, match, ids[scores >= _TWIN_SCORE * score])
+            outcome = self._examine(i, j, score, match, ids[scores >= _ALIAS_SCORE * score])
             if isinstance(outcome, LoopRecord):
                 self.loops.records.append(outcome)
             else:
@@ -184,7 +184,7 @@ class LoopCloser:
         return inside[: loops.top]
 
     def _examine(
-        self, i: int, j: int, score: float, match: PairMatch | None, twins: NDArray[np.int64]
+        self, i: int, j: int, score: float, match: PairMatch | None, aliases: NDArray[np.int64]
     ) -> tuple[PoseEdge, LoopRecord] | LoopRecord:
         """The edge of a candidate that passed every test alone, or why it did not."""
 
@@ -210,7 +210,7 @@ class LoopCloser:
         supported = self._neighbours_agree(match)
         if supported is False or (supported is None and count < self._settings.alone_inliers):
             return refuse(LoopVerdict.REJECTED, "neighbouring keyframes do not confirm it", count)
-        shift_m = self._unseen_twin(edge, twins)
+        shift_m = self._unseen_alias(edge, aliases)
         if shift_m is not None:
             reason = (
                 f"places {shift_m:.2f} m apart look the same here, and another such step is as possible as this one"
@@ -218,16 +218,16 @@ class LoopCloser:
             return refuse(LoopVerdict.AMBIGUOUS, reason, count)
         return edge, LoopRecord(i, j, score, LoopVerdict.ACCEPTED, "verified", count)
 
-    def _unseen_twin(self, edge: PoseEdge, twins: NDArray[np.int64]) -> float | None:
+    def _unseen_alias(self, edge: PoseEdge, aliases: NDArray[np.int64]) -> float | None:
         """How far off the robot could be too if the site repeats as it is seen to, or said to; None where it cannot be.
 
         Twins look like the old keyframe; those that lie elsewhere count. The way to each of them is a step by which the site repeats,
         perhaps also to a place where no keyframe is yet: a first visit must not be taken for a return.
         """
         ways = np.zeros((0, 3))
-        if len(twins):
-            twins = twins[self._are_apart(edge.j, twins)]
-            ways = self._map_from_body[twins, :3, 3] - self._map_from_body[edge.j, :3, 3]
+        if len(aliases):
+            aliases = aliases[self._are_apart(edge.j, aliases)]
+            ways = self._map_from_body[aliases, :3, 3] - self._map_from_body[edge.j, :3, 3]
         steps = np.concatenate([ways, -ways, _around(self._settings.repeats_every_m)])
         if not len(steps):
             return None

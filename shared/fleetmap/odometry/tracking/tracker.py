@@ -117,9 +117,9 @@ class Tracker:
                 self._memory.clear()
                 guess = motion_since(self._frame_index - 1)
                 sure = guess is not None and rotation_sigma_rad is not None
-                resection, share = self._follow(frame, np.eye(4) if guess is None else guess, sure)
-                if resection is not None:
-                    motion, covariance = resection.cam_from_source, resection.cov_rot_trans
+                pnp, share = self._follow(frame, np.eye(4) if guess is None else guess, sure)
+                if pnp is not None:
+                    motion, covariance = pnp.cam_from_source, pnp.cov_rot_trans
         self._renew_disparities(frame)
         self._add_corners(frame)
         self._previous = frame
@@ -143,17 +143,17 @@ class Tracker:
             return None, 0.0
         pixels, points_cam = self._points.pixels, self._points_cam(self._points.pixels)
         flowed, kept = self._flow(frame, self._predict(points_cam, pixels, cam_from_previous), sure)
-        resection = self._motion(points_cam, flowed, kept, cam_from_previous)
+        pnp = self._motion(points_cam, flowed, kept, cam_from_previous)
         before = int(kept.sum())
         carried = np.empty((len(pixels), 3))  # the old disparity is the prior of the new one
-        if resection is not None:
-            motion, limit_px = resection.cam_from_source, self._settings.ransac_px
+        if pnp is not None:
+            motion, limit_px = pnp.cam_from_source, self._settings.ransac_px
             tracker_kernels.carry(points_cam, pixels, flowed, motion, self._lens, limit_px, kept, carried)
         else:
             carried[:, :2], carried[:, 2] = flowed, np.nan
         share = float(kept.sum()) / max(before, 1)
         self._points = _Points(self._points.ids[kept], carried[kept])
-        return resection, share
+        return pnp, share
 
     def _flow(self, frame: RectifiedFrame, predicted: Array, sure: bool) -> tuple[Array, NDArray[np.bool_]]:
         """Pyramidal Lucas-Kanade with back-check: pixels (N, 2) and which ones hold.
