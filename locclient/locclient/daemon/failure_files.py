@@ -23,7 +23,6 @@ def write_failure(folder: Path, report: FailureReport) -> Path:
         target = folder / f"{name}.json"
         target.write_text(json.dumps(fields, indent=2) + "\n")
     except OSError as error:
-        raise StoreError(
-            f"{folder} cannot be written ({error.strerror}); choose another folder with [run] failures"
-        ) from error
+        reason = f"{folder} cannot be written ({error.strerror}); choose another folder with [run] failures"
+        raise StoreError(reason) from error
     return target

@@ -47,9 +47,8 @@ class Outbox:
                 self._set_aside()
                 self._check()
         except (OSError, sqlite3.Error) as error:
-            raise StoreError(
-                f"the spool {path} cannot be used ({error}); choose another file with [run] spool"
-            ) from error
+            reason = f"the spool {path} cannot be used ({error}); choose another file with [run] spool"
+            raise StoreError(reason) from error
 
     def put(self, report: QueuedReport) -> None:
         """Keeps a report; one with an id that waits already is not kept twice. Raises StoreError where the disk refuses."""

@@ -21,16 +21,13 @@ class Hypothesis:
 class Estimate:
     """Pose of the body at one frame, with what led to it.
 
-    map_from_body (4, 4), cov_rot_trans (6, 6): map axes, rotation first; None while unknown.
-    cause: what stands in the way of TRACKING; image: quality of the frame's images, with their own cause, also while TRACKING.
-    fix: the one that was finished with this frame, taken from the frame of fix_stamp_ns, which may be a few frames older.
-    refused: why a fix was not used.
-    innovation: squared Mahalanobis distance between fix and prediction; innovation_m: metres, for fixes that were believed or found
-    where the robot should be.
-    moved_m: for a pose confirmed with this frame, its distance from the pose that was claimed until fixes contradicted it, where
-    that is more than its covariance admits: one of the two was wrong.
-    hypotheses: the competing poses while AMBIGUOUS.
-    stage_s: seconds by stage, by the clock that was passed in.
+    map_from_body (4, 4), cov_rot_trans (6, 6): map axes, rotation first; None while unknown. cause: what stands in the way of TRACKING;
+    image: quality of the frame's images, with their own cause, also while TRACKING. fix: the one that was finished with this frame, taken
+    from the frame of fix_stamp_ns, which may be a few frames older. refused: why a fix was not used. innovation: squared Mahalanobis
+    distance between fix and prediction; innovation_m: metres, for fixes that were believed or found where the robot should be. moved_m: for
+    a pose confirmed with this frame, its distance from the pose that was claimed until fixes contradicted it, where that is more than its
+    covariance admits: one of the two was wrong. hypotheses: the competing poses while AMBIGUOUS. stage_s: seconds by stage, by the clock
+    that was passed in.
     """
 
     stamp_ns: int

@@ -45,9 +45,8 @@ def load_map(source: MapSource) -> tuple[LoadedMap, FetchedTiles, str]:
     manifest = source.manifest(ready.wanted)
     tiles = source.tiles(manifest)
     if not tiles.tiles:
-        raise LinkError(
-            f"none of the {len(manifest.tiles)} tiles of version {manifest.version} is usable: {tiles.refused}"
-        )
+        reason = f"none of the {len(manifest.tiles)} tiles of version {manifest.version} is usable: {tiles.refused}"
+        raise LinkError(reason)
     vocabulary = decode_vocabulary(source.vocabulary(manifest))
     return LoadedMap(ready.wanted, manifest, vocabulary, tiles.tiles), tiles, ready.note
 

@@ -72,9 +72,8 @@ def _calibration(section: SourceSection) -> RigCalibration:
         raise UsageError("[source] calibration is missing: a live camera needs the path of its Kalibr camchain")
     calibration = read_calibration(Path(section.calibration))
     if len(calibration.cameras) < 2:
-        raise UsageError(
-            f"{section.calibration} describes {len(calibration.cameras)} camera; a live source needs a stereo pair"
-        )
+        reason = f"{section.calibration} describes {len(calibration.cameras)} camera; a live source needs a stereo pair"
+        raise UsageError(reason)
     return calibration
 
 

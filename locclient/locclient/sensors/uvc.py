@@ -119,9 +119,8 @@ class UvcSource:
 def split_frame(picture: np.ndarray, stamp_ns: int) -> CameraFrame:
     """The left and right half of a picture (H, 2 W) or (H, 2 W, 3), grey; RecordingError for anything else."""
     if picture.dtype != np.uint8 or picture.ndim not in (2, 3) or picture.shape[1] % 2 or not picture.size:
-        raise RecordingError(
-            f"the camera sent {picture.dtype} of shape {picture.shape}; two pictures side by side are expected"
-        )
+        reason = f"the camera sent {picture.dtype} of shape {picture.shape}; two pictures side by side are expected"
+        raise RecordingError(reason)
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.ndim == 3 else picture
     middle = grey.shape[1] // 2
     return CameraFrame(stamp_ns, np.ascontiguousarray(grey[:, :middle]), np.ascontiguousarray(grey[:, middle:]))

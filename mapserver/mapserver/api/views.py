@@ -174,8 +174,7 @@ class CanaryAct(Act):
     """Who lets some robots try a version, and why; share of the robots, the setting's without it."""
 
     model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={"examples": [{"actor": "ada", "reason": "the nightly map", "share": 0.05}]},
+        extra="forbid", json_schema_extra={"examples": [{"actor": "ada", "reason": "the nightly map", "share": 0.05}]}
     )
     share: Annotated[float | None, Field(gt=0, lt=1)] = None
 

@@ -17,11 +17,10 @@ _TAIL = 0.05
 class Counters:
     """Sums over some reports; two of them add up. Times in milliseconds, so that sums are exact.
 
-    observed, driving: time that reports cover, and of it with the wheels turning; after_fix: since the run's first fix, localised: of
-    it TRACKING; usable: with a position that may be relied upon. failures: reported ones; suspected: those that are estimates of
-    silent ones; blind_seen: stretches of blindness that the server saw in the statuses itself. exceeded: innovations beyond
-    their 99.9 % bound; jumps: fixes more than 0.30 m from where the robot took itself to be; docks_wrong: arrivals where the estimate
-    was so far off.
+    observed, driving: time that reports cover, and of it with the wheels turning; after_fix: since the run's first fix, localised: of it
+    TRACKING; usable: with a position that may be relied upon. failures: reported ones; suspected: those that are estimates of silent ones;
+    blind_seen: stretches of blindness that the server saw in the statuses itself. exceeded: innovations beyond their 99.9 % bound; jumps:
+    fixes more than 0.30 m from where the robot took itself to be; docks_wrong: arrivals where the estimate was so far off.
     """
 
     reports: int = 0

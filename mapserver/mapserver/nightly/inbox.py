@@ -121,9 +121,8 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
         sync_folder(folder)
         sync_folder(path.parent)
     except OSError as error:
-        raise StoreError(
-            f"{path} cannot be moved to {folder} ({error.strerror}); check the rights and space of the inbox"
-        ) from error
+        message = f"{path} cannot be moved to {folder} ({error.strerror}); check the rights and space of the inbox"
+        raise StoreError(message) from error
     return target
 
 

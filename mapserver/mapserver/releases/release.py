@@ -39,8 +39,7 @@ def publish(
 def promote(store: MapStore, site: str, version: int, *, actor: Actor = NOBODY) -> None:
     """Makes a version that was published before the current one.
 
-    Raises UsageError for an unknown version, StateError for a draft, StoreError or MapFormatError for one whose
-    bytes are not all there.
+    Raises UsageError for an unknown version, StateError for a draft, StoreError or MapFormatError for one whose bytes are not all there.
     """
     store.check_bytes(store.version(site, version))
     store.change_releases(site, lambda rows: rules.promotion(rows, version, actor))

@@ -24,9 +24,8 @@ def chosen_draft(rows: SiteReleases, number: int | None) -> VersionInfo:
         return _draft(rows, number)
     drafts = [info for info in rows.versions.values() if info.state == "draft"]
     if not drafts:
-        raise UsageError(
-            f"site {rows.site} has no draft to publish; make one with `mapserver build --site {rows.site}`"
-        )
+        reason = f"site {rows.site} has no draft to publish; make one with `mapserver build --site {rows.site}`"
+        raise UsageError(reason)
     return drafts[-1]
 
 
@@ -162,9 +161,8 @@ def _check_running(rows: SiteReleases, canary: CanaryRow) -> None:
 
 def _known(rows: SiteReleases, version: int) -> VersionInfo:
     if version not in rows.versions:
-        raise UsageError(
-            f"site {rows.site} has no version {version}; `mapserver versions --site {rows.site}` lists them"
-        )
+        reason = f"site {rows.site} has no version {version}; `mapserver versions --site {rows.site}` lists them"
+        raise UsageError(reason)
     return rows.versions[version]
 
 

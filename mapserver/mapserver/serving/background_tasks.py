@@ -44,9 +44,7 @@ def server_tasks(
             "looking for jobs that were killed", _JOBS_EVERY_S, lambda: end_interrupted(store, time.time_ns())
         ),
         BackgroundTask(
-            "looking at canaries",
-            settings.canary.check_every_s,
-            lambda: review(store, settings.canary, time.time_ns()),
+            "looking at canaries", settings.canary.check_every_s, lambda: review(store, settings.canary, time.time_ns())
         ),
     ]
 

@@ -86,9 +86,8 @@ def encode_archive(survey: SurveyMap) -> bytes:
     body = [array.tobytes() for array in arrays.values()]
     size = _HEAD_SIZE.size + len(head) + sum(len(part) for part in body)
     if size > MAX_ARCHIVE_PAYLOAD_BYTES:
-        raise MapFormatError(
-            f"archive of {size} bytes, the limit is {MAX_ARCHIVE_PAYLOAD_BYTES}; survey in several parts"
-        )
+        reason = f"archive of {size} bytes, the limit is {MAX_ARCHIVE_PAYLOAD_BYTES}; survey in several parts"
+        raise MapFormatError(reason)
     payload = b"".join([_HEAD_SIZE.pack(len(head)), head, *body])
     return pack(ARCHIVE_MAGIC, ARCHIVE_FORMAT, payload, level=_LEVEL)
 
@@ -106,9 +105,8 @@ def decode_archive(data: bytes) -> SurveyMap:
     arrays: dict[str, AnyArray] = {}
     for entry in head.arrays:
         if dtypes.get(entry.name) != entry.dtype or entry.name in arrays:
-            raise MapFormatError(
-                f"archive: array {entry.name!r} of {entry.dtype!r} is none of ours; the bytes are damaged"
-            )
+            reason = f"archive: array {entry.name!r} of {entry.dtype!r} is none of ours; the bytes are damaged"
+            raise MapFormatError(reason)
         count = prod(entry.shape)
         end = offset + count * np.dtype(entry.dtype).itemsize
         if end > len(payload):
@@ -117,9 +115,8 @@ def decode_archive(data: bytes) -> SurveyMap:
         offset = end
     if offset != len(payload) or len(arrays) != len(dtypes):
         missing = sorted(set(dtypes) - set(arrays))
-        raise MapFormatError(
-            f"archive: {len(payload) - offset} bytes too many, arrays missing: {missing}; it is damaged"
-        )
+        reason = f"archive: {len(payload) - offset} bytes too many, arrays missing: {missing}; it is damaged"
+        raise MapFormatError(reason)
     trajectory = Trajectory(arrays.pop("trajectory_stamps_ns"), arrays.pop("trajectory_frame_from_body"))
     if number == 1:
         arrays["obs_sigma_px"] = np.repeat(arrays["obs_sigma_px"][:, None], 2, axis=1)

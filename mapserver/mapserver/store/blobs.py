@@ -92,9 +92,8 @@ class BlobFolder:
                 make_folder(path.parent.parent)
                 write_atomically(path, chunks)
         except OSError as error:
-            raise StoreError(
-                f"{path} cannot be written ({error.strerror}); check the disk's space and rights"
-            ) from error
+            reason = f"{path} cannot be written ({error.strerror}); check the disk's space and rights"
+            raise StoreError(reason) from error
 
     def _reading(self, sha256: str) -> bytes:
         path = self.path(sha256)

@@ -17,8 +17,7 @@ _BUSY_TIMEOUT_MS = 30_000
 def open_database(path: Path) -> Database:
     """The database at `path`, created or migrated as needed, usable from any thread under one lock.
 
-    Raises NewerFormatError for one that a newer fleetmap made, StoreError for one that cannot be opened or is another
-    program's.
+    Raises NewerFormatError for one that a newer fleetmap made, StoreError for one that cannot be opened or is another program's.
     """
     connection = sqlite3.connect(path, timeout=_BUSY_TIMEOUT_MS / 1000, isolation_level=None, check_same_thread=False)
     try:
@@ -66,9 +65,8 @@ def _check_ours(connection: sqlite3.Connection, path: Path) -> None:
     number = connection.execute("PRAGMA user_version").fetchone()[0]
     tables = connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]
     if application != APPLICATION_ID and (application != 0 or number != 0 or tables != 0):
-        raise StoreError(
-            f"{path} is not the database of a map store (application id {application}); choose another --store"
-        )
+        reason = f"{path} is not the database of a map store (application id {application}); choose another --store"
+        raise StoreError(reason)
     if number > len(MIGRATIONS):
         raise NewerFormatError(
             f"{path} has store format {number}, this fleetmap reads up to {len(MIGRATIONS)}; update fleetmap to open it"

@@ -77,9 +77,8 @@ def write_export(path: Path, info: VersionInfo, manifest: Manifest, blobs: BlobF
         write_atomically(path, _export_chunks(head, blobs))
         return path.stat().st_size
     except OSError as error:
-        raise StoreError(
-            f"{path} cannot be written ({error.strerror}); check the folder, its space and rights"
-        ) from error
+        reason = f"{path} cannot be written ({error.strerror}); check the folder, its space and rights"
+        raise StoreError(reason) from error
 
 
 def _export_chunks(head: ExportHead, blobs: BlobFolder) -> Iterator[bytes]:

@@ -10,15 +10,7 @@ import msgspec
 from fleetmap.errors import UsageError
 from fleetmap.messages import FailureReport
 from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters, hour_of
-from mapserver.store.rows import (
-    AXES,
-    FailureDetail,
-    FailureFilter,
-    FailureRow,
-    FleetRetention,
-    PictureRow,
-    TraceRow,
-)
+from mapserver.store.rows import AXES, FailureDetail, FailureFilter, FailureRow, FleetRetention, PictureRow, TraceRow
 from mapserver.store.transactions import Transactions
 
 CounterKey = tuple[str, str, str, int]

@@ -73,9 +73,8 @@ class MapStore(StoreQueries):
             make_folder(path / "sites")
             store = cls(path, clock_ns)
         except (OSError, sqlite3.Error) as error:
-            raise StoreError(
-                f"the store {path} cannot be opened ({error}); check the path, its rights and space"
-            ) from error
+            reason = f"the store {path} cannot be opened ({error}); check the path, its rights and space"
+            raise StoreError(reason) from error
         return store
 
     def close(self) -> None:
@@ -226,9 +225,8 @@ class MapStore(StoreQueries):
         if not rows:
             return None
         if rows[0]["manifest_sha256"] != sha256:
-            raise StateError(
-                f"site {manifest.site} has another version {manifest.version}; import it into a store of its own"
-            )
+            reason = f"site {manifest.site} has another version {manifest.version}; import it into a store of its own"
+            raise StateError(reason)
         return VersionInfo(**rows[0])
 
     def _put_blobs(self, reader: ExportReader) -> None:

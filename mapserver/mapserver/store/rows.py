@@ -231,8 +231,7 @@ class CanaryRow:
 class SiteReleases:
     """What releases of a site are decided by: its versions by number, and the canary that runs, if any.
 
-    rollback_target: the version that was current before, None where none was; rollback_row: its row in the record of what was
-    current.
+    rollback_target: the version that was current before, None where none was; rollback_row: its row in the record of what was current.
     """
 
     site: str
