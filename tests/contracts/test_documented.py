@@ -162,6 +162,7 @@ def test_files_that_are_named_exist(document: str) -> None:
     """A path in a document may be shortened at its left: `survey/pipeline.py`."""
     named = set(re.findall(r"`([\w./-]+\.(?:py|toml|sh|service))`", text(document)))
     files = [path.as_posix() for root in ROOTS for path in (REPOSITORY / root).rglob("*") if path.is_file()]
+    files += [path.as_posix() for path in REPOSITORY.iterdir() if path.is_file()]
     missing = {name for name in named if not any(f"/{path}".endswith(f"/{name}") for path in files)}
     # A reader's own files, and files that a robot or server makes.
     assert missing <= {"locclient.toml", "mapserver.toml", "camchain.yaml"}

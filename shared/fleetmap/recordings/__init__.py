@@ -1,7 +1,7 @@
 """Recordings of camera robots: EuRoC, TUM-VI, KITTI and 7-Scenes folders, and MCAP.
 
 To add a format: a module whose function reads the folder or file into `RecordingParts` and hands them to `finalize`,
-and a line in RECORDING_FORMATS (examples/new_recording_format.py is one in 40 lines).
+and a line in RECORDING_FORMATS (examples/new_recording_format.py is one).
 """
 
 from collections.abc import Callable
