@@ -269,7 +269,7 @@ class InertialMode(WindowMode):
     def predict(self, stamp_ns: int) -> None:
         """See Mode."""
         window, imu = self.window, self._imu
-        self._frame_ns = stamp_ns
+        self._frame_ns, self._last_odom_from_body = stamp_ns, window.filter.state.odom_from_body
         end_ns = stamp_ns + int(window.filter.imu_minus_cam_s * 1e9)
         if longest_gap_ns(imu.samples.imu, window.stamp_ns, end_ns) > _IMU_GAP_NS and len(window.filter.clone_ids) > 1:
             self._bridge_gap(end_ns)
@@ -299,7 +299,6 @@ class InertialMode(WindowMode):
         used = window.update(frame_index, tracked, self._rig.settings.filter.chunk_frames, 1)
         if monitor.is_wrong_start(window.filter.imu_minus_cam_s, self.cam_from_earlier(frame_index - 1), seen):
             return Step(self._begin_again(frame_index, tracked), used, np.eye(4))
-        self._last_odom_from_body = window.filter.state.odom_from_body
         return Step(self, used)
 
     def _bridge_gap(self, end_ns: int) -> None:

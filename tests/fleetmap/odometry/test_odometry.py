@@ -1,13 +1,18 @@
 """The odometry on pictures of a painted room, with exact truth."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3_inverse, se3_log, so3_exp
-from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings, OdometryStatus
+from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings, OdometryStatus, modes
+from fleetmap.odometry.checks.divergence_monitor import DivergenceMonitor
+from fleetmap.odometry.init.dynamic_initialization import dynamic_initialization
+from fleetmap.odometry.init.initial_state import InitialState
 from fleetmap.odometry.modes import InertialMode
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracking.tracker import Tracker
@@ -220,6 +225,22 @@ def test_a_prediction_costs_less_than_a_guess_and_may_be_wrong(monkeypatch: pyte
         assert np.linalg.norm(se3_log(tracked.cam_from_previous @ se3_inverse(step))) < 0.02
     assert levels == {"well": [1], "badly": [1, 3], "guessed": [3]}
     assert min(held.values()) > 0.9 * max(held.values())
+
+
+def test_a_filter_that_is_wrong_at_once_goes_on_from_the_last_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not from where its start was valid, which may be long before the frame that it was found at."""
+
+    def earlier(*inputs: Any) -> InitialState | None:
+        start = dynamic_initialization(*inputs)
+        return None if start is None else replace(start, stamp_ns=start.stamp_ns - 4 * FRAME_NS)
+
+    monkeypatch.setattr(modes, "dynamic_initialization", earlier)
+    monkeypatch.setattr(DivergenceMonitor, "is_wrong_start", lambda *_: True)
+    _, estimates = run((stereo_frame(k * FRAME_NS) for k in range(1, 41)), IMU)
+    started = next(n for n, estimate in enumerate(estimates) if estimate.inertial)
+    last, now = estimates[started], estimates[started + 1]
+    assert not now.inertial
+    assert np.linalg.norm(relative_error(last, now)[3:]) < 0.02
 
 
 @pytest.mark.parametrize("broken", ["clocks", "velocity"])
