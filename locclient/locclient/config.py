@@ -9,8 +9,10 @@ from fleetmap.cli_options import Commands, Options, command_defaults, file_type
 from fleetmap.config import Section, read_given, refuse_internal
 from fleetmap.recordings import Topics
 from locclient.daemon.publishers import OutputSection
-from locclient.daemon.run_settings import RunSection
 from locclient.localization.settings import LocalizerSettings
+from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
+from locclient.maps.tile_selection import TileSelectionSettings
+from locclient.robot.version_trial import TrialSettings
 from locclient.sensors.source import SourceSection
 
 TIERS = {
@@ -37,6 +39,25 @@ TIERS = {
         "localizer.sight": "dark_contrast glare_share blurred_share occluded_depth_share",
     },
 }
+
+
+class RunSection(Section, frozen=True):
+    """Who the robot is, where its map comes from, and what it may keep."""
+
+    server: str | None = None
+    store: str | None = None
+    site: str | None = None
+    robot: str | None = None
+    prior: str | None = None
+    cache: str | None = None
+    cache_bytes: int = DEFAULT_MAX_BYTES
+    spool: str | None = None
+    spool_bytes: int = 50_000_000
+    failures: str | None = None
+    frame_queue: int = 2
+    imu_wait_s: float = 0.05
+    window: TileSelectionSettings = TileSelectionSettings()
+    trial: TrialSettings = TrialSettings()
 
 
 class LocclientConfig(Section, frozen=True):

@@ -13,10 +13,9 @@ from fleetmap.errors import LinkError, UsageError
 from fleetmap.mapformat import check_name
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
-from locclient.config import LocclientConfig
+from locclient.config import LocclientConfig, RunSection
 from locclient.daemon.outbox import Outbox
 from locclient.daemon.publishers import Publisher, open_publisher
-from locclient.daemon.run_settings import RunSection
 from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.maps.connection import cache_folder

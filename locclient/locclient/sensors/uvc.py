@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,25 +15,6 @@ from locclient.sensors.ros2 import Ros2Source
 
 _REOPEN_S = 1.0
 _CLOCKS_AGREE_S = 1.0
-
-
-class Capture(Protocol):
-    """The methods used of cv2.VideoCapture."""
-
-    def isOpened(self) -> bool:  # noqa: N802
-        """Whether the device is open."""
-
-    def set(self, prop: int, value: float) -> bool:
-        """Asks for a property."""
-
-    def get(self, prop: int) -> float:
-        """A property."""
-
-    def read(self) -> tuple[bool, Any]:
-        """Waits for the next picture."""
-
-    def release(self) -> None:
-        """Closes the device."""
 
 
 class VideoMode(NamedTuple):
@@ -55,7 +36,7 @@ class UvcSource:
 
     def __init__(
         self,
-        open_capture: Callable[[], Capture],
+        open_capture: Callable[[], cv2.VideoCapture],
         calibration: RigCalibration,
         mode: VideoMode,
         topics: Ros2Source | None,
@@ -89,7 +70,7 @@ class UvcSource:
         if self._topics is not None:
             self._topics.close()
 
-    def _read_frames(self, capture: Capture, intake: Intake, wait: Callable[[float], bool]) -> None:
+    def _read_frames(self, capture: cv2.VideoCapture, intake: Intake, wait: Callable[[float], bool]) -> None:
         """Until the camera is gone or it is time to stop."""
         if not capture.isOpened():
             return
@@ -109,7 +90,7 @@ class UvcSource:
             except RecordingError:
                 intake.count_unreadable()
 
-    def _stamp_ns(self, capture: Capture) -> int:
+    def _stamp_ns(self, capture: cv2.VideoCapture) -> int:
         now_s, wall_ns = self._monotonic_s(), self._wall_ns()
         driver_s = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
         age_s = now_s - driver_s if abs(now_s - driver_s) < _CLOCKS_AGREE_S else 0.0

@@ -1,4 +1,4 @@
-"""Locks of running jobs. The operating system releases the lock when the process dies: a running job without one was killed."""
+"""Locks of running jobs and nights. The operating system releases the lock when the process dies: a running job without one was killed."""
 
 import fcntl
 import os
@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fleetmap.errors import StoreError
+from fleetmap.errors import BusyError, StoreError
 from mapserver.store import JobInfo, MapStore
 
 INTERRUPTED = "interrupted"
@@ -20,17 +20,25 @@ _YOUNG_S = 60.0  # a job is noted before it holds its lock
 def held(store: Path, job: int) -> Iterator[None]:
     """Shows that a job runs, for the block. Raises StoreError where the disk refuses."""
     path = _path(store, job)
-    try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise StoreError(f"{path} cannot be made ({error.strerror}); check the store's rights and space") from error
-    try:
+    with _opened(path) as descriptor:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                path.unlink()
+
+
+@contextmanager
+def only_one(store: Path, site: str) -> Iterator[None]:
+    """Holds the site's night for the block; raises BusyError where another process does, StoreError where the disk refuses."""
+    path = store / f"nightly-{site}.lock"
+    with _opened(path) as descriptor:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BusyError(f"another nightly run of site {site} holds {path}; it ends by itself, try later") from error
         yield
-    finally:
-        with suppress(OSError):
-            path.unlink()
-        os.close(descriptor)
 
 
 def end_interrupted(maps: MapStore, now_ns: int) -> list[int]:
@@ -70,3 +78,15 @@ def _is_held(store: Path, job: int) -> bool:
 
 def _path(store: Path, job: int) -> Path:
     return store / f"job-{job}.lock"
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[int]:
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise StoreError(f"{path} cannot be made ({error.strerror}); check the store's rights and space") from error
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)

@@ -8,8 +8,7 @@ from markupsafe import Markup
 from mapserver.dashboard import drawing
 from mapserver.dashboard.drawing import Bar
 from mapserver.dashboard.markup import badge, joined, link, moment, share, table
-from mapserver.fleet_statistics.kpis import Rate
-from mapserver.fleet_statistics.rate_format import driven_words, figure, format_rate, is_telling
+from mapserver.fleet_statistics.kpis import Rate, driven_words, figure, format_rate, is_telling
 from mapserver.fleet_statistics.resurvey_test import TileConcern
 from mapserver.store import CanaryRow
 

@@ -1,4 +1,4 @@
-"""Key performance indicators of a fleet: counters that add up, and rates, shares and intervals of them. Pure.
+"""Key performance indicators of a fleet: counters that add up, and rates, shares and intervals of them, also as text. Pure.
 
 A robot-day is 16 h of driving. Intervals hold the true value with 95 %.
 """
@@ -11,6 +11,8 @@ from scipy.special import betaincinv, gammaincinv
 ROBOT_DAY_S = 16 * 3600.0
 HOUR_NS = 3_600_000_000_000
 _TAIL = 0.05
+LEAST_ROBOT_DAYS = 0.1
+"""Below it (96 minutes of driving) one failure would read as ten or more per robot-day: counts are shown, no rate."""
 
 
 @dataclass(slots=True)
@@ -184,6 +186,33 @@ def share(hits: int, tries: int) -> Share:
     low = 0.0 if hits == 0 else float(betaincinv(hits, tries - hits + 1, tail))
     high = 1.0 if hits == tries else float(betaincinv(hits + 1, tries - hits, 1 - tail))
     return Share(hits, tries, hits / tries, low, high)
+
+
+def is_telling(found: Rate) -> bool:
+    """Whether enough was driven to give a rate."""
+    return found.robot_days >= LEAST_ROBOT_DAYS
+
+
+def figure(value: float | None) -> str:
+    """A rate with two digits, without exponent."""
+    if value is None:
+        return "–"
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def format_rate(found: Rate) -> str:
+    """A rate with the interval that holds the true one with 95 %; a dash where too little was driven."""
+    if not is_telling(found):
+        return "–"
+    return f"{figure(found.per_robot_day)} ({figure(found.low)} to {figure(found.high)})"
+
+
+def driven_words(robot_days: float) -> str:
+    """How much was driven: minutes, hours or robot-days."""
+    hours = robot_days * ROBOT_DAY_S / 3600
+    if hours < 1:
+        return f"{hours * 60:.0f} min of driving"
+    return f"{hours:.1f} h of driving" if robot_days < 1 else f"{figure(robot_days)} robot-days"
 
 
 def hour_of(stamp_ns: int) -> int:

@@ -16,10 +16,9 @@ from rich.console import Console
 from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, SurveyError
 from mapserver import releases
 from mapserver.build.build import BuildOptions, BuildRequest, build_draft
-from mapserver.build.job_lock import INTERRUPTED, end_interrupted, held
+from mapserver.build.job_lock import INTERRUPTED, end_interrupted, held, only_one
 from mapserver.nightly import inbox as boxes
 from mapserver.nightly.inbox import Recorded
-from mapserver.nightly.lock import only_one
 from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore, VersionInfo
 from mapserver.survey.settings import SurveySettings

@@ -24,8 +24,7 @@ from fleetmap.messages import (
     split_key,
 )
 from mapserver.fleet.fleet import Fleet
-from mapserver.serving.authorization_cache import AuthorizationCache
-from mapserver.serving.byte_cache import ByteCache
+from mapserver.serving.caches import AuthorizationCache, ByteCache
 from mapserver.store import MapStore
 
 Count = Callable[[str, str, int], None]

@@ -1,50 +1,101 @@
-"""The SQLite file of a store: opening, numbered migrations, transactions. All settings of SQLite are here."""
+"""The SQLite file of an open store: numbered migrations, reading, write transactions, the log. All settings of SQLite are here."""
 
 import sqlite3
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from sqlite_utils import Database
 
 from fleetmap.errors import NewerFormatError, StoreError
 from mapserver.store.migrations import MIGRATIONS
+from mapserver.store.rows import LogEntry
 
 APPLICATION_ID = 0x464D4150  # "FMAP": says whose file this is
 _BUSY_TIMEOUT_MS = 30_000
 
 
-def open_database(path: Path) -> Database:
-    """The database at `path`, created or migrated as needed, usable from any thread under one lock.
+class Transactions:
+    """The database at a path, created or migrated as needed. Methods may be called from any thread.
 
-    Raises NewerFormatError for one that a newer fleetmap made, StoreError for one that cannot be opened or is another program's.
+    One connection writes and another one reads, each under a lock of its own: reading does not wait while a write is forced to the
+    disk. Within a transaction its own thread reads what it has written. Raises NewerFormatError for a database that a newer
+    fleetmap made, StoreError for one that cannot be opened or is another program's.
     """
+
+    def __init__(self, path: Path, clock_ns: Callable[[], int]) -> None:
+        self.now_ns = clock_ns
+        self._path = path
+        self._lock, self._reading = threading.RLock(), threading.Lock()
+        self._writing_thread: int | None = None
+        self._database = _opened(path, _prepare)
+        try:
+            self._reader = _opened(path, lambda reader, _: reader.conn.execute("PRAGMA query_only = ON"))
+        except sqlite3.Error as error:
+            self._database.close()
+            raise StoreError(f"the store {path} cannot be read ({error}); check its disk") from error
+
+    def close(self) -> None:
+        """Closes the database; nothing here must be used afterwards."""
+        with self._lock, self._reading:
+            self._reader.close()
+            self._database.close()  # the last one tidies up the write-ahead log
+
+    @contextmanager
+    def write(self, *, durable: bool = True) -> Iterator[sqlite3.Connection]:
+        """One transaction: all of the block or nothing. Raises StoreError where the disk refuses."""
+        with self._lock:
+            self._writing_thread = threading.get_ident()
+            try:
+                with _transaction(self._database, durable=durable) as connection:
+                    yield connection
+            except sqlite3.Error as error:
+                raise StoreError(f"the store {self._path} refuses to be written ({error}); check its disk") from error
+            finally:
+                self._writing_thread = None
+
+    def query(self, sql: str, values: tuple[object, ...] = ()) -> list[dict[str, Any]]:
+        """The rows by column. Raises StoreError where the disk refuses."""
+        try:
+            if self._writing_thread == threading.get_ident():
+                return list(self._database.query(sql, values))
+            with self._reading:
+                return list(self._reader.query(sql, values))
+        except sqlite3.Error as error:
+            raise StoreError(f"the store {self._path} cannot be read ({error}); check its disk") from error
+
+    def log(self, connection: sqlite3.Connection, site: str, entry: LogEntry) -> None:
+        """One line of a site's history, within a transaction."""
+        connection.execute(
+            """INSERT INTO events (stamp_ns, site, kind, detail, version, actor, reason)
+               VALUES (?, ?, ?, ?, ?, ?, ?)""",
+            (self.now_ns(), site, entry.kind, entry.detail, entry.version, entry.actor.name, entry.actor.reason),
+        )
+
+
+def _opened(path: Path, prepare: Callable[[Database, Path], object]) -> Database:
+    """A prepared connection, usable from any thread under one lock."""
     connection = sqlite3.connect(path, timeout=_BUSY_TIMEOUT_MS / 1000, isolation_level=None, check_same_thread=False)
     try:
         database = Database(connection, execute_plugins=False)
-        _check_ours(connection, path)
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA foreign_keys = ON")
-        _migrate(database)
+        prepare(database, path)
     except BaseException:
         connection.close()
         raise
     return database
 
 
-def open_reader(path: Path) -> Database:
-    """A second connection to a database that `open_database` has open, which cannot write; usable from any thread under one lock."""
-    connection = sqlite3.connect(path, timeout=_BUSY_TIMEOUT_MS / 1000, isolation_level=None, check_same_thread=False)
-    try:
-        connection.execute("PRAGMA query_only = ON")
-    except BaseException:
-        connection.close()
-        raise
-    return Database(connection, execute_plugins=False)
+def _prepare(database: Database, path: Path) -> None:
+    _check_ours(database.conn, path)
+    database.conn.execute("PRAGMA journal_mode = WAL")
+    database.conn.execute("PRAGMA foreign_keys = ON")
+    _migrate(database)
 
 
 @contextmanager
-def transaction(database: Database, *, durable: bool = True) -> Iterator[sqlite3.Connection]:
+def _transaction(database: Database, *, durable: bool) -> Iterator[sqlite3.Connection]:
     """One write transaction: all of the block or nothing; a durable one is on the disk when it ends."""
     connection = database.conn
     # NORMAL may lose the last commits when the power fails, never the file's integrity: enough for robots' reports.
@@ -76,7 +127,7 @@ def _check_ours(connection: sqlite3.Connection, path: Path) -> None:
 def _migrate(database: Database) -> None:
     done = int(database.conn.execute("PRAGMA user_version").fetchone()[0])
     for number in range(done + 1, len(MIGRATIONS) + 1):
-        with transaction(database) as connection:
+        with _transaction(database, durable=True) as connection:
             # Another process may have come first between the look above and the lock that this transaction holds.
             if int(connection.execute("PRAGMA user_version").fetchone()[0]) >= number:
                 continue

@@ -10,8 +10,8 @@ import msgspec
 from fleetmap.errors import UsageError
 from fleetmap.messages import FailureReport
 from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters, hour_of
+from mapserver.store.database import Transactions
 from mapserver.store.rows import AXES, FailureDetail, FailureFilter, FailureRow, FleetRetention, PictureRow, TraceRow
-from mapserver.store.transactions import Transactions
 
 CounterKey = tuple[str, str, str, int]
 """Site, axis, key, hour."""

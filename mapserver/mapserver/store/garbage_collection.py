@@ -4,8 +4,8 @@ import sqlite3
 from dataclasses import dataclass, field
 
 from mapserver.store.blobs import BlobFolder
+from mapserver.store.database import Transactions
 from mapserver.store.rows import Actor, LogEntry, SiteReleases
-from mapserver.store.transactions import Transactions
 from mapserver.store.version_rows import set_state, site_releases
 
 _DAY_NS = 86_400_000_000_000

@@ -12,6 +12,7 @@ from fleetmap.errors import UsageError
 from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest
 from mapserver.quality.figures import Evidence
 from mapserver.store.blobs import BlobFolder
+from mapserver.store.database import Transactions
 from mapserver.store.fleet_queries import FleetQueries, keep_last_reports
 from mapserver.store.rows import (
     NOBODY,
@@ -26,7 +27,6 @@ from mapserver.store.rows import (
     VerdictRow,
     VersionInfo,
 )
-from mapserver.store.transactions import Transactions
 from mapserver.store.version_rows import canaries, site_releases
 
 JOB_STATES = ("running", "done", "failed")

@@ -7,8 +7,8 @@ from typing import Any
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import Manifest, current_path, decode_manifest
 from mapserver.store.blobs import BlobFolder
+from mapserver.store.database import Transactions
 from mapserver.store.rows import SiteReleases, VersionInfo
-from mapserver.store.transactions import Transactions
 from mapserver.store.version_rows import references, site_releases
 
 

@@ -4,8 +4,8 @@ import json
 import sqlite3
 
 from fleetmap.mapformat import Manifest
+from mapserver.store.database import Transactions
 from mapserver.store.rows import CanaryRow, LogEntry, ReleaseChanges, SiteReleases, VerdictRow, VersionInfo
-from mapserver.store.transactions import Transactions
 
 # The newest row of a version that was current before the one that is current now.
 _ROLLBACK_TARGET = """

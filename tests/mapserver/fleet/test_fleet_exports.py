@@ -19,7 +19,7 @@ from mapserver.cli import app
 from mapserver.dashboard.pages.shift_page import html_page
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.shift_summary import SummarySettings, summarise
-from mapserver.fleet_statistics.rate_format import driven_words
+from mapserver.fleet_statistics.kpis import driven_words
 from mapserver.store import FailureFilter, MapStore
 from support.fleet.made_fleet import NS, Known, MadeRobot, drive
 from support.storage.map_samples import save_sample_draft
@@ -192,7 +192,6 @@ def test_the_schemas_have_foxgloves_fields() -> None:
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
     from foxglove_schemas_protobuf.Log_pb2 import Log
     from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-
     from mapserver.fleet.export_schemas import SCHEMAS
 
     for message in (CompressedImage, Log, PoseInFrame):

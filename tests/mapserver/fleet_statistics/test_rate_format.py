@@ -1,7 +1,6 @@
 """Rates are told where enough was driven, counts everywhere."""
 
-from mapserver.fleet_statistics.kpis import rate
-from mapserver.fleet_statistics.rate_format import driven_words, format_rate, is_telling
+from mapserver.fleet_statistics.kpis import driven_words, format_rate, is_telling, rate
 
 
 def test_one_failure_in_two_minutes_is_no_rate() -> None:

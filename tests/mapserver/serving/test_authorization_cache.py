@@ -1,6 +1,6 @@
 """What may be fetched is remembered for some seconds, what may not is asked for each time."""
 
-from mapserver.serving.authorization_cache import AuthorizationCache
+from mapserver.serving.caches import AuthorizationCache
 
 
 def test_the_store_is_asked_once_in_some_seconds() -> None:

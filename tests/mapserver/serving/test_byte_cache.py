@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from mapserver.serving.byte_cache import ByteCache
+from mapserver.serving.caches import ByteCache
 
 
 def test_the_least_recently_used_go_first() -> None:

@@ -14,7 +14,7 @@ from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services
 from mapserver.dashboard.live import LiveRobot, LiveSite
 from mapserver.dashboard.markup import age, joined, share
 from mapserver.dashboard.plan import Plan
-from mapserver.fleet_statistics.rate_format import driven_words
+from mapserver.fleet_statistics.kpis import driven_words
 
 _MOVE_EVERY_S, _TABLE_EVERY_S = 1.0, 2.0
 _SHAPES = {"good": "circle", "warn": "triangle", "bad": "square", "quiet": "circle"}

@@ -10,8 +10,7 @@ from mapserver.dashboard.drawing import Bar
 from mapserver.dashboard.fleet_parts import Figure, Trial
 from mapserver.dashboard.markup import joined, moment, share, table
 from mapserver.fleet.shift_summary import FleetSummary
-from mapserver.fleet_statistics.kpis import HOUR_NS, Kpis, Rate
-from mapserver.fleet_statistics.rate_format import format_rate, is_telling
+from mapserver.fleet_statistics.kpis import HOUR_NS, Kpis, Rate, format_rate, is_telling
 
 _STYLE = Path(__file__).parents[1] / "style.css"
 _ROWS = 15

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fleetmap.errors import StoreError
-from mapserver.store.transactions import Transactions
+from mapserver.store.database import Transactions
 
 COUNT = "SELECT count(*) AS n FROM events"
 _LINE = "INSERT INTO events (stamp_ns, site, kind, detail) VALUES (1, 'hall', 'note', 'x')"
