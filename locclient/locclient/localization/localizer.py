@@ -1,7 +1,8 @@
 """The localizer: samples and tiles in, one estimate for each frame out. Pure."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,8 +33,7 @@ _HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
 
 
-@dataclass(frozen=True, slots=True)
-class _QueryResult:
+class _QueryResult(NamedTuple):
     """The result of a map query; fields as in Estimate."""
 
     fix: Fix | None = None
@@ -41,7 +41,7 @@ class _QueryResult:
     innovation: float | None = None
     innovation_m: float | None = None
     moved_m: float | None = None
-    stamp_ns: int | None = None
+    fix_stamp_ns: int | None = None
 
 
 class Localizer:
@@ -62,9 +62,8 @@ class Localizer:
         self._camera, self._body_from_cam = camera, body_from_cam
         self._cam_from_body = se3_inverse(body_from_cam)
         self._base_from_body = calibration.base_from_body
-        self._odometry = Odometry(
-            calibration, camera, body_from_cam, imu_minus_cam_s, settings.odometry, settings.stereo
-        )
+        rig = (calibration, camera, body_from_cam, imu_minus_cam_s)
+        self._odometry = Odometry(*rig, settings.odometry, settings.stereo)
         self._relocalizer: Relocalizer | None = None
         self._map_version: int | None = None
         self._prior: InitialPosePrior | None = None
@@ -122,17 +121,12 @@ class Localizer:
             map_from_body=None,
             cov_rot_trans=None,
             map_version=self._map_version,
-            fix=result.fix,
-            refused=result.refused,
-            innovation=result.innovation,
             hypotheses=(),
             odometry=odometry,
             stage_s=stage_s,
             cause=image.cause,
             image=image,
-            fix_stamp_ns=result.stamp_ns,
-            innovation_m=result.innovation_m,
-            moved_m=result.moved_m,
+            **result._asdict(),
         )
         prior, has_failed = self._prior_hypothesis(), self._failed_queries > 0
         state = LocalizationState(self._confirmed, self._candidates, prior, has_failed, self._was_tracking)
@@ -188,7 +182,7 @@ class Localizer:
             while is_at_once:
                 next(self._work)
         except StopIteration as done:
-            result: _QueryResult = replace(done.value, stamp_ns=self._query_frame.stamp_ns)
+            result: _QueryResult = done.value._replace(fix_stamp_ns=self._query_frame.stamp_ns)
             self._work = self._query_frame = None
             self._failed_queries = 0 if result.fix is not None else self._failed_queries + 1
             return result

@@ -30,6 +30,7 @@ from fleetmap.messages import (
 from locclient.maps.chunked_download import ChunkReader
 from locclient.maps.map_source import (
     FetchedTiles,
+    MapSource,
     ReadyVersion,
     address_of,
     checked_manifest,
@@ -39,7 +40,7 @@ from locclient.maps.map_source import (
 from locclient.maps.tile_cache import TileCache
 
 
-class MapClient:
+class MapClient(MapSource):
     """Fetches maps through a cache, and reports.
 
     Cached bytes are not fetched again, so that a known version can be read while the server is away. A robot with an active version
@@ -50,9 +51,8 @@ class MapClient:
         self, bus: Bus, cache: TileCache, site: str, robot: str, *, timeout_s: float = 5.0, patience_s: float = 0.0
     ) -> None:
         """patience_s: how long a server may be away in the middle of a fetch. Raises UsageError for names that cannot be keys."""
-        self._bus = bus
-        self._cache = cache
-        self._site = check_name(site, "site")
+        super().__init__(site)
+        self._bus, self._cache = bus, cache
         self._robot = check_name(robot, "robot")
         self._timeout_s = timeout_s
         self._chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
@@ -77,9 +77,8 @@ class MapClient:
 
     def on_wanted(self, listener: Callable[[WantedVersion], None]) -> Handle:
         """Calls `listener`, on a thread of the bus, whenever the server wants another version."""
-        return self._bus.subscribe(
-            self._key("wanted"), lambda _, payload: listener(decode_message(payload, WantedVersion))
-        )
+        key = self._key("wanted")
+        return self._bus.subscribe(key, lambda _, payload: listener(decode_message(payload, WantedVersion)))
 
     def active(self) -> WantedVersion | None:
         """The version that is whole in the cache, None before the first one."""
@@ -139,11 +138,9 @@ class MapClient:
         base = None if active is None else active.blobs[0]
         return checked_manifest(self._blob(manifest_key(self._site, version), sha256, MAX_MANIFEST_BYTES, base), wanted)
 
-    def vocabulary(self, manifest: Manifest) -> bytes:
-        """The version's vocabulary: the one that ships, or from the cache or the server; errors as of `manifest`."""
-        entry = manifest.vocabulary
-        shipped = shipped_vocabulary(entry.sha256)
-        return shipped or self._blob(blob_key(self._site, entry.sha256), entry.sha256, entry.bytes, None)
+    def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
+        """The verified bytes of an address, from the cache or the server; errors as of `manifest`."""
+        return self._blob(blob_key(self._site, sha256), sha256, max_bytes, None)
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
         """Tiles of the version, from the cache or the server: all, or those of `cells` that it has.
@@ -211,9 +208,8 @@ class MapClient:
 
     def ack(self, version: int | None, *, stamp_ns: int, refused: str = "") -> None:
         """Tells the server which version this robot runs and, if so, why not the wanted one."""
-        message = RobotAck(
-            site=self._site, robot=self._robot, stamp_ns=stamp_ns, version=version, refused=refused[:2000]
-        )
+        own = {"site": self._site, "robot": self._robot}
+        message = RobotAck(**own, stamp_ns=stamp_ns, version=version, refused=refused[:2000])
         self._bus.publish(self._key("ack"), encode_message(message))
 
     def report_failure(self, payload: bytes) -> FailureAck:

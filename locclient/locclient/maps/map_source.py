@@ -4,7 +4,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError
@@ -40,47 +39,36 @@ class ReadyVersion:
     note: str = ""
 
 
-class MapSource(Protocol):
-    """What a robot reads its map from."""
-
-    def ready(self) -> ReadyVersion:
-        """The version to run now."""
-
-    def manifest(self, wanted: WantedVersion) -> Manifest:
-        """The manifest of that version."""
-
-    def vocabulary(self, manifest: Manifest) -> bytes:
-        """The vocabulary of that version."""
-
-    def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
-        """Tiles of that version: all, or those of `cells` that it has."""
-
-
-class _DiskMapSource(ABC):
-    """A MapSource over bytes on this machine's disk."""
+class MapSource(ABC):
+    """Source that a robot reads its map from."""
 
     def __init__(self, site: str) -> None:
         """Raises UsageError for a name that no site can have."""
         self._site = check_name(site, "site")
 
     @abstractmethod
-    def blob(self, sha256: str) -> bytes:
-        """The verified bytes of an address."""
+    def ready(self) -> ReadyVersion:
+        """The version to run now."""
+
+    @abstractmethod
+    def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
+        """The verified bytes of an address. max_bytes: the most that may come over a network."""
 
     def manifest(self, wanted: WantedVersion) -> Manifest:
         """The wanted version's manifest; errors as of `blob`, LinkError without a version, MapFormatError where it is another."""
         return checked_manifest(self.blob(address_of(wanted)[1]), wanted)
 
     def vocabulary(self, manifest: Manifest) -> bytes:
-        """The version's vocabulary; errors as of `blob`."""
-        return shipped_vocabulary(manifest.vocabulary.sha256) or self.blob(manifest.vocabulary.sha256)
+        """The version's vocabulary: the one that ships, or errors as of `blob`."""
+        entry = manifest.vocabulary
+        return shipped_vocabulary(entry.sha256) or self.blob(entry.sha256, entry.bytes)
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
-        """Tiles of the version, as `MapClient.tiles`."""
+        """Tiles of the version: all, or those of `cells` that it has. One that cannot be used is refused with its reason."""
         return collect_tiles(manifest, cells, lambda entry: self.blob(entry.sha256))
 
 
-class CachedMap(_DiskMapSource):
+class CachedMap(MapSource):
     """Reads from the cache alone and waits for nobody; for another thread than the MapClient's, with a TileCache of its own."""
 
     def __init__(self, cache: TileCache, site: str) -> None:
@@ -94,7 +82,7 @@ class CachedMap(_DiskMapSource):
             raise LinkError(f"the cache has no version of site {self._site} yet; it has to come from a server first")
         return ReadyVersion(active.wanted(self._site))
 
-    def blob(self, sha256: str) -> bytes:
+    def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
         """The verified bytes of an address; LinkError where they are not here."""
         data = self._cache.get(sha256)
         if data is None:
@@ -102,7 +90,7 @@ class CachedMap(_DiskMapSource):
         return data
 
 
-class LocalMapSource(_DiskMapSource):
+class LocalMapSource(MapSource):
     """Reads from a store's folder, without its database; for a robot without a server."""
 
     def __init__(self, folder: Path, site: str) -> None:
@@ -125,11 +113,10 @@ class LocalMapSource(_DiskMapSource):
             return WantedVersion(site=self._site, version=None, manifest_sha256=None)
         except (OSError, UnicodeDecodeError, MapFormatError) as error:
             raise StoreError(f"{path} cannot be read ({error}); open the store with mapserver to repair it") from error
-        return WantedVersion(
-            site=self._site, version=decode_manifest(self.blob(sha256)).version, manifest_sha256=sha256
-        )
+        version = decode_manifest(self.blob(sha256)).version
+        return WantedVersion(site=self._site, version=version, manifest_sha256=sha256)
 
-    def blob(self, sha256: str) -> bytes:
+    def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
         """The verified bytes of an address; raises StoreError for missing ones, MapFormatError for damaged ones."""
         path = self._folder / blob_path(sha256)
         try:

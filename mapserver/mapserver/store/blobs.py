@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fleetmap.errors import MapFormatError, StoreError
 from fleetmap.mapformat import blob_path, sha256_hex, verified
-from mapserver.store.files import TEMPORARY_SUFFIX, make_folder, read_chunks, read_file, sync_folder, write_atomically
+from mapserver.store.files import TEMPORARY_SUFFIX, make_folder, read_chunks, sync_folder, write_atomically
 
 _FOLDER = "blobs"
 
@@ -33,7 +33,7 @@ class BlobFolder:
 
     def get(self, sha256: str) -> bytes:
         """The bytes of an address; raises StoreError for missing ones, MapFormatError for damaged ones."""
-        return verified(self._reading(sha256), sha256)
+        return verified(b"".join(self.chunks(sha256)), sha256)
 
     def chunks(self, sha256: str) -> Iterator[bytes]:
         """The bytes of an address in pieces, unverified; raises StoreError for missing ones."""
@@ -41,7 +41,9 @@ class BlobFolder:
         try:
             yield from read_chunks(path)
         except OSError as error:
-            raise _unreadable(path, error) from error
+            raise StoreError(
+                f"{path} cannot be read ({error.strerror}); the store is incomplete, restore it"
+            ) from error
 
     def is_whole(self, sha256: str) -> bool:
         """Whether the bytes of an address are there and are what it says; reads them in pieces."""
@@ -65,10 +67,6 @@ class BlobFolder:
         """Files that are no blobs, such as what a killed process left behind."""
         return sorted(path for path in self._files() if not _is_address(path))
 
-    def remove(self, sha256: str) -> int:
-        """Removes the file of an address and returns its size; raises StoreError where the disk refuses."""
-        return self.remove_file(self.path(sha256))
-
     def remove_file(self, path: Path) -> int:
         """Removes a file and returns its size; raises StoreError where the disk refuses."""
         try:
@@ -85,22 +83,14 @@ class BlobFolder:
             if path.is_file() and path.stat().st_size == size_bytes and self.is_whole(sha256):
                 # Who wrote it may have died before its name was on the disk.
                 sync_folder(path.parent)
-                make_folder(path.parent)
-                make_folder(path.parent.parent)
-            else:
-                make_folder(path.parent)
-                make_folder(path.parent.parent)
+                chunks = ()
+            make_folder(path.parent)
+            make_folder(path.parent.parent)
+            if chunks:
                 write_atomically(path, chunks)
         except OSError as error:
             reason = f"{path} cannot be written ({error.strerror}); check the disk's space and rights"
             raise StoreError(reason) from error
-
-    def _reading(self, sha256: str) -> bytes:
-        path = self.path(sha256)
-        try:
-            return read_file(path)
-        except OSError as error:
-            raise _unreadable(path, error) from error
 
     def _files(self) -> Iterator[Path]:
         return (path for path in (self._root / _FOLDER).glob("*/*") if path.is_file())
@@ -108,10 +98,6 @@ class BlobFolder:
 
 def _is_address(path: Path) -> bool:
     return len(path.name) == 64 and not path.name.endswith(TEMPORARY_SUFFIX) and path.name[:2] == path.parent.name
-
-
-def _unreadable(path: Path, error: OSError) -> StoreError:
-    return StoreError(f"{path} cannot be read ({error.strerror}); the store is incomplete, restore it")
 
 
 def _checked(chunks: Iterable[bytes], sha256: str, size_bytes: int) -> Iterator[bytes]:

@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from sqlite_utils import Database
 
@@ -15,6 +15,9 @@ from mapserver.store.rows import LogEntry
 
 APPLICATION_ID = 0x464D4150  # "FMAP": says whose file this is
 _BUSY_TIMEOUT_MS = 30_000
+
+
+Row = TypeVar("Row")
 
 
 class Transactions:
@@ -66,11 +69,14 @@ class Transactions:
         except sqlite3.Error as error:
             raise StoreError(f"the store {self._path} cannot be read ({error}); check its disk") from error
 
+    def rows(self, kind: Callable[..., Row], sql: str, values: tuple[object, ...] = ()) -> list[Row]:
+        """The rows, each as a `kind` with a field for every column. Raises StoreError where the disk refuses."""
+        return [kind(**row) for row in self.query(sql, values)]
+
     def log(self, connection: sqlite3.Connection, site: str, entry: LogEntry) -> None:
         """One line of a site's history, within a transaction."""
         connection.execute(
-            """INSERT INTO events (stamp_ns, site, kind, detail, version, actor, reason)
-               VALUES (?, ?, ?, ?, ?, ?, ?)""",
+            "INSERT INTO events (stamp_ns, site, kind, detail, version, actor, reason) VALUES (?, ?, ?, ?, ?, ?, ?)",
             (self.now_ns(), site, entry.kind, entry.detail, entry.version, entry.actor.name, entry.actor.reason),
         )
 

@@ -3,6 +3,7 @@
 import sqlite3
 from collections.abc import Iterable, Mapping
 from dataclasses import astuple, dataclass, field
+from itertools import accumulate
 from typing import Any
 
 import msgspec
@@ -95,9 +96,8 @@ class FleetQueries:
     ) -> dict[tuple[str, str], Counters]:
         """Sums by (site, key) of an axis over hours from `since_hour` to before `until_hour`."""
         values = (_axis(axis), site, key, since_hour, until_hour)
-        rows = self._transactions.query(
-            f"SELECT k.site, k.key, {_SUMS} {_COUNTED} GROUP BY k.id ORDER BY k.site, k.key", values
-        )
+        query = f"SELECT k.site, k.key, {_SUMS} {_COUNTED} GROUP BY k.id ORDER BY k.site, k.key"
+        rows = self._transactions.query(query, values)
         return {(row.pop("site"), row.pop("key")): Counters(**row) for row in rows}
 
     def hours(
@@ -110,7 +110,8 @@ class FleetQueries:
 
     def failures(self, wanted: FailureFilter, *, before: int | None = None, limit: int = -1) -> list[FailureRow]:
         """Failures, the last to arrive first, of numbers below `before`."""
-        rows = self._transactions.query(
+        return self._transactions.rows(
+            FailureRow,
             f"""SELECT {_FAILURE_COLUMNS} FROM failures
                 WHERE (?1 IS NULL OR site = ?1) AND (?2 IS NULL OR robot = ?2) AND (?3 IS NULL OR version = ?3)
                 AND (?4 IS NULL OR tile = ?4) AND (?5 IS NULL OR cause = ?5) AND (?6 IS NULL OR kind = ?6)
@@ -118,7 +119,6 @@ class FleetQueries:
                 AND (?9 IS NULL OR number < ?9) ORDER BY number DESC LIMIT ?10""",
             (*astuple(wanted), before, limit),
         )
-        return [FailureRow(**row) for row in rows]
 
     def failure(self, number: int) -> FailureDetail:
         """One failure with its context; raises UsageError where it does not exist."""
@@ -126,31 +126,27 @@ class FleetQueries:
         if not rows:
             raise UsageError(f"there is no failure {number}; the list of failures shows those that are kept")
         report = msgspec.msgpack.decode(rows[0].pop("report"), type=FailureReport)
-        pictures = self._transactions.query(
-            """SELECT place, kind, stamp_ns, length(jpeg) bytes FROM failure_pictures
-               WHERE number = ? ORDER BY place""",
-            (number,),
-        )
-        return FailureDetail(FailureRow(**rows[0]), report, [PictureRow(**row) for row in pictures])
+        query = "SELECT place, kind, stamp_ns, length(jpeg) bytes FROM failure_pictures WHERE number = ? ORDER BY place"
+        pictures = self._transactions.rows(PictureRow, query, (number,))
+        return FailureDetail(FailureRow(**rows[0]), report, pictures)
 
     def picture(self, number: int, place: int) -> bytes:
         """The JPEG of a failure; raises UsageError where there is none, or none any more."""
-        rows = self._transactions.query(
-            "SELECT jpeg FROM failure_pictures WHERE number = ? AND place = ?", (number, place)
-        )
+        query = "SELECT jpeg FROM failure_pictures WHERE number = ? AND place = ?"
+        rows = self._transactions.query(query, (number, place))
         if not rows:
             raise UsageError(f"failure {number} has no picture {place}; old ones go when pictures need too much space")
         return bytes(rows[0]["jpeg"])
 
     def trace(self, site: str, robot: str, *, since_hour: int = 0) -> list[TraceRow]:
         """Where a robot was, oldest first."""
-        rows = self._transactions.query(
+        return self._transactions.rows(
+            TraceRow,
             """SELECT k.site, k.key robot, t.hour, t.stamp_ns, t.status, t.version, t.x_map_m, t.y_map_m, t.radius_95_m
                FROM traces t JOIN tally_keys k ON k.id = t.key_id
                WHERE t.hour >= ? AND k.site = ? AND k.axis = 'robot' AND k.key = ? ORDER BY t.hour, t.stamp_ns""",
             (since_hour, site, robot),
         )
-        return [TraceRow(**row) for row in rows]
 
     def prune(self, retention: FleetRetention) -> int:
         """Removes what is too old or too much; returns how many rows went."""
@@ -205,30 +201,22 @@ def _axis(axis: str) -> str:
 def _add_counters(
     connection: sqlite3.Connection, ids: Mapping[tuple[str, str, str], int], counters: Mapping[CounterKey, Counters]
 ) -> None:
-    connection.executemany(
-        _ADD,
-        [(ids[key[:3]], key[3], *counts.values()) for key, counts in sorted(counters.items(), key=lambda kv: kv[0])],
-    )
+    ordered = sorted(counters.items(), key=lambda item: item[0])
+    connection.executemany(_ADD, [(ids[key[:3]], key[3], *counts.values()) for key, counts in ordered])
 
 
 def _prune_traces(connection: sqlite3.Connection, keep: int) -> int:
     """Whole hours go, the oldest first, until at most `keep` rows stay (the running hour stays whatever it holds)."""
     hours = connection.execute("SELECT hour, count(*) FROM traces GROUP BY hour ORDER BY hour DESC").fetchall()
-    kept = 0
-    for position, (hour, count) in enumerate(hours):
-        kept += count
-        if kept > keep and position > 0:
-            return connection.execute("DELETE FROM traces WHERE hour <= ?", (hour,)).rowcount
-    return 0
+    sums = accumulate(count for _, count in hours)
+    last = next((hour for (hour, _), kept in [*zip(hours, sums, strict=True)][1:] if kept > keep), None)
+    return connection.execute("DELETE FROM traces WHERE hour <= ?", (last,)).rowcount
 
 
 def _prune_pictures(connection: sqlite3.Connection, keep_bytes: int) -> int:
-    rows = connection.execute(
+    sizes = connection.execute(
         "SELECT number, sum(length(jpeg)) FROM failure_pictures GROUP BY number ORDER BY number DESC"
     ).fetchall()
-    kept = 0
-    for number, size in rows:
-        kept += size
-        if kept > keep_bytes:
-            return connection.execute("DELETE FROM failure_pictures WHERE number <= ?", (number,)).rowcount
-    return 0
+    sums = accumulate(size for _, size in sizes)
+    last = next((number for (number, _), kept in zip(sizes, sums, strict=True) if kept > keep_bytes), None)
+    return connection.execute("DELETE FROM failure_pictures WHERE number <= ?", (last,)).rowcount

@@ -50,11 +50,8 @@ def collect(
             _plan(transactions, retention, garbage)
             _write_down(transactions, connection, garbage, actor)
     kept = _mentioned(transactions, set(garbage.removed) if dry_run else set())
-    for sha256 in sorted(blobs.addresses() - kept):
-        path = blobs.path(sha256)
-        garbage.freed_bytes += path.stat().st_size if dry_run else blobs.remove_file(path)
-        garbage.files += 1
-    for path in blobs.unreferenced():
+    unmentioned = [blobs.path(sha256) for sha256 in sorted(blobs.addresses() - kept)]
+    for path in [*unmentioned, *blobs.unreferenced()]:
         garbage.freed_bytes += path.stat().st_size if dry_run else blobs.remove_file(path)
         garbage.files += 1
     return garbage

@@ -29,7 +29,7 @@ from fleetmap.mapformat import (
     encode_manifest,
     encode_tile,
 )
-from mapserver.store.export_import import ExportReader, open_export, write_export
+from mapserver.store.export_import import open_export, write_export
 from mapserver.store.files import locked, make_folder, read_file, sync_folder, write_atomically
 from mapserver.store.garbage_collection import Garbage, Retention, collect
 from mapserver.store.queries import StoreQueries
@@ -161,9 +161,8 @@ class MapStore(StoreQueries):
 
     def export_version(self, site: str, version: int, path: Path, *, archive: bool = True) -> int:
         """Writes a version into one file and returns its size; errors as of `manifest`, StoreError for the disk."""
-        return write_export(
-            path, self.version(site, version), self.manifest(site, version), self._blobs, archive=archive
-        )
+        info, manifest = self.version(site, version), self.manifest(site, version)
+        return write_export(path, info, manifest, self._blobs, archive=archive)
 
     def import_version(self, path: Path, *, actor: Actor = NOBODY) -> VersionInfo:
         """Takes a version out of an export file, as a draft of its site with its own number; publishing comes after.
@@ -179,7 +178,8 @@ class MapStore(StoreQueries):
             if known is not None:
                 return known
             reader.check_tiles(manifest)
-            self._put_blobs(reader)
+            for number, blob in enumerate(reader.head.blobs):
+                self._blobs.put_chunks(reader.chunks(number), blob.sha256, blob.bytes)
             archive = reader.head.archive()
             with self._transactions.write() as connection:
                 connection.execute("INSERT OR IGNORE INTO sites (site) VALUES (?)", (manifest.site,))
@@ -191,9 +191,8 @@ class MapStore(StoreQueries):
 
     def _put_tile(self, tile: Tile) -> TileEntry:
         data = encode_tile(tile)
-        return TileEntry(
-            x=tile.tile_x, y=tile.tile_y, sha256=self._blobs.put(data), bytes=len(data), landmarks=len(tile)
-        )
+        sha256 = self._blobs.put(data)
+        return TileEntry(x=tile.tile_x, y=tile.tile_y, sha256=sha256, bytes=len(data), landmarks=len(tile))
 
     def _draft_row(self, manifest: Manifest, archive_sha256: str | None, job: int | None) -> VersionInfo:
         """The row of a new draft; its manifest is on the disk when this returns."""
@@ -219,19 +218,11 @@ class MapStore(StoreQueries):
         )
 
     def _known_import(self, manifest: Manifest, sha256: str) -> VersionInfo | None:
-        rows = self._transactions.query(
-            "SELECT * FROM versions WHERE site = ? AND version = ?", (manifest.site, manifest.version)
-        )
-        if not rows:
-            return None
-        if rows[0]["manifest_sha256"] != sha256:
+        known = self._find_version(manifest.site, manifest.version)
+        if known is not None and known.manifest_sha256 != sha256:
             reason = f"site {manifest.site} has another version {manifest.version}; import it into a store of its own"
             raise StateError(reason)
-        return VersionInfo(**rows[0])
-
-    def _put_blobs(self, reader: ExportReader) -> None:
-        for number, blob in enumerate(reader.head.blobs):
-            self._blobs.put_chunks(reader.chunks(number), blob.sha256, blob.bytes)
+        return known
 
     def _repair_current_files(self) -> None:
         for row in self._transactions.query("SELECT site, manifest_sha256 FROM versions WHERE state = 'current'"):

@@ -15,12 +15,9 @@ from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import Transactions
 from mapserver.store.fleet_queries import FleetQueries, keep_last_reports
 from mapserver.store.rows import (
-    NOBODY,
-    Actor,
     CanaryRow,
     Event,
     JobInfo,
-    LogEntry,
     RobotInfo,
     SiteInfo,
     SiteReleases,
@@ -54,29 +51,29 @@ class StoreQueries:
 
     def sites(self) -> list[SiteInfo]:
         """All sites by name."""
-        rows = self._transactions.query(
-            """SELECT s.site,
-                      (SELECT version FROM versions v WHERE v.site = s.site AND state = 'current') current_version,
-                      (SELECT count(*) FROM versions v WHERE v.site = s.site) versions, s.vocabulary_sha256
-               FROM sites s ORDER BY s.site"""
+        return self._transactions.rows(
+            SiteInfo,
+            """SELECT s.site, (SELECT version FROM versions v WHERE v.site = s.site AND state = 'current') current_version,
+               (SELECT count(*) FROM versions v WHERE v.site = s.site) versions, s.vocabulary_sha256
+               FROM sites s ORDER BY s.site""",
         )
-        return [SiteInfo(**row) for row in rows]
 
     def versions(self, site: str, *, after: int = 0, limit: int = -1) -> list[VersionInfo]:
         """Versions of a site, oldest first, behind number `after`; raises UsageError for a site that is not known."""
         self._check_site(site)
-        rows = self._transactions.query(
-            "SELECT * FROM versions WHERE site = ? AND version > ? ORDER BY version LIMIT ?", (site, after, limit)
+        return self._transactions.rows(
+            VersionInfo,
+            "SELECT * FROM versions WHERE site = ? AND version > ? ORDER BY version LIMIT ?",
+            (site, after, limit),
         )
-        return [VersionInfo(**row) for row in rows]
 
     def version(self, site: str, version: int) -> VersionInfo:
         """One version; raises UsageError where it does not exist."""
         self._check_site(site)
-        rows = self._transactions.query("SELECT * FROM versions WHERE site = ? AND version = ?", (site, version))
-        if not rows:
+        found = self._find_version(site, version)
+        if found is None:
             raise UsageError(f"site {site} has no version {version}; `mapserver versions --site {site}` lists them")
-        return VersionInfo(**rows[0])
+        return found
 
     def current(self, site: str) -> VersionInfo | None:
         """The site's current version, None before the first publication; raises UsageError for an unknown site."""
@@ -133,12 +130,8 @@ class StoreQueries:
             (site, version),
         )
         return [
-            VerdictRow(
-                row["stamp_ns"],
-                bool(row["accepted"]),
-                bool(row["forced"]),
-                tuple(json.loads(row["reasons"])),
-                json.loads(row["report"]),
+            msgspec.convert(
+                row | {name: json.loads(row[name]) for name in ("reasons", "report")}, VerdictRow, strict=False
             )
             for row in rows
         ]
@@ -151,10 +144,9 @@ class StoreQueries:
 
     def events(self, site: str, *, after: int = 0, limit: int = -1) -> list[Event]:
         """A site's history, oldest first, behind event `after`."""
-        rows = self._transactions.query(
-            "SELECT * FROM events WHERE site = ? AND id > ? ORDER BY id LIMIT ?", (site, after, limit)
+        return self._transactions.rows(
+            Event, "SELECT * FROM events WHERE site = ? AND id > ? ORDER BY id LIMIT ?", (site, after, limit)
         )
-        return [Event(**row) for row in rows]
 
     def canaries(self, site: str | None = None, *, running: bool = False) -> list[CanaryRow]:
         """Versions that some robots (of a site) tried first, the last one first; those that run alone with `running`."""
@@ -162,8 +154,9 @@ class StoreQueries:
 
     def last_events(self, site: str, limit: int) -> list[Event]:
         """The last of a site's history, newest first."""
-        rows = self._transactions.query("SELECT * FROM events WHERE site = ? ORDER BY id DESC LIMIT ?", (site, limit))
-        return [Event(**row) for row in rows]
+        return self._transactions.rows(
+            Event, "SELECT * FROM events WHERE site = ? ORDER BY id DESC LIMIT ?", (site, limit)
+        )
 
     def robots(self, site: str | None = None) -> list[RobotInfo]:
         """What every robot (of a site) said last."""
@@ -201,13 +194,6 @@ class StoreQueries:
         with self._transactions.write(durable=False) as connection:
             keep_last_reports(connection, {(site, robot): (version, self._clock_ns(), report)})
 
-    def record_event(
-        self, site: str, kind: str, detail: str, *, version: int | None = None, actor: Actor = NOBODY
-    ) -> None:
-        """Keeps one line of a site's history."""
-        with self._transactions.write() as connection:
-            self._transactions.log(connection, site, LogEntry(kind, detail, version, actor))
-
     def begin_job(self, site: str, kind: str) -> int:
         """The number of a new running job."""
         with self._transactions.write() as connection:
@@ -232,9 +218,13 @@ class StoreQueries:
             known = ", ".join(info.site for info in self.sites()) or "none"
             raise UsageError(f"the store has no site {site}; it has: {known}")
 
+    def _find_version(self, site: str, version: int) -> VersionInfo | None:
+        query = "SELECT * FROM versions WHERE site = ? AND version = ?"
+        return next(iter(self._transactions.rows(VersionInfo, query, (site, version))), None)
+
     def _current_row(self, site: str) -> VersionInfo | None:
-        rows = self._transactions.query("SELECT * FROM versions WHERE site = ? AND state = 'current'", (site,))
-        return VersionInfo(**rows[0]) if rows else None
+        query = "SELECT * FROM versions WHERE site = ? AND state = 'current'"
+        return next(iter(self._transactions.rows(VersionInfo, query, (site,))), None)
 
     def _now(self) -> str:
         moment = datetime.fromtimestamp(self._clock_ns() / 1e9, UTC)

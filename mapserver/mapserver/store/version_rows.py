@@ -30,11 +30,8 @@ def site_releases(transactions: Transactions, site: str) -> SiteReleases:
 
 def canaries(transactions: Transactions, site: str | None, *, running: bool) -> list[CanaryRow]:
     """Canaries (of a site), the last one first."""
-    rows = transactions.query(
-        """SELECT * FROM canaries WHERE (?1 IS NULL OR site = ?1) AND (?2 = 0 OR state = 'running') ORDER BY id DESC""",
-        (site, int(running)),
-    )
-    return [CanaryRow(**row) for row in rows]
+    query = "SELECT * FROM canaries WHERE (?1 IS NULL OR site = ?1) AND (?2 = 0 OR state = 'running') ORDER BY id DESC"
+    return transactions.rows(CanaryRow, query, (site, int(running)))
 
 
 def apply_changes(
@@ -61,10 +58,8 @@ def apply_changes(
             (site, new.version, new.base_version, new.share, new.threshold, now_ns, new.actor.name, new.actor.reason),
         )
     if (end := changes.ended_canary) is not None:
-        connection.execute(
-            "UPDATE canaries SET state = ?, ended_ns = ?, outcome = ? WHERE id = ?",
-            (end.state, now_ns, end.outcome, end.id),
-        )
+        query = "UPDATE canaries SET state = ?, ended_ns = ?, outcome = ? WHERE id = ?"
+        connection.execute(query, (end.state, now_ns, end.outcome, end.id))
     for entry in changes.log:
         transactions.log(connection, site, entry)
 
@@ -82,11 +77,8 @@ def insert_verdict(connection: sqlite3.Connection, version: tuple[str, int], ver
     """A verdict on (site, number)."""
     judged = (verdict.stamp_ns, int(verdict.accepted), int(verdict.forced))
     texts = (json.dumps(verdict.reasons), json.dumps(verdict.report, sort_keys=True))
-    connection.execute(
-        """INSERT INTO verdicts (site, version, stamp_ns, accepted, forced, reasons, report)
-           VALUES (?, ?, ?, ?, ?, ?, ?)""",
-        (*version, *judged, *texts),
-    )
+    columns = "site, version, stamp_ns, accepted, forced, reasons, report"
+    connection.execute(f"INSERT INTO verdicts ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?)", (*version, *judged, *texts))
 
 
 def insert_draft(
@@ -95,9 +87,8 @@ def insert_draft(
     """The rows of a new draft, within a transaction; its bytes are on the disk already."""
     row = {name: getattr(draft, name) for name in VersionInfo.__dataclass_fields__}
     connection.execute(f"INSERT INTO versions ({', '.join(row)}) VALUES ({', '.join(f':{name}' for name in row)})", row)
-    connection.execute(
-        "UPDATE sites SET last_version = max(last_version, ?) WHERE site = ?", (draft.version, draft.site)
-    )
+    query = "UPDATE sites SET last_version = max(last_version, ?) WHERE site = ?"
+    connection.execute(query, (draft.version, draft.site))
     connection.executemany(
         "INSERT INTO version_blobs (site, version, kind, sha256) VALUES (?, ?, ?, ?)",
         [(draft.site, draft.version, kind, sha256) for kind, sha256 in sorted(references(draft, manifest))],
