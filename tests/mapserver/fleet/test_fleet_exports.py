@@ -192,6 +192,7 @@ def test_the_schemas_have_foxgloves_fields() -> None:
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
     from foxglove_schemas_protobuf.Log_pb2 import Log
     from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+
     from mapserver.fleet.exports import SCHEMAS
 
     for message in (CompressedImage, Log, PoseInFrame):
