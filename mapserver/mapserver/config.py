@@ -1,8 +1,7 @@
-"""Configuration file of `mapserver`: what is common to all commands, a section for each command, and the settings of maps,
-gate and fleet.
+"""Configuration file of `mapserver`: what is common to all commands, a section for each command, and the settings of maps, gate and fleet.
 
-A command's section holds its options under their names, with `_` for `-`. Paths are relative to the working directory,
-as on the command line.
+A command's section holds its options under their names, with `_` for `-`. Paths are relative to the working directory, as on the command
+line.
 """
 
 from pathlib import Path

@@ -68,11 +68,10 @@ _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fle
 class BuildOptions:
     """Choices of a build. Files that are not named are not written.
 
-    frames: an A:B:C slice of each recording. use: only the sensors of a poorer set. trajectory_source, initial_trajectory:
-    an entry of TRAJECTORY_SOURCES and its file. replay: earlier recordings of the current
-    version, of which frames are looked for in the draft. threads, scheduler: see worker.py. settings: those of the survey; for None
-    the preset of the first recording's sensors with the [survey] section of the file `config` over it. job: the
-    number of the job that builds, for its draft.
+    frames: an A:B:C slice of each recording. use: only the sensors of a poorer set. trajectory_source, initial_trajectory: an entry of
+    TRAJECTORY_SOURCES and its file. replay: earlier recordings of the current version, of which frames are looked for in the draft.
+    threads, scheduler: see worker.py. settings: those of the survey; for None the preset of the first recording's sensors with the [survey]
+    section of the file `config` over it. job: the number of the job that builds, for its draft.
     """
 
     frames: str = "::"

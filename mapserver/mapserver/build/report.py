@@ -27,17 +27,16 @@ MIN_MATCHED = 3  # stamps with a truth, below which no alignment is defined
 class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     """The stable keys.
 
-    recordings: their names. duration_s: from the first to the last selected frame. seconds: wall time from opening the
-    recording until the map is ready to be stored. realtime_factor: duration_s / seconds, above 1 faster than recorded.
-    path_m: length of the estimated trajectory of the selected frames. map_bytes: what a robot downloads for the whole
-    site (manifest and tiles), vocabulary apart; None until it is stored. loops: counts of candidates and their fates.
-    ate_rmse_m, ate_sim3_rmse_m: root mean square position error of every selected frame that has an estimate and a
-    known truth, after one rigid (similarity) alignment; evaluated_share: their share of the selected frames. All three
-    are None without ground truth. scale: metric, or unknown for one camera that nothing told the metres; scale_error: by how much
-    the estimate is too large (0.01 is 1 %), None without ground truth. peak_rss_mb: most memory the process held, in 10^6 bytes.
-    findings: by recording, what the doctor found wanting in it, and what was corrected.
-    culled: what the surveys did not hand on. sessions: what became of every recording, and of the map's landmarks by it.
-    directions: which way the places of each tile look, and which way none does.
+    recordings: their names. duration_s: from the first to the last selected frame. seconds: wall time from opening the recording until the
+    map is ready to be stored. realtime_factor: duration_s / seconds, above 1 faster than recorded. path_m: length of the estimated
+    trajectory of the selected frames. map_bytes: what a robot downloads for the whole site (manifest and tiles), vocabulary apart; None
+    until it is stored. loops: counts of candidates and their fates. ate_rmse_m, ate_sim3_rmse_m: root mean square position error of every
+    selected frame that has an estimate and a known truth, after one rigid (similarity) alignment; evaluated_share: their share of the
+    selected frames. All three are None without ground truth. scale: metric, or unknown for one camera that nothing told the metres;
+    scale_error: by how much the estimate is too large (0.01 is 1 %), None without ground truth. peak_rss_mb: most memory the process held,
+    in 10^6 bytes. findings: by recording, what the doctor found wanting in it, and what was corrected. culled: what the surveys did not
+    hand on. sessions: what became of every recording, and of the map's landmarks by it. directions: which way the places of each tile look,
+    and which way none does.
     """
 
     recordings: list[str]
@@ -115,11 +114,7 @@ class BuildCost(msgspec.Struct, frozen=True):
 
 
 def make_report(
-    recordings: "Sequence[Surveyed]",
-    joined: Joined,
-    found: Accuracy,
-    cost: BuildCost,
-    directions: list[TileDirections],
+    recordings: "Sequence[Surveyed]", joined: Joined, found: Accuracy, cost: BuildCost, directions: list[TileDirections]
 ) -> BuildReport:
     """The report of surveyed recordings, map_bytes still unknown."""
     survey_map = joined.map

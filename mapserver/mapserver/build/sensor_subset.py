@@ -16,12 +16,7 @@ if TYPE_CHECKING:
 
 # What each set can be reduced to, itself included.
 REDUCTIONS: dict[SensorSet, tuple[SensorSet, ...]] = {
-    SensorSet.STEREO_INERTIAL: (
-        SensorSet.STEREO_INERTIAL,
-        SensorSet.STEREO,
-        SensorSet.MONO_INERTIAL,
-        SensorSet.MONO,
-    ),
+    SensorSet.STEREO_INERTIAL: (SensorSet.STEREO_INERTIAL, SensorSet.STEREO, SensorSet.MONO_INERTIAL, SensorSet.MONO),
     SensorSet.STEREO: (SensorSet.STEREO, SensorSet.MONO),
     SensorSet.RGBD: (SensorSet.RGBD, SensorSet.MONO),
     SensorSet.MONO_INERTIAL: (SensorSet.MONO_INERTIAL, SensorSet.MONO),

@@ -1,7 +1,6 @@
 """Compressed responses of the server; the page library's files are compressed once for all browsers.
 
-A page requests some sixteen of them, half a megabyte. Reading and compressing them for each browser takes longer than the rest of
-the page.
+A page requests some sixteen of them, half a megabyte. Reading and compressing them for each browser takes longer than the rest of the page.
 """
 
 from dataclasses import dataclass, field

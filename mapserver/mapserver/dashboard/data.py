@@ -28,10 +28,7 @@ class VersionQuality:
 
 @dataclass(frozen=True, slots=True)
 class SiteHistory:
-    """Versions and events of a site, newest first.
-
-    before: target of a rollback, if any; trial: the version on trial, if any.
-    """
+    """Versions and events of a site, newest first. before: target of a rollback, if any; trial: the version on trial, if any."""
 
     site: SiteInfo
     versions: list[VersionInfo]

@@ -34,9 +34,8 @@ class DisparityZero:
 def disparity_zero(before: RectifiedFrame, after: RectifiedFrame, camera: StereoCamera) -> DisparityZero | None:
     """The offset by which two moments agree best; None where too little moved or too few points were followed.
 
-    Unknown are rotation, translation and the offset: a point at ray r (z = 1) with disparity d is seen along
-    R r + (d + offset (1 + x^2)) t / (focal baseline) afterwards, x along its ray in the right camera. Robust least squares, two
-    rows for each point.
+    Unknown are rotation, translation and the offset: a point at ray r (z = 1) with disparity d is seen along R r + (d + offset (1 + x^2)) t
+    / (focal baseline) afterwards, x along its ray in the right camera. Robust least squares, two rows for each point.
     """
     pixels, tracked, disparities = followed(before, after)
     if len(pixels) < _MIN_POINTS or np.median(np.hypot(*(tracked - pixels).T)) < _MIN_FLOW_PX:

@@ -35,10 +35,7 @@ class Limits(NamedTuple):
 
 
 def judge(name: str, value: float, limits: Limits, good: str, bad: str) -> Finding:
-    """A finding about a value that should be small.
-
-    `good` is its sentence when it is, `bad` (with the next step) when not.
-    """
+    """A finding about a value that should be small. `good` is its sentence when it is, `bad` (with the next step) when not."""
     warn_above, fail_above, unit = limits
     verdict = Verdict.FAIL if value > fail_above else Verdict.WARN if value > warn_above else Verdict.OK
     limit = f"warn above {warn_above:g} {unit}, fail above {fail_above:g} {unit}".replace(" ,", ",").strip()

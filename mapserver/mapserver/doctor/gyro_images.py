@@ -17,10 +17,7 @@ _NAMES = ("camera-imu time offset", "gyro scale", "gyro axes")
 
 @dataclass(frozen=True, slots=True)
 class CameraTurns:
-    """Rotation rates seen by the images.
-
-    Intervals from starts_ns to ends_ns (K,), rates_body_radps (K, 3) mean in body axes.
-    """
+    """Rotation rates seen by the images. Intervals from starts_ns to ends_ns (K,), rates_body_radps (K, 3) mean in body axes."""
 
     starts_ns: Stamps
     ends_ns: Stamps
@@ -29,10 +26,7 @@ class CameraTurns:
 
 @dataclass(frozen=True, slots=True)
 class GyroFit:
-    """What explains the images' rates best: body_from_gyro (3, 3) orthogonal, perhaps a mirror.
-
-    Scale gyro over images.
-    """
+    """What explains the images' rates best: body_from_gyro (3, 3) orthogonal, perhaps a mirror. Scale gyro over images."""
 
     offset_s: float
     body_from_gyro: Array
@@ -64,8 +58,7 @@ def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> t
 def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> GyroFit:
     """The offset (beyond imu_minus_cam_s), rotation or mirror, and scale that make the gyro fit the images' rates best.
 
-    First the offset by the magnitudes, which know no axes, then the axes by orthogonal Procrustes, then the offset by
-    the vectors.
+    First the offset by the magnitudes, which know no axes, then the axes by orthogonal Procrustes, then the offset by the vectors.
     """
     offsets_s = np.arange(-_SEARCH_S, _SEARCH_S + _STEP_S / 2, _STEP_S)
     seen = turns.rates_body_radps - turns.rates_body_radps.mean(axis=0)
@@ -113,10 +106,7 @@ def _correlation(first: Array, second: Array) -> float:
 
 
 def _axes(seen: Array, gyro: Array) -> tuple[Array, int]:
-    """Orthogonal body_from_gyro (3, 3) and about how many axes both turn.
-
-    Where one axis is not seen it completes a rotation.
-    """
+    """Orthogonal body_from_gyro (3, 3) and about how many axes both turn. Where one axis is not seen it completes a rotation."""
     u, singular, vt = np.linalg.svd(seen.T @ (gyro - gyro.mean(axis=0)))
     axes_seen = int((singular > 0.03 * singular[0]).sum())
     sign = 1.0 if axes_seen == 3 else float(np.sign(np.linalg.det(u @ vt)))
@@ -163,11 +153,7 @@ def _axes_finding(fit: GyroFit) -> Finding:
     words = f"the gyro's axes are {angle_deg:.1f} degrees from the calibration, {about}"
     advice = "check body_from_cam (T_cam_imu) and how the IMU is mounted"
     return judge(
-        _NAMES[2],
-        angle_deg,
-        Limits(4.0, 15.0, "degrees"),
-        words,
-        f"{words} ({_in_axes(fit.body_from_gyro)}); {advice}",
+        _NAMES[2], angle_deg, Limits(4.0, 15.0, "degrees"), words, f"{words} ({_in_axes(fit.body_from_gyro)}); {advice}"
     )
 
 

@@ -1,7 +1,4 @@
-"""Left and right image against the calibration.
-
-Is the right one the right one, and do rows match after rectification?
-"""
+"""Left and right image against the calibration. Is the right one the right one, and do rows match after rectification?"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,10 +32,7 @@ _NOTHING = StereoMatches(np.zeros(0), np.zeros(0), np.zeros(0))
 
 
 def match_stereo(frame: RectifiedFrame) -> StereoMatches:
-    """Matches that do not presume the calibration.
-
-    ORB both ways, refined by Lucas-Kanade, any sign of disparity, rows within 25 px.
-    """
+    """Matches that do not presume the calibration. ORB both ways, refined by Lucas-Kanade, any sign of disparity, rows within 25 px."""
     empty = _NOTHING
     if frame.right is None:
         return empty

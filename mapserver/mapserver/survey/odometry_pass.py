@@ -10,13 +10,7 @@ from fleetmap.geometry import Array, rotation_between_vectors, se3
 from fleetmap.odometry import OdometryEstimate, OdometryStatus, make_odometry
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import wheel_between
-from mapserver.survey.keyframes.keyframes import (
-    FrameSummary,
-    Keyframe,
-    KeyframePolicy,
-    make_keyframes,
-    sharpness,
-)
+from mapserver.survey.keyframes.keyframes import FrameSummary, Keyframe, KeyframePolicy, make_keyframes, sharpness
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 

@@ -194,11 +194,7 @@ def _posed(odometry: OdometryPass, state: SurveyState) -> PosedKeyframes:
 
 
 def _close_loops(
-    odometry: OdometryPass,
-    state: SurveyState,
-    matched: set[tuple[int, int]],
-    options: SurveyConfig,
-    tools: SurveyTools,
+    odometry: OdometryPass, state: SurveyState, matched: set[tuple[int, int]], options: SurveyConfig, tools: SurveyTools
 ) -> tuple[SurveyState, Loops]:
     """Finds loops; the keyframes are then where the pose graph with them says."""
     chain, scale_walk = chain_edges(odometry, state), options.settings.monocular.scale_walk

@@ -14,9 +14,8 @@ from fleetmap.sensors.samples import Stamps, Trajectory
 class History:
     """History of K keyframes and N landmarks over the versions of a site. An id is never used twice.
 
-    keyframe_ids (K,); is_place (K,): robots are offered the keyframe as a place. landmark_expected, landmark_seen (N,): in
-    how many keyframes of later surveys a landmark should have been seen, and was; landmark_missed (N,): how often it was not
-    since it was seen last.
+    keyframe_ids (K,); is_place (K,): robots are offered the keyframe as a place. landmark_expected, landmark_seen (N,): in how many
+    keyframes of later surveys a landmark should have been seen, and was; landmark_missed (N,): how often it was not since it was seen last.
     """
 
     keyframe_ids: NDArray[np.uint32]
@@ -32,13 +31,12 @@ class History:
 class SurveyMap:
     """A finished survey in `map`; K keyframes, N landmarks, M observations, F selected frames.
 
-    map_from_body (K, 4, 4). points_map (N, 3), descriptors (N, 32) uint8, point_sigma_m (N,) largest standard deviation.
-    obs_keyframe and obs_landmark (M,) index the arrays here; obs_pixels (M, 3) is u_left, v, u_right (NaN without a right
-    match); obs_sigma_px (M, 2) of u and v, and of the disparity; the first
-    observation of each landmark is its reference. trajectory holds all F frames; where trajectory_estimated (F,) is false the transform
-    is a guess between neighbours. patches (N, P, P) uint8 are cut from each landmark's reference keyframe at its octave.
-    history: None for a survey that no other was compared with yet.
-    scale_known is False for one camera's map whose metres are of the survey's own making.
+    map_from_body (K, 4, 4). points_map (N, 3), descriptors (N, 32) uint8, point_sigma_m (N,) largest standard deviation. obs_keyframe and
+    obs_landmark (M,) index the arrays here; obs_pixels (M, 3) is u_left, v, u_right (NaN without a right match); obs_sigma_px (M, 2) of u
+    and v, and of the disparity; the first observation of each landmark is its reference. trajectory holds all F frames; where
+    trajectory_estimated (F,) is false the transform is a guess between neighbours. patches (N, P, P) uint8 are cut from each landmark's
+    reference keyframe at its octave. history: None for a survey that no other was compared with yet. scale_known is False for one camera's
+    map whose metres are of the survey's own making.
     """
 
     camera: StereoCamera

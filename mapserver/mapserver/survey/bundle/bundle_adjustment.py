@@ -44,9 +44,8 @@ DAMPING_FLOOR = 1e-9
 def optimize(problem: BundleProblem, settings: BundleSettings) -> BundleResult:
     """The optimum near the problem's values, which stay untouched.
 
-    Raises SurveyError where no keyframe, prior or gauge holds the map in place, and for values that are not finite.
-    Inertial edges follow bias changes to first order; where those are large, preintegrate again at the result's biases
-    and optimise once more.
+    Raises SurveyError where no keyframe, prior or gauge holds the map in place, and for values that are not finite. Inertial edges follow
+    bias changes to first order; where those are large, preintegrate again at the result's biases and optimise once more.
     """
     bundle = _Bundle(problem, settings)
     damping, converged, iterations = settings.lambda_start, False, 0

@@ -19,9 +19,8 @@ from mapserver.survey.tracks.tracks import Landmarks
 class KeyframeMotion:
     """Velocities and biases at K keyframes; inertial is False for a rig whose gravity was never found.
 
-    velocities_mps, gyro_bias_radps, accel_bias_mps2 (K, 3); relative: odometry between neighbours, used where there is
-    no IMU, and where pictures show nothing. goes_on (K,): whether an inertial factor joins a keyframe with the one before;
-    True everywhere for None.
+    velocities_mps, gyro_bias_radps, accel_bias_mps2 (K, 3); relative: odometry between neighbours, used where there is no IMU, and where
+    pictures show nothing. goes_on (K,): whether an inertial factor joins a keyframe with the one before; True everywhere for None.
     """
 
     inertial: bool

@@ -116,9 +116,8 @@ def inertial_residual(
 ) -> None:
     """Residual (15,) and Jacobian (15, 30) of one inertial edge over [pose, velocity, biases] of i and of j.
 
-    motion (9,): velocity, gyro bias, accelerometer bias. increments (67,): dt, dR, dv, dp, the five bias derivatives
-    and the biases they were taken at. Residual order: rotation, velocity, position, biases. Source: Forster et al.
-    2017, eq. 45.
+    motion (9,): velocity, gyro bias, accelerometer bias. increments (67,): dt, dR, dv, dp, the five bias derivatives and the biases they
+    were taken at. Residual order: rotation, velocity, position, biases. Source: Forster et al. 2017, eq. 45.
     """
     dt_s, delta_rot = increments[0], increments[1:10].reshape(3, 3)
     rot_by_gyro, vel_by_gyro, vel_by_accel = (

@@ -1,8 +1,7 @@
 """Values of bundle adjustment: the problem, its settings and its result.
 
-Perturbations, here and in every information and covariance: rotation first, in the axes of the target frame, about the
-source's origin. For map_from_body that is R <- Exp(rot) R, p <- p + trans, both in map axes; for i_from_j in the axes
-of i.
+Perturbations, here and in every information and covariance: rotation first, in the axes of the target frame, about the source's origin. For
+map_from_body that is R <- Exp(rot) R, p <- p + trans, both in map axes; for i_from_j in the axes of i.
 """
 
 from dataclasses import dataclass, field, replace
@@ -113,10 +112,9 @@ class BundleSettings(Section, frozen=True):
 class BundleResult:
     """The optimum.
 
-    map_from_body (K, 4, 4), points_map (N, 3); velocities and biases (K, 3), None without inertial terms. costs: half
-    the robust sum of squares at the start and after every accepted step. squared_sigmas (M,): each observation's
-    squared residual in sigmas, in the problem's order, huge for points behind the camera. solver: dense, pcg or sparse,
-    the last one used.
+    map_from_body (K, 4, 4), points_map (N, 3); velocities and biases (K, 3), None without inertial terms. costs: half the robust sum of
+    squares at the start and after every accepted step. squared_sigmas (M,): each observation's squared residual in sigmas, in the problem's
+    order, huge for points behind the camera. solver: dense, pcg or sparse, the last one used.
     """
 
     map_from_body: Array

@@ -111,9 +111,8 @@ def factor_chains(
 ) -> None:
     """Factors S without its off-diagonal image blocks: block-diagonal but for the inertial chains.
 
-    sequence (P,): slots, each after its predecessor. link (P,): the edge to the predecessor, -1 for none. Fills
-    inverses (P, D, D) of the pivots and couplings (P, D, D) from the predecessor. Positive definite, since the images'
-    block diagonal and the edges each are.
+    sequence (P,): slots, each after its predecessor. link (P,): the edge to the predecessor, -1 for none. Fills inverses (P, D, D) of the
+    pivots and couplings (P, D, D) from the predecessor. Positive definite, since the images' block diagonal and the edges each are.
     """
     count, size = free.shape
     for p in range(count):

@@ -1,10 +1,9 @@
 """Bundle adjustment's inner loops over image observations.
 
-A pose changes as R <- Exp(rot) R, p <- p + trans, both in map axes, so with q = point - p an observation's derivative
-by the pose is [skew(q); I] times (minus) its derivative by the point. Everything an observation says therefore fits
-into one symmetric (3, 3) information matrix of the point, kept as six numbers, and the (6, 3) coupling is never stored.
-Observations are sorted by landmark; `landmark_ptr` (N + 1,) delimits them. `slots` (K,) holds each keyframe's place in
-the reduced system, -1 for none.
+A pose changes as R <- Exp(rot) R, p <- p + trans, both in map axes, so with q = point - p an observation's derivative by the pose is
+[skew(q); I] times (minus) its derivative by the point. Everything an observation says therefore fits into one symmetric (3, 3) information
+matrix of the point, kept as six numbers, and the (6, 3) coupling is never stored. Observations are sorted by landmark; `landmark_ptr` (N +
+1,) delimits them. `slots` (K,) holds each keyframe's place in the reduced system, -1 for none.
 """
 
 import numpy as np
@@ -50,9 +49,8 @@ def evaluate(
 ) -> float:
     """The robust cost of all observations; `squared` (M,) receives each one's squared length in sigmas.
 
-    lens: focal, cx, cy, focal times baseline. cam_from_map (K, 3, 3) rotations, positions (K, 3) of the body,
-    cam_from_body_m (3,) the body's origin in the camera. weights (M, 2): 1 / sigma of pixel and of disparity, the
-    latter 0 without a right image.
+    lens: focal, cx, cy, focal times baseline. cam_from_map (K, 3, 3) rotations, positions (K, 3) of the body, cam_from_body_m (3,) the
+    body's origin in the camera. weights (M, 2): 1 / sigma of pixel and of disparity, the latter 0 without a right image.
     """
     cost = 0.0
     for n in range(len(keyframes)):

@@ -21,12 +21,10 @@ def loop_weights(
 ) -> tuple[Array, gtsam.Values]:
     """Weight (len(loops),) of each loop, 1 believed and 0 not, and where the keyframes are then.
 
-    `certain`: all that is taken for true. A loop is consistent while its squared residual stays within
-    `bound`. Each step makes the cost a little less convex and takes
-    up where the last one ended, so that the whole costs little more than one solve. It begins once near `start`, where
-    at least the better half of the loops pulls, and, should that end in disbelief, once more with every loop pulling;
-    the lower truncated cost
-    wins. is_rough: only near `start`. Source: Yang et al. 2020, Graduated non-convexity for robust spatial perception.
+    `certain`: all that is taken for true. A loop is consistent while its squared residual stays within `bound`. Each step makes the cost a
+    little less convex and takes up where the last one ended, so that the whole costs little more than one solve. It begins once near
+    `start`, where at least the better half of the loops pulls, and, should that end in disbelief, once more with every loop pulling; the
+    lower truncated cost wins. is_rough: only near `start`. Source: Yang et al. 2020, Graduated non-convexity for robust spatial perception.
     """
     squared = squared_residuals(loops, start)
     if (squared <= bound).all():

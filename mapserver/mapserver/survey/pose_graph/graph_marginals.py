@@ -1,9 +1,8 @@
 """Marginal covariances of relative transforms in a pose graph, as the loop gate needs them very often.
 
-Perturbing every keyframe in map axes (map_from_body -> Exp(x_k) @ map_from_body) makes each edge a measurement of the
-plain difference x_j - x_i: odometry a chain of independent steps, every other edge a rank-6 update of it (recursive least
-squares). So a query costs a few small matrix products, with no factorisation, and an accepted loop is added without
-starting again. First order, exact for the linearised graph.
+Perturbing every keyframe in map axes (map_from_body -> Exp(x_k) @ map_from_body) makes each edge a measurement of the plain difference x_j
+- x_i: odometry a chain of independent steps, every other edge a rank-6 update of it (recursive least squares). So a query costs a few small
+matrix products, with no factorisation, and an accepted loop is added without starting again. First order, exact for the linearised graph.
 """
 
 from collections.abc import Sequence

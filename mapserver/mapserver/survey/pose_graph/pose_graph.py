@@ -70,12 +70,11 @@ def optimize_pose_graph(
 ) -> PoseGraphResult:
     """The places of K keyframes that fit the edges best, from a start map_from_body (K, 4, 4); `fixed` stays.
 
-    robust: loops that contradict the rest are disbelieved, by graduated non-convexity with truncated least squares in
-    which all other edges are known to be true; a loop counts as consistent while its squared residual stays within the
-    0.999 of chi-square. noise "estimated": within a bound that goes by the better 0.7 of the
-    loops, for graphs whose covariances are right only up to a common factor. Where the result is less likely than its edges'
-    covariances allow, a second start without any guess (chordal relaxation of the rotations) is tried, and the better
-    result taken. Raises SurveyError for edges that leave a keyframe without connection, point outside or carry no
+    robust: loops that contradict the rest are disbelieved, by graduated non-convexity with truncated least squares in which all other edges
+    are known to be true; a loop counts as consistent while its squared residual stays within the 0.999 of chi-square. noise "estimated":
+    within a bound that goes by the better 0.7 of the loops, for graphs whose covariances are right only up to a common factor. Where the
+    result is less likely than its edges' covariances allow, a second start without any guess (chordal relaxation of the rotations) is
+    tried, and the better result taken. Raises SurveyError for edges that leave a keyframe without connection, point outside or carry no
     proper covariance. Source: Yang et al. 2020 (GNC); Carlone et al. 2015 (chordal start), as gtsam has it.
     """
     check_edges(len(map_from_body), edges)
