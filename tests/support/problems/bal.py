@@ -13,8 +13,8 @@ from fleetmap.errors import SurveyError
 from fleetmap.geometry import AnyArray, Array, so3_exp
 from mapserver.survey.bundle.problem import BundleSettings
 from mapserver.survey.bundle.reduced_system import ReducedSystem, build_chains, solve_dense, solve_sparse
-from mapserver.survey.bundle.schur_kernels import invert_landmarks
-from mapserver.survey.bundle.sparsity import ObservationTable, Structure, block_pattern
+from mapserver.survey.bundle.schur_kernels import ObservationTable, invert_landmarks
+from mapserver.survey.bundle.sparsity import Structure, block_pattern
 from support.problems import bal_kernels
 from support.problems.bal_kernels import CAMERA_UNKNOWNS
 
@@ -153,15 +153,11 @@ def _structure(problem: BalProblem) -> tuple[Structure, AnyArray]:
     row_ptr, cols = block_pattern(table, np.zeros(count + 1, np.int64), np.zeros(0, np.int32))
     structure = Structure(
         order=np.arange(len(cameras)),
-        keyframes=cameras,
-        landmarks=problem.landmarks,
-        landmark_ptr=landmark_ptr,
+        table=table,
         pixels=problem.pixels,
         weights=np.ones((len(cameras), 2)),
         slots=slots,
         slot_keyframes=slots,
-        slot_ptr=slot_ptr,
-        slot_obs=slot_obs,
         free=np.ones((count, CAMERA_UNKNOWNS), np.bool_),
         row_ptr=row_ptr,
         cols=cols,

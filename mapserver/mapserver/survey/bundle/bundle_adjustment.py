@@ -20,8 +20,15 @@ from mapserver.survey.bundle.problem import (
     continued,
 )
 from mapserver.survey.bundle.reduced_system import Chains, ReducedSystem, build_chains, marginal_blocks, solve_reduced
-from mapserver.survey.bundle.reprojection_kernels import evaluate, linearise, step_landmarks, step_poses
-from mapserver.survey.bundle.schur_kernels import invert_landmarks, reduce_to_poses
+from mapserver.survey.bundle.reprojection_kernels import (
+    ImageNormal,
+    Measured,
+    evaluate,
+    linearise,
+    step_landmarks,
+    step_poses,
+)
+from mapserver.survey.bundle.schur_kernels import Eliminated, View, invert_landmarks, reduce_to_poses
 from mapserver.survey.bundle.sparsity import Structure, build_structure
 
 __all__ = [
@@ -102,25 +109,22 @@ class _Bundle:
         self.state = _initial_state(problem)
         s, points = self.structure, len(problem.points_map)
         self.chains: Chains = build_chains(s.slots[self.terms.ends].astype(np.int64), len(s.slot_keyframes))
-        self.obs_info, self.squared = np.zeros((len(s.order), 6)), np.zeros(len(s.order))
-        self.point_info, self.point_rhs = np.zeros((points, 6)), np.zeros((points, 3))
-        self.inverse = np.zeros((points, 6))
-        self.pose_info, self.pose_rhs = np.zeros((len(s.free), 6, 6)), np.zeros((len(s.free), 6))
+        self.squared, self.measured = np.zeros(len(s.order)), Measured(s.pixels, s.weights)
+        self.robust = settings.huber_sigmas, settings.cutoff_sigmas
+        shapes = (len(s.order), 6), (points, 6), (points, 3), (len(s.free), 6, 6), (len(s.free), 6)
+        self.images = ImageNormal(*(np.zeros(shape) for shape in shapes))
+        self.eliminated = Eliminated(self.images.obs_info, np.zeros((points, 6)), self.images.point_rhs)
         self.normal: Normal
         self.solver = "none"
         self.spare = self.state.like()
 
-    def _views(self, state: State) -> tuple[Array, Array, Array, Array, Array]:
-        """Lens, rotations cam_from_map, positions, the body in the camera, points: as the kernels take a state."""
+    def _view(self, state: State) -> View:
         cam_from_map = np.ascontiguousarray(self.cam_from_body @ state.rotations.transpose(0, 2, 1))
-        return self.lens, cam_from_map, state.positions_m, self.body_in_cam_m, state.points_map
+        return View(self.lens, cam_from_map, state.positions_m, self.body_in_cam_m, state.points_map)
 
     def cost(self, state: State) -> float:
         """Half the robust sum of squares of everything."""
-        s, settings = self.structure, self.settings
-        observed = s.keyframes, s.landmarks, s.pixels, s.weights
-        robust = settings.huber_sigmas, settings.cutoff_sigmas
-        images = evaluate(*self._views(state), *observed, *robust, self.squared)
+        images = evaluate(self._view(state), self.structure.table, self.measured, self.robust, self.squared)
         return images + self.terms.linearise(state).cost
 
     def first_bad(self) -> str:
@@ -137,32 +141,26 @@ class _Bundle:
 
     def linearise(self) -> None:
         """Normal equations at the current state."""
-        s, settings, state = self.structure, self.settings, self.state
-        self.pose_info[:] = 0.0
-        self.pose_rhs[:] = 0.0
-        observed = s.keyframes, s.landmark_ptr, s.pixels, s.weights
-        robust = settings.huber_sigmas, settings.cutoff_sigmas
-        normal = self.obs_info, self.point_info, self.point_rhs, self.pose_info, self.pose_rhs
-        linearise(*self._views(state), *observed, *robust, s.slots, *normal)
-        self.normal = self.terms.linearise(state)
+        self.images.pose_info[:], self.images.pose_rhs[:] = 0.0, 0.0
+        linearise(self._view(self.state), self.structure.table, self.measured, self.robust, self.images)
+        self.normal = self.terms.linearise(self.state)
 
     def reduced(self, damping: float) -> ReducedSystem:
         """The system over the keyframes after eliminating the landmarks, damped by `damping` times its diagonal."""
-        s, state, normal = self.structure, self.state, self.normal
+        s, images, normal = self.structure, self.images, self.normal
         count, size = s.free.shape
         blocks, rhs, diagonal = np.zeros((len(s.cols), 6, 6)), np.zeros((count, size)), np.zeros((count, size))
-        blocks[s.row_ptr[1:] - 1] = self.pose_info
-        rhs[:, :6] = self.pose_rhs
-        diagonal[:, :6] = np.einsum("paa->pa", self.pose_info)
+        blocks[s.row_ptr[1:] - 1] = images.pose_info
+        rhs[:, :6] = images.pose_rhs
+        diagonal[:, :6] = np.einsum("paa->pa", images.pose_info)
         self._add_terms(blocks, rhs, diagonal)
         damp = damping * diagonal + DAMPING_FLOOR
         if size > 6:
             damp[:, 6:] += normal.motion_diagonal[s.slot_keyframes]
         if not self.problem.points_held:  # else their inverses are zero, and so are their steps
-            invert_landmarks(self.point_info, damping, self.inverse)
-            observed = s.keyframes, s.landmarks, s.landmark_ptr, s.slots, s.slot_keyframes, s.slot_ptr, s.slot_obs
-            landmarks = self.obs_info, self.inverse, self.point_rhs
-            reduce_to_poses(state.positions_m, state.points_map, *observed, *landmarks, s.row_ptr, s.cols, blocks, rhs)
+            invert_landmarks(images.point_info, damping, self.eliminated.inverse)
+            view, pattern = self._view(self.state), (s.slot_keyframes, s.row_ptr, s.cols)
+            reduce_to_poses(view, s.table, self.eliminated, pattern, blocks, rhs)
         rhs[~s.free] = 0.0
         return ReducedSystem(s, self.chains, blocks, normal.edge_blocks, damp, rhs)
 
@@ -204,9 +202,7 @@ class _Bundle:
         step, self.solver = solve_reduced(self.reduced(damping), self.settings, self.solver)
         if step is None:
             return None
-        landmarks = self.obs_info, self.inverse, self.point_rhs
-        observed = s.keyframes, s.landmark_ptr, s.slots
-        step_landmarks(state.positions_m, state.points_map, *observed, *landmarks, step, moved.points_map)
+        step_landmarks(self._view(state), s.table, self.eliminated, step, moved.points_map)
         step_poses(state.rotations, state.positions_m, s.slots, step, moved.rotations, moved.positions_m)
         moved.motions[:] = state.motions
         moved.motions[s.slot_keyframes] += step[:, 6:]
@@ -240,9 +236,9 @@ class _Bundle:
 
 def _initial_state(problem: BundleProblem) -> State:
     inertial, count = problem.inertial, len(problem.map_from_body)
-    parts = (
-        () if inertial is None else (inertial.velocities_map_mps, inertial.gyro_bias_radps, inertial.accel_bias_mps2)
-    )
+    parts: tuple[Array, ...] = ()
+    if inertial is not None:
+        parts = inertial.velocities_map_mps, inertial.gyro_bias_radps, inertial.accel_bias_mps2
     return State(
         rotations=np.array(problem.map_from_body[:, :3, :3], np.float64, order="C"),
         positions_m=np.array(problem.map_from_body[:, :3, 3], np.float64, order="C"),

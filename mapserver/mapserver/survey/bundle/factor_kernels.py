@@ -1,5 +1,7 @@
 """Linearisation of pose priors, relative poses and inertial edges (Forster et al. 2017). Conventions: problem.py."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from fleetmap.geometry import AnyArray, Array
@@ -15,6 +17,17 @@ from fleetmap.inertial.so3_kernels import (
     right_jacobian_into,
 )
 from fleetmap.numerics.kernel import kernel
+
+Moment = tuple[Array, Array, Array]
+"""Rotation (3, 3), position (3,) and motion (9,) of a keyframe: velocity, gyro bias, accelerometer bias."""
+
+
+class Measurement(NamedTuple):
+    """A measured rotation (3, 3) and translation (3,), and the information (6, 6) of its error."""
+
+    rotation: Array
+    translation_m: Array
+    information: Array
 
 
 @kernel
@@ -45,44 +58,28 @@ def quadratic(jacobian: Array, residual: Array, information: Array, block: Array
 
 
 @kernel
-def linearise_prior(
-    rotation: Array,
-    position_m: Array,
-    known_rotation: Array,
-    known_m: Array,
-    information: Array,
-    block: Array,
-    rhs: Array,
-) -> float:
+def linearise_prior(rotation: Array, position_m: Array, prior: Measurement, block: Array, rhs: Array) -> float:
     """Cost of one pose prior; fills block (6, 6) and rhs (6,)."""
     residual, jacobian = np.empty(6), np.zeros((6, 6))
-    off = rotation @ known_rotation.T
+    off = rotation @ prior.rotation.T
     log_into(off, residual[:3])
     inverse_left_jacobian_into(residual[:3], jacobian[:3, :3])
     for a in range(3):
-        residual[3 + a] = position_m[a] - known_m[a]
+        residual[3 + a] = position_m[a] - prior.translation_m[a]
         jacobian[3 + a, 3 + a] = 1.0
-    return quadratic(jacobian, residual, information, block, rhs)
+    return quadratic(jacobian, residual, prior.information, block, rhs)
 
 
 @kernel
 def linearise_relative(
-    rotations: Array,
-    positions_m: Array,
-    i: int,
-    j: int,
-    measured: Array,
-    measured_m: Array,
-    information: Array,
-    block: Array,
-    rhs: Array,
+    rotations: Array, positions_m: Array, ends: tuple[int, int], relative: Measurement, block: Array, rhs: Array
 ) -> float:
     """Cost of one relative pose; fills block (12, 12) and rhs (12,) over keyframes i, j."""
-    residual, jacobian = np.empty(6), np.zeros((6, 12))
+    (i, j), (residual, jacobian) = ends, (np.empty(6), np.zeros((6, 12)))
     rot_i, between, off, inverse = rotations[i], np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     turned, lever = np.empty((3, 3)), np.empty((3, 3))
     matmul3_transposed(rot_i, rotations[j], between)
-    matmul3(between, np.ascontiguousarray(measured.T), off)
+    matmul3(between, np.ascontiguousarray(relative.rotation.T), off)
     log_into(off, residual[:3])
     apart = positions_m[j] - positions_m[i]
     matvec3_transposed(rot_i, apart, residual[3:])
@@ -91,40 +88,29 @@ def linearise_relative(
     matmul3(inverse, i_from_map, turned)
     matmul3_skew(i_from_map, apart, lever)
     for a in range(3):
-        residual[3 + a] -= measured_m[a]
+        residual[3 + a] -= relative.translation_m[a]
         for b in range(3):
             jacobian[a, b] = -turned[a, b]
             jacobian[a, 6 + b] = turned[a, b]
             jacobian[3 + a, b] = lever[a, b]
             jacobian[3 + a, 3 + b] = -i_from_map[a, b]
             jacobian[3 + a, 9 + b] = i_from_map[a, b]
-    return quadratic(jacobian, residual, information, block, rhs)
+    return quadratic(jacobian, residual, relative.information, block, rhs)
 
 
 @kernel
 def inertial_residual(
-    rot_i: Array,
-    rot_j: Array,
-    pos_i: Array,
-    pos_j: Array,
-    motion_i: Array,
-    motion_j: Array,
-    gravity: Array,
-    increments: Array,
-    residual: Array,
-    jacobian: Array,
+    i: Moment, j: Moment, gravity: Array, increments: Array, residual: Array, jacobian: Array
 ) -> None:
     """Residual (15,) and Jacobian (15, 30) of one inertial edge over [pose, velocity, biases] of i and of j.
 
-    motion (9,): velocity, gyro bias, accelerometer bias. increments (67,): dt, dR, dv, dp, the five bias derivatives and the biases they
+    increments (67,): dt, dR, dv, dp, the five bias derivatives and the biases they
     were taken at. Residual order: rotation, velocity, position, biases. Source: Forster et al. 2017, eq. 45.
     """
+    (rot_i, pos_i, motion_i), (rot_j, pos_j, motion_j) = i, j
     dt_s, delta_rot = increments[0], increments[1:10].reshape(3, 3)
-    rot_by_gyro, vel_by_gyro, vel_by_accel = (
-        increments[16:25].reshape(3, 3),
-        increments[25:34].reshape(3, 3),
-        increments[34:43].reshape(3, 3),
-    )
+    rot_by_gyro, vel_by_gyro = increments[16:25].reshape(3, 3), increments[25:34].reshape(3, 3)
+    vel_by_accel = increments[34:43].reshape(3, 3)
     pos_by_gyro, pos_by_accel = increments[43:52].reshape(3, 3), increments[52:61].reshape(3, 3)
     gyro, accel = motion_i[3:6] - increments[61:64], motion_i[6:9] - increments[64:67]
     bend, turn, corrected = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
@@ -183,32 +169,21 @@ def inertial_residual(
 
 @kernel
 def linearise_inertial(
-    rotations: Array,
-    positions_m: Array,
-    motions: Array,
+    variables: tuple[Array, Array, Array],
     gravity: Array,
     ends: AnyArray,
-    increments: Array,
-    informations: Array,
+    edges: tuple[Array, Array],
     blocks: Array,
     rhs: Array,
 ) -> float:
     """Cost of all inertial edges; fills blocks (E, 30, 30) and rhs (E, 30). ends (E, 2), informations (E, 15, 15)."""
+    rotations, positions_m, motions = variables
+    increments, informations = edges
     residual, jacobian = np.empty(15), np.empty((15, 30))
     cost = 0.0
     for e in range(len(ends)):
         i, j = ends[e, 0], ends[e, 1]
-        inertial_residual(
-            rotations[i],
-            rotations[j],
-            positions_m[i],
-            positions_m[j],
-            motions[i],
-            motions[j],
-            gravity,
-            increments[e],
-            residual,
-            jacobian,
-        )
+        first, second = (rotations[i], positions_m[i], motions[i]), (rotations[j], positions_m[j], motions[j])
+        inertial_residual(first, second, gravity, increments[e], residual, jacobian)
         cost += quadratic(jacobian, residual, informations[e], blocks[e], rhs[e])
     return cost

@@ -6,7 +6,7 @@ import numpy as np
 
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.inertial import GRAVITY_MAP, Preintegrated
-from mapserver.survey.bundle.factor_kernels import linearise_inertial, linearise_prior, linearise_relative
+from mapserver.survey.bundle.factor_kernels import Measurement, linearise_inertial, linearise_prior, linearise_relative
 from mapserver.survey.bundle.problem import BundleProblem, PriorTerm, RelativeTerm
 
 # Below this an increment's covariance means nothing: rounding of the sums, and it keeps empty intervals invertible.
@@ -61,16 +61,14 @@ class Terms:
         edge_blocks, edge_rhs = np.zeros((len(self.ends), 30, 30)), np.zeros((len(self.ends), 30))
         cost = 0.0
         for n, term in enumerate(self.relative):
-            rotation, translation = _split(term.i_from_j)
-            measured, output = (rotation, translation, term.information), (relative_blocks[n], relative_rhs[n])
-            cost += linearise_relative(state.rotations, state.positions_m, term.i, term.j, *measured, *output)
+            measured, output = _measurement(term.i_from_j, term.information), (relative_blocks[n], relative_rhs[n])
+            cost += linearise_relative(state.rotations, state.positions_m, (term.i, term.j), measured, *output)
         for n, prior in enumerate(self.priors):
-            rotation, translation = _split(prior.map_from_body)
-            measured, output = (rotation, translation, prior.information), (prior_blocks[n], prior_rhs[n])
-            cost += linearise_prior(state.rotations[prior.k], state.positions_m[prior.k], *measured, *output)
+            measured, output = _measurement(prior.map_from_body, prior.information), (prior_blocks[n], prior_rhs[n])
+            cost += linearise_prior(state.rotations[prior.k], state.positions_m[prior.k], measured, *output)
         if len(self.ends):
-            variables, edges = (state.rotations, state.positions_m, state.motions), (self.ends, self.increments)
-            cost += linearise_inertial(*variables, GRAVITY_MAP, *edges, self.informations, edge_blocks, edge_rhs)
+            variables, edges = (state.rotations, state.positions_m, state.motions), (self.increments, self.informations)
+            cost += linearise_inertial(variables, GRAVITY_MAP, self.ends, edges, edge_blocks, edge_rhs)
         off = state.motions - self.motion_mean
         cost += 0.5 * float((self.motion_weight * off**2).sum())
         blocks = relative_blocks, relative_rhs, prior_blocks, prior_rhs, edge_blocks, edge_rhs
@@ -98,19 +96,16 @@ def pack_terms(problem: BundleProblem) -> Terms:
 
 
 def _pack(summed: Preintegrated) -> Array:
-    parts = (
-        [summed.dt_s],
-        summed.delta_rotation,
-        summed.delta_velocity_mps,
-        summed.delta_position_m,
-        summed.d_rotation_d_gyro,
-        summed.d_velocity_d_gyro,
-        summed.d_velocity_d_accel,
-        summed.d_position_d_gyro,
-        summed.d_position_d_accel,
-        summed.gyro_bias_radps,
-        summed.accel_bias_mps2,
+    s = summed
+    increments = [s.dt_s], s.delta_rotation, s.delta_velocity_mps, s.delta_position_m
+    by_gyro_accel = (
+        s.d_rotation_d_gyro,
+        s.d_velocity_d_gyro,
+        s.d_velocity_d_accel,
+        s.d_position_d_gyro,
+        s.d_position_d_accel,
     )
+    parts = *increments, *by_gyro_accel, s.gyro_bias_radps, s.accel_bias_mps2
     return np.concatenate([np.ravel(part) for part in parts])
 
 
@@ -122,5 +117,5 @@ def _information(cov: Array) -> Array:
     return np.asarray(0.5 * (inverse + inverse.T) / np.outer(sigma, sigma))
 
 
-def _split(target_from_source: Array) -> tuple[Array, Array]:
-    return np.ascontiguousarray(target_from_source[:3, :3]), np.ascontiguousarray(target_from_source[:3, 3])
+def _measurement(measured: Array, information: Array) -> Measurement:
+    return Measurement(np.ascontiguousarray(measured[:3, :3]), np.ascontiguousarray(measured[:3, 3]), information)

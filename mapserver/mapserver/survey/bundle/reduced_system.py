@@ -10,7 +10,13 @@ import scipy.sparse.linalg
 
 from fleetmap.geometry import AnyArray, Array
 from mapserver.survey.bundle.problem import BundleSettings
-from mapserver.survey.bundle.reduced_system_kernels import conjugate_gradients, factor_chains, fill_lower
+from mapserver.survey.bundle.reduced_system_kernels import (
+    ChainFactors,
+    SystemArrays,
+    conjugate_gradients,
+    factor_chains,
+    fill_lower,
+)
 from mapserver.survey.bundle.sparsity import Structure
 
 
@@ -37,6 +43,13 @@ class ReducedSystem:
     edge_blocks: Array
     damp: Array
     rhs: Array
+
+    @property
+    def arrays(self) -> SystemArrays:
+        """S as the kernels take it."""
+        s = self.structure
+        edges = self.chains.edge_slots, self.edge_blocks
+        return SystemArrays(self.blocks, s.row_ptr, s.cols, *edges, self.damp, s.free)
 
 
 def build_chains(edge_slots: AnyArray, count: int) -> Chains:
@@ -73,11 +86,8 @@ def solve_reduced(system: ReducedSystem, settings: BundleSettings, last: str) ->
 
 def dense_lower(system: ReducedSystem) -> Array:
     """S as a dense (PD, PD) array in Fortran order whose upper triangle is valid (and equals the lower one of S)."""
-    unknowns, s = system.rhs.size, system.structure
-    lower = np.zeros((unknowns, unknowns))
-    fill_lower(
-        system.blocks, s.row_ptr, s.cols, system.chains.edge_slots, system.edge_blocks, system.damp, s.free, lower
-    )
+    lower = np.zeros((system.rhs.size, system.rhs.size))
+    fill_lower(system.arrays, lower)
     return lower.T
 
 
@@ -106,16 +116,14 @@ def marginal_blocks(system: ReducedSystem, slots: AnyArray) -> Array:
 def solve_pcg(system: ReducedSystem, settings: BundleSettings) -> Array | None:
     """The step by preconditioned conjugate gradients, None where they stall."""
     count, size = system.rhs.shape
-    s, chains = system.structure, system.chains
     inverses, couplings, step = np.empty((count, size, size)), np.empty((count, size, size)), np.empty((count, size))
-    edges = chains.edge_slots, system.edge_blocks, system.damp, s.free
-    chain = chains.sequence, chains.link, inverses, couplings
+    factors = ChainFactors(system.chains.sequence, system.chains.link, inverses, couplings)
     try:
-        factor_chains(system.blocks, s.row_ptr, *edges, *chain)
+        factor_chains(system.arrays, factors)
     except np.linalg.LinAlgError:
         return None
     limits = settings.pcg_tolerance, settings.pcg_max_iterations
-    iterations = conjugate_gradients(system.blocks, s.row_ptr, s.cols, *edges, *chain, system.rhs, *limits, step)
+    iterations = conjugate_gradients(system.arrays, factors, system.rhs, limits, step)
     return step if iterations >= 0 else None
 
 

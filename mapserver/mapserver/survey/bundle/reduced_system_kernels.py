@@ -3,6 +3,8 @@
 P slots of D = 6 or 15 unknowns. `free` (P, D) tells which move; held ones keep a unit diagonal and a zero step.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,18 +14,35 @@ from fleetmap.numerics.kernel import kernel
 Mask = NDArray[np.bool_]
 
 
+class SystemArrays(NamedTuple):
+    """S: row p's blocks are row_ptr[p]:row_ptr[p + 1] with columns cols; edge_slots (E, 2); diagonal damp and mask free (P, D)."""
+
+    blocks: Array
+    row_ptr: AnyArray
+    cols: AnyArray
+    edge_slots: AnyArray
+    edge_blocks: Array
+    damp: Array
+    free: Mask
+
+
+class ChainFactors(NamedTuple):
+    """Factors of S without its off-diagonal image blocks.
+
+    sequence (P,): slots, each after its predecessor. link (P,): the edge to the predecessor, -1 for none. inverses (P, D, D) of the
+    pivots, couplings (P, D, D) from the predecessor.
+    """
+
+    sequence: AnyArray
+    link: AnyArray
+    inverses: Array
+    couplings: Array
+
+
 @kernel
-def fill_lower(
-    blocks: Array,
-    row_ptr: AnyArray,
-    cols: AnyArray,
-    edge_slots: AnyArray,
-    edge_blocks: Array,
-    damp: Array,
-    free: Mask,
-    lower: Array,
-) -> None:
+def fill_lower(system: SystemArrays, lower: Array) -> None:
     """Adds S to the zeroed dense `lower` (PD, PD); only its lower triangle is complete."""
+    blocks, row_ptr, cols, edge_slots, edge_blocks, damp, free = system
     count, size = free.shape
     width = blocks.shape[1]
     for p in range(count):
@@ -48,18 +67,9 @@ def fill_lower(
 
 
 @kernel
-def multiply(
-    blocks: Array,
-    row_ptr: AnyArray,
-    cols: AnyArray,
-    edge_slots: AnyArray,
-    edge_blocks: Array,
-    damp: Array,
-    free: Mask,
-    x: Array,
-    out: Array,
-) -> None:
+def multiply(system: SystemArrays, x: Array, out: Array) -> None:
     """out = S x for x (P, D) that is zero where held."""
+    blocks, row_ptr, cols, edge_slots, edge_blocks, damp, free = system
     count, size = free.shape
     for p in range(count):
         for a in range(size):
@@ -97,23 +107,13 @@ def multiply(
 
 
 @kernel
-def factor_chains(
-    blocks: Array,
-    row_ptr: AnyArray,
-    edge_slots: AnyArray,
-    edge_blocks: Array,
-    damp: Array,
-    free: Mask,
-    sequence: AnyArray,
-    link: AnyArray,
-    inverses: Array,
-    couplings: Array,
-) -> None:
+def factor_chains(system: SystemArrays, factors: ChainFactors) -> None:
     """Factors S without its off-diagonal image blocks: block-diagonal but for the inertial chains.
 
-    sequence (P,): slots, each after its predecessor. link (P,): the edge to the predecessor, -1 for none. Fills inverses (P, D, D) of the
-    pivots and couplings (P, D, D) from the predecessor. Positive definite, since the images' block diagonal and the edges each are.
+    Fills inverses and couplings. Positive definite, since the images' block diagonal and the edges each are.
     """
+    blocks, row_ptr, _, edge_slots, edge_blocks, damp, free = system
+    sequence, link, inverses, couplings = factors
     count, size = free.shape
     for p in range(count):
         inverses[p] = 0.0
@@ -149,10 +149,9 @@ def factor_chains(
 
 
 @kernel
-def solve_chains(
-    inverses: Array, couplings: Array, edge_slots: AnyArray, sequence: AnyArray, link: AnyArray, x: Array, out: Array
-) -> None:
+def solve_chains(factors: ChainFactors, edge_slots: AnyArray, x: Array, out: Array) -> None:
     """out (P, D) = what `factor_chains` factored, applied inversely to x."""
+    sequence, link, inverses, couplings = factors
     count, size = x.shape
     for n in range(count):
         p = sequence[n]
@@ -177,42 +176,29 @@ def solve_chains(
 
 @kernel
 def conjugate_gradients(
-    blocks: Array,
-    row_ptr: AnyArray,
-    cols: AnyArray,
-    edge_slots: AnyArray,
-    edge_blocks: Array,
-    damp: Array,
-    free: Mask,
-    sequence: AnyArray,
-    link: AnyArray,
-    inverses: Array,
-    couplings: Array,
-    rhs: Array,
-    tolerance: float,
-    max_iterations: int,
-    x: Array,
+    system: SystemArrays, factors: ChainFactors, rhs: Array, limits: tuple[float, int], x: Array
 ) -> int:
     """Solves S x = rhs from zero; returns the iterations, -1 where the preconditioned residual stays too large.
 
     Source: Saad, Iterative Methods for Sparse Linear Systems, algorithm 9.1.
     """
+    tolerance, max_iterations = limits
     x[:, :] = 0.0
     residual, direction, image, preconditioned = rhs.copy(), np.empty_like(rhs), np.empty_like(rhs), np.empty_like(rhs)
-    solve_chains(inverses, couplings, edge_slots, sequence, link, residual, preconditioned)
+    solve_chains(factors, system.edge_slots, residual, preconditioned)
     direction[:, :] = preconditioned
     size = np.sum(residual * preconditioned)
     enough = tolerance * tolerance * size
     if size == 0.0:
         return 0
     for iteration in range(max_iterations):
-        multiply(blocks, row_ptr, cols, edge_slots, edge_blocks, damp, free, direction, image)
+        multiply(system, direction, image)
         curvature = np.sum(direction * image)
         if not curvature > 0.0:
             return -1
         x += (size / curvature) * direction
         residual -= (size / curvature) * image
-        solve_chains(inverses, couplings, edge_slots, sequence, link, residual, preconditioned)
+        solve_chains(factors, system.edge_slots, residual, preconditioned)
         smaller = np.sum(residual * preconditioned)
         if smaller <= enough:
             return iteration + 1

@@ -2,19 +2,37 @@
 
 A pose changes as R <- Exp(rot) R, p <- p + trans, both in map axes, so with q = point - p an observation's derivative by the pose is
 [skew(q); I] times (minus) its derivative by the point. Everything an observation says therefore fits into one symmetric (3, 3) information
-matrix of the point, kept as six numbers, and the (6, 3) coupling is never stored. Observations are sorted by landmark; `landmark_ptr` (N +
-1,) delimits them. `slots` (K,) holds each keyframe's place in the reduced system, -1 for none.
+matrix of the point, kept as six numbers, and the (6, 3) coupling is never stored.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.inertial.so3_kernels import exp_into, matmul3
 from fleetmap.numerics.kernel import inline_kernel, kernel
-from mapserver.survey.bundle.schur_kernels import add_lifted
+from mapserver.survey.bundle.schur_kernels import Eliminated, ObservationTable, View, add_lifted
 
 MIN_DEPTH_M = 0.02
 BEHIND_SIGMAS = 1000.0  # what an observation counts as whose point is behind the camera
+
+
+class Measured(NamedTuple):
+    """Pixels (M, 3): u, v, disparity. weights (M, 2): 1 / sigma of pixel and of disparity, the latter 0 without a right image."""
+
+    pixels: Array
+    weights: Array
+
+
+class ImageNormal(NamedTuple):
+    """Normal equations of the images: obs_info (M, 6), point_info (N, 6), point_rhs (N, 3), pose_info (P, 6, 6), pose_rhs (P, 6)."""
+
+    obs_info: Array
+    point_info: Array
+    point_rhs: Array
+    pose_info: Array
+    pose_rhs: Array
 
 
 @inline_kernel
@@ -34,24 +52,14 @@ def robust_weight(norm: float, huber: float, cutoff: float) -> float:
 
 @kernel
 def evaluate(
-    lens: Array,
-    cam_from_map: Array,
-    positions_m: Array,
-    cam_from_body_m: Array,
-    points_map: Array,
-    keyframes: AnyArray,
-    landmarks: AnyArray,
-    pixels: Array,
-    weights: Array,
-    huber: float,
-    cutoff: float,
-    squared: Array,
+    view: View, table: ObservationTable, measured: Measured, robust: tuple[float, float], squared: Array
 ) -> float:
     """The robust cost of all observations; `squared` (M,) receives each one's squared length in sigmas.
 
-    lens: focal, cx, cy, focal times baseline. cam_from_map (K, 3, 3) rotations, positions (K, 3) of the body, cam_from_body_m (3,) the
-    body's origin in the camera. weights (M, 2): 1 / sigma of pixel and of disparity, the latter 0 without a right image.
+    robust: sigmas from which the cost is linear, and constant.
     """
+    lens, cam_from_map, positions_m, cam_from_body_m, points_map = view
+    keyframes, landmarks, (pixels, weights), (huber, cutoff) = table.keyframes, table.landmarks, measured, robust
     cost = 0.0
     for n in range(len(keyframes)):
         rot, point, position = cam_from_map[keyframes[n]], points_map[landmarks[n]], positions_m[keyframes[n]]
@@ -72,28 +80,16 @@ def evaluate(
 
 @kernel
 def linearise(
-    lens: Array,
-    cam_from_map: Array,
-    positions_m: Array,
-    cam_from_body_m: Array,
-    points_map: Array,
-    keyframes: AnyArray,
-    landmark_ptr: AnyArray,
-    pixels: Array,
-    weights: Array,
-    huber: float,
-    cutoff: float,
-    slots: AnyArray,
-    obs_info: Array,
-    point_info: Array,
-    point_rhs: Array,
-    pose_info: Array,
-    pose_rhs: Array,
+    view: View, table: ObservationTable, measured: Measured, robust: tuple[float, float], normal: ImageNormal
 ) -> None:
     """Normal equations at the current values, as for `evaluate`; the right-hand sides point downhill.
 
-    Fills obs_info (M, 6), point_info (N, 6), point_rhs (N, 3); adds to pose_info (P, 6, 6) and pose_rhs (P, 6).
+    Fills obs_info, point_info and point_rhs; adds to pose_info and pose_rhs.
     """
+    lens, cam_from_map, positions_m, cam_from_body_m, points_map = view
+    keyframes, landmark_ptr, slots = table.keyframes, table.landmark_ptr, table.slots
+    (pixels, weights), (huber, cutoff) = measured, robust
+    obs_info, point_info, point_rhs, pose_info, pose_rhs = normal
     row_u, row_v, row_d, slope, info = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(6)
     for point_index in range(len(points_map)):
         point = points_map[point_index]
@@ -142,45 +138,19 @@ def _add_pose(info: Array, slope: Array, qx: float, qy: float, qz: float, block:
     rhs[3] += slope[0]
     rhs[4] += slope[1]
     rhs[5] += slope[2]
-    add_lifted(
-        info[0],
-        info[1],
-        info[2],
-        info[1],
-        info[3],
-        info[4],
-        info[2],
-        info[4],
-        info[5],
-        qx,
-        qy,
-        qz,
-        qx,
-        qy,
-        qz,
-        1.0,
-        block,
-    )
+    rows = (info[0], info[1], info[2]), (info[1], info[3], info[4]), (info[2], info[4], info[5])
+    add_lifted(rows, (qx, qy, qz), (qx, qy, qz), 1.0, block)
 
 
 @kernel
-def step_landmarks(
-    positions_m: Array,
-    points_map: Array,
-    keyframes: AnyArray,
-    landmark_ptr: AnyArray,
-    slots: AnyArray,
-    obs_info: Array,
-    inverse: Array,
-    point_rhs: Array,
-    pose_step: Array,
-    moved: Array,
-) -> None:
+def step_landmarks(view: View, table: ObservationTable, eliminated: Eliminated, pose_step: Array, moved: Array) -> None:
     """Back-substitution: moved (N, 3) are the points after the step that goes with pose_step (P, >= 6).
 
     No point moves farther than half its distance to the nearest keyframe that sees it, so that one weak point cannot
     jump behind a camera and spoil the step of all others.
     """
+    positions_m, points_map, slots = view.positions_m, view.points_map, table.slots
+    keyframes, landmark_ptr, (obs_info, inverse, point_rhs) = table.keyframes, table.landmark_ptr, eliminated
     for landmark in range(len(points_map)):
         point, v = points_map[landmark], inverse[landmark]
         sx, sy, sz = point_rhs[landmark, 0], point_rhs[landmark, 1], point_rhs[landmark, 2]

@@ -1,31 +1,65 @@
 """Elimination of the landmarks by the Schur complement. Layout: reprojection_kernels.py. Source: Triggs et al. 2000, section 6.1."""
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.numerics.kernel import inline_kernel, kernel
 
+Indices = NDArray[np.int32]
+Vector = tuple[float, float, float]
+Rows = tuple[Vector, Vector, Vector]
+Pattern = tuple[AnyArray, AnyArray, AnyArray]  # keyframes of the slots, row_ptr and cols of the blocks
 LANDMARK_FLOOR = 1e-9  # relative to the trace: a point seen once by one camera keeps its depth
+
+
+class View(NamedTuple):
+    """A state as the images show it: rotations cam_from_map (K, 3, 3), positions_m (K, 3) of the body, points_map (N, 3).
+
+    lens: focal, cx, cy, focal times baseline. cam_from_body_m (3,): the body's origin in the camera.
+    """
+
+    lens: Array
+    cam_from_map: Array
+    positions_m: Array
+    cam_from_body_m: Array
+    points_map: Array
+
+
+class ObservationTable(NamedTuple):
+    """M observations sorted by landmark; landmark_ptr (N + 1,) delimits each landmark's.
+
+    slot_obs[slot_ptr[p]:slot_ptr[p + 1]] are those of the keyframe in slot p; slots (K,) of the keyframes, -1 for held ones.
+    """
+
+    slot_ptr: AnyArray
+    slot_obs: Indices
+    landmarks: Indices
+    keyframes: Indices
+    landmark_ptr: AnyArray
+    slots: Indices
+
+
+class Eliminated(NamedTuple):
+    """Normal equations of the landmarks: obs_info (M, 6) of observations, inverse (N, 6) and point_rhs (N, 3) of landmarks."""
+
+    obs_info: Array
+    inverse: Array
+    point_rhs: Array
 
 
 @kernel
 def count_row_blocks(
-    slot_ptr: AnyArray,
-    slot_obs: AnyArray,
-    landmarks: AnyArray,
-    keyframes: AnyArray,
-    landmark_ptr: AnyArray,
-    slots: AnyArray,
-    pair_ptr: AnyArray,
-    pair_cols: AnyArray,
-    row_ptr: AnyArray,
-    cols: AnyArray,
+    table: ObservationTable, pair_ptr: AnyArray, pair_cols: AnyArray, row_ptr: AnyArray, cols: AnyArray
 ) -> None:
     """Fills row_ptr (P + 1,) and, if `cols` is not empty, the columns <= row of the reduced system's blocks, ascending.
 
     A row couples to every slot that shares a landmark, and to pair_cols[pair_ptr[p]:pair_ptr[p + 1]]. Call once with an
     empty `cols` for the size and once to fill.
     """
+    slot_ptr, slot_obs, landmarks, keyframes, landmark_ptr, slots = table
     count = len(slot_ptr) - 1
     seen = np.full(count, -1, np.int32)
     found = np.empty(count, np.int32)
@@ -63,49 +97,30 @@ def invert_landmarks(point_info: Array, damping: float, inverse: Array) -> None:
             inverse[n] = 0.0
             continue
         floor = LANDMARK_FLOOR * trace
-        a, d, f = (
-            info[0] * (1.0 + damping) + floor,
-            info[3] * (1.0 + damping) + floor,
-            info[5] * (1.0 + damping) + floor,
-        )
+        a, d = info[0] * (1.0 + damping) + floor, info[3] * (1.0 + damping) + floor
+        f = info[5] * (1.0 + damping) + floor
         b, c, e = info[1], info[2], info[4]
         minor_a, minor_b, minor_c = d * f - e * e, c * e - b * f, b * e - c * d
         scale = 1.0 / (a * minor_a + b * minor_b + c * minor_c)
         inverse[n, 0], inverse[n, 1], inverse[n, 2] = minor_a * scale, minor_b * scale, minor_c * scale
-        inverse[n, 3], inverse[n, 4], inverse[n, 5] = (
-            (a * f - c * c) * scale,
-            (b * c - a * e) * scale,
-            (a * d - b * b) * scale,
-        )
+        inverse[n, 3], inverse[n, 4] = (a * f - c * c) * scale, (b * c - a * e) * scale
+        inverse[n, 5] = (a * d - b * b) * scale
 
 
 @kernel
 def reduce_to_poses(
-    positions_m: Array,
-    points_map: Array,
-    keyframes: AnyArray,
-    landmarks: AnyArray,
-    landmark_ptr: AnyArray,
-    slots: AnyArray,
-    slot_keyframes: AnyArray,
-    slot_ptr: AnyArray,
-    slot_obs: AnyArray,
-    obs_info: Array,
-    inverse: Array,
-    point_rhs: Array,
-    row_ptr: AnyArray,
-    cols: AnyArray,
-    blocks: Array,
-    rhs: Array,
+    view: View, table: ObservationTable, eliminated: Eliminated, pattern: Pattern, blocks: Array, rhs: Array
 ) -> None:
     """Subtracts the landmarks' Schur complement from blocks (B, 6, 6) and rhs (P, >= 6), row by row.
 
     slot_obs[slot_ptr[p]:slot_ptr[p + 1]] are the observations of the keyframe in slot p; row p's blocks are those of
     the columns cols[row_ptr[p]:row_ptr[p + 1]], all <= p.
     """
+    slot_ptr, slot_obs, landmarks, keyframes, landmark_ptr, slots = table
+    (obs_info, inverse, point_rhs), (slot_keyframes, row_ptr, cols) = eliminated, pattern
+    positions_m, points_map = view.positions_m, view.points_map
     place = np.full(len(slot_keyframes), -1, np.int32)
-    y = np.empty((3, 3))
-    m = np.empty((3, 3))
+    y, m = np.empty((3, 3)), np.empty((3, 3))
     for p in range(len(slot_keyframes)):
         for s in range(row_ptr[p], row_ptr[p + 1]):
             place[cols[s]] = s
@@ -136,25 +151,9 @@ def reduce_to_poses(
                     m[a, 0] = y[a, 0] * other[0] + y[a, 1] * other[1] + y[a, 2] * other[2]
                     m[a, 1] = y[a, 0] * other[1] + y[a, 1] * other[3] + y[a, 2] * other[4]
                     m[a, 2] = y[a, 0] * other[2] + y[a, 1] * other[4] + y[a, 2] * other[5]
-                add_lifted(
-                    m[0, 0],
-                    m[0, 1],
-                    m[0, 2],
-                    m[1, 0],
-                    m[1, 1],
-                    m[1, 2],
-                    m[2, 0],
-                    m[2, 1],
-                    m[2, 2],
-                    ax,
-                    ay,
-                    az,
-                    point[0] - there[0],
-                    point[1] - there[1],
-                    point[2] - there[2],
-                    -1.0,
-                    blocks[place[q]],
-                )
+                rows = (m[0, 0], m[0, 1], m[0, 2]), (m[1, 0], m[1, 1], m[1, 2]), (m[2, 0], m[2, 1], m[2, 2])
+                apart = point[0] - there[0], point[1] - there[1], point[2] - there[2]
+                add_lifted(rows, (ax, ay, az), apart, -1.0, blocks[place[q]])
 
 
 @inline_kernel
@@ -170,63 +169,20 @@ def _symmetric_product(left: Array, right: Array, out: Array) -> None:
 
 
 @inline_kernel
-def add_lifted(
-    m00: float,
-    m01: float,
-    m02: float,
-    m10: float,
-    m11: float,
-    m12: float,
-    m20: float,
-    m21: float,
-    m22: float,
-    ax: float,
-    ay: float,
-    az: float,
-    bx: float,
-    by: float,
-    bz: float,
-    sign: float,
-    block: Array,
-) -> None:
+def add_lifted(m: Rows, a: Vector, b: Vector, sign: float, block: Array) -> None:
     """block += sign [skew(a); I] M [skew(b); I]^T for a (3, 3) M."""
+    (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = m
+    (ax, ay, az), (bx, by, bz) = a, b
     # right half first: M skew(b)^T, row r is b x M[r]
-    r00, r01, r02 = by * m02 - bz * m01, bz * m00 - bx * m02, bx * m01 - by * m00
-    r10, r11, r12 = by * m12 - bz * m11, bz * m10 - bx * m12, bx * m11 - by * m10
-    r20, r21, r22 = by * m22 - bz * m21, bz * m20 - bx * m22, bx * m21 - by * m20
-    block[0, 0] += sign * (ay * r20 - az * r10)
-    block[0, 1] += sign * (ay * r21 - az * r11)
-    block[0, 2] += sign * (ay * r22 - az * r12)
-    block[1, 0] += sign * (az * r00 - ax * r20)
-    block[1, 1] += sign * (az * r01 - ax * r21)
-    block[1, 2] += sign * (az * r02 - ax * r22)
-    block[2, 0] += sign * (ax * r10 - ay * r00)
-    block[2, 1] += sign * (ax * r11 - ay * r01)
-    block[2, 2] += sign * (ax * r12 - ay * r02)
-    block[0, 3] += sign * (ay * m20 - az * m10)
-    block[0, 4] += sign * (ay * m21 - az * m11)
-    block[0, 5] += sign * (ay * m22 - az * m12)
-    block[1, 3] += sign * (az * m00 - ax * m20)
-    block[1, 4] += sign * (az * m01 - ax * m21)
-    block[1, 5] += sign * (az * m02 - ax * m22)
-    block[2, 3] += sign * (ax * m10 - ay * m00)
-    block[2, 4] += sign * (ax * m11 - ay * m01)
-    block[2, 5] += sign * (ax * m12 - ay * m02)
-    block[3, 0] += sign * r00
-    block[3, 1] += sign * r01
-    block[3, 2] += sign * r02
-    block[4, 0] += sign * r10
-    block[4, 1] += sign * r11
-    block[4, 2] += sign * r12
-    block[5, 0] += sign * r20
-    block[5, 1] += sign * r21
-    block[5, 2] += sign * r22
-    block[3, 3] += sign * m00
-    block[3, 4] += sign * m01
-    block[3, 5] += sign * m02
-    block[4, 3] += sign * m10
-    block[4, 4] += sign * m11
-    block[4, 5] += sign * m12
-    block[5, 3] += sign * m20
-    block[5, 4] += sign * m21
-    block[5, 5] += sign * m22
+    turned = (
+        (by * m02 - bz * m01, bz * m00 - bx * m02, bx * m01 - by * m00),
+        (by * m12 - bz * m11, bz * m10 - bx * m12, bx * m11 - by * m10),
+        (by * m22 - bz * m21, bz * m20 - bx * m22, bx * m21 - by * m20),
+    )
+    for c in range(3):
+        for first, right in ((0, turned), (3, m)):
+            block[0, first + c] += sign * (ay * right[2][c] - az * right[1][c])
+            block[1, first + c] += sign * (az * right[0][c] - ax * right[2][c])
+            block[2, first + c] += sign * (ax * right[1][c] - ay * right[0][c])
+            for row in range(3):
+                block[3 + row, first + c] += sign * right[row][c]

@@ -1,7 +1,6 @@
 """Sparsity of a bundle problem: observations sorted by landmark, slots of the free keyframes, block pattern of the reduced system."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import AnyArray, Array
 from mapserver.survey.bundle.problem import BundleProblem
-from mapserver.survey.bundle.schur_kernels import count_row_blocks
+from mapserver.survey.bundle.schur_kernels import ObservationTable, count_row_blocks
 
 Indices = NDArray[np.int32]
 
@@ -24,15 +23,11 @@ class Structure:
     """
 
     order: AnyArray
-    keyframes: Indices
-    landmarks: Indices
-    landmark_ptr: AnyArray
+    table: ObservationTable
     pixels: Array
     weights: Array
     slots: Indices
     slot_keyframes: Indices
-    slot_ptr: AnyArray
-    slot_obs: Indices
     free: NDArray[np.bool_]
     row_ptr: AnyArray
     cols: Indices
@@ -58,21 +53,7 @@ def build_structure(problem: BundleProblem) -> Structure:
     slot_ptr, slot_obs = _observations_by_slot(slots, keyframes, len(slot_keyframes))
     table = ObservationTable(slot_ptr, slot_obs, landmarks, keyframes, landmark_ptr, slots)
     row_ptr, cols = _pattern(problem, table)
-    return Structure(
-        order=order,
-        keyframes=keyframes,
-        landmarks=landmarks,
-        landmark_ptr=landmark_ptr,
-        pixels=pixels,
-        weights=weights,
-        slots=slots,
-        slot_keyframes=slot_keyframes,
-        slot_ptr=slot_ptr,
-        slot_obs=slot_obs,
-        free=moves[slot_keyframes],
-        row_ptr=row_ptr,
-        cols=cols,
-    )
+    return Structure(order, table, pixels, weights, slots, slot_keyframes, moves[slot_keyframes], row_ptr, cols)
 
 
 def _check(problem: BundleProblem) -> None:
@@ -128,25 +109,13 @@ def _observations_by_slot(slots: Indices, keyframes: Indices, count: int) -> tup
     return np.searchsorted(obs_slots[by_slot[held:]], np.arange(count + 1)), by_slot[held:].astype(np.int32)
 
 
-def block_pattern(table: "ObservationTable", pair_ptr: AnyArray, pair_first: Indices) -> tuple[AnyArray, Indices]:
+def block_pattern(table: ObservationTable, pair_ptr: AnyArray, pair_first: Indices) -> tuple[AnyArray, Indices]:
     """Row pointers and columns of the reduced system's blocks: slots that share a landmark or a pair."""
     row_ptr, cols = np.zeros(len(table.slot_ptr), np.int64), np.zeros(0, np.int32)
-    shared = (*table, pair_ptr, pair_first, row_ptr)
-    count_row_blocks(*shared, cols)
+    count_row_blocks(table, pair_ptr, pair_first, row_ptr, cols)
     cols = np.empty(int(row_ptr[-1]), np.int32)
-    count_row_blocks(*shared, cols)
+    count_row_blocks(table, pair_ptr, pair_first, row_ptr, cols)
     return row_ptr, cols
-
-
-class ObservationTable(NamedTuple):
-    """M observations, sorted by landmark, by slot and by landmark; slots (K,) of the keyframes, -1 for held ones."""
-
-    slot_ptr: AnyArray
-    slot_obs: Indices
-    landmarks: Indices
-    keyframes: Indices
-    landmark_ptr: AnyArray
-    slots: Indices
 
 
 def _pattern(problem: BundleProblem, table: ObservationTable) -> tuple[AnyArray, Indices]:
