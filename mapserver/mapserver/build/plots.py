@@ -1,7 +1,7 @@
 """Pictures of a survey: from above, and its errors over time."""
 
 import io
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
@@ -98,37 +98,18 @@ def _layout(plan: _Plan, *, has_errors: bool) -> "tuple[Figure, Axes, Axes | Non
 
 def _draw_map(axes: "Axes", plan: _Plan, loops: Loops) -> None:
     size = float(np.clip(20_000 / max(len(plan.landmarks), 1), 0.8, 4.0))
-    axes.scatter(plan.landmarks[:, 0], plan.landmarks[:, 1], s=size, c=_POINT, alpha=0.55, linewidths=0, zorder=1)
+    _dots(axes, plan.landmarks, s=size, c=_POINT, alpha=0.55, linewidths=0, zorder=1)
     _draw_loops(axes, plan, loops)
     steps = np.stack([plan.path[:-1], plan.path[1:]], axis=1)
     pieces = LineCollection(list(steps), cmap=_TIME, linewidths=2.4, zorder=4, capstyle="round")
     pieces.set_array(plan.seconds[:-1])
     axes.add_collection(pieces)
-    axes.scatter(
-        plan.places[:, 0],
-        plan.places[:, 1],
-        s=10,
-        c="white",
-        edgecolors=_INK,
-        linewidths=0.6,
-        zorder=5,
-        label="keyframe",
-    )
+    _dots(axes, plan.places, s=10, c="white", edgecolors=_INK, linewidths=0.6, zorder=5, label="keyframe")
     if len(plan.guessed):
-        axes.scatter(
-            plan.guessed[:, 0],
-            plan.guessed[:, 1],
-            s=16,
-            marker="x",
-            c=_GUESS,
-            linewidths=1,
-            zorder=5,
-            label="only guessed",
-        )
-    for point, marker, colour, label in ((plan.path[0], "o", _GOOD, "start"), (plan.path[-1], "s", _BAD, "end")):
-        axes.scatter(
-            point[0], point[1], s=55, marker=marker, c=colour, edgecolors="white", linewidths=1, zorder=6, label=label
-        )
+        _dots(axes, plan.guessed, s=16, marker="x", c=_GUESS, linewidths=1, zorder=5, label="only guessed")
+    for points, marker, colour, label in ((plan.path[:1], "o", _GOOD, "start"), (plan.path[-1:], "s", _BAD, "end")):
+        look = {"marker": marker, "c": colour, "edgecolors": "white", "label": label}
+        _dots(axes, points, s=55, linewidths=1, zorder=6, **look)
     axes.set(xlim=(plan.low[0], plan.high[0]), ylim=(plan.low[1], plan.high[1]))
     axes.set(xlabel=plan.labels[0], ylabel=plan.labels[1])
     axes.set_aspect("equal", adjustable="box")
@@ -140,6 +121,10 @@ def _draw_map(axes: "Axes", plan: _Plan, loops: Loops) -> None:
     bar.ax.spines[:].set_visible(False)
     spacing = {"columnspacing": 1.2, "handlelength": 1.4, "borderaxespad": 0.2}
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=6, frameon=False, fontsize=8, **spacing)
+
+
+def _dots(axes: "Axes", points: Array, **look: Any) -> None:
+    axes.scatter(points[:, 0], points[:, 1], **look)
 
 
 def _draw_loops(axes: "Axes", plan: _Plan, loops: Loops) -> None:

@@ -70,6 +70,7 @@ def _print(console: "Console", source: "Recording", findings: "list[Finding]") -
 
 def _as_json(source: "Recording", findings: "list[Finding]") -> str:
     import json
+    from dataclasses import asdict
 
     from mapserver.doctor.findings import worst
 
@@ -81,15 +82,6 @@ def _as_json(source: "Recording", findings: "list[Finding]") -> str:
         "imu_samples": len(source.imu),
         "duration_s": float(source.frame_stamps_ns[-1] - source.frame_stamps_ns[0]) * 1e-9,
         "verdict": worst(findings).value,
-        "findings": [
-            {
-                "name": finding.name,
-                "verdict": finding.verdict.value,
-                "value": finding.value,
-                "limit": finding.limit,
-                "sentence": finding.sentence,
-            }
-            for finding in findings
-        ],
+        "findings": [asdict(finding) for finding in findings],
     }
     return json.dumps(report, indent=2, sort_keys=False) + "\n"

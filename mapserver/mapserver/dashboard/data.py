@@ -82,8 +82,9 @@ class MapData:
 
     def quality(self, site: str, version: int) -> VersionQuality:
         """A version with all that was said about it."""
+        store = self._store
         return VersionQuality(
-            self._store.version(site, version), self._store.manifest(site, version), self._store.verdicts(site, version)
+            store.version(site, version), store.manifest(site, version), store.verdicts(site, version)
         )
 
     def plan(self, site: str, version: int) -> Plan:
@@ -111,11 +112,8 @@ class MapData:
             for version in (before, after)
         )
         changed = {cell: "changed" for cell in old.keys() & new.keys() if old[cell] != new[cell]}
-        return (
-            changed
-            | dict.fromkeys(new.keys() - old.keys(), "added")
-            | dict.fromkeys(old.keys() - new.keys(), "removed")
-        )
+        added, removed = new.keys() - old.keys(), old.keys() - new.keys()
+        return changed | dict.fromkeys(added, "added") | dict.fromkeys(removed, "removed")
 
     def jobs(self, site: str) -> list[JobInfo]:
         """The last jobs of a site, newest first."""

@@ -152,9 +152,8 @@ def _axes_finding(fit: GyroFit) -> Finding:
     about = f"judged about {fit.axes_seen} of 3 axes"
     words = f"the gyro's axes are {angle_deg:.1f} degrees from the calibration, {about}"
     advice = "check body_from_cam (T_cam_imu) and how the IMU is mounted"
-    return judge(
-        _NAMES[2], angle_deg, Limits(4.0, 15.0, "degrees"), words, f"{words} ({_in_axes(fit.body_from_gyro)}); {advice}"
-    )
+    bad = f"{words} ({_in_axes(fit.body_from_gyro)}); {advice}"
+    return judge(_NAMES[2], angle_deg, Limits(4.0, 15.0, "degrees"), words, bad)
 
 
 def _in_axes(body_from_gyro: Array) -> str:

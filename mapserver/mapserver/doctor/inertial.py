@@ -23,10 +23,7 @@ def gravity_magnitude(imu: ImuSamples) -> Finding:
     magnitude = float(np.median(np.linalg.norm(accel[calm].mean(axis=1), axis=1)))
     error = abs(magnitude - GRAVITY_MPS2)
     verdict = Verdict.OK if error < 0.25 else Verdict.WARN if error < 0.8 else Verdict.FAIL
-    sentence = (
-        f"{magnitude:.2f} m/s^2 when calm"
-        if verdict is Verdict.OK
-        else f"{magnitude:.2f} m/s^2 when calm instead of {GRAVITY_MPS2}; check the accelerometer's unit, scale and "
-        f"calibration"
-    )
+    sentence = f"{magnitude:.2f} m/s^2 when calm"
+    if verdict is not Verdict.OK:
+        sentence += f" instead of {GRAVITY_MPS2}; check the accelerometer's unit, scale and calibration"
     return Finding(name, verdict, magnitude, "warn 0.25, fail 0.8 m/s^2 from 9.81", sentence)

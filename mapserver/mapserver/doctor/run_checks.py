@@ -107,9 +107,8 @@ def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count:
     return seen
 
 
-_Moment = tuple[
-    Image, RectifiedFrame | None, RectifiedFrame | None
-]  # left as recorded, the pair, the pair a little later
+# Left as recorded, the pair, the pair a little later.
+_Moment = tuple[Image, RectifiedFrame | None, RectifiedFrame | None]
 
 
 def _moments(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int) -> Iterator[_Moment]:
@@ -196,7 +195,5 @@ def _readable(frames: _Frames) -> Finding:
     limit = "every frame that was looked at must be readable"
     if not frames.errors:
         return Finding("images", Verdict.OK, 0.0, limit, f"all {frames.tried} frames that were looked at are whole")
-    count = len(frames.errors)
-    return Finding(
-        "images", Verdict.FAIL, float(count), limit, f"{count} of {frames.tried} cannot be read; {frames.errors[0]}"
-    )
+    sentence = f"{len(frames.errors)} of {frames.tried} cannot be read; {frames.errors[0]}"
+    return Finding("images", Verdict.FAIL, float(len(frames.errors)), limit, sentence)

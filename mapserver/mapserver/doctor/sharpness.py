@@ -25,14 +25,12 @@ def sharpness(variances: Sequence[float]) -> Finding:
     values = np.array(variances)
     median = float(np.median(values))
     blurred = float((values < _BLURRED_SHARE_OF_MEDIAN * median).mean())
-    limit = (
-        f"median: warn below {_FLAT:g}, fail below {_BLIND:g}; warn if {_MANY:.0%} are below a quarter of the median"
-    )
+    quarter = f"warn if {_MANY:.0%} are below a quarter of the median"
+    limit = f"median: warn below {_FLAT:g}, fail below {_BLIND:g}; {quarter}"
     spread = f"variance of the Laplacian: median {median:.0f}, tenth percentile {np.percentile(values, 10):.0f}"
     if median < _BLIND:
-        return Finding(
-            "sharpness", Verdict.FAIL, median, limit, f"{spread}; the images show next to nothing, look at the lens"
-        )
+        advice = "the images show next to nothing, look at the lens"
+        return Finding("sharpness", Verdict.FAIL, median, limit, f"{spread}; {advice}")
     if median < _FLAT or blurred > _MANY:
         advice = f"{blurred:.0%} are blurred; shorten the exposure, clean and focus the lens"
         return Finding("sharpness", Verdict.WARN, median, limit, f"{spread}; {advice}")

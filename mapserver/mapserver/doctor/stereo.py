@@ -60,14 +60,9 @@ def swapped_cameras(pairs: Sequence[StereoMatches]) -> Finding:
     if len(decided) < _MIN_MATCHES:
         return not_judged(name, f"{len(decided)} matches with a disparity above 1 px are too few")
     wrong_share = float((decided < 0).mean())
-    return judge(
-        name,
-        wrong_share,
-        Limits(0.2, 0.5, "of the matches with negative disparity"),
-        "the left image is the left one",
-        f"{wrong_share:.0%} of the matches have negative disparity; left and right are swapped, exchange the folders "
-        f"or topics",
-    )
+    bad = f"{wrong_share:.0%} of the matches have negative disparity; left and right are swapped, exchange the folders or topics"
+    limits = Limits(0.2, 0.5, "of the matches with negative disparity")
+    return judge(name, wrong_share, limits, "the left image is the left one", bad)
 
 
 def epipolar_error(pairs: Sequence[StereoMatches], focal_px: float) -> Finding:
@@ -83,26 +78,16 @@ def epipolar_error(pairs: Sequence[StereoMatches], focal_px: float) -> Finding:
     tilt_deg, roll_deg = np.degrees(np.arctan2(at_middle_px, focal_px)), np.degrees(np.arctan(roll))
     angles = f"the cameras look {tilt_deg:+.2f} degrees apart up and down and are rolled by {roll_deg:+.2f} degrees"
     words = f"rows differ by {median:.2f} px in the median, {p90:.2f} px at 90 %, {np.median(errors):+.2f} px with sign"
-    return judge(
-        name,
-        median,
-        Limits(0.5, 1.2, "px (median)"),
-        words,
-        f"{words}: {angles}; calibrate the cameras again, or check their time",
-    )
+    bad = f"{words}: {angles}; calibrate the cameras again, or check their time"
+    return judge(name, median, Limits(0.5, 1.2, "px (median)"), words, bad)
 
 
 def _refined(frame: RectifiedFrame, left: Array, right: Array) -> StereoMatches:
     if len(left) == 0 or frame.right is None:
         return _NOTHING
+    corners, guess = left.reshape(-1, 1, 2), right.reshape(-1, 1, 2).copy()
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        frame.left,
-        frame.right,
-        left.reshape(-1, 1, 2),
-        right.reshape(-1, 1, 2).copy(),
-        winSize=(15, 15),
-        maxLevel=0,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        frame.left, frame.right, corners, guess, winSize=(15, 15), maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
     )
     found = found.reshape(-1, 2)
     kept = (status.ravel() == 1) & (np.abs(found - right).max(axis=1) < 3.0)

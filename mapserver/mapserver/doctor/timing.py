@@ -60,17 +60,9 @@ def stamp_order(issues: Sequence[DataIssue]) -> Finding:
 
 def other_issues(issues: Sequence[DataIssue]) -> list[Finding]:
     """One warning for everything else that could not be read."""
-    return [
-        Finding(
-            "lost data",
-            Verdict.WARN,
-            None,
-            "nothing lost",
-            f"{issue.what}: {issue.detail}; copy the recording again if it has more",
-        )
-        for issue in issues
-        if "stamps not increasing" not in issue.what
-    ]
+    lost = [issue for issue in issues if "stamps not increasing" not in issue.what]
+    words = [f"{issue.what}: {issue.detail}; copy the recording again if it has more" for issue in lost]
+    return [Finding("lost data", Verdict.WARN, None, "nothing lost", sentence) for sentence in words]
 
 
 def camera_imu_overlap(frame_stamps_ns: Stamps, imu_stamps_ns: Stamps, imu_minus_cam_s: float) -> Finding:
@@ -82,14 +74,9 @@ def camera_imu_overlap(frame_stamps_ns: Stamps, imu_stamps_ns: Stamps, imu_minus
     inside = (moments_ns >= imu_stamps_ns[0] - step_ns) & (moments_ns <= imu_stamps_ns[-1] + step_ns)
     outside_share = 1 - float(inside.mean())
     start_s = float(imu_stamps_ns[0] - moments_ns[0]) * 1e-9
-    return judge(
-        "camera-imu overlap",
-        outside_share,
-        Limits(0.01, 0.5, "of the frames without IMU"),
-        "the IMU ran while the camera did",
-        f"{outside_share:.0%} of the frames have no IMU at their time, which starts {start_s:+.3f} s after them; "
-        "stamp both sensors by one clock",
-    )
+    bad = f"{outside_share:.0%} of the frames have no IMU at their time, which starts {start_s:+.3f} s after them"
+    limits, good = Limits(0.01, 0.5, "of the frames without IMU"), "the IMU ran while the camera did"
+    return judge("camera-imu overlap", outside_share, limits, good, f"{bad}; stamp both sensors by one clock")
 
 
 def _rate(name: str, rate_hz: float, slowest_hz: float, advice: str) -> Finding:
@@ -103,11 +90,7 @@ def _gaps(name: str, stamps_ns: Stamps, warn_s: float, fail_s: float, what: str)
     longest = int(np.argmax(steps_s))
     count = int((steps_s > warn_s).sum())
     at_s = float(stamps_ns[longest] - stamps_ns[0]) * 1e-9
-    return judge(
-        name,
-        float(steps_s[longest]),
-        Limits(round(warn_s, 4), max(fail_s, round(warn_s, 4)), "s"),
-        f"the longest step is {steps_s[longest]:.3f} s",
-        f"{count} gaps without {what}, the longest {steps_s[longest]:.3f} s, {at_s:.1f} s after the start; "
-        "look at the recorder's disk and the driver's queue",
-    )
+    limits = Limits(round(warn_s, 4), max(fail_s, round(warn_s, 4)), "s")
+    bad = f"{count} gaps without {what}, the longest {steps_s[longest]:.3f} s, {at_s:.1f} s after the start"
+    good, advice = f"the longest step is {steps_s[longest]:.3f} s", "look at the recorder's disk and the driver's queue"
+    return judge(name, float(steps_s[longest]), limits, good, f"{bad}; {advice}")

@@ -1,5 +1,7 @@
 """All errors of one trajectory in one table. Pure."""
 
+from dataclasses import astuple
+
 import numpy as np
 
 from fleetmap.recordings.covariances import StampedCovariances
@@ -62,22 +64,17 @@ def summary(
 
 def _drift(estimate: Trajectory, truth: Trajectory) -> Summary:
     found = drift(estimate, truth)
+    lengths: tuple[float | None, ...] = (None,) if found is None else found.lengths_m
     return {
         "drift_translation_share": None if found is None else found.translation_share,
         "drift_rotation_radpm": None if found is None else found.rotation_radpm,
-        "drift_shortest_m": None if found is None else found.lengths_m[0],
-        "drift_longest_m": None if found is None else found.lengths_m[-1],
+        "drift_shortest_m": lengths[0],
+        "drift_longest_m": lengths[-1],
         "drift_segments": 0 if found is None else found.segments,
     }
 
 
 def _nees(placed: Trajectory, truth: Trajectory, covariances: StampedCovariances | None) -> Summary:
     found = None if covariances is None else consistency(placed, covariances, truth)
-    return {
-        "nees_position": None if found is None else found.position,
-        "nees_rotation": None if found is None else found.rotation,
-        "nees": None if found is None else found.both,
-        "nees_inside_share": None if found is None else found.inside_share,
-        "nees_position_inside_share": None if found is None else found.position_inside_share,
-        "nees_stamps": 0 if found is None else found.stamps,
-    }
+    keys = "nees_position", "nees_rotation", "nees", "nees_inside_share", "nees_position_inside_share", "nees_stamps"
+    return dict(zip(keys, (None,) * 5 + (0,) if found is None else astuple(found), strict=True))

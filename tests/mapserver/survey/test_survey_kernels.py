@@ -9,7 +9,7 @@ from fleetmap.geometry import se3, so3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.finish.map_assembly_kernels import mark_duplicates, medoids
 from mapserver.survey.tracks.pairs_kernels import predict_features, share_in_view
-from mapserver.survey.tracks.tracks_kernels import align_observations
+from mapserver.survey.tracks.tracks_kernels import PatchFeatures, align_observations
 from support.worlds.synthetic_texture import picture, smooth_texture
 
 CAMERA = StereoCamera(300.0, 160.0, 120.0, 0.1, 320, 240)
@@ -60,17 +60,17 @@ def test_patches_are_aligned_as_one_by_one() -> None:
     motion = se3(so3_exp(np.array([0.0, 0.0, 0.02])), np.array([0.0, 0.0, 0.05]))
     found = np.empty((count, 3))
     rows = np.arange(count)
-    align_observations(
-        *pyramid, pixels, octaves, angles, rows, points, *pyramid, own_pixels, own_octaves, own_angles, rows, motion, 4, 3.0,
-        0.8, found,
-    )  # fmt: skip
+    whole, half, quarter = pyramid
+    reference = PatchFeatures((whole, half, quarter), pixels, octaves, angles, rows)
+    own = PatchFeatures((whole, half, quarter), own_pixels, own_octaves, own_angles, rows)
+    align_observations(reference, own, points, motion, (4, 3.0, 0.8), found)
     warp = patch_align.similarity_from_motion(CAMERA, points, motion)
     unknown = ~np.isfinite(warp).all(axis=(1, 2))
     assert 0 < unknown.sum() < count
     warp[unknown] = patch_align.similarity_from_features(octaves, angles, own_octaves, own_angles)[unknown]
-    reference = patch_align.Patches(pyramid, pixels, octaves)
+    first = patch_align.Patches(pyramid, pixels, octaves)
     current = patch_align.Patches(pyramid, own_pixels, own_octaves)
-    expected = patch_align.refine_matches(reference, current, warp, patch_align.AlignSettings())
+    expected = patch_align.refine_matches(first, current, warp, patch_align.AlignSettings())
     assert np.isfinite(expected[:, 0]).sum() > count // 3
     np.testing.assert_allclose(found, expected, atol=1e-6)
 

@@ -19,7 +19,7 @@ from mapserver.survey.bundle.bundle_rounds import (
     with_keyframes_of,
 )
 from mapserver.survey.keyframes.keyframes import Keyframe
-from mapserver.survey.keyframes.revisit_thinning_kernels import mark_repeated
+from mapserver.survey.keyframes.revisit_thinning_kernels import TrackMembers, mark_repeated
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.tracks.tracks import Landmarks, Tracks
 
@@ -43,7 +43,7 @@ def redundant_keyframes(tracks: Tracks, keyframes: list[Keyframe], settings: Sur
     octaves = octaves[first_of[tracks.keyframes] + tracks.features]
     gap, least = settings.loops.min_gap_keyframes, settings.loops.alone_inliers
     limits = gap, cull.repeated_visits, cull.repeated_share, least
-    mark_repeated(order, row_starts, track, starts, tracks.keyframes, octaves, *limits, redundant)
+    mark_repeated(order, row_starts, TrackMembers(track, starts, tracks.keyframes, octaves), limits, redundant)
     while (alone := _left_alone(tracks.keyframes, track, redundant, least)).any():
         redundant |= alone
     return redundant
@@ -115,11 +115,8 @@ def _together(adjusted: Landmarks, numbers: NDArray[np.int64], placed: Landmarks
     """The same landmarks with the observations of both; those that were adjusted first."""
     landmark = np.concatenate([adjusted.obs_landmark, placed.obs_landmark])
     order = np.argsort(landmark, kind="stable")
-    return Landmarks(
-        adjusted.points_map,
-        np.concatenate([numbers[adjusted.obs_keyframe].astype(np.int32), placed.obs_keyframe])[order],
-        landmark[order],
-        np.concatenate([adjusted.obs_feature, placed.obs_feature])[order],
-        np.concatenate([adjusted.obs_pixels, placed.obs_pixels])[order],
-        np.concatenate([adjusted.obs_sigma_px, placed.obs_sigma_px])[order],
-    )
+    keyframes = np.concatenate([numbers[adjusted.obs_keyframe].astype(np.int32), placed.obs_keyframe])[order]
+    features = np.concatenate([adjusted.obs_feature, placed.obs_feature])[order]
+    pixels = np.concatenate([adjusted.obs_pixels, placed.obs_pixels])[order]
+    sigmas = np.concatenate([adjusted.obs_sigma_px, placed.obs_sigma_px])[order]
+    return Landmarks(adjusted.points_map, keyframes, landmark[order], features, pixels, sigmas)

@@ -1,5 +1,7 @@
 """Inner loop of revisit thinning: keyframes whose tracks enough other visits see too."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,6 +9,15 @@ from fleetmap.numerics.kernel import inner_kernel, kernel
 
 Indices = NDArray[np.int64]
 Octaves = NDArray[np.int8]
+
+
+class TrackMembers(NamedTuple):
+    """M members: track, keyframe and octave (M,) of each; starts (G + 1,) delimits each track's, by rising keyframe."""
+
+    tracks: Indices
+    starts: Indices
+    keyframes: Indices
+    octaves: Octaves
 
 
 @inner_kernel
@@ -29,27 +40,21 @@ def _other_visits(
 def mark_repeated(
     rows: Indices,
     row_starts: Indices,
-    tracks: Indices,
-    starts: Indices,
-    keyframes: Indices,
-    octaves: Octaves,
-    gap: int,
-    visits: int,
-    share: float,
-    least: int,
+    members: TrackMembers,
+    limits: tuple[int, int, float, int],
     spare: NDArray[np.bool_],
 ) -> None:
     """Sets spare (K,), from the last keyframe to the second, where a share of its tracks and `least` of them have so many other visits.
 
-    rows[row_starts[k] : row_starts[k + 1]] are keyframe k's members of tracks; tracks (M,) and octaves (M,) of each member,
-    starts (G + 1,) delimits each track's, by rising keyframe. Members more than `gap` keyframes apart are of different visits.
+    rows[row_starts[k] : row_starts[k + 1]] are keyframe k's members. limits: gap (members more than so many keyframes apart are of
+    different visits), visits, share, least.
     """
+    (tracks, starts, keyframes, octaves), (gap, visits, share, least) = members, limits
     for k in range(len(spare) - 1, 0, -1):
         repeated = 0
         for at in range(row_starts[k], row_starts[k + 1]):
             member = rows[at]
             track = tracks[member]
-            repeated += (
-                _other_visits(member, starts[track], starts[track + 1], keyframes, octaves, gap, spare) >= visits
-            )
+            others = _other_visits(member, starts[track], starts[track + 1], keyframes, octaves, gap, spare)
+            repeated += others >= visits
         spare[k] = repeated >= least and repeated >= share * (row_starts[k + 1] - row_starts[k])

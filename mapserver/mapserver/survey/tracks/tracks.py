@@ -2,20 +2,19 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.features import stereo
-from fleetmap.features.patch_align import AlignSettings
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.keyframes.keyframes import Keyframe, Pictures, PosedKeyframes, with_pictures
 from mapserver.survey.settings import NoiseSettings, SurveySettings
 from mapserver.survey.tracks.pairs import PairMatch
-from mapserver.survey.tracks.tracks_kernels import align_observations
+from mapserver.survey.tracks.tracks_kernels import PatchFeatures, align_observations
 from mapserver.survey.tracks.tracks_kernels import join as join_kernel
 
 _BATCH = 16  # keyframes: their sources overlap, so that few pictures travel twice
@@ -198,7 +197,8 @@ class _ObservationBatch:
 def _observe_batch(shared: tuple[StereoCamera, SurveySettings], batch: _ObservationBatch) -> tuple[Array, Array]:
     """Pixels (M, 3) and sigmas (M, 2) of one batch."""
     camera, settings = shared
-    noise, keyframes = settings.noise, batch.keyframes
+    noise, align, keyframes = settings.noise, settings.align, batch.keyframes
+    limits = align.half_window_px, align.max_shift_px, align.min_correlation
     pixels, sigmas = np.empty((len(batch.table), 3)), np.empty((len(batch.table), 2))
     for k in np.unique(batch.table[:, 0]).tolist():
         rows = np.flatnonzero(batch.table[:, 0] == k)
@@ -214,8 +214,9 @@ def _observe_batch(shared: tuple[StereoCamera, SurveySettings], batch: _Observat
         for source, inner in zip(sources.tolist(), np.split(others, starts[1:]), strict=True):
             cam_from_source = cam_from_map @ batch.map_from_cam[source]
             points_source = transform_points(se3_inverse(batch.map_from_cam[source]), points_map[inner])
-            pair = _FeaturePairs(keyframes[source], references[inner, 2], own, features[inner])
-            refined = _align(pair, pictures, points_source, cam_from_source, settings.align)
+            theirs = _patch_features(keyframes[source], keyframes[source].pictures, references[inner, 2])
+            ours, refined = _patch_features(own, pictures, features[inner]), np.empty((len(inner), 3))
+            align_observations(theirs, ours, points_source, cam_from_source, limits, refined)
             sure = np.isfinite(refined[:, 0])
             left[inner[sure]] = refined[sure, :2]
             sigma[inner[sure]] = np.hypot(noise.aligned_sigma_px, refined[sure, 2])
@@ -229,28 +230,6 @@ def _descriptor_sigma(keyframe: Keyframe, features: NDArray[np.int64], noise: No
     return np.asarray(noise.descriptor_sigma_px * 1.2 ** keyframe.features.octaves[features].astype(np.float64))
 
 
-class _FeaturePairs(NamedTuple):
-    """Features `theirs` (N,) of a reference keyframe and `ours` (N,) of another, of the same landmarks."""
-
-    reference: Keyframe
-    theirs: NDArray[np.int64]
-    own: Keyframe
-    ours: NDArray[np.int64]
-
-
-def _align(
-    pairs: _FeaturePairs,
-    pictures: Pictures,
-    points_reference: Array,
-    own_from_reference: Array,
-    settings: AlignSettings,
-) -> Array:
-    """Refined pixels (N, 3) of `ours`, NaN where the patches do not agree; `pictures` are those of `own`."""
-    refined, a, b = np.empty((len(pairs.ours), 3)), pairs.reference.features, pairs.own.features
-    whole, half, quarter = pairs.reference.pyramid
-    theirs = whole, half, quarter, a.pixels, a.octaves, a.angles_deg, pairs.theirs, points_reference
-    whole, half, quarter = pictures.pyramid
-    ours = whole, half, quarter, b.pixels, b.octaves, b.angles_deg, pairs.ours
-    limits = settings.half_window_px, settings.max_shift_px, settings.min_correlation
-    align_observations(*theirs, *ours, own_from_reference, *limits, refined)
-    return refined
+def _patch_features(keyframe: Keyframe, pictures: Pictures, chosen: NDArray[np.int64]) -> PatchFeatures:
+    own, (whole, half, quarter) = keyframe.features, pictures.pyramid
+    return PatchFeatures((whole, half, quarter), own.pixels, own.octaves, own.angles_deg, chosen)

@@ -1,6 +1,7 @@
 """Joining matched features to tracks by a union-find that never puts one keyframe twice into a group; aligning their patches."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,9 +66,19 @@ def _halving(octave: int) -> int:
     return int(min(max(np.rint(octave * _LOG2_SCALE), 0.0), 2.0))
 
 
+class PatchFeatures(NamedTuple):
+    """Features of a keyframe, those of them that are chosen (N,), and its picture whole, halved and quartered."""
+
+    pyramid: tuple[Picture, Picture, Picture]
+    pixels: Array
+    octaves: Octaves
+    angles_deg: NDArray[np.float32]
+    chosen: Indices
+
+
 @inner_kernel
-def _of_level(level: int, whole: Picture, half: Picture, quarter: Picture) -> Picture:
-    return whole if level == 0 else (half if level == 1 else quarter)
+def _of_level(level: int, pyramid: tuple[Picture, Picture, Picture]) -> Picture:
+    return pyramid[0] if level == 0 else (pyramid[1] if level == 1 else pyramid[2])
 
 
 @kernel
@@ -91,78 +102,49 @@ def _warp_of_motion(x: float, y: float, z: float, own_from_reference: Array, war
     if not 0.02 < abs(determinant) < 50.0:
         return False
     a, b, c, d = warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1]
-    warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1] = (
-        d / determinant,
-        -b / determinant,
-        -c / determinant,
-        a / determinant,
-    )
+    warp[0, 0], warp[0, 1] = d / determinant, -b / determinant
+    warp[1, 0], warp[1, 1] = -c / determinant, a / determinant
     return True
 
 
 @kernel
 def align_observations(
-    whole: Picture,
-    half: Picture,
-    quarter: Picture,
-    pixels: Array,
-    octaves: Octaves,
-    angles_deg: NDArray[np.float32],
-    theirs: Indices,
+    reference: PatchFeatures,
+    own: PatchFeatures,
     points_reference: Array,
-    own_whole: Picture,
-    own_half: Picture,
-    own_quarter: Picture,
-    own_pixels: Array,
-    own_octaves: Octaves,
-    own_angles_deg: NDArray[np.float32],
-    ours: Indices,
     own_from_reference: Array,
-    half_window: int,
-    max_shift_px: float,
-    min_correlation: float,
+    limits: tuple[int, float, float],
     out: Array,
 ) -> None:
-    """Refined pixels of one keyframe's features `ours` (N,) against features `theirs` (N,) of a reference keyframe.
+    """Refined pixels of one keyframe's chosen features (N,) against those of a reference keyframe.
 
-    Pyramids, pixels, octaves, angles of both; points_reference (N, 3) as the reference's camera sees them. The warp comes
-    from the motion own_from_reference (4, 4), which is finer than octaves and angles; from those where it is degenerate.
-    out (N, 3): x, y, sigma_px in level-0 pixels, NaN where the patches do not agree.
+    points_reference (N, 3) as the reference's camera sees them. The warp comes from the motion own_from_reference (4, 4), which is
+    finer than octaves and angles; from those where it is degenerate. limits: half window and largest shift in pixels, least
+    correlation. out (N, 3): x, y, sigma_px in level-0 pixels, NaN where the patches do not agree.
     """
+    half_window, max_shift_px, min_correlation = limits
+    theirs, ours = reference.chosen, own.chosen
     side = 2 * half_window + 1
-    template, window, warp, found = (
-        np.empty((side + 2, side + 2)),
-        np.empty((side, side)),
-        np.empty((2, 2)),
-        np.empty(4),
-    )
+    template, window = np.empty((side + 2, side + 2)), np.empty((side, side))
+    warp, found = np.empty((2, 2)), np.empty(4)
     for n in range(len(theirs)):
         i, j = theirs[n], ours[n]
         x, y, z = points_reference[n, 0], points_reference[n, 1], points_reference[n, 2]
         if not _warp_of_motion(x, y, z, own_from_reference, warp):
-            scale = 1.2 ** float(int(octaves[i]) - int(own_octaves[j]))
-            angle = math.radians(float(angles_deg[i]) - float(own_angles_deg[j]))
+            scale = 1.2 ** float(int(reference.octaves[i]) - int(own.octaves[j]))
+            angle = math.radians(float(reference.angles_deg[i]) - float(own.angles_deg[j]))
             warp[0, 0] = warp[1, 1] = scale * math.cos(angle)
             warp[1, 0] = scale * math.sin(angle)
             warp[0, 1] = -warp[1, 0]
-        level, own_level = _halving(int(octaves[i])), _halving(int(own_octaves[j]))
+        level, own_level = _halving(int(reference.octaves[i])), _halving(int(own.octaves[j]))
         size, own_size = 2.0**level, 2.0**own_level
         for a in range(2):
             for b in range(2):
                 warp[a, b] *= own_size / size
-        align_patch(
-            _of_level(level, whole, half, quarter),
-            _of_level(own_level, own_whole, own_half, own_quarter),
-            pixels[i, 0] / size,
-            pixels[i, 1] / size,
-            own_pixels[j, 0] / own_size,
-            own_pixels[j, 1] / own_size,
-            warp,
-            half_window,
-            max_shift_px,
-            template,
-            window,
-            found,
-        )
+        image, own_image = _of_level(level, reference.pyramid), _of_level(own_level, own.pyramid)
+        x, y = reference.pixels[i, 0] / size, reference.pixels[i, 1] / size
+        own_x, own_y = own.pixels[j, 0] / own_size, own.pixels[j, 1] / own_size
+        space = template, window, found
+        align_patch(image, own_image, x, y, own_x, own_y, warp, half_window, max_shift_px, *space)
         for a in range(3):
             out[n, a] = found[a] * own_size if found[3] >= min_correlation else np.nan
