@@ -18,6 +18,9 @@ The message holds the offending value and the next step. Caught only in the comm
 "I do not know where I am" is a value with a status, never one of these.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class FleetmapError(Exception):
     """Base of the tree; `exit_status` is what a command line ends with."""
@@ -77,3 +80,12 @@ class BusyError(FleetmapError):
     """Another process is at the same work; it ends by itself."""
 
     exit_status = 5
+
+
+@contextmanager
+def disk_errors(fault: object, advice: str, kind: type[FleetmapError] = StoreError) -> Iterator[None]:
+    """Raises `kind` in the place of an OSError of the block: "FAULT (the system's reason); ADVICE"."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{fault} ({error.strerror}); {advice}") from error

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import msgspec
 
-from fleetmap.errors import StoreError
+from fleetmap.errors import disk_errors
 from fleetmap.messages import FailureReport
 
 
@@ -14,7 +14,7 @@ def write_failure(folder: Path, report: FailureReport) -> Path:
     name = f"{report.stamp_ns}-{report.kind}-{report.cause}"
     fields = msgspec.to_builtins(msgspec.structs.replace(report, thumbnails=()))
     fields["thumbnails"] = []
-    try:
+    with disk_errors(f"{folder} cannot be written", "choose another folder with [run] failures"):
         folder.mkdir(parents=True, exist_ok=True)
         for number, picture in enumerate(report.thumbnails):
             path = folder / f"{name}-{number}-{picture.kind}.jpg"
@@ -22,7 +22,4 @@ def write_failure(folder: Path, report: FailureReport) -> Path:
             fields["thumbnails"].append(path.name)
         target = folder / f"{name}.json"
         target.write_text(json.dumps(fields, indent=2) + "\n")
-    except OSError as error:
-        reason = f"{folder} cannot be written ({error.strerror}); choose another folder with [run] failures"
-        raise StoreError(reason) from error
     return target

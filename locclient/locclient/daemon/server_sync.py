@@ -135,10 +135,8 @@ class ServerSync:
 
     def _refuse(self, wanted: WantedVersion, reason: str) -> None:
         _log.warning("version %s is refused: %s", wanted.version, reason)
-        self._last_ack = (
-            None if self._running is None else self._running.version,
-            f"version {wanted.version}: {reason}",
-        )
+        running = None if self._running is None else self._running.version
+        self._last_ack = (running, f"version {wanted.version}: {reason}")
         self._acknowledge()
 
     def _acknowledge_again(self) -> None:

@@ -13,9 +13,8 @@ from locclient.localization.pose_covariance import boxminus
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
-Observations = Sequence[
-    tuple[Fix, PoseHypothesis]
-]  # the fixes of one query, and each one's pose, propagated to the present
+# The fixes of one query, and each one's pose, propagated to the present.
+Observations = Sequence[tuple[Fix, PoseHypothesis]]
 
 
 class HypothesisSet:

@@ -45,10 +45,8 @@ class InitialPosePrior:
         """Whether the robot's motion leads back from a present pose to within the 0.999 bound of the prior's position."""
         if self._since is None:
             return True
-        since, cov_since = self._since.now_map_from_body, self._since.now_cov
-        map_from_then, covariance = compose_inverse_cov(
-            hypothesis.now_map_from_body, hypothesis.now_cov, since, cov_since
-        )
+        since, now = ((h.now_map_from_body, h.now_cov) for h in (self._since, hypothesis))
+        map_from_then, covariance = compose_inverse_cov(*now, *since)
         map_from_base = map_from_then @ se3_inverse(self._base_from_body)
         off_m = map_from_base[:2, 3] - self._prior.map_from_base[:2, 3]
         return bool(off_m @ np.linalg.solve(self._cov_m2() + covariance[3:5, 3:5], off_m) < _CHI2_999)

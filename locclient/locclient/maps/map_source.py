@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
-from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError
+from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, disk_errors
 from fleetmap.mapformat import (
     Manifest,
     Tile,
@@ -119,10 +119,8 @@ class LocalMapSource(MapSource):
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
         """The verified bytes of an address; raises StoreError for missing ones, MapFormatError for damaged ones."""
         path = self._folder / blob_path(sha256)
-        try:
+        with disk_errors(f"{path} cannot be read", "the store is incomplete"):
             data = path.read_bytes()
-        except OSError as error:
-            raise StoreError(f"{path} cannot be read ({error.strerror}); the store is incomplete") from error
         return verified(data, sha256)
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import msgspec
 
-from fleetmap.errors import MapFormatError, StoreError
+from fleetmap.errors import MapFormatError, StoreError, disk_errors
 from fleetmap.mapformat import blob_path, check_name, check_sha256, verified
 from fleetmap.messages import WantedVersion
 
@@ -43,12 +43,10 @@ class TileCache:
         self._faults: deque[str] = deque(maxlen=_MAX_FAULTS)
         self._last_fault = ""
         self._reserved: dict[str, frozenset[str]] = {}
-        try:
+        with disk_errors(f"the cache {folder} cannot be used", "choose another folder"):
             folder.mkdir(parents=True, exist_ok=True)
             self._sizes = self._scan()
             self._active = self._read_active()
-        except OSError as error:
-            raise StoreError(f"the cache {folder} cannot be used ({error.strerror}); choose another folder") from error
 
     def __contains__(self, sha256: str) -> bool:
         return sha256 in self._sizes

@@ -71,11 +71,6 @@ def fetch_map(maps: str | Path, site: str, options: LocalizeOptions = _DEFAULTS)
 
 def _connection_options(maps: str | Path, site: str, options: LocalizeOptions) -> dict[str, object]:
     is_server = isinstance(maps, str) and _ENDPOINT.match(maps) is not None
-    return {
-        "server": maps if is_server else None,
-        "store": None if is_server else Path(maps),
-        "site": site,
-        "robot": options.robot,
-        "cache": options.cache,
-        "cache_bytes": options.cache_bytes,
-    }
+    source = {"server": maps, "store": None} if is_server else {"server": None, "store": Path(maps)}
+    own = {"robot": options.robot, "cache": options.cache, "cache_bytes": options.cache_bytes}
+    return {**source, "site": site, **own}

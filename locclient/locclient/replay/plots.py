@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.errors import UsageError
+from fleetmap.errors import UsageError, disk_errors
 from fleetmap.failure_definition import ERROR_LIMIT_M, radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.messages import Status
@@ -57,10 +57,8 @@ class RunPlot:
 def save_picture(plot: RunPlot, path: Path) -> None:
     """Writes the picture as PNG; UsageError where it cannot be written."""
     _, data = cv2.imencode(".png", draw_run(plot))
-    try:
+    with disk_errors(f"the picture cannot be written to {path}", "check the path", UsageError):
         path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise UsageError(f"the picture cannot be written to {path} ({error.strerror}); check the path") from error
 
 
 def draw_run(plot: RunPlot) -> NDArray[np.uint8]:
@@ -78,9 +76,8 @@ def draw_run(plot: RunPlot) -> NDArray[np.uint8]:
         radii_mm = [1e3 * radius_95_m(frame.cov_rot_trans) for frame in plot.frames]
         values, label = np.where(np.isfinite(radii_mm), radii_mm, np.nan), "95 % radius of the position, mm"
     known = values[~np.isnan(values)]
-    ceiling = (
-        min(1.1 * float(known.max(initial=0.0)), 2.0 * _LIMIT_MM) or 1.0
-    )  # what is beyond stands at the upper edge
+    # Values beyond the ceiling stand at the upper edge.
+    ceiling = min(1.1 * float(known.max(initial=0.0)), 2.0 * _LIMIT_MM) or 1.0
     scale = min(ceiling, _LIMIT_MM)
     _draw_plan(canvas, plan, plot, values / scale)
     _draw_colour_bar(canvas, plan, scale, label)
@@ -170,9 +167,8 @@ def _draw_over_time(canvas: Canvas, plan: ChartAxes, plot: RunPlot, values: Arra
         canvas.dashes(axes.pixels(np.array([[0.0, level], [span_s, level]])), colour, 1.5)
         entries.append(("dashes", words.format(level), colour))
     draw_legend(canvas, np.array([left, plan.low[1] - 18.0]), entries)
-    _draw_statuses(
-        canvas, ChartAxes(np.array([left, plan.high[1] + 66.0]), np.array([right, plan.high[1] + 80.0]), *limits), plot
-    )
+    strip = np.array([left, plan.high[1] + 66.0]), np.array([right, plan.high[1] + 80.0])
+    _draw_statuses(canvas, ChartAxes(*strip, *limits), plot)
 
 
 def _draw_statuses(canvas: Canvas, strip: ChartAxes, plot: RunPlot) -> None:

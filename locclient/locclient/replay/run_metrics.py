@@ -45,10 +45,8 @@ def localised(frames: Frames) -> list[bool]:
     """For each frame: TRACKING, or a fix of its own where the recording is so sparse that frames are over a second apart."""
     out = []
     for index, frame in enumerate(frames):
-        neighbours = [
-            abs(frames[k].stamp_ns - frame.stamp_ns) * 1e-9 for k in (index - 1, index + 1) if 0 <= k < len(frames)
-        ]
-        sparse = bool(neighbours) and max(neighbours) > SPARSE_S
+        beside = [frames[k].stamp_ns for k in (index - 1, index + 1) if 0 <= k < len(frames)]
+        sparse = max((abs(stamp_ns - frame.stamp_ns) * 1e-9 for stamp_ns in beside), default=0.0) > SPARSE_S
         out.append(frame.status is Status.TRACKING or (sparse and frame.has_fix))
     return out
 

@@ -35,9 +35,8 @@ class ContinuousOdom:
         if change is not None and self._is_localized:
             self._odom_from_own = self._odom_from_own @ se3_inverse(change)
         odom_from_body = self._odom_from_own @ estimate.odometry.odom_from_body
+        odom_from_base = odom_from_body @ self._body_from_base
         if estimate.map_from_body is None:
-            return PublishedPose(odom_from_body @ self._body_from_base, None)
+            return PublishedPose(odom_from_base, None)
         self._is_localized = True
-        return PublishedPose(
-            odom_from_body @ self._body_from_base, estimate.map_from_body @ se3_inverse(odom_from_body)
-        )
+        return PublishedPose(odom_from_base, estimate.map_from_body @ se3_inverse(odom_from_body))

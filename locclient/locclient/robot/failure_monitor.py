@@ -45,13 +45,8 @@ class FailureMonitor:
         self._doubted_ns: int | None = None
         self._contradicting_looks = 0
         self._good_ns: int | None = None
-        self._running = False
+        self.is_running = False  # a reported failure has not ended yet
         self._last: Estimate | None = None
-
-    @property
-    def is_running(self) -> bool:
-        """Whether a reported failure has not ended yet."""
-        return self._running
 
     def handle(self, estimate: Estimate) -> Failure | None:
         """The failure that is detected with this frame, if any."""
@@ -62,7 +57,7 @@ class FailureMonitor:
         self._follow(now_ns, blind, self._contradicting_looks >= CONTRADICTING_LOOKS)
         if blind:
             self._causes[failure_cause(estimate)] += 1
-        if self._running:
+        if self.is_running:
             return None
         if self._blind_ns is not None and (now_ns - self._blind_ns) * 1e-9 > BLIND_S:
             return self._detected(FailureKind.BLIND, self._causes.most_common(1)[0][0], self._blind_ns, now_ns)
@@ -74,7 +69,7 @@ class FailureMonitor:
 
     def handle_silence(self, for_s: float) -> Failure | None:
         """The failure of a source that has sent no frame for so long; None before the first fix."""
-        if self._running or not self._had_fix or self._last is None or for_s <= BLIND_S:
+        if self.is_running or not self._had_fix or self._last is None or for_s <= BLIND_S:
             return None
         began_ns = self._last.stamp_ns
         self._good_ns = None
@@ -112,11 +107,11 @@ class FailureMonitor:
         elif self._good_ns is None:
             self._good_ns = now_ns
         elif (now_ns - self._good_ns) * 1e-9 >= GOOD_S:
-            self._running = False
+            self.is_running = False
 
     def _detected(self, kind: FailureKind, cause: Cause, began_ns: int, now_ns: int) -> Failure:
         assert self._last is not None
-        self._running = True
+        self.is_running = True
         image = None if cause is Cause.NO_FRAMES else self._last.image
         return Failure(kind, cause, began_ns, (now_ns - began_ns) * 1e-9, self._last, image, tuple(self._fixes))
 

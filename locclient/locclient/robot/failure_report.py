@@ -3,6 +3,9 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.messages import MAX_THUMBNAIL_BYTES, FailureReport, Placement, Thumbnail
@@ -67,15 +70,14 @@ def _tile(context: FailureContext, map_from_base: Array | None) -> tuple[int, in
 def _thumbnails(context: FailureContext, profile: RobotProfile) -> tuple[Thumbnail, ...]:
     now_ns, running = context.failure.estimate.stamp_ns, context.running
     frames = [*context.images] if context.left is None else [*context.images, (now_ns, context.left)]
-    made = [
-        Thumbnail(stamp_ns=stamp_ns, kind="frame", jpeg=small_jpeg(left, _FRAME_WIDTH_PX, MAX_THUMBNAIL_BYTES))
-        for stamp_ns, left in frames
-    ]
+    made = [_thumbnail(stamp_ns, "frame", left, _FRAME_WIDTH_PX) for stamp_ns, left in frames]
     if context.left is not None and context.map_from_cam is not None and running is not None:
         title = f"{context.failure.kind}, {context.failure.cause}, version {running.version}"
-        drawn = match_view(
-            context.left, profile.camera, context.map_from_cam, running.tiles.values(), profile.settings, title
-        )
-        jpeg = small_jpeg(drawn, _MATCHES_WIDTH_PX, MAX_THUMBNAIL_BYTES)
-        made.append(Thumbnail(stamp_ns=now_ns, kind="matches", jpeg=jpeg))
+        place = (context.left, profile.camera, context.map_from_cam)
+        drawn = match_view(*place, running.tiles.values(), profile.settings, title)
+        made.append(_thumbnail(now_ns, "matches", drawn, _MATCHES_WIDTH_PX))
     return tuple(made)
+
+
+def _thumbnail(stamp_ns: int, kind: str, image: NDArray[np.uint8], width_px: int) -> Thumbnail:
+    return Thumbnail(stamp_ns=stamp_ns, kind=kind, jpeg=small_jpeg(image, width_px, MAX_THUMBNAIL_BYTES))

@@ -43,9 +43,8 @@ def warm_up_kernels(calibration: RigCalibration, rectifier: Rectifier, settings:
     for number in range(_FRAMES):
         stamps_ns = np.arange(number * _FRAME_NS, (number + 1) * _FRAME_NS, _IMU_NS, dtype=np.int64)
         if calibration.imu is not None:
-            localizer.handle_imu(
-                ImuSamples(stamps_ns, np.zeros((len(stamps_ns), 3)), np.tile(upwards, (len(stamps_ns), 1)))
-            )
+            gyro_radps, accel_mps2 = np.zeros((len(stamps_ns), 3)), np.tile(upwards, (len(stamps_ns), 1))
+            localizer.handle_imu(ImuSamples(stamps_ns, gyro_radps, accel_mps2))
         localizer.handle_wheel([WheelSample(int(stamps_ns[0]), np.zeros(3), 0.0, 0.1, 0.1)])
         frame = _view(wall, camera, number)
         found += localizer.handle_stereo(frame).fix is not None
@@ -68,9 +67,8 @@ def gc_frozen() -> Iterator[None]:
 def _disambiguate() -> None:
     """Runs what only competing hypotheses need."""
     one, other = ObservationHistory(), ObservationHistory()
-    observed = CovisibleLandmarks(
-        np.zeros(1, np.uint32), np.zeros((1, 3)), np.zeros((1, 32), np.uint8), np.ones(1, bool)
-    )
+    ids, descriptors = np.zeros(1, np.uint32), np.zeros((1, 32), np.uint8)
+    observed = CovisibleLandmarks(ids, np.zeros((1, 3)), descriptors, np.ones(1, bool))
     for history in (one, other):
         history.add(np.eye(4), observed)
     shared = np.zeros(1, bool)

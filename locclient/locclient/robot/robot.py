@@ -75,9 +75,8 @@ class Outcome:
         if map_from_odom is None or estimate.cov_rot_trans is None:
             return None
         map_from_base = map_from_odom @ self.published.odom_from_base
-        return PoseMessage.of(
-            estimate.stamp_ns, map_from_base, estimate.cov_rot_trans, estimate.status, estimate.map_version
-        )
+        where = (estimate.stamp_ns, map_from_base, estimate.cov_rot_trans)
+        return PoseMessage.of(*where, estimate.status, estimate.map_version)
 
 
 @dataclass
@@ -109,9 +108,8 @@ class Robot:
         """clock_s measures CPU; the default measures nothing."""
         self._rectifier, self._clock_s = rectifier, clock_s
         self.base_from_body = calibration.base_from_body
-        self.localizer = Localizer(
-            calibration, rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s, settings, clock_s
-        )
+        mounting = (rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s)
+        self.localizer = Localizer(calibration, *mounting, settings, clock_s)
         self._trial_settings = trial
         self._versions = _Versions()
         self._odom = ContinuousOdom(calibration.base_from_body)
@@ -219,9 +217,8 @@ class Robot:
         else:
             assert versions.good is not None
             self._show(versions.good)
-            self._versions = replace(
-                versions, trial=self._new_trial(), is_recheck=True, candidate_reason=versions.trial.reason
-            )
+            reason, trial = versions.trial.reason, self._new_trial()
+            self._versions = replace(versions, trial=trial, is_recheck=True, candidate_reason=reason)
 
     def _end_recheck(self, verdict: TrialVerdict) -> None:
         """The candidate is refused where the good version gives fixes, else postponed: nothing could be seen."""
@@ -230,9 +227,9 @@ class Robot:
         assert versions.good is not None
         failed = f"of version {versions.candidate.version} {versions.candidate_reason}"
         if verdict is TrialVerdict.CONFIRMED:
-            reason = f"{failed}, where version {versions.good.version} gives fixes"
-            versions.changes.append(VersionChange(versions.candidate.wanted, Change.REFUSED, reason))
+            change, reason = Change.REFUSED, f"{failed}, where version {versions.good.version} gives fixes"
         else:
+            change = Change.POSTPONED
             reason = f"{failed}, and version {versions.good.version} gives no fixes either; it is tried again later"
-            versions.changes.append(VersionChange(versions.candidate.wanted, Change.POSTPONED, reason))
+        versions.changes.append(VersionChange(versions.candidate.wanted, change, reason))
         self._versions = replace(versions, candidate=None, trial=None, is_recheck=False)

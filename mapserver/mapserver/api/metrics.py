@@ -45,16 +45,12 @@ _VERSION_SUMS: tuple[tuple[str, str, Callable[[Counters], float]], ...] = (
 _SITE_ROBOTS: tuple[tuple[str, str, Callable[[list[RobotStatus]], float]], ...] = (
     ("robots", "Robots that ever reported.", len),
     ("robots_seen", "Robots that reported in the last minute.", lambda robots: len(_seen(robots))),
-    (
-        "robots_current",
-        "Robots on the wanted version.",
-        lambda robots: sum(robot.version == robot.wanted_version is not None for robot in robots),
-    ),
+    ("robots_current", "Robots on the wanted version.", lambda robots: sum(map(_is_current, robots))),
     ("robots_present", "Robots on the bus now.", lambda robots: sum(robot.is_present is True for robot in robots)),
     (
         "clock_skew_max_seconds",
         "The most that a robot's clock is wrong.",
-        lambda robots: max((abs(robot.clock_ahead_s or 0.0) for robot in robots), default=0.0),
+        lambda robots: max(map(_skew_s, robots), default=0.0),
     ),
 )
 
@@ -148,6 +144,14 @@ def _filled(family: Family, values: Iterable[tuple[tuple[str, ...], float]]) -> 
     for labels, value in values:
         family.add_metric(labels, value)
     return family
+
+
+def _is_current(robot: RobotStatus) -> bool:
+    return robot.version == robot.wanted_version is not None
+
+
+def _skew_s(robot: RobotStatus) -> float:
+    return abs(robot.clock_ahead_s or 0.0)
 
 
 def _seen(robots: list[RobotStatus]) -> list[RobotStatus]:

@@ -22,28 +22,18 @@ _STATUS: tuple[tuple[type[FleetmapError], HTTPStatus], ...] = (
 )
 
 
+_CONTENT = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
 PROBLEM_RESPONSES: dict[int | str, dict[str, Any]] = {
-    "4XX": {
-        "description": "What was asked for is not there, not right or not allowed.",
-        "content": {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}},
-    },
-    "5XX": {
-        "description": "The store cannot be read or written; the server's log says more.",
-        "content": {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}},
-    },
+    "4XX": {"description": "What was asked for is not there, not right or not allowed.", "content": _CONTENT},
+    "5XX": {"description": "The store cannot be read or written; the server's log says more.", "content": _CONTENT},
 }
 """What every endpoint may answer instead, for the OpenAPI document."""
 
 
 def problem(status: int, detail: str, path: str, headers: dict[str, str] | None = None) -> JSONResponse:
     """A problem document; its type is about:blank, so that its title is the status's phrase."""
-    content = {
-        "type": "about:blank",
-        "title": HTTPStatus(status).phrase,
-        "status": status,
-        "detail": detail,
-        "instance": path,
-    }
+    kind = {"type": "about:blank", "title": HTTPStatus(status).phrase, "status": status}
+    content = kind | {"detail": detail, "instance": path}
     return JSONResponse(content, status, headers=headers, media_type="application/problem+json")
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
 from mapserver.fleet.fleet import RobotStatus
 from mapserver.fleet_statistics.canary_test import CanaryFinding
@@ -139,13 +139,14 @@ class CanaryView:
     robots: list[str]
 
 
+def _body(**example: JsonValue) -> ConfigDict:
+    return ConfigDict(extra="forbid", json_schema_extra={"examples": [example]})
+
+
 class Act(BaseModel):
     """Who changes something, and why."""
 
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={"examples": [{"actor": "ada", "reason": "robots lose themselves in aisle 3"}]},
-    )
+    model_config = _body(actor="ada", reason="robots lose themselves in aisle 3")
     actor: Annotated[str, Field(min_length=1, max_length=200)]
     reason: Annotated[str, Field(max_length=2000)] = ""
 
@@ -157,10 +158,7 @@ class Act(BaseModel):
 class PublishAct(Act):
     """Who publishes, and why; with `force` also what the gate refuses, except beyond hard limits."""
 
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={"examples": [{"actor": "ada", "reason": "hall 2 was emptied", "force": True}]},
-    )
+    model_config = _body(actor="ada", reason="hall 2 was emptied", force=True)
     force: bool = False
 
     @model_validator(mode="after")
@@ -173,28 +171,20 @@ class PublishAct(Act):
 class CanaryAct(Act):
     """Who lets some robots try a version, and why; share of the robots, the setting's without it."""
 
-    model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"examples": [{"actor": "ada", "reason": "the nightly map", "share": 0.05}]}
-    )
+    model_config = _body(actor="ada", reason="the nightly map", share=0.05)
     share: Annotated[float | None, Field(gt=0, lt=1)] = None
+
+
+_NOT_FOUND: dict[str, JsonValue] = {
+    **{"type": "about:blank", "title": "Not Found", "status": 404, "instance": "/v1/sites/hall/versions/9"},
+    "detail": "site hall has no version 9; `mapserver versions --site hall` lists them",
+}
 
 
 class Problem(BaseModel):
     """An error, as RFC 9457 describes it."""
 
-    model_config = ConfigDict(
-        json_schema_extra={
-            "examples": [
-                {
-                    "type": "about:blank",
-                    "title": "Not Found",
-                    "status": 404,
-                    "detail": "site hall has no version 9; `mapserver versions --site hall` lists them",
-                    "instance": "/v1/sites/hall/versions/9",
-                }
-            ]
-        }
-    )
+    model_config = ConfigDict(json_schema_extra={"examples": [_NOT_FOUND]})
     type: str
     title: str
     status: int

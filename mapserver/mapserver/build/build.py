@@ -16,7 +16,7 @@ from rich.console import Console
 
 from fleetmap.bow import encode_vocabulary
 from fleetmap.config import Section, load_toml, to_dict
-from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError
+from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError, disk_errors
 from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
@@ -392,7 +392,5 @@ def _write_files(run: _Run, built: Built, draft: Draft) -> None:
 
 def write_file(path: Path, data: bytes) -> None:
     """Writes a result of a build; StoreError where the disk refuses."""
-    try:
+    with disk_errors(f"{path} cannot be written", "the draft is stored all the same"):
         path.write_bytes(data)
-    except OSError as error:
-        raise StoreError(f"{path} cannot be written ({error.strerror}); the draft is stored all the same") from error

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from fleetmap.errors import StoreError
+from fleetmap.errors import StoreError, disk_errors
 from fleetmap.features.patch_align import half_pyramid
 from fleetmap.geometry import AnyArray
 from fleetmap.sensors.rectification import RectifiedFrame
@@ -28,12 +28,8 @@ class ImageSpill:
     """An ImageStore over an unnamed file in `folder`, which the system removes with the process."""
 
     def __init__(self, folder: Path) -> None:
-        try:
+        with disk_errors(f"{folder} takes no temporary file", "check its rights and space"):
             self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed with the store
-        except OSError as error:
-            raise StoreError(
-                f"{folder} takes no temporary file ({error.strerror}); check its rights and space"
-            ) from error
         self._places: list[_Place] = []
         self._held: OrderedDict[int, Pictures] = OrderedDict()
 
@@ -47,12 +43,8 @@ class ImageSpill:
         """See ImageStore."""
         frame, number = pictures.frame, len(self._places)
         parts = (frame.left, frame.right, frame.disparity_px)
-        try:
+        with disk_errors(f"picture {number} of the survey cannot be set aside", "make space beside the store"):
             self._places.append(_Place(frame.stamp_ns, tuple(self._write(part) for part in parts)))
-        except OSError as error:
-            raise StoreError(
-                f"picture {number} of the survey cannot be set aside ({error.strerror}); make space beside the store"
-            ) from error
         self._hold(number, pictures)
         return number
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fleetmap.errors import BusyError, StoreError
+from fleetmap.errors import BusyError, disk_errors
 from mapserver.store import JobInfo, MapStore
 
 INTERRUPTED = "interrupted"
@@ -82,10 +82,8 @@ def _path(store: Path, job: int) -> Path:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[int]:
-    try:
+    with disk_errors(f"{path} cannot be made", "check the store's rights and space"):
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise StoreError(f"{path} cannot be made ({error.strerror}); check the store's rights and space") from error
     try:
         yield descriptor
     finally:

@@ -32,7 +32,7 @@ def report(
     """Write one page for the shift leader: failures per robot-day, the worst robots, versions, causes, tiles to survey again."""
     import time
 
-    from fleetmap.errors import StoreError
+    from fleetmap.errors import disk_errors
     from mapserver.dashboard.pages.shift_page import html_page
     from mapserver.fleet.shift_summary import SummarySettings, summarise
     from mapserver.store import MapStore
@@ -41,10 +41,8 @@ def report(
     judged_by = SummarySettings(settings.canary, settings.resurvey)
     with MapStore.open(store) as maps:
         page = html_page(summarise(maps, site, hours, time.time_ns(), judged_by))
-    try:
+    with disk_errors(f"{out} cannot be written", "choose another place"):
         out.write_text(page, "utf-8")
-    except OSError as error:
-        raise StoreError(f"{out} cannot be written ({error.strerror}); choose another place") from error
     typer.echo(str(out))
 
 
@@ -108,17 +106,15 @@ def resurvey(
 def _write_route(found: "ResurveyList", path: Path) -> None:
     import json as json_text
 
-    from fleetmap.errors import StoreError
+    from fleetmap.errors import disk_errors
     from mapserver.fleet_statistics.resurvey_test import route_csv, route_geojson
 
     if path.suffix == ".csv":
         text = route_csv(found.route)
     else:
         text = json_text.dumps(route_geojson(found.site, found.version or 0, found.route), indent=1) + "\n"
-    try:
+    with disk_errors(f"{path} cannot be written", "choose another place"):
         path.write_text(text, "utf-8")
-    except OSError as error:
-        raise StoreError(f"{path} cannot be written ({error.strerror}); choose another place") from error
 
 
 FLEET = Group(

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
-from fleetmap.errors import BusyError, FleetmapError, StoreError
+from fleetmap.errors import BusyError, FleetmapError, disk_errors
 from mapserver.commands.options import SurveyOptions
 
 
@@ -61,7 +61,5 @@ def _write(options: NightlyOptions) -> None:
     content = None if report is None else last_report(options.store, options.site)
     if report is None or content is None:
         return
-    try:
+    with disk_errors(f"{report} cannot be written", "the store's jobs say the same"):
         report.write_bytes(msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n")
-    except OSError as error:
-        raise StoreError(f"{report} cannot be written ({error.strerror}); the store's jobs say the same") from error

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
-from fleetmap.errors import UsageError
+from fleetmap.errors import UsageError, disk_errors
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -56,10 +56,8 @@ def train_vocabulary(
     rows = np.concatenate(pictures)
     vocabulary = train(rows, branching, levels, np.random.default_rng(options.seed), images)
     data = encode_vocabulary(vocabulary)
-    try:
+    with disk_errors(f"--out {out} cannot be written", "check folder and space", UsageError):
         out.write_bytes(data)
-    except OSError as error:
-        raise UsageError(f"--out {out} cannot be written ({error.strerror}); check folder and space") from error
     typer.echo(
         f"{out}: {vocabulary.word_count} words from {len(rows)} features of {len(pictures)} pictures, {len(data)} bytes, "
         f"{vocabulary_hash(vocabulary)}"

@@ -30,9 +30,8 @@ def review(store: MapStore, settings: CanarySettings, now_ns: int) -> list[Canar
         if finding.action == "wait":
             continue
         try:
-            releases.end_canary(
-                store, canary, promote=finding.action == "promote", outcome=finding.reason, actor=Actor(ACTOR)
-            )
+            promote = finding.action == "promote"
+            releases.end_canary(store, canary, promote=promote, outcome=finding.reason, actor=Actor(ACTOR))
         except FleetmapError as error:
             _log.error("the canary of site %s, version %d, is not ended: %s", canary.site, canary.version, error)
             continue

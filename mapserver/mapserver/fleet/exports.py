@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, get_args, get_type_hints
 
 from mcap.writer import CompressionType, Writer
 
-from fleetmap.errors import StoreError
+from fleetmap.errors import disk_errors
 from fleetmap.messages import FailureKind, report_dict
 from mapserver.fleet.fleet import finite
 from mapserver.store import FailureDetail, FailureFilter, FailureRow, MapStore
@@ -100,12 +100,10 @@ def write_mcap(store: MapStore, wanted: FailureFilter, path: Path) -> int:
     with _appearing(path) as file:
         writer = Writer(file, compression=CompressionType.NONE)
         writer.start(profile="", library="fleetmap")
-        channels = {
-            topic: writer.register_channel(
-                topic, "json", writer.register_schema(name, "jsonschema", json.dumps(SCHEMAS[name]).encode())
-            )
-            for topic, name in _TOPICS.items()
-        }
+        channels = {}
+        for topic, name in _TOPICS.items():
+            schema = writer.register_schema(name, "jsonschema", json.dumps(SCHEMAS[name]).encode())
+            channels[topic] = writer.register_channel(topic, "json", schema)
         for found in failures_oldest_first(store, wanted):
             for topic, message in _messages(store, found):
                 stamp_ns = max(0, found.failure.happened_ns)
@@ -150,10 +148,8 @@ def _messages(store: MapStore, found: FailureDetail) -> Iterator[tuple[str, dict
 def _appearing(path: Path) -> Iterator[BinaryIO]:
     """The file at a path, which appears there when the block ends well. Raises StoreError where the disk refuses."""
     part = path.with_name(path.name + ".part")
-    try:
+    with disk_errors(f"{part} cannot be written", "choose another place"):
         file = part.open("wb")
-    except OSError as error:
-        raise StoreError(f"{part} cannot be written ({error.strerror}); choose another place") from error
     try:
         with file:
             yield file

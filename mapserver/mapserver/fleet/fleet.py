@@ -81,9 +81,8 @@ class Fleet:
         self._robots: dict[tuple[str, str], _Robot] = {}
         for info in store.robots():
             skew = ClockSkew(info.last_report.get("clock_ahead_s"))
-            self._robots[info.site, info.robot] = _Robot(
-                info.version, info.last_seen_ns, dict(info.last_report), skew=skew
-            )
+            robot = _Robot(info.version, info.last_seen_ns, dict(info.last_report), skew=skew)
+            self._robots[info.site, info.robot] = robot
 
     def wanted_version(self, site: str, robot: str) -> WantedVersion:
         """The version that a robot should run: its site's current one, or that which it tries before the others.

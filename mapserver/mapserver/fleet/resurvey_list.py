@@ -26,22 +26,20 @@ def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns
     now_hour = hour_of(now_ns)
     recent_hour = now_hour - round(settings.recent_days * 24)
     before_hour = recent_hour - round(settings.before_days * 24)
-    recent = store.fleet.counters(site, "tile", since_hour=recent_hour)
-    before = store.fleet.counters(site, "tile", since_hour=before_hour, until_hour=recent_hour)
-    found = concerns(
-        {key: counts for (_, key), counts in recent.items()},
-        {key: counts for (_, key), counts in before.items()},
-        settings,
+    recent, before = (
+        {
+            key: counts
+            for (_, key), counts in store.fleet.counters(site, "tile", since_hour=since, until_hour=until).items()
+        }
+        for since, until in ((recent_hour, 1 << 60), (before_hour, recent_hour))
     )
+    found = concerns(recent, before, settings)
     if current is None:
         return ResurveyList(site, None, found, [])
     manifest = store.manifest(site, current.version)
     entries = {f"{tile.x},{tile.y}": tile for tile in manifest.tiles}
-    places = {
-        concern.tile: _place(store, entries[concern.tile], manifest.tile_size_m)
-        for concern in found
-        if concern.tile in entries
-    }
+    tiles = [concern.tile for concern in found if concern.tile in entries]
+    places = {tile: _place(store, entries[tile], manifest.tile_size_m) for tile in tiles}
     return ResurveyList(site, current.version, found, route(found, places))
 
 

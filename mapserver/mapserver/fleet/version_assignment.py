@@ -27,16 +27,10 @@ class VersionAssignment:
 
 def read_assignment(store: MapStore, site: str) -> VersionAssignment:
     """The assignment of a site as it is now; raises UsageError for an unknown one."""
-    info = store.current(site)
-    current = WantedVersion(
-        site=site,
-        version=None if info is None else info.version,
-        manifest_sha256=None if info is None else info.manifest_sha256,
-    )
-    running = store.canaries(site, running=True)
+    info, running = store.current(site), store.canaries(site, running=True)
+    number, address = (None, None) if info is None else (info.version, info.manifest_sha256)
+    current = WantedVersion(site=site, version=number, manifest_sha256=address)
     if not running:
         return VersionAssignment(current, None, None)
-    address = store.version(site, running[0].version).manifest_sha256
-    return VersionAssignment(
-        current, running[0], WantedVersion(site=site, version=running[0].version, manifest_sha256=address)
-    )
+    number, address = running[0].version, store.version(site, running[0].version).manifest_sha256
+    return VersionAssignment(current, running[0], WantedVersion(site=site, version=number, manifest_sha256=address))

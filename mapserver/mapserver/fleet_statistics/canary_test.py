@@ -100,9 +100,8 @@ def evidence_of_harm(canary: Rate, others: Rate, margin_ratio: float) -> float:
         return 1.0
     odds = margin_ratio * canary.robot_days / others.robot_days
     expected, alternative = odds / (1 + odds), odds * _WORSE_BY / (1 + odds * _WORSE_BY)
-    log_ratio = canary.events * np.log(alternative / expected) + others.events * np.log(
-        (1 - alternative) / (1 - expected)
-    )
+    ours, theirs = np.log(alternative / expected), np.log((1 - alternative) / (1 - expected))
+    log_ratio = canary.events * ours + others.events * theirs
     return float(np.mean(np.exp(np.minimum(log_ratio, 600.0))))
 
 
@@ -120,16 +119,13 @@ def within_margin(canary: Rate, others: Rate, margin_ratio: float, margin_per_ro
 
 def _why_wait(canary: Rate, others: Rate, within: float, evidence: float) -> str:
     if canary.robot_days <= 0 or others.robot_days <= 0:
-        return (
-            f"nothing can be said before robots drive with {'it' if canary.robot_days <= 0 else 'the version before'}"
-        )
+        missing = "it" if canary.robot_days <= 0 else "the version before"
+        return f"nothing can be said before robots drive with {missing}"
     return f"too early to tell: within the margin with {within:.1%}, evidence of harm {evidence:.2g} to 1"
 
 
 def _rate_text(found: Rate) -> str:
     if found.per_robot_day is None:
         return f"{found.events} failures before anything was driven"
-    return (
-        f"{found.events} in {found.robot_days:.3g} robot-days ({found.per_robot_day:.3g} per robot-day, "
-        f"{found.low:.3g} to {found.high:.3g})"
-    )
+    words = f"{found.per_robot_day:.3g} per robot-day, {found.low:.3g} to {found.high:.3g}"
+    return f"{found.events} in {found.robot_days:.3g} robot-days ({words})"

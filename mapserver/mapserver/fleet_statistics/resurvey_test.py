@@ -133,9 +133,8 @@ def _rising(now: Counters, then: Counters, total: Counters, settings: ResurveySe
     chance = float(betainc(now.events, events + 1, odds / (1 + odds)))
     if chance * tests > settings.alpha:
         return []
-    return [
-        f"{now.events} failures in {now.driving_ms / 3.6e6:.1f} h of driving, {events} in {days * 16:.1f} h {words}"
-    ]
+    driven = f"{now.driving_ms / 3.6e6:.1f} h of driving"
+    return [f"{now.events} failures in {driven}, {events} in {days * 16:.1f} h {words}"]
 
 
 def _fading(now: Counters, then: Counters, settings: ResurveySettings) -> list[str]:

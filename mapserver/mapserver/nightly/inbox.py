@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
 
-from fleetmap.errors import RecordingError, StoreError, UsageError
+from fleetmap.errors import RecordingError, UsageError, disk_errors
 from fleetmap.recordings import OpenOptions, open_recording
 from mapserver.store.files import make_folder, sync_folder, write_atomically
 
@@ -112,7 +112,7 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
     """
     folder = path.parent / where
     prefix = "" if sha256 is None or path.name.startswith(sha256[:_HASH_SIGNS]) else f"{sha256[:_HASH_SIGNS]}-"
-    try:
+    with disk_errors(f"{path} cannot be moved to {folder}", "check the rights and space of the inbox"):
         make_folder(folder)
         target = _free(folder, prefix + path.name)
         if reason is not None:
@@ -120,9 +120,6 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
         os.replace(path, target)  # noqa: PTH105
         sync_folder(folder)
         sync_folder(path.parent)
-    except OSError as error:
-        message = f"{path} cannot be moved to {folder} ({error.strerror}); check the rights and space of the inbox"
-        raise StoreError(message) from error
     return target
 
 

@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from fleetmap.errors import MapFormatError, StoreError
+from fleetmap.errors import MapFormatError, disk_errors
 from fleetmap.mapformat import blob_path, sha256_hex, verified
 from mapserver.store.files import TEMPORARY_SUFFIX, make_folder, read_chunks, sync_folder, write_atomically
 
@@ -38,12 +38,8 @@ class BlobFolder:
     def chunks(self, sha256: str) -> Iterator[bytes]:
         """The bytes of an address in pieces, unverified; raises StoreError for missing ones."""
         path = self.path(sha256)
-        try:
+        with disk_errors(f"{path} cannot be read", "the store is incomplete, restore it"):
             yield from read_chunks(path)
-        except OSError as error:
-            raise StoreError(
-                f"{path} cannot be read ({error.strerror}); the store is incomplete, restore it"
-            ) from error
 
     def is_whole(self, sha256: str) -> bool:
         """Whether the bytes of an address are there and are what it says; reads them in pieces."""
@@ -69,16 +65,14 @@ class BlobFolder:
 
     def remove_file(self, path: Path) -> int:
         """Removes a file and returns its size; raises StoreError where the disk refuses."""
-        try:
+        with disk_errors(f"{path} cannot be removed", "check the folder's rights"):
             size = path.stat().st_size
             os.unlink(path)  # noqa: PTH108
-        except OSError as error:
-            raise StoreError(f"{path} cannot be removed ({error.strerror}); check the folder's rights") from error
         return size
 
     def _keep(self, sha256: str, size_bytes: int, chunks: Iterable[bytes]) -> None:
         path = self.path(sha256)
-        try:
+        with disk_errors(f"{path} cannot be written", "check the disk's space and rights"):
             # A file of that name may be damaged; reading it costs less than writing it.
             if path.is_file() and path.stat().st_size == size_bytes and self.is_whole(sha256):
                 # Who wrote it may have died before its name was on the disk.
@@ -88,9 +82,6 @@ class BlobFolder:
             make_folder(path.parent.parent)
             if chunks:
                 write_atomically(path, chunks)
-        except OSError as error:
-            reason = f"{path} cannot be written ({error.strerror}); check the disk's space and rights"
-            raise StoreError(reason) from error
 
     def _files(self) -> Iterator[Path]:
         return (path for path in (self._root / _FOLDER).glob("*/*") if path.is_file())

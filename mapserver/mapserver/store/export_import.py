@@ -24,7 +24,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from fleetmap.errors import MapFormatError, NewerFormatError, StoreError
+from fleetmap.errors import MapFormatError, NewerFormatError, StoreError, disk_errors
 from fleetmap.mapformat import Manifest, check_name, decode_manifest, decode_tile, verified
 from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Name, Positive, Sha256
 from mapserver.store.blobs import BlobFolder
@@ -73,12 +73,9 @@ def write_export(path: Path, info: VersionInfo, manifest: Manifest, blobs: BlobF
         size = sum(len(chunk) for chunk in blobs.chunks(info.archive_sha256))
         entries.append(ExportBlob(kind="archive", sha256=info.archive_sha256, bytes=size))
     head = ExportHead(site=info.site, version=info.version, blobs=tuple(entries))
-    try:
+    with disk_errors(f"{path} cannot be written", "check the folder, its space and rights"):
         write_atomically(path, _export_chunks(head, blobs))
         return path.stat().st_size
-    except OSError as error:
-        reason = f"{path} cannot be written ({error.strerror}); check the folder, its space and rights"
-        raise StoreError(reason) from error
 
 
 def _export_chunks(head: ExportHead, blobs: BlobFolder) -> Iterator[bytes]:
@@ -197,10 +194,8 @@ def open_export(path: Path) -> Iterator[ExportReader]:
     Raises StoreError where it cannot be read, NewerFormatError for a newer format, MapFormatError for anything else
     that is no whole export.
     """
-    try:
+    with disk_errors(f"{path} cannot be read", "check the path"):
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except OSError as error:
-        raise StoreError(f"{path} cannot be read ({error.strerror}); check the path") from error
     try:
         yield ExportReader(descriptor, path)
     except OSError as error:

@@ -76,9 +76,8 @@ def _version_faults(transactions: Transactions, blobs: BlobFolder, info: Version
     except FleetmapError as error:
         return [f"{name}: {error}"]
     faults = []
-    rows = transactions.query(
-        "SELECT kind, sha256 FROM version_blobs WHERE site = ? AND version = ?", (info.site, info.version)
-    )
+    query = "SELECT kind, sha256 FROM version_blobs WHERE site = ? AND version = ?"
+    rows = transactions.query(query, (info.site, info.version))
     if {(row["kind"], row["sha256"]) for row in rows} != references(info, manifest):
         faults.append(f"{name}: the database does not mention exactly the bytes of its manifest")
     stored, made = _figures(info), _figures_of(manifest)
