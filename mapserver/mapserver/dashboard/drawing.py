@@ -72,19 +72,15 @@ def scale_bar(plan: Plan) -> Markup:
 def coverage(plan: Plan) -> Markup:
     """Tiles, the fuller the darker."""
     most = max((tile.landmarks for tile in plan.tiles), default=1) or 1
-    return joined(
-        _cell(
-            plan, (tile.x, tile.y), "tile", f"tile {tile.x},{tile.y}: {tile.landmarks} landmarks", tile.landmarks / most
-        )
-        for tile in plan.tiles
-    )
+    words = [f"tile {tile.x},{tile.y}: {tile.landmarks} landmarks" for tile in plan.tiles]
+    named = zip(plan.tiles, words, strict=True)
+    return joined(_cell(plan, (tile.x, tile.y), "tile", name, tile.landmarks / most) for tile, name in named)
 
 
 def cells(plan: Plan, kinds: Mapping[tuple[int, int], str]) -> Markup:
     """Tiles by what became of them: added, changed or removed."""
-    return joined(
-        _cell(plan, place, kind, f"tile {place[0]},{place[1]}: {kind}", 1.0) for place, kind in sorted(kinds.items())
-    )
+    placed = sorted(kinds.items())
+    return joined(_cell(plan, place, kind, f"tile {place[0]},{place[1]}: {kind}", 1.0) for place, kind in placed)
 
 
 def _cell(plan: Plan, place: tuple[int, int], css: str, words: str, fullness: float) -> Markup:
@@ -153,9 +149,8 @@ def bars(found: list[Bar], name: str) -> Markup:
     ]
     for number, bar in enumerate(found):
         x = left + (number + 0.5) * step
-        parts.append(
-            Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="middle">{}</text>').format(x, height + 4, bar.label)
-        )
+        label = Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="middle">{}</text>')
+        parts.append(label.format(x, height + 4, bar.label))
         if bar.value is None or bar.low is None or bar.high is None:
             continue
         parts.append(

@@ -106,12 +106,10 @@ class HealthData:
         )
 
     def _trials(self, site: str, now_ns: int) -> tuple[Trial, ...]:
-        recent = [
-            row for row in self._store.canaries(site) if row.ended_ns is None or now_ns - row.ended_ns < _ENDED_SHOWN_NS
-        ]
-        return tuple(
-            Trial(row, row.outcome or find(self._store, row, self._canary, now_ns).reason) for row in recent[:3]
-        )
+        rows = self._store.canaries(site)
+        recent = [row for row in rows if row.ended_ns is None or now_ns - row.ended_ns < _ENDED_SHOWN_NS][:3]
+        findings = [row.outcome or find(self._store, row, self._canary, now_ns).reason for row in recent]
+        return tuple(Trial(row, finding) for row, finding in zip(recent, findings, strict=True))
 
 
 def _sum(hours: Mapping[int, Counters], since: int, until: int) -> Counters:

@@ -109,14 +109,8 @@ def continued_covariances(estimates: Sequence[OdometryEstimate]) -> Array:
 
 
 def _summary(frame: RectifiedFrame, estimate: OdometryEstimate) -> FrameSummary:
-    return FrameSummary(
-        frame.stamp_ns,
-        estimate.odom_from_body,
-        estimate.track_ids,
-        estimate.scene_depth_m,
-        sharpness(frame),
-        estimate.after_gap,
-    )
+    e = estimate
+    return FrameSummary(frame.stamp_ns, e.odom_from_body, e.track_ids, e.scene_depth_m, sharpness(frame), e.after_gap)
 
 
 def longest_run(odometry: OdometryPass, body_from_cam: Array) -> OdometryPass:
@@ -136,12 +130,9 @@ def longest_run(odometry: OdometryPass, body_from_cam: Array) -> OdometryPass:
     odom_from_body, covariances = odometry.odom_from_body, odometry.covariances
     if not odometry.inertial and end > first:
         odom_from_body, covariances = _levelled(odom_from_body, covariances, body_from_cam, inside)
+    keyframes, tracked = [k for k in odometry.keyframes if inside[k.frame_index]], odometry.tracked & inside
     return replace(
-        odometry,
-        odom_from_body=odom_from_body,
-        covariances=covariances,
-        tracked=odometry.tracked & inside,
-        keyframes=[k for k in odometry.keyframes if inside[k.frame_index]],
+        odometry, odom_from_body=odom_from_body, covariances=covariances, tracked=tracked, keyframes=keyframes
     )
 
 

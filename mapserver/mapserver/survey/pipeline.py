@@ -1,5 +1,6 @@
 """The survey from end to end: the list of its stages, each a function from a state to a new one."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -151,26 +152,21 @@ def _match_neighbours(
     near = max(settings.loops.min_gap_keyframes, previous)
     candidates = finder.candidates(state.map_from_body, previous=previous, only_near=near)
     covariances = odometry.covariances[[k.frame_index for k in odometry.keyframes]]
-    return finder.match(
-        candidates,
-        state.map_from_body,
-        drift_allowance_m(covariances, state.map_from_body[:, :3, 3]),
-        rotation_sigma_rad=_ADJUSTED_SIGMA_RAD if odometry.inertial else None,
-        is_known=True,
-        progress=lambda n: tools.progress("matching", n + 1, len(candidates)),
-    )
+    allowed_m = drift_allowance_m(covariances, state.map_from_body[:, :3, 3])
+    sigma_rad = _ADJUSTED_SIGMA_RAD if odometry.inertial else None
+    report = _progress(tools, "matching", len(candidates))
+    return finder.match(candidates, state.map_from_body, allowed_m, rotation_sigma_rad=sigma_rad, progress=report)
 
 
 def _match_all(state: SurveyState, finder: PairFinder, settings: SurveySettings, tools: SurveyTools) -> list[PairMatch]:
     candidates = finder.candidates(state.map_from_body, previous=settings.pairs.previous)
-    return finder.match(
-        candidates,
-        state.map_from_body,
-        fixed_allowance_m(state.map_from_body),
-        rotation_sigma_rad=_ADJUSTED_SIGMA_RAD,
-        is_known=True,
-        progress=lambda n: tools.progress("matching again", n + 1, len(candidates)),
-    )
+    allowed_m, report = fixed_allowance_m(state.map_from_body), _progress(tools, "matching again", len(candidates))
+    sigma_rad = _ADJUSTED_SIGMA_RAD
+    return finder.match(candidates, state.map_from_body, allowed_m, rotation_sigma_rad=sigma_rad, progress=report)
+
+
+def _progress(tools: SurveyTools, stage: str, total: int) -> Callable[[int], None]:
+    return lambda number: tools.progress(stage, number + 1, total)
 
 
 def _first_landmarks(

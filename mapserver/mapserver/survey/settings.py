@@ -47,9 +47,8 @@ class LoopSettings(Section, frozen=True):
     min_gap_keyframes: int = 8
     max_innovation: float = 22.458  # 0.999 of chi-square with 6 degrees of freedom
     view_range_depths: float = 1.0  # largest distance between keyframes with common view, in median scene depths
-    repeats_every_m: float = (
-        0.0  # how far apart aisles that look alike are, where the site's people know it; 0 where they do not
-    )
+    # How far apart aisles that look alike are, where the site's people know it; 0 where they do not.
+    repeats_every_m: float = 0.0
     min_inliers: int = 15  # of one rigid motion
     alone_inliers: int = 30  # the same without a neighbouring keyframe that confirms the revisit
     min_cells: int = 6  # of 48 image cells with inliers

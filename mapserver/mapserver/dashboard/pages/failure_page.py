@@ -58,11 +58,8 @@ def install(services: Services) -> None:
             detail = await load(services.health.failure, number(failure, "failure") or 0)
             html(back_link(context, "failures", "All failures"))
             html(Markup("<h1>Failure {} of {}</h1>").format(detail.failure.number, detail.failure.robot))
-            html(
-                Markup('<div class="pair">{}{}</div>').format(
-                    _summary(context, detail), await _position(services, context, detail)
-                )
-            )
+            position = await _position(services, context, detail)
+            html(Markup('<div class="pair">{}{}</div>').format(_summary(context, detail), position))
             html(_pictures(context, detail))
             html(_fixes(detail.report))
 
@@ -152,14 +149,8 @@ def _rows(context: PageContext, wanted: FailureFilter, found: list[FailureRow]) 
     listed = table(head, rows, empty="No failures match these filters.", name="Failures")
     if len(found) <= FAILURES_SHOWN:
         return listed
-    older = context.to(
-        "failures",
-        robot=wanted.robot,
-        version=wanted.version,
-        tile=wanted.tile,
-        cause=wanted.cause,
-        before=shown[-1].number,
-    )
+    filters = {name: getattr(wanted, name) for name in ("robot", "version", "tile", "cause")}
+    older = context.to("failures", **filters, before=shown[-1].number)
     return Markup("{}<p>{}</p>").format(listed, link(older, "Older failures"))
 
 
@@ -169,28 +160,24 @@ def _summary(context: PageContext, detail: FailureDetail) -> Markup:
     def figure(value: float | None, unit: str = "") -> str | None:
         return None if value is None else f"{value:.3g}{unit}"
 
+    def same(name: str, value: object) -> Markup | None:
+        return None if value is None else link(context.to("failures", **{name: value}), value)
+
     suspected = row.kind == FailureKind.SUSPECTED
+    doubt = (
+        "The robot suspects a failure because its fixes contradict its position. Suspected failures are an estimate."
+    )
     return Markup("<div><h2>What happened</h2>{}{}</div>").format(
-        notice(
-            "warn",
-            "The robot suspects a failure because its fixes contradict its position. Suspected failures are an estimate.",
-        )
-        if suspected
-        else "",
+        notice("warn", doubt) if suspected else "",
         facts(
             [
                 ("Began", moment(row.happened_ns)),
                 ("Duration when reported", f"{row.duration_s:.1f} s"),
                 ("Cause", row.cause.replace("_", " ")),
                 ("State of the robot", STATUSES.get(row.status, (row.status,))[0]),
-                ("Robot", link(context.to("failures", robot=row.robot), row.robot)),
-                (
-                    "Map version",
-                    None
-                    if row.version is None
-                    else link(context.to("failures", version=row.version), str(row.version)),
-                ),
-                ("Tile", None if row.tile is None else link(context.to("failures", tile=row.tile), row.tile)),
+                ("Robot", same("robot", row.robot)),
+                ("Map version", same("version", row.version)),
+                ("Tile", same("tile", row.tile)),
                 ("Position uncertainty (95 % radius)", figure(report.radius_95_m, " m")),
                 ("Last fix against prediction (squared Mahalanobis distance)", figure(report.innovation)),
                 ("Matches in the last fix", report.inliers),

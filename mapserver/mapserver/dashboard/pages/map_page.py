@@ -71,13 +71,8 @@ def _trial_words(history: SiteHistory) -> str:
 def _changes(services: Services, context: PageContext, history: SiteHistory) -> None:
     """Buttons that change the versions."""
     current = history.site.current_version
-    html(
-        Markup("<p>{}</p>").format(
-            "No version is published yet."
-            if current is None
-            else f"Robots should use version {current}." + _trial_words(history)
-        )
-    )
+    used = f"Robots should use version {current}." + _trial_words(history)
+    html(Markup("<p>{}</p>").format("No version is published yet." if current is None else used))
     with ui.row().classes("actions"):
         if history.trial is not None:
             _stop_button(services, context, history.trial)
@@ -221,17 +216,10 @@ def _verdicts(quality: VersionQuality) -> Markup:
         if verdict.forced:
             tone, words = "warn", "published by force"
         reasons = joined(Markup("<li>{}</li>").format(reason) for reason in verdict.reasons)
-        missing = verdict.report.get("not_judged")
-        parts.append(
-            Markup("<p>Gate, {}: {}</p><ul>{}</ul>{}").format(
-                moment(verdict.stamp_ns),
-                badge(tone, words),
-                reasons,
-                Markup('<p class="quiet">Not judged: {}.</p>').format(", ".join(missing).replace("_", " "))
-                if missing
-                else "",
-            )
-        )
+        missing = ", ".join(verdict.report.get("not_judged") or ()).replace("_", " ")
+        unjudged = Markup('<p class="quiet">Not judged: {}.</p>').format(missing) if missing else ""
+        entry = Markup("<p>Gate, {}: {}</p><ul>{}</ul>{}")
+        parts.append(entry.format(moment(verdict.stamp_ns), badge(tone, words), reasons, unjudged))
     return joined(parts)
 
 
@@ -276,12 +264,10 @@ def _difference_facts(found: Difference) -> Markup:
     if found.landmarks_moved and found.moved_median_m is not None and found.moved_max_m is not None:
         moved = f"{found.landmarks_moved}, by {found.moved_median_m:.3f} m (median), at most {found.moved_max_m:.3f} m"
     tiles = f"{found.tiles_added} added, {found.tiles_changed} changed, {found.tiles_removed} removed, {found.tiles_kept} unchanged"
+    landmarks = f"{found.landmarks_added} new, {found.landmarks_removed} removed, {found.landmarks_kept} unchanged"
     pairs: list[tuple[str, object]] = [
         ("Tiles", tiles),
-        (
-            "Landmarks",
-            f"{found.landmarks_added} new, {found.landmarks_removed} removed, {found.landmarks_kept} unchanged",
-        ),
+        ("Landmarks", landmarks),
         ("Landmarks that moved", moved),
         ("A robot downloads", f"{size(found.fetch_bytes)} of {size(found.full_bytes)}"),
         ("Vocabulary", "changed" if found.vocabulary_changed else "unchanged"),

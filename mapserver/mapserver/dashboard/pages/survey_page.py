@@ -40,11 +40,8 @@ def install(services: Services) -> None:
 
             ui.timer(_REFRESH_S, refresh, immediate=False)
             wanted = number(job, "job")
-            chosen = (
-                await load(services.maps.job, wanted)
-                if wanted is not None
-                else next((j for j in jobs if j.report), None)
-            )
+            newest = next((j for j in jobs if j.report), None)
+            chosen = newest if wanted is None else await load(services.maps.job, wanted)
             if chosen is not None:
                 await _one_job(services, context, chosen)
 
@@ -123,11 +120,8 @@ def _recordings(report: dict[str, Any]) -> Markup:
     ]
     listed = table(("Recording", "Result", "Why"), rows, empty="The report names no recordings.", name="Recordings")
     loops = report.get("loops")
-    counted = (
-        facts([(name.replace("_", " "), count) for name, count in loops.items()])
-        if isinstance(loops, dict)
-        else Markup("")
-    )
+    counts = loops.items() if isinstance(loops, dict) else None
+    counted = Markup("") if counts is None else facts([(name.replace("_", " "), count) for name, count in counts])
     return Markup("<div><h2>Recordings</h2>{}<h2>Loop counts</h2>{}</div>").format(listed, counted)
 
 
@@ -137,11 +131,9 @@ async def _loops(services: Services, context: PageContext, report: dict[str, Any
         html(Markup('<h2>Loops on the map</h2><p class="quiet">The report contains no loops.</p>'))
         return
     known = {info.version for info in (await load(services.maps.history, context.site)).versions}
-    version = (
-        report.get("version")
-        if report.get("version") in known
-        else await load(services.maps.current_version, context.site)
-    )
+    version = report.get("version")
+    if version not in known:
+        version = await load(services.maps.current_version, context.site)
     if version is None:
         html(Markup('<p class="notice">The version of this job was removed, and no version is current.</p>'))
         return

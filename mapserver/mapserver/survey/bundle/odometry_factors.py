@@ -1,5 +1,6 @@
 """Odometry between neighbouring keyframes, as factors of an adjustment and as edges of a pose graph. Pure."""
 
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -17,14 +18,10 @@ def odometry_factors(odometry: OdometryPass, map_from_body: Array) -> list[Relat
 
     For one camera this also holds the scale, which its landmarks leave open.
     """
-    numbers = [k.frame_index for k in odometry.keyframes]
-    factors = []
-    for k, (a, b) in enumerate(pairwise(numbers)):
-        i_from_j = se3_inverse(map_from_body[k]) @ map_from_body[k + 1]
-        factors.append(
-            RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(25.0 * _edge_covariance(odometry, a, b)).astype(np.float64))
-        )
-    return factors
+    return [
+        _factor(k, se3_inverse(map_from_body[k]) @ map_from_body[k + 1], 25.0 * _edge_covariance(odometry, a, b))
+        for k, a, b in _neighbours(odometry)
+    ]
 
 
 def blackout_factors(odometry: OdometryPass, state: SurveyState) -> list[RelativeTerm]:
@@ -35,25 +32,31 @@ def blackout_factors(odometry: OdometryPass, state: SurveyState) -> list[Relativ
     if not odometry.has_wheels:
         return []
     seen = np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns))
-    numbers = [k.frame_index for k in odometry.keyframes]
     factors = []
-    for k, (a, b) in enumerate(pairwise(numbers)):
+    for k, a, b in _neighbours(odometry):
         if min(seen[k], seen[k + 1]) < MIN_SEEN:
             i_from_j = se3_inverse(odometry.odom_from_body[a]) @ odometry.odom_from_body[b]
-            factors.append(
-                RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(_edge_covariance(odometry, a, b)).astype(np.float64))
-            )
+            factors.append(_factor(k, i_from_j, _edge_covariance(odometry, a, b)))
     return factors
 
 
 def chain_edges(odometry: OdometryPass, state: SurveyState) -> list[PoseEdge]:
     """Edges between neighbours with their adjusted motion and the covariance of the odometry."""
     edges = []
-    numbers = [k.frame_index for k in odometry.keyframes]
-    for k, (a, b) in enumerate(pairwise(numbers)):
+    for k, a, b in _neighbours(odometry):
         i_from_j = se3_inverse(state.map_from_body[k]) @ state.map_from_body[k + 1]
         edges.append(PoseEdge(k, k + 1, i_from_j, _edge_covariance(odometry, a, b), is_loop=False))
     return edges
+
+
+def _neighbours(odometry: OdometryPass) -> Iterator[tuple[int, int, int]]:
+    """Number of each keyframe but the last, its frame and that of the next one."""
+    for k, (a, b) in enumerate(pairwise(keyframe.frame_index for keyframe in odometry.keyframes)):
+        yield k, a, b
+
+
+def _factor(k: int, i_from_j: Array, covariance: Array) -> RelativeTerm:
+    return RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(covariance).astype(np.float64))
 
 
 def _edge_covariance(odometry: OdometryPass, a: int, b: int) -> Array:

@@ -101,9 +101,8 @@ class BundleSettings(Section, frozen=True):
     lambda_start: float = 1e-4  # first damping
     relative_cost_tolerance: float = 1e-4  # relative gain of the last step
     dense_unknowns: int = 1500  # reduced systems up to this size are solved by dense Cholesky
-    sparse_couplings: float = (
-        40.0  # for each keyframe; up to so many sparse factorisation is quicker than conjugate gradients
-    )
+    # For each keyframe; up to so many sparse factorisation is quicker than conjugate gradients.
+    sparse_couplings: float = 40.0
     pcg_tolerance: float = 1e-4  # relative residual at the end
     pcg_max_iterations: int = 300  # then the step is solved again by sparse factorisation
 

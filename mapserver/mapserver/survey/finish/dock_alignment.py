@@ -97,19 +97,15 @@ def aligned_by_priors(
         for place, target, (survey_from_body, prior) in zip(places, targets, usable, strict=True):
             arm = scale * turn @ place
             by_place = np.hstack([-skew(arm), np.eye(3), arm[:, None]])
-            off_turn = so3_log(
-                prior.map_from_base[:3, :3] @ base_from_body[:3, :3] @ (turn @ survey_from_body[:3, :3]).T
-            )
+            map_from_body = prior.map_from_base[:3, :3] @ base_from_body[:3, :3]
+            off_turn = so3_log(map_from_body @ (turn @ survey_from_body[:3, :3]).T)
             jacobian = np.vstack([np.hstack([np.eye(3), np.zeros((3, 4))]), by_place])
             residual = np.concatenate([off_turn, target - arm - shift])
             weight = np.linalg.inv(prior.cov_rot_trans)
             hessian += jacobian.T @ weight @ jacobian
             gradient += jacobian.T @ weight @ residual
         step = np.linalg.solve(hessian, gradient)
-        turn, shift, scale = (
-            so3_exp(np.asarray(step[:3], np.float64)) @ turn,
-            shift + step[3:6],
-            scale * float(np.exp(step[6])),
-        )
+        turn, scale = so3_exp(np.asarray(step[:3], np.float64)) @ turn, scale * float(np.exp(step[6]))
+        shift = shift + step[3:6]
     sigma = float(np.sqrt(np.linalg.inv(hessian)[6, 6]))
     return DockAlignment(se3(turn, shift), scale, sigma) if sigma <= _MAX_SCALE_SIGMA_SHARE else None

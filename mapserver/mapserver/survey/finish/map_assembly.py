@@ -35,9 +35,8 @@ def assemble(state: SurveyState, odometry: OdometryPass, settings: SurveySetting
     frame_stamps = np.array([e.stamp_ns for e in odometry.estimates], np.int64)
     numbers = [k.frame_index for k in odometry.keyframes]
     map_from_body = frame_trajectory(frame_stamps, odometry.odom_from_body, numbers, state.map_from_body)
-    handed_on = replace(
-        state, stamps_ns=state.stamps_ns[kept], map_from_body=state.map_from_body[kept], landmarks=marks
-    )
+    stamps_ns, map_from_kept = state.stamps_ns[kept], state.map_from_body[kept]
+    handed_on = replace(state, stamps_ns=stamps_ns, map_from_body=map_from_kept, landmarks=marks)
     survey_map = SurveyMap(
         camera=state.camera,
         body_from_cam=state.body_from_cam,

@@ -22,15 +22,13 @@ def transform_map(survey_map: SurveyMap, new_from_map: Array) -> SurveyMap:
 
 def scaled(survey_map: SurveyMap, scale: float) -> SurveyMap:
     """The same survey `scale` times as large, in metres from now on; cameras keep their mounting, which was in metres before."""
+    frames = _grown(survey_map.trajectory.frame_from_body, survey_map.body_from_cam, scale)
     return replace(
         survey_map,
         map_from_body=_grown(survey_map.map_from_body, survey_map.body_from_cam, scale),
         points_map=scale * survey_map.points_map,
         point_sigma_m=scale * survey_map.point_sigma_m,
-        trajectory=Trajectory(
-            survey_map.trajectory.stamps_ns,
-            _grown(survey_map.trajectory.frame_from_body, survey_map.body_from_cam, scale),
-        ),
+        trajectory=Trajectory(survey_map.trajectory.stamps_ns, frames),
         scale_known=True,
     )
 

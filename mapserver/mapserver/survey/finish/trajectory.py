@@ -20,9 +20,8 @@ def frame_trajectory(
             out[f] = map_from_body[after]
             continue
         sides = [k for k in (after - 1, after) if 0 <= k < len(keyframe_frames)]
-        carried = [
-            map_from_body[k] @ se3_inverse(odom_from_body[keyframe_frames[k]]) @ odom_from_body[f] for k in sides
-        ]
+        there = [(map_from_body[k], odom_from_body[keyframe_frames[k]]) for k in sides]
+        carried = [map_from_k @ se3_inverse(odom_from_k) @ odom_from_body[f] for map_from_k, odom_from_k in there]
         if len(sides) == 1:
             out[f] = carried[0]
             continue

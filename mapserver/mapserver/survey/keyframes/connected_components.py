@@ -5,7 +5,6 @@ Only one component can be in a map: the pose of any other relative to it is unkn
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from fleetmap.geometry import Array
 from mapserver.survey.bundle.bundle_rounds import SurveyState, state_of
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.odometry_pass import OdometryPass
+from mapserver.survey.survey_map import SurveyMap
 
 _MIN_SHARED = 15  # landmarks, as many as a loop needs matches
 MIN_SEEN = 8  # landmarks without which a keyframe counts as blind
@@ -27,34 +27,17 @@ _APART = "nothing says for sure where it lies to the largest part; drive it agai
 _BLIND = "too little was seen to tie it to anything; drive it again, with light"
 
 
-class Observations(Protocol):
-    """Observations of landmarks by keyframes, as a SurveyMap has them."""
-
-    @property
-    def keyframe_stamps_ns(self) -> NDArray[np.int64]:
-        """(K,)."""
-
-    @property
-    def landmark_ids(self) -> NDArray[Any]:
-        """(N,)."""
-
-    @property
-    def obs_keyframe(self) -> NDArray[np.int32]:
-        """(M,) numbers of keyframes."""
-
-    @property
-    def obs_landmark(self) -> NDArray[np.int32]:
-        """(M,) numbers of landmarks."""
-
-
 @dataclass(frozen=True, slots=True)
 class Covisibility:
-    """Observations of a survey that is no map yet."""
+    """Observations of a survey that is no map yet: K keyframes, N landmarks, numbers (M,) of both for each observation."""
 
     keyframe_stamps_ns: NDArray[np.int64]
     landmark_ids: NDArray[np.int64]
     obs_keyframe: NDArray[np.int32]
     obs_landmark: NDArray[np.int32]
+
+
+Observations = SurveyMap | Covisibility
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,12 +75,10 @@ class Loops:
         """The same with every loop rejected whose pose-graph weight is below one half; one weight for each edge."""
         outliers = {(e.i, e.j) for e, weight in zip(self.edges, weights, strict=True) if weight < 0.5}
         reason = "contradicts the other loops in the pose graph"
-        records = [
-            replace(r, verdict=LoopVerdict.REJECTED, reason=reason)
-            if (r.i, r.j) in outliers and r.verdict is LoopVerdict.ACCEPTED
-            else r
-            for r in self.records
-        ]
+        records = list(self.records)
+        for n, r in enumerate(records):
+            if (r.i, r.j) in outliers and r.verdict is LoopVerdict.ACCEPTED:
+                records[n] = replace(r, verdict=LoopVerdict.REJECTED, reason=reason)
         return Loops(records, [e for e in self.edges if (e.i, e.j) not in outliers])
 
 
@@ -177,10 +175,8 @@ class LoopCloser:
         ):
             if refused:
                 first, *others = (int(ids[n]) for n in refused)
-                score = float(scores[refused[0]])
-                self.loops.records.append(
-                    LoopRecord(i, first, score, LoopVerdict.GATED_OUT, reason, also=tuple(others))
-                )
+                fate = float(scores[refused[0]]), LoopVerdict.GATED_OUT, reason
+                self.loops.records.append(LoopRecord(i, first, *fate, also=tuple(others)))
         return inside[: loops.top]
 
     def _examine(
@@ -196,25 +192,20 @@ class LoopCloser:
         count = len(match.features)
         cells = _cells(self._keyframes[i], match.features[:, 1], self._camera)
         if count < self._settings.min_inliers or cells < self._settings.min_cells:
-            return refuse(
-                LoopVerdict.REJECTED, f"{count} matches in {cells} of 48 cells are too few or too crowded", count
-            )
+            reason = f"{count} matches in {cells} of 48 cells are too few or too crowded"
+            return refuse(LoopVerdict.REJECTED, reason, count)
         edge = self._edge(match)
         innovation = self._marginals.innovation_squared(edge)
         if innovation > self._settings.max_innovation:
-            return refuse(
-                LoopVerdict.GATED_OUT,
-                f"matches, but from where the robot cannot be (innovation {innovation:.0f})",
-                count,
-            )
+            reason = f"matches, but from where the robot cannot be (innovation {innovation:.0f})"
+            return refuse(LoopVerdict.GATED_OUT, reason, count)
         supported = self._neighbours_agree(match)
         if supported is False or (supported is None and count < self._settings.alone_inliers):
             return refuse(LoopVerdict.REJECTED, "neighbouring keyframes do not confirm it", count)
         shift_m = self._unseen_alias(edge, aliases)
         if shift_m is not None:
-            reason = (
-                f"places {shift_m:.2f} m apart look the same here, and another such step is as possible as this one"
-            )
+            alike = f"places {shift_m:.2f} m apart look the same here"
+            reason = f"{alike}, and another such step is as possible as this one"
             return refuse(LoopVerdict.AMBIGUOUS, reason, count)
         return edge, LoopRecord(i, j, score, LoopVerdict.ACCEPTED, "verified", count)
 

@@ -75,11 +75,8 @@ class ChainCovariance:
         start = self._sums[self._starts[i]]
         walked_i, walked_j = self._sums[i] - start, self._sums[js] - start
         ahead = (js >= i)[:, None, None]
-        return np.asarray(
-            np.where(
-                ahead, walked_i - self._shares[i] @ walked_j, walked_j - walked_i @ self._shares[js].transpose(0, 2, 1)
-            )
-        )
+        onward, back = walked_i - self._shares[i] @ walked_j, walked_j - walked_i @ self._shares[js].transpose(0, 2, 1)
+        return np.asarray(np.where(ahead, onward, back))
 
     def _anchor(self, k: int) -> int:
         """The slot of place k, made an anchor if it is none yet."""

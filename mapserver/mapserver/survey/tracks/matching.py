@@ -68,7 +68,7 @@ class PairFinder:
         allowed_m: Callable[[int, int], float],
         *,
         rotation_sigma_rad: float | None,
-        is_known: bool,
+        is_known: bool = True,
         progress: Callable[[int], None],
     ) -> list[PairMatch]:
         """Verified matches whose measured motion agrees with the predicted one to within allowed_m(i, j)."""
