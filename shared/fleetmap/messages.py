@@ -64,6 +64,7 @@ class Cause(StrEnum):
     NO_MATCH = "no_match"
     FIX_REFUSED = "fix_refused"
     MOVED = "moved"
+    CALIBRATION = "calibration"
 
 
 class FailureKind(StrEnum):
