@@ -13,10 +13,9 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings.export_mcap import copy_to_mcap
 from mapserver.cli import app
+from support.recordings.calibration_faults import IMAGE_FAULTS, pair_turn
 from support.recordings.recording_samples import write_euroc
 from support.recordings.spoiled_recording import (
-    swapped,
-    with_camera_turned,
     with_clock_shift,
     with_darkness,
     with_imu,
@@ -62,10 +61,8 @@ def remarks(report: dict[str, Any]) -> str:
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        pytest.param(swapped, "left and right are swapped", id="swapped"),
-        pytest.param(
-            lambda r: with_camera_turned(r, (1, 0, 0), 1.0), r"look [+-](0\.9|1\.0)\d degrees apart", id="tilted"
-        ),
+        pytest.param(IMAGE_FAULTS["swapped"].recording, "left and right are swapped", id="swapped"),
+        pytest.param(pair_turn("pitch", 1.0).recording, r"look [+-](0\.9|1\.0)\d degrees apart", id="tilted"),
     ],
 )
 def test_cameras_unlike_their_calibration_are_refused(

@@ -23,14 +23,12 @@ from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings.export_mcap import copy_to_mcap
 from mapserver.build.build import BuildOptions, BuildRequest, build_draft
 from mapserver.config import MapserverConfig
+from support.recordings.calibration_faults import IMAGE_FAULTS, camera_imu_turn, pair_turn
 from support.recordings.spoiled_recording import (
-    swapped,
-    with_camera_turned,
     with_clock_shift,
     with_darkness,
     with_imu,
     with_lost_frames,
-    with_rig_turned,
 )
 
 LIMIT_M = 0.10
@@ -38,14 +36,14 @@ Spoil = Callable[[Recording, Recording], Recording]
 CASES: dict[str, Spoil] = {
     "nothing wrong": lambda good, _: good,
     "IMU of another run": lambda good, other: with_imu(good, other.imu),
-    "left and right swapped": lambda good, _: swapped(good),
+    "left and right swapped": lambda good, _: IMAGE_FAULTS["swapped"].recording(good),
     "20 % of frames lost": lambda good, _: with_lost_frames(good, 0.2, np.random.default_rng(0)),
     "30 s of darkness": lambda good, _: with_darkness(good, 6.0, 36.0),
     "2 s of darkness": lambda good, _: with_darkness(good, 10.0, 12.0),
-    "right camera tilted 1 degree": lambda good, _: with_camera_turned(good, (1, 0, 0), 1.0),
-    "right camera toed in 1 degree": lambda good, _: with_camera_turned(good, (0, 1, 0), 1.0),
-    "right camera rolled 1 degree": lambda good, _: with_camera_turned(good, (0, 0, 1), 1.0),
-    "cameras 1 degree off the IMU": lambda good, _: with_rig_turned(good, (0, 1, 0), 1.0),
+    "right camera tilted 1 degree": lambda good, _: pair_turn("pitch", 1.0).recording(good),
+    "right camera toed in 1 degree": lambda good, _: pair_turn("yaw", 1.0).recording(good),
+    "right camera rolled 1 degree": lambda good, _: pair_turn("roll", 1.0).recording(good),
+    "cameras 1 degree off the IMU": lambda good, _: camera_imu_turn("yaw", 1.0).recording(good),
     "clock 20 ms late": lambda good, _: with_clock_shift(good, 0.02),
     "clock 20 ms early": lambda good, _: with_clock_shift(good, -0.02),
 }

@@ -7,11 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import se3, so3_exp
 from fleetmap.recordings import Recording
 from fleetmap.recordings.images import StoredFrame, decode_frame, decode_grey, png_image
 from fleetmap.recordings.recording import FrameSource
-from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
 
 
@@ -36,9 +34,10 @@ class _Frames:
         self.source.close()
 
 
-def _with_frames(
+def with_frames(
     recording: Recording, indices: NDArray[np.int64], spoil: Callable[[StoredFrame], StoredFrame] = lambda frame: frame
 ) -> Recording:
+    """The frames at `indices` alone, each changed by `spoil`."""
     frames = _Frames(recording.frames, indices, spoil)
     return replace(recording, frames=frames, frame_stamps_ns=recording.frame_stamps_ns[indices])
 
@@ -46,23 +45,13 @@ def _with_frames(
 def part(recording: Recording, start_s: float, end_s: float) -> Recording:
     """The frames from start_s to end_s after the first; everything else whole."""
     times_s = (recording.frame_stamps_ns - recording.frame_stamps_ns[0]) * 1e-9
-    return _with_frames(recording, np.flatnonzero((times_s >= start_s) & (times_s < end_s)))
-
-
-def swapped(recording: Recording) -> Recording:
-    """Left and right images exchanged."""
-
-    def exchange(frame: StoredFrame) -> StoredFrame:
-        assert frame.right is not None
-        return StoredFrame(frame.stamp_ns, frame.right, frame.left)
-
-    return _with_frames(recording, np.arange(len(recording)), exchange)
+    return with_frames(recording, np.flatnonzero((times_s >= start_s) & (times_s < end_s)))
 
 
 def with_lost_frames(recording: Recording, share: float, rng: np.random.Generator) -> Recording:
     """Without so many of the frames, drawn at random."""
     kept = np.sort(rng.permutation(len(recording))[: round((1 - share) * len(recording))])
-    return _with_frames(recording, kept)
+    return with_frames(recording, kept)
 
 
 def with_darkness(recording: Recording, start_s: float, end_s: float) -> Recording:
@@ -78,7 +67,7 @@ def with_darkness(recording: Recording, start_s: float, end_s: float) -> Recordi
         left, right = (png_image(np.clip(rng.normal(2.0, 0.8, shape), 0, 255).astype(np.uint8)) for _ in range(2))
         return StoredFrame(frame.stamp_ns, left, right)
 
-    return _with_frames(recording, np.arange(len(recording)), darken)
+    return with_frames(recording, np.arange(len(recording)), darken)
 
 
 def with_imu(recording: Recording, imu: ImuSamples) -> Recording:
@@ -93,29 +82,7 @@ def without_imu(recording: Recording) -> Recording:
     return replace(recording, imu=ImuSamples.empty(), calibration=calibration, sensor_set=SensorSet.STEREO)
 
 
-def with_camera_turned(recording: Recording, axis: tuple[float, float, float], angle_deg: float) -> Recording:
-    """The calibration says that the right camera is turned by so much about its own axes, which it is not."""
-    turn = so3_exp(np.radians(angle_deg) * np.array(axis) / np.linalg.norm(axis))
-    return _calibrated(recording, 1, lambda c: replace(c, body_from_cam=c.body_from_cam @ se3(turn, np.zeros(3))))
-
-
-def with_rig_turned(recording: Recording, axis: tuple[float, float, float], angle_deg: float) -> Recording:
-    """The calibration has both cameras turned by so much against the IMU, about body axes."""
-    turn = se3(so3_exp(np.radians(angle_deg) * np.array(axis) / np.linalg.norm(axis)), np.zeros(3))
-    for number in range(len(recording.calibration.cameras)):
-        recording = _calibrated(recording, number, lambda c: replace(c, body_from_cam=turn @ c.body_from_cam))
-    return recording
-
-
 def with_clock_shift(recording: Recording, shift_s: float) -> Recording:
     """The IMU's stamps are later by shift_s, which the calibration does not say."""
     stamps_ns = recording.imu.stamps_ns + round(shift_s * 1e9)
     return replace(recording, imu=replace(recording.imu, stamps_ns=stamps_ns))
-
-
-def _calibrated(
-    recording: Recording, number: int, change: Callable[[CameraCalibration], CameraCalibration]
-) -> Recording:
-    cameras = list(recording.calibration.cameras)
-    cameras[number] = change(cameras[number])
-    return replace(recording, calibration=replace(recording.calibration, cameras=tuple(cameras)))

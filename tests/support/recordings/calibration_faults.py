@@ -1,0 +1,215 @@
+"""Calibration faults for recordings of any format: a rig described wrongly, images exchanged or mirrored, foreign sensors.
+
+A `RigFault` changes what is believed of the rig and nothing that was recorded, so it can be given to every program as `--calibration
+FILE` (`write_calibration`). An `ImageFault` changes the stored images and needs a new recording (`copy_to_mcap`). All are
+deterministic. Rotations are about the axes of the left camera (x right, y down, z forward) unless said otherwise.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
+from fleetmap.recordings import Recording, format_calibration
+from fleetmap.recordings.images import StoredFrame, StoredImage, decode_grey, png_image
+from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from support.recordings.spoiled_recording import with_frames
+
+RigChange = Callable[[RigCalibration], RigCalibration]
+AXES = {"pitch": (1.0, 0.0, 0.0), "yaw": (0.0, 1.0, 0.0), "roll": (0.0, 0.0, 1.0)}
+
+
+@dataclass(frozen=True, slots=True)
+class RigFault:
+    """One wrong parameter. kind: a key for tables; size in `unit`, with sign; needs: the fewest sensors with which it means something."""
+
+    kind: str
+    size: float
+    unit: str
+    change: RigChange
+    needs_imu: bool = False
+    needs_pair: bool = True
+
+    @property
+    def name(self) -> str:
+        """Kind, size and unit in words."""
+        return f"{self.kind} {self.size:+g} {self.unit}"
+
+    def applies_to(self, recording: Recording) -> bool:
+        """Whether the recording has the sensors that this fault is about."""
+        rig = recording.calibration
+        return (rig.imu is not None or not self.needs_imu) and (len(rig.cameras) > 1 or not self.needs_pair)
+
+    def recording(self, good: Recording) -> Recording:
+        """The good recording as it opens with the wrong calibration."""
+        return replace(good, calibration=self.change(good.calibration))
+
+    def write_calibration(self, good: RigCalibration, path: Path) -> Path:
+        """A camchain for `--calibration` that has this fault."""
+        path.write_text(format_calibration(self.change(good)))
+        return path
+
+
+def baseline(percent: float) -> RigFault:
+    """The right camera is said to be so much further from the left one than it is."""
+
+    def change(rig: RigCalibration) -> RigCalibration:
+        left, right, *rest = rig.cameras
+        left_from_right = se3_inverse(left.body_from_cam) @ right.body_from_cam
+        left_from_right[:3, 3] *= 1.0 + 0.01 * percent
+        moved = replace(right, body_from_cam=left.body_from_cam @ left_from_right)
+        return replace(rig, cameras=(left, moved, *rest))
+
+    return RigFault("baseline", percent, "%", change)
+
+
+def focal(percent: float, cameras: Iterable[int] | None = None) -> RigFault:
+    """The focal lengths of all cameras, or of those with the numbers `cameras`, are said to be so much larger than they are."""
+    chosen = None if cameras is None else set(cameras)
+
+    def scaled(camera: CameraCalibration) -> CameraCalibration:
+        return replace(camera, intrinsics_px=camera.intrinsics_px * [1 + 0.01 * percent, 1 + 0.01 * percent, 1, 1])
+
+    def change(rig: RigCalibration) -> RigCalibration:
+        return _with_cameras(rig, scaled, chosen)
+
+    kind = "focal" if chosen is None else "focal of cam" + ",".join(map(str, sorted(chosen)))
+    return RigFault(kind, percent, "%", change, needs_pair=chosen is not None)
+
+
+def pair_turn(axis: str, degrees: float) -> RigFault:
+    """The right camera is said to be turned against the left one (a key of AXES, the right camera's own axes) as it is not."""
+    turn = se3(_rotation(AXES[axis], degrees), np.zeros(3))
+
+    def change(rig: RigCalibration) -> RigCalibration:
+        return _with_cameras(rig, lambda c: replace(c, body_from_cam=c.body_from_cam @ turn), {1})
+
+    return RigFault(f"pair {axis}", degrees, "deg", change)
+
+
+def camera_imu_turn(axis: str, degrees: float) -> RigFault:
+    """All cameras are said to be turned together against the IMU, about the left camera's axis; their places stay."""
+
+    def change(rig: RigCalibration) -> RigCalibration:
+        axes = rig.cameras[0].body_from_cam[:3, :3]
+        turn = axes @ _rotation(AXES[axis], degrees) @ axes.T
+        centre = rig.cameras[0].body_from_cam[:3, 3]
+        about_left = se3(turn, centre - turn @ centre)
+        return _with_cameras(rig, lambda c: replace(c, body_from_cam=about_left @ c.body_from_cam), None)
+
+    return RigFault(f"camera-imu {axis}", degrees, "deg", change, needs_imu=True, needs_pair=False)
+
+
+def delay(milliseconds: float) -> RigFault:
+    """The IMU's stamps are said to be so much later than they are, against the cameras'."""
+
+    def change(rig: RigCalibration) -> RigCalibration:
+        return _with_cameras(rig, lambda c: replace(c, imu_minus_cam_s=c.imu_minus_cam_s + 1e-3 * milliseconds), None)
+
+    return RigFault("delay", milliseconds, "ms", change, needs_imu=True, needs_pair=False)
+
+
+def another_robots_file(rig: RigCalibration) -> RigFault:
+    """The calibration file of another robot whose images have the same size."""
+    return RigFault("another robot's file", 1.0, "file", lambda _: rig)
+
+
+def unlike_robot(rig: RigCalibration, seed: int) -> RigCalibration:
+    """The rig of another robot of the same make: what tolerances of lenses and mounts make of it.
+
+    Focal lengths 1.5 %, principal points 4 px, the pair's angles 0.4 degrees, its baseline 1 %, the IMU's angles 1 degree (sigmas).
+    """
+    rng = np.random.default_rng(seed)
+
+    def built(camera: CameraCalibration) -> CameraCalibration:
+        lens = camera.intrinsics_px * (1 + 0.015 * rng.standard_normal()) * [1, 1, 0, 0]
+        lens += camera.intrinsics_px * [0, 0, 1, 1] + 4.0 * rng.standard_normal(4) * [0, 0, 1, 1]
+        own = se3(so3_exp(np.radians(0.4) * rng.standard_normal(3)), np.zeros(3))
+        return replace(camera, intrinsics_px=lens, body_from_cam=camera.body_from_cam @ own)
+
+    other = (
+        baseline(float(rng.standard_normal())).change(_with_cameras(rig, built, None)) if len(rig.cameras) > 1 else rig
+    )
+    turned = se3(so3_exp(np.radians(1.0) * rng.standard_normal(3)), np.zeros(3))
+    return _with_cameras(other, lambda c: replace(c, body_from_cam=turned @ c.body_from_cam), None)
+
+
+def standard_faults() -> list[RigFault]:
+    """Every size that the project states a figure for, both signs where the sign matters."""
+    both = [(size, sign) for size in (1.0, 2.0, 5.0, 20.0) for sign in (1, -1)]
+    return [
+        *(baseline(sign * size) for size, sign in both),
+        *(focal(sign * size) for size in (0.5, 1.0, 2.0, 5.0) for sign in (1, -1)),
+        *(focal(size, (number,)) for size in (1.0, 2.0) for number in (0, 1)),
+        *(pair_turn(axis, sign * size) for size in (0.05, 0.2, 0.5) for axis in AXES for sign in (1, -1)),
+        *(camera_imu_turn(axis, 1.0) for axis in AXES),
+        *(delay(sign * size) for size in (5.0, 20.0) for sign in (1, -1)),
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFault:
+    """Images that are not what the calibration describes."""
+
+    kind: str
+    spoil: Callable[[StoredFrame], StoredFrame]
+
+    @property
+    def name(self) -> str:
+        """The kind, as for a RigFault."""
+        return self.kind
+
+    def recording(self, good: Recording) -> Recording:
+        """The good recording with these images."""
+        return with_frames(good, np.arange(len(good)), self.spoil)
+
+
+def _exchanged(frame: StoredFrame) -> StoredFrame:
+    assert frame.right is not None
+    return replace(frame, left=frame.right, right=frame.left)
+
+
+def _mirrored(frame: StoredFrame) -> StoredFrame:
+    right = None if frame.right is None else _flipped(frame.right)
+    return replace(frame, left=_flipped(frame.left), right=right)
+
+
+def _one_mirrored(frame: StoredFrame) -> StoredFrame:
+    assert frame.right is not None
+    return replace(frame, right=_flipped(frame.right))
+
+
+def _upside_down(frame: StoredFrame) -> StoredFrame:
+    right = None if frame.right is None else _flipped(frame.right, -1)
+    return replace(frame, left=_flipped(frame.left, -1), right=right)
+
+
+IMAGE_FAULTS = {
+    fault.kind: fault
+    for fault in (
+        ImageFault("swapped", _exchanged),
+        ImageFault("mirrored", _mirrored),
+        ImageFault("mirrored and swapped", lambda frame: _exchanged(_mirrored(frame))),
+        ImageFault("right mirrored", _one_mirrored),
+        ImageFault("upside down", _upside_down),
+        ImageFault("upside down and swapped", lambda frame: _exchanged(_upside_down(frame))),
+    )
+}
+
+
+def _flipped(image: StoredImage, how: int = 1) -> StoredImage:
+    return png_image(np.ascontiguousarray(cv2.flip(decode_grey(image), how)))
+
+
+def _rotation(axis: tuple[float, float, float], degrees: float) -> Array:
+    return so3_exp(np.radians(degrees) * np.array(axis))
+
+
+def _with_cameras(
+    rig: RigCalibration, change: Callable[[CameraCalibration], CameraCalibration], chosen: set[int] | None
+) -> RigCalibration:
+    cameras = [change(c) if chosen is None or n in chosen else c for n, c in enumerate(rig.cameras)]
+    return replace(rig, cameras=tuple(cameras))
