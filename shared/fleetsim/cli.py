@@ -49,6 +49,9 @@ class RecordOptions:
     camera_shift_mm: Annotated[
         float, Option(min=0.0, max=50.0, help="Each camera sits this far from its calibrated place.")
     ] = 0.0
+    camera_pipeline: Annotated[
+        str, Option(metavar="NAME", help="What lens, sensor and codec make of the pictures: clean, soft, phone, ...")
+    ] = "clean"
     format_: Annotated[str, Option("--format", help="mcap or euroc.")] = "mcap"
     images: Annotated[str, Option(help="How mcap stores pictures: png, jpeg (smaller, with loss) or raw.")] = "png"
     force: Annotated[bool, Option("--force", help="Write over an existing file.")] = False
@@ -90,6 +93,7 @@ def record(
         faults=tuple(parse_fault(text) for text in given.fault or []),
         size_px=_size_px(given.size),
         hidden=HiddenErrors(given.camera_delay_ms * 1e-3, turn_rad, given.camera_shift_mm * 1e-3),
+        camera_pipeline=given.camera_pipeline,
     )
     from fleetsim.commands import record_order
 
@@ -110,6 +114,26 @@ def show(
     from fleetsim.recorder import Order
 
     typer.echo(show_order(Order(**asdict(run_options)), out, pictures))
+
+
+@app.command()
+def reprocess(
+    recording: Annotated[
+        Path, typer.Argument(metavar="RECORDING", help="A recording in any format that fleetmap reads.")
+    ],
+    out: Annotated[Path, Option(help="File to write (.mcap).")],
+    camera_pipeline: Annotated[str, Option(metavar="NAME", help="As of `fleetsim record`.")],
+    seed: Annotated[int, Option(min=0, help="The noise follows from it.")] = 0,
+) -> None:
+    """Puts a recording's pictures through an image pipeline without rendering them again."""
+    if out.exists() or out.suffix != ".mcap":
+        raise UsageError(f"{out} {'exists already' if out.exists() else 'should end in .mcap'}; choose another name")
+    from fleetmap.recordings import open_recording
+    from fleetsim.imaging.reprocess import reprocess
+
+    with open_recording(recording) as opened:
+        reprocess(opened, out, camera_pipeline, seed)
+        typer.echo(f"{out}: {len(opened)} frames through {camera_pipeline}")
 
 
 def _size_px(text: str | None) -> tuple[int, int] | None:

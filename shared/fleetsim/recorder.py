@@ -11,6 +11,7 @@ import numpy as np
 from fleetmap.errors import UsageError
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
+from fleetsim.imaging.pipelines import find_pipeline, process_frame
 from fleetsim.motion.body_motion import CarriedMotion, Motion, RouteMotion
 from fleetsim.motion.routes import check_clear
 from fleetsim.render.painter import Look
@@ -30,7 +31,8 @@ _TRUTH_STEP_S = 0.02
 class Order:
     """A run to record. robot: a run of the scenario, its first one for None. frames: at most so many, all for None.
 
-    hidden: errors of mounting and clock that the recording's calibration does not admit.
+    hidden: errors of mounting and clock that the recording's calibration does not admit. camera_pipeline: a key of
+    IMAGE_PIPELINES.
     """
 
     scenario: str
@@ -43,6 +45,7 @@ class Order:
     faults: tuple[Fault, ...] = ()
     size_px: tuple[int, int] | None = None
     hidden: HiddenErrors = field(default_factory=HiddenErrors)
+    camera_pipeline: str = "clean"
 
 
 class Writer(Protocol):
@@ -82,9 +85,10 @@ class Session:
 
     def frames(self) -> Iterator[CameraFrame]:
         """The pictures, one pair at a time; stamps on the cameras' clock."""
+        pipeline = find_pipeline(self.order.camera_pipeline)
         for time_s, stamp_ns in zip(self.frame_times_s, self.frame_stamps_ns(), strict=True):
             shot = self.renderer.shoot(time_s)
-            yield CameraFrame(stamp_ns, shot.left, shot.right)
+            yield process_frame(CameraFrame(stamp_ns, shot.left, shot.right), pipeline, self.order.seed)
 
     def frame_stamps_ns(self) -> list[int]:
         """Stamps of the frames: late ones late, all shifted by the rig's hidden delay."""
@@ -112,6 +116,7 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     scenario = find_scenario(order.scenario)
     if order.light not in LIGHT_STATES:
         raise UsageError(f"unknown light {order.light!r}; known are {', '.join(LIGHT_STATES)}")
+    find_pipeline(order.camera_pipeline)
     if order.day < 0 or order.seed < 0:
         raise UsageError(f"seed {order.seed} and day {order.day} must not be negative")
     name, run = scenario.run(order.robot)
