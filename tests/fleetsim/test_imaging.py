@@ -14,6 +14,7 @@ from fleetsim.imaging import stages
 from fleetsim.imaging.pipelines import IMAGE_PIPELINES, ImagePipeline, process_frame
 from fleetsim.imaging.reprocess import processed
 
+RNG = np.random.default_rng(0)
 REAL_PIPELINES = [name for name in IMAGE_PIPELINES if name != "clean"]
 
 
@@ -38,7 +39,7 @@ def _centroid(picture: stages.Grey) -> np.ndarray:
         lambda picture: stages.rescale(picture, 0.8),
         lambda picture: stages.rescale(picture, 1.25),
         lambda picture: stages.gamma(picture, 2.2),
-        lambda picture, rng=np.random.default_rng(0): stages.bayer(picture, 0.0, rng),
+        lambda picture: stages.bayer(picture, 0.0, RNG),
         lambda picture: stages.jpeg(stages.quantise(picture), 80).astype(np.float32),
     ],
     ids=["blur", "sharpen", "smaller", "larger", "gamma", "bayer", "jpeg"],
