@@ -205,7 +205,7 @@ class StartingMode(VisualMode):
     ) -> None:
         """not_before_ns: earlier samples led to a static start that was wrong."""
         super().__init__(window, cam_from_previous)
-        self._imu, self._not_before_ns = imu, not_before_ns
+        self._imu, self.not_before_ns = imu, not_before_ns
         self._trajectory: list[tuple[int, Array]] = []
 
     def begin(self, stamp_ns: int) -> Mode:
@@ -227,7 +227,7 @@ class StartingMode(VisualMode):
         return Step(mode, step.used, change)
 
     def _static_start(self, stamp_ns: int) -> InitialState | None:
-        since = self._imu.samples.imu.between(self._not_before_ns, stamp_ns + 1)
+        since = self._imu.samples.imu.between(self.not_before_ns, stamp_ns + 1)
         return static_initialization(since, stamp_ns, self._rig.settings)
 
     def _dynamic_start(self, stamp_ns: int, odom_from_body: Array, lost: bool) -> InitialState | None:
@@ -287,6 +287,7 @@ class InertialMode(WindowMode):
         """See Mode; an IMU that contradicts the images is given up, a filter that diverged begins again."""
         window, monitor, seen = self.window, self._imu.monitor, tracked.cam_from_previous
         if seen is not None and monitor.is_wrong_imu(self.cam_from_earlier(frame_index - 1), seen):
+            window.filter.return_to_clone(frame_index - 1)  # vision moves the state from there, not once more
             return VisualMode(window, seen).process(frame_index, tracked)
         matched = window.matched_body(tracked)
         if matched is not None:

@@ -11,6 +11,7 @@ import pytest
 from fleetmap.geometry import Array, se3_inverse, se3_log, so3_exp
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings, OdometryStatus, modes
 from fleetmap.odometry.checks.divergence_monitor import DivergenceMonitor
+from fleetmap.odometry.filter.sliding_window import SlidingWindow
 from fleetmap.odometry.init.dynamic_initialization import dynamic_initialization
 from fleetmap.odometry.init.initial_state import InitialState
 from fleetmap.odometry.modes import InertialMode
@@ -18,6 +19,7 @@ from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracking.tracker import Tracker
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.samples import WheelSample
 from support.worlds.inertial_motion import analytic_motion
 from support.worlds.point_world import noisy_imu
 from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, black_frame, rig, stereo_frame
@@ -241,6 +243,36 @@ def test_a_filter_that_is_wrong_at_once_goes_on_from_the_last_estimate(monkeypat
     last, now = estimates[started], estimates[started + 1]
     assert not now.inertial
     assert np.linalg.norm(relative_error(last, now)[3:]) < 0.02
+
+
+def test_an_imu_that_is_given_up_moves_the_body_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frame at which it is given up was predicted by it already; vision moves the body from the frame before."""
+    calls, begun, update = iter(range(1000)), {}, SlidingWindow.update
+
+    def recorded(window: SlidingWindow, frame_index: int, *inputs: Any) -> Any:
+        begun[frame_index] = window.filter.state.odom_from_body
+        return update(window, frame_index, *inputs)
+
+    monkeypatch.setattr(DivergenceMonitor, "is_wrong_imu", lambda *_: next(calls) == 2)
+    monkeypatch.setattr(SlidingWindow, "update", recorded)
+    odometry, estimates = run((stereo_frame(k * FRAME_NS) for k in range(1, 26)), IMU)
+    given_up = next(n for n, estimate in enumerate(estimates) if estimate.inertial) + 3
+    last, now = estimates[given_up - 1], estimates[given_up]
+    assert last.inertial
+    assert not now.inertial
+    assert np.linalg.norm(relative_error(last, replace(now, odom_from_body=begun[given_up]))[3:]) < 0.02
+    assert odometry.motion_since(given_up - 1) is not None, "the window goes on"
+
+
+def test_wheels_of_a_rig_without_imu_are_not_collected() -> None:
+    odometry = Odometry(rig(None), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    period_ns = FRAME_NS // 5
+    for k in range(1, 21):
+        odometry.handle_wheel(
+            [WheelSample(k * FRAME_NS - n * period_ns, np.zeros(3), 0.0, 0.02, 0.02) for n in range(4, -1, -1)]
+        )
+        odometry.handle_stereo(black_frame(k * FRAME_NS))
+        assert len(odometry._samples._wheel) < 15
 
 
 @pytest.mark.parametrize("broken", ["clocks", "velocity"])

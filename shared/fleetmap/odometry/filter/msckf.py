@@ -147,6 +147,13 @@ class InvariantFilter:
         self._rotations = np.delete(self._rotations, index, axis=0)
         self._positions = np.delete(self._positions, index, axis=0)
 
+    def return_to_clone(self, clone_id: int) -> None:
+        """Takes rotation and position of the state back to a clone's, as certain as that is; what moved them since is forgotten."""
+        index = self.clone_ids.index(clone_id)
+        self.state.rotation, self.state.position_m = self._rotations[index].copy(), self._positions[index].copy()
+        self.covariance = _copied(self.covariance, _CLONES + 6 * index, 0)
+        self.true_error_cov = _copied(self.true_error_cov, CONSIDERED + _CLONES + 6 * index, CONSIDERED)
+
     def odom_from_clone(self, clone_id: int) -> Array:
         """(4, 4) odom_from_body of a clone."""
         index = self.clone_ids.index(clone_id)
@@ -337,6 +344,13 @@ def _grown(covariance: Array, jacobian: Array) -> Array:
     grown[:size, size:] = cross.T
     grown[size:, size:] = cross @ jacobian.T
     return grown
+
+
+def _copied(covariance: Array, at: int, nav: int) -> Array:
+    """The covariance where the errors of rotation and position of the state that begins at nav become those of the clone at `at`."""
+    order = np.arange(len(covariance))
+    order[nav : nav + 3], order[nav + 6 : nav + 9] = order[at : at + 3], order[at + 3 : at + 6]
+    return covariance[np.ix_(order, order)]
 
 
 def _without(covariance: Array, at: int) -> Array:

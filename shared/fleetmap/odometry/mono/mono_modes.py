@@ -14,7 +14,7 @@ from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.init.initial_state import InitialState
 from fleetmap.odometry.init.mono_inertial_init import mono_inertial_initialization
 from fleetmap.odometry.init.static_initialization import static_initialization
-from fleetmap.odometry.modes import ImuInputs, InertialMode, Mode, Step
+from fleetmap.odometry.modes import ImuInputs, InertialMode, Mode, StartingMode, Step, VisualMode
 from fleetmap.odometry.mono.mono_vo import VisualEstimate, VisualOdometry
 from fleetmap.odometry.tracking.tracker import Tracked
 from fleetmap.odometry.tracking.tracks import Observations, TrackBatch
@@ -117,16 +117,23 @@ class MonocularMode(Mode):
         self._newest_pixels: tuple[Ids, Array] = (np.zeros(0, np.int64), np.zeros((0, 2)))
         self._still_since_ns: int | None = None
         self._tried_ns = 0
+        self._not_before_ns = -(2**62)
 
     @property
     def stamp_ns(self) -> int:
         """See Mode."""
         return self._stamp_ns
 
-    def resume(self, stamp_ns: int, *, with_imu: bool) -> None:
-        """Goes on at a frame after an IMU was given up (for good without `with_imu`); vision begins again without metres."""
-        self._stamp_ns = stamp_ns
-        self._imu = self._imu if with_imu else None
+    def resume(self, mode: VisualMode) -> None:
+        """Goes on after a mode to which the filter gave way; vision begins again without metres.
+
+        Without the IMU where that was given up, else by those of its samples that led to no wrong start.
+        """
+        self._stamp_ns, self._still_since_ns = mode.stamp_ns, None
+        if isinstance(mode, StartingMode):
+            self._not_before_ns = mode.not_before_ns
+        else:
+            self._imu = None
 
     def points_in_camera(self, ids: Ids) -> Array:
         """(N, 3) tracked points in the newest frame's camera, NaN where unknown."""
@@ -216,7 +223,8 @@ class MonocularMode(Mode):
         """By rest, if image and IMU agree on it, else by motion; with the metres in one unit of vision, which rest leaves open."""
         stamp_ns, settings = self._stamp_ns, self._rig.settings
         if self._still_since_ns is not None and (stamp_ns - self._still_since_ns) * 1e-9 > _STILL_S:
-            resting = static_initialization(imu.samples.imu, stamp_ns, settings)
+            since = imu.samples.imu.between(self._not_before_ns, stamp_ns + 1)
+            resting = static_initialization(since, stamp_ns, settings)
             if resting is not None and stamp_ns - resting.stamp_ns < int(0.1e9):
                 covariance = resting.covariance
                 covariance[3:6, 3:6] = _STILL_SIGMA_MPS**2 * np.eye(3)

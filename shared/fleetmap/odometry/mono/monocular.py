@@ -65,7 +65,7 @@ class MonocularOdometry(Odometry):
     def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
         """The estimate at `frame`, of one image in spite of the name; newer than any before."""
         if isinstance(self._mode, VisualMode):  # the IMU was given up, or its filter diverged
-            self._vision.resume(self._mode.stamp_ns, with_imu=self._mode.waits_for_gravity)
+            self._vision.resume(self._mode)
             self._mode = self._vision
         return super().handle_stereo(frame)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, align_points, transform_points
+from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.odometry import (
     MonocularOdometry,
     Odometry,
@@ -14,10 +15,13 @@ from fleetmap.odometry import (
     OdometryStatus,
     make_odometry,
 )
+from fleetmap.odometry.checks.divergence_monitor import DivergenceMonitor
+from fleetmap.odometry.init.initial_state import InitialState
 from fleetmap.odometry.init.mono_inertial_init import mono_inertial_initialization
+from fleetmap.odometry.mono import mono_modes
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
-from fleetmap.sensors.samples import Trajectory
+from fleetmap.sensors.samples import ImuSamples, Trajectory
 from support.worlds.inertial_motion import analytic_motion
 from support.worlds.point_world import noisy_imu
 from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, rig, stereo_frame
@@ -133,3 +137,34 @@ def test_a_steady_way_shows_no_scale() -> None:
     trajectory = Trajectory(np.round(times_s * 1e9).astype(np.int64), cams)
     found = mono_inertial_initialization(trajectory, still, IMU, BODY_FROM_CAM, OdometrySettings())
     assert found is None
+
+
+def test_a_start_from_rest_that_was_wrong_is_not_made_again_from_the_same_samples(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The image stands still and so does the IMU: the filter starts, is found wrong, and starts again by newer samples alone."""
+    begun_ns: list[int] = []
+    found = mono_modes.static_initialization
+
+    def recorded(imu: ImuSamples, until_ns: int, settings: OdometrySettings) -> InitialState | None:
+        start = found(imu, until_ns, settings)
+        if start is not None:
+            begun_ns.append(int(imu.stamps_ns[0]))
+        return start
+
+    monkeypatch.setattr(mono_modes, "static_initialization", recorded)
+    wrong = iter([True])
+    monkeypatch.setattr(DivergenceMonitor, "is_wrong_start", lambda *_: next(wrong, False))
+    calibration, image = rig(IMU), stereo_frame(FRAME_NS).left
+    odometry = make_odometry(
+        replace(calibration, cameras=calibration.cameras[:1]), SINGLE, BODY_FROM_CAM, 0.0, OdometrySettings()
+    )
+    stamps_ns = np.arange(0, int(6e9), 5_000_000)
+    rest = np.tile([0.0, 0.0, GRAVITY_MPS2], (len(stamps_ns), 1))
+    odometry.handle_imu(ImuSamples(stamps_ns, np.zeros_like(rest), rest))
+    said = [odometry.handle_stereo(RectifiedFrame(k * FRAME_NS, image, None, None)) for k in range(1, 100)]
+    inertial = [n for n, estimate in enumerate(said) if estimate.inertial]
+    wrong_frame = inertial[0] + 1
+    assert not said[wrong_frame].inertial
+    assert said[-1].inertial, "gravity was found again"
+    assert begun_ns[-1] >= said[wrong_frame].stamp_ns - FRAME_NS > begun_ns[0]
