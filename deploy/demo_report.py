@@ -34,7 +34,7 @@ REPLAY_ROWS = (
     ("map version", "map_version", 1, "{:d}"),
     ("frames", "frames", 1, "{:d}"),
     ("first fix after", "first_fix_s", 1, "{:.2f} s"),
-    ("localised", "localised_share", 100, "{:.1f} %"),
+    ("localised, of all", "localised_share_of_all", 100, "{:.1f} %"),
     ("position error, median", "error_m.median", 1, "{:.3f} m"),
     ("position error, 95 %", "error_m.p95", 1, "{:.3f} m"),
     ("position error, 99 %", "error_m.p99", 1, "{:.3f} m"),

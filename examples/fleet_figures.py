@@ -18,7 +18,8 @@ def in_words(figures: Kpis) -> str:
     if failures.per_robot_day is None:
         return f"{figures.observed_h:7.1f} h, not driven"
     interval = f"{failures.low:.2f} to {failures.high:.2f}"
-    localised = "-" if figures.localised_share is None else f"{figures.localised_share:.1%}"
+    share = figures.localised_share_of_all
+    localised = "-" if share is None else f"{share:.1%} of the driving"
     return (
         f"{figures.driving_h:7.1f} h, {failures.per_robot_day:.2f} failures a day ({interval}), localised {localised}"
     )

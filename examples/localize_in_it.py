@@ -19,7 +19,7 @@ def main(recording: str, store: str, site: str, out: str | None = None, picture:
     for status, count in Counter(result.statuses).most_common():
         print(f"{status}: {count} frames")
     report = result.report
-    print(f"localised {report['localised_share']:.0%} of the frames, first fix after {report['first_fix_s']} s")
+    print(f"localised {report['localised_share_of_all']:.0%} of the frames, first fix after {report['first_fix_s']} s")
     if report.get("error_m"):
         print(f"position error against ground truth: {report['error_m']}")
     if out is not None:

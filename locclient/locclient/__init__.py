@@ -5,7 +5,7 @@ A whole recording, as `locclient replay` does it:
     from locclient import localize
 
     result = localize("drive.mcap", "maps", "hall")  # or "tcp/127.0.0.1:7447" for a server
-    result.report["localised_share"], result.map_from_body, result.statuses
+    result.report["localised_share_of_all"], result.map_from_body, result.statuses
     result.save_picture("drive.png")
 
 `Localizer` takes samples one by one and gives an `Estimate` for each frame; `Robot` adds failures and new map versions to it.

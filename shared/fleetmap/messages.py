@@ -68,10 +68,11 @@ class Cause(StrEnum):
 
 
 class FailureKind(StrEnum):
-    """`blind`: no position that may be relied upon. `suspected`: tracking, but fixes contradict it."""
+    """`blind`: no position that may be relied upon. `suspected`: tracking, but fixes contradict it. `not_found`: it searches for itself."""
 
     BLIND = "blind"
     SUSPECTED = "suspected"
+    NOT_FOUND = "not_found"
 
 
 class ChunkRequest(msgspec.Struct, frozen=True, kw_only=True):
@@ -125,6 +126,10 @@ fix_innovation, the largest squared Mahalanobis distance (6 degrees of freedom) 
 fix_innovation_m, the largest such distance in metres, and dock_error_m, the distance between estimate and dock at an arrival;
 both in metres only where the robot was TRACKING. Since the run began: frames, frames_dropped, landmarks_expected and
 landmarks_seen (searched for in images, and found), first_fix_s, the time to the first fix. The others are current."""
+
+
+OFF_MAP = "off_map"
+"""Flag of RobotHealth: the robot is not localised, and where it is the map has no tile."""
 
 
 class RobotHealth(msgspec.Struct, frozen=True, kw_only=True):

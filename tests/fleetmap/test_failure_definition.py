@@ -7,7 +7,17 @@ import numpy as np
 import pytest
 
 from fleetmap import failure_definition
-from fleetmap.failure_definition import is_blind, is_outside_bound, is_usable, is_wrong, radius_95_m
+from fleetmap.failure_definition import (
+    SearchClock,
+    is_blind,
+    is_driving,
+    is_found,
+    is_outside_bound,
+    is_usable,
+    is_wrong,
+    may_be_mapped,
+    radius_95_m,
+)
 from fleetmap.messages import Status
 
 
@@ -24,6 +34,40 @@ def test_a_position_is_usable_or_blind_or_neither(status: str, radius_m: float) 
     close = radius_m <= 0.30
     assert is_usable(status, radius_m) == (status == "TRACKING" or (status == "DEGRADED" and close))
     assert is_blind(status, radius_m) == (status in ("LOST", "AMBIGUOUS") or (status == "DEGRADED" and not close))
+
+
+@pytest.mark.parametrize(
+    ("driving", "seconds", "fails"),
+    [(True, 19.9, False), (True, 20.0, True), (False, 59.9, False), (False, 60.0, True)],
+)
+def test_a_search_is_over_after_its_time(driving: bool, seconds: float, fails: bool) -> None:
+    clock = SearchClock()
+    for stamp_ns in range(0, round(seconds * 1e9) + 1, 100_000_000):
+        over = clock.handle(stamp_ns, is_found=False, is_driving=driving)
+    assert over is fails
+    assert clock.began_ns == 0
+    assert not clock.handle(stamp_ns + 1, is_found=True, is_driving=driving)
+    assert clock.began_ns is None
+
+
+def test_where_there_is_no_map_nobody_searches() -> None:
+    clock = SearchClock()
+    assert not any(clock.handle(n * 10**9, is_found=False, is_driving=True, may_be_mapped=False) for n in range(100))
+    near, far = (may_be_mapped(x, 5.0, 1.0, [(0, 0), (1, 0)], 10.0) for x in (30.9, 31.1))
+    assert (near, far) == (True, False), "the radius and a tile's size beyond the last one, which ends at 20 m"
+    assert may_be_mapped(500.0, 5.0, np.inf, [(0, 0)], 10.0), "whoever may be anywhere may be on the map"
+
+
+def test_a_speed_that_nobody_knows_is_driving() -> None:
+    assert [is_driving(speed) for speed in (None, 0.0, 0.049, 0.05, -1.0)] == [True, False, False, True, True]
+
+
+def test_a_fix_finds_the_robot_only_with_a_position_to_rely_upon() -> None:
+    assert is_found(True, False, "TRACKING", 0.1)
+    assert is_found(False, True, "DEGRADED", 0.1)
+    assert not is_found(False, True, "DEGRADED", 0.4)
+    assert not is_found(False, True, "INITIALISING", 0.1)
+    assert not is_found(False, False, "DEGRADED", 0.1)
 
 
 def test_bounds_hold_what_they_say() -> None:
@@ -46,6 +90,7 @@ def test_users_read_the_same_definition() -> None:
         "for more than 2 s",
         "99.9 % bound for longer than 1 s",
         "5 s of good tracking",
+        "20 s of driving or 60 s of standing since the start, or since it was last localised",
     ):
         assert words in told
         assert words in page

@@ -14,7 +14,7 @@ from fleetmap.failure_definition import ERROR_LIMIT_M, radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.messages import Status
 from locclient.replay.drawing import INK, QUIET, Canvas, ChartAxes, Colour, draw_legend, ticks
-from locclient.replay.run_metrics import FrameRecord, error_m, frame_ms, localised, localised_share
+from locclient.replay.run_metrics import FrameRecord, error_m, frame_ms, localised, localised_share_of_all
 
 _WIDTH, _PLAN_WIDTH, _BESIDE_WIDTH = 2040, 1220.0, 640.0
 _TOP, _MIN_PLAN_HEIGHT, _MAX_PLAN_HEIGHT = 140.0, 520.0, 1100.0
@@ -96,9 +96,9 @@ def _view(plot: RunPlot) -> tuple[Array, Array]:
 
 
 def _figures(plot: RunPlot) -> str:
-    share, errors, times = localised_share(plot.frames), error_m(plot.frames), frame_ms(plot.frames)
+    share, errors, times = localised_share_of_all(plot.frames), error_m(plot.frames), frame_ms(plot.frames)
     figures = [f"{len(plot.frames)} frames in {plot.seconds[-1]:.0f} s" if plot.frames else "no frames"]
-    figures.append("never localised" if share is None else f"localised {100 * share:.1f} % after the first fix")
+    figures += [] if share is None else [f"localised {100 * share:.1f} % of all" if share else "never localised"]
     if errors is not None:
         figures.append(f"error: median {1e3 * errors['median']:.0f} mm, 99 % below {1e3 * errors['p99']:.0f} mm")
     if times is not None:

@@ -107,4 +107,6 @@ def frame_record(outcome: Outcome, truth_map_from_body: Array | None, wall_s: fl
         cpu_s=outcome.cpu_s,
         wall_s=wall_s,
         stage_s={**outcome.stage_s, "decode": decode_s},
+        speed_mps=outcome.speed_mps,
+        may_be_mapped=outcome.may_be_mapped,
     )

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap import failure_definition
-from fleetmap.failure_definition import BLIND_S, GOOD_S, SILENT_S
+from fleetmap.failure_definition import BLIND_S, GOOD_S, SILENT_S, SPARSE_S, SearchClock
 from fleetmap.geometry import Array
 from fleetmap.messages import Status
 
-SPARSE_S = 1.0  # frames farther apart than this are localised by a fix of their own
 WARM_UP_FRAMES = 20
 
 
@@ -19,7 +18,8 @@ class FrameRecord:
     """One frame of a run.
 
     Errors are unaligned against the truth in the map's frame, None where either is unknown; error_map_m (3,) is estimate minus
-    truth. cpu_s and wall_s: from decoded images to estimate. stage_s: seconds by stage, decoding included.
+    truth. cpu_s and wall_s: from decoded images to estimate. stage_s: seconds by stage, decoding included. speed_mps: by wheels or
+    odometry, None where neither knows it. may_be_mapped: False where the robot knows that the map does not cover its place.
     """
 
     stamp_ns: int
@@ -31,6 +31,8 @@ class FrameRecord:
     cpu_s: float
     wall_s: float
     stage_s: dict[str, float]
+    speed_mps: float | None = None
+    may_be_mapped: bool = True
 
     @property
     def error_m(self) -> float | None:
@@ -60,6 +62,24 @@ def localised_share(frames: Frames) -> float | None:
     """Share of localised frames among the first fix and everything after it."""
     start = first_fix(frames)
     return None if start is None else float(np.mean(localised(frames)[start:]))
+
+
+def localised_share_of_all(frames: Frames) -> float | None:
+    """Share of localised frames among all; None without any."""
+    return float(np.mean(localised(frames))) if frames else None
+
+
+def not_localised_share(frames: Frames) -> float | None:
+    """Share of the driving time in which the robot was not localised; None where it did not drive.
+
+    A frame speaks for the time since the one before. Frames without a known speed count as driving.
+    """
+    stamps_s = np.array([frame.stamp_ns for frame in frames], np.int64) * 1e-9
+    lasted_s = np.diff(stamps_s, prepend=stamps_s[:1])
+    driving = np.array([failure_definition.is_driving(frame.speed_mps) for frame in frames], bool)
+    driven_s = float(lasted_s[driving].sum())
+    lost = driving & ~np.array(localised(frames), bool)
+    return float(lasted_s[lost].sum()) / driven_s if driven_s > 0 else None
 
 
 def first_fix_s(frames: Frames) -> float | None:
@@ -113,7 +133,7 @@ def silent_failures(frames: Frames) -> int | None:
 def position_failures(frames: Frames) -> int:
     """Count of failures as `fleetmap.failure_definition` defines them; overlapping ones count once.
 
-    Without ground truth only blindness can be seen.
+    Without ground truth only blindness can be seen, and that the robot does not find itself.
     """
     start = first_fix(frames)
     after = list(frames[start:]) if start is not None else []
@@ -121,10 +141,29 @@ def position_failures(frames: Frames) -> int:
         _episodes(frames, _is_silent, SILENT_S)
         + _episodes(after, _is_blind, BLIND_S)
         + _episodes(frames, _is_overconfident, SILENT_S)
+        + not_found(frames)
     )
     good = localised(frames)
     bad = [any(test(f, good[k]) for test in (_is_silent, _is_blind, _is_overconfident)) for k, f in enumerate(frames)]
     return len(_merged(sorted(spans), [(f.stamp_ns, good[k] and not bad[k]) for k, f in enumerate(frames)]))
+
+
+def not_found(frames: Frames) -> list[tuple[int, int]]:
+    """(begin, end) stamps of stretches in which the robot did not find itself for too long."""
+    clock, stretches = SearchClock(), []
+    begin = None
+    for frame, is_localised in zip(frames, localised(frames), strict=True):
+        radius_m = failure_definition.radius_95_m(frame.cov_rot_trans)
+        fails = clock.handle(
+            frame.stamp_ns,
+            is_found=failure_definition.is_found(is_localised, frame.has_fix, frame.status, radius_m),
+            is_driving=failure_definition.is_driving(frame.speed_mps),
+            may_be_mapped=frame.may_be_mapped,
+        )
+        if begin is not None and not fails:
+            stretches.append((begin, frame.stamp_ns))
+        begin = clock.began_ns if fails else None
+    return stretches if begin is None else [*stretches, (begin, frames[-1].stamp_ns)]
 
 
 def _is_silent(frame: FrameRecord, is_localised: bool) -> bool:
@@ -202,8 +241,10 @@ def _spread(values: list[float], names: tuple[str, ...]) -> dict[str, float] | N
 
 METRICS: dict[str, Callable[[Frames], object]] = {
     "frames": len,
-    "first_fix_s": first_fix_s,
+    "localised_share_of_all": localised_share_of_all,
     "localised_share": localised_share,
+    "first_fix_s": first_fix_s,
+    "not_localised_share": not_localised_share,
     "frame_ms": frame_ms,
     "frame_wall_ms": frame_wall_ms,
     "stage_ms": stage_ms,

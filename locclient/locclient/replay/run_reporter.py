@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 
 from fleetmap.errors import LinkError
-from fleetmap.messages import RobotHealth
+from fleetmap.messages import OFF_MAP, RobotHealth
 from locclient.maps.connection import MapConnection
 from locclient.maps.map_client import MapClient
 from locclient.replay.run_metrics import METRICS
@@ -46,7 +46,7 @@ class RunReporter:
     def _publish_health(self) -> None:
         if self._connection.client is None or self._broken:
             return
-        result, estimate = self._result, self._result.estimates[-1]
+        result, estimate, mapped = self._result, self._result.estimates[-1], self._result.frames[-1].may_be_mapped
         figures: dict[str, float | int | str | bool | None] = {
             name: value for name, value in result.report.items() if isinstance(value, int | float | str | bool)
         }
@@ -60,7 +60,7 @@ class RunReporter:
             stamp_ns=estimate.stamp_ns,
             version=estimate.map_version,
             status=estimate.status,
-            flags=("tiles_refused",) if result.tiles.refused else (),
+            flags=(*(["tiles_refused"] if result.tiles.refused else []), *([] if mapped else [OFF_MAP])),
             metrics=figures | self._fixes.take(),
         )
         self._send(lambda to: to.publish_health(health))

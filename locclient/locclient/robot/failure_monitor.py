@@ -3,7 +3,19 @@
 from collections import Counter, deque
 from dataclasses import dataclass
 
-from fleetmap.failure_definition import BLIND_S, GOOD_S, SILENT_S, is_blind, is_wrong, radius_95_m
+from fleetmap.failure_definition import (
+    BLIND_S,
+    FIND_DRIVING_S,
+    GOOD_S,
+    SILENT_S,
+    SPARSE_S,
+    SearchClock,
+    is_blind,
+    is_driving,
+    is_found,
+    is_wrong,
+    radius_95_m,
+)
 from fleetmap.messages import Cause, FailureKind, FixNote, Status
 from locclient.localization.estimate import Estimate
 from locclient.localization.image_quality import ImageQuality
@@ -32,24 +44,41 @@ class Failure:
 class FailureMonitor:
     """Reports every failure once, when it has lasted long enough; the next may begin after GOOD_S of good tracking.
 
-    `blind`: after the first fix, no position that may be relied upon for BLIND_S. `suspected`: the robot is tracking, but the
+    `blind`: after the first fix, no position that may be relied upon for BLIND_S. `not_found`: searching for itself for too long, from
+    the start on or later. `suspected`: the robot is tracking, but the
     last fixes contradict it for SILENT_S, or it is found elsewhere than it had claimed, beyond its covariance. The robot can see
-    the first; the second estimates what only ground truth could show.
+    the first two; the third estimates what only ground truth could show.
     """
 
     def __init__(self) -> None:
         self._fixes: deque[FixNote] = deque(maxlen=_FIX_NOTES)
-        self._causes: Counter[Cause] = Counter()
+        self._causes: Counter[Cause] = Counter()  # of frames while blind
+        self._search = SearchClock()
+        self._search_causes: Counter[Cause] = Counter()
         self._had_fix = False
         self._blind_ns: int | None = None
         self._doubted_ns: int | None = None
+        self._contradicted_ns: int | None = None  # since when no fix was believed and some contradicted the estimate
         self._contradicting_looks = 0
         self._good_ns: int | None = None
         self.is_running = False  # a reported failure has not ended yet
         self._last: Estimate | None = None
 
-    def handle(self, estimate: Estimate) -> Failure | None:
-        """The failure that is detected with this frame, if any."""
+    @property
+    def begun_ns(self) -> dict[FailureKind, int]:
+        """Stamps of the first frames of what goes on and is, or may become, a failure."""
+        stamps = (self._blind_ns, self._search.began_ns, self._contradicted_ns)
+        kinds = (FailureKind.BLIND, FailureKind.NOT_FOUND, FailureKind.SUSPECTED)
+        return {kind: stamp_ns for kind, stamp_ns in zip(kinds, stamps, strict=True) if stamp_ns is not None}
+
+    def handle(
+        self, estimate: Estimate, speed_mps: float | None = None, *, may_be_mapped: bool = True
+    ) -> Failure | None:
+        """The failure that is detected with this frame, if any.
+
+        speed_mps: None where neither wheels nor odometry know it. may_be_mapped: False where the map does not cover the place.
+        """
+        is_lost = self._is_lost(estimate, speed_mps, may_be_mapped=may_be_mapped)
         self._last, now_ns = estimate, estimate.stamp_ns
         self._note_fix(estimate)
         self._had_fix |= estimate.fix is not None
@@ -61,6 +90,9 @@ class FailureMonitor:
             return None
         if self._blind_ns is not None and (now_ns - self._blind_ns) * 1e-9 > BLIND_S:
             return self._detected(FailureKind.BLIND, self._causes.most_common(1)[0][0], self._blind_ns, now_ns)
+        if is_lost and self._search.began_ns is not None:
+            cause = self._search_causes.most_common(1)[0][0]
+            return self._detected(FailureKind.NOT_FOUND, cause, self._search.began_ns, now_ns)
         if self._doubted_ns is not None and (now_ns - self._doubted_ns) * 1e-9 > SILENT_S:
             return self._detected(FailureKind.SUSPECTED, Cause.FIX_REFUSED, self._doubted_ns, now_ns)
         if estimate.moved_m is not None and is_wrong(estimate.moved_m):
@@ -68,12 +100,29 @@ class FailureMonitor:
         return None
 
     def handle_silence(self, for_s: float) -> Failure | None:
-        """The failure of a source that has sent no frame for so long; None before the first fix."""
-        if self.is_running or not self._had_fix or self._last is None or for_s <= BLIND_S:
+        """The failure of a source that has sent no frame for so long; None before the first frame."""
+        is_too_long = for_s > BLIND_S if self._had_fix else for_s >= FIND_DRIVING_S
+        if self.is_running or self._last is None or not is_too_long:
             return None
         began_ns = self._last.stamp_ns
         self._good_ns = None
-        return self._detected(FailureKind.BLIND, Cause.NO_FRAMES, began_ns, began_ns + int(for_s * 1e9))
+        kind = FailureKind.BLIND if self._had_fix else FailureKind.NOT_FOUND
+        return self._detected(kind, Cause.NO_FRAMES, began_ns, began_ns + int(for_s * 1e9))
+
+    def _is_lost(self, estimate: Estimate, speed_mps: float | None, *, may_be_mapped: bool) -> bool:
+        """Whether the robot has searched for itself for too long."""
+        before_ns = estimate.stamp_ns if self._last is None else self._last.stamp_ns
+        has_fix = estimate.fix is not None
+        is_localised = estimate.status is Status.TRACKING or (
+            has_fix and (estimate.stamp_ns - before_ns) * 1e-9 > SPARSE_S
+        )
+        found = is_found(is_localised, has_fix, estimate.status, radius_95_m(estimate.cov_rot_trans))
+        if found:
+            self._search_causes.clear()
+        else:
+            self._search_causes[failure_cause(estimate)] += 1
+        driving = is_driving(speed_mps)
+        return self._search.handle(estimate.stamp_ns, is_found=found, is_driving=driving, may_be_mapped=may_be_mapped)
 
     def _note_fix(self, estimate: Estimate) -> None:
         if estimate.fix is None and not estimate.refused:
@@ -89,6 +138,10 @@ class FailureMonitor:
             refused=estimate.refused[:_MAX_REFUSED_CHARS],
         )
         self._fixes.append(note)
+        if fix is not None:
+            self._contradicted_ns = None
+        elif estimate.innovation is not None and self._contradicted_ns is None:
+            self._contradicted_ns = estimate.stamp_ns
         contradicts = fix is None and estimate.innovation is not None and estimate.status is Status.TRACKING
         self._contradicting_looks = self._contradicting_looks + 1 if contradicts else 0
 

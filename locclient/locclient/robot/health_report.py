@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from fleetmap.failure_definition import is_blind, radius_95_m
-from fleetmap.messages import Cause, RobotHealth, Status
+from fleetmap.messages import OFF_MAP, Cause, RobotHealth, Status
 from locclient.localization.estimate import Estimate
 from locclient.robot.robot import Outcome
 
@@ -60,7 +60,7 @@ class HealthFigures:
     """Counts since the start, and the times of the last frames."""
 
     def __init__(self) -> None:
-        self._frames = self._localised = self._failures = 0
+        self._all_frames = self._frames = self._localised = self._failures = 0
         self._frame_ms: deque[float] = deque(maxlen=_RECENT)
         self._first_ns: int | None = None
         self._first_fix_s: float | None = None
@@ -82,9 +82,9 @@ class HealthFigures:
             self._first_ns, self._first_frame_ms = estimate.stamp_ns, 1e3 * outcome.cpu_s
         if estimate.fix is not None and self._first_fix_s is None:
             self._first_fix_s = (estimate.stamp_ns - self._first_ns) * 1e-9
-        if self._first_fix_s is not None:
-            self._frames += 1
-            self._localised += estimate.status is Status.TRACKING
+        self._all_frames += 1
+        self._frames += self._first_fix_s is not None
+        self._localised += estimate.status is Status.TRACKING
         self._fixes.handle(estimate, outcome.dock_error_m)
 
     def count_failure(self) -> None:
@@ -96,6 +96,7 @@ class HealthFigures:
         last = None if self._last is None else self._last.estimate
         flags: list[str] = [Cause.NO_FRAMES] if silent else []
         figures: dict[str, Figure] = {
+            "localised_share_of_all": self._localised / self._all_frames if self._all_frames else None,
             "localised_share": self._localised / self._frames if self._frames else None,
             "first_fix_s": self._first_fix_s,
             "first_frame_ms": self._first_frame_ms,
@@ -108,6 +109,7 @@ class HealthFigures:
             figures["exposure"], figures["sharpness"] = last.image.exposure, last.image.sharpness
             flags += ["blind"] if is_blind(last.status, radius_95_m(last.cov_rot_trans)) else []
             flags += [last.image.cause] if last.image.cause else []
+            flags += [] if self._last is None or self._last.may_be_mapped else [OFF_MAP]
         return RobotHealth(
             site=site,
             robot=robot,

@@ -5,12 +5,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
+import numpy as np
+
+from fleetmap.failure_definition import may_be_mapped, radius_95_m
 from fleetmap.geometry import Array
-from fleetmap.messages import PoseMessage, WantedVersion
+from fleetmap.messages import PoseMessage, Status, WantedVersion
+from fleetmap.odometry import OdometryStatus
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
-from fleetmap.sensors.samples import Image
+from fleetmap.sensors.samples import Image, WheelSample
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
@@ -23,6 +27,7 @@ from locclient.robot.version_trial import TrialSettings, TrialVerdict, VersionTr
 
 _THUMBNAIL_EVERY_NS = 1_000_000_000
 _THUMBNAILS = 2
+_WHEEL_NS = 500_000_000  # age from which wheel odometry says nothing of the present
 Clock = Callable[[], float]  # seconds
 
 
@@ -59,7 +64,8 @@ class Outcome:
     """Results of one frame.
 
     cpu_s: from the images as they came to the estimate; stage_s: the same by stage. dock_error_m: from `DockCheck`, None without
-    an arrival.
+    an arrival. speed_mps: by the wheels, else by the odometry, None where neither knows it. may_be_mapped: False where the robot is not
+    localised and the map has no tile near.
     """
 
     estimate: Estimate
@@ -68,6 +74,8 @@ class Outcome:
     stage_s: dict[str, float]
     failure: FailureContext | None
     dock_error_m: float | None = None
+    speed_mps: float | None = None
+    may_be_mapped: bool = True
 
     def pose_message(self) -> PoseMessage | None:
         """The pose for the server; None while there is no single one with a covariance."""
@@ -117,6 +125,7 @@ class Robot:
         self._docks = DockCheck(calibration.base_from_body)
         self._images: deque[tuple[int, Image]] = deque(maxlen=_THUMBNAILS)
         self._last: tuple[RectifiedFrame, Estimate] | None = None
+        self._wheel: WheelSample | None = None
 
     @property
     def held(self) -> list[LoadedMap]:
@@ -158,6 +167,7 @@ class Robot:
         """Results of a bundle with a frame; None without one. RecordingError for images that cannot be read."""
         self.localizer.handle_imu(bundle.imu)
         self.localizer.handle_wheel(bundle.wheel)
+        self._wheel = bundle.wheel[-1] if bundle.wheel else self._wheel
         for prior in bundle.priors:
             self.localizer.handle_prior(prior)
         if bundle.frame is None:
@@ -171,17 +181,34 @@ class Robot:
         cpu_s = self._clock_s() - begun_s
         stage_s = {"decode": decoded_s - begun_s, "rectify": rectified_s - decoded_s, **estimate.stage_s}
         self._try(estimate, frame)
-        failure = self.monitor.handle(estimate)
+        speed_mps, is_covered = self._speed_mps(estimate), self._may_be_mapped(estimate)
+        failure = self.monitor.handle(estimate, speed_mps, may_be_mapped=is_covered)
         context = None if failure is None else self._context(failure)
         if not self._images or estimate.stamp_ns - self._images[-1][0] >= _THUMBNAIL_EVERY_NS:
             self._images.append((estimate.stamp_ns, frame.left))
         dock_error_m = self._docks.handle(bundle.priors, estimate)
-        return Outcome(estimate, self._odom.handle(estimate), cpu_s, stage_s, context, dock_error_m)
+        published = self._odom.handle(estimate)
+        return Outcome(estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered)
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """The failure of a source that has sent no frame for so long."""
         failure = self.monitor.handle_silence(for_s)
         return None if failure is None else self._context(failure)
+
+    def _speed_mps(self, estimate: Estimate) -> float | None:
+        """Horizontal speed by the wheels, else by an odometry that holds; None where neither knows it."""
+        if self._wheel is not None and abs(estimate.stamp_ns - self._wheel.stamp_ns) <= _WHEEL_NS:
+            return float(np.linalg.norm(self._wheel.velocity_base_mps[:2]))
+        odometry = estimate.odometry
+        holds = odometry.inertial or odometry.status is not OdometryStatus.DEGRADED
+        return float(np.linalg.norm(odometry.velocity_odom_mps)) if holds and odometry.scale_known else None
+
+    def _may_be_mapped(self, estimate: Estimate) -> bool:
+        if estimate.status is Status.TRACKING or estimate.map_from_body is None or self.running is None:
+            return True
+        manifest, (x_m, y_m) = self.running.manifest, estimate.map_from_body[:2, 3]
+        cells = ((tile.x, tile.y) for tile in manifest.tiles)
+        return may_be_mapped(x_m, y_m, radius_95_m(estimate.cov_rot_trans), cells, manifest.tile_size_m)
 
     def _context(self, failure: Failure) -> FailureContext:
         assert self._last is not None

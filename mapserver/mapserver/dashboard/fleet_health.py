@@ -99,7 +99,7 @@ class HealthData:
             kpis(days[-1]),
             kpis(week),
             trend_words(days[-1], week),
-            tuple(rate(counts.failures, counts.robot_days) for counts in days),
+            tuple(rate(counts.position_failures, counts.robot_days) for counts in days),
             {robot: kpis(counts) for (_, robot), counts in robots.items()},
             self._trials(site, now_ns),
             tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles),
@@ -113,10 +113,11 @@ class HealthData:
 
 
 def _sum(hours: Mapping[int, Counters], since: int, until: int) -> Counters:
-    total = Counters()
+    total, first = Counters(), hours.get(since, Counters())
     for hour, counts in hours.items():
         if since <= hour < until:
             total.add(counts)
+    total.continued = first.continued
     return total
 
 
@@ -128,12 +129,12 @@ def trend_words(day: Counters, week: Counters) -> str:
     """
     if day.robot_days <= 0 or week.robot_days <= 0:
         return "nothing to compare with yet"
-    total = day.failures + week.failures
+    total = day.position_failures + week.position_failures
     if total == 0:
         return "none in the week before either"
     share = day.robot_days / (day.robot_days + week.robot_days)
-    if 2 * (1 - float(bdtr(day.failures - 1, total, share)) if day.failures else 1.0) < _SIGNIFICANCE:
+    if 2 * (1 - float(bdtr(day.position_failures - 1, total, share)) if day.position_failures else 1.0) < _SIGNIFICANCE:
         return "more than in the week before"
-    if 2 * float(bdtr(day.failures, total, share)) < _SIGNIFICANCE:
+    if 2 * float(bdtr(day.position_failures, total, share)) < _SIGNIFICANCE:
         return "fewer than in the week before"
     return "no clear change from the week before"

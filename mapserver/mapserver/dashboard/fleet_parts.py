@@ -8,7 +8,7 @@ from markupsafe import Markup
 from mapserver.dashboard import drawing
 from mapserver.dashboard.drawing import Bar
 from mapserver.dashboard.markup import badge, joined, link, moment, share, table
-from mapserver.fleet_statistics.kpis import Rate, driven_words, figure, format_rate, is_telling
+from mapserver.fleet_statistics.kpis import Kpis, Rate, driven_words, figure, format_rate, is_telling
 from mapserver.fleet_statistics.resurvey_test import TileConcern
 from mapserver.store import CanaryRow
 
@@ -53,6 +53,14 @@ def rate_figure(name: str, found: Rate, more: str) -> Figure:
         return Figure(name, "–", f"{counted}: too little for a rate{more}")
     interval = f"{figure(found.low)} to {figure(found.high)} with 95 %"
     return Figure(name, figure(found.per_robot_day), f"{counted}: {interval}{more}")
+
+
+def localised_figure(name: str, found: Kpis) -> Figure:
+    """The share of all driving time in which robots were localised, and the time in which they were not."""
+    lost_min = 60 * found.not_localised_h
+    words = f"{lost_min:.0f} min" if lost_min < 120 else f"{found.not_localised_h:.1f} h"
+    shown = share(found.localised_share_of_all)
+    return Figure(name, shown or "–", f"{words} driven without being localised" if shown else "nothing was driven")
 
 
 def trial_notices(trials: Iterable[Trial]) -> Markup:

@@ -50,6 +50,7 @@ class _Stream:
     health: HealthStream = field(default_factory=HealthStream)
     trace_ns: int = -(1 << 62)
     status: str = ""
+    hour: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,10 +105,13 @@ class Ingest:
         canary = self._canary(site, now_ns)
         with self._lock:
             stream = self._streams.setdefault((site, robot), _Stream())
+            is_continued = stream.health.in_failure and stream.hour is not None and hour > stream.hour
             counts = stream.health.take_health(health)
+            stream.hour = hour
             self._batch.last_reports[site, robot] = (version, now_ns, report)
             if counts is None:
                 return
+            counts.continued = int(is_continued)
             place = None if estimate is None or estimate.map_version != health.version else estimate.position_map_m
             for axis, key in _keys(robot, _version_key(health.version, grid), _arm(canary, health.version)):
                 self._batch.add(site, axis, key, hour, counts)
@@ -124,7 +128,7 @@ class Ingest:
         canary = self._canary(report.site, now_ns)
         arm = _arm(canary, report.version) if canary is not None and happened_ns >= canary.started_ns else None
         counts = Counters(suspected=1) if report.kind == FailureKind.SUSPECTED else Counters(failures=1)
-        counts.blind_failures = int(report.kind == FailureKind.BLIND)
+        counts.blind_failures = int(report.kind in {FailureKind.BLIND, FailureKind.NOT_FOUND})
         keys = _keys(report.robot, _version_key(report.version, grid), arm)
         keys.append(("cause", self._cause(report.site, report.cause)))
         if grid is not None and report.tile is not None:

@@ -2,12 +2,20 @@
 
 import math
 
-from fleetmap.failure_definition import BLIND_S, CHI2_6_0999, GOOD_S, is_blind, is_usable, is_wrong
-from fleetmap.messages import PoseMessage, RobotHealth, Status
+from fleetmap.failure_definition import (
+    BLIND_S,
+    CHI2_6_0999,
+    GOOD_S,
+    SearchClock,
+    is_blind,
+    is_driving,
+    is_usable,
+    is_wrong,
+)
+from fleetmap.messages import OFF_MAP, PoseMessage, RobotHealth, Status
 from mapserver.fleet_statistics.kpis import Counters
 
 MAX_GAP_S = 5.0  # a robot that is silent for longer was not observed meanwhile
-DRIVING_MPS = 0.05
 _MAX_COUNT = 1 << 40
 _MAX_FIGURE = 1e15
 
@@ -27,7 +35,9 @@ class HealthStream:
         self._jump_ns: int | None = None
         self._silent_ms = 0
         self._watched_ns = 0  # time that reports cover since the first fix, by which blindness is measured
-        self._in_failure = False
+        self.in_failure = False  # blind, or not found for too long, and no 5 s of good tracking since
+        self._search = SearchClock()
+        self._search_ns = 0  # time that reports cover, by which the search is measured
         self._place: tuple[int, float, float] | None = None
         self._pose_mps: float | None = None
 
@@ -51,8 +61,8 @@ class HealthStream:
         dt_ms = self._elapsed_ms(health)
         counts = Counters(reports=1, observed_ms=dt_ms)
         speed_mps = figures.get("speed_mps", self._pose_mps)
-        counts.driving_ms = dt_ms if speed_mps is not None and abs(speed_mps) >= DRIVING_MPS else 0
-        self._count_status(counts, health, figures, dt_ms)
+        counts.driving_ms = dt_ms if speed_mps is not None and is_driving(speed_mps) else 0
+        self._count_status(counts, health, figures, dt_ms, speed_mps)
         self._count_fixes(counts, health.stamp_ns, figures)
         self._count_work(counts, figures)
         self._stamp_ns, self._wall_ns, self._figures = health.stamp_ns, health.wall_ns, figures
@@ -74,7 +84,8 @@ class HealthStream:
 
     def _begin_run(self) -> None:
         self._stamp_ns, self._figures = None, {}
-        self._has_fix = self._fix_counted = self._in_failure = False
+        self._has_fix = self._fix_counted = self.in_failure = False
+        self._search, self._search_ns = SearchClock(), 0
         self._blind_since_ns = self._good_since_ns = self._jump_ns = None
 
     def _elapsed_ms(self, health: RobotHealth) -> int:
@@ -91,40 +102,53 @@ class HealthStream:
         self._silent_ms = self._silent_ms + dt_ms if health.stamp_ns == self._stamp_ns else 0
         return self._silent_ms > BLIND_S * 1e3
 
-    def _count_status(self, counts: Counters, health: RobotHealth, figures: dict[str, float], dt_ms: int) -> None:
+    def _count_status(
+        self, counts: Counters, health: RobotHealth, figures: dict[str, float], dt_ms: int, speed_mps: float | None
+    ) -> None:
         is_stale = self._is_stale(health, dt_ms)
         is_tracking = health.status == Status.TRACKING and not is_stale
         radius_m = figures.get("radius_95_m", math.inf)
         self._has_fix = self._has_fix or is_tracking or "first_fix_s" in figures
         counts.usable_ms = dt_ms if not is_stale and is_usable(health.status, radius_m) else 0
+        counts.judged_ms = dt_ms if is_driving(speed_mps) else 0
+        counts.found_ms = counts.judged_ms if is_tracking else 0
+        is_new = self._is_search_failure(dt_ms, is_tracking, is_driving(speed_mps), OFF_MAP not in health.flags)
         if self._has_fix:
             counts.after_fix_ms = dt_ms
             counts.localised_ms = dt_ms if is_tracking else 0
             self._watched_ns += dt_ms * 1_000_000
             is_blind_now = is_stale or is_blind(health.status, radius_m)
-            counts.blind_seen = self._blindness(self._watched_ns, dt_ms, is_blind_now, is_tracking)
+            is_new |= self._is_blindness(self._watched_ns, dt_ms, is_blind_now)
+        counts.blind_seen = int(is_new and not self.in_failure)
+        self.in_failure |= is_new
+        self._end_failure(dt_ms, is_tracking)
 
-    def _blindness(self, watched_ns: int, dt_ms: int, is_blind_now: bool, is_tracking: bool) -> int:
-        """1 where a stretch of blindness became a failure with this report.
+    def _is_search_failure(self, dt_ms: int, is_found: bool, is_driving: bool, may_be_mapped: bool) -> bool:
+        """Whether the robot has not found itself for too long with this report."""
+        self._search_ns += dt_ms * 1_000_000
+        return self._search.handle(
+            self._search_ns, is_found=is_found, is_driving=is_driving, may_be_mapped=may_be_mapped
+        )
 
-        A stretch lasts until the next report that is better, and a failure until 5 s of good tracking.
-        """
+    def _is_blindness(self, watched_ns: int, dt_ms: int, is_blind_now: bool) -> bool:
+        """Whether a stretch of blindness has become a failure with this report. It lasts until the next report that is better."""
         if dt_ms == 0:
-            self._blind_since_ns = self._good_since_ns = None  # what was in between is unknown
+            self._blind_since_ns = None  # what was in between is unknown
         began = self._blind_since_ns is not None and watched_ns - self._blind_since_ns > BLIND_S * 1e9
         if not is_blind_now:
             self._blind_since_ns = None
         elif self._blind_since_ns is None:
             self._blind_since_ns = watched_ns
+        return began
+
+    def _end_failure(self, dt_ms: int, is_tracking: bool) -> None:
+        """A failure lasts until 5 s of good tracking."""
         if not is_tracking:
             self._good_since_ns = None
-        elif self._good_since_ns is None:
-            self._good_since_ns = watched_ns
-        is_new = began and not self._in_failure
-        self._in_failure = self._in_failure or began
-        if self._good_since_ns is not None and watched_ns - self._good_since_ns >= GOOD_S * 1e9:
-            self._in_failure = False
-        return int(is_new)
+        elif self._good_since_ns is None or dt_ms == 0:
+            self._good_since_ns = self._search_ns
+        if self._good_since_ns is not None and self._search_ns - self._good_since_ns >= GOOD_S * 1e9:
+            self.in_failure = False
 
     def _count_fixes(self, counts: Counters, stamp_ns: int, figures: dict[str, float]) -> None:
         if "first_fix_s" in figures and not self._fix_counted:
@@ -138,7 +162,7 @@ class HealthStream:
         if self._has_fix and is_wrong(figures.get("fix_innovation_m", 0.0)):
             # The estimate was wrong before, or is now. Jumps without 5 s between them are one; one within a failure belongs to it.
             is_new = self._jump_ns is None or stamp_ns - self._jump_ns >= GOOD_S * 1e9
-            counts.jumps = int(is_new and not self._in_failure)
+            counts.jumps = int(is_new and not self.in_failure)
             self._jump_ns = stamp_ns
         dock_m = figures.get("dock_error_m")
         if dock_m is not None:

@@ -21,8 +21,10 @@ class Counters:
 
     observed, driving: time that reports cover, and of it with the wheels turning; after_fix: since the run's first fix, localised: of it
     TRACKING; usable: with a position that may be relied upon. failures: reported ones; suspected: those that are estimates of silent ones;
-    blind_seen: stretches of blindness that the server saw in the statuses itself. exceeded: innovations beyond their 99.9 % bound; jumps:
-    fixes more than 0.30 m from where the robot took itself to be; docks_wrong: arrivals where the estimate was so far off.
+    blind_failures: those of the reported that statuses show too; blind_seen: such failures that the server saw in the statuses itself.
+    exceeded: innovations beyond their 99.9 % bound; jumps: fixes more than 0.30 m from where the robot took itself to be; docks_wrong:
+    arrivals where the estimate was so far off. judged: driving time, also at an unknown speed, of which it is known how much was localised;
+    found: that. continued: failures of an earlier hour that were running when the hour began, of sums over several hours the first one.
     """
 
     reports: int = 0
@@ -50,6 +52,9 @@ class Counters:
     suspected: int = 0
     blind_failures: int = 0
     blind_seen: int = 0
+    judged_ms: int = 0
+    found_ms: int = 0
+    continued: int = 0
 
     def add(self, other: Self) -> None:
         """Adds what another one holds."""
@@ -75,13 +80,23 @@ class Counters:
 
     @property
     def unreported_blindness(self) -> int:
-        """Stretches of blindness in the statuses for which no failure was reported (yet)."""
+        """Failures in the statuses, blindness and robots that do not find themselves, which were not reported (yet)."""
         return max(0, self.blind_seen - self.blind_failures)
+
+    @property
+    def position_failures(self) -> int:
+        """Failures that began: reported ones, and those that only the statuses show."""
+        return self.failures + self.unreported_blindness
+
+    @property
+    def overlapping(self) -> int:
+        """Failures that began or were running already when the time of these sums began."""
+        return self.position_failures + self.continued
 
     @property
     def events(self) -> int:
         """Everything that speaks against a map: failures, blindness not reported, silent ones as estimated."""
-        return self.failures + self.unreported_blindness + self.silent_estimated
+        return self.position_failures + self.silent_estimated
 
 
 COUNTER_COLUMNS = tuple(field.name for field in fields(Counters))
@@ -113,13 +128,18 @@ class Share:
 class Kpis:
     """Key performance indicators of some counters; None where nothing was counted.
 
-    silent_estimated is an estimate, not a count: robots do not know the truth. unreported_blindness: stretches of blindness in the
-    statuses for which no failure was reported (yet).
+    localised_share_of_all: of all driving time; localised_share: of the time since each run's first fix. not_localised_h: driving.
+    failures: those that began, reported or seen in the statuses; failures_running: those that ran before, and still did when the time of
+    these figures began. silent_estimated is an estimate, not a count: robots do not know the truth. unreported_blindness: those of the
+    failures that no robot reported (yet).
     """
 
     observed_h: float
     driving_h: float
+    localised_share_of_all: float | None
+    not_localised_h: float
     failures: Rate
+    failures_running: int
     silent_estimated: Rate
     docks_wrong: Share
     unreported_blindness: int
@@ -140,7 +160,10 @@ def kpis(counts: Counters) -> Kpis:
     return Kpis(
         observed_h=counts.observed_ms / 3.6e6,
         driving_h=counts.driving_ms / 3.6e6,
-        failures=rate(counts.failures, counts.robot_days),
+        localised_share_of_all=_over(counts.found_ms, counts.judged_ms),
+        not_localised_h=(counts.judged_ms - counts.found_ms) / 3.6e6,
+        failures=rate(counts.position_failures, counts.robot_days),
+        failures_running=counts.continued,
         silent_estimated=rate(counts.silent_estimated, counts.robot_days),
         docks_wrong=share(counts.docks_wrong, counts.docks),
         unreported_blindness=counts.unreported_blindness,

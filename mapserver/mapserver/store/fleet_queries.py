@@ -22,6 +22,7 @@ LastReports = dict[tuple[str, str], tuple[int | None, int, dict[str, Any]]]
 
 _DAY_NS = 86_400_000_000_000
 _SUMS = ", ".join(f"sum(t.{name}) {name}" for name in COUNTER_COLUMNS)
+_SUMS_OF_WINDOW = _SUMS.replace("sum(t.continued)", "sum(CASE WHEN t.hour = ?4 THEN t.continued ELSE 0 END)")
 _COUNTED = """FROM tally_keys k JOIN tallies t ON t.key_id = k.id
     WHERE k.axis = ?1 AND (?2 IS NULL OR k.site = ?2) AND (?3 IS NULL OR k.key = ?3) AND t.hour >= ?4 AND t.hour < ?5"""
 _ADD = f"""INSERT INTO tallies (key_id, hour, {", ".join(COUNTER_COLUMNS)})
@@ -96,7 +97,7 @@ class FleetQueries:
     ) -> dict[tuple[str, str], Counters]:
         """Sums by (site, key) of an axis over hours from `since_hour` to before `until_hour`."""
         values = (_axis(axis), site, key, since_hour, until_hour)
-        query = f"SELECT k.site, k.key, {_SUMS} {_COUNTED} GROUP BY k.id ORDER BY k.site, k.key"
+        query = f"SELECT k.site, k.key, {_SUMS_OF_WINDOW} {_COUNTED} GROUP BY k.id ORDER BY k.site, k.key"
         rows = self._transactions.query(query, values)
         return {(row.pop("site"), row.pop("key")): Counters(**row) for row in rows}
 

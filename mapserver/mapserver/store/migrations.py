@@ -195,4 +195,9 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
             WHERE e.site = versions.site AND e.version = versions.version AND e.kind = 'saved' AND e.actor = 'nightly'
             AND e.reason LIKE 'nightly job %')""",
     ),
+    # Of all driving time how much was localised, and failures that outlast the hour in which they began.
+    tuple(
+        f"ALTER TABLE tallies ADD COLUMN {name} INTEGER NOT NULL DEFAULT 0"
+        for name in ("judged_ms", "found_ms", "continued")
+    ),
 )

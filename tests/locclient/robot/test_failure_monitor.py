@@ -64,6 +64,28 @@ def test_what_is_no_failure_is_not_told() -> None:
     assert monitor.handle_silence(1.0) is None
 
 
+@pytest.mark.parametrize(
+    ("speed_mps", "after_s"), [(1.0, 20.0), (None, 20.0), (0.0, 60.0)], ids=["driving", "unknown", "standing"]
+)
+def test_a_robot_that_never_finds_itself_fails_once(speed_mps: float | None, after_s: float) -> None:
+    """Also where it goes on for twenty minutes, and again after it had found itself."""
+    monitor, told = FailureMonitor(), []
+    for tenth in range(12000):
+        searching = estimate(0.1 * tenth, Status.INITIALISING, known=False, refused="nothing agrees")
+        told.append(monitor.handle(searching, speed_mps))
+    failures = [failure for failure in told if failure is not None]
+    assert [(failure.kind, failure.cause, failure.stamp_ns) for failure in failures] == [("not_found", "no_match", 0)]
+    assert failures[0].duration_s == pytest.approx(after_s, abs=0.11)
+    assert play(monitor, 1200, 1206, fix=True) == []
+    assert [failure.kind for failure in play(monitor, 1206, 1240, status=Status.LOST, known=False)] == ["blind"]
+
+
+def test_where_the_map_has_no_tile_nobody_fails_to_find_itself() -> None:
+    monitor = FailureMonitor()
+    outside = (estimate(float(n), Status.DEGRADED, sigma_m=0.5) for n in range(200))
+    assert not any(monitor.handle(moment, 1.0, may_be_mapped=False) for moment in outside)
+
+
 def test_fixes_that_contradict_are_a_suspicion() -> None:
     monitor = FailureMonitor()
     play(monitor, 0, 3, fix=True)
@@ -91,6 +113,12 @@ def test_a_place_that_turns_out_to_be_another_is_told_once() -> None:
 def test_silence_is_a_failure_of_its_own() -> None:
     monitor = FailureMonitor()
     assert monitor.handle_silence(10.0) is None, "nothing has come yet"
+    starting = FailureMonitor()
+    play(starting, 0, 1, status=Status.INITIALISING, known=False)
+    assert starting.handle_silence(19.0) is None
+    never = starting.handle_silence(20.0)
+    assert never is not None
+    assert (never.kind, never.cause) == ("not_found", "no_frames")
     play(monitor, 0, 3, fix=True)
     failure = monitor.handle_silence(2.5)
     assert failure is not None

@@ -2,12 +2,13 @@
 
 from typing import Any
 
+import msgspec
 import pytest
 
-from fleetmap.messages import PoseMessage, RobotHealth
+from fleetmap.messages import OFF_MAP, PoseMessage, RobotHealth
 from mapserver.fleet_statistics.clock_skew import ClockSkew, server_time_ns
 from mapserver.fleet_statistics.health_stream import HealthStream
-from mapserver.fleet_statistics.kpis import Counters
+from mapserver.fleet_statistics.kpis import Counters, kpis
 
 NS = 1_000_000_000
 
@@ -50,6 +51,46 @@ def statuses(text: str) -> list[RobotHealth]:
 )
 def test_blindness_as_failures_are_defined(text: str, failures: int) -> None:
     assert total(statuses(text)).blind_seen == failures
+
+
+@pytest.mark.parametrize(
+    ("text", "speed_mps", "failures"),
+    [
+        ("i" * 20, 1.0, 0),  # nineteen seconds of driving: each report speaks for the second before it
+        ("i" * 22, 1.0, 1),
+        ("i" * 1200, 1.0, 1),  # one that lasts is one
+        ("i" * 60, 0.0, 0),
+        ("i" * 62, 0.0, 1),  # standing
+        ("i" * 22, None, 1),  # a speed that nobody knows counts as driving
+        ("i" * 22 + "t" * 8 + "i" * 22, 1.0, 2),
+        ("i" * 22 + "ttt" + "i" * 22, 1.0, 1),  # not five seconds good in between
+        ("ttt" + "l" * 1200, 1.0, 1),  # blind from the third second on, and not found from the twentieth: one failure
+    ],
+)
+def test_a_robot_that_does_not_find_itself_fails(text: str, speed_mps: float | None, failures: int) -> None:
+    """Availability and failures agree: a robot without a position for twenty minutes has failed."""
+    speed = {} if speed_mps is None else {"speed_mps": speed_mps}
+    found = total([msgspec.structs.replace(report, metrics={**report.metrics, **speed}) for report in statuses(text)])
+    assert found.blind_seen == failures
+    assert kpis(found).failures.events == failures
+    if "t" not in text:
+        assert kpis(found).availability == 0.0
+
+
+def test_what_no_map_covers_is_no_failure() -> None:
+    reports = [msgspec.structs.replace(report, flags=(OFF_MAP,)) for report in statuses("i" * 100)]
+    assert total(reports).blind_seen == 0
+
+
+def test_the_share_that_leads_is_of_all_driving_time() -> None:
+    """Twenty seconds without a fix, ten with one, all driven, and ten of standing lost: a third, not everything."""
+    reports = [health(n, "INITIALISING" if n <= 20 else "TRACKING", speed_mps=1.0) for n in range(31)]
+    reports += [health(n, "LOST", speed_mps=0.0) for n in range(31, 41)]
+    found = kpis(total(reports))
+    assert found.localised_share_of_all == pytest.approx(1 / 3)
+    assert found.not_localised_h == pytest.approx(20 / 3600)
+    assert kpis(total(reports[:11])).localised_share_of_all == 0.0, "never localised is none of it, not unknown"
+    assert kpis(total(reports[:11])).localised_share is None
 
 
 def test_time_is_counted_where_it_belongs() -> None:
@@ -109,7 +150,8 @@ def test_repeated_and_replayed_reports() -> None:
 def test_nonsense_counts_nothing() -> None:
     nonsense = {"frames": "many", "fix_innovation": float("nan"), "speed_mps": True, "landmarks_seen": 1e300}
     found = total([health(0, **nonsense), health(1, **nonsense)])
-    assert found == Counters(reports=2, observed_ms=1000, after_fix_ms=1000, localised_ms=1000, usable_ms=1000)
+    times = dict.fromkeys(("observed_ms", "after_fix_ms", "localised_ms", "usable_ms", "judged_ms", "found_ms"), 1000)
+    assert found == Counters(reports=2, **times)
 
 
 def test_docks_and_innovations() -> None:

@@ -107,6 +107,8 @@ def test_a_draft_of_an_older_store_is_known_by_the_job_that_its_log_names(tmp_pa
         save_sample_draft(store, actor=Actor("ada", "nightly job 18 was lost"))
     connection = sqlite3.connect(tmp_path / "store.sqlite3")
     connection.execute("ALTER TABLE versions DROP COLUMN job")
+    for name in ("judged_ms", "found_ms", "continued"):
+        connection.execute(f"ALTER TABLE tallies DROP COLUMN {name}")
     connection.execute("PRAGMA user_version = 4")
     connection.close()
     with MapStore.open(tmp_path) as store:

@@ -24,7 +24,7 @@ _COLUMNS = {
     "state": "State",
     "version": "Map version",
     "rate": "Failures in 24 h",
-    "localised": "Localised",
+    "localised": "Localised while driving",
     "since": "Last heard",
     "remarks": "Remarks",
 }
@@ -77,6 +77,7 @@ def _figures(live: LiveSite, health: SiteHealth) -> Markup:
     return fleet_parts.figures(
         [
             Figure("Robots heard now", f"{heard} of {len(live.robots)}", "reported within 10 s"),
+            fleet_parts.localised_figure("Localised while driving, last 24 h", day),
             Figure("Localised now", live.count("good"), f"{live.count('warn')} unsure or starting", "good"),
             Figure("Lost now", lost, "position unknown", "bad" if lost else ""),
             fleet_parts.rate_figure("Failures per robot-day, last 24 h", day.failures, f"; {health.trend}"),
@@ -162,8 +163,8 @@ def _row(context: PageContext, robot: LiveRobot, health: SiteHealth) -> dict[str
         "state": robot.words,
         "tone": robot.tone,
         "version": version,
-        "rate": 0 if own is None else own.failures.events,
-        "localised": "–" if own is None else share(own.localised_share) or "–",
+        "rate": 0 if own is None else own.failures.events + own.failures_running,
+        "localised": "–" if own is None else share(own.localised_share_of_all) or "–",
         "since": "now" if robot.seconds_since < 3 else f"{age(robot.seconds_since)} ago",
         "remarks": ", ".join(remarks),
         "to": context.to("failures", robot=robot.name),

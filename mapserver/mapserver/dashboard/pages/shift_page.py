@@ -48,12 +48,13 @@ def _figures(summary: FleetSummary) -> Markup:
     lost = f"{_number(total.frame_ms_mean, 'ms')} of CPU per frame"
     return fleet_parts.figures(
         [
+            fleet_parts.localised_figure("Localised while driving", total),
             fleet_parts.rate_figure(
                 "Failures per robot-day", total.failures, f"; before: {_rate(summary.before.failures)}"
             ),
             fleet_parts.rate_figure("Silent failures per robot-day, an estimate", total.silent_estimated, ""),
             Figure("Time with a usable position", _share(total.availability), f"of {total.observed_h:.1f} h observed"),
-            Figure("Localised", _share(total.localised_share), "of the time after the first fix"),
+            Figure("Localised after the first fix", _share(total.localised_share), "of the time since then"),
             Figure("Time to the first fix", _number(total.first_fix_mean_s, "s"), "mean"),
             Figure("Frames lost", _share(total.frame_drop_share), lost),
         ]
@@ -64,8 +65,8 @@ def _unreported(count: int) -> Markup:
     if not count:
         return Markup("")
     return Markup(
-        '<p class="notice bad">{} times a robot was blind without reporting a failure (yet): a report may be on its way, or the '
-        "robot does not report.</p>"
+        '<p class="notice bad">{} times a robot was blind or did not find itself, and reported no failure (yet): a report may be on its '
+        "way, or the robot does not report.</p>"
     ).format(count)
 
 
@@ -90,17 +91,17 @@ def _kpis_table(title: str, name: str, rows: Sequence[tuple[str, Kpis]]) -> Mark
     body = [
         (
             key or "none",
-            found.failures.events,
+            _share(found.localised_share_of_all),
+            found.failures.events + found.failures_running,
             _rate(found.failures),
             found.silent_estimated.events,
             f"{found.driving_h:.1f}",
             _share(found.availability),
-            _share(found.localised_share),
             _share(found.frame_drop_share),
         )
         for key, found in rows[:_ROWS]
     ]
-    head = (name, "Failures", "Per robot-day", "Suspected", "Hours driven", "Usable", "Localised", "Frames lost")
+    head = (name, "Localised", "Failures", "Per robot-day", "Suspected", "Hours driven", "Usable", "Frames lost")
     more = f"and {len(rows) - _ROWS} more" if len(rows) > _ROWS else ""
     shown = table(head, body, empty="", name=title)
     return Markup('<h2>{}</h2>{}<p class="quiet">{}</p>').format(title, shown, more)
