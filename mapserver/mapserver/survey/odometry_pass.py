@@ -10,12 +10,14 @@ from fleetmap.geometry import Array, rotation_between_vectors, se3
 from fleetmap.odometry import OdometryEstimate, OdometryStatus, make_odometry
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import wheel_between
+from mapserver.survey.frame_tracks import FrameTracks
 from mapserver.survey.keyframes.keyframes import FrameSummary, Keyframe, KeyframePolicy, make_keyframes, sharpness
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 _LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of a frame, as its stamp may be too early
 _GIVEN_UP_RAD, _GIVEN_UP_M = 0.1, 1.0
+_NO_IDS = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +26,8 @@ class OdometryPass:
 
     odom_from_body (F, 4, 4), covariances (F, 6, 6) in odom axes, rotation first; tracked (F,): whether the frame is tied to the
     ones before; inertial: whether gravity was found; scale_known: whether lengths are metres; has_wheels: whether wheel odometry
-    took part. Of one camera only tracked frames are in one frame and scale, and only they give keyframes.
+    took part; tracks: the points that were followed, None of given poses. Of one camera only tracked frames are in one frame and
+    scale, and only they give keyframes.
     """
 
     estimates: list[OdometryEstimate]
@@ -35,6 +38,7 @@ class OdometryPass:
     inertial: bool
     scale_known: bool = True
     has_wheels: bool = False
+    tracks: FrameTracks | None = None
 
 
 def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> OdometryPass:
@@ -48,6 +52,7 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
     policy = KeyframePolicy(settings.keyframes)
     estimates: list[OdometryEstimate] = []
     odom_from_body: list[Array] = []
+    seen: list[FrameTracks] = []
 
     def chosen() -> Iterator[tuple[int, RectifiedFrame]]:
         fed_ns = -(2**62)
@@ -58,7 +63,8 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
             odometry.handle_wheel(wheel_between(inputs.wheel, fed_ns, until_ns))
             fed_ns = until_ns
             estimate = odometry.handle_stereo(frame)
-            _append(estimate, estimates, odom_from_body)
+            seen.append(FrameTracks.of_frame(estimate))
+            _append(replace(estimate, track_ids=_NO_IDS, track_pixels=None), estimates, odom_from_body)
             tools.progress("odometry", number + 1, inputs.frame_count)
             if policy.wants(_summary(frame, estimate)):
                 yield number, frame
@@ -74,6 +80,7 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
         inertial,
         bool(estimates) and estimates[-1].scale_known,
         inertial and len(inputs.wheel) > 0 and settings.odometry.filter.use_wheels,
+        FrameTracks.joined(seen),
     )
     return done if rectifier.camera.baseline_m > 0 else longest_run(done, rectifier.body_from_cam)
 

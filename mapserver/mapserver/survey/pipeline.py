@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
 from fleetmap.errors import SurveyError
@@ -12,6 +13,7 @@ from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState, b
 from mapserver.survey.bundle.odometry_factors import blackout_factors, chain_edges, odometry_factors
 from mapserver.survey.bundle.stereo_yaw_check import NO_YAW, StereoYaw, estimate_stereo_yaw, without_stereo_yaw
 from mapserver.survey.finish.culling import Culled
+from mapserver.survey.finish.frame_adjustment import place_frames
 from mapserver.survey.finish.map_assembly import assemble
 from mapserver.survey.given_poses import poses_as_odometry
 from mapserver.survey.keyframes.connected_components import (
@@ -48,6 +50,7 @@ class Survey:
 
     odometry: the initial trajectory. state: the adjusted variables, which still name the feature of each observation.
     components: the connected components, of which one is the map. stereo_yaw: the extrinsic yaw error of the pair.
+    seen (F,): frames that points of the map place; the others are where odometry or the IMU carries them.
     """
 
     map: SurveyMap
@@ -58,6 +61,7 @@ class Survey:
     culled: Culled
     stereo_yaw: StereoYaw
     components: list[Component]
+    seen: NDArray[np.bool_]
 
 
 def survey(inputs: SurveyInputs, options: SurveyConfig, tools: SurveyTools | None = None) -> Survey:
@@ -101,11 +105,12 @@ def survey_from(
     sigmas_m = SigmaBetween(odometry.covariances[frames_of])
     components = find_components(covisibility_of(state), sigmas_m, settings.join_sigma_m)
     state, odometry, loops = only_kept(state, odometry, loops, components.kept)
-    survey_map, culled = assemble(state, odometry, settings)
+    placed = place_frames(odometry, state, settings, stereo_yaw.correction_px, tools.executor)
+    survey_map, culled = assemble(state, odometry, placed, settings)
     between = between_kept(len(survey_map.trajectory), frames_of, components.kept)
     survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
     every = [*components.components, *components.stray]
-    return Survey(survey_map, options.vocabulary, loops, odometry, state, culled, stereo_yaw, every)
+    return Survey(survey_map, options.vocabulary, loops, odometry, state, culled, stereo_yaw, every, placed.seen)
 
 
 def _initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:

@@ -21,7 +21,8 @@ class OdometryStatus(StrEnum):
 class OdometryEstimate:
     """The body at one frame.
 
-    odom_from_body (4, 4); cov_rot_trans (6, 6) in odom axes; velocity, biases (3,). track_ids (N,) of the points seen;
+    odom_from_body (4, 4); cov_rot_trans (6, 6) in odom axes; velocity, biases (3,). track_ids (N,) of the points seen and
+    track_pixels (N, 3), u_left v u_right, where (None of an odometry that follows none);
     after_gap where they had to be matched by descriptors; inertial once gravity is known. new_odom_from_old_odom is
     given when the frame `odom` was redefined (gravity found): earlier estimates must be multiplied by it from the left.
     imu_minus_cam_s is the time offset as estimated so far, 0 without an IMU.
@@ -46,3 +47,4 @@ class OdometryEstimate:
     scale_known: bool = True
     revised: tuple[tuple[int, Array], ...] = ()
     imu_minus_cam_s: float = 0.0
+    track_pixels: Array | None = None

@@ -137,6 +137,7 @@ class WindowMode(Mode):
             new_odom_from_old_odom=step.new_odom_from_old_odom,
             revised=step.revised,
             imu_minus_cam_s=offset_s,
+            track_pixels=tracked.pixels,
         )
 
 

@@ -19,7 +19,7 @@ def odometry_factors(odometry: OdometryPass, map_from_body: Array) -> list[Relat
     For one camera this also holds the scale, which its landmarks leave open.
     """
     return [
-        _factor(k, se3_inverse(map_from_body[k]) @ map_from_body[k + 1], 25.0 * _edge_covariance(odometry, a, b))
+        _factor(k, se3_inverse(map_from_body[k]) @ map_from_body[k + 1], 25.0 * edge_covariance(odometry, a, b))
         for k, a, b in _neighbours(odometry)
     ]
 
@@ -36,7 +36,7 @@ def blackout_factors(odometry: OdometryPass, state: SurveyState) -> list[Relativ
     for k, a, b in _neighbours(odometry):
         if min(seen[k], seen[k + 1]) < MIN_SEEN:
             i_from_j = se3_inverse(odometry.odom_from_body[a]) @ odometry.odom_from_body[b]
-            factors.append(_factor(k, i_from_j, _edge_covariance(odometry, a, b)))
+            factors.append(_factor(k, i_from_j, edge_covariance(odometry, a, b)))
     return factors
 
 
@@ -45,7 +45,7 @@ def chain_edges(odometry: OdometryPass, state: SurveyState) -> list[PoseEdge]:
     edges = []
     for k, a, b in _neighbours(odometry):
         i_from_j = se3_inverse(state.map_from_body[k]) @ state.map_from_body[k + 1]
-        edges.append(PoseEdge(k, k + 1, i_from_j, _edge_covariance(odometry, a, b), is_loop=False))
+        edges.append(PoseEdge(k, k + 1, i_from_j, edge_covariance(odometry, a, b), is_loop=False))
     return edges
 
 
@@ -59,7 +59,7 @@ def _factor(k: int, i_from_j: Array, covariance: Array) -> RelativeTerm:
     return RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(covariance).astype(np.float64))
 
 
-def _edge_covariance(odometry: OdometryPass, a: int, b: int) -> Array:
+def edge_covariance(odometry: OdometryPass, a: int, b: int) -> Array:
     """(6, 6) of i_from_j between frames a and b, axes of a: what the odometry's uncertainty gained, with a floor."""
     rotation = odometry.odom_from_body[a, :3, :3].T
     gained = odometry.covariances[b] - odometry.covariances[a]

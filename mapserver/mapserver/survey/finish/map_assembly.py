@@ -12,8 +12,8 @@ from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.bundle.bundle_rounds import SurveyState
 from mapserver.survey.finish.culling import Culled, cull
+from mapserver.survey.finish.frame_adjustment import PlacedFrames
 from mapserver.survey.finish.map_assembly_kernels import medoids
-from mapserver.survey.finish.trajectory import frame_trajectory
 from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.settings import SurveySettings
@@ -21,11 +21,12 @@ from mapserver.survey.survey_map import SurveyMap
 from mapserver.survey.tracks.tracks import Landmarks, of_features
 
 _PATCH_HALF_PX = 10  # a 9 px window seen from nearer or turned still finds all of itself
-_MIN_TIED = 8
 _CHUNK = 5000  # landmarks
 
 
-def assemble(state: SurveyState, odometry: OdometryPass, settings: SurveySettings) -> tuple[SurveyMap, Culled]:
+def assemble(
+    state: SurveyState, odometry: OdometryPass, placed: PlacedFrames, settings: SurveySettings
+) -> tuple[SurveyMap, Culled]:
     """The SurveyMap of an adjusted survey, in the survey's own frame, and what was left out of it."""
     every_sigma = point_sigmas_m(state)
     marks, kept, culled = cull(state, odometry.keyframes, every_sigma, settings.cull)
@@ -33,8 +34,6 @@ def assemble(state: SurveyState, odometry: OdometryPass, settings: SurveySetting
     marks = replace(marks, obs_keyframe=(np.cumsum(kept) - 1)[marks.obs_keyframe].astype(np.int32))
     octaves = of_features(marks, [k.features.octaves for k in keyframes])
     frame_stamps = np.array([e.stamp_ns for e in odometry.estimates], np.int64)
-    numbers = [k.frame_index for k in odometry.keyframes]
-    map_from_body = frame_trajectory(frame_stamps, odometry.odom_from_body, numbers, state.map_from_body)
     stamps_ns, map_from_kept = state.stamps_ns[kept], state.map_from_body[kept]
     handed_on = replace(state, stamps_ns=stamps_ns, map_from_body=map_from_kept, landmarks=marks)
     survey_map = SurveyMap(
@@ -51,8 +50,8 @@ def assemble(state: SurveyState, odometry: OdometryPass, settings: SurveySetting
         obs_pixels=marks.obs_pixels,
         obs_octave=octaves,
         obs_sigma_px=marks.obs_sigma_px,
-        trajectory=Trajectory(frame_stamps, map_from_body),
-        trajectory_estimated=_estimated(state, odometry),
+        trajectory=Trajectory(frame_stamps, placed.map_from_body),
+        trajectory_estimated=_estimated(state, odometry, placed),
         patches=cut_patches(marks, keyframes),
         scale_known=odometry.scale_known,
     )
@@ -125,10 +124,9 @@ def cut_patches(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8
     return out
 
 
-def _estimated(state: SurveyState, odometry: OdometryPass) -> NDArray[np.bool_]:
+def _estimated(state: SurveyState, odometry: OdometryPass, placed: PlacedFrames) -> NDArray[np.bool_]:
     """(F,) frames that something measured ties to the map: landmarks, unbroken odometry, or the IMU through a gap."""
-    tied = odometry.tracked.astype(bool).copy()
-    counts = np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns))
-    for keyframe, count in zip(odometry.keyframes, counts, strict=True):
-        tied[keyframe.frame_index] |= bool(count >= _MIN_TIED) or state.motion.inertial
+    tied = odometry.tracked.astype(bool) | placed.seen
+    if state.motion.inertial:
+        tied[[k.frame_index for k in odometry.keyframes]] = True
     return tied

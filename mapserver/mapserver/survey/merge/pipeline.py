@@ -1,13 +1,13 @@
 """Stages that make the next map of a survey and a map: found, adjusted together, compared, merged."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.bundle.odometry_factors import chain_edges
-from mapserver.survey.finish.trajectory import frame_trajectory
+from mapserver.survey.finish.frame_adjustment import place_frames
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
 from mapserver.survey.merge.guided_matching import Sighting, match_keyframe, session_relocalizer
@@ -106,11 +106,9 @@ def _compare(
     seen = count_landmarks(base, guess.keyframes, map_from_cam, joint.sightings)
     gone = faded(base, seen, settings) if anchored else np.zeros(len(base.points_map), bool)
     change, moved_keyframes, moved_landmarks = what_changes(base, survey, joint, gone, settings, anchored=anchored)
-    keyframe_frames = [k.frame_index for k in guess.keyframes]
-    stamps = np.array([e.stamp_ns for e in guess.estimates], np.int64)
-    trajectory = Trajectory(
-        stamps, frame_trajectory(stamps, guess.odom_from_body, keyframe_frames, joint.map_from_body)
-    )
+    there = replace(state, map_from_body=joint.map_from_body)
+    placed = place_frames(guess, there, settings, survey.stereo_yaw.correction_px)
+    trajectory = Trajectory(survey.map.trajectory.stamps_ns, placed.map_from_body)
     frames = SessionFrames(guess.keyframes, trajectory, survey.map.trajectory_estimated)
     result = merged(base, change, seen, frames, settings.sessions.new_place_landmarks)
     fresh = int((change.added_rows < 0).sum())

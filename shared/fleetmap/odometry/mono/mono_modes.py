@@ -193,6 +193,7 @@ class MonocularMode(Mode):
             new_odom_from_old_odom=None,
             scale_known=False,
             revised=step.revised,
+            track_pixels=tracked.pixels,
         )
 
     def _body(self, vision_from_cam: Array) -> Array:

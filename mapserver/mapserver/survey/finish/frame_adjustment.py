@@ -1,0 +1,245 @@
+"""Adjustment of the frames between keyframes: each is placed by the points that it shares with the adjusted keyframes.
+
+Keyframes stay where they are. Between two of them the frames, and the points that odometry followed through them, are adjusted
+together. The IMU holds frames to each other; odometry does where there is no IMU, and where pictures show too little.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.inertial import preintegrate
+from mapserver.survey.bundle.bundle_adjustment import (
+    BundleProblem,
+    BundleSettings,
+    InertialTerms,
+    MotionPrior,
+    RelativeTerm,
+    continued,
+    optimize,
+)
+from mapserver.survey.bundle.bundle_rounds import SurveyState, scaled_noise
+from mapserver.survey.bundle.odometry_factors import edge_covariance
+from mapserver.survey.bundle.stereo_yaw_check import disparity_shift
+from mapserver.survey.executor import SERIAL, Executor, in_batches
+from mapserver.survey.finish.trajectory import frame_trajectory
+from mapserver.survey.keyframes.connected_components import MIN_SEEN
+from mapserver.survey.odometry_pass import OdometryPass
+from mapserver.survey.settings import SurveySettings
+
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+_BATCH = 8  # intervals
+_BESIDE = 1  # keyframes beyond those at the ends that place points too; tracks slip, so that distant ones would bend the result
+_MIN_SPREAD = np.radians(1.0) ** 2 / 4  # of a point's rays: what two have that are 1 degree apart
+_BIAS_SIGMAS = np.repeat([np.inf, 1e-4, 1e-3], 3)  # m/s, rad/s, m/s^2, around what the keyframes were adjusted to
+# Frames begin near their optimum, and what is left to gain after these steps is hundredths of a millimetre.
+_ROUGH = BundleSettings(max_iterations=10, relative_cost_tolerance=1e-2, lambda_start=1e-6)
+_FINAL = BundleSettings(
+    max_iterations=10, relative_cost_tolerance=1e-3, lambda_start=1e-6, huber_sigmas=0.7, cutoff_sigmas=2.5
+)
+_WIDE = 25.0  # factor on odometry's covariance where it only decides what pictures leave open
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedFrames:
+    """map_from_body (F, 4, 4); seen (F,): whether points that keyframes see too place the frame, else odometry or the IMU alone."""
+
+    map_from_body: Array
+    seen: Mask
+
+
+@dataclass(frozen=True, slots=True)
+class _Interval:
+    """Frames (n,) from one keyframe to the next, their slots (n,) in the problem, and which observations (M,) are of points that
+    keyframes see."""
+
+    frames: Indices
+    slots: Indices
+    problem: BundleProblem
+    tied: Mask
+
+
+def place_frames(
+    odometry: OdometryPass,
+    state: SurveyState,
+    settings: SurveySettings,
+    correction_px: float = 0.0,
+    executor: Executor = SERIAL,
+) -> PlacedFrames:
+    """All F frames of a survey with adjusted keyframes; as odometry carries them where no points of the map are seen.
+
+    correction_px: what the survey subtracts from disparities.
+    """
+    chain = _Chain(odometry, state, settings, correction_px)
+    placed, seen = chain.map_from_body.copy(), np.zeros(len(chain.map_from_body), bool)
+    seen[chain.numbers] = np.bincount(state.landmarks.obs_keyframe, minlength=len(chain.numbers)) >= MIN_SEEN
+    if odometry.tracks is None:
+        return PlacedFrames(placed, seen)
+    ends = pairwise([-1, *chain.numbers.tolist(), len(placed)])
+    batches = in_batches([(a, b) for a, b in ends if b - a > 1], _BATCH)
+    built = ([i for a, b in batch if (i := chain.interval(a, b)) is not None] for batch in batches)
+    for results in executor.map(_adjust, settings.noise.cut_sigmas, built):
+        for frames, map_from_body, is_seen in results:
+            placed[frames], seen[frames] = map_from_body, is_seen
+    return PlacedFrames(placed, seen)
+
+
+def _adjust(cut_sigmas: float, intervals: list[_Interval]) -> list[tuple[Indices, Array, Mask]]:
+    """The frames, map_from_body and whether they are seen, of each interval; outliers are dropped on the way."""
+    out = []
+    for interval in intervals:
+        problem = interval.problem
+        result = optimize(problem, _ROUGH)
+        keep = result.squared_sigmas < cut_sigmas**2
+        problem = replace(
+            continued(problem, result),
+            obs_keyframe=problem.obs_keyframe[keep],
+            obs_landmark=problem.obs_landmark[keep],
+            obs_pixels=problem.obs_pixels[keep],
+            obs_sigma_px=problem.obs_sigma_px[keep],
+        )
+        result = optimize(problem, _FINAL)
+        ties = np.bincount(problem.obs_keyframe[interval.tied[keep]], minlength=len(problem.fixed))
+        seen = ties[interval.slots] >= MIN_SEEN
+        out.append((interval.frames, result.map_from_body[interval.slots], seen))
+    return out
+
+
+class _Chain:
+    """All frames where odometry carries them, and what they and the keyframes saw of the points that odometry followed."""
+
+    def __init__(
+        self, odometry: OdometryPass, state: SurveyState, settings: SurveySettings, correction_px: float
+    ) -> None:
+        self._odometry, self._state, self._noise = odometry, state, settings.noise
+        self._imu_noise = None if state.motion.noise is None else scaled_noise(state.motion.noise, settings)
+        self._stamps_ns = np.array([e.stamp_ns for e in odometry.estimates], np.int64)
+        self.numbers = np.array([k.frame_index for k in odometry.keyframes], np.int64)
+        self.map_from_body = frame_trajectory(
+            self._stamps_ns, odometry.odom_from_body, self.numbers.tolist(), state.map_from_body
+        )
+        self.is_keyframe = np.zeros(len(self.map_from_body), bool)
+        self.is_keyframe[self.numbers] = True
+        self._correction_px = correction_px
+
+    def interval(self, a: int, b: int) -> _Interval | None:
+        """The frames between keyframes a and b, of which one may lie beyond the ends; None where they see nothing of the map."""
+        first, last = np.searchsorted(self.numbers, [a, b])
+        beside = self.numbers[max(first - _BESIDE, 0) : last + _BESIDE + 1]
+        frames = self._frames_between(a, b)
+        nodes = np.union1d(frames, beside)
+        ids, which, pixels = self._seen_by(nodes)
+        fixed = self.is_keyframe[nodes]
+        _, marks = np.unique(ids, return_inverse=True)
+        points, known = self._points(nodes, which, marks, pixels)
+        moving, held = (np.bincount(marks[rows], minlength=len(points)) for rows in (~fixed[which], fixed[which]))
+        known &= (moving > 0) & (moving + held > 1)
+        rows = np.flatnonzero(known[marks])
+        which, marks, pixels = which[rows], (np.cumsum(known) - 1)[marks[rows]], pixels[rows]
+        tied = held[known][marks] > 0
+        ties = np.bincount(which[tied], minlength=len(nodes))
+        if (ties[~fixed] < MIN_SEEN).all():
+            return None
+        sigmas = np.tile([self._noise.aligned_sigma_px, self._noise.disparity_sigma_px], (len(rows), 1))
+        joined = np.flatnonzero((nodes >= max(a, 0)) & (nodes <= b))
+        problem = BundleProblem(
+            camera=self._state.camera,
+            body_from_cam=self._state.body_from_cam,
+            map_from_body=self.map_from_body[nodes],
+            fixed=fixed,
+            points_map=points[known],
+            obs_keyframe=which,
+            obs_landmark=marks,
+            obs_pixels=pixels,
+            obs_sigma_px=sigmas,
+            inertial=self._inertial(nodes, joined) if self._state.motion.inertial else None,
+            relative=self._relative(nodes, joined, ties >= MIN_SEEN),
+        )
+        return _Interval(frames, np.searchsorted(nodes, frames), problem, tied)
+
+    def _frames_between(self, a: int, b: int) -> Indices:
+        """Those between; before the first keyframe and after the last one only what follows on without a break."""
+        frames, lost = np.arange(a + 1, b), np.flatnonzero(~self._odometry.tracked[a + 1 : b].astype(bool))
+        if a < 0 and len(lost):
+            return frames[lost[-1] + 1 :]
+        return frames[: lost[0]] if b == len(self.is_keyframe) and len(lost) else frames
+
+    def _seen_by(self, nodes: Indices) -> tuple[Indices, Indices, Array]:
+        """Of all that the nodes saw: the track (M,), which node (M,), pixels (M, 3)."""
+        assert self._odometry.tracks is not None
+        ids, which, pixels = self._odometry.tracks.of(nodes)
+        pixels[:, 2] += self._correction_px * disparity_shift(self._state.camera, pixels)
+        return ids, which, pixels
+
+    def _points(self, nodes: Indices, which: Indices, marks: Indices, pixels: Array) -> tuple[Array, Mask]:
+        """points_map (N, 3) to start from, and which are known: by a disparity, of a keyframe's at best the nearest, else by rays."""
+        camera, count = self._state.camera, int(marks.max(initial=-1)) + 1
+        map_from_cam = self.map_from_body[nodes] @ self._state.body_from_cam
+        at_keyframe, disparities = self.is_keyframe[nodes][which], pixels[:, 0] - pixels[:, 2]
+        with np.errstate(invalid="ignore"):
+            measured = np.isfinite(disparities) & (disparities > 0) & (camera.baseline_m > 0)
+        best = np.lexsort((-disparities, ~at_keyframe, ~measured, marks))[
+            np.searchsorted(np.sort(marks), np.arange(count))
+        ]
+        seen = camera.point_from_pixel(pixels[best, :2], disparities[best])
+        at = map_from_cam[which[best]]
+        points, known = np.einsum("nij,nj->ni", at[:, :3, :3], seen) + at[:, :3, 3], measured[best]
+        if not known.all():
+            held = np.bincount(marks[at_keyframe], minlength=count) > 1
+            rows = np.flatnonzero(~known[marks] & (at_keyframe | ~held[marks]))
+            crossed, sure = self._crossings(map_from_cam[which[rows]], pixels[rows], marks[rows], count)
+            points[sure], known = crossed[sure], known | sure
+        return points, known
+
+    def _crossings(self, map_from_cam: Array, pixels: Array, marks: Indices, count: int) -> tuple[Array, Mask]:
+        """(count, 3) nearest to all rays of each point, and where they differ enough in direction to say so."""
+        camera = self._state.camera
+        rays = np.column_stack([(pixels[:, :2] - camera.lens[1:3]) / camera.focal_px, np.ones(len(pixels))])
+        rays = np.einsum("mij,mj->mi", map_from_cam[:, :3, :3], rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+        systems, sides = np.zeros((count, 3, 3)), np.zeros((count, 3))
+        np.add.at(systems, marks, across)
+        np.add.at(sides, marks, np.einsum("mij,mj->mi", across, map_from_cam[:, :3, 3]))
+        views = np.bincount(marks, minlength=count)
+        sure = np.linalg.eigvalsh(systems)[:, 0] > _MIN_SPREAD * np.maximum(views, 1)
+        points = np.full((count, 3), np.nan)
+        points[sure] = np.linalg.solve(systems[sure], sides[sure][:, :, None])[:, :, 0]
+        return points, sure
+
+    def _inertial(self, nodes: Indices, joined: Indices) -> InertialTerms:
+        """The IMU between the nodes that are joined, which are neighbours in time."""
+        motion, offset_ns = self._state.motion, int(self._state.motion.imu_minus_cam_s * 1e9)
+        assert self._imu_noise is not None
+        nearest = np.clip(np.searchsorted(self.numbers, nodes), 0, len(self.numbers) - 1)
+        gyro, accel = motion.gyro_bias_radps[nearest], motion.accel_bias_mps2[nearest]
+        stamps_ns = self._stamps_ns[nodes] + offset_ns
+        velocities = np.zeros((len(nodes), 3))
+        seconds = (stamps_ns[joined] - stamps_ns[joined[0]]) * 1e-9
+        velocities[joined] = np.gradient(self.map_from_body[nodes[joined], :3, 3], seconds, axis=0)
+        edges = []
+        for i, j in pairwise(joined.tolist()):
+            felt = preintegrate(motion.imu, int(stamps_ns[i]), int(stamps_ns[j]), gyro[i], accel[i], self._imu_noise)
+            edges.append((i, j, felt))
+        priors = [
+            MotionPrior(k, np.concatenate([np.zeros(3), gyro[k], accel[k]]), _BIAS_SIGMAS)
+            for k in joined[[0, -1]].tolist()
+        ]
+        return InertialTerms(velocities, gyro, accel, edges, priors)
+
+    def _relative(self, nodes: Indices, joined: Indices, sees: Mask) -> list[RelativeTerm]:
+        """Odometry between neighbours: weakly without an IMU, and as it is where either sees too little."""
+        odometry, terms = self._odometry, []
+        for i, j in pairwise(joined.tolist()):
+            if (sees[i] and sees[j]) and self._state.motion.inertial:
+                continue
+            f, g = int(nodes[i]), int(nodes[j])
+            wide = _WIDE if sees[i] and sees[j] else 1.0
+            i_from_j = se3_inverse(odometry.odom_from_body[f]) @ odometry.odom_from_body[g]
+            information = np.linalg.inv(wide * edge_covariance(odometry, f, g)).astype(np.float64)
+            terms.append(RelativeTerm(i, j, i_from_j, information))
+        return terms
