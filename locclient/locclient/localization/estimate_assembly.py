@@ -31,10 +31,11 @@ def assemble(estimate: Estimate, state: LocalizationState, settings: TrackSettin
     if state.confirmed is not None:
         return _of_confirmed(estimate, state.confirmed, state.has_failed, settings)
     ranking, competitors = state.candidates.ranking()
-    status = Status.AMBIGUOUS if competitors else Status.LOST if state.was_tracking else Status.INITIALISING
+    is_open = bool(competitors) or (bool(ranking) and state.candidates.may_be_lookalike(ranking[0]))
+    status = Status.AMBIGUOUS if is_open else Status.LOST if state.was_tracking else Status.INITIALISING
     estimate = replace(estimate, status=status, hypotheses=_published(ranking))
     if ranking:
-        return estimate if competitors else _with_pose(estimate, ranking[0], settings)
+        return estimate if is_open else _with_pose(estimate, ranking[0], settings)
     if state.prior is None or estimate.map_version is None:
         return estimate
     # Nothing in the map agrees: the prior and the odometry since, as far as that goes.

@@ -29,6 +29,7 @@ class HypothesisSet:
         self._disambiguated: PoseHypothesis | None = None
         self._abandoned: PoseHypothesis | None = None  # published as the robot's pose until fixes named another
         self._viewpoint_gate = ViewpointGate()
+        self.lookalike_recall = 0.0  # that places outside the map may reach; 0 where there are none
 
     def tracked(self) -> list[PoseHypothesis]:
         """All that must be propagated by the odometry."""
@@ -61,6 +62,10 @@ class HypothesisSet:
         if not any(h is best for h in order):  # it may have been pruned in a query that goes on
             return order, scoring.competitors(self.hypotheses, self._settings)
         return sorted(order, key=lambda h: h is not best), []
+
+    def may_be_lookalike(self, hypothesis: PoseHypothesis) -> bool:
+        """Whether a place that is not in the map could look as much like the hypothesis: by its recall in all queries so far."""
+        return 0.0 < self.lookalike_recall >= hypothesis.recall
 
     def is_confirmed(self, hypothesis: PoseHypothesis, fixes: Sequence[Fix]) -> bool:
         """By enough fixes over enough distance, or as the only hypothesis by a single unambiguous fix."""

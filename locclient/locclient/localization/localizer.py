@@ -66,6 +66,7 @@ class Localizer:
         self._odometry = Odometry(*rig, settings.odometry, settings.stereo)
         self._relocalizer: Relocalizer | None = None
         self._map_version: int | None = None
+        self._lookalike_recall = 0.0
         self._prior: InitialPosePrior | None = None
         self._confirmed: PoseHypothesis | None = None
         self._candidates = HypothesisSet(settings.track)  # while none is confirmed
@@ -92,9 +93,18 @@ class Localizer:
         self._prior = InitialPosePrior(prior, self._base_from_body)
 
     def handle_version(
-        self, version: int, tiles: Iterable[Tile], vocabulary: Vocabulary, survey_focal_px: float
+        self,
+        version: int,
+        tiles: Iterable[Tile],
+        vocabulary: Vocabulary,
+        survey_focal_px: float,
+        lookalike_recall: float = 0.0,
     ) -> None:
-        """The tiles to use from now on, all of one version. A map query that goes on is given up."""
+        """The tiles to use from now on, all of one version. A map query that goes on is given up.
+
+        lookalike_recall: the landmark recall that places which are not in the map may reach by their likeness to those that are.
+        """
+        self._lookalike_recall = lookalike_recall
         self._map_version = version
         view = MapView(tiles, vocabulary, survey_focal_px)
         self._relocalizer = Relocalizer(view, self._camera, self._settings.relocalizer)
@@ -249,6 +259,11 @@ class Localizer:
     def _is_reliable(self, fix: Fix) -> bool:
         return is_reliable(fix, self._settings.fix, self._track.strong_inliers)
 
+    def _is_lookalike_excluded(self) -> bool:
+        """Whether the robot cannot be where nothing is mapped and all looks like a place of the map."""
+        is_near = self._prior is not None and self._prior.is_tight(self._track.near_prior_sigma_m)
+        return is_near or self._track.is_whole_site_mapped
+
     def _observations(self, fixes: Sequence[Fix]) -> Observations:
         """The fixes of the query that goes on, with their poses at the present."""
         assert self._query_frame is not None
@@ -318,6 +333,7 @@ class Localizer:
     def _update_candidates(self, fixes: list[Fix]) -> TimeSliced[_QueryResult]:
         """Updates the candidates, and confirms the one without competitors that has enough support or a tight prior."""
         candidates = self._candidates
+        candidates.lookalike_recall = 0.0 if self._is_lookalike_excluded() else self._lookalike_recall
         yield from candidates.update(self._observations(fixes), self._odom_from_body())
         if not fixes:
             return _QueryResult(None, "nothing in the map agrees with this frame")
@@ -326,6 +342,8 @@ class Localizer:
             return _QueryResult(None, f"{len(competitors) + 1} places agree with what was seen")
         moved_m = None
         has_prior = self._prior is not None and self._prior.is_tight(self._track.tight_prior_sigma_m)
+        if not has_prior and candidates.may_be_lookalike(best):
+            return _QueryResult(None, "a place that is not in the map may look as much like this one")
         if has_prior or candidates.is_confirmed(best, fixes):
             moved_m = candidates.moved_m(best)
             candidates.reset()

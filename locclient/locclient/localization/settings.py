@@ -22,6 +22,7 @@ class TrackSettings(Section, frozen=True):
     # Votes of another place, as a share of the best one's, that forbid it; chance reaches 0.36
     strong_twin_share: float = 0.5
     tight_prior_sigma_m: float = 0.6  # a prior this tight confirms the first fix
+    near_prior_sigma_m: float = 2.1  # 3.7 sigmas of it exclude the look-alikes that the map server looks for, 8 m away
     # Squared Mahalanobis distance from the prediction: 0.999 of chi-square, 6 degrees of freedom
     innovation_limit: float = 22.458
     hypothesis_distance_m: float = 0.5  # within which fixes support one hypothesis

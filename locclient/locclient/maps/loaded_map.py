@@ -22,3 +22,9 @@ class LoadedMap:
     def version(self) -> int:
         """Its number."""
         return self.manifest.version
+
+    @property
+    def lookalike_recall(self) -> float:
+        """The landmark recall that places outside the map may reach by likeness, as its build measured; 0 for maps of older builds."""
+        found = self.manifest.report.get("lookalike_recall")
+        return float(found) if isinstance(found, int | float) else 0.0

@@ -218,8 +218,10 @@ class Robot:
         return FailureContext(failure, tuple(self._images), frame.left, map_from_cam, self.running)
 
     def _show(self, loaded: LoadedMap) -> None:
-        focal_px = loaded.manifest.camera.focal_px
-        self.localizer.handle_version(loaded.version, loaded.tiles.values(), loaded.vocabulary, focal_px)
+        focal_px, lookalike_recall = loaded.manifest.camera.focal_px, loaded.lookalike_recall
+        self.localizer.handle_version(
+            loaded.version, loaded.tiles.values(), loaded.vocabulary, focal_px, lookalike_recall
+        )
 
     def _new_trial(self) -> VersionTrial | None:
         """Begins at the last frame of the version before; None without one, then at the next frame."""

@@ -60,7 +60,7 @@ from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.landmark_budget import choose_landmarks
 from mapserver.tiles.tiling import TILE_SIZE_M, tiles_from_survey
 
-_NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled", "directions")
+_NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled", "directions", "starts")
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fleetmap")
 
 
@@ -278,7 +278,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         seconds=time.perf_counter() - run.started_s,
         peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
     )
-    report = make_report(built.surveyed, built.joined, built.accuracy, cost, evidence.directions or [])
+    report = make_report(built.surveyed, built.joined, built.accuracy, cost, evidence)
     details = DraftDetails(
         created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
         tile_size_m=TILE_SIZE_M,
@@ -315,7 +315,7 @@ def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None)
     replayed = []
     if before is not None:
         reading = options.frames, options.calibration, options.use
-        replayed = replayed_probes(options.replay, before, *reading, camera)
+        replayed = replayed_probes(options.replay, before, *reading, (camera, run.settings.orb))
     trajectories = _map_trajectories(built.joined)
     sessions = [JudgedSession(t, s.held_out, s.survey) for t, s in zip(trajectories, built.taken, strict=True)]
     return examine_draft(tiles, camera, built.vocabulary.vocabulary, before, sessions, replayed)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
 from fleetmap.errors import RecordingError
+from fleetmap.features.orb import OrbSettings
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Manifest, RecordingEntry, Tile, decode_tile, encode_tile
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
@@ -52,21 +53,25 @@ class JudgedSession(NamedTuple):
     survey: Survey
 
 
-def held_out_of(recording: Recording, selected: Sequence[int], rectifier: Rectifier, survey: Survey) -> list[HeldOut]:
+def held_out_of(
+    recording: Recording, selected: Sequence[int], rectifier: Rectifier, survey: Survey, orb: OrbSettings
+) -> list[HeldOut]:
     """Frames of a surveyed recording that did not become keyframes, read again. Damaged ones are left out."""
     keyframes = [k.frame_index for k in survey.odometry.keyframes]
     numbers = held_out_frames(keyframes, survey.map.trajectory_estimated, PROBES)
-    return _read(recording, selected, numbers, rectifier)
+    return _read(recording, selected, numbers, rectifier, orb)
 
 
-def _read(recording: Recording, selected: Sequence[int], numbers: Sequence[int], rectifier: Rectifier) -> list[HeldOut]:
+def _read(
+    recording: Recording, selected: Sequence[int], numbers: Sequence[int], rectifier: Rectifier, orb: OrbSettings
+) -> list[HeldOut]:
     found = []
     for number in numbers:
         try:
             frame = rectifier.rectify(recording.read_frame(int(selected[number])))
         except RecordingError:
             continue
-        features = probe_features(frame, rectifier.camera)
+        features = probe_features(frame, rectifier.camera, orb)
         found.append(HeldOut(number, rectifier.camera, rectifier.body_from_cam, features))
     return found
 
@@ -106,10 +111,14 @@ def replayed_probes(
     frames: str,
     calibration: Path | None,
     use: SensorSet | None,
-    pinhole: StereoCamera,
+    seen_by: tuple[StereoCamera, OrbSettings],
 ) -> list[Probe]:
-    """Frames of earlier recordings where the version that was made of them says they are; none of recordings it knows not."""
+    """Frames of earlier recordings where the version that was made of them says they are; none of recordings it knows not.
+
+    seen_by: the camera to which they are resampled, and the survey's features.
+    """
     probes: list[Probe] = []
+    pinhole, orb = seen_by
     for path in paths:
         with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
             recording = reduced(opened, use)
@@ -122,7 +131,7 @@ def replayed_probes(
             rectifier = Rectifier(recording.calibration, has_depth=has_depth, pinhole=pinhole)
             map_from_body, free = known
             numbers = spread(np.flatnonzero(free), PROBES // len(paths))
-            probes += [x.probe(map_from_body) for x in _read(recording, selected.tolist(), numbers, rectifier)]
+            probes += [x.probe(map_from_body) for x in _read(recording, selected.tolist(), numbers, rectifier, orb)]
     return probes
 
 

@@ -12,7 +12,8 @@ from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Trajectory
 from mapserver.evaluation.trajectory_error import AteResult, absolute_trajectory_error, paired
 from mapserver.quality.directions import one_way_words
-from mapserver.quality.figures import TileDirections
+from mapserver.quality.figures import Evidence, Starts, TileDirections
+from mapserver.quality.starts import lookalike_words
 from mapserver.survey.loops.loops import LoopRecord, LoopVerdict
 from mapserver.survey.merge.multi_session import Joined
 from mapserver.survey.survey_map import SurveyMap
@@ -36,7 +37,8 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     scale_error: by how much the estimate is too large (0.01 is 1 %), None without ground truth. peak_rss_mb: most memory the process held,
     in 10^6 bytes. findings: by recording, what the doctor found wanting in it, and what was corrected. culled: what the surveys did not
     hand on. sessions: what became of every recording, and of the map's landmarks by it. directions: which way the places of each tile look,
-    and which way none does.
+    and which way none does. starts: robots that start without a prior where nothing is mapped; lookalike_recall: of these, what a start
+    must exceed to be believed, None where nothing could tell.
     """
 
     recordings: list[str]
@@ -59,6 +61,8 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     culled: dict[str, int]
     sessions: list[dict[str, Any]]
     directions: list[TileDirections]
+    starts: Starts | None = None
+    lookalike_recall: float | None = None
 
 
 class Accuracy(msgspec.Struct, frozen=True):
@@ -114,7 +118,7 @@ class BuildCost(msgspec.Struct, frozen=True):
 
 
 def make_report(
-    recordings: "Sequence[Surveyed]", joined: Joined, found: Accuracy, cost: BuildCost, directions: list[TileDirections]
+    recordings: "Sequence[Surveyed]", joined: Joined, found: Accuracy, cost: BuildCost, evidence: Evidence
 ) -> BuildReport:
     """The report of surveyed recordings, map_bytes still unknown."""
     survey_map = joined.map
@@ -142,7 +146,9 @@ def make_report(
         culled={key: sum(count[key] for count in culled) for key in culled[0]},
         findings={s.entry.name: s.remarks() for s in recordings},
         sessions=sessions_report([s.entry.name for s in recordings], joined),
-        directions=directions,
+        directions=evidence.directions or [],
+        starts=evidence.starts,
+        lookalike_recall=None if evidence.starts is None else evidence.starts.lookalike_recall,
     )
 
 
@@ -195,7 +201,7 @@ def sentence(site: str, version: int, parent: int | None, report: BuildReport) -
     left = [s["recording"] for s in report.sessions if not s["joined"]]
     left_out = f"; left out, they could not be joined: {', '.join(left)}" if left else ""
     one_way = one_way_words(report.directions)
-    warned = f"; {one_way}" if one_way else ""
+    warned = "".join(f"; {words}" for words in (one_way, lookalike_words(report.starts)) if words)
     if report.scale == "unknown":
         return (
             f"site {site}: draft {version} of {report.keyframes} keyframes and {report.landmarks} landmarks, {sizes}; its scale is "

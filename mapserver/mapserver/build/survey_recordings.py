@@ -153,7 +153,7 @@ def survey_recording(
             survey=done,
             map_from_survey=map_from_survey,
             findings=admission.remarks,
-            held_out=held_out_of(recording, indices.tolist(), rectifier, done),
+            held_out=held_out_of(recording, indices.tolist(), rectifier, done, options.settings.orb),
         )
 
 

@@ -12,9 +12,9 @@ from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import Stamps
 from mapserver.quality.figures import Aliasing, Compared, Evidence, ProbeFigures, TrajectoryBreaks
-from mapserver.quality.probes import PRIOR_RADIUS_M, Probe, most_similar_beyond, relocalized
+from mapserver.quality.probes import ELSEWHERE_M, Probe, most_similar_beyond, relocalized
+from mapserver.quality.starts import starts_without_prior
 
-_ELSEWHERE_M = 2 * PRIOR_RADIUS_M + 2.0  # a neighbourhood that shares no place with the true one's
 _STRETCH_M, _APART_M = 3.0, 1.0
 _BREAK_M, _BREAK_SHARE = 0.15, 0.05
 _CONTINUOUS_NS = 500_000_000
@@ -38,6 +38,7 @@ def examine(draft: MapView, before: MapView | None, probes: Probes, motion: Traj
         last_version=compare(draft, before, probes.last_version),
         aliasing=aliasing(draft, frames),
         aliasing_before=None if before is None else aliasing(before, frames),
+        starts=starts_without_prior(draft, frames),
         motion=motion,
     )
 
@@ -87,7 +88,7 @@ def aliasing(view: MapView, probes: Sequence[Probe]) -> Aliasing | None:
     """Each probe offered with the prior of the far place that looks most like it; None where there is no such place."""
     offered = accepted = 0
     for probe in probes:
-        elsewhere = most_similar_beyond(view, probe, _ELSEWHERE_M)
+        elsewhere = most_similar_beyond(view, probe, ELSEWHERE_M)
         if elsewhere is not None:
             offered += 1
             accepted += relocalized(view, probe, elsewhere) is not None

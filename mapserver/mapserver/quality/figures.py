@@ -30,6 +30,28 @@ class Aliasing(msgspec.Struct, frozen=True):
     accepted_share: float
 
 
+class LookAlike(msgspec.Struct, frozen=True):
+    """A place, (x, y) in `map`, that is taken for another one once nothing around it is mapped; recall: landmark recall there."""
+
+    place: tuple[float, float]
+    taken_for: tuple[float, float]
+    recall: float
+
+
+class Starts(msgspec.Struct, frozen=True):
+    """Frames without a prior in the tiles less all around their own place: robots that start where nothing is mapped.
+
+    taken_share: of those that are taken for another place. lookalike_recall: the landmark recall that a start without a prior must
+    exceed: an unmapped place like these exceeds it with a probability of at most max_wrong_share. lookalikes: the taken frames.
+    """
+
+    frames: int
+    taken_share: float
+    lookalike_recall: float
+    max_wrong_share: float
+    lookalikes: list[LookAlike]
+
+
 class TrajectoryBreaks(msgspec.Struct, frozen=True):
     """Stretches of the survey against odometry: in how many separate places its trajectory is torn, and the worst difference."""
 
@@ -58,5 +80,6 @@ class Evidence(msgspec.Struct, frozen=True):
     last_version: Compared | None = None
     aliasing: Aliasing | None = None
     aliasing_before: Aliasing | None = None
+    starts: Starts | None = None
     motion: TrajectoryBreaks | None = None
     directions: list[TileDirections] | None = None

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features.orb import Features
+from fleetmap.features.orb import Features, OrbSettings
 from fleetmap.geometry import Array
 from fleetmap.numerics.time_sliced import finished
 from fleetmap.relocalization.frame_features import FrameFeatures, features_with_depth
@@ -18,6 +19,7 @@ from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from mapserver.survey.survey_map import SurveyMap
 
 PRIOR_RADIUS_M = 3.0
+ELSEWHERE_M = 2 * PRIOR_RADIUS_M + 2.0  # a neighbourhood that shares no place with the true one's
 _SAME_WAY_COSINE = 0.5
 _ROBOTS = RelocalizerSettings()
 
@@ -31,9 +33,10 @@ class Probe:
     map_from_cam: Array
 
 
-def probe_features(frame: RectifiedFrame, camera: StereoCamera) -> FrameFeatures:
-    """What a robot would extract from a frame, with the depth of all features."""
-    return features_with_depth(frame, camera, _ROBOTS.orb, _ROBOTS.stereo)
+def probe_features(frame: RectifiedFrame, camera: StereoCamera, survey_orb: OrbSettings) -> FrameFeatures:
+    """What a robot that extracts as the survey did would extract from a frame, as many as robots do, with the depth of all."""
+    orb = msgspec.structs.replace(survey_orb, count=_ROBOTS.orb.count)
+    return features_with_depth(frame, camera, orb, _ROBOTS.stereo)
 
 
 def relocalized(view: MapView, probe: Probe, prior_map_from_cam: Array) -> Fix | None:
@@ -46,6 +49,17 @@ def relocalized(view: MapView, probe: Probe, prior_map_from_cam: Array) -> Fix |
     fixes = finished(relocalizer.anywhere(probe.features, places_around(view.map_from_cam, *around)))
     near = (fix for fix in fixes if places_around(fix.map_from_cam[None], *around).all())
     return next((fix for fix in near if is_reliable(fix, _ROBOTS.fix)), None)
+
+
+def taken_elsewhere(view: MapView, probe: Probe, radius_m: float) -> Fix | None:
+    """Of the fixes that robots would believe without a prior, were nothing within a radius of a probe mapped, the one with the
+    largest landmark recall; None without any."""
+    place_m = probe.map_from_cam[:3, 3]
+    is_far = np.linalg.norm(view.map_from_cam[:, :3, 3] - place_m, axis=1) > radius_m
+    fixes = finished(Relocalizer(view, probe.camera, _ROBOTS).anywhere(probe.features, is_far))
+    far = (fix for fix in fixes if np.linalg.norm(fix.map_from_cam[:3, 3] - place_m) > radius_m)
+    believed = (fix for fix in far if is_reliable(fix, _ROBOTS.fix))
+    return max(believed, key=lambda fix: fix.landmark_recall, default=None)
 
 
 def most_similar_beyond(view: MapView, probe: Probe, radius_m: float) -> Array | None:

@@ -7,18 +7,23 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from fleetmap import features
 from fleetmap.bow import decode_vocabulary
 from fleetmap.bow.shipped_vocabulary import default_vocabulary_bytes
+from fleetmap.features.orb import Features, OrbSettings, detect_in_slices
 from fleetmap.geometry import Array, se3, so3_exp, transform_points
 from fleetmap.mapformat import BlobEntry, CameraEntry, Manifest, Tile, TileEntry, encode_tile
+from fleetmap.numerics.time_sliced import TimeSliced
+from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, Trajectory
+from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples, Trajectory
 from mapserver.build.draft_evidence import Before, HeldOut, JudgedSession, examine_draft
 from mapserver.quality.evidence import trajectory_breaks
 from mapserver.quality.figures import Evidence
 from mapserver.quality.gate import GateSettings, GateVerdict, judge
 from mapserver.quality.probes import held_out_frames, probe_features
+from mapserver.quality.starts import lookalike_words
 from mapserver.survey.pipeline import Survey, survey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
@@ -52,7 +57,7 @@ def surveyed(rig: RigCalibration) -> tuple[Survey, list[HeldOut]]:
     done = survey(inputs, SurveyConfig(SETTINGS, WORDS))
     keyframes = [k.frame_index for k in done.odometry.keyframes]
     numbers = held_out_frames(keyframes, done.map.trajectory_estimated, 40)
-    seen = [probe_features(rectifier.rectify(frames[n]), rectifier.camera) for n in numbers]
+    seen = [probe_features(rectifier.rectify(frames[n]), rectifier.camera, SETTINGS.orb) for n in numbers]
     camera, body_from_cam = rectifier.camera, rectifier.body_from_cam
     return done, [HeldOut(n, camera, body_from_cam, found) for n, found in zip(numbers, seen, strict=True)]
 
@@ -202,6 +207,35 @@ def test_a_site_that_is_in_the_map_twice_is_refused() -> None:
     assert evidence.aliasing is not None
     assert evidence.aliasing.accepted_share > 0.5
     assert any("aliasing_probes" in reason for reason in said.reasons)
+    starts = evidence.starts
+    assert starts is not None
+    assert starts.taken_share > 0.5
+    assert starts.lookalike_recall == max(alike.recall for alike in starts.lookalikes) > 0.3
+    assert starts.max_wrong_share == pytest.approx(1 / (starts.frames + 1), abs=1e-4)
+    for alike in starts.lookalikes:
+        assert abs(np.hypot(*np.subtract(alike.place, alike.taken_for)) - 20.0) < 1.0
+    assert "stays AMBIGUOUS" in lookalike_words(starts)
+
+
+def test_a_site_that_is_in_the_map_once_has_no_look_alikes() -> None:
+    _, evidence = verdict(sound()[0].map, has_current=False)
+    assert evidence.starts is None  # the room is too small for another place
+    assert lookalike_words(None) == ""
+
+
+def test_probes_are_extracted_as_the_survey_did(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[OrbSettings] = []
+
+    def other(image: Image, settings: OrbSettings) -> TimeSliced[Features]:
+        asked.append(settings)
+        return (yield from detect_in_slices(image, settings))
+
+    monkeypatch.setitem(features.EXTRACTORS, "other", other)
+    rectifier = Rectifier(calibration())
+    sample = ride_sample(two_walls, 2, FRAME_S)
+    frame = rectifier.rectify(CameraFrame(int(sample.stamps_ns[0]), sample.left[0], sample.right[0]))
+    probe_features(frame, rectifier.camera, OrbSettings(extractor="other", count=1200, fast_threshold=9))
+    assert [(s.extractor, s.fast_threshold, s.count) for s in asked] == [("other", 9, RelocalizerSettings().orb.count)]
 
 
 def test_a_map_made_with_a_wrong_calibration_is_refused() -> None:

@@ -108,12 +108,13 @@ class Robot:
         self.localizer._odometry = self.odometry  # type: ignore[assignment]
         self.frames = 0
         self.inliers = 40
+        self.landmark_recall = 1.0
         self.is_dark = False
         self.rng = np.random.default_rng(0)
         self.map_from_body = MAP_FROM_ODOM.copy()
 
-    def load(self, version: int = 1) -> "Robot":
-        self.localizer.handle_version(version, [], Vocabulary.__new__(Vocabulary), 400.0)
+    def load(self, version: int = 1, lookalike_recall: float = 0.0) -> "Robot":
+        self.localizer.handle_version(version, [], Vocabulary.__new__(Vocabulary), 400.0, lookalike_recall)
         return self
 
     def go(self, step_m: float, offsets: Iterable[Array] = TRUE, turn_rad: float = 0.02) -> Estimate:
@@ -138,6 +139,7 @@ class Robot:
             self.inliers,
             20,
             alias_ratio=self.relocalizer.alias_ratio,
+            landmark_recall=self.landmark_recall,
         )
 
     def error_m(self, estimate: Estimate) -> float:

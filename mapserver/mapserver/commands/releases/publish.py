@@ -23,6 +23,7 @@ def publish(
     """Take a draft through the gate and make it the current version; status 4 if the gate refuses it."""
     from mapserver import releases
     from mapserver.quality.directions import one_way_words
+    from mapserver.quality.starts import lookalike_words
     from mapserver.store import MapStore
 
     gate = settings_of(context).gate
@@ -40,3 +41,5 @@ def publish(
         typer.echo(f"not judged, evidence missing: {', '.join(verdict.report['not_judged'])}")
     if one_way := one_way_words(directions):
         typer.echo(one_way)
+    if alike := lookalike_words(None if evidence is None else evidence.starts):
+        typer.echo(alike)
