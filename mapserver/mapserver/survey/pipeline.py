@@ -64,6 +64,16 @@ class Survey:
     seen: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class AdjustedChain:
+    """The keyframes of a survey before its loops are closed: matched holds the pairs that were matched already."""
+
+    odometry: OdometryPass
+    state: SurveyState
+    matched: set[tuple[int, int]]
+    depths: MonoDepths | None
+
+
 def survey(inputs: SurveyInputs, options: SurveyConfig, tools: SurveyTools | None = None) -> Survey:
     """Maps one recording. Raises SurveyError where it holds too little to map."""
     tools = tools or SurveyTools()
@@ -79,6 +89,27 @@ def survey_from(
 ) -> Survey:
     """All stages after the initial trajectory."""
     settings, tools = options.settings, tools or SurveyTools()
+    chain = adjusted_chain(odometry, inputs, settings, tools)
+    odometry, state, depths = chain.odometry, chain.state, chain.depths
+    state, loops = _close_loops(odometry, state, chain.matched, options, tools)
+    odometry, state, stereo_yaw = _adjust_globally(odometry, state, depths, settings, tools)
+    tools.progress("global adjustment", 2, 2)
+    frames_of = np.array([k.frame_index for k in odometry.keyframes], np.int64)
+    sigmas_m = SigmaBetween(odometry.covariances[frames_of])
+    components = find_components(covisibility_of(state), sigmas_m, settings.join_sigma_m)
+    state, odometry, loops = only_kept(state, odometry, loops, components.kept)
+    placed = place_frames(odometry, state, settings, stereo_yaw.correction_px, tools.executor)
+    survey_map, culled = assemble(state, odometry, placed, settings)
+    between = between_kept(len(survey_map.trajectory), frames_of, components.kept)
+    survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
+    every = [*components.components, *components.stray]
+    return Survey(survey_map, options.vocabulary, loops, odometry, state, culled, stereo_yaw, every, placed.seen)
+
+
+def adjusted_chain(
+    odometry: OdometryPass, inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools
+) -> AdjustedChain:
+    """Keyframes matched with their neighbours and adjusted, before loops are looked for; SurveyError where there is too little."""
     if len(odometry.keyframes) < _MIN_KEYFRAMES:
         raise SurveyError(
             f"{len(odometry.estimates)} frames gave {len(odometry.keyframes)} keyframe(s) that belong together; a map needs "
@@ -98,19 +129,7 @@ def survey_from(
     if state.motion.inertial:
         state = bundle_rounds(state, settings, rounds=2)
     odometry = _with_depths(odometry, state, depths)
-    state, loops = _close_loops(odometry, state, matched, options, tools)
-    odometry, state, stereo_yaw = _adjust_globally(odometry, state, depths, settings, tools)
-    tools.progress("global adjustment", 2, 2)
-    frames_of = np.array([k.frame_index for k in odometry.keyframes], np.int64)
-    sigmas_m = SigmaBetween(odometry.covariances[frames_of])
-    components = find_components(covisibility_of(state), sigmas_m, settings.join_sigma_m)
-    state, odometry, loops = only_kept(state, odometry, loops, components.kept)
-    placed = place_frames(odometry, state, settings, stereo_yaw.correction_px, tools.executor)
-    survey_map, culled = assemble(state, odometry, placed, settings)
-    between = between_kept(len(survey_map.trajectory), frames_of, components.kept)
-    survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
-    every = [*components.components, *components.stray]
-    return Survey(survey_map, options.vocabulary, loops, odometry, state, culled, stereo_yaw, every, placed.seen)
+    return AdjustedChain(odometry, state, matched, depths)
 
 
 def _initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:

@@ -88,14 +88,15 @@ def pack_terms(problem: BundleProblem) -> Terms:
         relative=problem.relative,
         priors=problem.priors,
         ends=np.array([(i, j) for i, j, _ in edges], np.int64).reshape(-1, 2),
-        increments=np.array([_pack(summed) for _, _, summed in edges]).reshape(-1, 67),
+        increments=np.array([packed_increments(summed) for _, _, summed in edges]).reshape(-1, 67),
         informations=np.array([_information(summed.cov) for _, _, summed in edges]).reshape(-1, 15, 15),
         motion_mean=mean,
         motion_weight=weight,
     )
 
 
-def _pack(summed: Preintegrated) -> Array:
+def packed_increments(summed: Preintegrated) -> Array:
+    """(67,) as `inertial_residual` takes them."""
     s = summed
     increments = [s.dt_s], s.delta_rotation, s.delta_velocity_mps, s.delta_position_m
     by_gyro_accel = (

@@ -1,0 +1,15 @@
+"""Calibration measured from recordings: a rig's parameters with their covariance, or what motion would show them."""
+
+from mapserver.calibration.estimate import CalibrationEstimate, ParameterEstimate, estimate_from
+from mapserver.calibration.parameters import CalibrationParameter
+from mapserver.calibration.recordings import estimate_calibration
+from mapserver.calibration.survey_data import stretch_of_survey
+
+__all__ = [
+    "CalibrationEstimate",
+    "CalibrationParameter",
+    "ParameterEstimate",
+    "estimate_calibration",
+    "estimate_from",
+    "stretch_of_survey",
+]

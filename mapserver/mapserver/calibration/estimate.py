@@ -1,0 +1,149 @@
+"""The calibration that recordings show: every parameter with its sigma, and whether that is good enough to be used."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import Rectifier
+from mapserver.calibration.estimator import Adjusted, adjust, prior_information
+from mapserver.calibration.parameters import COLUMNS, INDEX, RANGES, CalibrationParameter, RigAxes, corrected_rig
+from mapserver.calibration.problem import CalibrationData
+
+P = CalibrationParameter
+_PAIR = {P.BASELINE, P.FOCAL_RATIO, P.PAIR_PITCH, P.PAIR_YAW, P.PAIR_ROLL, P.BASELINE_Y, P.BASELINE_Z}
+_INERTIAL = {P.CAMERA_IMU_X, P.CAMERA_IMU_Y, P.CAMERA_IMU_Z, P.TIME_OFFSET, P.GYRO_NOISE, P.ACCEL_NOISE}
+_LARGEST_PRIOR_SHARE = 0.5  # of the prior's sigma: above, the estimate is what was believed before
+_ADVICE = dict.fromkeys(P, "drive turns")
+_ADVICE[P.BASELINE] = "the accelerometer is hardly excited: start, stop and turn more often, or record wheel odometry"
+_ADVICE |= dict.fromkeys((P.CAMERA_IMU_X, P.CAMERA_IMU_Y, P.CAMERA_IMU_Z), "turn to both sides, and start and stop")
+_ADVICE |= {P.TIME_OFFSET: "begin and end turns briskly"}
+_ADVICE |= {P.CAMERA_POSITION_X: "turn to both sides", P.CAMERA_POSITION_Y: "turn to both sides"}
+_ADVICE |= {P.CAMERA_POSITION_Z: "a robot on a level floor does not show it: tilt it over a ramp, or measure by hand"}
+_ADVICE |= {P.WHEEL_SCALE: "the wheels' own error and the baseline's look alike: start, stop and turn more often"}
+_ADVICE |= dict.fromkeys((P.GYRO_NOISE, P.ACCEL_NOISE), "record for longer")
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterEstimate:
+    """Correction of one parameter: estimate 0 where the calibration is right.
+
+    sigma: the prior's where nothing shows the parameter. is_judged: known well enough to be used. reason: what motion or sensor
+    would show it, empty where it is judged.
+    """
+
+    name: CalibrationParameter
+    estimate: float
+    sigma: float
+    unit: str
+    is_judged: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """What took part."""
+
+    has_pair: bool
+    has_imu: bool
+    has_wheels: bool
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationEstimate:
+    """All parameters, and the covariance (C, C) of the first C of them, which are columns of the adjustment.
+
+    keyframes, observations: how much was seen.
+    """
+
+    parameters: tuple[ParameterEstimate, ...]
+    covariance: Array
+    keyframes: int
+    observations: int
+
+    def get(self, name: CalibrationParameter) -> ParameterEstimate:
+        """The estimate of one parameter."""
+        return next(p for p in self.parameters if p.name is name)
+
+    def corrections(self) -> Array:
+        """(C,) corrections of the judged parameters, given that the others keep their values: those are zero."""
+        theta = np.array([p.estimate for p in self.parameters[: len(COLUMNS)]])
+        judged = np.array([p.is_judged for p in self.parameters[: len(COLUMNS)]])
+        kept = ~judged
+        if kept.any() and judged.any():
+            across = self.covariance[np.ix_(judged, kept)]
+            theta[judged] -= across @ np.linalg.solve(self.covariance[np.ix_(kept, kept)], theta[kept])
+        theta[kept] = 0.0
+        return theta
+
+    def corrected(self, rig: RigCalibration) -> RigCalibration:
+        """`rig`, which must be that of the recordings, with all that is judged corrected."""
+        return corrected_rig(rig, RigAxes.of(rig, Rectifier(rig)), self.corrections())
+
+
+def estimate_from(stretches: Sequence[CalibrationData]) -> CalibrationEstimate:
+    """What stretches of drives with one rig say together."""
+    return combined([adjust(data) for data in stretches], stretches)
+
+
+def combined(adjusted: Sequence[Adjusted], stretches: Sequence[CalibrationData]) -> CalibrationEstimate:
+    """The sum of their information; the prior counts once."""
+    information = np.diag(prior_information())
+    pull = np.zeros(len(COLUMNS))
+    for each in adjusted:
+        own = each.information - np.diag(prior_information())
+        information += own
+        pull += each.information @ each.theta
+    covariance: Array = np.asarray(np.linalg.inv(information), np.float64)
+    theta = covariance @ pull
+    first = stretches[0]
+    sensors = Sensors(
+        len(first.calibration.cameras) > 1, first.is_inertial, any(len(data.wheel) > 0 for data in stretches)
+    )
+    sigmas = np.sqrt(np.diag(covariance))
+    found = [_judged(p, float(theta[INDEX[p]]), float(sigmas[INDEX[p]]), sensors) for p in COLUMNS]
+    given = first.calibration.imu
+    for name, scale, sigma in () if given is None else _noise(adjusted):
+        found.append(_judged(name, scale - 1.0, sigma, sensors))
+    keyframes = sum(len(data.stamps_ns) for data in stretches)
+    return CalibrationEstimate(tuple(found), covariance, keyframes, sum(each.observations for each in adjusted))
+
+
+def _noise(adjusted: Sequence[Adjusted]) -> list[tuple[CalibrationParameter, float, float]]:
+    """Name, scale and sigma of the IMU's noise: means weighted by their redundancy."""
+    found = []
+    for name, pairs in (
+        (P.GYRO_NOISE, [(a.scales.gyro, a.gyro_sigma) for a in adjusted]),
+        (P.ACCEL_NOISE, [(a.scales.accel, a.accel_sigma) for a in adjusted]),
+    ):
+        weights = np.array([sigma**-2.0 for _, sigma in pairs])
+        total = float(weights.sum())
+        if total > 0:
+            scale = float(weights @ [value for value, _ in pairs]) / total
+            found.append((name, scale, scale * total**-0.5))
+        else:
+            found.append((name, 1.0, RANGES[name].prior_sigma))
+    return found
+
+
+def _judged(name: CalibrationParameter, estimate: float, sigma: float, sensors: Sensors) -> ParameterEstimate:
+    limits = RANGES[name]
+    known = sigma <= limits.useful_sigma and sigma <= _LARGEST_PRIOR_SHARE * limits.prior_sigma
+    reason = "" if known else _reason(name, sensors)
+    return ParameterEstimate(name, estimate, sigma, limits.unit, known, reason)
+
+
+def _reason(name: CalibrationParameter, sensors: Sensors) -> str:
+    if name in _PAIR and not sensors.has_pair:
+        return "there is one camera"
+    if name in _INERTIAL and not sensors.has_imu:
+        return "there is no IMU"
+    if name is P.WHEEL_SCALE and not sensors.has_wheels:
+        return "there is no wheel odometry"
+    if name is P.BASELINE and not (sensors.has_imu or sensors.has_wheels):
+        return "neither an IMU nor wheels measure metres: record one of them"
+    if name.startswith("camera position") and not (sensors.has_imu or sensors.has_wheels):
+        return "there is neither an IMU nor wheel odometry"
+    return _ADVICE[name]

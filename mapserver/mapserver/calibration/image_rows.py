@@ -1,0 +1,239 @@
+"""Rows of the adjustment that images give: each observation against its landmark, as a function of the calibration.
+
+Measured pixels are taken back to the raw images once; what they mean follows from the lenses, so that a changed calibration moves the
+measurements instead of asking for other images. Rows are compared at the scale of the raw pixels, whose errors are known: at a fixed
+scale a longer focal length would shrink the errors, and so seem likelier than it is.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleetmap.geometry import Array, so3_exp
+from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from fleetmap.sensors.rectification import StereoCamera
+from mapserver.calibration.parameters import COLUMNS, INDEX, CalibrationParameter, RigAxes, corrected_rig, right_camera
+from mapserver.calibration.problem import CalibrationData, MotionState
+from mapserver.calibration.schur_kernels import ImageRows
+
+P = CalibrationParameter
+_MIN_DEPTH_M = 0.05
+_LENS = [INDEX[P.FOCAL], INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y]]
+_STEP_PX = 0.01
+HUBER_SIGMAS, CUTOFF_SIGMAS = 3.0, 8.0  # of an observation's four rows together
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Raw pixels (M, 2) in the left and the right image, and the sigmas of the rows (M, 4), infinite where nothing is seen."""
+
+    calibration: RigCalibration
+    axes: RigAxes
+    camera: StereoCamera
+    left_px: Array
+    right_px: Array
+    row_sigmas: Array
+
+    @classmethod
+    def of(cls, data: CalibrationData) -> "Observations":
+        """The observations of `data` as the raw images show them."""
+        rig, camera = data.calibration, data.rectifier.camera
+        axes = RigAxes.of(rig, data.rectifier)
+        pixels, sigma = data.obs_pixels, data.obs_sigma_px
+        left = rig.cameras[0].pixel_from_ray(_rays(camera, pixels[:, :2]) @ axes.rect_from_cam[0])
+        right = np.full_like(left, np.nan)
+        if axes.baseline_m > 0:
+            right = rig.cameras[1].pixel_from_ray(_rays(camera, pixels[:, 2:]) @ axes.rect_from_cam[1])
+        sigmas = np.column_stack([sigma[:, 0], sigma[:, 0], sigma[:, 1], sigma[:, 2]])
+        sigmas[~np.isfinite(left).all(axis=1)] = np.inf
+        sigmas[~np.isfinite(right).all(axis=1), 2:] = np.inf
+        return cls(rig, axes, camera, left, right, np.where(np.isfinite(sigmas), sigmas, np.inf))
+
+    def measured(self, theta: Array) -> Array:
+        """(M, 4) rows: left pixel, disparity and row difference in the rectified image that theta gives."""
+        rig = corrected_rig(self.calibration, self.axes, theta)
+        views = self.views(theta)
+        left = _pixels(rig.cameras[0].ray_from_pixel(self.left_px) @ self.axes.rect_from_cam[0].T, views[0])
+        if self.axes.baseline_m == 0:
+            return np.column_stack([left, np.zeros_like(left)])
+        rect_from_right, _ = right_camera(self.axes, theta)
+        right = _pixels(rig.cameras[1].ray_from_pixel(self.right_px) @ rect_from_right.T, views[1])
+        return np.column_stack([left, left - right])
+
+    def views(self, theta: Array) -> tuple[StereoCamera, StereoCamera]:
+        """The pinholes of left and right, each as long as its lens."""
+        left = self.camera.focal_px * (1.0 + float(theta[INDEX[P.FOCAL]]))
+        right = left * (1.0 + float(theta[INDEX[P.FOCAL_RATIO]]))
+        return replace(self.camera, focal_px=left), replace(self.camera, focal_px=right)
+
+    def measured_slopes(self, theta: Array) -> Array:
+        """(M, 4, C) derivatives of `measured`, the scale of its pinholes held.
+
+        A ray depends on its pixel's distance to the principal point in focal lengths, so that what it changes by with the
+        pixel says what it changes by with the lens.
+        """
+        rig, slopes = corrected_rig(self.calibration, self.axes, theta), np.zeros((len(self.left_px), 4, len(COLUMNS)))
+        views = self.views(theta)
+        left = _pixel_slopes(rig.cameras[0], self.left_px, self.axes.rect_from_cam[0], views[0])
+        slopes[:, :2, _LENS] = _by_lens(rig.cameras[0], self.left_px, left)
+        slopes[:, :2, INDEX[P.FOCAL]] /= 1.0 + theta[INDEX[P.FOCAL]]
+        if self.axes.baseline_m == 0:
+            return slopes
+        rect_from_right, _ = right_camera(self.axes, theta)
+        right = _pixel_slopes(rig.cameras[1], self.right_px, rect_from_right, views[1])
+        by_right = _by_lens(rig.cameras[1], self.right_px, right)
+        slopes[:, 2:] = slopes[:, :2]
+        slopes[:, 2:, INDEX[P.FOCAL_RATIO]] = -by_right[:, :, 0] / (1.0 + theta[INDEX[P.FOCAL_RATIO]])
+        by_right[:, :, 0] /= 1.0 + theta[INDEX[P.FOCAL]]
+        slopes[:, 2:, _LENS] -= by_right
+        rays = rig.cameras[1].ray_from_pixel(self.right_px) @ rect_from_right.T
+        for axis, parameter in enumerate((P.PAIR_PITCH, P.PAIR_YAW, P.PAIR_ROLL)):
+            turned = np.cross(np.eye(3)[axis], rays)
+            slopes[:, 2:, INDEX[parameter]] = -_projected(rays, turned) * views[1].focal_px
+        return slopes
+
+
+def _pixel_slopes(camera: CameraCalibration, pixels: Array, rect_from_cam: Array, view: StereoCamera) -> Array:
+    """(M, 2, 2) how the rectified pixel changes with the raw one, by central differences."""
+    columns = []
+    for step in np.eye(2) * _STEP_PX:
+        ends = [camera.ray_from_pixel(pixels + sign * step) @ rect_from_cam.T for sign in (1.0, -1.0)]
+        columns.append((_pixels(ends[0], view) - _pixels(ends[1], view)) / (2.0 * _STEP_PX))
+    return np.stack(columns, axis=2)
+
+
+def _pixels(rays: Array, view: StereoCamera) -> Array:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(rays[:, :2] / rays[:, 2:] * view.focal_px + [view.cx_px, view.cy_px])
+
+
+def _rays(camera: StereoCamera, pixels: Array) -> Array:
+    return np.column_stack([(pixels - [camera.cx_px, camera.cy_px]) / camera.focal_px, np.ones(len(pixels))])
+
+
+def _by_lens(camera: CameraCalibration, pixels: Array, slopes: Array) -> Array:
+    """(M, 2, 3) derivatives of rectified pixels by the logarithm of the focal length and by the principal point."""
+    by_focal = -np.einsum("mij,mj->mi", slopes, pixels - camera.intrinsics_px[2:])
+    return np.concatenate([by_focal[:, :, None], -slopes], axis=2)
+
+
+def _projected(rays: Array, change: Array) -> Array:
+    """(M, 2) how a ray's place in the plane z = 1 changes."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray((change[:, :2] - rays[:, :2] / rays[:, 2:] * change[:, 2:]) / rays[:, 2:])
+
+
+@dataclass(frozen=True)
+class _View:
+    """Landmarks as the keyframes see them: in the left camera (M, 3), and where they are from the body (M, 3), map axes."""
+
+    in_left: Array
+    from_body: Array
+    rect_from_map: Array
+    right_m: Array
+
+
+def _view(seen: Observations, data: CalibrationData, state: MotionState, theta: Array) -> _View:
+    turned = seen.axes.body_from_rect @ so3_exp(theta[INDEX[P.CAMERA_IMU_X] : INDEX[P.CAMERA_IMU_Z] + 1])
+    shift = theta[INDEX[P.CAMERA_POSITION_X] : INDEX[P.CAMERA_POSITION_Z] + 1]
+    place = seen.calibration.cameras[0].body_from_cam[:3, 3] + shift
+    body_from_map = state.map_from_body[:, :3, :3].transpose(0, 2, 1)
+    rect_from_map = (turned.T @ body_from_map)[data.obs_keyframe]
+    from_body = state.points_map[data.obs_landmark] - state.map_from_body[data.obs_keyframe, :3, 3]
+    in_left = np.einsum("mij,mj->mi", rect_from_map, from_body) - turned.T @ place
+    apart = right_camera(seen.axes, theta)[1] if seen.axes.baseline_m > 0 else np.zeros(3)
+    return _View(in_left, from_body, rect_from_map, apart)
+
+
+def image_residuals(
+    seen: Observations, data: CalibrationData, state: MotionState, theta: Array, scales: Array
+) -> tuple[Array, Array]:
+    """Whitened rows (M, 4), zero where nothing is seen, and the robust cost's weight of each observation (M,).
+
+    scales (4,): factors on the rows' sigmas.
+    """
+    view = _view(seen, data, state, theta)
+    off = seen.measured(theta) - _predicted(view, seen.views(theta))
+    usable = (view.in_left[:, 2] > _MIN_DEPTH_M)[:, None] & np.isfinite(seen.row_sigmas)
+    rows = np.where(usable, off, 0.0) / (np.where(usable, seen.row_sigmas, 1.0) * scales)
+    norm = np.linalg.norm(rows, axis=1)
+    weight = np.where(norm > CUTOFF_SIGMAS, 0.0, np.minimum(1.0, HUBER_SIGMAS / np.maximum(norm, 1e-9)))
+    return rows, weight
+
+
+def robust_cost(rows: Array) -> float:
+    """Half the robust sum of squares: square, linear from HUBER_SIGMAS, constant from CUTOFF_SIGMAS."""
+    reach = np.minimum(np.linalg.norm(rows, axis=1), CUTOFF_SIGMAS)
+    linear = HUBER_SIGMAS * (reach - 0.5 * HUBER_SIGMAS)
+    return float(np.where(reach <= HUBER_SIGMAS, 0.5 * reach**2, linear).sum())
+
+
+def image_rows(
+    seen: Observations,
+    data: CalibrationData,
+    point: tuple[MotionState, Array],
+    scales: Array,
+    fixed: tuple[Array, Array],
+) -> ImageRows:
+    """The rows and their derivatives at a state and theta.
+
+    fixed: what hardly changes near it: rates_map (K, 3), angular rate of the body, and `measured_slopes` (M, 4, C).
+    """
+    (state, theta), (rates_map, slopes) = point, fixed
+    view = _view(seen, data, state, theta)
+    rows, weight = image_residuals(seen, data, state, theta, scales)
+    views = seen.views(theta)
+    by_left = _projection_slopes(view.in_left, views[0])
+    by_cam = np.concatenate([by_left, np.zeros_like(by_left)], axis=1)
+    by_apart = np.zeros((len(rows), 4, 3))
+    if seen.axes.baseline_m > 0:
+        by_right = _projection_slopes(view.in_left - view.right_m, views[1])
+        by_cam[:, 2:], by_apart[:, 2:] = by_left - by_right, by_right
+    by_point = -np.einsum("mij,mjk->mik", by_cam, view.rect_from_map)
+    by_keyframe = np.concatenate([np.cross(by_point, view.from_body[:, None, :]), -by_point], axis=2)
+    by_calibration = slopes.copy()
+    turned = slice(INDEX[P.CAMERA_IMU_X], INDEX[P.CAMERA_IMU_Z] + 1)
+    # X <- Exp(-phi) X changes by X x phi
+    by_calibration[:, :, turned] = -np.cross(by_cam, view.in_left[:, None, :])
+    map_from_body = state.map_from_body[data.obs_keyframe, :3, :3]
+    placed = slice(INDEX[P.CAMERA_POSITION_X], INDEX[P.CAMERA_POSITION_Z] + 1)
+    by_calibration[:, :, placed] = -np.einsum("mij,mjk->mik", by_point, map_from_body)
+    rates = np.concatenate([rates_map, state.motions[:, :3]], axis=1)[data.obs_keyframe]
+    by_calibration[:, :, INDEX[P.TIME_OFFSET]] = np.einsum("mij,mj->mi", by_keyframe, rates)
+    if seen.axes.baseline_m > 0:
+        _by_baseline(by_calibration, by_apart, seen.axes, theta)
+    off = rows * np.where(np.isfinite(seen.row_sigmas), seen.row_sigmas, 0.0) * scales
+    by_calibration[:, :, INDEX[P.FOCAL]] += off / (1.0 + theta[INDEX[P.FOCAL]])
+    by_calibration[:, 2:, INDEX[P.FOCAL_RATIO]] += (off[:, 2:] - off[:, :2]) / (1.0 + theta[INDEX[P.FOCAL_RATIO]])
+    factor = np.sqrt(weight)[:, None] / np.where(np.isfinite(seen.row_sigmas), seen.row_sigmas * scales, np.inf)
+    factor[view.in_left[:, 2] <= _MIN_DEPTH_M] = 0.0
+    weighted = (np.nan_to_num(by) * factor[:, :, None] for by in (by_keyframe, by_point, by_calibration))
+    return ImageRows(rows * np.sqrt(weight)[:, None], *(np.ascontiguousarray(by) for by in weighted))
+
+
+def _by_baseline(by_calibration: Array, by_apart: Array, axes: RigAxes, theta: Array) -> None:
+    """Derivatives by the right camera's place: the disparity row holds minus the right pixel, which falls with it."""
+    for parameter in (P.BASELINE, P.BASELINE_Y, P.BASELINE_Z):
+        step = np.zeros(len(COLUMNS))
+        step[INDEX[parameter]] = 1e-6
+        moved = (right_camera(axes, theta + step)[1] - right_camera(axes, theta - step)[1]) / 2e-6
+        # row = measured - (left - right(X - t)); d right / dt = -slopes
+        by_calibration[:, :, INDEX[parameter]] = -np.einsum("mij,j->mi", by_apart, moved)
+
+
+def _predicted(view: _View, views: tuple[StereoCamera, StereoCamera]) -> Array:
+    left = views[0].pixel_from_point(view.in_left)[:, :2]
+    if not view.right_m.any():
+        return np.column_stack([left, np.zeros_like(left)])
+    right = views[1].pixel_from_point(view.in_left - view.right_m)[:, :2]
+    return np.column_stack([left, left - right])
+
+
+def _projection_slopes(points: Array, camera: StereoCamera) -> Array:
+    """(M, 2, 3) derivatives of pixels by points."""
+    z = np.maximum(points[:, 2], _MIN_DEPTH_M)
+    slopes = np.zeros((len(points), 2, 3))
+    slopes[:, 0, 0] = slopes[:, 1, 1] = camera.focal_px / z
+    slopes[:, 0, 2] = -camera.focal_px * points[:, 0] / z**2
+    slopes[:, 1, 2] = -camera.focal_px * points[:, 1] / z**2
+    return slopes

@@ -1,0 +1,50 @@
+"""Values that a calibration is estimated from: keyframes, landmarks, inertial samples, wheels."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import AnyArray, Array
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import ImuSamples, WheelSample
+
+
+@dataclass(frozen=True)
+class MotionState:
+    """Variables of K keyframes and N landmarks.
+
+    map_from_body (K, 4, 4); motions (K, 9): velocity in map, gyro bias, accelerometer bias, zero without an IMU; points_map (N, 3).
+    """
+
+    map_from_body: Array
+    motions: Array
+    points_map: Array
+
+
+@dataclass(frozen=True)
+class CalibrationData:
+    """One stretch of a recording, as a survey has followed it under `calibration`, with `rectifier` made from that.
+
+    stamps_ns (K,) on the cameras' clock. Observations are sorted by landmark: obs_keyframe, obs_landmark (M,); obs_pixels (M, 4) of
+    the rectified pair: u_left, v_left, u_right, v_right, the last two NaN where the right image shows nothing. obs_sigma_px (M, 3): of the
+    left pixel, of the disparity, of the row difference. imu: empty without one.
+    """
+
+    calibration: RigCalibration
+    rectifier: Rectifier
+    stamps_ns: NDArray[np.int64]
+    start: MotionState
+    obs_keyframe: AnyArray
+    obs_landmark: AnyArray
+    obs_pixels: Array
+    obs_sigma_px: Array
+    imu: ImuSamples
+    wheel: Sequence[WheelSample] = ()
+
+    @property
+    def is_inertial(self) -> bool:
+        """Whether an IMU takes part."""
+        return self.calibration.imu is not None and len(self.imu) > 0
