@@ -64,6 +64,9 @@ class Cause(StrEnum):
     NO_MATCH = "no_match"
     FIX_REFUSED = "fix_refused"
     MOVED = "moved"
+    CARRIED = "carried"
+    ALIASED = "aliased"
+    MAP_CHANGED = "map_changed"
     CALIBRATION = "calibration"
 
 
@@ -255,7 +258,9 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
 
     stamp_ns: when it began, sensor clock; wall_ns: the same moment by the robot's wall clock. duration_s: how long it had lasted
     when it was detected. kind: a `FailureKind`; suspected ones estimate silent failures and are not a count. cause: a `Cause`.
-    tile, map_from_base: by the last estimate. exposure: mean brightness of the left image, 0 to 1; sharpness: variance of the steps
+    tile, map_from_base, radius_95_m: what the robot believed when it began, None where it had claimed no pose. wrong_by_m: how far from
+    there fixes that agree with each other put it, None where none do. landmarks_expected, landmarks_seen: in the image from which on
+    the robot was not localised, by its belief then. exposure: mean brightness of the left image, 0 to 1; sharpness: variance of the steps
     between neighbouring pixels of a row, 1 is typical for the robot.
     """
 
@@ -272,6 +277,9 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     tile: tuple[int, int] | None = None
     map_from_base: Placement | None = None
     radius_95_m: float | None = None
+    wrong_by_m: float | None = None
+    landmarks_expected: int | None = None
+    landmarks_seen: int | None = None
     innovation: float | None = None
     inliers: int | None = None
     exposure: float | None = None

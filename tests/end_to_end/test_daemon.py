@@ -15,7 +15,7 @@ import pytest
 
 from fleetmap.bus import MemoryBus, MemoryHub, ZenohBus
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
-from locclient.daemon.outbox import Outbox
+from locclient.delivery.outbox import Outbox
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver.fleet.fleet import Fleet

@@ -14,11 +14,11 @@ from fleetmap.mapformat import check_name
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
 from locclient.config import LocclientConfig, RunSection
-from locclient.daemon.outbox import Outbox
 from locclient.daemon.publishers import Publisher, open_publisher
 from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
-from locclient.maps.connection import cache_folder
+from locclient.delivery.outbox import Outbox
+from locclient.maps.connection import cache_folder, outbox_path
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
@@ -70,7 +70,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         if bus is not None:
             stack.callback(bus.close)
         publisher = _publisher(config, bus, site, name, stack)
-        outbox = Outbox(outbox_path(run, site, name), max_bytes=run.spool_bytes)
+        outbox = Outbox(configured_outbox(run, site, name), max_bytes=run.spool_bytes)
         if outbox.set_aside is not None:
             _log.warning("the spool was damaged; it lies in %s now, and a new one was begun", outbox.set_aside)
         begun_s = time.monotonic()
@@ -95,7 +95,9 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         has_imu, offset_s = calibration.imu is not None, rectifier.imu_minus_cam_s
         intake = Intake(frames=run.frame_queue, imu_minus_cam_s=offset_s, has_imu=has_imu, imu_wait_s=run.imu_wait_s)
         yield RuntimeParts(
-            profile=RobotProfile(site, name, robot.base_from_body, rectifier.camera, config.localizer),
+            profile=RobotProfile(
+                site, name, robot.base_from_body, rectifier.body_from_cam, rectifier.camera, config.localizer
+            ),
             source=source,
             intake=intake,
             robot=robot,
@@ -109,11 +111,9 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         )
 
 
-def outbox_path(run: RunSection, site: str, robot: str) -> Path:
-    """The file of the spool: as set, else beside the cache, one for each robot of the machine."""
-    if run.spool is not None:
-        return Path(run.spool)
-    return cache_folder().parent / "spool" / f"{site}.{robot}.sqlite3"
+def configured_outbox(run: RunSection, site: str, robot: str) -> Path:
+    """The file of the spool: as set, else beside the usual cache."""
+    return outbox_path(site, robot) if run.spool is None else Path(run.spool)
 
 
 def _publisher(config: LocclientConfig, bus: Bus | None, site: str, name: str, stack: ExitStack) -> Publisher | None:

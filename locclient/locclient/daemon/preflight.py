@@ -13,8 +13,8 @@ from fleetmap.sensors.calibration import RigCalibration, stereo_baseline_m
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from locclient.config import LocclientConfig
-from locclient.daemon.daemon import check_run, outbox_path
-from locclient.daemon.outbox import Outbox
+from locclient.daemon.daemon import check_run, configured_outbox
+from locclient.delivery.outbox import Outbox
 from locclient.maps.connection import cache_folder
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import LocalMapSource
@@ -150,7 +150,7 @@ def _clock(now_ns: int, synchronised: bool) -> Finding:
 
 
 def _outbox(config: LocclientConfig) -> Iterator[Finding]:
-    path = outbox_path(config.run, str(config.run.site), str(config.run.robot))
+    path = configured_outbox(config.run, str(config.run.site), str(config.run.robot))
     outbox = Outbox(path, max_bytes=config.run.spool_bytes)
     counts = outbox.counts()
     text = f"{path}: {counts['waiting']} reports wait, {counts['delivered']} delivered, {counts['dropped']} dropped"

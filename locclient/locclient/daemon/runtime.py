@@ -12,11 +12,11 @@ from pathlib import Path
 
 from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.messages import RobotHealth, WantedVersion, encode_message
-from locclient.daemon.failure_files import write_failure
-from locclient.daemon.outbox import Outbox, QueuedReport
 from locclient.daemon.publishers import Publisher
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.systemd_notify import ServiceManager
+from locclient.delivery.failure_files import write_failure
+from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader

@@ -6,14 +6,14 @@ from collections import deque
 from collections.abc import Callable
 
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError
-from fleetmap.messages import FailureReport, RobotHealth, WantedVersion, decode_message
-from locclient.daemon.outbox import Outbox, QueuedReport
+from fleetmap.messages import RobotHealth, WantedVersion
+from locclient.delivery.outbox import Outbox
+from locclient.delivery.report_delivery import deliver
 from locclient.maps.map_client import MapClient
 from locclient.robot.robot import Change, VersionChange
 
 _ASK_EVERY_S = 60.0
 _BACKOFF_S, _MAX_BACKOFF_S = 1.0, 30.0
-_DELIVERED_PER_STEP = 20
 _log = logging.getLogger(__name__)
 
 
@@ -58,7 +58,8 @@ class ServerSync:
             return
         try:
             self._publish_health()
-            self._deliver()
+            if not deliver(self.client, self._outbox):
+                self._silent_until_s = self._clock_s() + _MAX_BACKOFF_S
             self._fetch_again()
             if self._announced or now_s >= self._ask_at_s:
                 self._ask(now_s)
@@ -157,37 +158,3 @@ class ServerSync:
     def _publish_health(self) -> None:
         while self.health:
             self.client.publish_health(self.health.popleft())
-
-    def _deliver(self) -> None:
-        """Failures, oldest first. One that the server refuses for now does not hold up those behind it; a damaged one is dropped."""
-        for report in self._outbox.waiting(_DELIVERED_PER_STEP):
-            if not _is_whole(report):
-                self._outbox.refused(report.id)
-                continue
-            try:
-                ack = self.client.report_failure(report.payload)
-            except UnreachableError:
-                raise
-            except LinkError as error:
-                _log.warning("the report of failure %s waits: %s", report.id, error)
-                self._silent_until_s = self._clock_s() + _MAX_BACKOFF_S
-                continue
-            if ack.id != report.id:
-                _log.warning("the server acknowledged failure %s for %s; it is sent again", ack.id, report.id)
-            elif ack.refused:
-                _log.warning("the server will not keep failure %s: %s", report.id, ack.refused)
-                self._outbox.refused(report.id)
-            else:
-                self._outbox.done(report.id)
-
-
-def _is_whole(report: QueuedReport) -> bool:
-    """Whether a report is still the one that was put into the outbox; logs where it is not."""
-    try:
-        decoded_id = decode_message(report.payload, FailureReport).id
-    except LinkError as error:
-        _log.warning("the report of failure %s is damaged and dropped: %s", report.id, error)
-        return False
-    if decoded_id != report.id:
-        _log.warning("the report of failure %s is damaged and dropped: it tells of %s", report.id, decoded_id)
-    return decoded_id == report.id

@@ -19,12 +19,16 @@ _PATIENCE_S = 120.0  # with a server that goes away in the middle of a fetch; on
 
 @dataclass(frozen=True)
 class MapConnection:
-    """What a robot reads its map from, and the client that it reports with; None where it reads a store's folder."""
+    """What a robot reads its map from, and the client that it reports with; None where it reads a store's folder.
+
+    outbox: the file in which reports of failures wait for the server.
+    """
 
     source: MapSource
     client: MapClient | None
     site: str
     robot: str
+    outbox: Path | None = None
 
 
 @contextmanager
@@ -39,14 +43,19 @@ def connected(options: dict[str, Any]) -> Iterator[MapConnection]:
     try:
         client = MapClient(bus, cache, site, robot, patience_s=_PATIENCE_S)
         client.announce_presence()
-        yield MapConnection(client, client, site, robot)
+        yield MapConnection(client, client, site, robot, outbox_path(site, robot, options["cache"]))
         for fault in cache.take_faults():
             _log.warning("tile cache: %s", fault)
     finally:
         bus.close()
 
 
-def cache_folder(setting: str | None = None) -> Path:
+def outbox_path(site: str, robot: str, cache: str | Path | None = None) -> Path:
+    """The file of the outbox beside the tile cache, one for each robot of the machine."""
+    return cache_folder(cache).parent / "spool" / f"{site}.{robot}.sqlite3"
+
+
+def cache_folder(setting: str | Path | None = None) -> Path:
     """The folder of the setting `cache`, else `fleetmap/tiles` in the user's cache folder (XDG_CACHE_HOME)."""
     if setting is not None:
         return Path(setting)

@@ -18,6 +18,7 @@ from locclient.maps.map_source import FetchedTiles, MapSource
 from locclient.replay.run_metrics import FrameRecord
 from locclient.replay.run_reporter import RunReporter
 from locclient.replay.run_result import ReplayResult
+from locclient.robot.failure_report import RobotProfile
 from locclient.robot.jit_warmup import gc_frozen
 from locclient.robot.robot import Outcome, Robot
 from locclient.robot.sensor_bundle import SensorBundle
@@ -67,7 +68,9 @@ def replay(
     if prior is not None:
         robot.localizer.handle_prior(prior)
     result = ReplayResult([], [], [], loaded.manifest, tiles, [note] if note else [])
-    reporter = RunReporter(connection, result)
+    mounting = (robot.base_from_body, rectifier.body_from_cam, rectifier.camera)
+    profile = RobotProfile(connection.site, connection.robot, *mounting, options.settings)
+    reporter = RunReporter(connection, result, profile)
     has_truth = bool(loaded.manifest.configuration.get(TRUTH_FLAG))
     begun_s, first_ns = time.monotonic(), source.played_stamp_ns(source.recorded_stamp_ns(0))
     for number, imu in enumerate(source.imu_before_each()):

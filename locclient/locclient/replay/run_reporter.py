@@ -1,25 +1,39 @@
-"""Reports of a replay to the map server: acknowledgement, poses and health, thinned by sensor time."""
+"""Reports of a replay to the map server: acknowledgement, poses and health, thinned by sensor time, and every failure."""
 
 import time
+import uuid
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 
-from fleetmap.errors import LinkError
-from fleetmap.messages import OFF_MAP, RobotHealth
+from fleetmap.errors import FleetmapError, LinkError
+from fleetmap.messages import OFF_MAP, RobotHealth, encode_message
+from locclient.delivery.outbox import Outbox, QueuedReport
+from locclient.delivery.report_delivery import deliver
 from locclient.maps.connection import MapConnection
 from locclient.maps.map_client import MapClient
 from locclient.replay.run_metrics import METRICS
 from locclient.replay.run_result import ReplayResult
+from locclient.robot.failure_report import RobotProfile, failure_report
 from locclient.robot.health_report import FixFigures
-from locclient.robot.robot import Outcome
+from locclient.robot.robot import FailureContext, Outcome
 
 _HEALTH_EVERY_NS, _POSE_EVERY_NS = 1_000_000_000, 500_000_000
 
+_OUTBOX_BYTES = 50_000_000
+_DELIVERY_S, _RETRY_S = 10.0, 0.5  # at the end of a replay, for reports that wait
+
 
 class RunReporter:
-    """Sends reports while a replay goes on; a connection that breaks is noted once and does not stop the replay."""
+    """Sends reports while a replay goes on; a connection that breaks is noted once and does not stop the replay.
 
-    def __init__(self, connection: MapConnection, result: ReplayResult) -> None:
-        self._connection, self._result = connection, result
+    Failures go the way of `locclient run`: into the outbox, and from there to the server until it has acknowledged them. What it has not
+    when the replay ends is delivered by the robot's next run.
+    """
+
+    def __init__(self, connection: MapConnection, result: ReplayResult, profile: RobotProfile) -> None:
+        self._connection, self._result, self._profile = connection, result, profile
+        self._outbox: Outbox | None = None
         self._fixes = FixFigures()
         self._health_ns = self._pose_ns = -(2**62)
         self._broken = False
@@ -29,6 +43,8 @@ class RunReporter:
     def handle(self, outcome: Outcome) -> None:
         """Sends what is due after a frame, which stands in the result already."""
         self._fixes.handle(outcome.estimate, outcome.dock_error_m)
+        if outcome.failure is not None:
+            self._report_failure(outcome.failure)
         stamp_ns = outcome.estimate.stamp_ns
         message = outcome.pose_message()
         if message is not None and stamp_ns - self._pose_ns >= _POSE_EVERY_NS:
@@ -39,9 +55,51 @@ class RunReporter:
             self._publish_health()
 
     def finish(self) -> None:
-        """Sends the last report, with the figures of the whole run."""
+        """Sends the last report, with the figures of the whole run, and waits a while for the acknowledgement of failures."""
         if self._result.estimates:
             self._publish_health()
+        path, until_s = self._connection.outbox, time.monotonic() + _DELIVERY_S
+        if path is not None and (self._outbox is not None or path.exists()):
+            while self._deliver(path) and time.monotonic() < until_s:
+                time.sleep(_RETRY_S)
+        waiting = self._result.failure_reports["waiting"]
+        if waiting:
+            self._result.notes.append(f"{waiting} reports of failures wait in {path} for the server")
+
+    def _report_failure(self, context: FailureContext) -> None:
+        counts, path = self._result.failure_reports, self._connection.outbox
+        counts["detected"] += 1
+        if self._connection.client is None or path is None:
+            return
+        began_ns = time.time_ns() - int(context.failure.duration_s * 1e9)
+        report = failure_report(context, self._profile, report_id=uuid.uuid4().hex, wall_ns=began_ns)
+        try:
+            self._open(path).put(QueuedReport(report.id, encode_message(report)))
+        except FleetmapError as error:
+            self._result.notes.append(f"the report of a failure is lost: {error}")
+            return
+        self._deliver(path)
+
+    def _open(self, path: Path) -> Outbox:
+        self._outbox = self._outbox or Outbox(path, max_bytes=_OUTBOX_BYTES)
+        return self._outbox
+
+    def _deliver(self, path: Path) -> bool:
+        """Whether reports still wait after an attempt to send them, those of earlier runs among them."""
+        counts = self._result.failure_reports
+        assert self._connection.client is not None
+        try:
+            outbox = self._open(path)
+            before = outbox.counts()["delivered"]
+            with suppress(LinkError):  # they wait
+                deliver(self._connection.client, outbox)
+            after = outbox.counts()
+        except FleetmapError as error:
+            self._result.notes.append(f"reports of failures are not sent: {error}")
+            return False
+        counts["delivered"] += after["delivered"] - before
+        counts["waiting"] = after["waiting"]
+        return after["waiting"] > 0
 
     def _publish_health(self) -> None:
         if self._connection.client is None or self._broken:

@@ -20,7 +20,8 @@ from locclient.replay.run_metrics import METRICS, FrameRecord, localised
 class ReplayResult:
     """A finished replay, one entry a frame: records, estimates, and the true map_from_body (4, 4), None where unknown.
 
-    manifest, tiles: the map that was used. notes: what a user should know of the run, in words.
+    manifest, tiles: the map that was used. notes: what a user should know of the run, in words. failure_reports: how many failures the
+    robot detected, and of their reports how many the server has and how many still wait for it.
     """
 
     frames: list[FrameRecord]
@@ -29,6 +30,7 @@ class ReplayResult:
     manifest: Manifest
     tiles: FetchedTiles
     notes: list[str] = field(default_factory=list)
+    failure_reports: dict[str, int] = field(default_factory=lambda: {"detected": 0, "delivered": 0, "waiting": 0})
 
     @property
     def stamps_ns(self) -> Stamps:
@@ -63,6 +65,7 @@ class ReplayResult:
         built["site"] = self.manifest.site
         built["tiles"] = len(self.tiles.tiles)
         built["tiles_refused"] = {f"{x},{y}": reason for (x, y), reason in sorted(self.tiles.refused.items())}
+        built["failure_reports"] = self.failure_reports
         built["notes"] = self.notes
         return built
 

@@ -80,6 +80,7 @@ class FailureMonitor:
         """
         is_lost = self._is_lost(estimate, speed_mps, may_be_mapped=may_be_mapped)
         self._last, now_ns = estimate, estimate.stamp_ns
+        contradicted_ns = self._contradicted_ns or now_ns
         self._note_fix(estimate)
         self._had_fix |= estimate.fix is not None
         blind = self._had_fix and is_blind(estimate.status, radius_95_m(estimate.cov_rot_trans))
@@ -94,9 +95,9 @@ class FailureMonitor:
             cause = self._search_causes.most_common(1)[0][0]
             return self._detected(FailureKind.NOT_FOUND, cause, self._search.began_ns, now_ns)
         if self._doubted_ns is not None and (now_ns - self._doubted_ns) * 1e-9 > SILENT_S:
-            return self._detected(FailureKind.SUSPECTED, Cause.FIX_REFUSED, self._doubted_ns, now_ns)
+            return self._detected(FailureKind.SUSPECTED, Cause.FIX_REFUSED, contradicted_ns, now_ns)
         if estimate.moved_m is not None and is_wrong(estimate.moved_m):
-            return self._detected(FailureKind.SUSPECTED, Cause.MOVED, now_ns, now_ns)
+            return self._detected(FailureKind.SUSPECTED, Cause.MOVED, contradicted_ns, now_ns)
         return None
 
     def handle_silence(self, for_s: float) -> Failure | None:

@@ -9,12 +9,12 @@ import numpy as np
 
 from fleetmap.failure_definition import may_be_mapped, radius_95_m
 from fleetmap.geometry import Array
-from fleetmap.messages import PoseMessage, Status, WantedVersion
+from fleetmap.messages import Cause, PoseMessage, Status, WantedVersion
 from fleetmap.odometry import OdometryStatus
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
-from fleetmap.sensors.samples import Image, WheelSample
+from fleetmap.sensors.samples import WheelSample
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
@@ -22,11 +22,10 @@ from locclient.maps.loaded_map import LoadedMap
 from locclient.robot.continuous_odom import ContinuousOdom, PublishedPose
 from locclient.robot.dock_check import DockCheck
 from locclient.robot.failure_monitor import Failure, FailureMonitor
+from locclient.robot.failure_onset import Evidence, Onset, OnsetRecorder, refined_cause
 from locclient.robot.sensor_bundle import SensorBundle
 from locclient.robot.version_trial import TrialSettings, TrialVerdict, VersionTrial
 
-_THUMBNAIL_EVERY_NS = 1_000_000_000
-_THUMBNAILS = 2
 _WHEEL_NS = 500_000_000  # age from which wheel odometry says nothing of the present
 Clock = Callable[[], float]  # seconds
 
@@ -50,12 +49,15 @@ class VersionChange:
 
 @dataclass(frozen=True, slots=True)
 class FailureContext:
-    """A failure with what its report shows: earlier left images with their stamps, and the input of the match view."""
+    """A failure with what its report shows: its onset, the evidence for its cause, and the version that ran.
+
+    unmatched: the onset of the search for itself that it belongs to, when the robot knew its place best; else that of the failure.
+    """
 
     failure: Failure
-    images: tuple[tuple[int, Image], ...]
-    left: Image | None
-    map_from_cam: Array | None
+    onset: Onset
+    unmatched: Onset
+    evidence: Evidence
     running: LoadedMap | None
 
 
@@ -123,7 +125,7 @@ class Robot:
         self._odom = ContinuousOdom(calibration.base_from_body)
         self.monitor = FailureMonitor()
         self._docks = DockCheck(calibration.base_from_body)
-        self._images: deque[tuple[int, Image]] = deque(maxlen=_THUMBNAILS)
+        self._onsets = OnsetRecorder()
         self._last: tuple[RectifiedFrame, Estimate] | None = None
         self._wheel: WheelSample | None = None
 
@@ -183,17 +185,17 @@ class Robot:
         self._try(estimate, frame)
         speed_mps, is_covered = self._speed_mps(estimate), self._may_be_mapped(estimate)
         failure = self.monitor.handle(estimate, speed_mps, may_be_mapped=is_covered)
-        context = None if failure is None else self._context(failure)
-        if not self._images or estimate.stamp_ns - self._images[-1][0] >= _THUMBNAIL_EVERY_NS:
-            self._images.append((estimate.stamp_ns, frame.left))
-        dock_error_m = self._docks.handle(bundle.priors, estimate)
         published = self._odom.handle(estimate)
+        odom_from_body = published.odom_from_base @ self.base_from_body
+        context = None if failure is None else self._context(failure, odom_from_body)
+        self._onsets.handle(estimate, frame.left, odom_from_body, self.monitor.begun_ns)
+        dock_error_m = self._docks.handle(bundle.priors, estimate)
         return Outcome(estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered)
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """The failure of a source that has sent no frame for so long."""
         failure = self.monitor.handle_silence(for_s)
-        return None if failure is None else self._context(failure)
+        return None if failure is None else self._context(failure, None)
 
     def _speed_mps(self, estimate: Estimate) -> float | None:
         """Horizontal speed by the wheels, else by an odometry that holds; None where neither knows it."""
@@ -210,12 +212,20 @@ class Robot:
         cells = ((tile.x, tile.y) for tile in manifest.tiles)
         return may_be_mapped(x_m, y_m, radius_95_m(estimate.cov_rot_trans), cells, manifest.tile_size_m)
 
-    def _context(self, failure: Failure) -> FailureContext:
+    def _context(self, failure: Failure, odom_from_body: Array | None) -> FailureContext:
+        """odom_from_body: of the frame with which it was detected, None where none came."""
         assert self._last is not None
-        frame, estimate = self._last
-        map_from_body = estimate.map_from_body
-        map_from_cam = None if map_from_body is None else map_from_body @ self._rectifier.body_from_cam
-        return FailureContext(failure, tuple(self._images), frame.left, map_from_cam, self.running)
+        frame, began_ns = self._last[0], failure.stamp_ns
+        evidence = Evidence()
+        if odom_from_body is not None:
+            evidence = self._onsets.evidence(failure.estimate, failure.kind, began_ns, odom_from_body)
+        failure = replace(failure, cause=refined_cause(failure.cause, evidence))
+        was_carried = failure.cause is Cause.CARRIED
+        onset = self._onsets.onset(failure.kind, began_ns, frame.left, was_carried=was_carried)
+        lasted_s = failure.duration_s + max(0, began_ns - onset.stamp_ns) * 1e-9
+        failure = replace(failure, stamp_ns=min(began_ns, onset.stamp_ns), duration_s=lasted_s)
+        unmatched = onset if was_carried else self._onsets.search or onset
+        return FailureContext(failure, onset, unmatched, evidence, self.running)
 
     def _show(self, loaded: LoadedMap) -> None:
         focal_px, lookalike_recall = loaded.manifest.camera.focal_px, loaded.lookalike_recall

@@ -12,10 +12,10 @@ import pytest
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import RecordingError
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
-from locclient.daemon.outbox import Outbox
 from locclient.daemon.runtime import Runtime, RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.systemd_notify import ServiceManager
+from locclient.delivery.outbox import Outbox
 from locclient.localization.estimate import Estimate
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource
@@ -83,9 +83,9 @@ class World:
         client = MapClient(self.bus, caches[0], "room", "r1")
         outbox = Outbox(self.folder / "spool", max_bytes=10**7)
         intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=True, imu_wait_s=1.0)
-        camera, settings = robot_world.rectifier().camera, robot_world.SETTINGS
+        rig, settings = robot_world.rectifier(), robot_world.SETTINGS
         return RuntimeParts(
-            profile=RobotProfile("room", "r1", robot.base_from_body, camera, settings),
+            profile=RobotProfile("room", "r1", robot.base_from_body, rig.body_from_cam, rig.camera, settings),
             source=source,
             intake=intake,
             robot=robot,

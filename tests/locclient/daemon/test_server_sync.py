@@ -18,8 +18,8 @@ from fleetmap.messages import (
     encode_message,
     robot_key,
 )
-from locclient.daemon.outbox import Outbox, QueuedReport
 from locclient.daemon.server_sync import ServerSync
+from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from locclient.robot.robot import Change, VersionChange

@@ -11,9 +11,9 @@ from fleetmap.geometry import se3
 from fleetmap.messages import MAX_MESSAGE_BYTES, MAX_THUMBNAIL_BYTES, encode_message
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame
-from locclient.daemon.failure_files import write_failure
+from locclient.delivery.failure_files import write_failure
 from locclient.robot.jit_warmup import warm_up_kernels
-from locclient.robot.match_view import match_view, small_jpeg
+from locclient.robot.match_view import expected_matches, match_view, small_jpeg
 from mapserver.store import MapStore
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
@@ -33,12 +33,13 @@ def test_the_match_view_tells_the_right_place_from_a_wrong_one() -> None:
     right_place = robot_world.truth(30) @ rig.body_from_cam
     wrong_place = se3(np.eye(3), np.array([1.0, 0.0, 0.0])) @ right_place
     views = [
-        match_view(left, rig.camera, place, robot_world.tiles(), robot_world.SETTINGS, "test")
+        match_view(left, expected_matches(left, rig.camera, place, robot_world.tiles(), robot_world.SETTINGS), "test")
         for place in (right_place, wrong_place)
     ]
     assert views[0].shape == (rig.camera.height_px + 30, 2 * rig.camera.width_px, 3)
     assert green(views[0]) > 2 * green(views[1])
-    nowhere = match_view(np.zeros_like(left), rig.camera, right_place, [], robot_world.SETTINGS, "dark")
+    dark = np.zeros_like(left)
+    nowhere = match_view(dark, expected_matches(dark, rig.camera, right_place, [], robot_world.SETTINGS), "dark")
     assert green(nowhere) == 0
 
 
@@ -65,7 +66,8 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
             told.append(outcome.failure)
     assert len(told) == 1
     assert told[0].failure.estimate.cause is told[0].failure.estimate.image.cause is told[0].failure.cause
-    profile = RobotProfile("room", "r1", np.eye(4), robot_world.rectifier().camera, robot_world.SETTINGS)
+    rig = robot_world.rectifier()
+    profile = RobotProfile("room", "r1", np.eye(4), rig.body_from_cam, rig.camera, robot_world.SETTINGS)
     report = failure_report(told[0], profile, report_id="ab" * 16, wall_ns=7)
     assert (report.kind, report.cause, report.version) == ("blind", "dark", 1)
     assert report.status in {"DEGRADED", "LOST"}

@@ -68,6 +68,19 @@ def bundles(frames: int, *, dark: range = range(0)) -> Iterator[SensorBundle]:
         yield SensorBundle(CameraFrame(stamp_ns, left, right), imu)
 
 
+def carried(frames: int, at: int) -> Iterator[SensorBundle]:
+    """The ride until frame `at`, in the pause at the end of a cycle; then the robot stands where frame 40 was taken, as its IMU says."""
+    sample, rng = cycle(), np.random.default_rng(at)
+    for number, bundle in enumerate(bundles(frames)):
+        if number < at:
+            yield bundle
+            continue
+        gyro, accel = (rng.normal(0.0, sigma, bundle.imu.gyro_radps.shape) for sigma in (0.003, 0.02))
+        still = ImuSamples(bundle.imu.stamps_ns, gyro, accel + np.array([0.0, 0.0, 9.81]))
+        left, right = _noisy(sample.left[40], rng), _noisy(sample.right[40], rng)
+        yield SensorBundle(CameraFrame(bundle.frame.stamp_ns, left, right), still)
+
+
 def _noisy(picture: Image, rng: np.random.Generator) -> Image:
     """With a grey value more or less in every other pixel."""
     noise = rng.integers(-1, 2, picture.shape, dtype=np.int16)

@@ -5,7 +5,7 @@ from markupsafe import Markup
 from nicegui import ui
 
 from fleetmap.errors import FleetmapError
-from fleetmap.messages import FailureKind, FailureReport
+from fleetmap.messages import Cause, FailureKind, FailureReport
 from mapserver.dashboard import drawing
 from mapserver.dashboard.drawing import Mark
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN, FilterChoices
@@ -28,6 +28,16 @@ from mapserver.store import FailureDetail, FailureFilter, FailureRow
 
 _REFRESH_S = 3.0
 _PICTURES = {"frame": "Left camera image", "matches": "Matches: the image and the landmarks expected in it"}
+_KINDS = {FailureKind.NOT_FOUND: "does not find itself"}
+_ADVICE = {
+    Cause.CARRIED: "The robot was carried: what it sees ended between two images, and its fixes agree on another place.",
+    Cause.ALIASED: "Several places of the map look like what the robot sees. Something that differs, a dock or a coarse position tells "
+    "them apart.",
+    Cause.MAP_CHANGED: "Images and odometry are sound, but far fewer landmarks are there than the map holds: survey this place again.",
+    Cause.CALIBRATION: "The cameras do not agree with the map any more: check their mounting, then calibrate the robot.",
+    Cause.DARK: "The images are dark: check the light and the lenses.",
+    Cause.NO_MATCH: "Nothing in the map agrees: not mapped, or mapped in the other direction only.",
+}
 
 
 def install(services: Services) -> None:
@@ -127,7 +137,7 @@ def _tone(row: FailureRow) -> str:
 
 
 def _kind(row: FailureRow) -> Markup:
-    return badge(_tone(row), "suspected" if row.kind == FailureKind.SUSPECTED else row.kind)
+    return badge(_tone(row), _KINDS.get(FailureKind(row.kind), row.kind) if row.kind in set(FailureKind) else row.kind)
 
 
 def _rows(context: PageContext, wanted: FailureFilter, found: list[FailureRow]) -> Markup:
@@ -164,11 +174,15 @@ def _summary(context: PageContext, detail: FailureDetail) -> Markup:
         return None if value is None else link(context.to("failures", **{name: value}), value)
 
     suspected = row.kind == FailureKind.SUSPECTED
+    advice = _ADVICE.get(Cause(row.cause)) if row.cause in set(Cause) else None
+    wrong = f"Fixes that agree with each other put the robot {figure(report.wrong_by_m, ' m')} from where it believed to be."
     doubt = (
         "The robot suspects a failure because its fixes contradict its position. Suspected failures are an estimate."
     )
-    return Markup("<div><h2>What happened</h2>{}{}</div>").format(
+    return Markup("<div><h2>What happened</h2>{}{}{}{}</div>").format(
         notice("warn", doubt) if suspected else "",
+        "" if report.wrong_by_m is None else notice("bad", wrong),
+        "" if advice is None else notice("", advice),
         facts(
             [
                 ("Began", moment(row.happened_ns)),
@@ -178,7 +192,9 @@ def _summary(context: PageContext, detail: FailureDetail) -> Markup:
                 ("Robot", same("robot", row.robot)),
                 ("Map version", same("version", row.version)),
                 ("Tile", same("tile", row.tile)),
-                ("Position uncertainty (95 % radius)", figure(report.radius_95_m, " m")),
+                ("Believed uncertainty when it began (95 % radius)", figure(report.radius_95_m, " m")),
+                ("Believed position was wrong by", figure(report.wrong_by_m, " m")),
+                ("Landmarks expected and seen", _landmarks(report)),
                 ("Last fix against prediction (squared Mahalanobis distance)", figure(report.innovation)),
                 ("Matches in the last fix", report.inliers),
                 ("Brightness of the image (0 to 1)", figure(report.exposure)),
@@ -203,13 +219,19 @@ async def _position(services: Services, context: PageContext, detail: FailureDet
         if fix.position_map_m is not None
     ]
     if row.x_map_m is not None and row.y_map_m is not None:
-        found.append(Mark(row.x_map_m, row.y_map_m, _tone(row), "cross", "last estimate"))
+        found.append(Mark(row.x_map_m, row.y_map_m, _tone(row), "cross", "believed position"))
     address, marks = context.plan_picture(version), drawing.marks(plan, found)
     picture = drawing.site_map(plan, f"Position of failure {row.number}", address, marks)
     return Markup(
-        '<div><h2>Position</h2><div class="planbox">{}</div><p class="quiet">Cross: the last estimate. Dots: fixes before it. Map '
-        "version {}.</p></div>"
+        '<div><h2>Position</h2><div class="planbox">{}</div><p class="quiet">Cross: where the robot believed to be when it began. '
+        "Dots: fixes until the report. Map version {}.</p></div>"
     ).format(picture, version)
+
+
+def _landmarks(report: FailureReport) -> str | None:
+    if report.landmarks_expected is None or report.landmarks_seen is None:
+        return None
+    return f"{report.landmarks_expected} expected, {report.landmarks_seen} seen"
 
 
 def _pictures(context: PageContext, detail: FailureDetail) -> Markup:

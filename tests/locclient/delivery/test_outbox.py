@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fleetmap.errors import StoreError
-from locclient.daemon.outbox import Outbox, QueuedReport
+from locclient.delivery.outbox import Outbox, QueuedReport
 
 
 def report(name: str, size: int = 10) -> QueuedReport:
@@ -40,7 +40,7 @@ def test_the_oldest_are_dropped_and_counted(tmp_path: Path) -> None:
 
 def test_a_killed_process_loses_nothing_that_was_put(tmp_path: Path) -> None:
     script = (
-        "import os, signal, sys; from pathlib import Path; from locclient.daemon.outbox import Outbox, QueuedReport\n"
+        "import os, signal, sys; from pathlib import Path; from locclient.delivery.outbox import Outbox, QueuedReport\n"
         "spool = Outbox(Path(sys.argv[1]), max_bytes=10**6)\n"
         "for n in range(1000):\n"
         "    spool.put(QueuedReport(str(n), b'x' * 5000)); print(n, flush=True)\n"

@@ -1,0 +1,1 @@
+"""Delivery of failure reports: kept on the disk until the server has them."""

@@ -1,0 +1,194 @@
+"""Onset of a failure: what the robot believed when it began, and pictures from before. Pure."""
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from fleetmap.failure_definition import ERROR_LIMIT_M, radius_95_m
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.messages import Cause, FailureKind
+from fleetmap.odometry import OdometryStatus
+from fleetmap.sensors.samples import Image
+from locclient.localization.estimate import Estimate
+
+PICTURE_WIDTH_PX = 240
+_BEFORE_NS = (2_000_000_000, 500_000_000)
+_EVERY_NS, _KEPT = 250_000_000, 10  # pictures of the last 2.5 s, four a second
+_BREAK_NS = 3_000_000_000  # from a break of the odometry until a failure that it explains; fixes and status need up to two seconds
+_AGREEING_FIXES = 3  # that make a place elsewhere more than chance, as for a kidnapped robot
+_RECENT_FIX_NS = 2_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """The last pose that a robot claimed: map_from_body (4, 4), cov_rot_trans (6, 6) of the frame at stamp_ns.
+
+    odom_from_body (4, 4) of the same frame, in an odometry frame that is never redefined. fix_ns: stamp of the last fix until then;
+    recall: the share of the expected landmarks that it found.
+    """
+
+    stamp_ns: int
+    map_from_body: Array
+    cov_rot_trans: Array
+    odom_from_body: Array
+    fix_ns: int
+    recall: float
+
+    def carried_on(self, odom_from_body: Array) -> Array:
+        """map_from_body (4, 4) at a later frame, by odometry."""
+        return self.map_from_body @ se3_inverse(self.odom_from_body) @ odom_from_body
+
+    @property
+    def radius_95_m(self) -> float:
+        """Radius that held the position with 95 %."""
+        return radius_95_m(self.cov_rot_trans)
+
+
+@dataclass(frozen=True, slots=True)
+class Onset:
+    """The first frame of what became a failure. left: its left image; pictures: stamps and small images, the oldest first.
+
+    map_from_body (4, 4): what the robot believed, carried on to this frame; None, as belief, where it had claimed no pose.
+    """
+
+    stamp_ns: int
+    left: Image
+    pictures: tuple[tuple[int, Image], ...]
+    belief: Belief | None
+    map_from_body: Array | None
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What speaks for a cause when a failure is detected.
+
+    wrong_by_m: how far from the belief fixes that agree with each other put the robot, None without such fixes. broke: the odometry lost
+    every track between two sound images. had_fix: a fix had agreed with the belief shortly before. places: how many places elsewhere
+    have several fixes each.
+    """
+
+    wrong_by_m: float | None = None
+    broke: bool = False
+    had_fix: bool = False
+    places: int = 0
+
+
+def refined_cause(cause: Cause, evidence: Evidence) -> Cause:
+    """The cause of a failure by the evidence; faults of the image, of the calibration and of the source stay what they are."""
+    if cause not in {Cause.AMBIGUOUS, Cause.NO_MATCH, Cause.FIX_REFUSED, Cause.MOVED, Cause.ODOMETRY}:
+        return cause
+    if evidence.wrong_by_m is not None and evidence.broke:
+        return Cause.CARRIED
+    if evidence.wrong_by_m is not None and evidence.had_fix and cause is not Cause.ODOMETRY:
+        return Cause.ALIASED
+    return Cause.ALIASED if cause is Cause.AMBIGUOUS and evidence.places >= 2 else cause
+
+
+class OnsetRecorder:
+    """Keeps small pictures of the last seconds, and the onset of everything that goes on and may become a failure."""
+
+    def __init__(self) -> None:
+        self._pictures: deque[tuple[int, Image]] = deque(maxlen=_KEPT)
+        self._open: dict[FailureKind, Onset] = {}
+        self._belief: Belief | None = None
+        self._fix: tuple[int, float] = (-(1 << 62), 0.0)
+        self._break: Onset | None = None
+        self._was_odometry_lost = True
+        self._last: tuple[Estimate, Array] | None = None
+
+    def handle(
+        self, estimate: Estimate, left: Image, odom_from_body: Array, begun_ns: Mapping[FailureKind, int]
+    ) -> None:
+        """Follows a frame. begun_ns: since when what may become a failure goes on, by kind; odom_from_body as of `Belief`."""
+        stamp_ns, self._last = estimate.stamp_ns, (estimate, odom_from_body)
+        self._note_belief(estimate, odom_from_body)
+        if self._breaks(estimate):
+            self._break = self._onset(stamp_ns, left, odom_from_body)
+        for kind, began_ns in begun_ns.items():
+            if kind not in self._open or self._open[kind].stamp_ns != began_ns:
+                self._open[kind] = self._onset(began_ns, left, odom_from_body)
+        for kind in [kind for kind in self._open if kind not in begun_ns]:
+            del self._open[kind]
+        if not self._pictures or stamp_ns - self._pictures[-1][0] >= _EVERY_NS:
+            self._pictures.append((stamp_ns, _small(left)))
+
+    @property
+    def search(self) -> Onset | None:
+        """Of the search for itself that goes on."""
+        return self._open.get(FailureKind.NOT_FOUND)
+
+    def onset(self, kind: FailureKind, began_ns: int, left: Image, *, was_carried: bool = False) -> Onset:
+        """Of a failure that has been detected; of the break of the odometry for a robot that was carried then."""
+        assert self._last is not None
+        if was_carried and self._break is not None and self._is_break_of(began_ns):
+            return self._break
+        found = self._open.get(kind)
+        return found if found is not None else self._onset(began_ns, left, self._last[1])
+
+    def evidence(self, estimate: Estimate, kind: FailureKind, began_ns: int, odom_from_body: Array) -> Evidence:
+        """For the cause of a failure that is detected with this estimate."""
+        found = self._open.get(kind)
+        belief = self._belief if found is None else found.belief
+        elsewhere = [
+            h for h in estimate.hypotheses if belief is None or _is_beyond(h.map_from_body, belief, odom_from_body)
+        ]
+        agreed = [h for h in elsewhere if h.support >= _AGREEING_FIXES]
+        wrong_by_m = estimate.moved_m
+        if wrong_by_m is None and belief is not None and agreed:
+            best = max(agreed, key=lambda hypothesis: hypothesis.support)
+            wrong_by_m = _distance_m(best.map_from_body, belief.carried_on(odom_from_body))
+        had_fix = belief is not None and began_ns - belief.fix_ns <= _RECENT_FIX_NS
+        places = sum(hypothesis.support >= 2 for hypothesis in elsewhere)
+        return Evidence(wrong_by_m, self._is_break_of(began_ns), had_fix, places)
+
+    def _is_break_of(self, began_ns: int) -> bool:
+        return self._break is not None and self._break.stamp_ns >= began_ns - _BREAK_NS
+
+    def _breaks(self, estimate: Estimate) -> bool:
+        """Whether the odometry lost its tracks with this frame though the image is sound."""
+        is_lost = estimate.odometry.status is OdometryStatus.DEGRADED
+        begins, self._was_odometry_lost = is_lost and not self._was_odometry_lost, is_lost
+        return begins and estimate.image.cause is Cause.NONE
+
+    def _note_belief(self, estimate: Estimate, odom_from_body: Array) -> None:
+        """A pose without competitors is claimed; that of a candidate which must be confirmed is not."""
+        if estimate.fix is not None:
+            self._fix = (estimate.stamp_ns, estimate.fix.landmark_recall)
+        if estimate.map_from_body is None or estimate.cov_rot_trans is None or estimate.hypotheses:
+            return
+        claimed = (estimate.map_from_body, estimate.cov_rot_trans, odom_from_body)
+        self._belief = Belief(estimate.stamp_ns, *claimed, *self._fix)
+
+    def _onset(self, stamp_ns: int, left: Image, odom_from_body: Array) -> Onset:
+        before = [self._nearest(stamp_ns - age_ns, stamp_ns) for age_ns in _BEFORE_NS]
+        chosen = {picture[0]: picture[1] for picture in before if picture is not None}
+        belief = self._belief
+        map_from_body = None if belief is None else belief.carried_on(odom_from_body)
+        return Onset(stamp_ns, left, (*chosen.items(), (stamp_ns, _small(left))), belief, map_from_body)
+
+    def _nearest(self, wanted_ns: int, before_ns: int) -> tuple[int, Image] | None:
+        """The picture nearest to a stamp, among those before another one and not more than 0.5 s off."""
+        known = [picture for picture in self._pictures if picture[0] < before_ns]
+        nearest = min(known, key=lambda picture: abs(picture[0] - wanted_ns), default=None)
+        return nearest if nearest is not None and abs(nearest[0] - wanted_ns) <= 2 * _EVERY_NS else None
+
+
+def _is_beyond(map_from_body: Array, belief: Belief, odom_from_body: Array) -> bool:
+    """Whether a pose contradicts a belief: farther than an error may be, and than the belief's own radius."""
+    off_m = _distance_m(map_from_body, belief.carried_on(odom_from_body))
+    return off_m > max(ERROR_LIMIT_M, belief.radius_95_m)
+
+
+def _distance_m(one: Array, other: Array) -> float:
+    return float(np.linalg.norm(one[:3, 3] - other[:3, 3]))
+
+
+def _small(left: Image) -> Image:
+    height, width = left.shape
+    if width <= PICTURE_WIDTH_PX:
+        return left
+    size = (PICTURE_WIDTH_PX, max(1, round(height * PICTURE_WIDTH_PX / width)))
+    return np.asarray(cv2.resize(left, size, interpolation=cv2.INTER_AREA), np.uint8)
