@@ -125,6 +125,7 @@ def test_evidence_keys_are_documented() -> None:
         figures.TileDirections,
         figures.Starts,
         figures.LookAlike,
+        figures.RigEvidence,
     )
     keys = {field.name for kind in kinds for field in msgspec.structs.fields(kind)}
     assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Evidence"))} == keys

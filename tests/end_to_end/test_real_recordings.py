@@ -17,6 +17,7 @@ from fleetmap.recordings import open_recording
 from locclient.cli import app as locclient_app
 from mapserver.cli import app as mapserver_app
 from support.recordings.realdata import real_data
+from support.storage.known_rig import known_rig
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -35,7 +36,7 @@ def built(recording: Path, out: Path, *options: object) -> Report:
     to_store = ["--site", "s", "--store", out / "store"]
     files = ["--report", out / "b.json", "--trajectory", out / "b.tum"]
     run(mapserver_app, "build", recording, *to_store, "--frame-from-ground-truth", *files, *options)
-    run(mapserver_app, "publish", *to_store)
+    run(mapserver_app, "publish", *to_store, *known_rig(out))
     report: Report = json.loads((out / "b.json").read_text())
     return report
 

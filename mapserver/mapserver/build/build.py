@@ -46,7 +46,7 @@ from mapserver.build.survey_recordings import (
 )
 from mapserver.build.vocabulary_selection import ChosenVocabulary, choose_vocabulary, judged
 from mapserver.build.worker import open_executor
-from mapserver.quality.figures import Evidence
+from mapserver.quality.figures import Evidence, merged
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
 from mapserver.survey.finish.map_transform import transform_map
@@ -318,7 +318,9 @@ def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None)
         replayed = replayed_probes(options.replay, before, *reading, (camera, run.settings.orb))
     trajectories = _map_trajectories(built.joined)
     sessions = [JudgedSession(t, s.held_out, s.survey) for t, s in zip(trajectories, built.taken, strict=True)]
-    return examine_draft(tiles, camera, built.vocabulary.vocabulary, before, sessions, replayed)
+    evidence = examine_draft(tiles, camera, built.vocabulary.vocabulary, before, sessions, replayed)
+    known = [] if before is None else before.calibrations
+    return msgspec.structs.replace(evidence, calibrations=merged([*known, *(s.calibration for s in built.taken)]))
 
 
 def _map_trajectories(joined: Joined) -> list[Trajectory]:

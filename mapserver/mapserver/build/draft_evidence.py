@@ -22,7 +22,7 @@ from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver.build.sensor_subset import reduced
 from mapserver.quality.directions import tile_directions
 from mapserver.quality.evidence import Probes, examine, trajectory_breaks
-from mapserver.quality.figures import Evidence, TrajectoryBreaks
+from mapserver.quality.figures import Evidence, RigEvidence, TrajectoryBreaks
 from mapserver.quality.probes import Probe, held_out_frames, probe_features, probes_of_map, spread
 from mapserver.store import MapStore
 from mapserver.survey.pipeline import Survey
@@ -78,16 +78,20 @@ def _read(
 
 @dataclass(frozen=True, slots=True)
 class Before:
-    """The version that a draft is built on: its manifest, its survey, its tiles."""
+    """The version that a draft is built on: its manifest, its survey, its tiles, and the calibrations judged up to it."""
 
     manifest: Manifest
     survey: SurveyMap
     tiles: list[Tile]
+    calibrations: list[RigEvidence]
 
     @classmethod
     def of(cls, maps: MapStore, manifest: Manifest, survey: SurveyMap) -> "Before":
         """The version of this manifest and archive, with its tiles from the store."""
-        return cls(manifest, survey, [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles])
+        evidence = maps.evidence(manifest.site, manifest.version)
+        known = () if evidence is None else evidence.calibrations or ()
+        judged = [RigEvidence(rig.rig, rig.judged) for rig in known if rig.judged]
+        return cls(manifest, survey, [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles], judged)
 
     def trajectory_of(self, entry: RecordingEntry) -> tuple[Array, NDArray[np.bool_]] | None:
         """(F, 4, 4) map_from_body of a recording's frames when this version was made of it, and which (F,) may be offered.

@@ -21,6 +21,7 @@ from mapserver.build.report import check_truth
 from mapserver.build.sensor_subset import reduced
 from mapserver.build.trajectory_sources import trajectory_source
 from mapserver.build.worker import read_ahead
+from mapserver.quality.figures import RigEvidence
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey_by_priors
 from mapserver.survey.finish.map_transform import scaled, scaled_state
@@ -33,8 +34,8 @@ from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyToo
 class Surveyed:
     """One recording and its survey.
 
-    map_from_survey (4, 4): by its position priors, None without any. findings: the doctor's remarks. held_out: frames that
-    the survey did not use.
+    map_from_survey (4, 4): by its position priors, None without any. findings: the doctor's remarks. calibration: what it says of
+    the calibration. held_out: frames that the survey did not use.
     """
 
     entry: RecordingEntry
@@ -45,6 +46,7 @@ class Surveyed:
     survey: Survey
     map_from_survey: Array | None
     findings: tuple[str, ...]
+    calibration: RigEvidence
     held_out: list[HeldOut]
 
     def remarks(self) -> list[str]:
@@ -54,10 +56,11 @@ class Surveyed:
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """A recording fit to be surveyed: the doctor's remarks in words, and the correction of its clocks."""
+    """A recording fit to be surveyed: the doctor's remarks in words, the correction of its clocks, what it says of its calibration."""
 
     remarks: tuple[str, ...]
     correction_s: float
+    calibration: RigEvidence
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +126,7 @@ def _admission(
         result = checked(recording, executor=executor)
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
-        return Admission(tuple(result.remarks()), result.correction_s)
+        return Admission(tuple(result.remarks()), result.correction_s, result.calibration)
 
 
 def survey_recording(
@@ -153,6 +156,7 @@ def survey_recording(
             survey=done,
             map_from_survey=map_from_survey,
             findings=admission.remarks,
+            calibration=admission.calibration,
             held_out=held_out_of(recording, indices.tolist(), rectifier, done, options.settings.orb),
         )
 

@@ -18,6 +18,7 @@ from mapserver.doctor.findings import Finding, Limits, judge, not_judged
 
 _NAME = "stereo against motion"
 _MIN_POINTS, _MIN_PAIRS = 40, 5
+_DRIVE = "drive past things that are near and far, for metres and not on the spot"
 _MIN_FLOW_PX, _MIN_SPREAD_PX = 3.0, 2.0  # of the points' motion, and of their disparities
 _LARGEST_SIGMA_PX = 1.0
 _NOISE_PX = 0.5
@@ -68,7 +69,7 @@ def stereo_against_motion(zeros: Sequence[DisparityZero], camera: StereoCamera) 
     """Judges the median of what the pairs say, in degrees by which the cameras' angle to each other is off."""
     good = [zero for zero in zeros if zero.sigma_px < _LARGEST_SIGMA_PX]
     if len(good) < _MIN_PAIRS:
-        return not_judged(_NAME, f"{len(good)} pairs of moments say enough, {_MIN_PAIRS} are needed: too little motion")
+        return not_judged(_NAME, f"{len(good)} pairs of moments say enough, {_MIN_PAIRS} are needed", _DRIVE)
     offsets = np.array([zero.offset_px for zero in good])
     offset_px = float(np.median(offsets))
     spread_px = float(1.4826 * np.median(np.abs(offsets - offset_px)) / np.sqrt(len(offsets)))

@@ -7,23 +7,27 @@ from typing import NamedTuple
 
 
 class Verdict(StrEnum):
-    """How bad a finding is. Only FAIL ends the command with another exit status."""
+    """How bad a finding is, the best first. NOT_JUDGED is no OK. Only FAIL ends the command with another exit status."""
 
     OK = "ok"
+    NOT_JUDGED = "not judged"
     WARN = "warn"
     FAIL = "fail"
-    NOT_JUDGED = "not judged"
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One check: its name, what was measured against which limit (in words of the unit), and what to do next."""
+    """One check: its name, what was measured against which limit (in words of the unit), and what to do next.
+
+    missing: for a check that is not judged, the motion or sensor that would make it observable.
+    """
 
     name: str
     verdict: Verdict
     value: float | None
     limit: str
     sentence: str
+    missing: str = ""
 
 
 class Limits(NamedTuple):
@@ -42,12 +46,12 @@ def judge(name: str, value: float, limits: Limits, good: str, bad: str) -> Findi
     return Finding(name, verdict, value, limit, good if verdict is Verdict.OK else bad)
 
 
-def not_judged(name: str, reason: str) -> Finding:
-    """A check that this recording gives no ground for."""
-    return Finding(name, Verdict.NOT_JUDGED, None, "", f"not judged: {reason}")
+def not_judged(name: str, reason: str, missing: str) -> Finding:
+    """A check that this recording gives no ground for, and what it lacks."""
+    return Finding(name, Verdict.NOT_JUDGED, None, "", f"not judged: {reason}; {missing}", missing)
 
 
 def worst(findings: Sequence[Finding]) -> Verdict:
-    """The worst verdict of all."""
-    order = [Verdict.FAIL, Verdict.WARN, Verdict.OK]
-    return next((verdict for verdict in order if any(f.verdict is verdict for f in findings)), Verdict.NOT_JUDGED)
+    """The worst verdict of all; NOT_JUDGED without any."""
+    order = list(Verdict)
+    return max((f.verdict for f in findings), key=order.index, default=Verdict.NOT_JUDGED)

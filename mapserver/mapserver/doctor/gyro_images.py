@@ -7,6 +7,7 @@ import numpy as np
 from fleetmap.geometry import Array, rotation_angle_rad, rotation_between_vectors
 from fleetmap.sensors.samples import ImuSamples, Stamps
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
+from mapserver.doctor.timing import RECORD_IMU
 
 _MIN_PAIRS = 20
 _SEARCH_S, _STEP_S = 0.2, 0.002
@@ -40,16 +41,16 @@ def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> t
 
     With them the offset in seconds, where images and gyro agree well enough to correct the calibration by it.
     """
-    reason = _why_not(turns, imu, imu_minus_cam_s)
-    if reason:
-        return [not_judged(name, reason) for name in _NAMES], None
+    unknown = _why_not(turns, imu, imu_minus_cam_s)
+    if unknown:
+        return [not_judged(name, *unknown) for name in _NAMES], None
     fit = fit_gyro(turns, imu, imu_minus_cam_s)
     if fit.correlation < 0.6:
         words = f"the images' and the gyro's rates hardly agree (correlation {fit.correlation:.2f} at best)"
         advice = "check that the IMU belongs to this camera and that both are stamped by one clock"
         return [
             Finding("gyro axes", Verdict.FAIL, fit.correlation, "fail below correlation 0.6", f"{words}; {advice}"),
-            *(not_judged(name, words) for name in _NAMES[:2]),
+            *(not_judged(name, words, "check the gyro's axes first") for name in _NAMES[:2]),
         ], None
     findings = [_offset_finding(fit, imu_minus_cam_s), _scale_finding(fit), _axes_finding(fit)]
     return findings, fit.offset_s if fit.correlation > _SURE_CORRELATION else None
@@ -76,16 +77,23 @@ def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> Gyr
     return GyroFit(_peak(offsets_s, scores, offset), body_from_gyro, scale, float(scores[offset]), axes_seen)
 
 
-def _why_not(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> str:
+def _why_not(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tuple[str, str] | None:
+    """Why the gyro cannot be judged and what recording could; None where it can."""
     if len(imu) < 10:
-        return "there is no IMU"
+        return "there is no IMU", RECORD_IMU
     if len(turns.starts_ns) < _MIN_PAIRS:
-        return f"{len(turns.starts_ns)} pairs of consecutive frames could be compared, {_MIN_PAIRS} are needed"
+        return (
+            f"{len(turns.starts_ns)} pairs of consecutive frames could be compared, {_MIN_PAIRS} are needed",
+            "record every frame",
+        )
     rates = turns.rates_body_radps, _gyro_rates(turns, imu, imu_minus_cam_s)
     spreads = [float(np.sqrt(seen.var(axis=0).sum())) for seen in rates]  # an IMU that turns alone is another robot's
     if max(spreads) < _LEAST_RATE_RADPS:
-        return f"the camera hardly turns (rates vary by {spreads[0]:.3f} rad/s)"
-    return ""
+        return (
+            f"the camera hardly turns (rates vary by {spreads[0]:.3f} rad/s)",
+            "drive curves, to the left and to the right",
+        )
+    return None
 
 
 def _gyro_rates(turns: CameraTurns, imu: ImuSamples, shift_s: float) -> Array:

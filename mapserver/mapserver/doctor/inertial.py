@@ -4,6 +4,7 @@ import numpy as np
 
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.doctor.findings import Finding, Verdict, not_judged
+from mapserver.doctor.timing import RECORD_IMU
 
 GRAVITY_MPS2 = 9.81
 _WINDOW_S = 0.5
@@ -13,7 +14,7 @@ def gravity_magnitude(imu: ImuSamples) -> Finding:
     """The magnitude of the specific force in the calmest tenth of half-second windows."""
     name = "gravity magnitude"
     if len(imu) < 100:
-        return not_judged(name, f"{len(imu)} inertial samples are too few")
+        return not_judged(name, f"{len(imu)} inertial samples are too few", RECORD_IMU)
     period_s = float(np.median(np.diff(imu.stamps_ns))) * 1e-9
     width = max(10, round(_WINDOW_S / period_s))
     count = len(imu) // width

@@ -21,7 +21,7 @@ def laplacian_variance(image: Image) -> float:
 def sharpness(variances: Sequence[float]) -> Finding:
     """Judges the variances of some frames: how sharp the median is and how many fall far below it."""
     if not variances:
-        return not_judged("sharpness", "no frame could be read")
+        return not_judged("sharpness", "no frame could be read", "copy the recording again")
     values = np.array(variances)
     median = float(np.median(values))
     blurred = float((values < _BLURRED_SHARE_OF_MEDIAN * median).mean())

@@ -11,6 +11,7 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.doctor.findings import Finding, Limits, judge, not_judged
 
 _MIN_MATCHES = 40
+_NEAR = "drive in the light where both cameras see the same things, some of them near"
 _SEARCH_ROWS_PX = 25.0
 _LARGEST_SHARE_OF_WIDTH = 0.3
 
@@ -58,7 +59,7 @@ def swapped_cameras(pairs: Sequence[StereoMatches]) -> Finding:
     disparities = np.concatenate([p.disparities_px for p in pairs]) if pairs else np.zeros(0)
     decided = disparities[np.abs(disparities) > 1.0]
     if len(decided) < _MIN_MATCHES:
-        return not_judged(name, f"{len(decided)} matches with a disparity above 1 px are too few")
+        return not_judged(name, f"{len(decided)} matches with a disparity above 1 px are too few", _NEAR)
     wrong_share = float((decided < 0).mean())
     bad = f"{wrong_share:.0%} of the matches have negative disparity; left and right are swapped, exchange the folders or topics"
     limits = Limits(0.2, 0.5, "of the matches with negative disparity")
@@ -70,7 +71,7 @@ def epipolar_error(pairs: Sequence[StereoMatches], focal_px: float) -> Finding:
     name = "epipolar error"
     errors = np.concatenate([p.row_errors_px for p in pairs]) if pairs else np.zeros(0)
     if len(errors) < _MIN_MATCHES:
-        return not_judged(name, f"{len(errors)} stereo matches are too few")
+        return not_judged(name, f"{len(errors)} stereo matches are too few", _NEAR)
     magnitude = np.abs(errors)
     median, p90 = float(np.median(magnitude)), float(np.percentile(magnitude, 90))
     columns = np.concatenate([p.columns_px for p in pairs])

@@ -8,6 +8,8 @@ from fleetmap.sensors.samples import DataIssue, Stamps
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
 
 SPARSE_S = 0.35  # frames further apart than this are keyframes, not a video
+RECORD_IMU = "record an IMU"
+_ALL_FRAMES = "record every frame of the camera"
 _SLOWEST_CAMERA_HZ, _SLOWEST_IMU_HZ = 5.0, 90.0
 
 
@@ -20,14 +22,14 @@ def camera_rate(frame_stamps_ns: Stamps) -> Finding:
     """Frames per second, by the median step."""
     period_s = median_period_s(frame_stamps_ns)
     if period_s > SPARSE_S:
-        return not_judged("camera rate", f"frames are {period_s:.2f} s apart, this is no video")
+        return not_judged("camera rate", f"frames are {period_s:.2f} s apart, this is no video", _ALL_FRAMES)
     return _rate("camera rate", 1 / period_s, _SLOWEST_CAMERA_HZ, "record with a higher frame rate")
 
 
 def imu_rate(imu_stamps_ns: Stamps) -> Finding:
     """Inertial samples per second, by the median step."""
     if len(imu_stamps_ns) < 2:
-        return not_judged("imu rate", "there is no IMU")
+        return not_judged("imu rate", "there is no IMU", RECORD_IMU)
     rate_hz = 1 / median_period_s(imu_stamps_ns)
     return _rate("imu rate", rate_hz, _SLOWEST_IMU_HZ, "set the IMU to 200 Hz, slow ones miss vibration and turns")
 
@@ -36,14 +38,14 @@ def camera_gaps(frame_stamps_ns: Stamps) -> Finding:
     """The longest time without a frame."""
     period_s = median_period_s(frame_stamps_ns)
     if period_s > SPARSE_S:
-        return not_judged("camera gaps", f"frames are {period_s:.2f} s apart, this is no video")
+        return not_judged("camera gaps", f"frames are {period_s:.2f} s apart, this is no video", _ALL_FRAMES)
     return _gaps("camera gaps", frame_stamps_ns, max(3.5 * period_s, 0.3), 2.0, "frames")
 
 
 def imu_gaps(imu_stamps_ns: Stamps) -> Finding:
     """The longest time without an inertial sample."""
     if len(imu_stamps_ns) < 2:
-        return not_judged("imu gaps", "there is no IMU")
+        return not_judged("imu gaps", "there is no IMU", RECORD_IMU)
     return _gaps("imu gaps", imu_stamps_ns, max(3.5 * median_period_s(imu_stamps_ns), 0.02), 0.2, "inertial samples")
 
 
@@ -68,7 +70,7 @@ def other_issues(issues: Sequence[DataIssue]) -> list[Finding]:
 def camera_imu_overlap(frame_stamps_ns: Stamps, imu_stamps_ns: Stamps, imu_minus_cam_s: float) -> Finding:
     """The share of frames during which the IMU ran."""
     if len(imu_stamps_ns) == 0:
-        return not_judged("camera-imu overlap", "there is no IMU")
+        return not_judged("camera-imu overlap", "there is no IMU", RECORD_IMU)
     moments_ns = frame_stamps_ns + round(imu_minus_cam_s * 1e9)
     step_ns = round(median_period_s(imu_stamps_ns) * 1e9) if len(imu_stamps_ns) > 1 else 0
     inside = (moments_ns >= imu_stamps_ns[0] - step_ns) & (moments_ns <= imu_stamps_ns[-1] + step_ns)

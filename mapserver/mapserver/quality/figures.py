@@ -1,5 +1,7 @@
 """Figures of the evidence about a draft's tiles; docs/reports.md says what they mean. Light: the store reads them."""
 
+from collections.abc import Iterable
+
 import msgspec
 
 
@@ -72,6 +74,33 @@ class TileDirections(msgspec.Struct, frozen=True):
     missing: dict[str, int]
 
 
+class RigEvidence(msgspec.Struct, frozen=True):
+    """What recordings say about one calibration; rig: its fingerprint.
+
+    judged: subjects ("pair geometry", ...) that a recording found right, of this draft or of a version that it was built on. not_judged: by
+    subject what this draft's recordings lack. doubted: by subject what speaks against the calibration, without deciding.
+    """
+
+    rig: str
+    judged: list[str] = []
+    not_judged: dict[str, str] = {}
+    doubted: dict[str, str] = {}
+
+    def unknown(self) -> dict[str, str]:
+        """By subject that nothing ever judged what is missing."""
+        return {subject: missing for subject, missing in self.not_judged.items() if subject not in self.judged}
+
+
+def merged(rigs: Iterable[RigEvidence]) -> list[RigEvidence]:
+    """One for each calibration, in their order: what one recording judged is judged, what one doubts is doubted."""
+    found: dict[str, RigEvidence] = {}
+    for new in rigs:
+        old = found.get(new.rig, RigEvidence(new.rig))
+        judged = sorted({*old.judged, *new.judged})
+        found[new.rig] = RigEvidence(new.rig, judged, new.not_judged | old.not_judged, new.doubted | old.doubted)
+    return list(found.values())
+
+
 class Evidence(msgspec.Struct, frozen=True):
     """All of it; None where there was nothing to judge by."""
 
@@ -83,3 +112,4 @@ class Evidence(msgspec.Struct, frozen=True):
     starts: Starts | None = None
     motion: TrajectoryBreaks | None = None
     directions: list[TileDirections] | None = None
+    calibrations: list[RigEvidence] | None = None

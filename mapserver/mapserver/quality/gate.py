@@ -1,5 +1,6 @@
 """Gate before publishing: reasons against a draft, by itself and beside the version that robots use now. Pure."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Any, NamedTuple
@@ -8,7 +9,7 @@ import msgspec
 
 from fleetmap.config import Section
 from fleetmap.mapformat import Manifest
-from mapserver.quality.figures import Aliasing, Compared, Evidence
+from mapserver.quality.figures import Aliasing, Compared, Evidence, RigEvidence
 
 Share = Annotated[float, msgspec.Meta(ge=0)]
 
@@ -29,6 +30,7 @@ class GateSettings(Section, frozen=True):
     min_inliers_share: Share = 0.8
     max_aliased_share: Share = 0.1
     max_breaks: int = 1
+    allow_unjudged_calibration: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +59,8 @@ def judge(
 ) -> GateVerdict:
     """The verdict on a draft; `current` is None for a site's first version, `evidence` for a draft that nobody examined.
 
-    What cannot be judged, for want of frames or of a version to compare with, is named and refuses nothing.
+    What cannot be judged, for want of frames or of a version to compare with, is named and refuses nothing; but for the calibration of a
+    site's first version, whose metres all later ones keep.
     """
     report: dict[str, Any] = {"landmarks": draft.landmarks, "tiles": len(draft.tiles), "tile_bytes": draft.tile_bytes}
     examined = evidence or Evidence()
@@ -69,6 +72,8 @@ def judge(
     ):
         _compare(name, compared, settings, found)
     _judge_aliasing(examined.aliasing, examined.aliasing_before, settings, found)
+    is_held = current is None and not settings.allow_unjudged_calibration
+    _judge_calibrations(examined.calibrations, found, is_held=is_held)
     if examined.motion is None:
         found.not_judged.append("motion")
     elif examined.motion.breaks > settings.max_breaks:
@@ -161,6 +166,24 @@ def _judge_aliasing(
             f"aliasing_probes: {aliasing.accepted_share:.3f} of {aliasing.offered} frames are taken for another place that looks "
             f"like theirs, max_aliased_share is {settings.max_aliased_share:g}; if the site really looks alike there, raise it"
         )
+
+
+def _judge_calibrations(calibrations: Sequence[RigEvidence] | None, found: _Findings, *, is_held: bool) -> None:
+    """Doubts are for a person. So is what nobody judged where `is_held`: of a site's first map, with which later ones are compared."""
+    if calibrations is None:
+        found.not_judged.append("calibration")
+        return
+    for rig in calibrations:
+        found.reasons.extend([f"calibration {rig.rig}: {subject}: {words}" for subject, words in rig.doubted.items()])
+        for subject, missing in rig.unknown().items():
+            words = f"{subject} of calibration {rig.rig}: {missing}"
+            if is_held:
+                found.reasons.append(
+                    f"nothing judged the {words}; survey so, together with this recording or before it, or publish with --force, or "
+                    "set allow_unjudged_calibration, where you know it to be right"
+                )
+            else:
+                found.not_judged.append(words)
 
 
 def _size_reasons(shares: dict[str, float], version: int, settings: GateSettings) -> list[str]:

@@ -13,12 +13,12 @@ from typer.testing import CliRunner, Result
 
 from fleetmap.bow import decode_vocabulary
 from fleetmap.bow.shipped_vocabulary import DEFAULT_VOCABULARY_SHA256, default_vocabulary_bytes
-from fleetmap.errors import FleetmapError, RecordingError, StoreError, UsageError
+from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, UsageError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import decode_tile
 from mapserver import releases
 from mapserver.cli import app
-from mapserver.store import MapStore
+from mapserver.store import Actor, MapStore
 from mapserver.store.archive import decode_archive
 from support.recordings.recording_samples import make_sample, write_euroc
 
@@ -184,7 +184,9 @@ def test_a_site_keeps_its_vocabulary_whatever_is_surveyed(euroc: Path, done: Pat
         assert maps.manifest("lab", 1).vocabulary.sha256 == given
         assert maps.manifest("lab", 2).tiles != maps.manifest("lab", 1).tiles
         assert shipped.manifest("lab", 1).vocabulary.sha256 == DEFAULT_VOCABULARY_SHA256
-        releases.publish(maps, "lab", 2)
+        with pytest.raises(GateRefusedError, match="nothing judged the pair geometry"):  # the sample turns on the spot
+            releases.publish(maps, "lab", 2)
+        releases.publish(maps, "lab", 2, actor=Actor("kim", "the rig is the laboratory's"), force=True)
     (tmp_path / "shipped.fmvb").write_bytes(default_vocabulary_bytes())
     assert "has published" in str(refused(*lab, "--vocabulary", tmp_path / "shipped.fmvb"))
 

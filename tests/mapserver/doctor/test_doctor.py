@@ -145,6 +145,7 @@ def test_sparse_frames_are_not_judged(good: Recording) -> None:
     findings = found(sparse)
     for name in ("camera rate", "camera gaps", "camera-imu time offset", "gyro axes"):
         assert findings[name].verdict is Verdict.NOT_JUDGED
+        assert "record every frame" in findings[name].missing
     assert "frames are 2.00 s apart" in findings["camera rate"].sentence
 
 
@@ -217,7 +218,10 @@ def test_the_command_writes_json_and_ends_with_3_on_failure(tmp_path: Path) -> N
     folder = write_euroc(tmp_path / "r", SAMPLE)
     assert run(str(folder), "--json", str(tmp_path / "good.json")) == 0
     report = json.loads((tmp_path / "good.json").read_text())
-    assert (report["verdict"], report["frames"], report["sensor_set"]) == ("ok", 26, "stereo-inertial")
+    assert (report["verdict"], report["frames"], report["sensor_set"]) == ("not judged", 26, "stereo-inertial")
+    assert [f["missing"] for f in report["findings"] if f["verdict"] == "not judged"] == [
+        "drive past things that are near and far, for metres and not on the spot"
+    ]
     assert {f["name"] for f in report["findings"]} >= {"epipolar error", "gyro axes", "gravity magnitude"}
     for number in (0, 1):
         (folder / f"mav0/cam{number}/data").rename(folder / f"mav0/cam{number}/was")

@@ -20,7 +20,7 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples, Trajectory
 from mapserver.build.draft_evidence import Before, HeldOut, JudgedSession, examine_draft
 from mapserver.quality.evidence import trajectory_breaks
-from mapserver.quality.figures import Evidence
+from mapserver.quality.figures import Evidence, RigEvidence, merged
 from mapserver.quality.gate import GateSettings, GateVerdict, judge
 from mapserver.quality.probes import held_out_frames, probe_features
 from mapserver.quality.starts import lookalike_words
@@ -87,7 +87,7 @@ def verdict(
     """Of a draft with this map, built by the sound ride; the current version is the sound map."""
     done, own = sound()
     tiles, current = tiles_from_survey(survey_map), tiles_from_survey(done.map)
-    before = Before(manifest(current, 1), done.map, current) if has_current else None
+    before = Before(manifest(current, 1), done.map, current, []) if has_current else None
     session = JudgedSession(trajectory or done.map.trajectory, own if held_out is None else held_out, done)
     evidence = examine_draft(tiles, survey_map.camera, done.vocabulary, before, [session], [])
     said = judge(manifest(tiles, 2), manifest(current, 1) if has_current else None, None, GateSettings(), evidence)
@@ -283,12 +283,58 @@ def test_a_torn_survey_is_refused_though_its_tiles_agree_with_it() -> None:
     assert "held_out_frames" in said.report["not_judged"]
 
 
+STRAIGHT = RigEvidence("a1", not_judged={"pair geometry": "drive curves"})
+
+
+def with_calibrations(*rigs: RigEvidence, has_current: bool) -> GateVerdict:
+    tiles = tiles_from_survey(sound()[0].map)
+    evidence = Evidence(calibrations=merged(rigs))
+    return judge(manifest(tiles, 2), manifest(tiles, 1) if has_current else None, None, GateSettings(), evidence)
+
+
+def test_a_first_version_whose_calibration_nobody_could_judge_waits_for_a_person() -> None:
+    said = with_calibrations(STRAIGHT, has_current=False)
+    assert not said.hard_reasons
+    assert len(said.reasons) == 1
+    assert "pair geometry of calibration a1: drive curves" in said.reasons[0]
+    assert "--force" in said.reasons[0]
+
+
+@pytest.mark.parametrize("has_current", [False, True])
+def test_what_an_earlier_recording_with_this_calibration_judged_is_judged(has_current: bool) -> None:
+    said = with_calibrations(RigEvidence("a1", ["pair geometry"]), STRAIGHT, has_current=has_current)
+    assert said.accepted, said.reasons
+    other = with_calibrations(RigEvidence("b2", ["pair geometry"]), STRAIGHT, has_current=has_current)
+    assert other.accepted is has_current
+
+
+def test_a_later_version_is_compared_with_the_map_and_says_what_was_not_judged() -> None:
+    said = with_calibrations(STRAIGHT, has_current=True)
+    assert said.accepted, said.reasons
+    assert "pair geometry of calibration a1: drive curves" in said.report["not_judged"]
+
+
+def test_a_fleet_whose_calibration_is_judged_elsewhere_may_say_so() -> None:
+    tiles = tiles_from_survey(sound()[0].map)
+    settings = GateSettings(allow_unjudged_calibration=True)
+    said = judge(manifest(tiles, 1), None, None, settings, Evidence(calibrations=[STRAIGHT]))
+    assert said.accepted, said.reasons
+    assert "pair geometry of calibration a1: drive curves" in said.report["not_judged"]
+
+
+@pytest.mark.parametrize("has_current", [False, True])
+def test_doubts_about_a_calibration_wait_for_a_person(has_current: bool) -> None:
+    doubt = RigEvidence("a1", ["metric scale"], doubted={"pair geometry": "off by 0.2 degrees"})
+    said = with_calibrations(doubt, has_current=has_current)
+    assert [reason for reason in said.reasons if "calibration a1: pair geometry: off by 0.2 degrees" in reason]
+
+
 def test_without_evidence_only_hard_limits_refuse() -> None:
     tiles = tiles_from_survey(sound()[0].map)
     said = judge(manifest(tiles, 1), None, None, GateSettings())
     assert said.accepted
     assert set(said.report["not_judged"]) == {
         "held_out_frames", "yesterdays_recordings", "last_versions_places", "aliasing_probes", "motion",
-        "size_against_last_version",
+        "size_against_last_version", "calibration",
     }  # fmt: skip
     assert not judge(manifest([], 1), None, None, GateSettings()).accepted

@@ -98,7 +98,7 @@ def _doctor(report: dict[str, Any]) -> Markup:
         body = joined(
             Markup("<h3>{}</h3>{}").format(
                 name,
-                Markup("<ul>{}</ul>").format(joined(Markup("<li>{}</li>").format(words) for words in remarks))
+                Markup("<ul>{}</ul>").format(joined(map(_remark, remarks)))
                 if remarks
                 else Markup("<p>{}</p>").format(badge("good", "no findings")),
             )
@@ -106,6 +106,14 @@ def _doctor(report: dict[str, Any]) -> Markup:
             if isinstance(remarks, list)
         )
     return Markup("<div><h2>Findings of the doctor</h2>{}</div>").format(body)
+
+
+def _remark(words: str) -> Markup:
+    """A finding; one that could not be judged is no fault, and no "ok" either."""
+    name, unjudged, missing = words.partition(": not judged: ")
+    if not unjudged:
+        return Markup("<li>{}</li>").format(words)
+    return Markup("<li>{} {}: {}</li>").format(badge("quiet", "not judged"), name, missing)
 
 
 def _recordings(report: dict[str, Any]) -> Markup:
