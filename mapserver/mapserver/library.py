@@ -20,13 +20,22 @@ from fleetmap.geometry import Array
 from fleetmap.mapformat import Manifest, Tile, check_name, decode_tile
 from fleetmap.sensors.samples import Trajectory
 from mapserver import releases
-from mapserver.build.build import BuildOptions, BuildRequest, Built, Draft, build_draft, picture_png, write_file
+from mapserver.build.build import (
+    BuildOptions,
+    BuildRequest,
+    Built,
+    Draft,
+    build_draft,
+    picture_png,
+    write_file,
+)
 from mapserver.build.sensor_subset import sensor_set_of
 from mapserver.config import survey_settings
 from mapserver.store import NOBODY, Actor, MapStore
+from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_map import SurveyMap
 
-__all__ = ["BuildOptions", "BuiltMap", "MapArrays", "MapStore", "build_map", "open_map", "open_store"]
+__all__ = ["BuildOptions", "BuiltMap", "MapArrays", "MapStore", "build_map", "open_map", "open_store", "settings_for"]
 
 
 @dataclass(frozen=True)
@@ -89,12 +98,16 @@ def build_map(
     options = options or BuildOptions()
     paths = (recordings,) if isinstance(recordings, str | Path) else recordings
     request = BuildRequest(tuple(Path(path) for path in paths), check_name(site, "site"), Path(store), options)
-    settings = options.settings
-    if settings is None:
-        sensors = options.use or sensor_set_of(request.recordings[0], options.calibration)
-        settings = survey_settings(options.config, sensors)
-    draft, built = build_draft(request, settings, recorded=True)
+    draft, built = build_draft(request, settings_for(request), recorded=True)
     return BuiltMap(request.store, site, draft, built)
+
+
+def settings_for(request: BuildRequest) -> SurveySettings:
+    """Settings of the request's survey: its own, or the preset of the first recording's sensors with the [survey] of its file over it."""
+    options = request.options
+    if options.settings is not None:
+        return options.settings
+    return survey_settings(options.config, options.use or sensor_set_of(request.recordings[0], options.calibration))
 
 
 @dataclass(frozen=True)

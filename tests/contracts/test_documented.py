@@ -111,7 +111,9 @@ def test_build_report_keys_are_documented() -> None:
 
 
 def test_session_keys_are_documented() -> None:
-    keys = {"recording", "joined", "reason"} | {field.name for field in dataclasses.fields(Counts)}
+    keys = {"recording", "joined", "verdict", "reason", "evidence"} | {
+        field.name for field in dataclasses.fields(Counts)
+    }
     assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Sessions"))} == keys
 
 

@@ -36,9 +36,9 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     selected frames. All three are None without ground truth. scale: metric, or unknown for one camera that nothing told the metres;
     scale_error: by how much the estimate is too large (0.01 is 1 %), None without ground truth. peak_rss_mb: most memory the process held,
     in 10^6 bytes. findings: by recording, what the doctor found wanting in it, and what was corrected. culled: what the surveys did not
-    hand on. sessions: what became of every recording, and of the map's landmarks by it. directions: which way the places of each tile look,
-    and which way none does. starts: robots that start without a prior where nothing is mapped; lookalike_recall: of these, what a start
-    must exceed to be believed, None where nothing could tell.
+    hand on. sessions: what became of every recording, and of the map's landmarks by it. joins: the verdict on each that is in the map.
+    directions: which way the places of each tile look, and which way none does. starts: robots that start without a prior where nothing
+    is mapped; lookalike_recall: of these, what a start must exceed to be believed, None where nothing could tell.
     """
 
     recordings: list[str]
@@ -60,6 +60,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     findings: dict[str, list[str]]
     culled: dict[str, int]
     sessions: list[dict[str, Any]]
+    joins: dict[str, str]
     directions: list[TileDirections]
     starts: Starts | None = None
     lookalike_recall: float | None = None
@@ -146,6 +147,7 @@ def make_report(
         culled={key: sum(count[key] for count in culled) for key in culled[0]},
         findings={s.entry.name: s.remarks() for s in recordings},
         sessions=sessions_report([s.entry.name for s in recordings], joined),
+        joins={s.entry.name: o.verdict.value for s, o in zip(recordings, joined.outcomes, strict=True) if o.joined},
         directions=evidence.directions or [],
         starts=evidence.starts,
         lookalike_recall=None if evidence.starts is None else evidence.starts.lookalike_recall,
@@ -155,7 +157,8 @@ def make_report(
 def sessions_report(names: list[str], joined: Joined) -> list[dict[str, Any]]:
     """What became of every recording, in their order."""
     return [
-        {"recording": names[o.number], "joined": o.joined, "reason": o.reason}
+        {"recording": names[o.number], "joined": o.joined, "verdict": o.verdict.value, "reason": o.reason}
+        | ({} if o.evidence is None else {"evidence": asdict(o.evidence)})
         | ({} if o.counts is None else asdict(o.counts))
         for o in joined.outcomes
     ]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, expand_options, settings_of
+from fleetmap.cli_options import ConfigFile, config_path, expand_options, settings_of
 from fleetmap.errors import BusyError, FleetmapError, disk_errors
 from mapserver.commands.options import SurveyOptions
 
@@ -37,11 +37,10 @@ def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile 
     from mapserver.nightly import NightRequest, run_night
 
     FrameSelection.parse(options.frames)
-    settings = settings_of(context)
     asked = {name: value for name, value in vars(options).items() if name != "report"}
-    request = NightRequest(now_ns=time.time_ns(), **asked)
+    request = NightRequest(now_ns=time.time_ns(), config=config_path(context), **asked)
     try:
-        sentence = run_night(request, settings.survey, settings.gate, Console(stderr=True))
+        sentence = run_night(request, settings_of(context).gate, Console(stderr=True))
     except BusyError:
         raise
     except FleetmapError:

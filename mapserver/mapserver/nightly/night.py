@@ -17,14 +17,14 @@ from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, Sto
 from mapserver import releases
 from mapserver.build.build import BuildOptions, BuildRequest, build_draft
 from mapserver.build.job_lock import INTERRUPTED, end_interrupted, held, only_one
+from mapserver.library import settings_for
 from mapserver.nightly import inbox as boxes
 from mapserver.nightly.inbox import Recorded
 from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore, VersionInfo
-from mapserver.survey.settings import SurveySettings
 
 JOB = "nightly"
-_SHARED_WITH_BUILDS = ("frames", "calibration", "zones", "threads", "scheduler")
+_SHARED_WITH_BUILDS = ("frames", "calibration", "zones", "threads", "scheduler", "config")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +41,7 @@ class NightRequest:
     zones: Path | None = None
     threads: int | None = None
     scheduler: str | None = None
+    config: Path | None = None
 
 
 @dataclass
@@ -56,7 +57,7 @@ class NightReport:
     builds: list[dict[str, Any]] = field(default_factory=list)
 
 
-def run_night(request: NightRequest, survey: SurveySettings, gate: GateSettings, console: Console) -> str:
+def run_night(request: NightRequest, gate: GateSettings, console: Console) -> str:
     """Runs the night and returns the sentence that says how it ended.
 
     Raises BusyError where another night of the site runs, GateRefusedError for a refused draft, and other FleetmapErrors; the job
@@ -69,7 +70,7 @@ def run_night(request: NightRequest, survey: SurveySettings, gate: GateSettings,
         end_interrupted(maps, time.time_ns())
         try:
             with held(request.store, report.job):
-                sentence = _Night(request, survey, gate, console, maps, report).run()
+                sentence = _Night(request, gate, console, maps, report).run()
         except FleetmapError as error:
             with suppress(StoreError):  # a full disk: the next night finds this one's job running, and ends it
                 report.version = _current(maps, site)
@@ -117,7 +118,6 @@ class _Night:
     """The steps of a night."""
 
     _request: NightRequest
-    _survey: SurveySettings
     _gate: GateSettings
     _console: Console
     _maps: MapStore
@@ -191,7 +191,7 @@ class _Night:
         paths = tuple(recorded.path for recorded in recordings)
         build = BuildRequest(paths, request.site, request.store, options)
         try:
-            draft, _ = build_draft(build, self._survey, unusable)
+            draft, _ = build_draft(build, settings_for(build), unusable)
         except (RecordingError, SurveyError) as error:
             self._put_all_away(recordings, unusable, str(error))
             raise

@@ -11,6 +11,7 @@ from fleetmap.config import Section
 from fleetmap.mapformat import Manifest
 from mapserver.quality.figures import Aliasing, Compared, Evidence, RigEvidence
 
+_JOINED = "joined"  # the verdict of survey.merge.join_test on a recording that belongs to the site
 Share = Annotated[float, msgspec.Meta(ge=0)]
 
 
@@ -64,7 +65,7 @@ def judge(
     """
     report: dict[str, Any] = {"landmarks": draft.landmarks, "tiles": len(draft.tiles), "tile_bytes": draft.tile_bytes}
     examined = evidence or Evidence()
-    found = _Findings([], [])
+    found = _Findings([], [] if "joins" in draft.report else ["joining"])
     for name, compared in (
         ("held_out_frames", examined.held_out),
         ("yesterdays_recordings", examined.replayed),
@@ -211,6 +212,13 @@ def _hard_reasons(draft: Manifest, site_vocabulary: str | None) -> tuple[str, ..
             f"it uses vocabulary {draft.vocabulary.sha256}, site {draft.site} keeps {site_vocabulary}; build it again "
             "so that it takes the site's"
         )
+    joins = draft.report.get("joins")  # drafts of older servers do not say
+    verdicts = {} if joins is None else {entry.name: joins.get(entry.name, "none") for entry in draft.recordings}
+    reasons += [
+        f"it holds recording {name}, whose join verdict is {verdict!r}: it is not shown to belong to the site; build without it"
+        for name, verdict in verdicts.items()
+        if verdict != _JOINED
+    ]
     if draft.report.get("scale") == "unknown":
         reasons.append(
             "it has a scale of its own: one camera without IMU saw no dock or tag that could tell the metres; record with an IMU, a "

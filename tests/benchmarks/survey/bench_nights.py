@@ -121,7 +121,7 @@ def measure(work: Path, scenario: str, frames: str, rate: float) -> list[dict[st
             (inbox / f"{night.run}.mcap").symlink_to(kept)
             begun_s = time.monotonic()
             order = NightRequest(SITE, inbox, store, time.time_ns(), 0.0, frames)
-            run_night(order, settings.survey, settings.gate, Console(stderr=True))
+            run_night(order, settings.gate, Console(stderr=True))
             seconds = time.monotonic() - begun_s
             full, delta = fetched(store, folder / f"new-{night.run}"), fetched(store, folder / "cache")
             said = last_report(store, SITE)

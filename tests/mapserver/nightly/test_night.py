@@ -25,9 +25,11 @@ from fleetmap.errors import (
 )
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import open_recording
+from fleetmap.sensors.samples import SensorSet
 from mapserver import cli, releases
 from mapserver.build.build import BuildRequest, Draft
 from mapserver.build.survey_recordings import RecordingOptions, admit_recordings
+from mapserver.config import survey_settings
 from mapserver.nightly import NightRequest, last_report, night, run_night
 from mapserver.nightly.inbox import arrivals
 from mapserver.quality.gate import GateSettings
@@ -92,7 +94,27 @@ def hall(tmp_path: Path) -> Path:
 def spend(folder: Path) -> str:
     """One night, some time after everything came in."""
     order = NightRequest("hall", folder / "inbox", folder / "store", time.time_ns() + LATER_NS)
-    return run_night(order, SurveySettings(), GateSettings(), Console(file=io.StringIO()))
+    return run_night(order, GateSettings(), Console(file=io.StringIO()))
+
+
+def test_a_night_surveys_with_the_preset_of_the_sensors_as_a_build_does(
+    hall: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used: list[SurveySettings] = []
+
+    def spied(request: BuildRequest, settings: SurveySettings, unusable: dict[Path, str]) -> tuple[Draft, None]:
+        used.append(settings)
+        return built(request, settings, unusable)
+
+    config = hall / "site.toml"
+    config.write_text("[survey]\nseed = 5\n")
+    monkeypatch.setattr(night, "build_draft", spied)
+    monkeypatch.setattr("mapserver.library.sensor_set_of", lambda *_: SensorSet.MONO)
+    order = NightRequest("hall", hall / "inbox", hall / "store", time.time_ns() + LATER_NS, config=config)
+    run_night(order, GateSettings(), Console(file=io.StringIO()))
+    assert used == [survey_settings(config, SensorSet.MONO)]
+    assert used[0] != survey_settings(config, SensorSet.STEREO_INERTIAL)
+    assert used[0].seed == 5
 
 
 def states(folder: Path) -> list[tuple[str, list[str]]]:

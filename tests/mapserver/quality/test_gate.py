@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -12,7 +13,7 @@ from fleetmap.bow import decode_vocabulary
 from fleetmap.bow.shipped_vocabulary import default_vocabulary_bytes
 from fleetmap.features.orb import Features, OrbSettings, detect_in_slices
 from fleetmap.geometry import Array, se3, so3_exp, transform_points
-from fleetmap.mapformat import BlobEntry, CameraEntry, Manifest, Tile, TileEntry, encode_tile
+from fleetmap.mapformat import BlobEntry, CameraEntry, Manifest, RecordingEntry, Tile, TileEntry, encode_tile
 from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.calibration import RigCalibration
@@ -335,6 +336,25 @@ def test_without_evidence_only_hard_limits_refuse() -> None:
     assert said.accepted
     assert set(said.report["not_judged"]) == {
         "held_out_frames", "yesterdays_recordings", "last_versions_places", "aliasing_probes", "motion",
-        "size_against_last_version", "calibration",
+        "size_against_last_version", "calibration", "joining",
     }  # fmt: skip
     assert not judge(manifest([], 1), None, None, GateSettings()).accepted
+
+
+@pytest.mark.parametrize(
+    ("joins", "passes"), [({"a": "joined"}, True), ({"a": "undecided"}, False), ({}, False), (None, True)]
+)
+def test_a_recording_that_was_not_shown_to_belong_to_the_site_stops_a_draft(
+    joins: dict[str, str] | None, passes: bool
+) -> None:
+    """Even forced: the reason is a hard one. Drafts of servers that did not test are not judged by it, and that is said."""
+    entry = RecordingEntry(name="a", sha256="0" * 64, frames=3)
+    draft = msgspec.structs.replace(
+        manifest(tiles_from_survey(sound()[0].map), 1),
+        recordings=(entry,),
+        report={} if joins is None else {"joins": joins},
+    )
+    said = judge(draft, None, None, GateSettings())
+    assert said.accepted is passes
+    assert bool(said.hard_reasons) is not passes
+    assert ("joining" in said.report["not_judged"]) is (joins is None)

@@ -18,6 +18,7 @@ _REFRESH_S = 3.0
 _LONG_H = 12.0  # a job that is killed cannot say so
 _TONES = {"done": "good", "running": "warn", "failed": "bad"}
 _VERDICTS = {"accepted": "good", "rejected": "bad", "ambiguous": "bad", "gated_out": "quiet"}
+_LEFT_OUT = {"foreign": "another place", "undecided": "held"}
 _REASONS_SHOWN = 40
 
 
@@ -121,16 +122,35 @@ def _recordings(report: dict[str, Any]) -> Markup:
     rows = [
         (
             session.get("recording"),
-            badge("good", "in the map") if session.get("joined") else badge("bad", "left out"),
+            badge("good", "in the map")
+            if session.get("joined")
+            else badge("bad", _LEFT_OUT.get(str(session.get("verdict")), "left out")),
             session.get("reason"),
+            *_join_figures(session.get("evidence")),
         )
         for session in _dicts(report.get("sessions"))
     ]
-    listed = table(("Recording", "Result", "Why"), rows, empty="The report names no recordings.", name="Recordings")
+    listed = table(
+        ("Recording", "Result", "Why", "Fixes that agree", "Seen of the map"),
+        rows,
+        empty="The report names no recordings.",
+        name="Recordings",
+    )
     loops = report.get("loops")
     counts = loops.items() if isinstance(loops, dict) else None
     counted = Markup("") if counts is None else facts([(name.replace("_", " "), count) for name, count in counts])
     return Markup("<div><h2>Recordings</h2>{}<h2>Loop counts</h2>{}</div>").format(listed, counted)
+
+
+def _join_figures(evidence: Any) -> tuple[str, str]:
+    """Fixes and places, and the seen share with its bounds; dashes for the recording that began a map and for old reports."""
+    if not isinstance(evidence, dict) or not evidence.get("fixes"):
+        return "-", "-"
+    fixes = f"{evidence['fixes']} at {evidence['places']} places"
+    if not evidence.get("cells_expected"):
+        return fixes, "-"
+    low, share, high = (round(100 * evidence[name]) for name in ("share_low", "seen_share", "share_high"))
+    return fixes, f"{share} % of {evidence['cells_expected']} parts ({low} to {high} %)"
 
 
 async def _loops(services: Services, context: PageContext, report: dict[str, Any]) -> None:

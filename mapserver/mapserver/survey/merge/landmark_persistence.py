@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.pnp.pnp import GATE_SQUARED
@@ -13,13 +12,10 @@ from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.finish.map_assembly import point_information
 from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.merge.base_map import BaseMap
-from mapserver.survey.merge.guided_matching import Sighting
+from mapserver.survey.merge.confirmation import EDGE_PX, WIDER_VIEW_RAD, due
+from mapserver.survey.merge.guided_matching import Sighting, keyframe_features
 from mapserver.survey.settings import SurveySettings
 
-_EDGE_PX = 12.0
-_BESIDE_PX = 25.0  # so near a measured corner, what lies far behind it is hidden by the same thing
-_WIDER_VIEW_RAD = 0.17
-_MAX_OCTAVE = 7.0
 _PRIOR_COUNT = 4.0  # observations that the whole survey's rate counts for, where a landmark has no history
 _AGAINST = 7.815  # 0.95 of chi-square with 3 degrees of freedom: an observation that speaks against a place
 _DOUBTED, _SETTLED = 0.5, 0.8  # shares of sightings: against the old place, in favour of the new one
@@ -57,17 +53,9 @@ def count_landmarks(
 
 
 def _due(base: BaseMap, keyframe: Keyframe, map_from_cam: Array) -> Rows:
-    """Landmarks that this keyframe should see: inside their cone and reach, and no corner beside them that is much nearer."""
-    rows, pixels, octaves = base.visible(map_from_cam, -_EDGE_PX, _WIDER_VIEW_RAD)
-    fits = (octaves > 0.0) & (octaves < _MAX_OCTAVE)
-    rows, pixels = rows[fits], pixels[fits]
-    known = np.flatnonzero(np.isfinite(keyframe.disparities[:, 0]))
-    if not len(known) or not len(rows):
-        return rows
-    away_px, nearest = cKDTree(keyframe.features.pixels[known]).query(pixels[:, :2])
-    measured, disparity = keyframe.disparities[known[nearest], 0], pixels[:, 0] - pixels[:, 2]
-    hidden = (away_px < _BESIDE_PX) & (measured > disparity + np.maximum(2.0, 0.15 * disparity))
-    return np.asarray(rows[~hidden])
+    """Landmarks that this keyframe should see."""
+    expected = base.visible(map_from_cam, -EDGE_PX, WIDER_VIEW_RAD)
+    return np.asarray(expected.rows[due(expected, keyframe_features(keyframe).pixels)])
 
 
 def missed_since(base: BaseMap, counts: LandmarkCounts) -> NDArray[np.int64]:

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.finish.map_transform import transform_map
-from mapserver.survey.merge.pipeline import Counts, NotJoined, extend
+from mapserver.survey.merge.join_test import JoinEvidence, JoinVerdict, NotJoined
+from mapserver.survey.merge.pipeline import Counts, Extension, extend
 from mapserver.survey.pipeline import Survey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_map import SurveyMap
@@ -27,12 +28,18 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of session `number`: in the map or left out, why; counts where it was joined to something."""
+    """What became of session `number`: in the map or left out, why, by what evidence; counts where it was joined to something."""
 
     number: int
-    joined: bool
+    verdict: JoinVerdict
     reason: str
     counts: Counts | None = None
+    evidence: JoinEvidence | None = None
+
+    @property
+    def joined(self) -> bool:
+        """Whether it is in the map."""
+        return self.verdict is JoinVerdict.JOINED
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +68,7 @@ def join_sessions(base: SurveyMap | None, sessions: Sequence[Session], settings:
     if current is None:
         first = waiting.pop(0)
         current = _begun(sessions[first])
-        outcomes[first] = Outcome(first, True, "begins the map")
+        outcomes[first] = Outcome(first, JoinVerdict.JOINED, "begins the map")
         found[first] = (current.trajectory, current.trajectory_estimated)
     progress = True
     while waiting and progress:
@@ -72,9 +79,9 @@ def join_sessions(base: SurveyMap | None, sessions: Sequence[Session], settings:
                 current, session.survey, settings, anchored=anchored, map_from_survey=session.map_from_survey
             )
             if isinstance(result, NotJoined):
-                outcomes[number] = Outcome(number, False, result.reason)
+                outcomes[number] = Outcome(number, result.verdict, result.reason, evidence=result.evidence)
                 continue
-            outcomes[number] = Outcome(number, True, "found in the map", result.counts)
+            outcomes[number] = Outcome(number, JoinVerdict.JOINED, _words(result), result.counts, result.evidence)
             current, progress = result.map, True
             found[number] = (current.trajectory, current.trajectory_estimated)
             waiting.remove(number)
@@ -85,6 +92,11 @@ def join_sessions(base: SurveyMap | None, sessions: Sequence[Session], settings:
         tuple(found[n][0] for n in order),
         tuple(found[n][1] for n in order),
     )
+
+
+def _words(result: Extension) -> str:
+    found = result.evidence
+    return f"found in the map: {found.fixes} fixes at {found.places} places, {found.cells_seen} of {found.cells_expected} parts of it seen"
 
 
 def _begun(session: Session) -> SurveyMap:

@@ -5,16 +5,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleetmap.geometry import Array
+from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.bundle.odometry_factors import chain_edges
 from mapserver.survey.finish.frame_adjustment import place_frames
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
-from mapserver.survey.merge.guided_matching import Sighting, match_keyframe, session_relocalizer
+from mapserver.survey.merge.confirmation import firm_landmarks
+from mapserver.survey.merge.guided_matching import Sighting, keyframe_features, match_keyframe, session_relocalizer
+from mapserver.survey.merge.join_test import JoinEvidence, JoinTest, JoinVerdict, NotJoined, Visit
 from mapserver.survey.merge.joint_adjustment import Joint, adjust_jointly
 from mapserver.survey.merge.landmark_persistence import count_landmarks, faded
 from mapserver.survey.merge.merge import SessionFrames, merged
-from mapserver.survey.merge.session_alignment import find_fixes, follow_fixes, place_survey
 from mapserver.survey.pipeline import Survey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_map import SurveyMap
@@ -40,17 +42,11 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Extension:
-    """The next map (its trajectory is the new survey's), and what changed."""
+    """The next map (its trajectory is the new survey's), what changed, and the evidence for joining it."""
 
     map: SurveyMap
     counts: Counts
-
-
-@dataclass(frozen=True, slots=True)
-class NotJoined:
-    """A survey that cannot be placed in the map with certainty, and why."""
-
-    reason: str
+    evidence: JoinEvidence
 
 
 def extend(
@@ -61,11 +57,10 @@ def extend(
     anchored: bool,
     map_from_survey: Array | None = None,
 ) -> Extension | NotJoined:
-    """The map with a survey joined to it.
+    """The map with a survey joined to it, if it passes the test of `join_test`: at the place that fixes say, and once more adjusted.
 
     anchored: base_map is published: what did not move significantly stays to the bit; else all of it takes its best place.
-    map_from_survey: where position priors put the survey, if they do: fixes elsewhere are left out, and without enough fixes
-    it is taken as it is.
+    map_from_survey: where position priors put the survey, if they do.
     """
     state, guess = survey.state, survey.odometry
     if not (guess.scale_known and base_map.scale_known):
@@ -74,16 +69,13 @@ def extend(
         )
     base = BaseMap(base_map, state.camera, state.body_from_cam)
     relocalizer = session_relocalizer(base, survey.vocabulary, settings)
-    fixes = find_fixes(relocalizer, guess.keyframes, state.body_from_cam, settings.sessions.fix_keyframes)
-    survey_from_body = state.map_from_body  # the survey's own frame, named `map` before there was another
-    placed = place_survey(fixes, survey_from_body, map_from_survey, settings.sessions)
-    if isinstance(placed, str):
-        if map_from_survey is None:
-            return NotJoined(placed)
-        map_from_body, believed = map_from_survey @ survey_from_body, 0
-    else:
-        chain = [*chain_edges(guess, state), *survey.loops.edges]
-        map_from_body, believed = follow_fixes(placed, survey_from_body, chain)
+    test = _join_test(base, survey, relocalizer, map_from_survey, settings)
+    located = test.locate()
+    if isinstance(located, NotJoined):
+        return located
+    refused = test.judged(located, located.seen)
+    if refused is not None and refused.verdict is JoinVerdict.FOREIGN:
+        return refused
 
     def sightings(places_map_from_body: Array, radius_px: float) -> list[Sighting | None]:
         return [
@@ -91,16 +83,37 @@ def extend(
             for keyframe, place in zip(guess.keyframes, places_map_from_body, strict=True)
         ]
 
-    found = sightings(map_from_body, settings.sessions.search_px)
-    joint = adjust_jointly(base, state, map_from_body, found, settings, anchored=anchored)
+    found = sightings(located.map_from_body, settings.sessions.search_px)
+    joint = adjust_jointly(base, state, located.map_from_body, found, settings, anchored=anchored)
     found = sightings(joint.map_from_body, settings.sessions.guided_px)
     joint = adjust_jointly(base, state, joint.map_from_body, found, settings, anchored=anchored)
-    return _compare(base, survey, joint, settings, anchored, (len(fixes), believed))
+    seen = test.confirmation(joint.map_from_body)
+    refused = test.judged(located, seen)
+    if refused is not None:
+        return refused
+    result, counts = _compare(base, survey, joint, settings, anchored, (test.tried, located.believed))
+    return Extension(result, counts, test.evidence(located, seen))
+
+
+def _join_test(
+    base: BaseMap, survey: Survey, relocalizer: Relocalizer, map_from_survey: Array | None, settings: SurveySettings
+) -> JoinTest:
+    state, guess = survey.state, survey.odometry
+    visit = Visit(
+        keyframes=[keyframe_features(keyframe) for keyframe in guess.keyframes],
+        survey_from_body=state.map_from_body,  # the survey's own frame, named `map` before there was another
+        chain=[*chain_edges(guess, state), *survey.loops.edges],
+        camera=state.camera,
+        body_from_cam=state.body_from_cam,
+        map_from_survey=map_from_survey,
+    )
+    firm = firm_landmarks(len(base.points_map), base.map.obs_landmark)
+    return JoinTest(relocalizer, firm, visit, settings.sessions)
 
 
 def _compare(
     base: BaseMap, survey: Survey, joint: Joint, settings: SurveySettings, anchored: bool, fixes: tuple[int, int]
-) -> Extension:
+) -> tuple[SurveyMap, Counts]:
     state, guess = survey.state, survey.odometry
     map_from_cam = joint.map_from_body @ state.body_from_cam
     seen = count_landmarks(base, guess.keyframes, map_from_cam, joint.sightings)
@@ -126,4 +139,4 @@ def _compare(
         landmarks_added=fresh,
         seen_rate=round(seen.rate, 4),
     )
-    return Extension(result, counts)
+    return result, counts

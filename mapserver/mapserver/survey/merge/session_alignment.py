@@ -1,17 +1,22 @@
-"""Alignment of a survey to the map: many fixes, of which the largest set that agrees is believed if no other comes near it."""
+"""Alignments of a survey to the map: sets of fixes whose motion from one to the next is the survey's own."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.geometry import Array, se3_inverse
 from fleetmap.numerics.time_sliced import finished
+from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer
-from mapserver.survey.keyframes.keyframes import Keyframe
-from mapserver.survey.merge.guided_matching import keyframe_features
+from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
-from mapserver.survey.settings import SessionSettings
+
+_WIDEST_PX = 60.0  # a window in which a descriptor still finds its feature more often than another one
+_ANY_TURN_RAD = 0.5  # beyond which two fixes disagree whatever the covariances say
+_PLACE_M = 1.0  # between fixes that count as independent: nearer ones show the same things
+_MAP_SHAPE = np.diag([0.003**2] * 3 + [0.02**2] * 3)  # of the map between two places: twice what surveys are off by
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,22 +31,20 @@ class SessionFix:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """The fixes that agree (one for each keyframe), and map_from_survey (4, 4) of the best of them."""
+    """The fixes that agree (one for each keyframe), map_from_survey (4, 4) of the one that most agree with, and at how many places
+    they stand.
+    """
 
     fixes: tuple[SessionFix, ...]
     map_from_survey: Array
+    places: int
 
 
 def find_fixes(
-    relocalizer: Relocalizer, keyframes: Sequence[Keyframe], body_from_cam: Array, max_keyframes: int
+    relocalizer: Relocalizer, keyframes: Sequence[FrameFeatures], ks: Sequence[int], body_from_cam: Array
 ) -> list[SessionFix]:
-    """All fixes of at most `max_keyframes` keyframes, several for one keyframe where the map looks alike in several places."""
-    step = max(1, -(-len(keyframes) // max_keyframes))
-    return [
-        _at_body(k, fix, body_from_cam)
-        for k in range(0, len(keyframes), step)
-        for fix in finished(relocalizer.anywhere(keyframe_features(keyframes[k])))
-    ]
+    """All fixes of keyframes ks, several for one keyframe where the map looks alike in several places."""
+    return [_at_body(k, fix, body_from_cam) for k in ks for fix in finished(relocalizer.anywhere(keyframes[k]))]
 
 
 def _at_body(k: int, fix: Fix, body_from_cam: Array) -> SessionFix:
@@ -54,47 +57,63 @@ def _at_body(k: int, fix: Fix, body_from_cam: Array) -> SessionFix:
     )
 
 
-def place_survey(
-    fixes: Sequence[SessionFix], survey_from_body: Array, expected: Array | None, settings: SessionSettings
-) -> Placed | str:
-    """The fixes that agree on where the survey lies, or why they cannot be believed.
-
-    survey_from_body (K, 4, 4). expected: map_from_survey by position priors, None without; fixes far from it are left out.
-    """
-    if expected is not None:
-        fixes = [f for f in fixes if _near_priors(f, expected @ survey_from_body[f.k])]
-    if len({fix.k for fix in fixes}) < settings.min_fixes:
-        return f"{len(fixes)} fixes in the map, {settings.min_fixes} are needed"
-    supports = [_agreeing(fix, fixes, survey_from_body, settings) for fix in fixes]
-    best = max(range(len(fixes)), key=lambda n: (len(supports[n]), sum(f.inliers for f in supports[n])))
-    chosen = supports[best]
-    if len(chosen) < settings.min_fixes:
-        return f"at most {len(chosen)} of {len(fixes)} fixes agree on where it lies, {settings.min_fixes} are needed"
-    claimed = {id(fix) for fix in chosen}
-    rival = max((len(s) for s in supports if not claimed & {id(f) for f in s}), default=0)
-    if rival >= settings.rival_share * len(chosen):
-        return f"{len(chosen)} fixes say one place and {rival} another: the map looks alike there"
-    return Placed(tuple(chosen), fixes[best].map_from_body @ se3_inverse(survey_from_body[fixes[best].k]))
-
-
-def _near_priors(fix: SessionFix, expected: Array, slack_m: float = 3.0) -> bool:
-    return bool(np.linalg.norm(fix.map_from_body[:3, 3] - expected[:3, 3]) < slack_m)
-
-
-def _agreeing(
-    seed: SessionFix, fixes: Sequence[SessionFix], survey_from_body: Array, settings: SessionSettings
+def fixes_around(
+    relocalizer: Relocalizer, keyframes: Sequence[FrameFeatures], places: dict[int, Array], body_from_cam: Array
 ) -> list[SessionFix]:
-    """Of every keyframe the fix that lies where `seed` would have it, if there is one."""
-    map_from_survey = seed.map_from_body @ se3_inverse(survey_from_body[seed.k])
-    agreeing: dict[int, SessionFix] = {}
-    for fix in fixes:
-        off = se3_inverse(map_from_survey @ survey_from_body[fix.k]) @ fix.map_from_body
-        way_m = float(np.linalg.norm(survey_from_body[fix.k, :3, 3] - survey_from_body[seed.k, :3, 3]))
-        close = np.linalg.norm(off[:3, 3]) < settings.agreement_m + settings.agreement_share * way_m
-        turned = rotation_angle_rad(off[:3, :3])
-        if close and turned < np.radians(settings.agreement_deg) and fix.k not in agreeing:
-            agreeing[fix.k] = fix
-    return list(agreeing.values())
+    """Fixes of keyframes near where their bodies are expected, map_from_body (4, 4) by keyframe."""
+    found = (
+        (k, relocalizer.by_projection(keyframes[k], place @ body_from_cam, _WIDEST_PX)) for k, place in places.items()
+    )
+    return [_at_body(k, fix, body_from_cam) for k, fix in found if fix is not None]
+
+
+def alignments(fixes: Sequence[SessionFix], survey_from_body: Array, chain: GraphMarginals) -> list[Placed]:
+    """Sets of fixes that agree with the survey's own motion, the largest first; no fix is in two of them.
+
+    survey_from_body (K, 4, 4). Two fixes agree where the motion between them is that of the survey within 0.999 of chi-square of
+    the covariances of its chain, of both fixes and of the map's own shape.
+    """
+    agreeing = [_agreeing(n, fixes, survey_from_body, chain) for n in range(len(fixes))]
+    found: list[Placed] = []
+    free = set(range(len(fixes)))
+    while free:
+        sets = {n: [m for m in agreeing[n] if m in free] for n in sorted(free)}
+        best = max(sets, key=lambda n: (len(sets[n]), sum(fixes[m].inliers for m in sets[n]), -n))
+        chosen = tuple(fixes[m] for m in sets[best])
+        places = _places(survey_from_body[[fix.k for fix in chosen], :3, 3])
+        seed = fixes[best]
+        found.append(Placed(chosen, seed.map_from_body @ se3_inverse(survey_from_body[seed.k]), places))
+        free -= set(sets[best])
+    return sorted(found, key=lambda placed: -len(placed.fixes))
+
+
+def _agreeing(seed: int, fixes: Sequence[SessionFix], survey_from_body: Array, chain: GraphMarginals) -> list[int]:
+    """Of every keyframe the fix that agrees best with the seed's, if one does; the seed itself first."""
+    own = fixes[seed]
+    measured = se3_inverse(own.map_from_body) @ np.stack([fix.map_from_body for fix in fixes])
+    numbers = np.array([fix.k for fix in fixes])
+    predicted = se3_inverse(survey_from_body[own.k]) @ survey_from_body[numbers]
+    off = measured @ se3_inverse(predicted)
+    innovation = np.column_stack([Rotation.from_matrix(off[:, :3, :3]).as_rotvec(), off[:, :3, 3]])
+    near = np.flatnonzero((np.linalg.norm(innovation[:, :3], axis=1) < _ANY_TURN_RAD) & (numbers != own.k))
+    covariances = chain.relative_covs(own.k, numbers[near])
+    best: dict[int, tuple[float, int]] = {}
+    for row, covariance in zip(near.tolist(), covariances, strict=True):
+        carry = adjoint(measured[row])
+        spread = covariance + own.cov_rot_trans + carry @ fixes[row].cov_rot_trans @ carry.T + _MAP_SHAPE
+        squared = float(innovation[row] @ np.linalg.solve(spread, innovation[row]))
+        if squared < min(CHI2_6_0999, best.get(fixes[row].k, (np.inf, 0))[0]):
+            best[fixes[row].k] = squared, row
+    return [seed, *(row for _, row in best.values())]
+
+
+def _places(positions_m: Array) -> int:
+    """How many of positions (F, 3) lie a metre and more from each other, chosen in their order."""
+    chosen: list[Array] = []
+    for position in positions_m:
+        if all(np.linalg.norm(position - other) >= _PLACE_M for other in chosen):
+            chosen.append(position)
+    return len(chosen)
 
 
 def follow_fixes(placed: Placed, survey_from_body: Array, chain: Sequence[PoseEdge]) -> tuple[Array, int]:

@@ -1,0 +1,130 @@
+"""Confirmation of a map by a session: of the parts of the map that it should see, how many it sees again. Pure.
+
+The unit is a cell of space, not a landmark: landmarks of one thing stay or go together, and a session that is placed wrongly finds
+again what halls share (walls, columns, the ends of racks), many landmarks of few things.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.stats import beta
+
+from fleetmap.features.orb import SCALE_FACTOR
+from fleetmap.geometry import Array
+from fleetmap.relocalization.frame_features import FrameFeatures
+from fleetmap.relocalization.landmark_visibility import Rows, VisibleLandmarks, match_visible
+from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.settings import FixSettings
+from fleetmap.sensors.rectification import StereoCamera
+
+EDGE_PX = 12.0
+_BESIDE_PX = 25.0  # so near a measured corner, what lies far behind it is hidden by the same thing
+WIDER_VIEW_RAD = 0.17
+_MAX_OCTAVE = 7.0
+_WINDOW_PX, _DISPARITY_PX = 4.0, 2.0  # around a prediction that is good to a centimetre at two metres
+_MATCHING = FixSettings(guided_distance=60)  # bits: two views of one thing differ by some 40, two things by 128
+_CELL_M, _BLOCK_M = (
+    0.75,
+    1.5,
+)  # a thing, and things that may share their fate: goods on one pallet, pictures on one wall
+_FIRM_OBSERVATIONS = 4  # keyframes of the map by which a landmark is one that is found again
+_MIN_LANDMARKS = 4  # of a cell that is judged
+_SEEN_SHARE = 1 / 3  # of a cell's landmarks; by chance one in some hundred is found, of what stands there most are
+
+
+@dataclass(frozen=True, slots=True)
+class Confirmation:
+    """Cells of the map that a session should see, and those that it sees; low, high: bounds of their share at the test's error rate.
+
+    variance: of the share, with the dependence of cells in one block.
+    """
+
+    cells: int
+    seen: int
+    low: float
+    high: float
+    variance: float
+
+    @property
+    def share(self) -> float:
+        """Of the expected cells those that were seen; 0 without any."""
+        return self.seen / max(self.cells, 1)
+
+
+def firm_landmarks(count: int, obs_landmark: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """(N,) which of `count` landmarks enough keyframes of the map observe (M,) to expect that others find them too."""
+    return np.bincount(obs_landmark, minlength=count) >= _FIRM_OBSERVATIONS
+
+
+def due(expected: VisibleLandmarks, pixels: Array) -> NDArray[np.bool_]:
+    """(V,) which visible landmarks a picture with features at pixels (F, 3) should show.
+
+    Their octave is one that is searched, and no corner beside them is much nearer.
+    """
+    fits = np.asarray((expected.octaves > 0.0) & (expected.octaves < _MAX_OCTAVE))
+    known = np.flatnonzero(np.isfinite(pixels[:, 2]))
+    if not len(known) or not len(expected.rows):
+        return fits
+    away_px, nearest = cKDTree(pixels[known, :2]).query(expected.pixels[:, :2])
+    measured = (pixels[:, 0] - pixels[:, 2])[known[nearest]]
+    disparity = expected.pixels[:, 0] - expected.pixels[:, 2]
+    hidden = (away_px < _BESIDE_PX) & (measured > disparity + np.maximum(2.0, 0.15 * disparity))
+    return fits & ~hidden
+
+
+def look(
+    view: MapView, camera: StereoCamera, query: FrameFeatures, map_from_cam: Array
+) -> tuple[Rows, NDArray[np.bool_]]:
+    """Rows (V,) of the landmarks that a picture from there should show, and which of them it shows: the place is not refined."""
+    expected = view.visible(map_from_cam, camera, -EDGE_PX, WIDER_VIEW_RAD)
+    shown = due(expected, query.pixels)
+    expected = VisibleLandmarks(expected.rows[shown], expected.pixels[shown], expected.octaves[shown])
+    if not len(expected.rows):
+        return expected.rows, np.zeros(0, bool)
+    windows_px = _WINDOW_PX * SCALE_FACTOR ** np.clip(expected.octaves, 0, 3)
+    hit = match_visible(expected, view.descriptors[expected.rows], windows_px, query.features, _MATCHING)
+    measured = (query.pixels[:, 0] - query.pixels[:, 2])[hit]
+    off_px = np.abs(measured - expected.pixels[:, 0] + expected.pixels[:, 2])
+    return expected.rows, (hit >= 0) & ~(off_px > _DISPARITY_PX)
+
+
+def confirmation(
+    points_map: Array, looks: Sequence[tuple[Rows, NDArray[np.bool_]]], firm: NDArray[np.bool_], error_rate: float
+) -> Confirmation:
+    """Of the cells in which landmarks (N, 3) that are `firm` (N,) are expected by two looks and more, those with enough of them seen.
+
+    The bounds are those of Clopper and Pearson 1934 for as many independent cells as have the measured variance: blocks of cells
+    are the clusters of the sample. Source: Cochran 1977, Sampling Techniques, section 9A.
+    """
+    expected, seen = np.zeros(len(points_map), np.int64), np.zeros(len(points_map), np.int64)
+    for rows, is_seen in looks:
+        expected[rows] += 1
+        seen[rows[is_seen]] += 1
+    judged = np.flatnonzero(firm & (expected >= 2))
+    corners, cell = np.unique(np.floor(points_map[judged] / _CELL_M).astype(np.int64), axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    landmarks, found = (np.bincount(cell, weights, len(corners)) for weights in (None, (seen[judged] > 0) * 1.0))
+    enough = landmarks >= _MIN_LANDMARKS
+    is_seen = found[enough] >= _SEEN_SHARE * landmarks[enough]
+    blocks = np.floor(corners[enough] * (_CELL_M / _BLOCK_M))
+    return _bounded(is_seen, blocks, error_rate)
+
+
+def _bounded(is_seen: NDArray[np.bool_], blocks: Array, error_rate: float) -> Confirmation:
+    """The share of cells (C,) in blocks (C, 3), with its bounds."""
+    count = len(is_seen)
+    if count == 0:
+        return Confirmation(0, 0, 0.0, 1.0, 1.0)
+    share = float(is_seen.mean())
+    _, block = np.unique(blocks, axis=0, return_inverse=True)
+    off = np.bincount(block.reshape(-1), is_seen - share)
+    clustered = float((off**2).sum()) / count**2 * len(off) / max(len(off) - 1, 1)
+    alone = share * (1.0 - share) / count
+    effective = count * min(1.0, alone / clustered) if clustered > 0 else float(count)
+    k = share * effective
+    low = float(beta.ppf(error_rate, k, effective - k + 1)) if k > 0 else 0.0
+    high = float(beta.ppf(1.0 - error_rate, k + 1, effective - k)) if k < effective else 1.0
+    return Confirmation(count, int(is_seen.sum()), low, high, max(clustered, alone))

@@ -1,0 +1,226 @@
+"""Test whether a session belongs to a site, and where: joined, foreign, or undecided, at a stated error rate. Pure.
+
+Two things are asked, and a place that merely looks alike has to get both right: fixes at several places whose motion from one to the
+next is the session's own, and most of the parts of the map that the session should see from there. Position priors widen the search
+around where they point, choose between places of the site that look the same, and hold a session that they contradict; they are no
+evidence that it belongs to the site.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from fleetmap.geometry import Array
+from fleetmap.relocalization.frame_features import FrameFeatures
+from fleetmap.relocalization.relocalizer import Relocalizer
+from fleetmap.sensors.rectification import StereoCamera
+from mapserver.survey.merge.confirmation import Confirmation, confirmation, look
+from mapserver.survey.merge.session_alignment import Placed, alignments, find_fixes, fixes_around, follow_fixes
+from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
+from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from mapserver.survey.settings import SessionSettings
+
+_NEEDED_SHARE = 0.5  # of the expected cells: a map of which the greater part stands no more is to be surveyed anew
+_MIN_CELLS = 12  # with which a session that sees all of them passes
+_MOST_PLACES, _MOST_LOOKS = 4, 240  # alignments that are compared, keyframes that look
+_SAME_PLACE_M = 1.2
+_PRIOR_M = 3.0  # within which an alignment is where position priors put the session
+
+
+class JoinVerdict(StrEnum):
+    """Outcomes of the test."""
+
+    JOINED = "joined"
+    FOREIGN = "foreign"
+    UNDECIDED = "undecided"
+
+
+@dataclass(frozen=True, slots=True)
+class JoinEvidence:
+    """Figures of the test.
+
+    fixes: keyframes whose fixes agree with the session's own motion; places: those of them that lie a metre apart. cells_expected,
+    cells_seen: parts of the map that the session should see, and sees; seen_share with its bounds share_low, share_high at error_rate.
+    rival_share: the same share at the other place that looks most alike, None without one. priors_off_m: how far the place is from
+    where position priors put it, None without any.
+    """
+
+    fixes: int = 0
+    places: int = 0
+    cells_expected: int = 0
+    cells_seen: int = 0
+    seen_share: float = 0.0
+    share_low: float = 0.0
+    share_high: float = 1.0
+    error_rate: float = 0.0
+    rival_share: float | None = None
+    priors_off_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class NotJoined:
+    """A session that is not joined: why, and by what evidence."""
+
+    reason: str
+    verdict: JoinVerdict = JoinVerdict.UNDECIDED
+    evidence: JoinEvidence = JoinEvidence()
+
+
+@dataclass(frozen=True, slots=True)
+class Located:
+    """A session's place: map_from_body (K, 4, 4) of its keyframes, the fixes that agree and how many of them were believed."""
+
+    map_from_body: Array
+    placed: Placed
+    believed: int
+    seen: Confirmation
+    rival_share: float | None
+    priors_off_m: float | None
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A session as the test takes it.
+
+    keyframes (K) with their features and depths; survey_from_body (K, 4, 4) and the edges of its motion; camera on a body.
+    map_from_survey: where position priors put it, None without any.
+    """
+
+    keyframes: Sequence[FrameFeatures]
+    survey_from_body: Array
+    chain: Sequence[PoseEdge]
+    camera: StereoCamera
+    body_from_cam: Array
+    map_from_survey: Array | None = None
+
+
+class JoinTest:
+    """The test of one session in one map."""
+
+    def __init__(
+        self,
+        relocalizer: Relocalizer,
+        firm: NDArray[np.bool_],
+        visit: Visit,
+        settings: SessionSettings,
+    ) -> None:
+        """firm (N,): landmarks of the relocalizer's view that are expected to be found again."""
+        self._relocalizer, self._firm, self._visit, self._settings = relocalizer, firm, visit, settings
+        self.tried = 0
+
+    def locate(self) -> Located | NotJoined:
+        """Where the session is, if fixes say so and nowhere else looks alike. The map's confirmation there is not judged yet."""
+        visit, settings = self._visit, self._settings
+        ks = range(0, len(visit.keyframes), max(1, -(-len(visit.keyframes) // settings.fix_keyframes)))
+        fixes = find_fixes(self._relocalizer, visit.keyframes, ks, visit.body_from_cam)
+        if visit.map_from_survey is not None:
+            expected = {k: visit.map_from_survey @ visit.survey_from_body[k] for k in ks}
+            fixes += fixes_around(self._relocalizer, visit.keyframes, expected, visit.body_from_cam)
+        self.tried = len(ks)
+        found = alignments(fixes, visit.survey_from_body, GraphMarginals(visit.survey_from_body, visit.chain))
+        enough = [p for p in found if len(p.fixes) >= settings.min_fixes and p.places >= settings.min_places]
+        if not enough:
+            most = found[0] if found else Placed((), np.eye(4), 0)
+            return NotJoined(
+                f"it was not found in the map: at most {len(most.fixes)} fixes of {len(ks)} keyframes at {most.places} places agree "
+                f"on where it lies, {settings.min_fixes} at {settings.min_places} are needed; drive a longer way through places "
+                "that are in the map, the same way round",
+                evidence=JoinEvidence(len(most.fixes), most.places, error_rate=settings.join_error_rate),
+            )
+        return self._chosen([self._located(placed) for placed in enough[:_MOST_PLACES]])
+
+    def confirmation(self, map_from_body: Array) -> Confirmation:
+        """How much of the map the session sees with its keyframes at map_from_body (K, 4, 4)."""
+        visit, view = self._visit, self._relocalizer.view
+        ks = range(0, len(visit.keyframes), max(1, -(-len(visit.keyframes) // _MOST_LOOKS)))
+        looks = [look(view, visit.camera, visit.keyframes[k], map_from_body[k] @ visit.body_from_cam) for k in ks]
+        return confirmation(view.points_map, looks, self._firm, self._settings.join_error_rate)
+
+    def evidence(self, located: Located, seen: Confirmation) -> JoinEvidence:
+        """The figures of a place at which the session sees so much of the map."""
+        placed, share, low, high = located.placed, *(round(value, 4) for value in (seen.share, seen.low, seen.high))
+        return JoinEvidence(
+            fixes=len(placed.fixes),
+            places=placed.places,
+            cells_expected=seen.cells,
+            cells_seen=seen.seen,
+            seen_share=share,
+            share_low=low,
+            share_high=high,
+            error_rate=self._settings.join_error_rate,
+            rival_share=located.rival_share,
+            priors_off_m=located.priors_off_m,
+        )
+
+    def judged(self, located: Located, seen: Confirmation) -> NotJoined | None:
+        """Why a session that sees so much of the map is not joined; None where it is."""
+        if seen.cells >= _MIN_CELLS and seen.low > _NEEDED_SHARE:
+            return None
+        said = f"of {seen.cells} parts of the map that it should see there it sees {seen.seen}"
+        evidence = self.evidence(located, seen)
+        if seen.cells >= _MIN_CELLS and seen.high < _NEEDED_SHARE:
+            reason = (
+                f"it was recorded elsewhere, or all has changed: {said}, at most {seen.high:.0%} where half is needed"
+            )
+            return NotJoined(f"{reason}; build it as another --site", JoinVerdict.FOREIGN, evidence)
+        bounds = f"{seen.low:.0%} to {seen.high:.0%} where more than half is needed"
+        return NotJoined(
+            f"it is not certain that it belongs here: {said}, {bounds}; drive a longer way through places that are in the map, the same "
+            "way round",
+            JoinVerdict.UNDECIDED,
+            evidence,
+        )
+
+    def _located(self, placed: Placed) -> Located:
+        visit = self._visit
+        map_from_body, believed = follow_fixes(placed, visit.survey_from_body, visit.chain)
+        off_m = None
+        if visit.map_from_survey is not None:
+            by_priors = visit.map_from_survey @ visit.survey_from_body
+            ks = [fix.k for fix in placed.fixes]
+            apart_m = np.linalg.norm((map_from_body - by_priors)[ks, :3, 3], axis=1)
+            off_m = round(float(np.median(apart_m)), 2)
+        return Located(map_from_body, placed, believed, self.confirmation(map_from_body), None, off_m)
+
+    def _chosen(self, found: list[Located]) -> Located | NotJoined:
+        """The place that most of the map speaks for; undecided where another is as good and no position prior tells them apart."""
+        best = max(found, key=lambda one: (2 * one.seen.seen - one.seen.cells, len(one.placed.fixes)))
+        others = [one for one in found if not _same_place(one, best)]
+        alike = [best, *(one for one in others if self._is_alike(one, best))]
+        near = [one for one in alike if one.priors_off_m is not None and one.priors_off_m < _PRIOR_M]
+        rival_share = max((round(one.seen.share, 4) for one in others), default=None)
+        if len(alike) > 1 and len(near) != 1:
+            seen = " and ".join(f"{one.seen.seen} of {one.seen.cells}" for one in alike[:2])
+            located = _with_rival(best, rival_share)
+            return NotJoined(
+                f"{len(alike)} places of the map look alike to it: it sees {seen} parts of the map there; drive on to where they "
+                "differ, or past a dock",
+                evidence=self.evidence(located, located.seen),
+            )
+        chosen = _with_rival(near[0] if len(alike) > 1 else best, rival_share)
+        if chosen.priors_off_m is not None and chosen.priors_off_m >= _PRIOR_M:
+            return NotJoined(
+                f"its docks and what it sees name places {chosen.priors_off_m:.1f} m apart: correct the docks' positions, or leave "
+                "them out",
+                evidence=self.evidence(chosen, chosen.seen),
+            )
+        return chosen
+
+    def _is_alike(self, other: Located, best: Located) -> bool:
+        """Whether another place is not worse by more than chance, and would itself pass."""
+        sigmas = float(norm.isf(self._settings.join_error_rate))
+        apart = sigmas * np.sqrt(other.seen.variance + best.seen.variance)
+        return bool(other.seen.share > max(_NEEDED_SHARE, best.seen.share - apart))
+
+
+def _same_place(one: Located, other: Located) -> bool:
+    apart_m = np.linalg.norm((one.map_from_body - other.map_from_body)[:, :3, 3], axis=1)
+    return bool(np.median(apart_m) < _SAME_PLACE_M)
+
+
+def _with_rival(one: Located, rival_share: float | None) -> Located:
+    return Located(one.map_from_body, one.placed, one.believed, one.seen, rival_share, one.priors_off_m)
