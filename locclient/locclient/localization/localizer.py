@@ -150,6 +150,8 @@ class Localizer:
         if last is not None and change is not None:
             last = change @ last
         step = np.eye(4) if last is None else se3_inverse(last) @ odometry.odom_from_body
+        if last is not None and odometry.previous_from_body is not None:
+            step = odometry.previous_from_body
         for hypothesis in [*self._hypotheses(), *([self._query_frame] if self._query_frame else [])]:
             hypothesis.propagate(self._odometry, odometry, step, self._track)
             if change is not None:

@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.odometry import ContinuousFrame
 from locclient.localization.estimate import Estimate
 
 
@@ -19,22 +18,21 @@ class PublishedPose:
 class ContinuousOdom:
     """Follows estimates one after another.
 
-    The odometry redefines its own frame when it finds gravity or is initialized again. Before the first localized pose `odom` follows
-    it, because nobody navigates by it yet. Afterwards the difference goes into map_from_odom, which may jump, so that
+    The odometry redefines its own frame when it finds gravity, knows it better or is initialized again. Before the first localized pose
+    `odom` follows it, because nobody navigates by it yet. Afterwards the difference goes into map_from_odom, which may jump, so that
     odom_from_base never does.
     """
 
     def __init__(self, base_from_body: Array) -> None:
         self._body_from_base = se3_inverse(base_from_body)
-        self._odom_from_own = np.eye(4)
+        self._frame = ContinuousFrame()
         self._is_localized = False
 
     def handle(self, estimate: Estimate) -> PublishedPose:
         """The pose to publish for this frame."""
-        change = estimate.odometry.new_odom_from_old_odom
-        if change is not None and self._is_localized:
-            self._odom_from_own = self._odom_from_own @ se3_inverse(change)
-        odom_from_body = self._odom_from_own @ estimate.odometry.odom_from_body
+        if not self._is_localized:
+            self._frame = ContinuousFrame()
+        odom_from_body = self._frame.handle(estimate.odometry)
         odom_from_base = odom_from_body @ self._body_from_base
         if estimate.map_from_body is None:
             return PublishedPose(odom_from_base, None)

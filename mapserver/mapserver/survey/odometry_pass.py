@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, rotation_between_vectors, se3
-from fleetmap.odometry import OdometryEstimate, OdometryStatus, make_odometry
+from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse
+from fleetmap.odometry import ContinuousFrame, OdometryEstimate, OdometryStatus, make_odometry
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import wheel_between
 from mapserver.survey.frame_tracks import FrameTracks
@@ -50,8 +50,7 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
     mounting = rectifier.camera, rectifier.body_from_cam, offset_s
     odometry = make_odometry(inputs.calibration, *mounting, settings.odometry, settings.stereo)
     policy = KeyframePolicy(settings.keyframes)
-    estimates: list[OdometryEstimate] = []
-    odom_from_body: list[Array] = []
+    trajectory = _Trajectory()
     seen: list[FrameTracks] = []
 
     def chosen() -> Iterator[tuple[int, RectifiedFrame]]:
@@ -64,16 +63,17 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
             fed_ns = until_ns
             estimate = odometry.handle_stereo(frame)
             seen.append(FrameTracks.of_frame(estimate))
-            _append(replace(estimate, track_ids=_NO_IDS, track_pixels=None), estimates, odom_from_body)
+            frame_from_body = trajectory.append(estimate)
             tools.progress("odometry", number + 1, inputs.frame_count)
-            if policy.wants(_summary(frame, estimate)):
+            if policy.wants(_summary(frame, estimate, frame_from_body)):
                 yield number, frame
 
     keyframes = list(make_keyframes(chosen(), rectifier.camera, settings, tools.images, tools.executor))
+    estimates = trajectory.estimates
     inertial = bool(estimates) and inputs.calibration.imu is not None and estimates[-1].inertial
     done = OdometryPass(
         estimates,
-        np.array(odom_from_body),
+        trajectory.odom_from_body(),
         continued_covariances(estimates),
         np.array([e.status is not OdometryStatus.DEGRADED for e in estimates]),
         keyframes,
@@ -85,16 +85,26 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
     return done if rectifier.camera.baseline_m > 0 else longest_run(done, rectifier.body_from_cam)
 
 
-def _append(estimate: OdometryEstimate, estimates: list[OdometryEstimate], odom_from_body: list[Array]) -> None:
-    """Adds one frame's estimate, and applies its corrections of earlier frames."""
-    if estimate.new_odom_from_old_odom is not None:
-        odom_from_body[:] = [estimate.new_odom_from_old_odom @ earlier for earlier in odom_from_body]
-    estimates.append(estimate)
-    odom_from_body.append(estimate.odom_from_body)
-    for earlier, placed in estimate.revised:
-        odom_from_body[earlier] = placed
-        tracked = replace(estimates[earlier], odom_from_body=placed, status=OdometryStatus.TRACKING)
-        estimates[earlier] = replace(tracked, scale_known=estimate.scale_known)
+class _Trajectory:
+    """Estimates of all frames so far, and where each frame is in one continuous frame."""
+
+    def __init__(self) -> None:
+        self.estimates: list[OdometryEstimate] = []
+        self._frame, self._frame_from_body = ContinuousFrame(), list[Array]()
+
+    def append(self, estimate: OdometryEstimate) -> Array:
+        """frame_from_body (4, 4) of one more frame; applies its corrections of earlier frames."""
+        self.estimates.append(replace(estimate, track_ids=_NO_IDS, track_pixels=None))
+        self._frame_from_body.append(self._frame.handle(estimate))
+        for earlier, placed in estimate.revised:
+            self._frame_from_body[earlier] = self._frame.frame_from_odom @ placed
+            tracked = replace(self.estimates[earlier], odom_from_body=placed, status=OdometryStatus.TRACKING)
+            self.estimates[earlier] = replace(tracked, scale_known=estimate.scale_known)
+        return self._frame_from_body[-1]
+
+    def odom_from_body(self) -> Array:
+        """(F, 4, 4) in the frame of the last estimate, by which gravity is known best."""
+        return np.asarray(se3_inverse(self._frame.frame_from_odom) @ np.array(self._frame_from_body).reshape(-1, 4, 4))
 
 
 def continued_covariances(estimates: Sequence[OdometryEstimate]) -> Array:
@@ -115,9 +125,9 @@ def continued_covariances(estimates: Sequence[OdometryEstimate]) -> Array:
     return np.array(covariances)
 
 
-def _summary(frame: RectifiedFrame, estimate: OdometryEstimate) -> FrameSummary:
+def _summary(frame: RectifiedFrame, estimate: OdometryEstimate, frame_from_body: Array) -> FrameSummary:
     e = estimate
-    return FrameSummary(frame.stamp_ns, e.odom_from_body, e.track_ids, e.scene_depth_m, sharpness(frame), e.after_gap)
+    return FrameSummary(frame.stamp_ns, frame_from_body, e.track_ids, e.scene_depth_m, sharpness(frame), e.after_gap)
 
 
 def longest_run(odometry: OdometryPass, body_from_cam: Array) -> OdometryPass:

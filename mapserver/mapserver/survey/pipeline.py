@@ -137,12 +137,13 @@ def _initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
     rectifier, numbers = inputs.rectifier, [k.frame_index for k in odometry.keyframes]
     estimates = [odometry.estimates[n] for n in numbers]
     map_from_body = odometry.odom_from_body[numbers]
+    body_velocities = [e.odom_from_body[:3, :3].T @ e.velocity_odom_mps for e in estimates]
     motion = KeyframeMotion(
         inertial=odometry.inertial,
         imu=inputs.imu,
         noise=inputs.calibration.imu,
         imu_minus_cam_s=rectifier.imu_minus_cam_s,
-        velocities_mps=np.array([e.velocity_odom_mps for e in estimates]),
+        velocities_mps=np.einsum("kij,kj->ki", map_from_body[:, :3, :3], np.array(body_velocities)),
         gyro_bias_radps=np.array([e.gyro_bias_radps for e in estimates]),
         accel_bias_mps2=np.array([e.accel_bias_mps2 for e in estimates]),
         relative=[] if odometry.inertial else odometry_factors(odometry, map_from_body),

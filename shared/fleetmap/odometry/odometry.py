@@ -4,6 +4,7 @@ Never touches a file, a socket or a clock.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -67,7 +68,9 @@ class Odometry:
         tracked = self._tracker.track(frame, mode.cam_from_earlier, mode.rotation_sigma_rad)
         step = mode.process(frame_index, tracked)
         self._mode, self._frame_index = step.mode, frame_index + 1
-        return self._mode.estimate(frame.stamp_ns, frame_index, tracked, step)
+        estimate = self._mode.estimate(frame.stamp_ns, frame_index, tracked, step)
+        motion = self._mode.motion_since(frame_index - 1) if frame_index else None
+        return estimate if motion is None else replace(estimate, previous_from_body=motion[0])
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance.

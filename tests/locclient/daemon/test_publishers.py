@@ -82,3 +82,16 @@ def test_odom_is_continuous_once_a_place_was_named() -> None:
     np.testing.assert_allclose(after.odom_from_base[:3, 3] - before.odom_from_base[:3, 3], [0.1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(after.map_from_odom @ after.odom_from_base, redefined.map_from_body, atol=1e-12)
     np.testing.assert_allclose(after.map_from_odom, before.map_from_odom, atol=1e-12)
+
+
+def test_gravity_that_becomes_better_known_goes_into_map_from_odom() -> None:
+    """It turns the odometry's frame about an origin 12 m behind: 7 cm for the body, none of which was driven."""
+    turn, step = se3(so3_exp(np.array([0.0, 0.006, 0.0])), np.zeros(3)), se3(np.eye(3), np.array([0.1, 0.0, 0.0]))
+    frame = ContinuousOdom(np.eye(4))
+    before = frame.handle(estimate(1.0, x_m=2.0))
+    turned = estimate(1.1, x_m=2.1)
+    object.__setattr__(turned.odometry, "odom_from_body", turn @ turned.odometry.odom_from_body)
+    object.__setattr__(turned.odometry, "previous_from_body", step)
+    after = frame.handle(turned)
+    np.testing.assert_allclose(after.odom_from_base, before.odom_from_base @ step, atol=1e-12)
+    np.testing.assert_allclose(after.map_from_odom @ after.odom_from_base, turned.map_from_body, atol=1e-12)

@@ -1,0 +1,70 @@
+"""A frame without jumps: gravity that becomes better known, a frame that is redefined, and both in a simulated bend."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from benchmarks.common import consistency, estimator_loop
+from fleetmap.geometry import Array, se3_exp, se3_inverse
+from fleetmap.odometry import ContinuousFrame, OdometryEstimate
+
+STEP = se3_exp(np.array([0.0, 0.0, 0.02, 1.0, 0.0, 0.0]))
+TURN = se3_exp(np.array([0.0, 0.006, 0.0, 0.0, 0.0, 0.0]))  # a third of a degree about the origin
+
+
+def drive(frames: int) -> Array:
+    out = [np.eye(4)]
+    for _ in range(frames - 1):
+        out.append(out[-1] @ STEP)
+    return np.array(out)
+
+
+def estimate(odom_from_body: Array, motion: Array | None, change: Array | None = None) -> SimpleNamespace:
+    return SimpleNamespace(odom_from_body=odom_from_body, previous_from_body=motion, new_odom_from_old_odom=change)
+
+
+def steps_of(frame_from_body: Array) -> Array:
+    return se3_inverse(frame_from_body[:-1]) @ frame_from_body[1:]
+
+
+def test_gravity_that_becomes_better_known_moves_nothing() -> None:
+    truth, frame = drive(20), ContinuousFrame()
+    turned = [TURN @ place if n >= 17 else place for n, place in enumerate(truth)]
+    assert np.linalg.norm((turned[17] - truth[17])[:3, 3]) > 0.09
+    found = np.array([frame.handle(estimate(t, STEP if n else None)) for n, t in enumerate(turned)])
+    np.testing.assert_allclose(found, truth, atol=1e-9)
+    np.testing.assert_allclose(frame.frame_from_odom, se3_inverse(TURN), atol=1e-9)
+
+
+def test_a_frame_that_is_redefined_moves_nothing() -> None:
+    truth, frame = drive(10), ContinuousFrame()
+    found = [frame.handle(estimate(t, STEP)) for t in truth[:5]]
+    found.append(frame.handle(estimate(TURN @ truth[5], None, TURN)))
+    found += [frame.handle(estimate(TURN @ t, STEP)) for t in truth[6:]]
+    np.testing.assert_allclose(np.array(found), truth, atol=1e-9)
+
+
+def test_without_a_motion_estimates_follow_each_other_as_they_are() -> None:
+    truth, frame = drive(5), ContinuousFrame()
+    found = np.array([frame.handle(estimate(t, None)) for t in truth])
+    np.testing.assert_array_equal(found, truth)
+
+
+@pytest.fixture(scope="module")
+def bend() -> tuple[list[OdometryEstimate], Array]:
+    """Twelve seconds straight on and into a first bend, in which tilt and accelerometer bias come apart."""
+    session = consistency.Site().session(2001)
+    return estimator_loop.run_odometry(session, 200), session.map_from_body[:200]
+
+
+def test_no_frame_of_a_bend_jumps(bend: tuple[list[OdometryEstimate], Array]) -> None:
+    """Seen: a robot's `odom` 9 cm up and down from frame to frame, while each motion was known to millimetres."""
+    estimates, truth = bend
+    first = next(k for k, e in enumerate(estimates) if e.inertial)
+    frame = ContinuousFrame()
+    found = np.array([frame.handle(e) for e in estimates])[first:]
+    off = se3_inverse(steps_of(truth[first:])) @ steps_of(found)
+    apart = se3_inverse(steps_of(truth[first:])) @ steps_of(np.array([e.odom_from_body for e in estimates[first:]]))
+    assert np.linalg.norm(apart[:, :3, 3], axis=1).max() > 0.03  # else this shows nothing
+    assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.01
