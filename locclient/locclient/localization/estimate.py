@@ -6,6 +6,7 @@ from fleetmap.geometry import Array
 from fleetmap.messages import Cause, Status
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.relocalizer import Fix
+from locclient.localization.calibration.parameters import NOT_JUDGED, CalibrationState
 from locclient.localization.image_quality import GOOD_IMAGE, ImageQuality
 
 
@@ -27,7 +28,7 @@ class Estimate:
     distance between fix and prediction; innovation_m: metres, for fixes that were believed or found where the robot should be. moved_m: for
     a pose confirmed with this frame, its distance from the pose that was claimed until fixes contradicted it, where that is more than its
     covariance admits: one of the two was wrong. hypotheses: the competing poses while AMBIGUOUS. stage_s: seconds by stage, by the clock
-    that was passed in.
+    that was passed in. calibration: what the map shows of it.
     """
 
     stamp_ns: int
@@ -46,3 +47,4 @@ class Estimate:
     fix_stamp_ns: int | None = None
     innovation_m: float | None = None
     moved_m: float | None = None
+    calibration: CalibrationState = NOT_JUDGED

@@ -18,6 +18,9 @@ from fleetmap.relocalization.relocalizer import Fix, Relocalizer, is_reliable
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
+from locclient.localization.calibration.monitor import CalibrationMonitor, FinishedQuery
+from locclient.localization.calibration.pair_order import REVERSED_TEXT
+from locclient.localization.calibration.watch import Mounting
 from locclient.localization.estimate import Estimate
 from locclient.localization.estimate_assembly import LocalizationState, assemble
 from locclient.localization.hypothesis_scoring import recent
@@ -78,6 +81,10 @@ class Localizer:
         self._failed_queries = 0
         self._image_monitor = ImageQualityMonitor(settings.sight)
         self._was_tracking = False
+        mounting = Mounting(self._cam_from_body, calibration.base_from_body)
+        self._calibration = CalibrationMonitor(mounting, settings.relocalizer)
+        self._query_input: tuple[RectifiedFrame, OdometryEstimate] | None = None  # of that query
+        self._query_features: FrameFeatures | None = None
 
     def handle_imu(self, samples: ImuSamples) -> None:
         """IMU samples newer than any before."""
@@ -86,6 +93,7 @@ class Localizer:
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
         """Wheel odometry newer than any before."""
         self._odometry.handle_wheel(samples)
+        self._calibration.watch.handle_wheel(samples)
 
     def handle_prior(self, prior: PositionPrior) -> None:
         """A prior at this moment, used until a pose is confirmed, with a covariance that grows with the distance since. One whose
@@ -109,6 +117,7 @@ class Localizer:
         view = MapView(tiles, vocabulary, survey_focal_px)
         self._relocalizer = Relocalizer(view, self._camera, self._settings.relocalizer)
         self._work = self._query_frame = None
+        self._calibration.give_up()
 
     def handle_stereo(self, frame: RectifiedFrame) -> Estimate:
         """The estimate at `frame`, newer than any before."""
@@ -122,7 +131,9 @@ class Localizer:
             image = replace(image, cause=self._image_monitor.judge_depth(odometry.scene_depth_m))
         tracked_s = self._clock()
         self._propagate(odometry)
-        result = self._query_map(frame, odometry)
+        self._calibration.work()
+        is_reversed = self._calibration.is_reversed(frame, is_localized=self._confirmed is not None)
+        result = _QueryResult(refused=REVERSED_TEXT) if is_reversed else self._query_map(frame, odometry)
         self._last_ns = frame.stamp_ns
         stage_s = {"sight": judged_s - begun_s, "odometry": tracked_s - judged_s, "map": self._clock() - tracked_s}
         estimate = Estimate(
@@ -140,7 +151,10 @@ class Localizer:
         )
         prior, has_failed = self._prior_hypothesis(), self._failed_queries > 0
         state = LocalizationState(self._confirmed, self._candidates, prior, has_failed, self._was_tracking)
-        return assemble(estimate, state, self._track)
+        last_fix_ns = None if self._confirmed is None else self._confirmed.stamp_ns
+        return self._calibration.judged(
+            assemble(estimate, state, self._track), last_fix_ns, was_localized=self._was_tracking
+        )
 
     # --- odometry -----------------------------------------------------------------------------------------------------
 
@@ -185,6 +199,7 @@ class Localizer:
             is_at_once = self._is_sparse(frame.stamp_ns) or odometry.after_gap
             self._query_ns = frame.stamp_ns
             self._query_frame = PoseHypothesis.at(odometry, np.eye(4), np.zeros((6, 6)))
+            self._query_input, self._query_features = (frame, odometry), None
             for hypothesis in self._hypotheses():
                 hypothesis.mark_query()
             self._work = self._query(frame, self._relocalizer)
@@ -196,6 +211,9 @@ class Localizer:
         except StopIteration as done:
             result: _QueryResult = done.value._replace(fix_stamp_ns=self._query_frame.stamp_ns)
             self._work = self._query_frame = None
+            if self._relocalizer is not None and self._query_input is not None and self._query_features is not None:
+                looked = FinishedQuery(*self._query_input, self._query_features, result.fix, self._relocalizer)
+                self._calibration.add(looked)
             self._failed_queries = 0 if result.fix is not None else self._failed_queries + 1
             return result
         return _QueryResult()
@@ -215,7 +233,7 @@ class Localizer:
         return (stamp_ns - self._last_ns) * 1e-9 > _SPREAD_SHARE * self._track.fix_interval_s
 
     def _query(self, frame: RectifiedFrame, relocalizer: Relocalizer) -> TimeSliced[_QueryResult]:
-        features = yield from relocalizer.extract(frame)
+        features = self._query_features = yield from relocalizer.extract(frame)
         if self._confirmed is None:
             fixes = yield from self._search(features, relocalizer)
             return (yield from self._update_candidates(fixes))

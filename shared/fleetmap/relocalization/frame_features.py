@@ -37,6 +37,10 @@ class FrameFeatures:
             self.is_tried[at] = True
         return self.pixels[rows]
 
+    def without_depth(self) -> "FrameFeatures":
+        """A copy as of a single camera."""
+        return FrameFeatures(self.features, np.column_stack([self.pixels[:, :2], np.full(len(self.pixels), np.nan)]))
+
 
 def extract_features(frame: RectifiedFrame, settings: orb.OrbSettings) -> Generator[None, None, FrameFeatures]:
     """The features of one frame, no depth measured yet, in slices."""

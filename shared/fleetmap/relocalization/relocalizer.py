@@ -36,6 +36,7 @@ class Fix:
     expected, seen: how many landmarks that is a share of, and how many were found; 0 where none is expected.
     alias_ratio: support of the best other place relative to this one; 1 where no other place was searched for.
     covisible: the landmarks behind landmark_recall, None where the survey did not pass.
+    matched: all that was matched at the end, before any gate.
     """
 
     map_from_cam: Array
@@ -49,6 +50,7 @@ class Fix:
     seen: int = 0
     matches: NDArray[np.int64] | None = field(default=None, repr=False, compare=False)
     covisible: CovisibleLandmarks | None = field(default=None, repr=False, compare=False)
+    matched: Correspondences | None = field(default=None, repr=False, compare=False)
 
 
 class Relocalizer:
@@ -134,7 +136,8 @@ class Relocalizer:
             map_from_cam = se3_inverse(found.cam_from_source)
             matches = np.column_stack([hit[kept], rows[kept]])[found.inliers]
         assert found is not None
-        return self._verified(query, found, matches)
+        fix = self._verified(query, found, matches)
+        return None if fix is None else replace(fix, matched=matched)
 
     def _at_place(self, query: FrameFeatures, place: int, rotation: Array | None) -> Fix | None:
         settings = self._settings.fix

@@ -1,0 +1,147 @@
+"""What one frame says of the cameras' parameters, its own pose marginalized. Pure."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fleetmap.features.flow import Pyramid, follow, forward_backward_check
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
+from fleetmap.pnp.pnp import Correspondences
+from fleetmap.sensors.rectification import RectifiedFrame
+from locclient.localization.calibration.parameters import IMAGE
+
+_POSE = 6
+_CENTRE_SIGMA_PX = 1.0  # of the principal point, which is not told from a turn of the rig
+# Widths of the robust weight in sigmas, one for each step: a wrong calibration moves all disparities at once.
+_WIDTHS = (30.0, 6.0, 3.0)
+_ROW_POINTS, _ROW_WINDOW_PX, _ROW_BACK_PX, _ROW_SIGMA_PX = 40, 11, 0.5, 0.2
+_MIN_POINTS = 15
+_NEAREST_M = 0.3
+
+
+class CameraView(NamedTuple):
+    """information (6, 6) and score (6,) = information @ estimate of the first parameters of `PARAMETERS`.
+
+    pose_per_parameter (6, 6): how the pose of a fix, a left perturbation in camera axes of cam_from_map, follows each parameter.
+    """
+
+    information: Array
+    score: Array
+    pose_per_parameter: Array
+
+
+def row_errors(frame: RectifiedFrame, matched: Correspondences, map_from_cam: Array) -> Array:
+    """(N,) row of a point in the right image minus that in the left one, px; NaN where it was not looked for or not found.
+
+    Looked for around where the map says, in both directions, so that a pair that is turned up or down still shows it.
+    """
+    out = np.full(len(matched), np.nan)
+    if frame.right is None:
+        return out
+    points_cam = transform_points(se3_inverse(map_from_cam), matched.points_source)
+    seen = np.flatnonzero(points_cam[:, 2] > _NEAREST_M)
+    seen = seen[np.linspace(0, len(seen) - 1, min(len(seen), _ROW_POINTS)).astype(int)] if len(seen) else seen
+    left = matched.pixels[seen, :2]
+    lens = matched.camera.lens
+    predicted = left - np.column_stack([lens[3] / points_cam[seen, 2], np.zeros(len(seen))])
+    pyramids = Pyramid(frame.left), Pyramid(frame.right)
+    flow = follow(*pyramids, left, predicted, window_px=_ROW_WINDOW_PX, levels=1)
+    good = forward_backward_check(*pyramids, flow, window_px=_ROW_WINDOW_PX, within_px=_ROW_BACK_PX)
+    out[seen[good]] = flow.places[good, 1] - left[good, 1]
+    return out
+
+
+def camera_view(matched: Correspondences, map_from_cam: Array, rows_px: Array) -> CameraView | None:
+    """The view of a frame near map_from_cam with all that it matched, before any gate; None where too little has depth.
+
+    rows_px (N,): from `row_errors`. Source: Triggs et al. 2000, sections 6.1 (Schur complement) and 2.2 (self-calibration).
+    """
+    if np.isfinite(matched.pixels[:, 2]).sum() < _MIN_POINTS:
+        return None
+    cam_from_map, theta = se3_inverse(map_from_cam), np.zeros(IMAGE + 2)
+    prior = np.zeros(_POSE + IMAGE + 2)
+    prior[-2:] = _CENTRE_SIGMA_PX**-2
+    hessian = np.zeros((len(prior), len(prior)))
+    for width in _WIDTHS:
+        hessian, gradient = _normal_equations(matched, rows_px, cam_from_map, theta, width)
+        gradient[_POSE:] -= prior[_POSE:] * theta
+        hessian[range(len(prior)), range(len(prior))] += prior
+        try:
+            step = np.asarray(np.linalg.solve(hessian + 1e-9 * np.diag(np.diag(hessian) + 1.0), gradient), np.float64)
+        except np.linalg.LinAlgError:
+            return None
+        cam_from_map = se3(so3_exp(step[:3]), step[3:_POSE]) @ cam_from_map
+        theta = theta + step[_POSE:]
+    kept = slice(_POSE, _POSE + IMAGE)
+    free = [*range(_POSE), *range(_POSE + IMAGE, len(prior))]
+    cross = hessian[np.ix_(free, range(_POSE, _POSE + IMAGE))]
+    regular = hessian[np.ix_(free, free)] + 1e-9 * np.eye(len(free))
+    information = hessian[kept, kept] - cross.T @ np.linalg.solve(regular, cross)
+    pose_hessian = hessian[:_POSE, :_POSE] + 1e-9 * np.eye(_POSE)
+    shift = np.asarray(np.linalg.solve(pose_hessian, hessian[:_POSE, kept]), np.float64)
+    if not (np.isfinite(theta).all() and np.isfinite(information).all()):
+        return None
+    return CameraView(information, information @ theta[:IMAGE], shift)
+
+
+def _normal_equations(
+    matched: Correspondences, rows_px: Array, cam_from_map: Array, theta: Array, width: float
+) -> tuple[Array, Array]:
+    """Hessian and gradient of pose (a left perturbation), parameters and principal point, with Geman-McClure weights.
+
+    The right camera's focal length, roll and yaw change disparities, and the rows of the right image.
+    """
+    focal_px, cx_px, cy_px, _ = lens = matched.camera.lens
+    x, y, z = transform_points(cam_from_map, matched.points_source).T
+    is_before = z > _NEAREST_M
+    near = 1.0 / np.where(is_before, z, 1.0)
+    u, v, disparity = focal_px * x * near, focal_px * y * near, lens[3] * near
+    focal, depth, yaw, right_focal, roll, pitch, centre_u, centre_v = theta
+    right = u - disparity
+    across = right * v / focal_px
+    u_seen, v_seen, right_seen = matched.pixels.T
+    has_depth = np.isfinite(right_seen) & is_before
+    has_row = np.isfinite(rows_px) & is_before
+    residuals = np.stack(
+        [
+            (1 + focal) * u + cx_px + centre_u - u_seen,
+            (1 + focal) * v + cy_px + centre_v - v_seen,
+            (1 + focal) * (1 + depth) * disparity
+            + yaw * (focal_px + right * right / focal_px)
+            - right_focal * right
+            + roll * v
+            - pitch * across
+            - (u_seen - right_seen),
+            right_focal * v + roll * right + pitch * (focal_px + v * v / focal_px) - yaw * across - rows_px,
+        ],
+        axis=1,
+    )
+    count, zero = len(x), np.zeros(len(x))
+    jacobian = np.zeros((count, 4, _POSE + IMAGE + 2))
+    by_point = np.zeros((count, 3, 3))
+    by_point[:, 0, 0] = by_point[:, 1, 1] = focal_px * near
+    by_point[:, 0, 2], by_point[:, 1, 2], by_point[:, 2, 2] = -u * near, -v * near, -disparity * near
+    turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(count, 3, 3)  # d(point) / d(turn)
+    jacobian[:, :3, :3] = by_point @ turned
+    jacobian[:, :3, 3:_POSE] = by_point
+    of = jacobian[:, :, _POSE:]
+    of[:, 0, 0], of[:, 1, 0], of[:, 2, 0] = u, v, disparity
+    of[:, 2, 1], of[:, 2, 2], of[:, 2, 3] = disparity, focal_px + right * right / focal_px, -right
+    of[:, 2, 4], of[:, 2, 5] = v, -across
+    of[:, 3, 2], of[:, 3, 3], of[:, 3, 4], of[:, 3, 5] = -across, v, right, focal_px + v * v / focal_px
+    of[:, 0, IMAGE] = of[:, 1, IMAGE + 1] = 1.0
+    weights = 1.0 / matched.sigmas_px
+    scale = np.stack([weights[:, 0], weights[:, 0], weights[:, 1], np.full(count, 1 / _ROW_SIGMA_PX)], axis=1)
+    scaled = np.nan_to_num(residuals) * scale
+    of_left = _robust((scaled[:, :2] ** 2).sum(axis=1), width) * is_before
+    of_right = of_left * _robust(scaled[:, 2] ** 2, width) * has_depth
+    of_row = of_left * _robust(scaled[:, 3] ** 2, width) * has_row
+    robust = np.stack([of_left, of_left, of_right, of_row], axis=1)
+    rows = (jacobian * scale[:, :, None]).reshape(4 * count, -1)
+    weighted = rows * robust.reshape(-1, 1)
+    return np.asarray(rows.T @ weighted), np.asarray(-weighted.T @ scaled.ravel())
+
+
+def _robust(squared: Array, width: float) -> Array:
+    """Weight of a squared normalized residual. Source: Geman and McClure 1985."""
+    return np.asarray((width * width / (width * width + squared)) ** 2)

@@ -1,0 +1,113 @@
+"""Monitor of the calibration beside the localizer: the pair's order, the watch, and what is published of them. Pure."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleetmap.features.orb import OrbSettings
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.messages import Cause, Status
+from fleetmap.numerics.time_sliced import TimeSliced
+from fleetmap.odometry import OdometryEstimate
+from fleetmap.relocalization.frame_features import FrameFeatures
+from fleetmap.relocalization.relocalizer import Fix, Relocalizer, is_reliable
+from fleetmap.relocalization.settings import RelocalizerSettings
+from fleetmap.sensors.rectification import RectifiedFrame
+from locclient.localization.calibration.pair_order import REVERSED_TEXT, PairOrder, pair_order
+from locclient.localization.calibration.parameters import CalibrationState
+from locclient.localization.calibration.watch import CalibrationWatch, MapQuery, Mounting
+from locclient.localization.estimate import Estimate
+
+# Between two tests of the pair's order: until one has decided, after one has found it reversed, and while the robot is not localized.
+_UNDECIDED_S, _REVERSED_S, _NOT_LOCALIZED_S = 0.5, 5.0, 20.0
+_WITHOUT_DEPTH_S = 1.0  # between two searches without depth, while the frames agree with nothing in the map
+_HELD_S = 1.0  # by a fix of this age, a pose by wrong cameras is published
+_ORDER_CORNERS = 500
+
+
+@dataclass(frozen=True)
+class FinishedQuery:
+    """A look at the map that has ended, with or without a fix."""
+
+    frame: RectifiedFrame
+    odometry: OdometryEstimate
+    features: FrameFeatures
+    fix: Fix | None
+    relocalizer: Relocalizer
+
+
+class CalibrationMonitor:
+    """Holds what the localizer need not know of the watch. Its work is done in slices, in frames after the one that it is about."""
+
+    def __init__(self, rig: Mounting, settings: RelocalizerSettings) -> None:
+        self._rig, self._settings = rig, settings
+        self.watch = CalibrationWatch(rig, settings.stereo)
+        self._job: TimeSliced[None] | None = None
+        self._searched_ns: int | None = None
+        self._order, self._order_ns = PairOrder.UNKNOWN, -(2**62)
+
+    def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
+        """Whether the pair is known to be exchanged or mirrored; tests this frame where that is due."""
+        age_s = (frame.stamp_ns - self._order_ns) * 1e-9
+        undecided = {PairOrder.UNKNOWN: _UNDECIDED_S, PairOrder.REVERSED: _REVERSED_S}
+        if age_s >= undecided.get(self._order, np.inf if is_localized else _NOT_LOCALIZED_S):
+            order = pair_order(frame, OrbSettings(count=_ORDER_CORNERS))
+            self._order_ns = frame.stamp_ns
+            self._order = self._order if order is PairOrder.UNKNOWN else order
+        return self._order is PairOrder.REVERSED
+
+    def add(self, query: FinishedQuery) -> None:
+        """Takes a finished look at the map; a frame that agrees with nothing in it is looked for without its depth, from time to time."""
+        if query.fix is not None:
+            self._job = self._view(query)
+        elif self._job is None and query.frame.right is not None:
+            stamp_ns = query.odometry.stamp_ns
+            if self._searched_ns is None or (stamp_ns - self._searched_ns) * 1e-9 >= _WITHOUT_DEPTH_S:
+                self._searched_ns = stamp_ns
+                self._job = self._search(query)
+
+    def work(self) -> None:
+        """One slice of what is to be done."""
+        if self._job is not None and next(self._job, self) is self:
+            self._job = None
+
+    def give_up(self) -> None:
+        """Forgets work that is under way: the map has changed."""
+        self._job = None
+
+    def judged(self, estimate: Estimate, last_fix_ns: int | None, *, was_localized: bool) -> Estimate:
+        """The estimate with what is known of the calibration: where that is wrong, not TRACKING, and with a wider covariance.
+
+        last_fix_ns: of a confirmed pose. One that no fix holds is not published then, since the odometry is as wrong as the cameras.
+        """
+        state, is_reversed = self.watch.state, self._order is PairOrder.REVERSED
+        if is_reversed:
+            state = CalibrationState(text=REVERSED_TEXT)
+        if not state.is_wrong:
+            return replace(estimate, calibration=state)
+        status = Status.DEGRADED if estimate.status is Status.TRACKING else estimate.status
+        cause = Cause.CALIBRATION if estimate.cause in {Cause.NONE, Cause.UNMATCHED} else estimate.cause
+        estimate = replace(estimate, status=status, cause=cause, calibration=state)
+        is_held = last_fix_ns is not None and (estimate.odometry.stamp_ns - last_fix_ns) * 1e-9 <= _HELD_S
+        if is_held and not is_reversed:
+            return replace(estimate, cov_rot_trans=self._widened(estimate, state))
+        status = Status.LOST if was_localized else Status.INITIALISING
+        return replace(estimate, status=status, map_from_body=None, cov_rot_trans=None)
+
+    def _widened(self, estimate: Estimate, state: CalibrationState) -> Array | None:
+        covariance, map_from_body = estimate.cov_rot_trans, estimate.map_from_body
+        if covariance is None or map_from_body is None:
+            return covariance
+        return covariance + state.cov_bias(map_from_body @ se3_inverse(self._rig.cam_from_body), map_from_body)
+
+    def _view(self, query: FinishedQuery) -> TimeSliced[None]:
+        assert query.fix is not None
+        self.watch.handle(MapQuery(query.frame, query.odometry, query.fix, query.relocalizer.view))
+        yield
+
+    def _search(self, query: FinishedQuery) -> TimeSliced[None]:
+        """A wrong pair is wrong in depth first, and a fix needs that. Sought by the left camera alone."""
+        fixes = yield from query.relocalizer.anywhere(query.features.without_depth())
+        if fixes and is_reliable(fixes[0], self._settings.fix):
+            yield
+            self.watch.handle_unmatched(MapQuery(query.frame, query.odometry, fixes[0], query.relocalizer.view))

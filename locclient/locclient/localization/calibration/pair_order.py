@@ -1,0 +1,50 @@
+"""Order of a stereo pair: whether what is seen lies farther left in the right image, as it must. Pure."""
+
+from enum import StrEnum
+
+import numpy as np
+
+from fleetmap.features import extract, orb
+from fleetmap.features.matching import match_mutual
+from fleetmap.features.stereo import halved
+from fleetmap.sensors.rectification import RectifiedFrame
+
+REVERSED_TEXT = (
+    "matches have negative disparity: left and right images are exchanged, or mirrored; exchange the two topics, folders or cables, "
+    "or switch the mirroring off in the camera's driver"
+)
+_MIN_MATCHES = 40
+_DECIDED_PX, _ROW_SHARE, _WIDTH_SHARE = (
+    1.0,
+    0.03,
+    0.3,
+)  # a disparity with a sign; rows and columns as shares of the image
+_MAX_BITS, _RATIO = 48, 0.9
+_ODDS = 3.0  # chance spreads matches over both signs alike
+
+
+class PairOrder(StrEnum):
+    """Order of the images of a pair."""
+
+    UNKNOWN = "unknown"
+    RIGHT = "right"
+    REVERSED = "reversed"
+
+
+def pair_order(frame: RectifiedFrame, settings: orb.OrbSettings) -> PairOrder:
+    """The order that one frame shows, at half its size; UNKNOWN for a single camera, and where too little is seen or all of it is far."""
+    if frame.right is None:
+        return PairOrder.UNKNOWN
+    left, right = extract(halved(frame.left), settings), extract(halved(frame.right), settings)
+    pairs = match_mutual(left.descriptors, right.descriptors, _MAX_BITS, _RATIO)
+    offsets = left.pixels[pairs[:, 0]] - right.pixels[pairs[:, 1]]
+    height, width = (size // 2 for size in frame.left.shape)
+    is_near_row = np.abs(offsets[:, 1]) < _ROW_SHARE * height
+    decided = offsets[is_near_row & (np.abs(offsets[:, 0]) > _DECIDED_PX), 0]
+    decided = decided[np.abs(decided) < _WIDTH_SHARE * width]
+    positive, negative = int((decided > 0).sum()), int((decided < 0).sum())
+    if max(positive, negative) < _MIN_MATCHES:
+        return PairOrder.UNKNOWN
+    if negative > _ODDS * positive:
+        return PairOrder.REVERSED
+    return PairOrder.RIGHT if positive > _ODDS * negative else PairOrder.UNKNOWN

@@ -1,0 +1,233 @@
+"""Watch over the calibration: independent views gathered while the robot drives, and a test of each parameter. Pure."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleetmap.features import stereo
+from fleetmap.features.stereo import StereoSettings
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.odometry import OdometryEstimate
+from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.relocalizer import Fix
+from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.samples import WheelSample
+from locclient.localization.calibration import mounting
+from locclient.localization.calibration.camera_view import camera_view, row_errors
+from locclient.localization.calibration.mounting import BasePose, WheelTravel
+from locclient.localization.calibration.parameters import (
+    BIAS_LIMIT_M,
+    COUNT,
+    DRIFT_SIGMAS,
+    HEADING,
+    HEIGHT,
+    IMAGE,
+    NOT_JUDGED,
+    PARAMETERS,
+    TILT,
+    CalibrationState,
+    Drift,
+)
+from locclient.localization.pose_covariance import transport_cov
+
+_STEP_M, _FIRST_STEP_M, _STEP_RAD = 1.0, 0.5, 0.35  # between two views, and while they are few
+_MIN_NEW_SHARE = 0.1  # weight of a view that shows no landmark that was not in the window
+_WINDOW, _MIN_VIEWS = 40, 2  # views: of the window, and of a judgement
+# Views of the window's end that show a sudden change, and of what they are held against.
+_RECENT, _MIN_BEFORE = (4, 10), 6
+_FEW = 10  # views, before which they are taken more often
+# Of a parameter's floor: what a view shares with its neighbours, which few views do not show by their scatter.
+_LOCAL_FLOORS = 2.0
+_MAP_TILT_SIGMA_RAD = 0.05  # of a map whose survey had no IMU: it is levelled by its cameras
+_PRIOR_SIGMA = 10.0  # of a parameter: none, but what nothing shows must not make the equations singular
+_JUDGED_SIGMA_SHARE = 0.5  # a parameter known no better than this share of the prior was not judged
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How the camera is mounted: cam_from_body, base_from_body (4, 4)."""
+
+    cam_from_body: Array
+    base_from_body: Array
+
+
+@dataclass(frozen=True)
+class _View:
+    """information, score of PARAMETERS and the map's tilt; pose_per_parameter as in CameraView; landmark ids."""
+
+    information: Array
+    score: Array
+    pose_per_parameter: Array
+    ids: frozenset[int]
+
+
+@dataclass(frozen=True)
+class MapQuery:
+    """A look at the map that found a fix: the frame, the odometry there, the fix, and the map."""
+
+    frame: RectifiedFrame
+    odometry: OdometryEstimate
+    fix: Fix
+    view: MapView
+
+
+class CalibrationWatch:
+    """Compares what the robot sees with the map in which it is localized. It observes: no estimate changes until something has drifted.
+
+    Each view is linearized about the calibration with a pose of its own, so that information adds up; a view counts by the share of
+    its landmarks that no other of the window showed, because a landmark's error is the same in all views. A parameter's sigma is the
+    larger of what the information and what the scatter of the views says, and of its floor.
+
+    Sources: Triggs et al. 2000 (self-calibration in bundle adjustment), Huber 1967 (covariance from the scatter of scores).
+    """
+
+    def __init__(self, rig: Mounting, stereo_settings: StereoSettings) -> None:
+        self._rig, self._stereo = rig, stereo_settings
+        self._views: deque[_View] = deque(maxlen=_WINDOW)
+        self._wheels = WheelTravel()
+        self._last_map_from_cam: Array | None = None
+        self._last_base: BasePose | None = None
+        self.state = NOT_JUDGED
+
+    def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
+        """Wheel odometry newer than any before."""
+        self._wheels.handle(samples)
+
+    def handle(self, query: MapQuery) -> None:
+        """Takes a look at the map, where it is a new view."""
+        fix, matched, frame = query.fix, query.fix.matched, query.frame
+        if matched is None or not self._is_new(fix.map_from_cam):
+            return
+        self._last_map_from_cam = fix.map_from_cam
+        seen = None
+        if frame.right is not None:
+            seen = camera_view(matched, fix.map_from_cam, row_errors(frame, matched, fix.map_from_cam))
+        information, score = np.zeros((COUNT + 2, COUNT + 2)), np.zeros(COUNT + 2)
+        ids = (
+            frozenset[int]() if fix.matches is None else frozenset(query.view.landmark_ids[fix.matches[:, 1]].tolist())
+        )
+        if seen is not None:
+            share = self._new_share(ids)
+            information[:IMAGE, :IMAGE], score[:IMAGE] = share * seen.information, share * seen.score
+        self._add_mounting(query, information, score)
+        shift = np.zeros((6, IMAGE)) if seen is None else seen.pose_per_parameter
+        self._views.append(_View(information, score, shift, ids))
+        self.state = self._judged()
+
+    def handle_unmatched(self, query: MapQuery) -> None:
+        """As `handle`, for a frame that agrees with the map only without its depth: that is measured here for what was matched."""
+        matched = query.fix.matched
+        if matched is None:
+            return
+        found = stereo.disparities(query.frame, matched.camera, matched.pixels[:, :2], self._stereo)
+        pixels = np.column_stack([matched.pixels[:, :2], matched.pixels[:, 0] - found[:, 0]])
+        self.handle(replace(query, fix=replace(query.fix, matched=replace(matched, pixels=pixels))))
+
+    # --- views --------------------------------------------------------------------------------------------------------
+
+    def _is_new(self, map_from_cam: Array) -> bool:
+        last = self._last_map_from_cam
+        if last is None:
+            return True
+        moved_m = float(np.linalg.norm(map_from_cam[:3, 3] - last[:3, 3]))
+        step_m = _STEP_M if len(self._views) >= _FEW else _FIRST_STEP_M
+        return moved_m > step_m or rotation_angle_rad(last[:3, :3].T @ map_from_cam[:3, :3]) > _STEP_RAD
+
+    def _new_share(self, ids: frozenset[int]) -> float:
+        """Share of landmarks that no view of the window has shown."""
+        known = frozenset[int]().union(*(ids & view.ids for view in self._views))
+        return max(1.0 - len(known) / len(ids), _MIN_NEW_SHARE) if ids else 1.0
+
+    def _add_mounting(self, query: MapQuery, information: Array, score: Array) -> None:
+        fix, odometry = query.fix, query.odometry
+        if odometry.inertial:
+            jacobian, measured = mounting.tilt(fix, self._rig.cam_from_body, odometry)
+            at = np.r_[TILT, COUNT : COUNT + 2]
+            information[np.ix_(at, at)] += jacobian.T @ jacobian
+            score[at] += jacobian.T @ measured
+        if not self._wheels.is_heard:
+            return
+        map_from_base = fix.map_from_cam @ self._rig.cam_from_body @ se3_inverse(self._rig.base_from_body)
+        covariance = transport_cov(fix.cov_rot_trans, map_from_base[:3, 3] - fix.map_from_cam[:3, 3])
+        base = BasePose(map_from_base, covariance, self._wheels.travelled_m.copy())
+        turned = None if self._last_base is None else mounting.heading(self._last_base, base)
+        for at_one, measurement in ((HEADING, turned), (HEIGHT, mounting.height(base, query.view.points_map))):
+            if measurement is not None:
+                value, sigma = measurement
+                information[at_one, at_one] += sigma**-2
+                score[at_one] += value * sigma**-2
+        self._last_base = base
+
+    # --- judgement ----------------------------------------------------------------------------------------------------
+
+    def _judged(self) -> CalibrationState:
+        """By the window. Views before a change that its end shows are dropped: knocks and repairs show at once."""
+        views = list(self._views)
+        if len(views) < _MIN_VIEWS:
+            return self.state
+        for recent in _RECENT:
+            if len(views) >= recent + _MIN_BEFORE:
+                before, sigma_before = _estimate(views[:-recent])
+                now, sigma_now = _estimate(views[-recent:])
+                is_known = np.isfinite(sigma_before) & np.isfinite(sigma_now)
+                change = np.abs(now - before)[is_known] / np.hypot(sigma_before, sigma_now)[is_known]
+                if change.size and change.max() > DRIFT_SIGMAS:
+                    views = views[-recent:]
+                    self._views = deque(views, maxlen=_WINDOW)
+                    break
+        value, sigma = _estimate(views)
+        return _state(views, value, sigma)
+
+
+def _estimate(views: Sequence[_View]) -> tuple[Array, Array]:
+    """Values and sigmas (COUNT,) of PARAMETERS by some views, infinite where nothing showed one."""
+    prior = np.array([_PRIOR_SIGMA] * COUNT + [_MAP_TILT_SIGMA_RAD] * 2) ** -2.0
+    information = np.array([view.information for view in views])
+    score = np.array([view.score for view in views])
+    covariance = np.linalg.inv(information.sum(axis=0) + np.diag(prior))
+    value = covariance @ score.sum(axis=0)
+    off = (score - information @ value) @ covariance
+    scatter = np.sqrt((off**2).sum(axis=0) * len(views) / (len(views) - 1))
+    sigma = np.maximum(np.sqrt(np.diag(covariance)), scatter)[:COUNT]
+    common = np.array([parameter.floor for parameter in PARAMETERS]) * np.sqrt(1.0 + _LOCAL_FLOORS**2 / len(views))
+    is_shown = sigma < _JUDGED_SIGMA_SHARE * _PRIOR_SIGMA
+    return value[:COUNT], np.where(is_shown, np.hypot(sigma, common), np.inf)
+
+
+def _state(views: Sequence[_View], value: Array, sigma: Array) -> CalibrationState:
+    shifts = np.array([view.pose_per_parameter for view in views])  # (V, 6, IMAGE)
+    each = shifts * value[:IMAGE]
+    bias_m = np.sqrt((each[:, 3:] ** 2).sum(axis=1).mean(axis=0))
+    drifts = []
+    for k, parameter in enumerate(PARAMETERS):
+        if not np.isfinite(sigma[k]):
+            continue
+        costs_m = float(bias_m[k]) if k < IMAGE else 0.0
+        is_large = costs_m > BIAS_LIMIT_M or abs(value[k]) > parameter.limit
+        is_drifted = bool(is_large and abs(value[k]) > DRIFT_SIGMAS * sigma[k])
+        drifts.append(Drift(parameter, float(value[k]), float(sigma[k]), costs_m, is_drifted))
+    wrong = [drift for drift in drifts if drift.is_drifted]
+    if not wrong:
+        return CalibrationState(tuple(drifts))
+    wrong.sort(key=lambda drift: (-drift.bias_m, -abs(drift.value) / drift.sigma))
+    text = "; ".join(drift.text for drift in wrong)
+    return CalibrationState(tuple(drifts), _cov_bias(shifts, value, sigma), text)
+
+
+def _cov_bias(shifts: Array, value: Array, sigma: Array) -> Array:
+    """(6, 6) mean square of the poses' errors by all parameters, rotation first, camera axes: their values and their uncertainty.
+
+    Added is what they cost elsewhere: BIAS_LIMIT_M for each parameter at its limit, in any direction.
+    """
+    total = shifts @ value[:IMAGE]
+    known = np.where(np.isfinite(sigma[:IMAGE]), sigma[:IMAGE], 0.0)
+    covariance = (total[:, :, None] * total[:, None, :]).mean(axis=0)
+    covariance += (shifts * known**2 @ shifts.transpose(0, 2, 1)).mean(axis=0)
+    elsewhere = value[:IMAGE] / np.array([parameter.limit for parameter in PARAMETERS[:IMAGE]])
+    covariance[3:, 3:] += np.eye(3) * float((elsewhere**2).sum()) * BIAS_LIMIT_M**2
+    of_mount = np.where(np.isfinite(sigma[IMAGE:]), value[IMAGE:], 0.0)
+    covariance[:3, :3] += np.eye(3) * float((of_mount[:3] ** 2).sum())
+    covariance[3:, 3:] += np.eye(3) * float(of_mount[3] ** 2)
+    return np.asarray(covariance)

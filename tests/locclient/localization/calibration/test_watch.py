@@ -1,0 +1,151 @@
+"""The watch over a drive: what drifts is named, nothing else is, and repaired cameras are sound again."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from fleetmap.features.stereo import StereoSettings
+from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.messages import Cause, Status
+from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.relocalizer import Fix
+from fleetmap.relocalization.settings import RelocalizerSettings
+from fleetmap.sensors.rectification import RectifiedFrame
+from locclient.localization.calibration.monitor import CalibrationMonitor
+from locclient.localization.calibration.parameters import BASELINE, FOCAL, IMAGE, TILT, YAW
+from locclient.localization.calibration.watch import CalibrationWatch, MapQuery, Mounting
+from locclient.localization.estimate import Estimate
+from support.fleet.estimates import estimate
+from support.worlds.pinhole_pair import seen_with
+
+RIG = Mounting(np.eye(4), np.eye(4))
+NO_IMAGE = np.zeros((480, 640), np.uint8)
+LEVEL = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # map_from_cam of a camera that looks along the map's x
+
+
+def look(number: int, parameters: Array, turn: Array | None = None) -> MapQuery:
+    """The fix of one frame, a metre after the one before, by cameras whose true parameters differ so much from the calibration."""
+    matched, map_from_cam, _ = seen_with(parameters, 1000 + number)
+    level = se3(so3_exp(np.array([0, 0, 0.2 * number])) @ LEVEL, np.array([1.1 * number, 0.0, 0.4]))
+    points_map = (matched.points_source - map_from_cam[:3, 3]) @ map_from_cam[:3, :3] @ level[:3, :3].T + level[:3, 3]
+    ids = np.arange(120) + 60 * number  # half of what is seen was seen from the place before
+    fix = Fix(level, np.diag([1e-6] * 3 + [1e-4] * 3), 120, 20, matched=replace(matched, points_source=points_map))
+    fix = replace(fix, matches=np.column_stack([np.arange(120), np.arange(120)]))
+    body = level[:3, :3] @ so3_exp(-(np.zeros(3) if turn is None else turn))
+    odometry = replace(
+        estimate(float(number)).odometry, odom_from_body=se3(body, np.zeros(3)), inertial=turn is not None
+    )
+    view = cast(MapView, SimpleNamespace(landmark_ids=ids, points_map=points_map))
+    return MapQuery(RectifiedFrame(number, NO_IMAGE, NO_IMAGE, None), odometry, fix, view)
+
+
+def parameters(**sizes: float) -> Array:
+    out = np.zeros(IMAGE)
+    for name, size in sizes.items():
+        out[{"focal": FOCAL, "baseline": BASELINE, "yaw": YAW}[name]] = size
+    return out
+
+
+def drifted(watch: CalibrationWatch) -> list[str]:
+    return [drift.parameter.figure for drift in watch.state.drifts if drift.is_drifted]
+
+
+def test_good_cameras_are_left_alone() -> None:
+    watch = CalibrationWatch(RIG, StereoSettings())
+    for number in range(60):
+        watch.handle(look(number, parameters()))
+        assert not watch.state.is_wrong
+    assert watch.state.figures["calibration_focal_scale"] == pytest.approx(0.0, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("figure", "wrong"),
+    [
+        ("focal_scale", parameters(focal=-0.01)),
+        ("baseline_scale", parameters(baseline=0.04)),
+        ("pair_yaw_deg", parameters(yaw=0.0035)),
+    ],
+)
+def test_what_drifts_is_named_with_its_size(figure: str, wrong: Array) -> None:
+    watch = CalibrationWatch(RIG, StereoSettings())
+    for number in range(25):
+        watch.handle(look(number, wrong))
+    assert drifted(watch) == [figure]
+    told = watch.state.figures
+    value = told[f"calibration_{figure}"]
+    size = np.abs(wrong).max() * np.sign(wrong.sum()) * (np.degrees(1.0) if figure.endswith("deg") else 1.0)
+    assert abs(value - size) < 4 * told[f"calibration_{figure}_sigma"]
+    assert "from what the calibration says" in watch.state.text
+
+
+def test_a_knock_is_found_and_a_repair_too() -> None:
+    watch = CalibrationWatch(RIG, StereoSettings())
+    for number in range(40):
+        watch.handle(look(number, parameters()))
+    for number in range(40, 55):
+        watch.handle(look(number, parameters(yaw=0.003)))
+    assert drifted(watch) == ["pair_yaw_deg"]
+    for number in range(55, 75):
+        watch.handle(look(number, parameters()))
+    assert not watch.state.is_wrong
+
+
+def test_a_robot_that_stands_learns_nothing() -> None:
+    watch = CalibrationWatch(RIG, StereoSettings())
+    for _ in range(50):
+        watch.handle(look(3, parameters(focal=0.03)))
+    assert not watch.state.drifts
+
+
+def test_turned_cameras_are_told_from_a_tilted_map() -> None:
+    watch = CalibrationWatch(Mounting(np.eye(4), np.eye(4)), StereoSettings())
+    turn = np.zeros(3)
+    turn[0] = np.radians(2.0)
+    for number in range(30):
+        query = look(number, parameters(), turn)
+        watch.handle(query)
+    said = {drift.parameter.figure: drift for drift in watch.state.drifts}
+    assert TILT.start == IMAGE
+    assert said["camera_roll_deg"].is_drifted
+    assert abs(np.degrees(said["camera_roll_deg"].value) - 2.0) < 0.6
+
+
+def published(watch: CalibrationMonitor, before: Estimate, last_fix_ns: int | None) -> Estimate:
+    return watch.judged(before, last_fix_ns, was_localized=True)
+
+
+def test_a_wrong_calibration_is_published() -> None:
+    monitor = CalibrationMonitor(RIG, RelocalizerSettings())
+    tracking = estimate(5.0)
+    assert published(monitor, tracking, tracking.stamp_ns).status is Status.TRACKING
+    for number in range(25):
+        monitor.watch.handle(look(number, parameters(focal=-0.02)))
+    wrong = published(monitor, tracking, tracking.stamp_ns)
+    assert (wrong.status, wrong.cause) == (Status.DEGRADED, Cause.CALIBRATION)
+    assert wrong.cov_rot_trans is not None
+    assert tracking.cov_rot_trans is not None
+    assert np.sqrt(wrong.cov_rot_trans[5, 5]) > 0.03 > np.sqrt(tracking.cov_rot_trans[5, 5])
+    lost = published(monitor, tracking, tracking.stamp_ns - 2_000_000_000)
+    assert (lost.status, lost.cause, lost.map_from_body) == (Status.LOST, Cause.CALIBRATION, None)
+    dark = published(monitor, replace(tracking, cause=Cause.DARK), tracking.stamp_ns)
+    assert dark.cause is Cause.DARK
+
+
+def test_an_exchanged_pair_is_never_tracking(monkeypatch: pytest.MonkeyPatch) -> None:
+    from locclient.localization.calibration import monitor as module
+    from locclient.localization.calibration.pair_order import PairOrder
+
+    said: list[Any] = [PairOrder.UNKNOWN, PairOrder.REVERSED]
+    monkeypatch.setattr(module, "pair_order", lambda *_: said.pop(0))
+    monitor = CalibrationMonitor(RIG, RelocalizerSettings())
+    answers = [
+        monitor.is_reversed(RectifiedFrame(stamp, NO_IMAGE, NO_IMAGE, None), is_localized=False)
+        for stamp in (0, 100_000_000, 600_000_000, 700_000_000)
+    ]
+    assert answers == [False, False, True, True]
+    refused = published(monitor, estimate(1.0), 1_000_000_000)
+    assert (refused.status, refused.cause, refused.map_from_body) == (Status.LOST, Cause.CALIBRATION, None)
+    assert "exchanged" in refused.calibration.text
