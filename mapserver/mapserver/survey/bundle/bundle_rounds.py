@@ -11,6 +11,7 @@ from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.survey.bundle.bundle_adjustment import BundleProblem, BundleResult, InertialTerms, RelativeTerm, optimize
+from mapserver.survey.bundle.measured_noise import measured_sigmas
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.tracks.tracks import Landmarks
 
@@ -74,12 +75,16 @@ def bundle_rounds(
 ) -> SurveyState:
     """The adjusted state; outlying observations are dropped between rounds. `free` (K,) limits it to a window.
 
-    final: near the optimum; the last round takes the redescending cost of `final_bundle`. Inertial factors: Forster et al. 2017.
+    final: near the optimum; the last round takes the redescending cost of `final_bundle` with the noise that the others left
+    over. Inertial factors: Forster et al. 2017.
     """
     for round_number in range(rounds):
         last = round_number + 1 == rounds
         how = settings.rough_bundle if not last else settings.final_bundle if final else settings.bundle
-        result = optimize(bundle_problem(state, settings, free), how)
+        problem = bundle_problem(state, settings, free)
+        if last and final:
+            problem = replace(problem, obs_sigma_px=measured_sigmas(problem, how.huber_sigmas))
+        result = optimize(problem, how)
         state = apply_result(state, result)
         if not last:
             keep = result.squared_sigmas < settings.noise.cut_sigmas**2

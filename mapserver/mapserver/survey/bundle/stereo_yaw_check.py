@@ -14,6 +14,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.bundle.bundle_adjustment import BundleResult, BundleSettings, optimize
 from mapserver.survey.bundle.bundle_rounds import SurveyState, bundle_problem
+from mapserver.survey.bundle.measured_noise import measured_sigmas
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.tracks.tracks import Landmarks
 
@@ -62,6 +63,8 @@ def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings) -> StereoY
     measured = np.isfinite(state.landmarks.obs_pixels[:, 2])
     if measured.sum() < _MIN_DISPARITIES or state.is_depth_camera:
         return NO_YAW
+    sigmas = measured_sigmas(bundle_problem(state, settings, None), settings.final_bundle.huber_sigmas)
+    state = replace(state, landmarks=replace(state.landmarks, obs_sigma_px=sigmas))
     slope = _slope(state, 0.0, settings)
     shift, curvature = 0.0, 0.0
     step = _FIRST_TRY_PX if slope < 0 else -_FIRST_TRY_PX

@@ -1,0 +1,55 @@
+"""Measurement of the observations' noise from what an adjustment leaves over.
+
+A sigma that is claimed too large makes robust costs blunt: at depth edges disparities are too large, never too small (foreground
+fattening), and as long as those errors count as one sigma they pull the scale. How large the noise is differs from camera to
+camera, so that the survey measures it, class by class of the claimed sigma.
+"""
+
+import numpy as np
+
+from fleetmap.geometry import Array, se3_inverse
+from mapserver.survey.bundle.problem import BundleProblem
+
+_CLASSES = 8
+_LEAST_OBSERVATIONS = 100  # of a class: its median is then good to 15 %
+# Medians of |x| and of the length of a pair for normal noise of sigma 1
+_MEDIAN_OF_ONE, _MEDIAN_OF_TWO = 0.6745, 1.1774
+_EFFICIENT_HUBER = 1.345  # noise sigmas from which the cost is linear: 95 % efficient on normal noise (Huber 1964)
+
+
+def measured_sigmas(problem: BundleProblem, huber_sigmas: float) -> Array:
+    """(M, 2) sigmas of pixels and disparities for a robust cost that is linear from huber_sigmas.
+
+    The observations are sorted into classes by the sigma that they claim. Each class keeps its claims up to one factor: the median
+    residual at the problem's values says by how much its noise differs from the claim. The factor also makes up for a cost
+    that is linear from elsewhere than 1.345 noise sigmas. Classes of less than 100 observations stay as they are.
+    """
+    pixel, disparity = _residuals(problem)
+    widened = _EFFICIENT_HUBER / huber_sigmas
+    claimed = problem.obs_sigma_px
+    columns = [_by_class(pixel / _MEDIAN_OF_TWO, claimed[:, 0]), _by_class(disparity / _MEDIAN_OF_ONE, claimed[:, 1])]
+    return widened * np.stack(columns, axis=1)
+
+
+def _residuals(problem: BundleProblem) -> tuple[Array, Array]:
+    """Lengths (M,) of the residuals of pixel and disparity, NaN where there is none."""
+    cam_from_map = se3_inverse(problem.map_from_body @ problem.body_from_cam)[problem.obs_keyframe]
+    points = problem.points_map[problem.obs_landmark]
+    seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points) + cam_from_map[:, :3, 3]
+    off = problem.camera.pixel_from_point(seen) - problem.obs_pixels
+    return np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 0] - off[:, 2])
+
+
+def _by_class(noise: Array, claimed: Array) -> Array:
+    """(M,) the claimed sigmas times the median ratio of noise to claim in each class."""
+    known = np.isfinite(noise)
+    count = min(_CLASSES, int(known.sum()) // _LEAST_OBSERVATIONS)
+    if count == 0:
+        return claimed
+    limits = np.unique(np.quantile(claimed[known], np.arange(1, count) / count))
+    number, sigmas = np.searchsorted(limits, claimed), claimed.copy()
+    for each in range(len(limits) + 1):
+        own = number == each
+        if (own & known).sum() >= _LEAST_OBSERVATIONS // 2:
+            sigmas[own] *= np.median(noise[own & known] / claimed[own & known])
+    return sigmas
