@@ -28,8 +28,10 @@ from support.worlds.box_room import out_and_back, ride_sample
 FRAMES, FRAME_S = 50, 0.1
 REPORT_KEYS = {
     "frames": None,
-    "first_fix_s": None,
+    "localised_share_of_all": None,
     "localised_share": None,
+    "first_fix_s": None,
+    "not_localised_share": None,
     "frame_ms": ("mean", "p50", "p99", "max"),
     "frame_wall_ms": ("mean", "p50", "p99", "max"),
     "stage_ms": ("decode", "map", "odometry", "rectify", "sight"),
@@ -40,6 +42,7 @@ REPORT_KEYS = {
     "status_share": ("INITIALISING", "TRACKING", "DEGRADED", "AMBIGUOUS", "LOST"),
     "peak_rss_mb": None,
     "map_version": None,
+    "failure_reports": ("detected", "delivered", "waiting"),
 }
 
 
@@ -156,7 +159,7 @@ def test_other_viewpoints_are_localised_to_a_centimetre(replayed: tuple[dict[str
 def test_a_strong_fix_without_a_twin_is_believed_at_once(replayed: tuple[dict[str, Any], Path]) -> None:
     """Nothing in this room looks like another place of it; where something does, agreement over a metre is asked for."""
     report, _ = replayed
-    assert report["localised_share"] == 1.0
+    assert report["localised_share_of_all"] == report["localised_share"] == 1.0
     assert report["status_share"]["TRACKING"] == 1.0
 
 
@@ -190,6 +193,7 @@ def test_a_tight_prior_starts_at_once_and_a_wrong_one_never(site: Site, tmp_path
     assert right["error_m"]["max"] < 0.03
     wrong = site.replay(tmp_path, "--prior", "2.0,0.3,1.5,0.5", "--frames", ":12")
     assert wrong["localised_share"] is None
+    assert wrong["localised_share_of_all"] == 0.0, "of all frames none was, and that is known"
     assert wrong["error_m"] is None
     assert wrong["status_share"]["INITIALISING"] == 1.0
 

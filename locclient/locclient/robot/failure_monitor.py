@@ -78,12 +78,14 @@ class FailureMonitor:
 
         speed_mps: None where neither wheels nor odometry know it. may_be_mapped: False where the map does not cover the place.
         """
-        is_lost = self._is_lost(estimate, speed_mps, may_be_mapped=may_be_mapped)
+        # Of other statuses it decides nothing.
+        radius_m = radius_95_m(estimate.cov_rot_trans) if estimate.status is Status.DEGRADED else float("inf")
+        is_lost = self._is_lost(estimate, radius_m, is_driving(speed_mps), may_be_mapped=may_be_mapped)
         self._last, now_ns = estimate, estimate.stamp_ns
         contradicted_ns = self._contradicted_ns or now_ns
         self._note_fix(estimate)
         self._had_fix |= estimate.fix is not None
-        blind = self._had_fix and is_blind(estimate.status, radius_95_m(estimate.cov_rot_trans))
+        blind = self._had_fix and is_blind(estimate.status, radius_m)
         self._follow(now_ns, blind, self._contradicting_looks >= CONTRADICTING_LOOKS)
         if blind:
             self._causes[failure_cause(estimate)] += 1
@@ -110,20 +112,21 @@ class FailureMonitor:
         kind = FailureKind.BLIND if self._had_fix else FailureKind.NOT_FOUND
         return self._detected(kind, Cause.NO_FRAMES, began_ns, began_ns + int(for_s * 1e9))
 
-    def _is_lost(self, estimate: Estimate, speed_mps: float | None, *, may_be_mapped: bool) -> bool:
+    def _is_lost(self, estimate: Estimate, radius_m: float, is_driving: bool, *, may_be_mapped: bool) -> bool:
         """Whether the robot has searched for itself for too long."""
         before_ns = estimate.stamp_ns if self._last is None else self._last.stamp_ns
         has_fix = estimate.fix is not None
         is_localised = estimate.status is Status.TRACKING or (
             has_fix and (estimate.stamp_ns - before_ns) * 1e-9 > SPARSE_S
         )
-        found = is_found(is_localised, has_fix, estimate.status, radius_95_m(estimate.cov_rot_trans))
+        found = is_found(is_localised, has_fix, estimate.status, radius_m)
         if found:
             self._search_causes.clear()
         else:
             self._search_causes[failure_cause(estimate)] += 1
-        driving = is_driving(speed_mps)
-        return self._search.handle(estimate.stamp_ns, is_found=found, is_driving=driving, may_be_mapped=may_be_mapped)
+        return self._search.handle(
+            estimate.stamp_ns, is_found=found, is_driving=is_driving, may_be_mapped=may_be_mapped
+        )
 
     def _note_fix(self, estimate: Estimate) -> None:
         if estimate.fix is None and not estimate.refused:

@@ -4,8 +4,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-
-import numpy as np
+from math import hypot
 
 from fleetmap.failure_definition import may_be_mapped, radius_95_m
 from fleetmap.geometry import Array
@@ -198,12 +197,12 @@ class Robot:
         return None if failure is None else self._context(failure, None)
 
     def _speed_mps(self, estimate: Estimate) -> float | None:
-        """Horizontal speed by the wheels, else by an odometry that holds; None where neither knows it."""
+        """Speed by the wheels, else by an odometry that holds; None where neither knows it."""
         if self._wheel is not None and abs(estimate.stamp_ns - self._wheel.stamp_ns) <= _WHEEL_NS:
-            return float(np.linalg.norm(self._wheel.velocity_base_mps[:2]))
+            return hypot(*self._wheel.velocity_base_mps[:2])
         odometry = estimate.odometry
         holds = odometry.inertial or odometry.status is not OdometryStatus.DEGRADED
-        return float(np.linalg.norm(odometry.velocity_odom_mps)) if holds and odometry.scale_known else None
+        return hypot(*odometry.velocity_odom_mps) if holds and odometry.scale_known else None
 
     def _may_be_mapped(self, estimate: Estimate) -> bool:
         if estimate.status is Status.TRACKING or estimate.map_from_body is None or self.running is None:

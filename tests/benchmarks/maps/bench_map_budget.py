@@ -75,6 +75,7 @@ def row(
         "bytes": size,
         "bytes_per_m": size / float(made.report["path_m"]),
         "largest_tile_bytes": max(len(data) for data in encoded),
+        "localised_share_of_all": report["localised_share_of_all"],
         "localised_share": report["localised_share"],
         "error_m": report["error_m"],
         "silent_failures": report["silent_failures"],

@@ -95,6 +95,7 @@ def figures(result: ReplayResult) -> dict[str, Any]:
     return {
         "frames": len(frames),
         "first_fix_frame": first,
+        "localised_share_of_all": run_metrics.localised_share_of_all(frames),
         "localised_share": run_metrics.localised_share(frames),
         "median_mm": None if errors is None else 1e3 * errors["median"],
         "p99_mm": None if errors is None else 1e3 * errors["p99"],

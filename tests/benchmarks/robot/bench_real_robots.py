@@ -55,6 +55,7 @@ def drive(path: Path, store: Path, *, reverse: bool) -> dict[str, Any]:
     return {
         "frames": len(frames),
         "localised": sum(run_metrics.localised(frames)),
+        "localised_share_of_all": run_metrics.localised_share_of_all(frames),
         "localised_share": run_metrics.localised_share(frames),
         "median_mm": None if errors is None else 1e3 * errors["median"],
         "max_mm": None if errors is None else 1e3 * errors["max"],

@@ -12,9 +12,12 @@ import pytest
 from fleetmap.errors import LinkError, StoreError
 from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
 from mapserver import releases
+from mapserver.dashboard.fleet_health import HealthData
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
+from mapserver.fleet_statistics.canary_test import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, kpis
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings
 from mapserver.store import FailureFilter, FleetRetention, MapStore
 from support.fleet.made_fleet import NS, Known, MadeRobot, drive
 from support.storage.map_samples import save_sample_draft
@@ -96,6 +99,39 @@ def test_hours_add_up_to_the_whole(site: Site) -> None:
         whole.add(counts)
     assert whole == site.store.fleet.counters("lab", "site")["lab", ""]
     assert site.store.fleet.counters("lab", "site", since_hour=490_001)["lab", ""] == hours[490_001]
+
+
+@pytest.mark.parametrize("first", ["TRACKING", "INITIALISING"], ids=["lost", "never found"])
+def test_a_robot_that_is_lost_for_long_fails_in_every_window(site: Site, first: str) -> None:
+    """Twenty minutes from the last quarter of an hour on: one failure as long as it lasts, seen in the next hour too."""
+    status = {True: first, False: "LOST" if first == "TRACKING" else first}
+    for second in range(1200):
+        now_ns = START_NS + (1900 - 600 + second) * NS
+        site.set_ns(now_ns)
+        about = {"speed_mps": 1.0, "radius_95_m": 5.0}
+        health = RobotHealth(
+            site="lab", robot="r0", stamp_ns=now_ns, wall_ns=now_ns, version=1, status=status[second < 5], metrics=about
+        )
+        site.fleet.take_health("lab", "r0", health)
+    site.fleet.flush()
+
+    def window(**hours: int) -> Counters:
+        return site.store.fleet.counters("lab", "robot", **hours)["lab", "r0"]
+
+    assert (window().position_failures, window().continued) == (1, 0)
+    begun, after = window(until_hour=490_001), window(since_hour=490_001)
+    assert (begun.position_failures, begun.overlapping) == (1, 1)
+    assert (after.position_failures, after.continued, after.overlapping) == (0, 1, 1)
+    assert kpis(after).failures_running == 1
+    assert kpis(after).localised_share_of_all == 0.0
+    assert kpis(window()).availability == pytest.approx(0.0, abs=0.01)
+    assert (
+        HealthData(site.store, CanarySettings(), ResurveySettings(), lambda: now_ns)
+        .site("lab")
+        .robots["r0"]
+        .failures.events
+        == 1
+    )
 
 
 def test_what_comes_again_is_counted_once(site: Site) -> None:
