@@ -42,7 +42,7 @@ class RunReporter:
 
     def handle(self, outcome: Outcome) -> None:
         """Sends what is due after a frame, which stands in the result already."""
-        self._fixes.handle(outcome.estimate, outcome.dock_error_m)
+        self._fixes.handle(outcome.estimate, outcome.dock_error_m, outcome.speed_mps)
         if outcome.failure is not None:
             self._report_failure(outcome.failure)
         stamp_ns = outcome.estimate.stamp_ns

@@ -25,9 +25,11 @@ class FixFigures:
         self._expected = self._seen = 0
         self._largest: dict[str, float] = {}
         self._last: Estimate | None = None
+        self._speed_mps: float | None = None
 
-    def handle(self, estimate: Estimate, dock_error_m: float | None) -> None:
+    def handle(self, estimate: Estimate, dock_error_m: float | None, speed_mps: float | None = None) -> None:
         """Counts a frame."""
+        self._speed_mps = speed_mps
         was_tracking = self._last is not None and self._last.status is Status.TRACKING
         self._last = estimate
         self._note("fix_innovation", estimate.innovation)
@@ -46,7 +48,7 @@ class FixFigures:
         self._largest = {}
         figures |= {"landmarks_expected": self._expected, "landmarks_seen": self._seen}
         if self._last is not None:
-            figures["speed_mps"] = float(np.linalg.norm(self._last.odometry.velocity_odom_mps))
+            figures["speed_mps"] = self._speed_mps
             radius = radius_95_m(self._last.cov_rot_trans)
             figures["radius_95_m"] = radius if np.isfinite(radius) else None
         return figures
@@ -85,7 +87,7 @@ class HealthFigures:
         self._all_frames += 1
         self._frames += self._first_fix_s is not None
         self._localised += estimate.status is Status.TRACKING
-        self._fixes.handle(estimate, outcome.dock_error_m)
+        self._fixes.handle(estimate, outcome.dock_error_m, outcome.speed_mps)
 
     def count_failure(self) -> None:
         """Counts a detected failure."""

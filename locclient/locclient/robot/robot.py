@@ -4,16 +4,13 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from math import hypot
 
 from fleetmap.failure_definition import may_be_mapped, radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.messages import Cause, PoseMessage, Status, WantedVersion
-from fleetmap.odometry import OdometryStatus
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
-from fleetmap.sensors.samples import WheelSample
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
@@ -23,9 +20,9 @@ from locclient.robot.dock_check import DockCheck
 from locclient.robot.failure_monitor import Failure, FailureMonitor
 from locclient.robot.failure_onset import Evidence, Onset, OnsetRecorder, refined_cause
 from locclient.robot.sensor_bundle import SensorBundle
+from locclient.robot.speed import SpeedGauge
 from locclient.robot.version_trial import TrialSettings, TrialVerdict, VersionTrial
 
-_WHEEL_NS = 500_000_000  # age from which wheel odometry says nothing of the present
 Clock = Callable[[], float]  # seconds
 
 
@@ -126,7 +123,7 @@ class Robot:
         self._docks = DockCheck(calibration.base_from_body)
         self._onsets = OnsetRecorder()
         self._last: tuple[RectifiedFrame, Estimate] | None = None
-        self._wheel: WheelSample | None = None
+        self._speed = SpeedGauge()
 
     @property
     def held(self) -> list[LoadedMap]:
@@ -168,7 +165,6 @@ class Robot:
         """Results of a bundle with a frame; None without one. RecordingError for images that cannot be read."""
         self.localizer.handle_imu(bundle.imu)
         self.localizer.handle_wheel(bundle.wheel)
-        self._wheel = bundle.wheel[-1] if bundle.wheel else self._wheel
         for prior in bundle.priors:
             self.localizer.handle_prior(prior)
         if bundle.frame is None:
@@ -182,9 +178,10 @@ class Robot:
         cpu_s = self._clock_s() - begun_s
         stage_s = {"decode": decoded_s - begun_s, "rectify": rectified_s - decoded_s, **estimate.stage_s}
         self._try(estimate, frame)
-        speed_mps, is_covered = self._speed_mps(estimate), self._may_be_mapped(estimate)
-        failure = self.monitor.handle(estimate, speed_mps, may_be_mapped=is_covered)
         published = self._odom.handle(estimate)
+        speed_mps = self._speed.handle(bundle.wheel, estimate.odometry, published.odom_from_base)
+        is_covered = self._may_be_mapped(estimate)
+        failure = self.monitor.handle(estimate, speed_mps, may_be_mapped=is_covered)
         odom_from_body = published.odom_from_base @ self.base_from_body
         context = None if failure is None else self._context(failure, odom_from_body)
         self._onsets.handle(estimate, frame.left, odom_from_body, self.monitor.begun_ns)
@@ -195,14 +192,6 @@ class Robot:
         """The failure of a source that has sent no frame for so long."""
         failure = self.monitor.handle_silence(for_s)
         return None if failure is None else self._context(failure, None)
-
-    def _speed_mps(self, estimate: Estimate) -> float | None:
-        """Speed by the wheels, else by an odometry that holds; None where neither knows it."""
-        if self._wheel is not None and abs(estimate.stamp_ns - self._wheel.stamp_ns) <= _WHEEL_NS:
-            return hypot(*self._wheel.velocity_base_mps[:2])
-        odometry = estimate.odometry
-        holds = odometry.inertial or odometry.status is not OdometryStatus.DEGRADED
-        return hypot(*odometry.velocity_odom_mps) if holds and odometry.scale_known else None
 
     def _may_be_mapped(self, estimate: Estimate) -> bool:
         if estimate.status is Status.TRACKING or estimate.map_from_body is None or self.running is None:

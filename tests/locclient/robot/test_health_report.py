@@ -18,6 +18,7 @@ from locclient.replay.replay import frame_record
 from locclient.replay.run_reporter import RunReporter
 from locclient.replay.run_result import ReplayResult
 from locclient.robot.continuous_odom import ContinuousOdom
+from locclient.robot.failure_report import RobotProfile
 from locclient.robot.health_report import FixFigures, HealthFigures
 from locclient.robot.robot import Outcome
 from mapserver.fleet_statistics.health_stream import HealthStream
@@ -40,7 +41,7 @@ def look(
 def test_the_largest_since_the_report_before_and_sums_since_the_beginning() -> None:
     figures = FixFigures()
     for stamp_s, innovation, off_m in ((0.0, 1.0, 0.9), (0.2, 9.0, 0.02), (0.4, 2.0, 0.05)):
-        figures.handle(look(stamp_s, innovation, off_m, 100, 60), 0.01 if stamp_s else None)
+        figures.handle(look(stamp_s, innovation, off_m, 100, 60), 0.01 if stamp_s else None, speed_mps=1.0)
     first = figures.take()
     # The very first frame's metres do not count: nothing had been claimed.
     assert (first["fix_innovation"], first["fix_innovation_m"], first["dock_error_m"]) == (9.0, 0.05, 0.01)
@@ -114,7 +115,9 @@ def test_a_replay_tells_the_server_what_it_counts_with(store: MapStore) -> None:
     link, manifest = _Link(), store.manifest(robot_world.SITE, 1)
     result = ReplayResult([], [], [], manifest, FetchedTiles({}, {}))
     to: Any = link
-    reporter, watch, sums = RunReporter(MapConnection(to, to, robot_world.SITE, "r1"), result), HealthStream(), []
+    connection, rig = MapConnection(to, to, robot_world.SITE, "r1"), robot_world.rectifier()
+    profile = RobotProfile(robot_world.SITE, "r1", np.eye(4), rig.body_from_cam, rig.camera, robot_world.SETTINGS)
+    reporter, watch, sums = RunReporter(connection, result, profile), HealthStream(), []
     for number in range(50):
         said = look(0.1 * number, 4.0, 0.4 if number == 35 else 0.02, 50, 40)
         dock_error_m = 0.5 if number == 25 else None

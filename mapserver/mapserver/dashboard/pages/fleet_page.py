@@ -76,8 +76,8 @@ def _figures(live: LiveSite, health: SiteHealth) -> Markup:
     day = health.day
     return fleet_parts.figures(
         [
-            Figure("Robots heard now", f"{heard} of {len(live.robots)}", "reported within 10 s"),
             fleet_parts.localised_figure("Localised while driving, last 24 h", day),
+            Figure("Robots heard now", f"{heard} of {len(live.robots)}", "reported within 10 s"),
             Figure("Localised now", live.count("good"), f"{live.count('warn')} unsure or starting", "good"),
             Figure("Lost now", lost, "position unknown", "bad" if lost else ""),
             fleet_parts.rate_figure("Failures per robot-day, last 24 h", day.failures, f"; {health.trend}"),
@@ -154,6 +154,8 @@ def _row(context: PageContext, robot: LiveRobot, health: SiteHealth) -> dict[str
     remarks = [*robot.flags]
     if robot.is_canary:
         remarks.append("tries a new version")
+    if own is not None and own.silent_estimated.events:
+        remarks.append(f"suspected failures: {own.silent_estimated.events}")
     if robot.refused:
         remarks.append(f"refuses: {robot.refused}")
     if robot.clock_ahead_s is not None and abs(robot.clock_ahead_s) >= 1:
