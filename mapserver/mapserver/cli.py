@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from fleetmap.cli_exit import run_cli
 from fleetmap.cli_options import Commands, ConfigFile, Options, make_app
 from mapserver.commands.build import build
+from mapserver.commands.calibrate import calibrate
 from mapserver.commands.config import CONFIG
 from mapserver.commands.convert import convert
 from mapserver.commands.doctor import doctor
@@ -45,6 +46,7 @@ COMMANDS: Commands = {
     "import": import_,
     "convert": convert,
     "doctor": doctor,
+    "calibrate": calibrate,
     "evaluate": evaluate,
     "train-vocabulary": train_vocabulary,
     "fleet": FLEET,

@@ -1,7 +1,7 @@
 """The calibration that recordings show: every parameter with its sigma, and whether that is good enough to be used."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -76,11 +76,25 @@ class CalibrationEstimate:
             across = self.covariance[np.ix_(judged, kept)]
             theta[judged] -= across @ np.linalg.solve(self.covariance[np.ix_(kept, kept)], theta[kept])
         theta[kept] = 0.0
+        theta[INDEX[P.WHEEL_SCALE]] = 0.0  # no part of a rig's calibration
         return theta
 
     def corrected(self, rig: RigCalibration) -> RigCalibration:
         """`rig`, which must be that of the recordings, with all that is judged corrected."""
         return corrected_rig(rig, RigAxes.of(rig, Rectifier(rig)), self.corrections())
+
+
+def continued_from(before: Array, found: CalibrationEstimate) -> CalibrationEstimate:
+    """An estimate relative to a rig that had been corrected by `before` (C,), as one relative to the rig before that."""
+    if not before.any():
+        return found
+    parameters = []
+    for p in found.parameters:
+        earlier = float(before[INDEX[p.name]]) if p.name in INDEX else 0.0
+        is_share = not p.unit
+        total = (1.0 + earlier) * (1.0 + p.estimate) - 1.0 if is_share else earlier + p.estimate
+        parameters.append(replace(p, estimate=total))
+    return replace(found, parameters=tuple(parameters))
 
 
 def estimate_from(stretches: Sequence[CalibrationData]) -> CalibrationEstimate:

@@ -1,16 +1,18 @@
 """Calibration of recordings: their busiest stretches are followed as a survey would, and adjusted together with the calibration."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
+from msgspec import structs
+from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import SensorSet
-from mapserver.calibration.estimate import CalibrationEstimate, estimate_from
+from mapserver.calibration.estimate import CalibrationEstimate, continued_from, estimate_from
+from mapserver.calibration.parameters import COLUMNS, INDEX, CalibrationParameter, RigAxes, corrected_rig
 from mapserver.calibration.problem import CalibrationData
 from mapserver.calibration.survey_data import stretch_of_survey
 from mapserver.survey.odometry_pass import run_odometry
@@ -18,7 +20,21 @@ from mapserver.survey.pipeline import adjusted_chain
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
+P = CalibrationParameter
 LONGEST_S = 30.0  # of a recording: its busiest stretch
+_FEATURES = 700  # of a keyframe: a calibration needs fewer than a map
+_PASSES = 3
+# A correction above this changes what is matched and how: the images are rectified again and followed anew.
+_ANEW = {
+    P.FOCAL: 0.005,
+    P.FOCAL_RATIO: 0.002,
+    P.PRINCIPAL_X: 3.0,
+    P.PRINCIPAL_Y: 3.0,
+    P.TIME_OFFSET: 0.005,
+    P.BASELINE: 0.02,
+}
+_ANEW |= dict.fromkeys((P.PAIR_PITCH, P.PAIR_YAW, P.PAIR_ROLL), 0.002)
+_ANEW |= dict.fromkeys((P.CAMERA_IMU_X, P.CAMERA_IMU_Y, P.CAMERA_IMU_Z), 0.02)
 
 
 def estimate_calibration(
@@ -31,8 +47,37 @@ def estimate_calibration(
     if not recordings:
         raise RecordingError("no recording to calibrate from; name at least one")
     rig = recordings[0].calibration
-    stretches = [followed(recording, rig, settings, tools or SurveyTools()) for recording in recordings]
-    return estimate_from(stretches)
+    for other in recordings[1:]:
+        if not _is_same(rig, other.calibration):
+            raise RecordingError(
+                f"{other.path} has another calibration than {recordings[0].path}; calibrate the rigs one by one, or name the "
+                "calibration that both have with --calibration FILE"
+            )
+    settings = structs.replace(settings, orb=structs.replace(settings.orb, count=_FEATURES))
+    estimate, before = None, np.zeros(len(COLUMNS))
+    for _ in range(_PASSES):
+        axes = RigAxes.of(rig, Rectifier(rig))
+        current = corrected_rig(rig, axes, before) if before.any() else rig
+        stretches = [followed(r, current, settings, tools or SurveyTools()) for r in recordings]
+        estimate = continued_from(before, estimate_from(stretches))
+        after = estimate.corrections()
+        if not any(abs(after[INDEX[p]] - before[INDEX[p]]) > limit for p, limit in _ANEW.items()):
+            break
+        before = after
+    assert estimate is not None
+    return estimate
+
+
+def _is_same(rig: RigCalibration, other: RigCalibration) -> bool:
+    if len(rig.cameras) != len(other.cameras) or (rig.imu is None) != (other.imu is None):
+        return False
+    return all(
+        a.model == b.model
+        and np.array_equal(a.intrinsics_px, b.intrinsics_px)
+        and np.array_equal(a.distortion, b.distortion)
+        and np.allclose(a.body_from_cam, b.body_from_cam, atol=1e-9)
+        for a, b in zip(rig.cameras, other.cameras, strict=True)
+    )
 
 
 def followed(
@@ -47,7 +92,7 @@ def followed(
     return stretch_of_survey(chain.state, chain.odometry.keyframes, (rig, rectifier), recording.wheel)
 
 
-def busiest_frames(recording: Recording) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":
+def busiest_frames(recording: Recording) -> NDArray[np.int64]:
     """Numbers of the frames of the LONGEST_S seconds in which gyro and accelerometer feel most, the first where there is no IMU."""
     stamps, imu = recording.frame_stamps_ns, recording.imu
     last = np.searchsorted(stamps, stamps + int(LONGEST_S * 1e9))
@@ -63,8 +108,3 @@ def busiest_frames(recording: Recording) -> "np.ndarray[tuple[int], np.dtype[np.
     edges = np.searchsorted(imu.stamps_ns, stamps)
     best = int(starts[np.argmax(total[edges[last[starts]]] - total[edges[starts]])])
     return np.arange(best, last[best], dtype=np.int64)
-
-
-def with_calibration(recording: Recording, rig: RigCalibration) -> Recording:
-    """The recording under another calibration of its sensors."""
-    return replace(recording, calibration=rig)

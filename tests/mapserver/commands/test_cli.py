@@ -58,6 +58,9 @@ def test_exit_statuses(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: 
     assert status(monkeypatch, "versions", "--site", "lab", *to_store) == 0
     assert status(monkeypatch, "--help") == 0
     assert status(monkeypatch, "build", "--site", "lab") == 2
+    assert status(monkeypatch, "calibrate") == 2
+    assert status(monkeypatch, "calibrate", tmp_path / "none.mcap") == 3
+    assert status(monkeypatch, "calibrate", tmp_path / "none.mcap", "--out", tmp_path / "no" / "o.yaml") == 2
     assert status(monkeypatch, "no-such-command") == 2
     assert status(monkeypatch, "versions", "--site", "unknown", *to_store) == 2
     capsys.readouterr()

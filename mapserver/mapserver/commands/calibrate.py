@@ -1,0 +1,85 @@
+"""`mapserver calibrate`: a rig's calibration measured from its recordings."""
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleetmap.cli_options import ConfigFile, config_path
+from fleetmap.errors import RecordingError
+from mapserver.commands.options import Calibration, check_output
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from mapserver.calibration import CalibrationEstimate
+
+
+def calibrate(
+    context: typer.Context,
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="RECORDING...", help="Folders or .mcap files of one rig.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.yaml", help="Write the corrected calibration here, as a Kalibr camchain."),
+    ] = None,
+    calibration: Calibration = None,
+    config: ConfigFile = None,
+) -> None:
+    """Measure the calibration of cameras, IMU and wheels from recordings with turns, and write it.
+
+    What the recordings do not show keeps its value.
+    """
+    check_output("--out", out)
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from fleetmap.errors import UsageError, disk_errors
+    from fleetmap.recordings import OpenOptions, open_recording
+    from mapserver.calibration import estimate_calibration
+    from mapserver.calibration.calibration_file import corrected_file
+    from mapserver.config import survey_settings
+    from mapserver.survey.survey_inputs import SurveyTools
+
+    with ExitStack() as opened:
+        sources = [
+            opened.enter_context(open_recording(path, OpenOptions(calibration_file=calibration))) for path in recordings
+        ]
+        settings = survey_settings(config_path(context), sources[0].sensor_set)
+        progress = opened.enter_context(Progress(console=Console(stderr=True), transient=True))
+        task = progress.add_task("", total=None)
+        tools = SurveyTools(
+            progress=lambda stage, done, of: progress.update(task, description=stage, completed=done, total=of)
+        )
+        estimate = estimate_calibration(sources, settings, tools)
+        rig = sources[0].calibration
+    _print(Console(), estimate)
+    if out is None:
+        return
+    if not any(p.is_judged for p in estimate.parameters):
+        raise RecordingError(
+            f"--out {out}: nothing could be judged, so nothing is written; the table says what motion is missing"
+        )
+    with disk_errors(f"--out {out} cannot be written", "check folder and space", UsageError):
+        out.write_text(corrected_file(estimate, rig, [source.name for source in sources]), encoding="utf-8")
+    typer.echo(f"{out}: written; check it with `mapserver doctor RECORDING --calibration {out}`")
+
+
+def _print(console: "Console", estimate: "CalibrationEstimate") -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    from mapserver.calibration.calibration_file import in_words
+
+    table = Table(
+        title=f"{estimate.keyframes} keyframes, {estimate.observations} observations; corrections to the calibration"
+    )
+    for column in ("parameter", "correction", "sigma", "verdict"):
+        table.add_column(column, overflow="fold")
+    for p in estimate.parameters:
+        value, sigma = in_words(p)
+        verdict = Text("measured", "green") if p.is_judged else Text(f"not judged: {p.reason}", "dim")
+        table.add_row(Text(p.name.value), Text(value), Text(sigma), verdict)
+    console.print(table)

@@ -1,0 +1,119 @@
+"""How well a rig's calibration is found, and whether its covariance is right.
+
+`python tests/benchmarks/survey/bench_calibration.py drives [--seed 300] [--count 12] [--draws 3]`: simulated drives without pictures, each
+under calibrations that are off at random. `... recordings RECORDING... [--focal 0.05 --baseline -0.05]`: recordings whose own
+calibration is the truth, spoiled by that much.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from fleetmap.recordings import open_recording
+from fleetsim.recorder import Order
+from mapserver.calibration import CalibrationParameter, estimate_calibration, estimate_from
+from mapserver.calibration.parameters import COLUMNS, INDEX
+from mapserver.config import survey_settings
+from support.worlds.calibration_scene import make_stretch, measured, true_corrections, with_errors
+
+P = CalibrationParameter
+SCENARIOS = ("small-loop", "busy", "identical-aisles")
+DURATION_S = 60.0
+# Sigmas of the random errors that calibrations are given.
+ERRORS = {
+    P.BASELINE: 0.02, P.FOCAL: 0.01, P.FOCAL_RATIO: 0.003, P.PRINCIPAL_X: 3.0, P.PRINCIPAL_Y: 3.0, P.PAIR_PITCH: 0.002,
+    P.PAIR_YAW: 0.002, P.PAIR_ROLL: 0.002, P.BASELINE_Y: 0.003, P.BASELINE_Z: 0.003, P.CAMERA_IMU_X: 0.01, P.CAMERA_IMU_Y: 0.01,
+    P.CAMERA_IMU_Z: 0.01, P.CAMERA_POSITION_X: 0.01, P.CAMERA_POSITION_Y: 0.01, P.CAMERA_POSITION_Z: 0.01, P.TIME_OFFSET: 0.005,
+}  # fmt: skip
+WRONG = {"focal": P.FOCAL, "baseline": P.BASELINE, "yaw": P.PAIR_YAW, "delay": P.TIME_OFFSET}
+NAMED = (P.FOCAL, P.BASELINE, P.TIME_OFFSET, P.PAIR_YAW, P.PAIR_PITCH, P.CAMERA_IMU_Y)
+
+
+def drives(first_seed: int, count: int, draws: int) -> dict[str, Any]:
+    """ANEES over what was judged, and errors of the parameters with a target. The wheels' own error is part of the simulation."""
+    errors, nees = [], []
+    for number in range(count):
+        scenario, seed = SCENARIOS[number % len(SCENARIOS)], first_seed + number
+        stretch = make_stretch(Order(scenario, seed=seed), 0.0, DURATION_S, step_s=0.6, per_frame=80)
+        for draw in range(draws):
+            theta = np.zeros(len(COLUMNS))
+            theta[[INDEX[p] for p in ERRORS]] = np.random.default_rng([seed, draw]).standard_normal(len(ERRORS)) * list(
+                ERRORS.values()
+            )
+            given = with_errors(stretch.session.true, theta)
+            found = estimate_from([measured(stretch, given, draw)])
+            judged = [INDEX[p] for p in ERRORS if found.get(p).is_judged]
+            off = np.array([p.estimate for p in found.parameters[: len(COLUMNS)]]) - true_corrections(
+                given, stretch.session.true
+            )
+            kept = off[judged]
+            nees.append(float(kept @ np.linalg.solve(found.covariance[np.ix_(judged, judged)], kept)) / len(judged))
+            errors.append(off)
+            print(
+                json.dumps({"drive": f"{scenario} {seed} {draw}", "judged": len(judged), "nees": nees[-1]}), flush=True
+            )
+    return {
+        "drives": count * draws,
+        "anees": float(np.mean(nees)),
+        "anees_median": float(np.median(nees)),
+        **_summary(errors),
+    }
+
+
+def _summary(errors: Sequence[Array]) -> dict[str, Any]:
+    table = np.abs(np.array(errors))
+    return {
+        "p90_error": {str(p): float(np.percentile(table[:, INDEX[p]], 90)) for p in NAMED},
+        "worst_error": {str(p): float(table[:, INDEX[p]].max()) for p in NAMED},
+    }
+
+
+def recording(path: Path, wrong: dict[CalibrationParameter, float]) -> dict[str, Any]:
+    """Errors and sigmas of what is found in a recording whose own calibration is the truth, given one that is off by `wrong`."""
+    theta = np.zeros(len(COLUMNS))
+    for name, value in wrong.items():
+        theta[INDEX[name]] = value
+    with open_recording(path) as source:
+        true = source.calibration
+        given = with_errors(true, theta) if wrong else true
+        begun = time.process_time()
+        spoiled = replace(source, calibration=given)
+        found = estimate_calibration([spoiled], survey_settings(None, source.sensor_set))
+        cpu_s = time.process_time() - begun
+    off = np.array([p.estimate for p in found.parameters[: len(COLUMNS)]]) - true_corrections(given, true)
+    judged = [p.is_judged for p in found.parameters]
+    rows = {
+        str(p.name): {"error": float(e), "sigma": p.sigma, "judged": j, "unit": p.unit}
+        for p, e, j in zip(found.parameters, off, judged, strict=False)
+    }
+    return {"recording": path.name, "cpu_s": round(cpu_s, 1), "keyframes": found.keyframes, "parameters": rows}
+
+
+def main() -> None:
+    """Runs one of the two sections."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("section", choices=("drives", "recordings"))
+    parser.add_argument("paths", nargs="*", type=Path)
+    parser.add_argument("--seed", type=int, default=300)
+    parser.add_argument("--count", type=int, default=12)
+    parser.add_argument("--draws", type=int, default=3)
+    for name in WRONG:
+        parser.add_argument(f"--{name}", type=float, default=0.0)
+    asked = parser.parse_args()
+    if asked.section == "drives":
+        print(json.dumps(drives(asked.seed, asked.count, asked.draws), indent=1))
+        return
+    wrong = {parameter: getattr(asked, name) for name, parameter in WRONG.items() if getattr(asked, name)}
+    for path in asked.paths:
+        print(json.dumps(recording(path, wrong), indent=1))
+
+
+if __name__ == "__main__":
+    main()
