@@ -18,6 +18,7 @@ def test_survey(case: bench_survey.Case) -> None:
     bench_survey.show(rows)
     assert rows[0]["evaluated_share"] >= 0.98
     assert rows[0]["ate_rmse_m"] <= case.limit_m
+    assert case.worst_m is None or rows[0]["ate_max_m"] <= case.worst_m
 
 
 @pytest.mark.timeout(3600)

@@ -170,7 +170,8 @@ def report_details(
     """Keys of the full report beside the stable ones, which help to understand those; they may change.
 
     loop_records: every candidate, keyframe i against the older j of one recording. stage_s: wall seconds of each stage; reading
-    and decoding images are part of odometry. pair_turn: see survey/bundle/stereo_yaw_check.py. parts: the connected
+    and decoding images are part of odometry. frames_seen_in_map: frames that points of the map place; odometry or the IMU carries the
+    others, and all between keyframes where the trajectory was given. pair_turn: see survey/bundle/stereo_yaw_check.py. parts: the connected
     components of each survey, of which the kept one is in the map.
     """
     survey_map, first = joined.map, surveyed[0]
@@ -181,6 +182,7 @@ def report_details(
         "losses": [{"what": issue.what, "detail": issue.detail} for s in surveyed for issue in s.issues],
         "frames": len(survey_map.trajectory),
         "estimated_frames": int(survey_map.trajectory_estimated.sum()),
+        "frames_seen_in_map": sum(int(s.survey.seen.sum()) for s in surveyed),
         "observations": len(survey_map.obs_landmark),
         "point_sigma_median_m": float(np.median(survey_map.point_sigma_m)),
         "ate_max_m": None if found.rigid is None else found.rigid.max_m,

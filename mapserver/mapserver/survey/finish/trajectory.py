@@ -1,4 +1,4 @@
-"""Trajectory of all frames from the adjusted keyframes and the odometry between them."""
+"""Trajectory of all frames from adjusted keyframes and the motion between them, as odometry or an earlier adjustment knows it."""
 
 import numpy as np
 
@@ -9,9 +9,9 @@ from fleetmap.sensors.samples import Stamps
 def frame_trajectory(
     frame_stamps_ns: Stamps, odom_from_body: Array, keyframe_frames: list[int], map_from_body: Array
 ) -> Array:
-    """map_from_body (F, 4, 4) of all frames: odometry carried from the keyframe before and from the one after, blended by time.
+    """map_from_body (F, 4, 4) of all frames: carried from the keyframe before and from the one after, blended by time.
 
-    odom_from_body (F, 4, 4); keyframe_frames (K,) frame numbers, rising; map_from_body (K, 4, 4).
+    odom_from_body (F, 4, 4): the motion; keyframe_frames (K,) frame numbers, rising; map_from_body (K, 4, 4).
     """
     out = np.empty((len(frame_stamps_ns), 4, 4))
     for f in range(len(frame_stamps_ns)):

@@ -1,6 +1,6 @@
 """Stages that make the next map of a survey and a map: found, adjusted together, compared, merged."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from fleetmap.geometry import Array
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.bundle.odometry_factors import chain_edges
-from mapserver.survey.finish.frame_adjustment import place_frames
+from mapserver.survey.finish.trajectory import frame_trajectory
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
 from mapserver.survey.merge.confirmation import firm_landmarks
@@ -119,9 +119,10 @@ def _compare(
     seen = count_landmarks(base, guess.keyframes, map_from_cam, joint.sightings)
     gone = faded(base, seen, settings) if anchored else np.zeros(len(base.points_map), bool)
     change, moved_keyframes, moved_landmarks = what_changes(base, survey, joint, gone, settings, anchored=anchored)
-    there = replace(state, map_from_body=joint.map_from_body)
-    placed = place_frames(guess, there, settings, survey.stereo_yaw.correction_px)
-    trajectory = Trajectory(survey.map.trajectory.stamps_ns, placed.map_from_body)
+    # Between keyframes the survey's own frames were placed by what they saw; they follow the keyframes that moved.
+    stamps_ns, survey_from_body = survey.map.trajectory.stamps_ns, survey.map.trajectory.frame_from_body
+    numbers = [k.frame_index for k in guess.keyframes]
+    trajectory = Trajectory(stamps_ns, frame_trajectory(stamps_ns, survey_from_body, numbers, joint.map_from_body))
     frames = SessionFrames(guess.keyframes, trajectory, survey.map.trajectory_estimated)
     result = merged(base, change, seen, frames, settings.sessions.new_place_landmarks)
     fresh = int((change.added_rows < 0).sum())
