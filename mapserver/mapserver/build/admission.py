@@ -7,38 +7,44 @@ from dataclasses import dataclass, replace
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, format_calibration
 from fleetmap.sensors.calibration import RigCalibration
+from mapserver.calibration import CalibrationParameter
 from mapserver.doctor import Finding, Verdict, run_checks
+from mapserver.doctor.calibration import TOLERANCES, corrected, in_words, measure_calibration
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.executor import SERIAL, Executor
 
 # Wrong units, axes or cameras: a survey would not fail on them but be wrong. Gaps, blur and damage it can cope with.
-DECISIVE = {"camera-imu overlap", "gravity magnitude", "left and right", "epipolar error", "stereo against motion"}
-DECISIVE |= {"gyro scale", "gyro axes"}
+DECISIVE = {"camera-imu overlap", "gravity magnitude", "left and right", "epipolar error"}
+DECISIVE |= {"gyro scale", "gyro axes", *(parameter.value for parameter in TOLERANCES)}
 # What nothing but the calibration tells a map, and the checks that judge it.
-SUBJECTS = {"pair geometry": ("left and right", "epipolar error", "stereo against motion")}
+SUBJECTS = {
+    "metric scale": ("baseline", "focal length"),
+    "images against IMU": ("gyro axes",),  # a mirrored video, and another run's IMU
+    "pair geometry": ("left and right", "epipolar error", "focal ratio", "pair pitch", "pair yaw", "pair roll"),
+}
 SAMPLED_FRAMES, TURN_FRAMES = 20, 120
 _CORRECTED_FROM_S = 0.004  # two of the odometry's own sigmas: below, it finds the rest itself
 
 
 @dataclass(frozen=True)
 class CheckedRecording:
-    """A recording fit to be surveyed, its clocks corrected where that was needed.
+    """A recording fit to be surveyed.
 
-    findings: all that the doctor said. calibration: what they say of the calibration that the recording came with.
+    rig: its calibration, corrected where that was needed. findings: all that the doctor said. calibration: what they say of the calibration
+    that the recording came with. corrections: by parameter, in its unit.
     """
 
-    recording: Recording
+    rig: RigCalibration
     findings: list[Finding]
     calibration: RigEvidence
-    correction_s: float = 0.0
+    corrections: dict[str, float]
 
     def remarks(self) -> list[str]:
         """The findings that are not good and those that could not be judged, in words, and what was done about them."""
         words = [f"{f.name}: {f.sentence}" for f in self.findings if f.verdict is not Verdict.OK]
-        if self.correction_s:
-            words.append(
-                f"corrected: the time between camera and IMU by {self.correction_s * 1e3:+.1f} ms, as measured"
-            )
+        if self.corrections:
+            done = ", ".join(f"{name} by {in_words(name, value)}" for name, value in self.corrections.items())
+            words.append(f"corrected: {done}, as measured; robots that use this calibration file keep its error")
         return words
 
 
@@ -66,27 +72,37 @@ def rig_evidence(rig: str, findings: Sequence[Finding]) -> RigEvidence:
 def checked(
     recording: Recording, on_frame: Callable[[], None] = lambda: None, executor: Executor = SERIAL
 ) -> CheckedRecording:
-    """The recording with what was found in it. RecordingError where a check that decides failed."""
+    """What is found in the recording, and the calibration to survey it with. RecordingError where a check that decides failed.
+
+    A parameter that is wrong for sure is corrected, and the recording measured again: where that finds something wrong still, the
+    evidence conflicts, and a person must look at it.
+    """
     checks = run_checks(recording, on_frame, sampled=SAMPLED_FRAMES, turn_frames=TURN_FRAMES, executor=executor)
-    for finding in checks.findings:
+    _refuse(recording, checks.findings)
+    given = fingerprint(recording.calibration)
+    rig, corrections = corrected(recording.calibration, checks.calibration)
+    again: list[Finding] = []
+    if corrections:
+        measured = measure_calibration(replace(recording, calibration=rig), on_frame, executor)
+        again = [f for f in measured.findings if f.verdict in (Verdict.WARN, Verdict.FAIL)]
+    elif checks.measured_offset_s is not None and abs(checks.measured_offset_s) >= _CORRECTED_FROM_S:
+        corrections = {CalibrationParameter.TIME_OFFSET.value: round(checks.measured_offset_s, 7)}
+        rig = _with_clock(rig, checks.measured_offset_s)
+    settled = [f for f in checks.findings if f.name not in corrections or f.verdict is not Verdict.WARN]
+    found = rig_evidence(given, [*settled, *(replace(f, sentence=f"after its correction {f.sentence}") for f in again)])
+    return CheckedRecording(rig, checks.findings, found, corrections)
+
+
+def _refuse(recording: Recording, findings: Sequence[Finding]) -> None:
+    for finding in findings:
         if finding.verdict is Verdict.FAIL and finding.name in DECISIVE:
             raise RecordingError(
                 f"{recording.path}: {finding.name}: {finding.sentence}; a map of it would be wrong. "
                 "`mapserver doctor` shows every check"
             )
-    found = rig_evidence(fingerprint(recording.calibration), checks.findings)
-    offset_s = checks.measured_offset_s
-    if offset_s is None or abs(offset_s) < _CORRECTED_FROM_S:
-        return CheckedRecording(recording, checks.findings, found)
-    return CheckedRecording(with_clock(recording, offset_s), checks.findings, found, offset_s)
 
 
-def with_clock(recording: Recording, correction_s: float) -> Recording:
-    """The recording with so much added to the time between IMU and cameras."""
-    if correction_s == 0.0:
-        return recording
-    cameras = tuple(
-        replace(camera, imu_minus_cam_s=camera.imu_minus_cam_s + correction_s)
-        for camera in recording.calibration.cameras
-    )
-    return replace(recording, calibration=replace(recording.calibration, cameras=cameras))
+def _with_clock(rig: RigCalibration, correction_s: float) -> RigCalibration:
+    """The calibration with so much added to the time between IMU and cameras."""
+    moved = tuple(replace(camera, imu_minus_cam_s=camera.imu_minus_cam_s + correction_s) for camera in rig.cameras)
+    return replace(rig, cameras=moved)

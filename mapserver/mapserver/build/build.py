@@ -320,7 +320,7 @@ def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None)
     sessions = [JudgedSession(t, s.held_out, s.survey) for t, s in zip(trajectories, built.taken, strict=True)]
     evidence = examine_draft(tiles, camera, built.vocabulary.vocabulary, before, sessions, replayed)
     known = [] if before is None else before.calibrations
-    return msgspec.structs.replace(evidence, calibrations=merged([*known, *(s.calibration for s in built.taken)]))
+    return msgspec.structs.replace(evidence, calibrations=merged([*known, *(s.evidence() for s in built.taken)]))
 
 
 def _map_trajectories(joined: Joined) -> list[Trajectory]:

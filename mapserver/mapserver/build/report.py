@@ -35,7 +35,8 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     selected frame that has an estimate and a known truth, after one rigid (similarity) alignment; evaluated_share: their share of the
     selected frames. All three are None without ground truth. scale: metric, or unknown for one camera that nothing told the metres;
     scale_error: by how much the estimate is too large (0.01 is 1 %), None without ground truth. peak_rss_mb: most memory the process held,
-    in 10^6 bytes. findings: by recording, what the doctor found wanting in it, and what was corrected. culled: what the surveys did not
+    in 10^6 bytes. findings: by recording, what the doctor found wanting in it, and what was corrected. corrections: of the
+    calibration, by recording and parameter, in radians, seconds, pixels or shares. culled: what the surveys did not
     hand on. sessions: what became of every recording, and of the map's landmarks by it. joins: the verdict on each that is in the map.
     directions: which way the places of each tile look, and which way none does. starts: robots that start without a prior where nothing
     is mapped; lookalike_recall: of these, what a start must exceed to be believed, None where nothing could tell.
@@ -58,6 +59,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     scale_error: float | None
     peak_rss_mb: float
     findings: dict[str, list[str]]
+    corrections: dict[str, dict[str, float]] = {}
     culled: dict[str, int]
     sessions: list[dict[str, Any]]
     joins: dict[str, str]
@@ -146,6 +148,7 @@ def make_report(
         peak_rss_mb=round(cost.peak_rss_mb, 1),
         culled={key: sum(count[key] for count in culled) for key in culled[0]},
         findings={s.entry.name: s.remarks() for s in recordings},
+        corrections={s.entry.name: s.corrections for s in taken if s.corrections},
         sessions=sessions_report([s.entry.name for s in recordings], joined),
         joins={s.entry.name: o.verdict.value for s, o in zip(recordings, joined.outcomes, strict=True) if o.joined},
         directions=evidence.directions or [],

@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
@@ -13,14 +14,17 @@ from fleetmap.errors import RecordingError, SurveyError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import DataIssue, SensorSet, Trajectory
-from mapserver.build.admission import checked, with_clock
+from mapserver.build.admission import checked
 from mapserver.build.draft_evidence import HeldOut, held_out_of
 from mapserver.build.report import check_truth
 from mapserver.build.sensor_subset import reduced
 from mapserver.build.trajectory_sources import trajectory_source
 from mapserver.build.worker import read_ahead
+from mapserver.calibration import CalibrationParameter
+from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey_by_priors
@@ -35,7 +39,7 @@ class Surveyed:
     """One recording and its survey.
 
     map_from_survey (4, 4): by its position priors, None without any. findings: the doctor's remarks. calibration: what it says of
-    the calibration. held_out: frames that the survey did not use.
+    the calibration. corrections: of that, by parameter. held_out: frames that the survey did not use.
     """
 
     entry: RecordingEntry
@@ -47,20 +51,36 @@ class Surveyed:
     map_from_survey: Array | None
     findings: tuple[str, ...]
     calibration: RigEvidence
+    corrections: dict[str, float]
     held_out: list[HeldOut]
 
     def remarks(self) -> list[str]:
         """What was wanting in the recording, what was corrected and what was left out, in words."""
-        return [*self.findings, *(c.remark() for c in self.survey.components if not c.kept)]
+        yaw = self.survey.stereo_yaw
+        turned = [
+            f"corrected: disparities by {-yaw.shift_px:+.2f} px, sigma {yaw.sigma_px:.2f}, as the adjusted survey says"
+        ]
+        left_out = [component.remark() for component in self.survey.components if not component.kept]
+        return [*self.findings, *(turned if yaw.corrected else ()), *left_out]
+
+    def evidence(self) -> RigEvidence:
+        """What is known of its calibration: the pair is doubted where the survey's disparities deny the angle that the doctor let pass."""
+        yaw, limit = self.survey.stereo_yaw, TOLERANCES[CalibrationParameter.PAIR_YAW]
+        angle_rad = abs(yaw.correction_px) / self.survey.state.camera.focal_px
+        if angle_rad <= limit.warn_above + SURE_SIGMAS * limit.floor:
+            return self.calibration
+        words = f"the survey's disparities are {-yaw.shift_px:+.2f} px from what its motion says, which the doctor did not find"
+        return msgspec.structs.replace(self.calibration, doubted=self.calibration.doubted | {"pair geometry": words})
 
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """A recording fit to be surveyed: the doctor's remarks in words, the correction of its clocks, what it says of its calibration."""
+    """A recording fit to be surveyed: the doctor's remarks in words, the calibration to use, what was found of the given one."""
 
     remarks: tuple[str, ...]
-    correction_s: float
+    rig: RigCalibration
     calibration: RigEvidence
+    corrections: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +146,7 @@ def _admission(
         result = checked(recording, executor=executor)
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
-        return Admission(tuple(result.remarks()), result.correction_s, result.calibration)
+        return Admission(tuple(result.remarks()), result.rig, result.calibration, result.corrections)
 
 
 def survey_recording(
@@ -139,7 +159,7 @@ def survey_recording(
 ) -> Surveyed:
     """Surveys one recording as if `pinhole` (or the camera that suits it) had seen it."""
     with reading.open(path) as (opened, indices):
-        recording = with_clock(opened, admission.correction_s)
+        recording = replace(opened, calibration=admission.rig)
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         frames = read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices)
         given = reading.given_trajectory(recording, indices)
@@ -157,6 +177,7 @@ def survey_recording(
             map_from_survey=map_from_survey,
             findings=admission.remarks,
             calibration=admission.calibration,
+            corrections=admission.corrections,
             held_out=held_out_of(recording, indices.tolist(), rectifier, done, options.settings.orb),
         )
 

@@ -36,13 +36,14 @@ def doctor(
 
     from fleetmap.recordings import OpenOptions, open_recording
     from mapserver.doctor import Verdict, run_checks
+    from mapserver.doctor.calibration import followed_frames
     from mapserver.doctor.findings import worst
     from mapserver.doctor.run_checks import SAMPLED_FRAMES, TURN_FRAMES
 
     with open_recording(recording, OpenOptions(calibration_file=calibration)) as source:
         with Progress(console=Console(stderr=True), transient=True) as progress:
-            wanted = 2 * min(SAMPLED_FRAMES, len(source)) + (min(TURN_FRAMES, len(source)) if len(source.imu) else 0)
-            task = progress.add_task("frames", total=wanted)
+            wanted = min(SAMPLED_FRAMES, len(source)) + (min(TURN_FRAMES, len(source)) if len(source.imu) else 0)
+            task = progress.add_task("frames, and steps of the adjustment", total=wanted + followed_frames(source))
             findings = run_checks(source, lambda: progress.advance(task)).findings
         _print(Console(), source, findings)
         if json_file is not None:

@@ -31,18 +31,6 @@ def rotation_between(before: RectifiedFrame, after: RectifiedFrame, camera: Ster
     return _rotation_of_rays(pixels[is_tracked], tracked[is_tracked], camera)
 
 
-def followed(before: RectifiedFrame, after: RectifiedFrame) -> tuple[AnyArray, AnyArray, Array]:
-    """Left pixels (N, 2) of the first frame, where they went in the second one (N, 2), and their disparities (N,)."""
-    corners = cv2.goodFeaturesToTrack(before.left, _CORNERS, 0.01, 12)
-    if corners is None or before.right is None:
-        return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
-    pixels = corners.reshape(-1, 2).astype(np.float32)
-    tracked, is_tracked = _track(before.left, after.left, pixels)
-    disparities = _disparities(before, pixels)
-    kept = is_tracked & np.isfinite(disparities)
-    return pixels[kept], tracked[kept], disparities[kept]
-
-
 def _track(first: AnyArray, second: AnyArray, pixels: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Where the pixels (N, 2) went, and which of them came back to within half a pixel."""
     there, found, _ = _lucas_kanade(first, second, pixels)

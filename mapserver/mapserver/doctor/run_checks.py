@@ -11,8 +11,8 @@ from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, Image, SensorSet
 from mapserver.doctor import inertial, timing
+from mapserver.doctor.calibration import MeasuredCalibration, measure_calibration
 from mapserver.doctor.camera_rotation import rotation_between
-from mapserver.doctor.disparity_zero import DisparityZero, disparity_zero, stereo_against_motion
 from mapserver.doctor.findings import Finding, Verdict
 from mapserver.doctor.gyro_images import CameraTurns, gyro_check
 from mapserver.doctor.sharpness import laplacian_variance, sharpness
@@ -21,18 +21,18 @@ from mapserver.survey.executor import SERIAL, Executor
 
 SAMPLED_FRAMES = 40
 TURN_FRAMES = 200
-_MOTION_NS, _LONGEST_MOTION_NS = 250_000_000, 350_000_000  # between the two moments of stereo against motion
 
 
 @dataclass(frozen=True, slots=True)
 class CheckResults:
     """All findings, in a fixed order, and the time offset that gyro and images show beyond the calibration's.
 
-    measured_offset_s is None where it was not measured, or hardly.
+    measured_offset_s is None where it was not measured, or hardly. calibration: what was measured of it, nothing without a pair.
     """
 
     findings: list[Finding]
     measured_offset_s: float | None
+    calibration: MeasuredCalibration
 
 
 class _Frames:
@@ -63,7 +63,8 @@ def run_checks(
 ) -> CheckResults:
     """Everything the checks say about a recording.
 
-    Reads at most twice `sampled` frames, spread over the recording, and a run of `turn_frames`; `on_frame` is called after each.
+    Reads at most `sampled` frames, spread over the recording, a run of `turn_frames`, and with a pair the busiest 30 s; `on_frame` is
+    called after each.
     """
     stamps_ns, imu = recording.frame_stamps_ns, recording.imu
     frames = _Frames(recording, on_frame)
@@ -78,14 +79,15 @@ def run_checks(
         inertial.gravity_magnitude(imu),
     ]
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
+    calibration = MeasuredCalibration([], None)
     seen = _sampled(recording, frames, rectifier, sampled, executor)
     if recording.sensor_set in (SensorSet.STEREO, SensorSet.STEREO_INERTIAL):
         findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
-        findings += [stereo_against_motion(seen.zeros, rectifier.camera)]
+        calibration = measure_calibration(recording, on_frame, executor)
     turns = _camera_turns(recording, frames, rectifier, turn_frames, executor)
     checked, measured_offset_s = gyro_check(turns, imu, shift_s)
-    findings += [*checked, sharpness(seen.variances), _readable(frames)]
-    return CheckResults(findings + timing.other_issues(recording.issues), measured_offset_s)
+    findings += [*checked, *calibration.findings, sharpness(seen.variances), _readable(frames)]
+    return CheckResults(findings + timing.other_issues(recording.issues), measured_offset_s, calibration)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,44 +95,30 @@ class _Seen:
     """What frames all over the recording show."""
 
     pairs: list[StereoMatches]
-    zeros: list[DisparityZero]
     variances: list[float]
 
 
 def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, executor: Executor) -> _Seen:
-    seen = _Seen([], [], [])
-    moments = _moments(recording, frames, rectifier, count)
-    for variance, pair, zero in executor.map(_look, rectifier.camera, moments):
+    seen = _Seen([], [])
+    for variance, pair in executor.map(_look, None, _moments(recording, frames, rectifier, count)):
         seen.variances.append(variance)
         seen.pairs.extend([] if pair is None else [pair])
-        seen.zeros.extend([] if zero is None else [zero])
     return seen
 
 
-# Left as recorded, the pair, the pair a little later.
-_Moment = tuple[Image, RectifiedFrame | None, RectifiedFrame | None]
-
-
-def _moments(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int) -> Iterator[_Moment]:
-    """Frames spread over the recording; without a pair where there is no right picture."""
-    stamps_ns = recording.frame_stamps_ns
+def _moments(
+    recording: Recording, frames: _Frames, rectifier: Rectifier, count: int
+) -> Iterator[tuple[Image, RectifiedFrame | None]]:
+    """Frames spread over the recording: left as recorded, and the pair where there is a right picture."""
     for index in np.unique(np.linspace(0, len(recording) - 1, min(count, len(recording))).round().astype(int)):
         frame = frames.read(int(index))
-        if frame is None:
-            continue
-        if frame.right is None:
-            yield frame.left, None, None
-            continue
-        later = int(np.searchsorted(stamps_ns, stamps_ns[index] + _MOTION_NS))
-        near = later < len(recording) and stamps_ns[later] - stamps_ns[index] <= _LONGEST_MOTION_NS
-        after = frames.read(later) if near else None
-        yield frame.left, rectifier.rectify(frame), None if after is None else rectifier.rectify(after)
+        if frame is not None:
+            yield frame.left, None if frame.right is None else rectifier.rectify(frame)
 
 
-def _look(camera: StereoCamera, moment: _Moment) -> tuple[float, StereoMatches | None, DisparityZero | None]:
-    left, pair, after = moment
-    zero = None if pair is None or after is None else disparity_zero(pair, after, camera)
-    return laplacian_variance(left), None if pair is None else match_stereo(pair), zero
+def _look(_: None, moment: tuple[Image, RectifiedFrame | None]) -> tuple[float, StereoMatches | None]:
+    left, pair = moment
+    return laplacian_variance(left), None if pair is None else match_stereo(pair)
 
 
 def _camera_turns(

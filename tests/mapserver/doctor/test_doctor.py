@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from fleetmap.geometry import so3_exp
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, Stamps
+from mapserver.calibration import CalibrationParameter
 from mapserver.commands.doctor import doctor
 from mapserver.doctor import Finding, Verdict, run_checks
 from mapserver.doctor.gyro_images import CameraTurns, fit_gyro
@@ -65,10 +66,10 @@ def right_lower_by_3_px(frame: CameraFrame) -> CameraFrame:
 
 def test_a_good_recording_is_all_ok(good: Recording) -> None:
     findings = run_checks(good).findings
-    assert {f.name: f.verdict for f in findings if f.verdict is not Verdict.OK} == {
-        "stereo against motion": Verdict.NOT_JUDGED  # the sample turns on the spot
-    }
-    assert len({f.name for f in findings}) == len(findings) == 15
+    bad = {f.name: f.verdict for f in findings if f.verdict is not Verdict.OK}
+    assert set(bad.values()) == {Verdict.NOT_JUDGED}
+    assert "baseline" in bad  # a second of turning on the spot excites no accelerometer
+    assert len({f.name for f in findings}) == len(findings) == 14 + len(CalibrationParameter)
 
 
 @pytest.mark.parametrize(
@@ -219,9 +220,8 @@ def test_the_command_writes_json_and_ends_with_3_on_failure(tmp_path: Path) -> N
     assert run(str(folder), "--json", str(tmp_path / "good.json")) == 0
     report = json.loads((tmp_path / "good.json").read_text())
     assert (report["verdict"], report["frames"], report["sensor_set"]) == ("not judged", 26, "stereo-inertial")
-    assert [f["missing"] for f in report["findings"] if f["verdict"] == "not judged"] == [
-        "drive past things that are near and far, for metres and not on the spot"
-    ]
+    missing = {f["name"]: f["missing"] for f in report["findings"] if f["verdict"] == "not judged"}
+    assert "record wheel odometry" in missing["baseline"]
     assert {f["name"] for f in report["findings"]} >= {"epipolar error", "gyro axes", "gravity magnitude"}
     for number in (0, 1):
         (folder / f"mav0/cam{number}/data").rename(folder / f"mav0/cam{number}/was")
@@ -244,7 +244,7 @@ def test_no_false_alarm_on_real_recordings(name: str) -> None:
 
 def test_the_real_flight_agrees_with_its_calibration() -> None:
     findings = found(open_recording(real_data("euroc_mh01_start")))
-    assert {f.verdict for f in findings.values()} == {Verdict.OK}
+    assert {name for name, f in findings.items() if f.verdict is not Verdict.OK} == {"wheel scale"}  # it has none
     assert findings["camera-imu time offset"].value == pytest.approx(0, abs=2)
     assert findings["gyro scale"].value == pytest.approx(1, abs=0.02)
     assert findings["gyro axes"].value == pytest.approx(0, abs=1.5)

@@ -1,0 +1,164 @@
+"""Findings about the calibration: what a self-calibrating adjustment measured, against what an error of it would cost.
+
+A limit is the error that displaces something by 3 cm: a map of 20 m seen from its middle (its scale), a point at 3 m (bearings), or at 25
+baselines (depths), a robot at 2 m/s (clocks). Beyond the second limit the file describes another rig. To an estimate's own sigma comes
+what the adjustment cannot know: lens distortion that the model leaves, bias of sub-pixel matching, a gyro's scale.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleetmap.errors import FleetmapError
+from fleetmap.geometry import Array
+from fleetmap.recordings import Recording
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import Rectifier
+from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate, estimate_calibration
+from mapserver.calibration.parameters import RANGES
+from mapserver.calibration.recordings import busiest_frames
+from mapserver.doctor.findings import Finding, Verdict, not_judged
+from mapserver.doctor.timing import SPARSE_S, median_period_s
+from mapserver.survey.executor import Executor
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyTools
+
+P = CalibrationParameter
+SURE_SIGMAS = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """Of one parameter: systematic sigma, error that costs 3 cm, error of another rig; whether a build may correct it."""
+
+    floor: float
+    warn_above: float
+    fail_above: float = np.inf
+    correctable: bool = True
+
+
+_PIXELS = Tolerance(1.5, 4.0, 30.0)
+_ANGLE = Tolerance(1.5e-3, 5e-3, 0.1)
+_PLACE = Tolerance(0.01, 0.03, 0.3, correctable=False)
+_NOISE = Tolerance(0.5, 20.0, correctable=False)
+TOLERANCES = {
+    P.BASELINE: Tolerance(1.5e-3, 3e-3, 0.03),
+    P.FOCAL: Tolerance(7e-4, 3e-3, 0.03),
+    P.FOCAL_RATIO: Tolerance(2e-4, 1e-3, 0.03),
+    P.PRINCIPAL_X: _PIXELS,
+    P.PRINCIPAL_Y: _PIXELS,
+    P.PAIR_PITCH: Tolerance(2.5e-4, 1e-3, 7e-3),
+    P.PAIR_YAW: Tolerance(2.5e-4, 4e-4, 7e-3),
+    P.PAIR_ROLL: Tolerance(3e-4, 1.5e-3, 7e-3),
+    P.BASELINE_Y: Tolerance(5e-3, 0.02, 0.1),
+    P.BASELINE_Z: Tolerance(5e-3, 0.02, 0.1),
+    P.CAMERA_IMU_X: _ANGLE,
+    P.CAMERA_IMU_Y: _ANGLE,
+    P.CAMERA_IMU_Z: _ANGLE,
+    P.CAMERA_POSITION_X: _PLACE,
+    P.CAMERA_POSITION_Y: _PLACE,
+    P.CAMERA_POSITION_Z: _PLACE,
+    P.TIME_OFFSET: Tolerance(5e-4, 2e-3),
+    P.WHEEL_SCALE: Tolerance(5e-3, 0.02, correctable=False),
+    P.GYRO_NOISE: _NOISE,
+    P.ACCEL_NOISE: _NOISE,
+}
+# Which way a principal point's shift looks like a turn against the IMU.
+_SAME_BEARING = {P.CAMERA_IMU_X: (P.PRINCIPAL_Y, 1.0), P.CAMERA_IMU_Y: (P.PRINCIPAL_X, -1.0)}
+_SHOWN = {
+    "": (100.0, "%", 2),
+    "rad": (np.degrees(1.0), "degrees", 3),
+    "s": (1e3, "ms", 1),
+    "m": (1e3, "mm", 0),
+    "px": (1.0, "px", 2),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredCalibration:
+    """Findings of all parameters, and the estimate behind them; None where nothing could be estimated."""
+
+    findings: list[Finding]
+    estimate: CalibrationEstimate | None
+
+    def wrong(self) -> list[CalibrationParameter]:
+        """Parameters that are off by more than their error costs, for sure, and that a build may correct."""
+        bad = {f.name for f in self.findings if f.verdict is Verdict.WARN}
+        return [p for p in TOLERANCES if p.value in bad and TOLERANCES[p].correctable]
+
+
+def followed_frames(recording: Recording) -> int:
+    """How many frames `measure_calibration` reads; 0 where it judges nothing."""
+    is_judged = len(recording.calibration.cameras) > 1 and median_period_s(recording.frame_stamps_ns) <= SPARSE_S
+    return len(busiest_frames(recording)) if is_judged else 0
+
+
+def measure_calibration(recording: Recording, on_frame: Callable[[], None], executor: Executor) -> MeasuredCalibration:
+    """What the busiest stretch of a recording with a pair of cameras says about every parameter of its calibration."""
+    period_s = median_period_s(recording.frame_stamps_ns)
+    if period_s > SPARSE_S:
+        return _unknown(f"frames are {period_s:.2f} s apart", "record every frame of the camera")
+    tools = SurveyTools(progress=lambda *_: on_frame(), executor=executor)
+    try:
+        estimate = estimate_calibration([recording], SurveySettings(), tools)
+    except (FleetmapError, np.linalg.LinAlgError) as error:
+        return _unknown(f"the frames could not be followed: {error}", "record a drive in the light, with every frame")
+    focal_px = Rectifier(recording.calibration).camera.focal_px
+    return MeasuredCalibration(findings_of(estimate, focal_px), estimate)
+
+
+def findings_of(estimate: CalibrationEstimate, focal_px: float) -> list[Finding]:
+    """One finding for each parameter; focal_px: of the rectified pair."""
+    return [_finding(p, estimate, focal_px) for p in estimate.parameters]
+
+
+def corrected(rig: RigCalibration, measured: MeasuredCalibration) -> tuple[RigCalibration, dict[str, float]]:
+    """`rig` with what is wrong in it corrected, given that the rest is right; the corrections by parameter, in its unit."""
+    wrong = measured.wrong()
+    if measured.estimate is None or not wrong:
+        return rig, {}
+    chosen = tuple(replace(p, is_judged=p.name in wrong) for p in measured.estimate.parameters)
+    only = replace(measured.estimate, parameters=chosen)
+    by_parameter = zip(only.parameters, only.corrections(), strict=False)
+    return only.corrected(rig), {p.name.value: round(float(value), 7) for p, value in by_parameter if p.is_judged}
+
+
+def in_words(name: str, value: float) -> str:
+    """A correction as people read it, such as `-4.65 %`."""
+    factor, shown, digits = _SHOWN[RANGES[P(name)].unit]
+    return f"{factor * value:+.{digits}f} {shown}"
+
+
+def _unknown(reason: str, missing: str) -> MeasuredCalibration:
+    return MeasuredCalibration([not_judged(p.value, reason, missing) for p in P], None)
+
+
+def _finding(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_px: float) -> Finding:
+    name, tolerance = parameter.name, TOLERANCES[parameter.name]
+    factor, unit, digits = _SHOWN[parameter.unit]
+    if not parameter.is_judged:
+        sigma = f"known to {factor * parameter.sigma:.{digits}f} {unit} only"
+        return not_judged(name.value, sigma, parameter.reason)
+    value, own_sigma = _net(parameter, estimate, focal_px)
+    sigma_all = float(np.hypot(own_sigma, tolerance.floor))
+    sure = max(abs(value) - SURE_SIGMAS * sigma_all, 0.0)
+    is_bad = sure > tolerance.warn_above
+    verdict = Verdict.FAIL if sure > tolerance.fail_above else Verdict.WARN if is_bad else Verdict.OK
+    words = f"{factor * value:+.{digits}f} {unit} from the calibration, sigma {factor * sigma_all:.{digits}f}"
+    if is_bad:
+        words += "; calibrate again (`mapserver calibrate` writes what it finds), or name the matching file with --calibration"
+    limits = f"warn {factor * tolerance.warn_above:g}, fail {factor * tolerance.fail_above:g} {unit} for sure"
+    return Finding(name.value, verdict, value, limits, words)
+
+
+def _net(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_px: float) -> tuple[float, float]:
+    """Estimate and sigma; of a turn against the IMU what a shifted principal point, which looks the same, does not take back."""
+    if parameter.name not in _SAME_BEARING:
+        return parameter.estimate, parameter.sigma
+    other, sign = _SAME_BEARING[parameter.name]
+    names = [p.name for p in estimate.parameters[: len(estimate.covariance)]]
+    row: Array = np.zeros(len(names))
+    row[names.index(parameter.name)], row[names.index(other)] = 1.0, sign / focal_px
+    values = np.array([p.estimate for p in estimate.parameters[: len(names)]])
+    return float(row @ values), float(np.sqrt(row @ estimate.covariance @ row))

@@ -1,0 +1,74 @@
+"""What a build makes of a recording's calibration before it surveys."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import RecordingError
+from fleetmap.recordings import Recording, open_recording
+from mapserver.build import admission
+from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate
+from mapserver.calibration.parameters import COLUMNS, RANGES
+from mapserver.doctor.calibration import MeasuredCalibration, findings_of
+from mapserver.doctor.run_checks import CheckResults
+from support.recordings.recording_samples import make_sample, write_euroc
+
+P = CalibrationParameter
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return open_recording(write_euroc(tmp_path_factory.mktemp("admission") / "r", make_sample(3)))
+
+
+def measured(parameter: P, value: float) -> MeasuredCalibration:
+    """Everything known to a hundredth of its useful sigma, one parameter off."""
+    sigmas = np.array([0.01 * RANGES[p].useful_sigma for p in COLUMNS])
+    parameters = tuple(
+        ParameterEstimate(p, value if p is parameter else 0.0, float(s), RANGES[p].unit, True)
+        for p, s in zip(COLUMNS, sigmas, strict=True)
+    )
+    found = CalibrationEstimate(parameters, np.diag(sigmas**2), 40, 4000)
+    return MeasuredCalibration(findings_of(found, 200.0), found)
+
+
+def checked(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch, first: MeasuredCalibration, again: MeasuredCalibration
+) -> admission.CheckedRecording:
+    """With a doctor who measures `first`, and `again` after a correction."""
+    monkeypatch.setattr(admission, "run_checks", lambda *_, **__: CheckResults(list(first.findings), None, first))
+    monkeypatch.setattr(admission, "measure_calibration", lambda *_: again)
+    return admission.checked(recording)
+
+
+def test_a_baseline_of_another_rig_is_refused(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    off = measured(P.BASELINE, -0.0476)
+    with pytest.raises(RecordingError, match=r"baseline: -4.76 % from the calibration.*a map of it would be wrong"):
+        checked(recording, monkeypatch, off, off)
+
+
+def test_a_small_error_is_corrected_and_said(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = checked(recording, monkeypatch, measured(P.FOCAL, -0.0196), measured(P.FOCAL, 0.0))
+    given = recording.calibration.cameras[0].intrinsics_px[0]
+    assert found.rig.cameras[0].intrinsics_px[0] == pytest.approx(0.9804 * given)
+    assert found.corrections == {"focal length": -0.0196}
+    assert "corrected: focal length by -1.96 %, as measured" in found.remarks()[-1]
+    assert found.calibration.doubted == {}
+    assert "metric scale" in found.calibration.judged
+
+
+def test_a_correction_that_the_second_look_denies_is_for_a_person(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = checked(recording, monkeypatch, measured(P.PAIR_YAW, 0.003), measured(P.PAIR_YAW, 0.002))
+    assert "after its correction" in found.calibration.doubted["pair geometry"]
+
+
+def test_a_good_calibration_is_left_alone(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    good = measured(P.BASELINE, 0.001)
+    found = checked(recording, monkeypatch, good, good)
+    assert found.rig is recording.calibration
+    assert (found.corrections, found.remarks(), found.calibration.doubted) == ({}, [], {})
+    other = replace(recording.calibration, base_from_body=2 * np.eye(4))
+    assert found.calibration.rig == admission.fingerprint(recording.calibration) != admission.fingerprint(other)

@@ -1,0 +1,96 @@
+"""Verdicts on measured calibrations, and what a build makes of them."""
+
+import numpy as np
+import pytest
+
+from fleetmap.recordings import open_recording
+from mapserver.build.admission import rig_evidence
+from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate
+from mapserver.calibration.parameters import COLUMNS, RANGES
+from mapserver.doctor import Verdict
+from mapserver.doctor.calibration import (
+    TOLERANCES,
+    MeasuredCalibration,
+    corrected,
+    findings_of,
+    in_words,
+    measure_calibration,
+)
+from mapserver.survey.executor import SERIAL
+from support.recordings.realdata import real_data
+from support.recordings.recording_samples import calibration
+
+P = CalibrationParameter
+FOCAL_PX = 420.0
+
+
+def estimate(*, unknown: dict[P, str] | None = None, **off: float) -> CalibrationEstimate:
+    """All parameters right to a tenth of their limit, but for those that are off, by name of the member, and those that nothing shows."""
+    sigmas = np.array([0.1 * TOLERANCES[p].warn_above for p in COLUMNS])
+    values = {P[name.upper()]: value for name, value in off.items()}
+    parameters = [
+        ParameterEstimate(
+            p, values.get(p, 0.0), float(s), RANGES[p].unit, p not in (unknown or {}), (unknown or {}).get(p, "")
+        )
+        for p, s in zip(COLUMNS, sigmas, strict=True)
+    ]
+    return CalibrationEstimate(tuple(parameters), np.diag(sigmas**2), 40, 4000)
+
+
+def measured(found: CalibrationEstimate) -> MeasuredCalibration:
+    return MeasuredCalibration(findings_of(found, FOCAL_PX), found)
+
+
+def verdicts(found: CalibrationEstimate) -> dict[str, Verdict]:
+    return {f.name: f.verdict for f in findings_of(found, FOCAL_PX) if f.verdict is not Verdict.OK}
+
+
+@pytest.mark.parametrize("parameter", [p for p in COLUMNS if np.isfinite(TOLERANCES[p].fail_above)])
+def test_an_error_that_costs_3_cm_warns_and_that_of_another_rig_fails(parameter: P) -> None:
+    """Three sigmas come off first: what is not sure is no fault."""
+    limit = TOLERANCES[parameter]
+    slack = (
+        3.0 * float(np.hypot(0.1 * limit.warn_above, limit.floor))
+        + 3.0 * (RANGES[parameter].unit == "rad") * 0.4 / FOCAL_PX
+    )
+    name = parameter.name.lower()
+    assert verdicts(estimate(**{name: 0.99 * limit.warn_above})) == {}
+    assert verdicts(estimate(**{name: -1.01 * limit.warn_above - slack}))[parameter.value] is Verdict.WARN
+    assert verdicts(estimate(**{name: 1.01 * limit.fail_above + slack}))[parameter.value] is Verdict.FAIL
+
+
+def test_a_shifted_principal_point_that_looks_like_a_turn_is_no_turn() -> None:
+    turned = estimate(camera_imu_y=-0.0137, principal_x=-5.4)
+    assert P.CAMERA_IMU_Y.value not in verdicts(turned)
+    assert verdicts(estimate(camera_imu_y=-0.0137))[P.CAMERA_IMU_Y.value] is Verdict.WARN
+
+
+def test_what_is_wrong_is_corrected_and_the_rest_kept() -> None:
+    rig = calibration()
+    fixed, done = corrected(rig, measured(estimate(baseline=-0.0165, pair_yaw=0.0001)))
+    assert done == {"baseline": -0.0165}
+    before, after = (np.linalg.inv(r.cameras[0].body_from_cam) @ r.cameras[1].body_from_cam for r in (rig, fixed))
+    np.testing.assert_allclose(after[:3, 3], before[:3, 3] * (1 - 0.0165), atol=1e-9)
+    np.testing.assert_allclose(after[:3, :3], before[:3, :3], atol=1e-9)
+    assert in_words("baseline", done["baseline"]) == "-1.65 %"
+    assert in_words("pair yaw", 0.00349) == "+0.200 degrees"
+    assert corrected(rig, measured(estimate())) == (rig, {})
+
+
+def test_subjects_are_judged_by_all_of_their_parameters() -> None:
+    ways = {P.BASELINE: "record wheel odometry"}
+    lacking = rig_evidence("a1", findings_of(estimate(unknown=ways), FOCAL_PX))
+    assert lacking.not_judged == {"metric scale": "record wheel odometry"}
+    assert lacking.judged == ["pair geometry"]
+    conflict = rig_evidence("a1", findings_of(estimate(pair_yaw=0.003), FOCAL_PX))
+    assert set(conflict.doubted) == {"pair geometry"}
+    assert conflict.judged == ["metric scale"]
+
+
+def test_keyframes_alone_are_not_judged() -> None:
+    recording = open_recording(real_data("euroc_v101_keyframes"))
+    found = measure_calibration(recording, lambda: None, SERIAL)
+    assert {f.verdict for f in found.findings} == {Verdict.NOT_JUDGED}
+    assert all("record every frame" in f.missing for f in found.findings)
+    assert found.wrong() == []
+    assert corrected(recording.calibration, found) == (recording.calibration, {})
