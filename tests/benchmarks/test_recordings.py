@@ -1,10 +1,14 @@
 """How exact and how fast surveys of the recordings are; `make bench` prints the figures."""
 
 import os
+from pathlib import Path
 
 import pytest
 
-from benchmarks.survey import bench_build, bench_survey
+from benchmarks.survey import bench_build, bench_image_pipelines, bench_real_pairs, bench_survey
+from fleetsim.commands import record_order
+from fleetsim.recorder import Order
+from support.recordings.realdata import real_data
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -28,3 +32,27 @@ def test_build_speed_and_memory() -> None:
     bench_build.show(rows, len(os.sched_getaffinity(0)))
     assert rows["10 minutes"]["peak_rss_mb"] <= bench_build.MEMORY_LIMIT_MB
     assert rows["five aisles"]["times_20_hz"] >= bench_build.SPEED_LIMIT
+
+
+@pytest.mark.timeout(7200)
+def test_metres_do_not_depend_on_how_an_image_was_made(tmp_path: Path) -> None:
+    """Five aisles of a seed that nobody looked at, through every pipeline, with one configuration."""
+    record_order(Order("five-aisles", seed=300), tmp_path / "clean.mcap", "mcap")
+    rows = bench_image_pipelines.bench(tmp_path / "clean.mcap", [], 300)
+    bench_image_pipelines.show(rows)
+    assert max(abs(row.scale_error) for row in rows) <= bench_image_pipelines.SCALE_LIMIT
+    assert max(row.ate_m for row in rows) <= bench_image_pipelines.ATE_LIMIT_M
+
+
+def test_the_scale_error_of_v101_is_a_factor_of_its_rig() -> None:
+    """Seen: V1_01 0.6 % small. Disparities are too large by the same factor in every window and from both sides, with no offset.
+
+    A bias of matching would be an offset, and would change with the window.
+    """
+    real_data("euroc_v101_keyframes")
+    found = bench_real_pairs.examine("euroc_v101_keyframes")
+    bench_real_pairs.show([found])
+    factors = [line.factor for line in found.lines]
+    assert min(factors) > 0.5 * abs(found.scale_error)
+    assert max(factors) - min(factors) < 0.3 * abs(found.scale_error)
+    assert max(abs(line.offset_px) for line in found.lines) < 0.06
