@@ -116,9 +116,8 @@ def is_supported(hypothesis: PoseHypothesis, settings: TrackSettings) -> bool:
 
 
 def is_unambiguous(fix: Fix, settings: TrackSettings) -> bool:
-    """Whether a fix, the only one of its query, is so strong that no other place of this map can be meant."""
-    is_strong = fix.inliers >= settings.strong_inliers and fix.inlier_share >= settings.strong_share
-    return is_strong and fix.alias_ratio < settings.strong_twin_share
+    """Whether a fix, the only one of its query, agrees so well that no other place of this map can be meant."""
+    return fix.inlier_share >= settings.strong_share and fix.alias_ratio < settings.strong_twin_share
 
 
 def _count(

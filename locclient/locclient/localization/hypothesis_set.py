@@ -29,7 +29,9 @@ class HypothesisSet:
         self._disambiguated: PoseHypothesis | None = None
         self._abandoned: PoseHypothesis | None = None  # published as the robot's pose until fixes named another
         self._viewpoint_gate = ViewpointGate()
-        self.lookalike_recall = 0.0  # that places outside the map may reach; 0 where there are none
+        self.lookalike_recall: float | None = (
+            None  # that places outside the map may reach; None where nobody measured it
+        )
 
     def tracked(self) -> list[PoseHypothesis]:
         """All that must be propagated by the odometry."""
@@ -65,12 +67,16 @@ class HypothesisSet:
 
     def may_be_lookalike(self, hypothesis: PoseHypothesis) -> bool:
         """Whether a place that is not in the map could look as much like the hypothesis: by its recall in all queries so far."""
-        return 0.0 < self.lookalike_recall >= hypothesis.recall
+        return self.lookalike_recall is not None and 0.0 < self.lookalike_recall >= hypothesis.recall
 
     def is_confirmed(self, hypothesis: PoseHypothesis, fixes: Sequence[Fix]) -> bool:
-        """By enough fixes over enough distance, or as the only hypothesis by a single unambiguous fix."""
-        is_alone = len(self.hypotheses) == len(fixes) == 1 and scoring.is_unambiguous(fixes[0], self._settings)
-        return is_alone or scoring.is_supported(hypothesis, self._settings)
+        """By enough fixes over enough distance, or as the only hypothesis by an unambiguous fix: a strong one, or one of enough that
+        agree where the map's look-alikes were measured, so that no distance needs to exclude them."""
+        if len(self.hypotheses) == len(fixes) == 1 and scoring.is_unambiguous(fixes[0], self._settings):
+            has_enough = hypothesis.support >= self._settings.confirming_fixes
+            if fixes[0].inliers >= self._settings.strong_inliers or (has_enough and self.lookalike_recall is not None):
+                return True
+        return scoring.is_supported(hypothesis, self._settings)
 
     def moved_m(self, hypothesis: PoseHypothesis) -> float | None:
         """The distance of a hypothesis from the abandoned pose; None where their covariances admit it (Mahalanobis test)."""

@@ -18,6 +18,7 @@ from fleetmap.relocalization.relocalizer import Fix, Relocalizer, is_reliable
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
+from locclient.localization.alias_disambiguation import ViewpointGate
 from locclient.localization.calibration.monitor import CalibrationMonitor, FinishedQuery
 from locclient.localization.calibration.pair_order import REVERSED_TEXT
 from locclient.localization.calibration.watch import Mounting
@@ -33,6 +34,7 @@ from locclient.localization.settings import LocalizerSettings
 
 _SPREAD_SHARE = 0.45  # of the interval of map queries: at a lower frame rate a query is not spread over frames
 _HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
+_SLICES_WITHOUT_POSE = 3  # of a query, in a frame: a robot that does not know its place waits for nothing else
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
 
 
@@ -69,7 +71,7 @@ class Localizer:
         self._odometry = Odometry(*rig, settings.odometry, settings.stereo)
         self._relocalizer: Relocalizer | None = None
         self._map_version: int | None = None
-        self._lookalike_recall = 0.0
+        self._lookalike_recall: float | None = None
         self._prior: InitialPosePrior | None = None
         self._confirmed: PoseHypothesis | None = None
         self._candidates = HypothesisSet(settings.track)  # while none is confirmed
@@ -79,6 +81,8 @@ class Localizer:
         self._work: TimeSliced[_QueryResult] | None = None  # the query that goes on
         self._query_frame: PoseHypothesis | None = None  # the frame of that query, as the identity
         self._failed_queries = 0
+        self._failed_places: list[Array] = []  # tried in vain from the viewpoint of the gate
+        self._search_gate = ViewpointGate()
         self._image_monitor = ImageQualityMonitor(settings.sight)
         self._was_tracking = False
         mounting = Mounting(self._cam_from_body, calibration.base_from_body)
@@ -106,17 +110,19 @@ class Localizer:
         tiles: Iterable[Tile],
         vocabulary: Vocabulary,
         survey_focal_px: float,
-        lookalike_recall: float = 0.0,
+        lookalike_recall: float | None = None,
     ) -> None:
         """The tiles to use from now on, all of one version. A map query that goes on is given up.
 
-        lookalike_recall: the landmark recall that places which are not in the map may reach by their likeness to those that are.
+        lookalike_recall: the landmark recall that places which are not in the map may reach by their likeness to those that are; None
+        where nobody measured it.
         """
         self._lookalike_recall = lookalike_recall
         self._map_version = version
         view = MapView(tiles, vocabulary, survey_focal_px)
         self._relocalizer = Relocalizer(view, self._camera, self._settings.relocalizer)
         self._work = self._query_frame = None
+        self._failed_places.clear()
         self._calibration.give_up()
 
     def handle_stereo(self, frame: RectifiedFrame) -> Estimate:
@@ -172,6 +178,7 @@ class Localizer:
                 hypothesis.history.redefine_odom(change)
         if change is not None:
             self._candidates.redefine_odom(change)
+            self._search_gate.redefine_odom(change)
         self._last_odom_from_body = odometry.odom_from_body
         if self._prior is not None:
             self._prior.propagate(self._odometry, odometry, step, self._track)
@@ -205,7 +212,8 @@ class Localizer:
             self._work = self._query(frame, self._relocalizer)
         assert self._query_frame is not None
         try:
-            next(self._work)
+            for _ in range(1 if self._confirmed else _SLICES_WITHOUT_POSE):
+                next(self._work)
             while is_at_once:
                 next(self._work)
         except StopIteration as done:
@@ -270,7 +278,9 @@ class Localizer:
         if len(candidates) == 1:
             rotation = (candidates[0].query_map_from_body @ self._body_from_cam)[:3, :3]
         near = None if self._prior is None else self._prior.is_near(relocalizer.view.map_from_cam[:, :3, 3])
-        fixes = yield from relocalizer.anywhere(features, near, rotation, fixes)
+        if self._search_gate.is_new(self._odom_from_body()):
+            self._failed_places.clear()
+        fixes = yield from relocalizer.anywhere(features, near, rotation, fixes, self._failed_places)
         fixes = [fix for fix in fixes if self._is_reliable(fix)]
         if self._prior is None:
             return fixes
@@ -353,7 +363,8 @@ class Localizer:
     def _update_candidates(self, fixes: list[Fix]) -> TimeSliced[_QueryResult]:
         """Updates the candidates, and confirms the one without competitors that has enough support or a tight prior."""
         candidates = self._candidates
-        candidates.lookalike_recall = 0.0 if self._is_lookalike_excluded() else self._lookalike_recall
+        is_excluded = self._lookalike_recall is not None and self._is_lookalike_excluded()
+        candidates.lookalike_recall = 0.0 if is_excluded else self._lookalike_recall
         yield from candidates.update(self._observations(fixes), self._odom_from_body())
         if not fixes:
             return _QueryResult(None, "nothing in the map agrees with this frame")

@@ -24,7 +24,7 @@ class LoadedMap:
         return self.manifest.version
 
     @property
-    def lookalike_recall(self) -> float:
-        """The landmark recall that places outside the map may reach by likeness, as its build measured; 0 for maps of older builds."""
+    def lookalike_recall(self) -> float | None:
+        """The landmark recall that places outside the map may reach by likeness; None where its build did not measure it."""
         found = self.manifest.report.get("lookalike_recall")
-        return float(found) if isinstance(found, int | float) else 0.0
+        return float(found) if isinstance(found, int | float) else None

@@ -161,6 +161,10 @@ class VisualMode(WindowMode):
         """See Mode."""
         if self.window.filter.clone_ids:
             self._predict_random_walk(tracked)
+            if (
+                tracked.lost
+            ):  # no motion has verified these observations, and without an IMU nothing else contradicts wrong ones
+                tracked = replace(tracked, ids=tracked.ids[:0], pixels=tracked.pixels[:0])
         used = self.window.update(frame_index, tracked, self._rig.settings.filter.chunk_frames_without_imu, 4)
         return Step(self, used)
 

@@ -78,6 +78,7 @@ class Relocalizer:
         allowed: NDArray[np.bool_] | None = None,
         map_from_cam_rotation: Array | None = None,
         found: Sequence[Fix] = (),
+        failed: list[Array] | None = None,
     ) -> TimeSliced[list[Fix]]:
         """Fixes of all places that look like this one and verify, best first, duplicates removed; a slice for each place.
 
@@ -85,12 +86,16 @@ class Relocalizer:
         this frame that are known already, returned with the others. A place at which a fix or failed trials already stand is not
         tried again: it is made of the same landmarks. One further on is, since identical bays and aisles must be able to compete.
         The aliases of the best fix are tried in any case.
+
+        failed: map_from_cam of places that were tried in vain for earlier frames of this view; others are tried first, and those that
+        fail now are appended. Empty again once no others are left.
         """
         settings = self._settings.fix
         fixes = [fix for k, fix in enumerate(found) if _is_new(fix, found[:k])]
         tried: list[Array] = []
+        failed = [] if failed is None else failed
         max_trials = settings.top_places_found if fixes else settings.top_places
-        for place in self.view.similar_places(query.features.descriptors, allowed, _RANKED * settings.top_places):
+        for place in self._ranked(query, allowed, failed):
             map_from_place = self.view.map_from_cam[place]
             if _count_at([fix.map_from_cam for fix in fixes], map_from_place):
                 continue
@@ -102,7 +107,9 @@ class Relocalizer:
                 yield
             tried.append(map_from_place)
             fix = self._at_place(query, int(place), map_from_cam_rotation)
-            if fix is not None and _is_new(fix, fixes):
+            if fix is None:
+                failed.append(map_from_place)
+            elif _is_new(fix, fixes):
                 fixes.append(fix)
         fixes.sort(key=lambda f: -f.inliers)
         if fixes:
@@ -138,6 +145,23 @@ class Relocalizer:
         assert found is not None
         fix = self._verified(query, found, matches)
         return None if fix is None else replace(fix, matched=matched)
+
+    def _ranked(self, query: FrameFeatures, allowed: NDArray[np.bool_] | None, failed: list[Array]) -> Rows:
+        """The places to try, the most similar first; failed ones and what lies around several left out, unless no others are left."""
+        top = _RANKED * self._settings.fix.top_places
+        if not failed:
+            return self.view.similar_places(query.features.descriptors, allowed, top)
+        map_from_cam = self.view.map_from_cam
+        around = [places_around(map_from_cam, place, _SAME_PLACE_M, _SAME_PLACE_COSINE) for place in failed]
+        is_tried = np.any([(map_from_cam == place).all(axis=(1, 2)) for place in failed], axis=0)
+        is_open = ~is_tried & (np.sum(around, axis=0) < _TRIALS_AT_A_PLACE)
+        places = self.view.similar_places(
+            query.features.descriptors, is_open if allowed is None else allowed & is_open, top
+        )
+        if len(places):
+            return places
+        failed.clear()
+        return self.view.similar_places(query.features.descriptors, allowed, top)
 
     def _at_place(self, query: FrameFeatures, place: int, rotation: Array | None) -> Fix | None:
         settings = self._settings.fix

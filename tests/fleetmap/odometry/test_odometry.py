@@ -16,7 +16,7 @@ from fleetmap.odometry.init.dynamic_initialization import dynamic_initialization
 from fleetmap.odometry.init.initial_state import InitialState
 from fleetmap.odometry.modes import InertialMode
 from fleetmap.odometry.settings import TrackerSettings
-from fleetmap.odometry.tracking.tracker import Tracker
+from fleetmap.odometry.tracking.tracker import Tracked, Tracker
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import WheelSample
@@ -262,6 +262,29 @@ def test_an_imu_that_is_given_up_moves_the_body_once(monkeypatch: pytest.MonkeyP
     assert not now.inertial
     assert np.linalg.norm(relative_error(last, replace(now, odom_from_body=begun[given_up]))[3:]) < 0.02
     assert odometry.motion_since(given_up - 1) is not None, "the window goes on"
+
+
+def test_tracks_that_no_motion_explains_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without an IMU, as of a standing robot by night: what is followed in noise moved it by metres."""
+    taken: list[int] = []
+    track, update = Tracker.track, SlidingWindow.update
+
+    def lost(tracker: Tracker, *inputs: Any) -> Tracked:
+        found = track(tracker, *inputs)
+        return replace(found, cam_from_previous=None, cov_rot_trans=None) if tracker._frame_index > 2 else found
+
+    def recorded(window: SlidingWindow, frame_index: int, tracked: Tracked, *inputs: Any) -> Any:
+        taken.append(len(tracked.ids))
+        return update(window, frame_index, tracked, *inputs)
+
+    monkeypatch.setattr(Tracker, "track", lost)
+    monkeypatch.setattr(SlidingWindow, "update", recorded)
+    odometry = Odometry(rig(None), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    said = [odometry.handle_stereo(stereo_frame(k * FRAME_NS)) for k in range(1, 7)]
+    assert min(taken[:3]) > 50
+    assert taken[3:] == [0, 0, 0]
+    assert [e.status for e in said[3:]] == [OdometryStatus.DEGRADED] * 3
+    assert sigma_m(said[-1]) > 1.0
 
 
 def test_wheels_of_a_rig_without_imu_are_not_collected() -> None:

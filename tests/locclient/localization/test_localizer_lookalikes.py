@@ -85,3 +85,14 @@ def test_a_robot_that_was_carried_away_is_not_believed_at_a_look_alike(robot: Ro
     robot.map_from_body[:3, 3] += off(-12.0)
     after = robot.ride(20, 0.3, TRUE)
     assert after[-1].status is Status.AMBIGUOUS
+
+
+def test_fixes_that_agree_confirm_a_standing_robot_where_look_alikes_were_measured(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Weak ones, as by night; where nobody measured, a metre of motion must exclude a look-alike."""
+    for lookalike_recall, last in ((0.2, Status.TRACKING), (0.0, Status.TRACKING), (None, Status.INITIALISING)):
+        robot = Robot(monkeypatch).load(lookalike_recall=lookalike_recall)
+        robot.landmark_recall = 0.25
+        said = [robot.go(0.0, turn_rad=0.0).status for _ in range(3)]
+        assert said == [Status.INITIALISING, Status.INITIALISING, last]

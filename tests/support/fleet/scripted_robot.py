@@ -85,7 +85,12 @@ class ScriptedRelocalizer:
         return close[0] if close else None
 
     def anywhere(
-        self, seen: list[Fix], allowed: object = None, rotation: object = None, found: object = ()
+        self,
+        seen: list[Fix],
+        allowed: object = None,
+        rotation: object = None,
+        found: object = (),
+        failed: object = None,
     ) -> Generator[None, None, list[Fix]]:
         yield
         return list(seen)
@@ -113,7 +118,7 @@ class Robot:
         self.rng = np.random.default_rng(0)
         self.map_from_body = MAP_FROM_ODOM.copy()
 
-    def load(self, version: int = 1, lookalike_recall: float = 0.0) -> "Robot":
+    def load(self, version: int = 1, lookalike_recall: float | None = None) -> "Robot":
         self.localizer.handle_version(version, [], Vocabulary.__new__(Vocabulary), 400.0, lookalike_recall)
         return self
 

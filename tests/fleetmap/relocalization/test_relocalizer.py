@@ -1,0 +1,68 @@
+"""Which places of a map the relocalizer tries for a frame of a robot that does not know its place."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleetmap.bow import train_vocabulary
+from fleetmap.features.orb import Features
+from fleetmap.geometry import Array, se3
+from fleetmap.numerics.time_sliced import finished
+from fleetmap.relocalization.frame_features import FrameFeatures
+from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.relocalizer import Relocalizer
+from fleetmap.relocalization.settings import RelocalizerSettings
+from fleetmap.sensors.rectification import StereoCamera
+from support.storage.map_samples import random_tile
+
+CAMERA = StereoCamera(420.0, 319.5, 239.5, 0.12, 640, 480)
+PLACES = 20
+
+
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The places that are tried, none of which verifies."""
+    places: list[int] = []
+    monkeypatch.setattr(Relocalizer, "_at_place", lambda _, query, place, rotation: places.append(place))
+    return places
+
+
+def search(view: MapView, failed: list[Array] | None) -> None:
+    rng = np.random.default_rng(1)
+    descriptors = np.concatenate([view.descriptors[::3], rng.integers(0, 256, (100, 32), np.uint8)])
+    count = len(descriptors)
+    features = Features(np.zeros((count, 2)), np.zeros(count, np.int8), np.zeros(count, np.float32), descriptors)
+    relocalizer = Relocalizer(view, CAMERA, RelocalizerSettings())
+    assert not finished(relocalizer.anywhere(FrameFeatures(features, np.zeros((count, 3))), failed=failed))
+
+
+def line_of_places() -> MapView:
+    """Three metres apart."""
+    rng = np.random.default_rng(5)
+    tile = random_tile(rng, landmarks=4000, places=PLACES)
+    lists = tuple(np.sort(tile.landmark_ids[k * 200 : k * 200 + 200]) for k in range(PLACES))
+    map_from_cam = np.array([se3(np.eye(3), np.array([3.0 * k, 0.0, 0.0])) for k in range(PLACES)])
+    tile = replace(tile, place_landmark_ids=lists, map_from_cam=map_from_cam)
+    return MapView([tile], train_vocabulary(tile.descriptors, 10, 3, rng), 420.0)
+
+
+def test_a_standing_robot_tries_every_place_once_before_any_again(tried: list[int]) -> None:
+    view, failed, rounds = line_of_places(), [], []
+    for _ in range(3):
+        search(view, failed)
+        rounds.append(tried.copy())
+        tried.clear()
+    top = RelocalizerSettings().fix.top_places
+    assert [len(places) for places in rounds] == [top, top, PLACES - 2 * top]
+    assert set().union(*rounds) == set(range(PLACES))
+    search(view, failed)
+    assert tried == rounds[0]
+
+
+def test_without_memory_the_same_places_are_tried(tried: list[int]) -> None:
+    view = line_of_places()
+    search(view, None)
+    first = tried.copy()
+    search(view, None)
+    assert tried == first * 2
