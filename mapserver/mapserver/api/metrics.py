@@ -29,6 +29,8 @@ _SITE_SUMS: tuple[tuple[str, str, Callable[[Counters], float]], ...] = (
     ("unreported_blindness", "Stretches of blindness without a reported failure.", lambda c: c.unreported_blindness),
     ("observed_seconds", "Time that reports cover.", lambda counts: counts.observed_ms / 1e3),
     ("driving_seconds", "Of it driving; a robot-day is 57600 s.", lambda counts: counts.driving_ms / 1e3),
+    ("driving_judged_seconds", "Driving, also at an unknown speed.", lambda counts: counts.judged_ms / 1e3),
+    ("driving_localised_seconds", "Of that localised.", lambda counts: counts.found_ms / 1e3),
     ("usable_seconds", "Of it with a usable position.", lambda counts: counts.usable_ms / 1e3),
     ("after_first_fix_seconds", "Of it since the run's first fix.", lambda counts: counts.after_fix_ms / 1e3),
     ("localised_seconds", "Of that TRACKING.", lambda counts: counts.localised_ms / 1e3),

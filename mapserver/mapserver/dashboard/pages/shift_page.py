@@ -119,7 +119,7 @@ def _failures(summary: FleetSummary) -> Markup:
         (
             moment(row.happened_ns),
             row.robot,
-            row.kind,
+            row.kind.replace("_", " "),
             row.cause.replace("_", " "),
             row.version,
             row.tile,
