@@ -215,12 +215,13 @@ class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
 
     cause: a `Cause`, what stands in the way of TRACKING. odom_from_base is continuous; map_from_odom moves with every fix and is None
     while there is no single pose. cov_rot_trans: of map_from_base in map axes, rotation first, row by row, None with it.
-    hypotheses: competing poses while AMBIGUOUS.
+    hypotheses: competing poses while AMBIGUOUS. calibration: which parameter is wrong by how much, where the cause is that.
     """
 
     stamp_ns: int
     status: Name
     cause: Name = ""
+    calibration: Text = ""
     map_version: Version | None
     odom_from_base: Placement
     map_from_odom: Placement | None
@@ -261,7 +262,7 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     tile, map_from_base, radius_95_m: what the robot believed when it began, None where it had claimed no pose. wrong_by_m: how far from
     there fixes that agree with each other put it, None where none do. landmarks_expected, landmarks_seen: in the image from which on
     the robot was not localised, by its belief then. exposure: mean brightness of the left image, 0 to 1; sharpness: variance of the steps
-    between neighbouring pixels of a row, 1 is typical for the robot.
+    between neighbouring pixels of a row, 1 is typical for the robot. calibration: which parameter is wrong by how much, empty for none.
     """
 
     site: Name
@@ -284,6 +285,7 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     inliers: int | None = None
     exposure: float | None = None
     sharpness: float | None = None
+    calibration: Text = ""
     fixes: Annotated[tuple[FixNote, ...], msgspec.Meta(max_length=20)] = ()
     thumbnails: Annotated[tuple[Thumbnail, ...], msgspec.Meta(max_length=4)] = ()
 

@@ -8,13 +8,16 @@ from pathlib import Path
 
 from fleetmap.bus import ZenohBus
 from fleetmap.errors import FleetmapError, UnreachableError
+from fleetmap.features.orb import OrbSettings
 from fleetmap.recordings import StoredFrame
+from fleetmap.recordings.images import decode_frame
 from fleetmap.sensors.calibration import RigCalibration, stereo_baseline_m
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from locclient.config import LocclientConfig
 from locclient.daemon.daemon import check_run, configured_outbox
 from locclient.delivery.outbox import Outbox
+from locclient.localization.calibration.pair_order import REVERSED_TEXT, PairOrder, pair_order
 from locclient.maps.connection import cache_folder
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import LocalMapSource
@@ -68,9 +71,10 @@ def _guarded(what: str, check: Callable[[], Iterator[Finding]]) -> Iterator[Find
 def _sensors(config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
     source = open_source(config.source, config.topics)
     try:
-        yield _calibration(source.calibration, Rectifier(source.calibration, has_depth=source.has_depth))
+        rectifier = Rectifier(source.calibration, has_depth=source.has_depth)
+        yield _calibration(source.calibration, rectifier)
         if listen_s > 0:
-            yield from _streams(source, config, listen_s)
+            yield from _streams(source, config, listen_s, rectifier)
     finally:
         source.close()
 
@@ -86,7 +90,7 @@ def _calibration(calibration: RigCalibration, rectifier: Rectifier) -> Finding:
     return Finding(OK, "calibration", f"{text}, IMU {1e3 * rectifier.imu_minus_cam_s:+.1f} ms from the camera")
 
 
-def _streams(source: Source, config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
+def _streams(source: Source, config: LocclientConfig, listen_s: float, rectifier: Rectifier) -> Iterator[Finding]:
     until_s = time.monotonic() + listen_s
     intake = _StampRecorder(has_imu=source.calibration.imu is not None)
 
@@ -106,6 +110,7 @@ def _streams(source: Source, config: LocclientConfig, listen_s: float) -> Iterat
         bad = counts.frames_disordered + counts.unreadable
         hint = f", {bad} of them out of order or unreadable: check the driver" if bad else ""
         yield Finding(WARN if bad else OK, "frames", text + hint)
+    yield from _pair(intake.last_frame, rectifier)
     if source.calibration.imu is not None and is_live:
         imu_hz = counts.imu_samples / listen_s
         is_enough = imu_hz >= _MIN_IMU_HZ
@@ -120,12 +125,31 @@ def _streams(source: Source, config: LocclientConfig, listen_s: float) -> Iterat
             yield Finding(OK, "stamps", f"{1e3 * skew_s:.0f} ms behind the system's clock")
 
 
+def _pair(raw: CameraFrame | StoredFrame | None, rectifier: Rectifier) -> Iterator[Finding]:
+    """Whether the left image is the left one, by the last frame that came."""
+    if raw is None:
+        return
+    frame = rectifier.rectify(decode_frame(raw) if isinstance(raw, StoredFrame) else raw)
+    if frame.right is None:
+        return
+    order = pair_order(frame, OrbSettings())
+    if order is PairOrder.REVERSED:
+        yield Finding(FAIL, "left and right", REVERSED_TEXT)
+    elif order is PairOrder.RIGHT:
+        yield Finding(OK, "left and right", "the left image is the left one")
+    else:
+        yield Finding(
+            WARN, "left and right", "not judged: too little is seen near the robot; check where things stand within 5 m"
+        )
+
+
 class _StampRecorder(Intake):
-    """Keeps the stamps of accepted frames, and no frames."""
+    """Keeps the stamps of accepted frames, and the last frame."""
 
     def __init__(self, *, has_imu: bool) -> None:
         super().__init__(frames=1, imu_minus_cam_s=0.0, has_imu=has_imu, imu_wait_s=0.0)
         self.stamps_ns: list[int] = []
+        self.last_frame: CameraFrame | StoredFrame | None = None
 
     def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
         """See Intake."""
@@ -133,6 +157,7 @@ class _StampRecorder(Intake):
         super().put_frame(frame)
         if self.counts.frames > before:
             self.stamps_ns.append(frame.stamp_ns)
+            self.last_frame = frame
 
     def wait_for_room(self, timeout_s: float) -> bool:
         """See Intake; there is always room."""

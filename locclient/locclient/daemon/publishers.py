@@ -57,6 +57,7 @@ class MessagePackPublisher:
             stamp_ns=estimate.stamp_ns,
             status=estimate.status.value,
             cause=estimate.cause.value,
+            calibration=estimate.calibration.text[:2000],
             map_version=estimate.map_version,
             odom_from_base=Placement.of(published.odom_from_base),
             map_from_odom=None if published.map_from_odom is None else Placement.of(published.map_from_odom),

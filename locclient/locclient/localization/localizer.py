@@ -86,7 +86,7 @@ class Localizer:
         self._image_monitor = ImageQualityMonitor(settings.sight)
         self._was_tracking = False
         mounting = Mounting(self._cam_from_body, calibration.base_from_body)
-        self._calibration = CalibrationMonitor(mounting, settings.relocalizer)
+        self._calibration = CalibrationMonitor(mounting, settings.relocalizer, imu_minus_cam_s)
         self._query_input: tuple[RectifiedFrame, OdometryEstimate] | None = None  # of that query
         self._query_features: FrameFeatures | None = None
 

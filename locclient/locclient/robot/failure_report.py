@@ -38,8 +38,8 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
     matches = _matches(context, profile)
     seen = None if matches is None else int((matches[2] >= 0).sum())
     cause = failure.cause
-    if seen is not None and matches is not None and _has_map_changed(context, profile, len(matches[2]), seen):
-        cause = Cause.MAP_CHANGED
+    if seen is not None and matches is not None and cause is not Cause.CALIBRATION:
+        cause = Cause.MAP_CHANGED if _has_map_changed(context, profile, len(matches[2]), seen) else cause
     innovations = [note.innovation for note in failure.fixes if note.innovation is not None]
     inliers = [note.inliers for note in failure.fixes if note.inliers is not None]
     return FailureReport(
@@ -64,6 +64,7 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
         exposure=None if image is None else image.exposure,
         sharpness=None if image is None else image.sharpness,
         fixes=failure.fixes,
+        calibration=failure.estimate.calibration.text[:2000],
         thumbnails=_thumbnails(context, matches, cause),
     )
 

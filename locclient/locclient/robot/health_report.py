@@ -109,6 +109,8 @@ class HealthFigures:
         }
         if last is not None:
             figures["exposure"], figures["sharpness"] = last.image.exposure, last.image.sharpness
+            figures |= last.calibration.figures
+            flags += [Cause.CALIBRATION] if last.calibration.is_wrong else []
             flags += ["blind"] if is_blind(last.status, radius_95_m(last.cov_rot_trans)) else []
             flags += [last.image.cause] if last.image.cause else []
             flags += [] if self._last is None or self._last.may_be_mapped else [OFF_MAP]

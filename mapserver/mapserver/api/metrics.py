@@ -15,6 +15,7 @@ from prometheus_client.registry import Collector
 from fleetmap.messages import Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.kpis import Counters
+from mapserver.fleet_statistics.robot_calibration import PARAMETERS, calibration_figures
 from mapserver.store import MapStore
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -125,6 +126,15 @@ class _FleetCollector(Collector):
             counts = Counts(_status(robot) for robot in _seen(own))
             _filled(statuses, (((site, status), counts[status]) for status in (*Status, "other")))
         yield statuses
+        drifting = _gauge(
+            "site_robots_calibration", "Robots heard in the last minute that drift, by parameter.", "parameter"
+        )
+        for site, own in of_site.items():
+            drifts = Counts(
+                f.name for robot in _seen(own) for f in calibration_figures(robot.last_health) if f.is_drifted
+            )
+            _filled(drifting, (((site, name), drifts[name]) for name in PARAMETERS))
+        yield drifting
 
 
 def _gauge(name: str, words: str, *labels: str) -> GaugeMetricFamily:

@@ -10,6 +10,7 @@ from mapserver.dashboard.drawing import Bar
 from mapserver.dashboard.markup import badge, joined, link, moment, share, table
 from mapserver.fleet_statistics.kpis import Kpis, Rate, driven_words, figure, format_rate, is_telling
 from mapserver.fleet_statistics.resurvey_test import TileConcern
+from mapserver.fleet_statistics.robot_calibration import PARAMETERS, CalibrationFigure
 from mapserver.store import CanaryRow
 
 _TRIAL_WORDS = {
@@ -106,3 +107,28 @@ def resurvey(concerns: Sequence[TileConcern], tile_address: Callable[[str], str]
     ]
     head = ("Tile", "Why", "Recent failures per robot-day", "Before")
     return Markup("<h2>Survey again</h2>{}").format(table(head, rows, empty="", name="Tiles to survey again"))
+
+
+def calibrations(robots: Sequence[tuple[str, Sequence[CalibrationFigure]]]) -> Markup:
+    """What the map shows of the robots' cameras, those that drift first; nothing where no robot reports it."""
+    if not robots:
+        return Markup("")
+    shown = [name for name in PARAMETERS if any(one.name == name for _, found in robots for one in found)]
+    rows = []
+    for robot, found in sorted(robots, key=lambda item: (not any(one.is_drifted for one in item[1]), item[0])):
+        by_name = {one.name: one for one in found}
+        drifted = any(one.is_drifted for one in found)
+        state = badge("bad", "drifts") if drifted else badge("good", "agrees")
+        rows.append((robot, state, *(_calibration_cell(by_name.get(name)) for name in shown)))
+    head = ("Robot", "Calibration", *(PARAMETERS[name] for name in shown))
+    return Markup(
+        "<h2>Cameras against the map</h2>{}"
+        '<p class="quiet">What the map shows minus what a robot\'s calibration says, with its standard deviation. A robot whose camera '
+        "drifts says DEGRADED: look at its mounting and calibrate it again.</p>"
+    ).format(table(head, rows, empty="", name="Calibration of the robots' cameras"))
+
+
+def _calibration_cell(found: CalibrationFigure | None) -> Markup | str:
+    if found is None:
+        return "–"
+    return badge("bad", found.words) if found.is_drifted else found.words

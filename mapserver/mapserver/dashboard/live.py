@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from fleetmap.messages import Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
+from mapserver.fleet_statistics.robot_calibration import CalibrationFigure, calibration_figures
 
 SILENT_S = 10.0  # robots report every second
 _LEFT_S = 3.0
@@ -24,7 +25,10 @@ SILENT = ("silent", "quiet")
 
 @dataclass(frozen=True, slots=True)
 class LiveRobot:
-    """One robot as a page shows it; place: x and y of its last estimate in `map`, None where it never sent one."""
+    """One robot as a page shows it; place: x and y of its last estimate in `map`, None where it never sent one.
+
+    calibration: what the map shows of its cameras, empty for a robot that does not report it.
+    """
 
     name: str
     words: str
@@ -37,6 +41,7 @@ class LiveRobot:
     refused: str
     is_canary: bool
     clock_ahead_s: float | None
+    calibration: tuple[CalibrationFigure, ...] = ()
 
     @property
     def is_behind(self) -> bool:
@@ -102,4 +107,5 @@ def live_robot(status: RobotStatus) -> LiveRobot:
         refused=str((status.last_ack or {}).get("refused", "")),
         is_canary=status.is_canary,
         clock_ahead_s=status.clock_ahead_s,
+        calibration=calibration_figures(health),
     )

@@ -27,7 +27,7 @@ class OdometryEstimate:
     given when the frame `odom` was redefined (gravity found): earlier estimates must be multiplied by it from the left.
     previous_from_body (4, 4) is the motion since the frame before, as known now, None where it is not known. It is not what two
     estimates differ by: gravity that becomes better known turns all of `odom` about its origin, far from where the body is.
-    imu_minus_cam_s is the time offset as estimated so far, 0 without an IMU.
+    imu_minus_cam_s is the time offset as estimated so far, 0 without an IMU, and imu_minus_cam_sigma_s its standard deviation.
     scale_known is False for one camera whose scale nothing has shown: lengths are then in a unit of the odometry's own. revised:
     earlier frames that are placed anew, (frame index, odom_from_body (4, 4)).
     """
@@ -49,5 +49,6 @@ class OdometryEstimate:
     scale_known: bool = True
     revised: tuple[tuple[int, Array], ...] = ()
     imu_minus_cam_s: float = 0.0
+    imu_minus_cam_sigma_s: float = np.inf
     track_pixels: Array | None = None
     previous_from_body: Array | None = None

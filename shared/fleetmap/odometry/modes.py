@@ -137,6 +137,7 @@ class WindowMode(Mode):
             new_odom_from_old_odom=step.new_odom_from_old_odom,
             revised=step.revised,
             imu_minus_cam_s=offset_s,
+            imu_minus_cam_sigma_s=window_filter.offset_sigma_s if self.inertial else np.inf,
             track_pixels=tracked.pixels,
         )
 

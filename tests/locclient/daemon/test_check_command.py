@@ -2,14 +2,19 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
+import numpy as np
 import pytest
 import typer
 
 from fleetmap.errors import UsageError
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetmap.sensors.samples import CameraFrame
 from locclient import cli
 from locclient.config import LocclientConfig
-from locclient.daemon.preflight import _clock
+from locclient.daemon.preflight import _clock, _pair
 from mapserver import releases
 from mapserver.store import MapStore
 from support.recordings.recording_samples import make_sample, write_euroc
@@ -112,3 +117,15 @@ def test_clocks_are_judged() -> None:
     assert _clock(5, True).level == "fail"
     assert _clock(1_800_000_000 * 10**9, False).level == "warn"
     assert _clock(1_800_000_000 * 10**9, True).level == "ok"
+
+
+@pytest.mark.parametrize(("shift_px", "level"), [(12, "ok"), (-12, "fail"), (0, "warn")])
+def test_an_exchanged_pair_fails_the_check(shift_px: int, level: str) -> None:
+    """Blocks that lie farther left in the right image, farther right, as of exchanged or mirrored cameras, or at infinity."""
+    rng = np.random.default_rng(3)
+    wide = np.kron(rng.integers(20, 230, (60, 90)), np.ones((8, 8))) + rng.normal(0, 6, (480, 720))
+    left, right = (wide[:, at : at + 640].clip(0, 255).astype(np.uint8) for at in (40, 40 + shift_px))
+    rectifier = SimpleNamespace(rectify=lambda frame: RectifiedFrame(0, frame.left, frame.right, None))
+    (finding,) = _pair(CameraFrame(0, left, right, None), cast(Rectifier, rectifier))
+    assert (finding.what, finding.level) == ("left and right", level)
+    assert list(_pair(CameraFrame(0, left, None, None), cast(Rectifier, rectifier))) == []

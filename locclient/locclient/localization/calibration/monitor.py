@@ -39,9 +39,9 @@ class FinishedQuery:
 class CalibrationMonitor:
     """Holds what the localizer need not know of the watch. Its work is done in slices, in frames after the one that it is about."""
 
-    def __init__(self, rig: Mounting, settings: RelocalizerSettings) -> None:
+    def __init__(self, rig: Mounting, settings: RelocalizerSettings, imu_minus_cam_s: float = 0.0) -> None:
         self._rig, self._settings = rig, settings
-        self.watch = CalibrationWatch(rig, settings.stereo)
+        self.watch = CalibrationWatch(rig, settings.stereo, imu_minus_cam_s)
         self._job: TimeSliced[None] | None = None
         self._searched_ns: int | None = None
         self._order, self._order_ns = PairOrder.UNKNOWN, -(2**62)

@@ -27,6 +27,7 @@ from locclient.localization.calibration.parameters import (
     NOT_JUDGED,
     PARAMETERS,
     TILT,
+    TIME_OFFSET,
     CalibrationState,
     Drift,
 )
@@ -83,8 +84,9 @@ class CalibrationWatch:
     Sources: Triggs et al. 2000 (self-calibration in bundle adjustment), Huber 1967 (covariance from the scatter of scores).
     """
 
-    def __init__(self, rig: Mounting, stereo_settings: StereoSettings) -> None:
-        self._rig, self._stereo = rig, stereo_settings
+    def __init__(self, rig: Mounting, stereo_settings: StereoSettings, imu_minus_cam_s: float = 0.0) -> None:
+        """imu_minus_cam_s: the time offset of the calibration."""
+        self._rig, self._stereo, self._imu_minus_cam_s = rig, stereo_settings, imu_minus_cam_s
         self._views: deque[_View] = deque(maxlen=_WINDOW)
         self._wheels = WheelTravel()
         self._last_map_from_cam: Array | None = None
@@ -114,7 +116,8 @@ class CalibrationWatch:
         self._add_mounting(query, information, score)
         shift = np.zeros((6, IMAGE)) if seen is None else seen.pose_per_parameter
         self._views.append(_View(information, score, shift, ids))
-        self.state = self._judged()
+        state = self._judged()
+        self.state = state._replace(drifts=(*state.drifts, *self._time_offset(query.odometry)))
 
     def handle_unmatched(self, query: MapQuery) -> None:
         """As `handle`, for a frame that agrees with the map only without its depth: that is measured here for what was matched."""
@@ -160,13 +163,21 @@ class CalibrationWatch:
                 score[at_one] += value * sigma**-2
         self._last_base = base
 
+    def _time_offset(self, odometry: OdometryEstimate) -> list[Drift]:
+        sigma = float(np.hypot(odometry.imu_minus_cam_sigma_s, TIME_OFFSET.floor))
+        if not np.isfinite(sigma):
+            return []
+        value = odometry.imu_minus_cam_s - self._imu_minus_cam_s
+        is_drifted = abs(value) > max(TIME_OFFSET.limit, DRIFT_SIGMAS * sigma)
+        return [Drift(TIME_OFFSET, value, sigma, 0.0, is_drifted)]
+
     # --- judgement ----------------------------------------------------------------------------------------------------
 
     def _judged(self) -> CalibrationState:
         """By the window. Views before a change that its end shows are dropped: knocks and repairs show at once."""
         views = list(self._views)
         if len(views) < _MIN_VIEWS:
-            return self.state
+            return NOT_JUDGED
         for recent in _RECENT:
             if len(views) >= recent + _MIN_BEFORE:
                 before, sigma_before = _estimate(views[:-recent])

@@ -188,6 +188,7 @@ def _summary(context: PageContext, detail: FailureDetail) -> Markup:
                 ("Began", moment(row.happened_ns)),
                 ("Duration when reported", f"{row.duration_s:.1f} s"),
                 ("Cause", row.cause.replace("_", " ")),
+                ("Calibration", report.calibration or "–"),
                 ("State of the robot", STATUSES.get(row.status, (row.status,))[0]),
                 ("Robot", same("robot", row.robot)),
                 ("Map version", same("version", row.version)),

@@ -15,6 +15,7 @@ from mapserver.dashboard.live import LiveRobot, LiveSite
 from mapserver.dashboard.markup import age, joined, share
 from mapserver.dashboard.plan import Plan
 from mapserver.fleet_statistics.kpis import driven_words
+from mapserver.fleet_statistics.robot_calibration import PARAMETERS, CalibrationFigure
 
 _MOVE_EVERY_S, _TABLE_EVERY_S = 1.0, 2.0
 _SHAPES = {"good": "circle", "warn": "triangle", "bad": "square", "quiet": "circle"}
@@ -45,6 +46,7 @@ def install(services: Services) -> None:
             html(_legend())
             chart = html(_rates(health))
             robots = _table(context, live, health)
+            calibrations = html(fleet_parts.calibrations(_calibrations(live)))
             html(fleet_parts.resurvey(health.resurvey, lambda tile: context.to("failures", tile=tile)))
 
             async def move() -> None:
@@ -63,6 +65,7 @@ def install(services: Services) -> None:
                 if rows != robots.rows:
                     robots.rows = rows
                 chart.set_content(str(_rates(health)))
+                calibrations.set_content(str(fleet_parts.calibrations(_calibrations(live))))
 
             ui.timer(_MOVE_EVERY_S, move, immediate=False)
             ui.timer(_TABLE_EVERY_S, refresh_table, immediate=False)
@@ -123,6 +126,10 @@ def _rates(health: SiteHealth) -> Markup:
     return fleet_parts.rates(bars, remark)
 
 
+def _calibrations(live: LiveSite) -> list[tuple[str, tuple[CalibrationFigure, ...]]]:
+    return [(robot.name, robot.calibration) for robot in live.robots if robot.calibration]
+
+
 def _table(context: PageContext, live: LiveSite, health: SiteHealth) -> ui.table:
     html(Markup("<h2>Robots, problems first</h2>"))
     columns = [
@@ -151,7 +158,7 @@ def _row(context: PageContext, robot: LiveRobot, health: SiteHealth) -> dict[str
     version = "none" if robot.version is None else str(robot.version)
     if robot.is_behind and robot.wanted_version is not None:
         version += f", should be {robot.wanted_version}"
-    remarks = [*robot.flags]
+    remarks = [*robot.flags, *(f"{PARAMETERS[f.name]} {f.words}" for f in robot.calibration if f.is_drifted)]
     if robot.is_canary:
         remarks.append("tries a new version")
     if own is not None and own.silent_estimated.events:

@@ -292,6 +292,11 @@ class InvariantFilter:
         now = self.odom_from_clone(self.clone_ids[-1])
         return np.asarray(earlier_from_odom @ now), np.asarray(carry @ difference @ carry.T)
 
+    @property
+    def offset_sigma_s(self) -> float:
+        """Standard deviation of the time offset's true error."""
+        return float(np.sqrt(self.true_error_cov[CONSIDERED + _OFFSET, CONSIDERED + _OFFSET]))
+
     def body_covariance(self) -> Array:
         """cov_rot_trans (6, 6) of odom_from_body: rotation error in odom axes, then position error."""
         jacobian = np.zeros((6, _NAV))

@@ -149,3 +149,14 @@ def test_an_exchanged_pair_is_never_tracking(monkeypatch: pytest.MonkeyPatch) ->
     refused = published(monitor, estimate(1.0), 1_000_000_000)
     assert (refused.status, refused.cause, refused.map_from_body) == (Status.LOST, Cause.CALIBRATION, None)
     assert "exchanged" in refused.calibration.text
+
+
+def test_a_wrong_time_is_reported_and_costs_nothing() -> None:
+    watch = CalibrationWatch(RIG, StereoSettings(), imu_minus_cam_s=0.002)
+    for number in range(4):
+        query = look(number, parameters())
+        odometry = replace(query.odometry, imu_minus_cam_s=0.022, imu_minus_cam_sigma_s=0.0005)
+        watch.handle(replace(query, odometry=odometry))
+    assert watch.state.figures["calibration_time_offset_s"] == pytest.approx(0.020)
+    assert watch.state.figures["calibration_drifts"] == "time_offset_s"
+    assert not watch.state.is_wrong
