@@ -30,12 +30,12 @@ class CameraView(NamedTuple):
     pose_per_parameter: Array
 
 
-def row_errors(frame: RectifiedFrame, matched: Correspondences, map_from_cam: Array) -> Array:
-    """(N,) row of a point in the right image minus that in the left one, px; NaN where it was not looked for or not found.
+def pair_offsets(frame: RectifiedFrame, matched: Correspondences, map_from_cam: Array) -> Array:
+    """(N, 2) of points in the right image: column, and row minus that in the left one, px; NaN where not looked for or not found.
 
     Looked for around where the map says, in both directions, so that a pair that is turned up or down still shows it.
     """
-    out = np.full(len(matched), np.nan)
+    out = np.full((len(matched), 2), np.nan)
     if frame.right is None:
         return out
     points_cam = transform_points(se3_inverse(map_from_cam), matched.points_source)
@@ -47,14 +47,14 @@ def row_errors(frame: RectifiedFrame, matched: Correspondences, map_from_cam: Ar
     pyramids = Pyramid(frame.left), Pyramid(frame.right)
     flow = follow(*pyramids, left, predicted, window_px=_ROW_WINDOW_PX, levels=1)
     good = forward_backward_check(*pyramids, flow, window_px=_ROW_WINDOW_PX, within_px=_ROW_BACK_PX)
-    out[seen[good]] = flow.places[good, 1] - left[good, 1]
+    out[seen[good]] = flow.places[good] - left[good] * [0.0, 1.0]
     return out
 
 
 def camera_view(matched: Correspondences, map_from_cam: Array, rows_px: Array) -> CameraView | None:
     """The view of a frame near map_from_cam with all that it matched, before any gate; None where too little has depth.
 
-    rows_px (N,): from `row_errors`. Source: Triggs et al. 2000, sections 6.1 (Schur complement) and 2.2 (self-calibration).
+    rows_px (N,): from `pair_offsets`. Source: Triggs et al. 2000, sections 6.1 (Schur complement) and 2.2 (self-calibration).
     """
     if np.isfinite(matched.pixels[:, 2]).sum() < _MIN_POINTS:
         return None

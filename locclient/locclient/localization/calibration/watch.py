@@ -10,12 +10,13 @@ from fleetmap.features import stereo
 from fleetmap.features.stereo import StereoSettings
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.odometry import OdometryEstimate
+from fleetmap.pnp.pnp import Correspondences
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import WheelSample
 from locclient.localization.calibration import mounting
-from locclient.localization.calibration.camera_view import camera_view, row_errors
+from locclient.localization.calibration.camera_view import camera_view, pair_offsets
 from locclient.localization.calibration.mounting import BasePose, WheelTravel
 from locclient.localization.calibration.parameters import (
     BIAS_LIMIT_M,
@@ -105,7 +106,8 @@ class CalibrationWatch:
         self._last_map_from_cam = fix.map_from_cam
         seen = None
         if frame.right is not None:
-            seen = camera_view(matched, fix.map_from_cam, row_errors(frame, matched, fix.map_from_cam))
+            offsets = pair_offsets(frame, matched, fix.map_from_cam)
+            seen = camera_view(_with_depth(matched, offsets[:, 0]), fix.map_from_cam, offsets[:, 1])
         information, score = np.zeros((COUNT + 2, COUNT + 2)), np.zeros(COUNT + 2)
         ids = (
             frozenset[int]() if fix.matches is None else frozenset(query.view.landmark_ids[fix.matches[:, 1]].tolist())
@@ -190,6 +192,13 @@ class CalibrationWatch:
                     break
         value, sigma = _estimate(views)
         return _state(views, value, sigma)
+
+
+def _with_depth(matched: Correspondences, right_px: Array) -> Correspondences:
+    """With the columns of the right image where stereo matching, which keeps to the row, found none."""
+    has_none = np.isnan(matched.pixels[:, 2])
+    columns = np.where(has_none, right_px, matched.pixels[:, 2])
+    return replace(matched, pixels=np.column_stack([matched.pixels[:, :2], columns]))
 
 
 def _estimate(views: Sequence[_View]) -> tuple[Array, Array]:
