@@ -26,6 +26,7 @@ from mapserver.survey.survey_inputs import SurveyTools
 
 P = CalibrationParameter
 SURE_SIGMAS = 3.0
+_LONGER = "record a longer drive, with turns, starts and stops"
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,15 +138,17 @@ def _unknown(reason: str, missing: str) -> MeasuredCalibration:
 def _finding(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_px: float) -> Finding:
     name, tolerance = parameter.name, TOLERANCES[parameter.name]
     factor, unit, digits = _SHOWN[parameter.unit]
-    if not parameter.is_judged:
-        sigma = f"known to {factor * parameter.sigma:.{digits}f} {unit} only"
-        return not_judged(name.value, sigma, parameter.reason)
     value, own_sigma = _net(parameter, estimate, focal_px)
+    if not parameter.is_judged or own_sigma > tolerance.warn_above:
+        sigma = f"known to {factor * parameter.sigma:.{digits}f} {unit} only"
+        return not_judged(name.value, sigma, parameter.reason or _LONGER)
     sigma_all = float(np.hypot(own_sigma, tolerance.floor))
     sure = max(abs(value) - SURE_SIGMAS * sigma_all, 0.0)
     is_bad = sure > tolerance.warn_above
     verdict = Verdict.FAIL if sure > tolerance.fail_above else Verdict.WARN if is_bad else Verdict.OK
     words = f"{factor * value:+.{digits}f} {unit} from the calibration, sigma {factor * sigma_all:.{digits}f}"
+    if not is_bad and abs(value) > tolerance.warn_above + sigma_all:  # dear if it is true: neither sure nor silent
+        return not_judged(name.value, f"{words}: that may be chance", _LONGER)
     if is_bad:
         words += "; calibrate again (`mapserver calibrate` writes what it finds), or name the matching file with --calibration"
     limits = f"warn {factor * tolerance.warn_above:g}, fail {factor * tolerance.fail_above:g} {unit} for sure"

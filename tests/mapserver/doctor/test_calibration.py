@@ -54,9 +54,18 @@ def test_an_error_that_costs_3_cm_warns_and_that_of_another_rig_fails(parameter:
         + 3.0 * (RANGES[parameter].unit == "rad") * 0.4 / FOCAL_PX
     )
     name = parameter.name.lower()
-    assert verdicts(estimate(**{name: 0.99 * limit.warn_above})) == {}
+    assert parameter.value not in verdicts(estimate(**{name: 0.99 * limit.warn_above}))
     assert verdicts(estimate(**{name: -1.01 * limit.warn_above - slack}))[parameter.value] is Verdict.WARN
     assert verdicts(estimate(**{name: 1.01 * limit.fail_above + slack}))[parameter.value] is Verdict.FAIL
+
+
+def test_a_dear_error_that_may_be_chance_is_neither_ok_nor_a_fault() -> None:
+    """One percent of baseline, 10 cm of 10 m, two and a half sigmas from nothing."""
+    sigma = np.hypot(0.1 * 0.003, TOLERANCES[P.BASELINE].floor)
+    (finding,) = [f for f in findings_of(estimate(baseline=-0.003 - 2.5 * sigma), FOCAL_PX) if f.name == "baseline"]
+    assert finding.verdict is Verdict.NOT_JUDGED
+    assert "that may be chance" in finding.sentence
+    assert "turns" in finding.missing
 
 
 def test_a_shifted_principal_point_that_looks_like_a_turn_is_no_turn() -> None:
