@@ -42,6 +42,11 @@ def session_relocalizer(base: BaseMap, vocabulary: Vocabulary, settings: SurveyS
     to a tile's grid: what is matched becomes observations of the adjustment. And inliers, windows and sigmas are the survey's: a
     wrong join spoils a map for good, whereas a robot's next fix corrects a wrong one.
     """
+    return Relocalizer(base.view(vocabulary), base.camera, session_relocalization(settings))
+
+
+def session_relocalization(settings: SurveySettings) -> RelocalizerSettings:
+    """The relocalizer's settings for sessions."""
     sessions, pairs = settings.sessions, settings.pairs
     fix = FixSettings(
         min_inliers=sessions.min_inliers,
@@ -58,8 +63,7 @@ def session_relocalizer(base: BaseMap, vocabulary: Vocabulary, settings: SurveyS
         floor_rad=0.001,
         max_view_angle_deg=sessions.max_view_angle_deg,
     )
-    relocalization = RelocalizerSettings(settings.seed, settings.stereo, settings.orb, fix)
-    return Relocalizer(base.view(vocabulary), base.camera, relocalization)
+    return RelocalizerSettings(settings.seed, settings.stereo, settings.orb, fix)
 
 
 def keyframe_features(keyframe: Keyframe) -> FrameFeatures:

@@ -12,7 +12,6 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from fleetmap.geometry import Array
 from fleetmap.relocalization.frame_features import FrameFeatures
@@ -190,7 +189,7 @@ class JoinTest:
         """The place that most of the map speaks for; undecided where another is as good and no position prior tells them apart."""
         best = max(found, key=lambda one: (2 * one.seen.seen - one.seen.cells, len(one.placed.fixes)))
         others = [one for one in found if not _same_place(one, best)]
-        alike = [best, *(one for one in others if self._is_alike(one, best))]
+        alike = [best, *(one for one in others if one.seen.high >= max(_NEEDED_SHARE, best.seen.low))]
         near = [one for one in alike if one.priors_off_m is not None and one.priors_off_m < _PRIOR_M]
         rival_share = max((round(one.seen.share, 4) for one in others), default=None)
         if len(alike) > 1 and len(near) != 1:
@@ -209,12 +208,6 @@ class JoinTest:
                 evidence=self.evidence(chosen, chosen.seen),
             )
         return chosen
-
-    def _is_alike(self, other: Located, best: Located) -> bool:
-        """Whether another place is not worse by more than chance, and would itself pass."""
-        sigmas = float(norm.isf(self._settings.join_error_rate))
-        apart = sigmas * np.sqrt(other.seen.variance + best.seen.variance)
-        return bool(other.seen.share > max(_NEEDED_SHARE, best.seen.share - apart))
 
 
 def _same_place(one: Located, other: Located) -> bool:

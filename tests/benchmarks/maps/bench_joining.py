@@ -1,0 +1,273 @@
+"""Joining as a test: foreign sessions and true ones, rendered and without pictures, through the decision that builds take.
+
+    PYTHONPATH=tests python tests/benchmarks/maps/bench_joining.py [--parts foreign ...] [--sites 15] [--true-sites 34] [--rendered 7]
+        [--seed 300] [--work FOLDER] [--out FILE.json]
+
+A site is a building of its own seed. Foreign: every site's session in the map of every other site, without docks, with the docks of its
+own building (whose coordinates mean nothing in the other), with docks put anywhere. True: sessions of the same day, the next, three days
+on, of which half leads through what is not in the map, and against the survey's direction; rendered ones also by night. Lengths are 10
+to 80 m. Rates come with the 95 % bound of Clopper and Pearson. Without pictures there is no joint adjustment: errors are those of the
+pose graph of fixes.
+"""
+
+import argparse
+import json
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from rich.console import Console
+from scipy.stats import beta
+
+from benchmarks.common.joining_sites import (
+    SETTINGS,
+    Drive,
+    Site,
+    SiteMap,
+    cut,
+    drive,
+    error_m,
+    length_m,
+    session,
+    site_map,
+)
+from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.geometry import Array, se3
+from fleetmap.sensors.rectification import StereoCamera
+from fleetsim.commands import record_order
+from fleetsim.recorder import Order
+from fleetsim.scenarios import SCENARIOS, Scenario, find_scenario
+from mapserver.build.survey_recordings import RecordingOptions, Surveyed, admit_recordings, survey_recording
+from mapserver.survey.merge.join_test import JoinVerdict, NotJoined
+from mapserver.survey.merge.pipeline import extend
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
+
+_PLAIN = ("small-loop", "five-aisles", "busy")
+_LATER = (  # of the first rendered site, the second, and so on
+    (("next day", 1, "tote-1", "day"), ("night", 1, "survey", "night")),
+    (("three days on", 3, "survey", "day"), ("night", 1, "survey", "night")),
+    (("three days on", 3, "tote-1", "day"),),
+    (("next day", 1, "survey", "day"), ("night", 1, "survey", "night")),
+    (("same day", 0, "tote-1", "day"),),
+)
+_LENGTHS_M = (10.0, 20.0, 40.0, 80.0)
+_DOCKS = ("none", "own", "wrong")
+_MISPLACED_M = 0.05
+_FRAMES = 60
+
+
+class Shot(NamedTuple):
+    """A rendered session: its site, day, robot and light."""
+
+    site: Site
+    day: int = 0
+    robot: str = "survey"
+    light: str = "day"
+
+
+def rate(count: int, total: int) -> dict[str, Any]:
+    """A share with its bounds of 95 %."""
+    low = float(beta.ppf(0.025, count, total - count + 1)) if count else 0.0
+    high = float(beta.ppf(0.975, count + 1, total - count)) if count < total else 1.0
+    return {"count": count, "of": total, "share": count / max(total, 1), "low": low, "high": high}
+
+
+def decided(here: SiteMap, moved: Drive, docks: Array | None) -> dict[str, Any]:
+    """What the test says of a drive in a map, and how far off it is placed."""
+    test = here.test(moved, docks)
+    located = test.locate()
+    if isinstance(located, NotJoined):
+        return {"verdict": located.verdict.value, "cells": 0, "share": 0.0, "error_m": None, "reason": located.reason}
+    refused = test.judged(located, located.seen)
+    verdict = JoinVerdict.JOINED if refused is None else refused.verdict
+    off_m = error_m(located.map_from_body, moved.map_from_body, [fix.k for fix in located.placed.fixes])
+    figures = {"cells": located.seen.cells, "share": round(located.seen.share, 3), "error_m": round(off_m, 4)}
+    return {"verdict": verdict.value, **figures, "reason": "" if refused is None else refused.reason}
+
+
+def sites(count: int, seed: int) -> list[Site]:
+    """Buildings of all layouts, each with a seed of its own."""
+    kinds = ("small-loop", "five-aisles", "small-loop", "busy", "marked-ends", "identical-aisles", "five-aisles")
+    return [Site(kinds[n % len(kinds)], seed + n) for n in range(count)]
+
+
+def foreign(places: Sequence[Site]) -> Iterator[dict[str, Any]]:
+    """Every site's session in every other site's map."""
+    drives: dict[int, tuple[float, Drive]] = {}
+    for here in places:
+        known = site_map(session(here, 0, cut(here.route(), 0.0, 80.0), "map"))
+        for n, site in enumerate(places):
+            if site == here:
+                continue
+            if n not in drives:
+                way = cut(site.route(), 1.0 + n % 3, _LENGTHS_M[n % 4])
+                robot = ("surveyor", "tote")[n % 2]
+                drives[n] = length_m(way), drive(session(site, n % 2, way, f"foreign-{n}", robot))
+            way_m, moved = drives[n]
+            docks = _DOCKS[(n + here.seed) % 3]
+            shift_m = 0.0 if docks == "own" else 3.0 + 7.0 * (n % 3)
+            given = None if docks == "none" else moved.docks(shift_m, 0.0 if docks == "own" else 0.3)
+            row = {"kind": "foreign", "map": here, "session": site, "way_m": round(way_m), "docks": docks}
+            yield row | decided(known, moved, given)
+
+
+def true(places: Sequence[Site]) -> Iterator[dict[str, Any]]:
+    """Sessions of each site in its own map."""
+    for site in places:
+        route, back = site.route(), site.route(is_reversed=True)
+        whole_m = min(length_m(route), 80.0)
+        half = site_map(session(site, 0, cut(route, 0.0, whole_m / 2), "map"))
+        full = site_map(session(site, 0, cut(route, 0.0, whole_m), "map"))
+        n = site.seed % 4
+        asked = [
+            ("same day", full, 0, cut(route, 1.0 + n, _LENGTHS_M[n % 3]), "tote"),
+            ("next day", full, 1, cut(route, 2.0 + n, _LENGTHS_M[(n + 1) % 4]), "surveyor"),
+            ("next day", full, 1, cut(route, 4.0 + n, _LENGTHS_M[n % 2]), "runner"),
+            ("three days on", full, 3, cut(route, 1.0 + n, _LENGTHS_M[(n + 2) % 4]), "tote"),
+            ("partly new area", half, 1, cut(route, whole_m / 2 - 10.0, 24.0), "surveyor"),
+            ("opposite direction", full, 1, cut(back, length_m(back) - whole_m, _LENGTHS_M[(n + 2) % 4]), "tote"),
+        ]
+        for m, (kind, known, day, way, robot) in enumerate(asked):
+            moved = drive(session(site, day, way, f"true-{m}", robot))
+            docks = _DOCKS[(m + site.seed) % 2]
+            row = {"kind": kind, "map": site, "session": site, "way_m": round(length_m(way)), "docks": docks}
+            yield row | decided(known, moved, None if docks == "none" else moved.docks())
+
+
+def recorded(shot: Shot, work: Path) -> Path:
+    """The recording of a shot, rendered unless the work folder has it: each second picture of a run."""
+    site = shot.site
+    path = work / f"{site.scenario}-{site.seed}-d{shot.day}-{shot.robot}-{shot.light}-{_FRAMES}.mcap"
+    if not path.exists():
+        base = find_scenario(site.scenario)
+
+        def make() -> Scenario:
+            return replace(base, runs={name: replace(run, rate_hz=7.5) for name, run in base.runs.items()})
+
+        SCENARIOS[f"{site.scenario}-half"] = make
+        order = Order(f"{site.scenario}-half", site.seed, shot.day, shot.light, shot.robot, frames=_FRAMES)
+        record_order(order, path.with_suffix(".part"), "mcap", "png")
+        path.with_suffix(".part").rename(path)
+    return path
+
+
+def surveyed(path: Path, pinhole: StereoCamera | None) -> Surveyed:
+    """The survey of a recording, without a store."""
+    reading = RecordingOptions()
+    admitted = admit_recordings([path], reading, Console(quiet=True), needs_truth=False)
+    options = SurveyConfig(SETTINGS, default_vocabulary())
+    return survey_recording(path, admitted[path], reading, pinhole, options, SurveyTools())
+
+
+def level_from_map(survey: Surveyed) -> Array:
+    """The turn about z and the shift (4, 4) that bring a survey's frames nearest to their truth: a map's third axis is up."""
+    trajectory, truth = survey.survey.map.trajectory, survey.truth
+    assert truth is not None
+    pairs = [
+        (p[:3, 3], truth.at(int(s))) for s, p in zip(trajectory.stamps_ns, trajectory.frame_from_body, strict=True)
+    ]
+    ours, theirs = (np.array(part) for part in zip(*((a, b[:3, 3]) for a, b in pairs if b is not None), strict=True))
+    a, b = ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)
+    yaw = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum())
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
+    return se3(turn, theirs.mean(axis=0) - turn @ ours.mean(axis=0))
+
+
+def joined(here: Surveyed, other: Surveyed, docks: Array | None) -> dict[str, Any]:
+    """A rendered session in a rendered map, adjusted jointly and merged as a build does."""
+    result = extend(here.survey.map, other.survey, SETTINGS, anchored=True, map_from_survey=docks)
+    if isinstance(result, NotJoined):
+        seen = result.evidence
+        return {
+            "verdict": result.verdict.value,
+            "cells": seen.cells_expected,
+            "share": seen.seen_share,
+            "error_m": None,
+            "reason": result.reason,
+        }
+    assert other.truth is not None
+    level, off_m = level_from_map(here), []
+    for stamp, place in zip(result.map.trajectory.stamps_ns, result.map.trajectory.frame_from_body, strict=True):
+        truth = other.truth.at(int(stamp))
+        if truth is not None:
+            off_m.append(float(np.linalg.norm((level @ place)[:3, 3] - truth[:3, 3])))
+    figures = {"cells": result.evidence.cells_expected, "share": result.evidence.seen_share}
+    return {"verdict": "joined", **figures, "error_m": round(float(np.median(off_m)), 4), "reason": ""}
+
+
+def rendered(places: Sequence[Site], work: Path) -> Iterator[dict[str, Any]]:
+    """Pictures: every site's session in every other site's map, and later ones of each site in its own."""
+    known: dict[Site, Surveyed] = {}
+    pinhole = None
+    for site in places:
+        known[site] = surveyed(recorded(Shot(site), work), pinhole)
+        pinhole = pinhole or known[site].survey.state.camera
+    pairs = [(here, other) for here in places for other in places if here != other]
+    for n, (here, other) in enumerate(pairs):
+        own = known[other].map_from_survey
+        docks = _DOCKS[n % 3] if own is not None else "none"
+        shift = se3(np.eye(3), np.array([5.0, -3.0, 0.0]))
+        given = None if docks == "none" or own is None else own if docks == "own" else shift @ own
+        row = {"kind": "foreign", "map": here, "session": other, "way_m": 8, "docks": docks}
+        yield row | joined(known[here], known[other], given)
+    for n, site in enumerate(site for site in places if site.scenario in _PLAIN):
+        for kind, day, robot, light in _LATER[n % len(_LATER)]:
+            moved = surveyed(recorded(Shot(site, day, robot, light), work), pinhole)
+            row = {"kind": kind, "map": site, "session": site, "way_m": 8, "docks": "none"}
+            yield row | joined(known[site], moved, None)
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Rates by kind of session."""
+    result: dict[str, Any] = {}
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        own = [row for row in rows if row["kind"] == kind]
+        verdicts = [row["verdict"] for row in own]
+        result[kind] = {"joined": rate(verdicts.count("joined"), len(own)), "foreign": verdicts.count("foreign")}
+    kept = [row for row in rows if row["kind"] != "foreign" and row["verdict"] == "joined"]
+    off = [row for row in kept if row["error_m"] > _MISPLACED_M]
+    result["misplaced"] = rate(len(off), len(kept))
+    with_overlap = [row for row in rows if row["kind"] not in ("foreign", "opposite direction")]
+    result["true"] = rate(sum(row["verdict"] == "joined" for row in with_overlap), len(with_overlap))
+    return result
+
+
+def main() -> None:
+    """Prints a line for each session and the rates; writes JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sites", type=int, default=15, help="buildings without pictures: 210 foreign pairs")
+    parser.add_argument("--true-sites", type=int, default=34, help="buildings with six true sessions each")
+    parser.add_argument("--rendered", type=int, default=7, help="buildings with pictures: 42 foreign pairs")
+    parser.add_argument("--parts", nargs="+", default=["pictures", "foreign", "true"])
+    parser.add_argument("--seed", type=int, default=300)
+    parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "fleetmap-bench")
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    options.work.mkdir(parents=True, exist_ok=True)
+    plain = [Site(_PLAIN[n % 3], options.seed + 100 + n) for n in range(options.true_sites)]
+    parts = (
+        ("pictures", rendered(sites(options.rendered, options.seed), options.work)),
+        ("foreign", foreign(sites(options.sites, options.seed + 50))),
+        ("true", true(plain)),
+    )
+    rows = []
+    for part, found in parts:
+        for row in found if part in options.parts else ():
+            names = {name: f"{row[name].scenario} {row[name].seed}" for name in ("map", "session")}
+            rows.append(row | names | {"part": part})
+            print(json.dumps(rows[-1]), flush=True)
+    figures = {part: summary([row for row in rows if row["part"] == part]) for part in options.parts}
+    figures["all"] = summary(rows)
+    print(json.dumps(figures, indent=1))
+    if options.out is not None:
+        options.out.write_bytes(
+            msgspec.json.format(msgspec.json.encode({"rates": figures, "sessions": rows}), indent=2) + b"\n"
+        )
+
+
+if __name__ == "__main__":
+    main()

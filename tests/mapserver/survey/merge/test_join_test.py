@@ -1,0 +1,115 @@
+"""The test of joining: sessions of the site, of another building, past docks that are right, wrong or another building's."""
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, se3
+from mapserver.survey.merge.join_test import JoinTest, JoinVerdict, Located, NotJoined
+from support.worlds.aisle_world import Aisle, aisle, drive, join_test, relocalizer, repainted
+
+HOME = aisle(1)
+KNOWN = relocalizer(HOME, drive(56))
+PLACES = drive(30, start_m=2.0)
+
+
+def verdict(test: JoinTest) -> tuple[JoinVerdict, Located | NotJoined]:
+    located = test.locate()
+    if isinstance(located, NotJoined):
+        return located.verdict, located
+    refused = test.judged(located, located.seen)
+    return (JoinVerdict.JOINED, located) if refused is None else (refused.verdict, refused)
+
+
+def restocked(share: float, seed: int) -> Aisle:
+    """Home with a share of its half metres of shelf changed."""
+    shelf = np.floor(HOME.points_map * 2.0).astype(np.int64)
+    _, number = np.unique(shelf, axis=0, return_inverse=True)
+    rng = np.random.default_rng(seed)
+    changed = rng.random(number.max() + 1) < share
+    return repainted(HOME, aisle(50 + seed), changed[number.reshape(-1)])
+
+
+def shared_above(height_m: float) -> Aisle:
+    """Another building of which all above a height looks like home: what halls by one maker share."""
+    return repainted(HOME, aisle(9), HOME.points_map[:, 2] < height_m)
+
+
+def docks(metres: float = 0.0) -> Array:
+    return se3(np.eye(3), np.array([metres, 0.0, 0.0])) @ PLACES[0]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.12, 0.3])
+def test_a_session_of_the_site_is_joined_where_it_is(share: float) -> None:
+    for given in (None, docks()):
+        said, located = verdict(join_test(KNOWN, restocked(share, 3), PLACES, given))
+        assert said is JoinVerdict.JOINED
+        assert isinstance(located, Located)
+        assert located.placed.places >= 8
+        assert np.linalg.norm((located.map_from_body - PLACES)[:, :3, 3], axis=1).max() < 0.03
+
+
+def test_another_building_is_foreign_however_well_its_fixes_agree_and_its_docks_fit() -> None:
+    """Its fixes agree at eight places and more, to the centimetre: what it shares with the site is really there."""
+    for given in (None, docks()):
+        said, held = verdict(join_test(KNOWN, shared_above(1.2), PLACES, given))
+        assert said is JoinVerdict.FOREIGN
+        assert isinstance(held, NotJoined)
+        assert held.evidence.places >= 8
+        assert held.evidence.share_high < 0.5
+        assert "another --site" in held.reason
+
+
+def test_a_session_between_both_is_held_with_its_figures() -> None:
+    said, held = verdict(join_test(KNOWN, restocked(0.55, 4), PLACES, None))
+    assert said is JoinVerdict.UNDECIDED
+    assert isinstance(held, NotJoined)
+    assert held.evidence.share_low < 0.5 < held.evidence.share_high
+    assert "not certain" in held.reason
+
+
+def test_a_building_that_shares_nothing_is_not_found_with_any_docks() -> None:
+    for given in (None, docks(), docks(7.0)):
+        said, held = verdict(join_test(KNOWN, aisle(9), PLACES, given))
+        assert said is JoinVerdict.UNDECIDED
+        assert isinstance(held, NotJoined)
+        assert "not found in the map" in held.reason
+
+
+def test_docks_that_contradict_what_is_seen_hold_a_session() -> None:
+    said, held = verdict(join_test(KNOWN, HOME, PLACES, docks(8.0)))
+    assert said is JoinVerdict.UNDECIDED
+    assert isinstance(held, NotJoined)
+    assert held.evidence.priors_off_m == pytest.approx(8.0, abs=0.1)
+    assert "docks" in held.reason
+
+
+def test_aisles_that_look_the_same_hold_a_session_until_a_dock_tells_them_apart() -> None:
+    twin = aisle(1, y_m=30.0)
+    both = Aisle(
+        *(
+            np.concatenate(parts)
+            for parts in zip(*((a.points_map, a.descriptors, a.reaches_m) for a in (HOME, twin)), strict=True)
+        )
+    )
+    known = relocalizer(both, np.concatenate([drive(56), drive(56, y_m=30.0)]))
+    said, held = verdict(join_test(known, both, PLACES, None))
+    assert said is JoinVerdict.UNDECIDED
+    assert isinstance(held, NotJoined)
+    assert "look alike" in held.reason
+    for y_m in (0.0, 30.0):
+        places = drive(30, start_m=2.0, y_m=y_m)
+        said, located = verdict(join_test(known, both, places, places[0]))
+        assert said is JoinVerdict.JOINED
+        assert isinstance(located, Located)
+        assert np.linalg.norm((located.map_from_body - places)[:, :3, 3], axis=1).max() < 0.03
+
+
+def test_a_session_is_joined_by_its_overlap_which_must_be_long_enough() -> None:
+    """Two thirds of it lead through what the map has not; two metres of overlap are too few places."""
+    known = relocalizer(HOME, drive(26))
+    said, located = verdict(join_test(known, HOME, drive(40, start_m=6.0), None))
+    assert said is JoinVerdict.JOINED
+    assert isinstance(located, Located)
+    assert np.linalg.norm((located.map_from_body - drive(40, start_m=6.0))[:10, :3, 3], axis=1).max() < 0.03
+    said, _ = verdict(join_test(KNOWN, HOME, drive(5, start_m=6.0), None))
+    assert said is JoinVerdict.UNDECIDED
