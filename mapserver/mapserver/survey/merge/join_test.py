@@ -187,8 +187,10 @@ class JoinTest:
 
     def _chosen(self, found: list[Located]) -> Located | NotJoined:
         """The place that most of the map speaks for; undecided where another is as good and no position prior tells them apart."""
-        best = max(found, key=lambda one: (2 * one.seen.seen - one.seen.cells, len(one.placed.fixes)))
-        others = [one for one in found if not _same_place(one, best)]
+        ranked = sorted(found, key=lambda one: (one.seen.cells - 2 * one.seen.seen, -len(one.placed.fixes)))
+        best, *others = [
+            one for n, one in enumerate(ranked) if not any(_same_place(one, other) for other in ranked[:n])
+        ]
         alike = [best, *(one for one in others if one.seen.high >= max(_NEEDED_SHARE, best.seen.low))]
         near = [one for one in alike if one.priors_off_m is not None and one.priors_off_m < _PRIOR_M]
         rival_share = max((round(one.seen.share, 4) for one in others), default=None)
