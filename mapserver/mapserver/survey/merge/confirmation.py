@@ -37,10 +37,14 @@ _SEEN_SHARE = 1 / 3  # of a cell's landmarks; by chance one in some hundred is f
 
 @dataclass(frozen=True, slots=True)
 class Confirmation:
-    """Cells of the map that a session should see, and those that it sees; low, high: bounds of their share at the test's error rate."""
+    """Cells of the map that a session should see, and those that it sees; low, high: bounds of their share at the test's error rate.
+
+    blocks: in which the cells lie.
+    """
 
     cells: int
     seen: int
+    blocks: int
     low: float
     high: float
 
@@ -113,7 +117,7 @@ def _bounded(is_seen: NDArray[np.bool_], blocks: Array, error_rate: float) -> Co
     """The share of cells (C,) in blocks (C, 3), with its bounds."""
     count = len(is_seen)
     if count == 0:
-        return Confirmation(0, 0, 0.0, 1.0)
+        return Confirmation(0, 0, 0, 0.0, 1.0)
     share = float(is_seen.mean())
     _, block = np.unique(blocks, axis=0, return_inverse=True)
     off = np.bincount(block.reshape(-1), is_seen - share)
@@ -123,4 +127,4 @@ def _bounded(is_seen: NDArray[np.bool_], blocks: Array, error_rate: float) -> Co
     k = share * effective
     low = float(beta.ppf(error_rate, k, effective - k + 1)) if k > 0 else 0.0
     high = float(beta.ppf(1.0 - error_rate, k + 1, effective - k)) if k < effective else 1.0
-    return Confirmation(count, int(is_seen.sum()), low, high)
+    return Confirmation(count, int(is_seen.sum()), len(off), low, high)

@@ -24,7 +24,7 @@ from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import SessionSettings
 
 _NEEDED_SHARE = 0.5  # of the expected cells: a map of which the greater part stands no more is to be surveyed anew
-_MIN_CELLS = 12  # with which a session that sees all of them passes
+_MIN_BLOCKS = 12  # one wall, all that some halls share of what is in view, has half as many
 _MOST_PLACES, _MOST_LOOKS = 4, 240  # alignments that are compared, keyframes that look
 _SAME_PLACE_M = 1.2
 _PRIOR_M = 3.0  # within which an alignment is where position priors put the session
@@ -157,11 +157,11 @@ class JoinTest:
 
     def judged(self, located: Located, seen: Confirmation) -> NotJoined | None:
         """Why a session that sees so much of the map is not joined; None where it is."""
-        if seen.cells >= _MIN_CELLS and seen.low > _NEEDED_SHARE:
+        if seen.blocks >= _MIN_BLOCKS and seen.low > _NEEDED_SHARE:
             return None
         said = f"of {seen.cells} parts of the map that it should see there it sees {seen.seen}"
         evidence = self.evidence(located, seen)
-        if seen.cells >= _MIN_CELLS and seen.high < _NEEDED_SHARE:
+        if seen.blocks >= _MIN_BLOCKS and seen.high < _NEEDED_SHARE:
             reason = (
                 f"it was recorded elsewhere, or all has changed: {said}, at most {seen.high:.0%} where half is needed"
             )
