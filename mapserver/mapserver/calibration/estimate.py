@@ -16,6 +16,7 @@ P = CalibrationParameter
 _PAIR = {P.BASELINE, P.FOCAL_RATIO, P.PAIR_PITCH, P.PAIR_YAW, P.PAIR_ROLL, P.BASELINE_Y, P.BASELINE_Z}
 _INERTIAL = {P.CAMERA_IMU_X, P.CAMERA_IMU_Y, P.CAMERA_IMU_Z, P.TIME_OFFSET, P.GYRO_NOISE, P.ACCEL_NOISE}
 _LARGEST_PRIOR_SHARE = 0.5  # of the prior's sigma: above, the estimate is what was believed before
+MIN_KEYFRAMES = 20  # neighbouring views share their errors: few of them agree with each other about a wrong calibration
 _ADVICE = dict.fromkeys(P, "drive turns")
 _ADVICE[P.BASELINE] = "the accelerometer is hardly excited: start, stop and turn more often, or record wheel odometry"
 _ADVICE |= dict.fromkeys((P.CAMERA_IMU_X, P.CAMERA_IMU_Y, P.CAMERA_IMU_Z), "turn to both sides, and start and stop")
@@ -49,6 +50,7 @@ class Sensors:
     has_pair: bool
     has_imu: bool
     has_wheels: bool
+    keyframes: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,17 +114,43 @@ def combined(adjusted: Sequence[Adjusted], stretches: Sequence[CalibrationData])
         pull += each.information @ each.theta
     covariance: Array = np.asarray(np.linalg.inv(information), np.float64)
     theta = covariance @ pull
+    covariance += np.diag(_common_errors(stretches) ** 2)
     first = stretches[0]
-    sensors = Sensors(
-        len(first.calibration.cameras) > 1, first.is_inertial, any(len(data.wheel) > 0 for data in stretches)
-    )
+    keyframes = sum(len(data.stamps_ns) for data in stretches)
+    has_wheels = any(len(data.wheel) > 0 for data in stretches)
+    sensors = Sensors(len(first.calibration.cameras) > 1, first.is_inertial, has_wheels, keyframes)
     sigmas = np.sqrt(np.diag(covariance))
     found = [_judged(p, float(theta[INDEX[p]]), float(sigmas[INDEX[p]]), sensors) for p in COLUMNS]
     given = first.calibration.imu
     for name, scale, sigma in () if given is None else _noise(adjusted):
         found.append(_judged(name, scale - 1.0, sigma, sensors))
-    keyframes = sum(len(data.stamps_ns) for data in stretches)
     return CalibrationEstimate(tuple(found), covariance, keyframes, sum(each.observations for each in adjusted))
+
+
+def _common_errors(stretches: Sequence[CalibrationData]) -> Array:
+    """(C,) what an error that all pixels or disparities have in common shifts each parameter by: an angle, a share, a lever."""
+    data, errors = stretches[0], np.zeros(len(COLUMNS))
+    camera, bias_px = data.rectifier.camera, data.bias_px
+    disparities = np.concatenate([each.obs_pixels[:, 0] - each.obs_pixels[:, 2] for each in stretches])
+    known = disparities[np.isfinite(disparities)]
+    disparity_px = max(float(np.median(known)), 1.0) if len(known) else 1.0
+    half, beside = 0.5 * camera.width_px, 0.25 * camera.width_px / camera.focal_px
+    sizes = {
+        P.BASELINE: bias_px / disparity_px,
+        P.FOCAL: bias_px / (0.5 * half),
+        P.FOCAL_RATIO: bias_px / half,
+        P.PRINCIPAL_X: bias_px / beside**2,
+        P.PRINCIPAL_Y: bias_px / beside**2,
+        P.CAMERA_IMU_X: bias_px / beside**2 / camera.focal_px,
+        P.CAMERA_IMU_Y: bias_px / beside**2 / camera.focal_px,
+        P.PAIR_PITCH: bias_px / camera.focal_px,
+        P.PAIR_YAW: bias_px / camera.focal_px,
+        P.PAIR_ROLL: bias_px / half,
+        P.BASELINE_Y: bias_px / disparity_px,
+        P.BASELINE_Z: bias_px / (disparity_px * beside),
+    }
+    errors[[INDEX[p] for p in sizes]] = list(sizes.values())
+    return errors
 
 
 def _noise(adjusted: Sequence[Adjusted]) -> list[tuple[CalibrationParameter, float, float]]:
@@ -144,12 +172,18 @@ def _noise(adjusted: Sequence[Adjusted]) -> list[tuple[CalibrationParameter, flo
 
 def _judged(name: CalibrationParameter, estimate: float, sigma: float, sensors: Sensors) -> ParameterEstimate:
     limits = RANGES[name]
-    known = sigma <= limits.useful_sigma and sigma <= _LARGEST_PRIOR_SHARE * limits.prior_sigma
+    known = (
+        sensors.keyframes >= MIN_KEYFRAMES
+        and sigma <= limits.useful_sigma
+        and sigma <= _LARGEST_PRIOR_SHARE * limits.prior_sigma
+    )
     reason = "" if known else _reason(name, sensors)
     return ParameterEstimate(name, estimate, sigma, limits.unit, known, reason)
 
 
 def _reason(name: CalibrationParameter, sensors: Sensors) -> str:
+    if sensors.keyframes < MIN_KEYFRAMES:
+        return f"too short: {sensors.keyframes} keyframes, {MIN_KEYFRAMES} are needed"
     if name in _PAIR and not sensors.has_pair:
         return "there is one camera"
     if name in _INERTIAL and not sensors.has_imu:

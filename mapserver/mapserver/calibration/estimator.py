@@ -27,7 +27,7 @@ from mapserver.calibration.motion_rows import (
     wheel_edges,
     wheel_rows,
 )
-from mapserver.calibration.parameters import COLUMNS, INDEX, RANGES, CalibrationParameter
+from mapserver.calibration.parameters import COLUMNS, INDEX, LENS_SIGMAS, RANGES, UNKNOWNS, CalibrationParameter
 from mapserver.calibration.problem import CalibrationData, MotionState
 from mapserver.calibration.schur_kernels import BorderedLandmarks, ImageRows, landmark_steps, reduce_landmarks
 
@@ -47,8 +47,8 @@ class ErrorScales:
     """Factors on the sigmas of pixels, disparities, row differences (4,: two of pixels), of gyro, accelerometer and wheels."""
 
     images: Array = field(default_factory=lambda: np.ones(4))
-    gyro: float = 2.0
-    accel: float = 5.0
+    gyro: float = 1.0
+    accel: float = 1.0
     wheel: float = 1.0
 
     def noise(self, given: ImuNoise) -> ImuNoise:
@@ -84,9 +84,9 @@ class _System:
 def adjust(data: CalibrationData) -> Adjusted:
     """The calibration that explains `data` best."""
     problem = _Problem(data)
-    theta, state = np.zeros(len(COLUMNS)), data.start
+    theta, state = np.zeros(UNKNOWNS), data.start
     scales = problem.first_scales(theta, state)
-    information, sigmas = np.diag(prior_information()), (np.inf, np.inf)
+    information, sigmas = np.diag(_prior()), (np.inf, np.inf)
     for round_number in range(_ROUNDS):
         problem.prepare(state, theta, scales)
         theta, state = problem.descend(theta, state)
@@ -97,12 +97,20 @@ def adjust(data: CalibrationData) -> Adjusted:
         else:
             sigmas = problem.scale_sigmas(system)
     seen = int(np.isfinite(problem.seen.row_sigmas[:, 0]).sum())
-    return Adjusted(theta, information, state, scales, *sigmas, seen)
+    own = len(COLUMNS)
+    lens = np.linalg.solve(information[own:, own:], information[own:, :own])
+    reported = information[:own, :own] - information[:own, own:] @ lens
+    return Adjusted(theta[:own], reported, state, scales, *sigmas, seen)
 
 
 def prior_information() -> Array:
     """(C,) of the calibration that came with the recording."""
     return np.array([RANGES[p].prior_sigma ** -2 for p in COLUMNS])
+
+
+def _prior() -> Array:
+    """(UNKNOWNS,) the same with the lenses' errors."""
+    return np.concatenate([prior_information(), LENS_SIGMAS**-2.0])
 
 
 class _Problem:
@@ -112,7 +120,7 @@ class _Problem:
         self.data, self.seen = data, Observations.of(data)
         self.stride = 15 if data.is_inertial else 6
         self.count = len(data.stamps_ns)
-        self.size = self.stride * self.count + len(COLUMNS)
+        self.size = self.stride * self.count + UNKNOWNS
         marks = len(data.start.points_map)
         self.starts = np.searchsorted(data.obs_landmark, np.arange(marks + 1))
         self.keyframes = data.obs_keyframe.astype(np.int64)
@@ -150,7 +158,7 @@ class _Problem:
         """Half the robust sum of squares, priors included."""
         rows, _ = image_residuals(self.seen, self.data, self._at_exposure(theta, state), theta, self.scales.images)
         edges = sum(float(each.residual @ each.residual) for each in self._edges(theta, state))
-        return robust_cost(rows) + 0.5 * (edges + float(prior_information() @ theta**2) + self._held(state)[2])
+        return robust_cost(rows) + 0.5 * (edges + float(_prior() @ theta**2) + self._held(state)[2])
 
     def system(self, theta: Array, state: MotionState, damping: float = 0.0) -> _System:
         """The normal equations at theta and `state`."""
@@ -159,8 +167,8 @@ class _Problem:
         images = image_rows(self.seen, self.data, (exposed, theta), self.scales.images, fixed)
         system = self._reduced(images, self._edges(theta, state), damping)
         diagonal, rhs, _ = self._held(state)
-        system.information[np.diag_indices(self.size)] += np.concatenate([diagonal, prior_information()])
-        system.rhs[:] += np.concatenate([rhs, -prior_information() * theta])
+        system.information[np.diag_indices(self.size)] += np.concatenate([diagonal, _prior()])
+        system.rhs[:] += np.concatenate([rhs, -_prior() * theta])
         return system
 
     def _held(self, state: MotionState) -> tuple[Array, Array, float]:
@@ -177,7 +185,7 @@ class _Problem:
 
     def _reduced(self, images: ImageRows, edges: list[Rows], damping: float) -> _System:
         info, rhs = np.zeros((self.size, self.size)), np.zeros(self.size)
-        marks, columns = len(self.starts) - 1, len(COLUMNS)
+        marks, columns = len(self.starts) - 1, UNKNOWNS
         gone = BorderedLandmarks(np.empty((marks, 3, 3)), np.empty((marks, 3)), np.empty((marks, 3, columns)))
         reduce_landmarks(images, self.keyframes, self.starts, (self.stride, damping), (info, rhs), gone)
         border = self.size - columns
@@ -194,7 +202,7 @@ class _Problem:
         """Step of the unknowns (D,) and of the landmarks (N, 3)."""
         step = scipy.linalg.cho_solve(self._factor(system, damping), system.rhs, check_finite=False)
         moved = np.empty((len(self.starts) - 1, 3))
-        border = self.size - len(COLUMNS)
+        border = self.size - UNKNOWNS
         by_keyframe = np.ascontiguousarray(step[:border].reshape(self.count, self.stride))
         steps = by_keyframe, np.ascontiguousarray(step[border:])
         landmark_steps(system.images, self.keyframes, self.starts, system.eliminated, steps, moved)
@@ -214,7 +222,7 @@ class _Problem:
             while moved is None and damping < 1e3:
                 try:
                     step, points = self.solve(self.system(theta, state, damping), damping)
-                    tried = theta + step[self.size - len(COLUMNS) :], self._moved(state, step, points)
+                    tried = theta + step[self.size - UNKNOWNS :], self._moved(state, step, points)
                     new = self.cost(*tried)
                 except np.linalg.LinAlgError:
                     new = np.inf
@@ -231,7 +239,7 @@ class _Problem:
         return theta, state
 
     def _moved(self, state: MotionState, step: Array, points: Array) -> MotionState:
-        steps = step[: self.size - len(COLUMNS)].reshape(self.count, self.stride)
+        steps = step[: self.size - UNKNOWNS].reshape(self.count, self.stride)
         placed = state.map_from_body.copy()
         for k in range(self.count):
             placed[k, :3, :3] = so3_exp(steps[k, :3]) @ placed[k, :3, :3]
@@ -241,7 +249,7 @@ class _Problem:
 
     def calibration_information(self, system: _System) -> Array:
         """(C, C) of the calibration with everything else marginalised."""
-        border = self.size - len(COLUMNS)
+        border = self.size - UNKNOWNS
         info = system.information
         factor = scipy.linalg.cho_factor(info[:border, :border], lower=False, check_finite=False)
         coupled = scipy.linalg.cho_solve(factor, info[:border, border:], check_finite=False)
@@ -279,7 +287,7 @@ class _Problem:
         rng, sums = np.random.default_rng(0), np.zeros((_DRAWS, 6))
         images, edges = system.images, system.edges
         active = np.abs(images.by_keyframe).sum(axis=2) > 0
-        border = self.size - len(COLUMNS)
+        border = self.size - UNKNOWNS
         for draw in range(_DRAWS):
             drawn = images._replace(residuals=np.where(active, rng.standard_normal(active.shape), 0.0))
             others = [replace(each, residual=rng.standard_normal(len(each.residual))) for each in edges]

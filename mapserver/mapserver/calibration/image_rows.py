@@ -12,7 +12,15 @@ import numpy as np
 from fleetmap.geometry import Array, so3_exp
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.rectification import StereoCamera
-from mapserver.calibration.parameters import COLUMNS, INDEX, CalibrationParameter, RigAxes, corrected_rig, right_camera
+from mapserver.calibration.parameters import (
+    COLUMNS,
+    INDEX,
+    UNKNOWNS,
+    CalibrationParameter,
+    RigAxes,
+    corrected_rig,
+    right_camera,
+)
 from mapserver.calibration.problem import CalibrationData, MotionState
 from mapserver.calibration.schur_kernels import ImageRows
 
@@ -54,10 +62,13 @@ class Observations:
         rig = corrected_rig(self.calibration, self.axes, theta)
         views = self.views(theta)
         left = _pixels(rig.cameras[0].ray_from_pixel(self.left_px) @ self.axes.rect_from_cam[0].T, views[0])
+        common, apart = theta[len(COLUMNS) :].reshape(2, 4)
+        left += _lens_terms(left, views[0]) @ (common - 0.5 * apart)
         if self.axes.baseline_m == 0:
             return np.column_stack([left, np.zeros_like(left)])
         rect_from_right, _ = right_camera(self.axes, theta)
         right = _pixels(rig.cameras[1].ray_from_pixel(self.right_px) @ rect_from_right.T, views[1])
+        right += _lens_terms(right, views[1]) @ (common + 0.5 * apart)
         return np.column_stack([left, left - right])
 
     def views(self, theta: Array) -> tuple[StereoCamera, StereoCamera]:
@@ -72,11 +83,14 @@ class Observations:
         A ray depends on its pixel's distance to the principal point in focal lengths, so that what it changes by with the
         pixel says what it changes by with the lens.
         """
-        rig, slopes = corrected_rig(self.calibration, self.axes, theta), np.zeros((len(self.left_px), 4, len(COLUMNS)))
+        rig, slopes = corrected_rig(self.calibration, self.axes, theta), np.zeros((len(self.left_px), 4, UNKNOWNS))
         views = self.views(theta)
         left = _pixel_slopes(rig.cameras[0], self.left_px, self.axes.rect_from_cam[0], views[0])
         slopes[:, :2, _LENS] = _by_lens(rig.cameras[0], self.left_px, left)
         slopes[:, :2, INDEX[P.FOCAL]] /= 1.0 + theta[INDEX[P.FOCAL]]
+        rays = rig.cameras[0].ray_from_pixel(self.left_px) @ self.axes.rect_from_cam[0].T
+        terms, lens = _lens_terms(_pixels(rays, views[0]), views[0]), len(COLUMNS)
+        slopes[:, :2, lens : lens + 4], slopes[:, :2, lens + 4 :] = terms, -0.5 * terms
         if self.axes.baseline_m == 0:
             return slopes
         rect_from_right, _ = right_camera(self.axes, theta)
@@ -87,6 +101,9 @@ class Observations:
         by_right[:, :, 0] /= 1.0 + theta[INDEX[P.FOCAL]]
         slopes[:, 2:, _LENS] -= by_right
         rays = rig.cameras[1].ray_from_pixel(self.right_px) @ rect_from_right.T
+        terms = _lens_terms(_pixels(rays, views[1]), views[1])
+        slopes[:, 2:, lens : lens + 4] -= terms
+        slopes[:, 2:, lens + 4 :] -= 0.5 * terms
         for axis, parameter in enumerate((P.PAIR_PITCH, P.PAIR_YAW, P.PAIR_ROLL)):
             turned = np.cross(np.eye(3)[axis], rays)
             slopes[:, 2:, INDEX[parameter]] = -_projected(rays, turned) * views[1].focal_px
@@ -115,6 +132,15 @@ def _by_lens(camera: CameraCalibration, pixels: Array, slopes: Array) -> Array:
     """(M, 2, 3) derivatives of rectified pixels by the logarithm of the focal length and by the principal point."""
     by_focal = -np.einsum("mij,mj->mi", slopes, pixels - camera.intrinsics_px[2:])
     return np.concatenate([by_focal[:, :, None], -slopes], axis=2)
+
+
+def _lens_terms(pixels: Array, view: StereoCamera) -> Array:
+    """(M, 2, 4) pixels by which radial (r^2, r^4) and tangential terms of a lens move pixels (M, 2). Source: Brown 1966."""
+    x, y = ((pixels - [view.cx_px, view.cy_px]) / view.focal_px).T
+    squared = x**2 + y**2
+    across = [x * squared, x * squared**2, 2.0 * x * y, squared + 2.0 * x**2]
+    down = [y * squared, y * squared**2, squared + 2.0 * y**2, 2.0 * x * y]
+    return np.asarray(np.stack([np.stack(across, axis=1), np.stack(down, axis=1)], axis=1) * view.focal_px)
 
 
 def _projected(rays: Array, change: Array) -> Array:
@@ -214,7 +240,7 @@ def image_rows(
 def _by_baseline(by_calibration: Array, by_apart: Array, axes: RigAxes, theta: Array) -> None:
     """Derivatives by the right camera's place: the disparity row holds minus the right pixel, which falls with it."""
     for parameter in (P.BASELINE, P.BASELINE_Y, P.BASELINE_Z):
-        step = np.zeros(len(COLUMNS))
+        step = np.zeros(UNKNOWNS)
         step[INDEX[parameter]] = 1e-6
         moved = (right_camera(axes, theta + step)[1] - right_camera(axes, theta - step)[1]) / 2e-6
         # row = measured - (left - right(X - t)); d right / dt = -slopes

@@ -8,7 +8,7 @@ from fleetmap.geometry import Array, se3_inverse, skew, so3_exp, so3_log
 from fleetmap.inertial import GRAVITY_MAP, imu_intervals, preintegrate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import wheel_between
-from mapserver.calibration.parameters import COLUMNS, INDEX, CalibrationParameter
+from mapserver.calibration.parameters import INDEX, UNKNOWNS, CalibrationParameter
 from mapserver.calibration.problem import CalibrationData, MotionState
 from mapserver.survey.bundle.factor_kernels import inertial_residual
 from mapserver.survey.bundle.factors import FLOOR_SIGMA, packed_increments
@@ -128,7 +128,7 @@ def inertial_rows(edge: InertialEdge, state: MotionState) -> Rows:
         for map_from_body, motion in zip(state.map_from_body[k : k + 2], state.motions[k : k + 2], strict=True)
     ]
     inertial_residual(ends[0], ends[1], GRAVITY_MAP, edge.increments, residual, jacobian)
-    nothing = np.zeros((15, len(COLUMNS)))
+    nothing = np.zeros((15, UNKNOWNS))
     return Rows(k, edge.whitening @ residual, edge.whitening @ jacobian, nothing, edge.groups)
 
 
@@ -139,7 +139,7 @@ def wheel_rows(edge: WheelEdge, state: MotionState, wheel_scale: float, stride: 
     apart = state.map_from_body[k + 1, :3, 3] - state.map_from_body[k, :3, 3]
     whitening = edge.whitening @ edge.base_from_body
     residual = whitening @ (body_from_map @ apart - (1.0 + wheel_scale) * edge.way_m - edge.lever_m)
-    by_keyframes, by_calibration = np.zeros((3, 2 * stride)), np.zeros((3, len(COLUMNS)))
+    by_keyframes, by_calibration = np.zeros((3, 2 * stride)), np.zeros((3, UNKNOWNS))
     by_keyframes[:, :3] = whitening @ body_from_map @ skew(apart)
     by_keyframes[:, 3:6] = -whitening @ body_from_map
     by_keyframes[:, stride + 3 : stride + 6] = whitening @ body_from_map

@@ -42,6 +42,11 @@ class CalibrationParameter(StrEnum):
 P = CalibrationParameter
 # The noise scales are no columns of the adjustment: they follow from its residuals.
 COLUMNS: tuple[CalibrationParameter, ...] = tuple(p for p in P if p not in (P.GYRO_NOISE, P.ACCEL_NOISE))
+# Errors of the lens model take part and are not reported: radial and tangential terms of both lenses, and the right one's difference.
+# Their size is what is left of a board's calibration, 0.3 px at the corner of a wide image: no other parameter is to take them up.
+# Tangential terms look like a principal point beside its place: left wide, they take up errors of the images.
+LENS_SIGMAS = np.array([1e-3, 1e-3, 5e-5, 5e-5] * 2)
+UNKNOWNS = len(COLUMNS) + len(LENS_SIGMAS)
 INDEX: dict[CalibrationParameter, int] = {p: n for n, p in enumerate(COLUMNS)}
 
 
@@ -102,7 +107,7 @@ class RigAxes:
 
 
 def corrected_rig(rig: RigCalibration, axes: RigAxes, theta: Array) -> RigCalibration:
-    """`rig` with corrections theta (len(COLUMNS),) applied: lenses, the pair's shape, its mounting on the IMU, the clocks."""
+    """`rig` with corrections theta: lenses, the pair's shape, its mounting on the IMU, the clocks. The first len(COLUMNS) of them count."""
     left = _camera(rig.cameras[0], theta, 0)
     body_from_rect = axes.body_from_rect @ so3_exp(theta[INDEX[P.CAMERA_IMU_X] : INDEX[P.CAMERA_IMU_Z] + 1])
     shift = theta[INDEX[P.CAMERA_POSITION_X] : INDEX[P.CAMERA_POSITION_Z] + 1]

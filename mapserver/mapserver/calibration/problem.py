@@ -30,7 +30,8 @@ class CalibrationData:
 
     stamps_ns (K,) on the cameras' clock. Observations are sorted by landmark: obs_keyframe, obs_landmark (M,); obs_pixels (M, 4) of
     the rectified pair: u_left, v_left, u_right, v_right, the last two NaN where the right image shows nothing. obs_sigma_px (M, 3): of the
-    left pixel, of the disparity, of the row difference. imu: empty without one.
+    left pixel, of the disparity, of the row difference. imu: empty without one. bias_px: error that pixels and disparities may have in
+    common, which no number of them averages out.
     """
 
     calibration: RigCalibration
@@ -43,6 +44,7 @@ class CalibrationData:
     obs_sigma_px: Array
     imu: ImuSamples
     wheel: Sequence[WheelSample] = ()
+    bias_px: float = 0.0
 
     @property
     def is_inertial(self) -> bool:
