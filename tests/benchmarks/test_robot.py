@@ -74,3 +74,9 @@ def test_memory_of_half_an_hour(work: Path, tmp_path: Path) -> None:
 def test_starts_among_identical_aisles(name: str, tmp_path: Path) -> None:
     found = results(tmp_path, "bench_aliased_starts.py", "--only", name)["figures"][name]
     assert not misses(found, bench_aliased_starts.PROMISES[name])
+
+
+def test_wrong_calibrations(work: Path, tmp_path: Path) -> None:
+    """Every fault is found within 30 s or costs at most 3 cm, and the good robot is not found fault with."""
+    found = results(tmp_path, "bench_calibration_watch.py", "--work", work)["faults"]
+    assert [fault["fault"] for fault in found if not fault["is_right"]] == []
