@@ -5,7 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.survey import bench_build, bench_image_pipelines, bench_real_pairs, bench_survey
+from benchmarks.survey import (
+    bench_build,
+    bench_calibration_faults,
+    bench_image_pipelines,
+    bench_real_pairs,
+    bench_survey,
+)
 from fleetsim.commands import record_order
 from fleetsim.recorder import Order
 from support.recordings.realdata import real_data
@@ -23,6 +29,16 @@ def test_survey(case: bench_survey.Case) -> None:
     assert rows[0]["evaluated_share"] >= 0.98
     assert rows[0]["ate_rmse_m"] <= case.limit_m
     assert case.worst_m is None or rows[0]["ate_max_m"] <= case.worst_m
+
+
+@pytest.mark.timeout(3600)
+def test_calibration_faults_of_a_real_pair() -> None:
+    """Both are named, and neither goes out without a word."""
+    rows = bench_calibration_faults.bench(real_data("kitti_stereo_51"), 6.0, ["pair yaw +0.2", "swapped"], 0)
+    named = {row.fault: row.found_by for row in rows}
+    assert named["pair yaw +0.2 deg"]
+    assert named["swapped"] == ["left and right"]
+    assert bench_calibration_faults.summary(rows)["silent"] == 0
 
 
 @pytest.mark.timeout(3600)
