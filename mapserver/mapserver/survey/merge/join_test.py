@@ -24,7 +24,7 @@ from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import SessionSettings
 
 _NEEDED_SHARE = 0.5  # of the expected cells: a map of which the greater part stands no more is to be surveyed anew
-_MIN_BLOCKS = 12  # one wall, all that some halls share of what is in view, has half as many
+_MIN_BLOCKS = 8  # of a metre and a half: two walls of three by three metres
 _MOST_PLACES, _MOST_LOOKS = 4, 240  # alignments that are compared, keyframes that look
 _SAME_PLACE_M = 1.2
 _PRIOR_M = 3.0  # within which an alignment is where position priors put the session
