@@ -22,8 +22,8 @@ class PoseHypothesis:
     map_from_body and cov_rot_trans: at that frame. now_map_from_body, now_cov: propagated to the present. query_map_from_body,
     query_cov: at the frame of the present map query, which may be some frames old. stamp_ns: of the last fix. support: number of
     fixes that agreed. inlier_sum, recall_sum, queries: sums of inliers, of landmark recall, and of map queries, older ones decayed.
-    all_recalls: the landmark recall of every query, 0 without a fix. misses: queries since the last fix. kidnap_hypotheses: places
-    that rejected fixes name instead.
+    recall_total, looks: landmark recall of all queries, 0 for those without a fix, and their number. misses: queries since the last
+    fix. kidnap_hypotheses: places that rejected fixes name instead.
     """
 
     frame_index: int
@@ -38,7 +38,8 @@ class PoseHypothesis:
     inlier_sum: float = 0.0
     recall_sum: float = 0.0
     queries: float = 0.0
-    all_recalls: list[float] = field(default_factory=list)
+    recall_total: float = 0.0
+    looks: int = 0
     misses: int = 0
     travelled_m: float = 0.0
     kidnap_hypotheses: list["PoseHypothesis"] = field(default_factory=list)
@@ -69,19 +70,19 @@ class PoseHypothesis:
     @property
     def recall(self) -> float:
         """Landmark recall, mean of all queries."""
-        return sum(self.all_recalls) / max(len(self.all_recalls), 1)
+        return self.recall_total / max(self.looks, 1)
 
     def decay(self, kept_share: float) -> None:
         """Begins a map query: older ones weigh less."""
         self.inlier_sum, self.recall_sum = kept_share * self.inlier_sum, kept_share * self.recall_sum
         self.queries = kept_share * self.queries + 1.0
-        self.all_recalls.append(0.0)
+        self.looks += 1
 
     def add_fix(self, inliers: int, landmark_recall: float) -> None:
         """Counts a fix of this query at this pose."""
         self.inlier_sum += inliers
         self.recall_sum += landmark_recall
-        self.all_recalls[-1] = landmark_recall
+        self.recall_total += landmark_recall
 
     def mark_query(self) -> None:
         """Keeps the present pose for the map query that begins now."""

@@ -26,10 +26,8 @@ WIDER_VIEW_RAD = 0.17
 _MAX_OCTAVE = 7.0
 _WINDOW_PX, _DISPARITY_PX = 4.0, 2.0  # around a prediction that is good to a centimetre at two metres
 _MATCHING = FixSettings(guided_distance=60)  # bits: two views of one thing differ by some 40, two things by 128
-_CELL_M, _BLOCK_M = (
-    0.75,
-    1.5,
-)  # a thing, and things that may share their fate: goods on one pallet, pictures on one wall
+# A thing, and things that may share their fate: goods on one pallet, pictures on one wall
+_CELL_M, _BLOCK_M = 0.75, 1.5
 _FIRM_OBSERVATIONS = 4  # keyframes of the map by which a landmark is one that is found again
 _MIN_LANDMARKS = 4  # of a cell that is judged
 _SEEN_SHARE = 1 / 3  # of a cell's landmarks; by chance one in some hundred is found, of what stands there most are
