@@ -1,4 +1,4 @@
-"""A map from a recording: python examples/build_a_map.py RECORDING STORE SITE [PICTURE.png]
+"""A map from a recording: python examples/build_a_map.py RECORDING STORE SITE [PICTURE.png [known-rig]]
 
 The same as `mapserver build` and `mapserver publish`, with the map as arrays on the way.
 """
@@ -7,10 +7,10 @@ import sys
 
 import numpy as np
 
-from mapserver import build_map, open_map
+from mapserver import GateSettings, build_map, open_map
 
 
-def main(recording: str, store: str, site: str, picture: str | None = None) -> None:
+def main(recording: str, store: str, site: str, picture: str | None = None, rig: str = "") -> None:
     """Builds, publishes and reads a map."""
     # Odometry, keyframes, loops, bundle adjustment, and a draft in the store.
     draft = build_map([recording], store, site)
@@ -20,8 +20,9 @@ def main(recording: str, store: str, site: str, picture: str | None = None) -> N
     print(f"{len(positions_m)} frames over {length_m:.1f} m")
     if picture is not None:
         draft.save_picture(picture)
-    # The gate judges the draft; one that it refuses raises GateRefusedError with the reasons.
-    draft.publish()
+    # The gate judges the draft; one that it refuses raises GateRefusedError with the reasons. A drive that is short or straight
+    # cannot judge its rig's calibration: whoever knows that to be right says so.
+    draft.publish(gate=GateSettings(allow_unjudged_calibration=rig == "known-rig"))
     # The published version as robots get it.
     published = open_map(store, site)
     print(f"version {published.version}: {len(published.points_map)} landmarks in {len(published.tiles)} tiles")

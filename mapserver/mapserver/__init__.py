@@ -18,9 +18,19 @@ from typing import TYPE_CHECKING, Any
 from fleetmap.errors import FleetmapError
 
 if TYPE_CHECKING:
-    from mapserver.library import BuildOptions, BuiltMap, MapArrays, MapStore, build_map, open_map, open_store
+    from mapserver.library import (
+        BuildOptions,
+        BuiltMap,
+        GateSettings,
+        MapArrays,
+        MapStore,
+        build_map,
+        open_map,
+        open_store,
+    )
 
-__all__ = ["BuildOptions", "BuiltMap", "MapArrays", "MapStore", "__version__", "build_map", "open_map", "open_store"]
+__all__ = ["BuildOptions", "BuiltMap", "GateSettings", "MapArrays", "MapStore", "build_map", "open_map", "open_store"]
+__all__ += ["__version__"]
 
 try:
     __version__ = metadata.version("fleetmap")

@@ -31,11 +31,13 @@ from mapserver.build.build import (
 )
 from mapserver.build.sensor_subset import sensor_set_of
 from mapserver.config import survey_settings
+from mapserver.quality.gate import GateSettings
 from mapserver.store import NOBODY, Actor, MapStore
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_map import SurveyMap
 
-__all__ = ["BuildOptions", "BuiltMap", "MapArrays", "MapStore", "build_map", "open_map", "open_store", "settings_for"]
+__all__ = ["BuildOptions", "BuiltMap", "GateSettings", "MapArrays", "MapStore", "build_map", "open_map", "open_store"]
+__all__ += ["settings_for"]
 
 
 @dataclass(frozen=True)
@@ -85,10 +87,14 @@ class BuiltMap:
         """Draws the map from above as a PNG."""
         write_file(Path(path), picture_png(self.site, self.draft, self.built))
 
-    def publish(self, *, force: bool = False, actor: Actor = NOBODY) -> None:
-        """Makes it the site's current version; GateRefusedError where it is not good enough, unless forced."""
+    def publish(self, *, gate: GateSettings | None = None, force: bool = False, actor: Actor = NOBODY) -> None:
+        """Makes it the site's current version; GateRefusedError where it is not good enough by `gate`, unless forced.
+
+        A site's first version is refused where its recordings are too short or too straight to judge the calibration;
+        `GateSettings(allow_unjudged_calibration=True)` says that the rig is known.
+        """
         with MapStore.open(self.store) as maps:
-            releases.publish(maps, self.site, self.version, force=force, actor=actor)
+            releases.publish(maps, self.site, self.version, force=force, actor=actor, gate=gate or GateSettings())
 
 
 def build_map(

@@ -11,6 +11,8 @@ from zipfile import ZipFile
 
 import pytest
 
+from support.storage.known_rig import known_rig
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 SOURCES = os.pathsep.join(str(REPOSITORY / folder) for folder in ("shared", "mapserver", "locclient"))
 NOT_ON_ROBOTS = (
@@ -66,7 +68,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for module, *arguments in (
         ["fleetsim.cli", "record", "clip", "--out", "clip.mcap", "--frames", "60"],
         ["mapserver.cli", "build", "clip.mcap", "--site", "lab", "--store", "store", "--frame-from-ground-truth"],
-        ["mapserver.cli", "publish", "--site", "lab", "--store", "store"],
+        ["mapserver.cli", "publish", "--site", "lab", "--store", "store", *known_rig(folder)],
     ):
         start = f"from {module} import main; main()"
         run([sys.executable, "-c", start, *arguments], folder, sources=SOURCES)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import mapserver
-from fleetmap.errors import StateError, UsageError
-from mapserver import BuildOptions, build_map, open_map, open_store
+from fleetmap.errors import GateRefusedError, StateError, UsageError
+from mapserver import BuildOptions, GateSettings, build_map, open_map, open_store
 from support.recordings.recording_samples import write_euroc
 from support.worlds.box_room import out_and_back, ride_sample
 
@@ -31,7 +31,9 @@ def test_a_map_in_five_lines(recording: Path, tmp_path: Path) -> None:
     assert (tmp_path / "map.png").read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(StateError, match="no published version"):
         open_map(tmp_path / "maps", "hall")
-    draft.publish()
+    with pytest.raises(GateRefusedError, match="nothing judged"):  # six metres there and back
+        draft.publish()
+    draft.publish(gate=GateSettings(allow_unjudged_calibration=True))
     with open_store(str(tmp_path / "maps")) as maps:
         current = maps.current("hall")
         assert current is not None
