@@ -1,5 +1,6 @@
 """What one fix says of how the cameras are mounted: gravity, the driving direction, and the floor. Pure."""
 
+from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -18,35 +19,46 @@ _MIN_IN_SLAB, _MIN_DENSITY = (
     3.0,
 )  # landmarks of a floor, and how much more of them than in the slabs above, in the mean
 _BELOW_SHARE = 0.05  # of the landmarks, below the floor: reflections, and errors of depth
-_MIN_STEP_M, _MAX_TURN_RAD = 0.4, 0.15  # of a step whose chord shows the driving direction
+_MIN_STEP_M, _MAX_TURN_RAD = 0.4, 0.15  # of a step that shows the driving direction
+_KEPT_SAMPLES = 2000  # of wheel odometry: 20 s at 100 Hz, a hundred times what a fix takes
 
 
 class BasePose(NamedTuple):
-    """The base by a fix, with what the wheels had measured until then: metres forward and to the left."""
+    """The base by a fix, and by the wheels at the moment of that frame: `WheelTravel.at`."""
 
     map_from_base: Array
     cov_rot_trans: Array
-    travelled_m: Array
+    by_wheels: Array
 
 
 class WheelTravel:
-    """Sum of what the wheels measured, forward and left. is_heard: whether there are wheels, so that the robot stands on a floor."""
+    """The base's path by the wheels alone. is_heard: whether there are wheels, so that the robot stands on a floor."""
 
     def __init__(self) -> None:
-        self.travelled_m = np.zeros(2)
-        self._last_ns: int | None = None
+        self._stamps_ns: deque[int] = deque(maxlen=_KEPT_SAMPLES)
+        self._x_y_yaw: deque[Array] = deque(maxlen=_KEPT_SAMPLES)
 
     @property
     def is_heard(self) -> bool:
         """Whether wheel odometry has come."""
-        return self._last_ns is not None
+        return bool(self._x_y_yaw)
 
     def handle(self, samples: Sequence[WheelSample]) -> None:
         """Adds samples in the order of their stamps."""
         for sample in samples:
-            if self._last_ns is not None:
-                self.travelled_m += sample.velocity_base_mps[:2] * (sample.stamp_ns - self._last_ns) * 1e-9
-            self._last_ns = sample.stamp_ns
+            x_y_yaw = np.zeros(3)
+            if self._x_y_yaw:
+                last, elapsed_s = self._x_y_yaw[-1], (sample.stamp_ns - self._stamps_ns[-1]) * 1e-9
+                turn_rad = sample.yaw_rate_radps * elapsed_s
+                step_m = _turned(sample.velocity_base_mps[:2] * elapsed_s, last[2] + 0.5 * turn_rad)
+                x_y_yaw = last + np.append(step_m, turn_rad)
+            self._stamps_ns.append(sample.stamp_ns)
+            self._x_y_yaw.append(x_y_yaw)
+
+    def at(self, stamp_ns: int) -> Array:
+        """(3,) x, y in metres and yaw in radians since the first sample; NaN before the samples that are kept and after the newest."""
+        elapsed_ns = np.array(self._stamps_ns) - stamp_ns
+        return np.array([np.interp(0, elapsed_ns, values, np.nan, np.nan) for values in np.array(self._x_y_yaw).T])
 
 
 def tilt(fix: Fix, cam_from_body: Array, odometry: OdometryEstimate) -> tuple[Array, Array]:
@@ -65,18 +77,26 @@ def tilt(fix: Fix, cam_from_body: Array, odometry: OdometryEstimate) -> tuple[Ar
 def heading(before: BasePose, now: BasePose) -> tuple[float, float] | None:
     """The cameras' turn against the body about its z, and its sigma; None where a step does not show it.
 
-    That is the angle from where the map says the base went to where the wheels say. The chord of an arc runs along the mean of the
-    headings at its ends.
+    That is the angle from where the map says the base went to where the wheels say. What the wheels turned less than the map says is
+    taken to have come evenly, so that it turns the step by its half; were it all at one end, by all or nothing.
     """
     before_from_now = se3_inverse(before.map_from_base) @ now.map_from_base
     turn_rad = float(so3_log(before_from_now[:3, :3])[2])
-    step_m, wheels_m = before_from_now[:2, 3], now.travelled_m - before.travelled_m
+    wheels_m = _turned(now.by_wheels[:2] - before.by_wheels[:2], -before.by_wheels[2])
+    missing_rad = turn_rad - float(now.by_wheels[2] - before.by_wheels[2])
+    step_m = before_from_now[:2, 3]
     length_m = float(np.linalg.norm(step_m))
     if abs(turn_rad) > _MAX_TURN_RAD or not _MIN_STEP_M < length_m < 2 * float(np.linalg.norm(wheels_m)):
         return None
-    angle = np.arctan2(wheels_m[1], wheels_m[0]) - np.arctan2(step_m[1], step_m[0]) + 0.5 * turn_rad
+    angle = np.arctan2(wheels_m[1], wheels_m[0]) - np.arctan2(step_m[1], step_m[0]) + 0.5 * missing_rad
     variances = [end.cov_rot_trans[3:5, 3:5].trace() / 2 for end in (before, now)]
-    return float((angle + np.pi) % (2 * np.pi) - np.pi), float(np.sqrt(sum(variances))) / length_m
+    sigma = np.hypot(np.sqrt(sum(variances)) / length_m, missing_rad / np.sqrt(12))  # uniform from one end to the other
+    return float((angle + np.pi) % (2 * np.pi) - np.pi), float(sigma)
+
+
+def _turned(vector: Array, by_rad: float) -> Array:
+    cosine, sine = np.cos(by_rad), np.sin(by_rad)
+    return np.array([cosine * vector[0] - sine * vector[1], sine * vector[0] + cosine * vector[1]])
 
 
 def height(base: BasePose, points_map: Array) -> tuple[float, float] | None:

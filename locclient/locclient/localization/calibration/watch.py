@@ -156,7 +156,7 @@ class CalibrationWatch:
             return
         map_from_base = fix.map_from_cam @ self._rig.cam_from_body @ se3_inverse(self._rig.base_from_body)
         covariance = transport_cov(fix.cov_rot_trans, map_from_base[:3, 3] - fix.map_from_cam[:3, 3])
-        base = BasePose(map_from_base, covariance, self._wheels.travelled_m.copy())
+        base = BasePose(map_from_base, covariance, self._wheels.at(odometry.stamp_ns))
         turned = None if self._last_base is None else mounting.heading(self._last_base, base)
         for at_one, measurement in ((HEADING, turned), (HEIGHT, mounting.height(base, query.view.points_map))):
             if measurement is not None:
