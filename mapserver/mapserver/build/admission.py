@@ -1,7 +1,7 @@
 """Checks before a survey: a recording that could only make a wrong map is refused, a clock offset is corrected."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from fleetmap.errors import RecordingError
@@ -39,13 +39,28 @@ class CheckedRecording:
     calibration: RigEvidence
     corrections: dict[str, float]
 
+    def statements(self) -> list[str]:
+        """Each finding that is not good or could not be judged, in words, and what was done about them."""
+        return self._with_corrections(f"{f.name}: {f.sentence}" for f in self.findings if f.verdict is not Verdict.OK)
+
     def remarks(self) -> list[str]:
-        """The findings that are not good and those that could not be judged, in words, and what was done about them."""
-        words = [f"{f.name}: {f.sentence}" for f in self.findings if f.verdict is not Verdict.OK]
-        if self.corrections:
-            done = ", ".join(f"{name} by {in_words(name, value)}" for name, value in self.corrections.items())
-            words.append(f"corrected: {done}, as measured; robots that use this calibration file keep its error")
-        return words
+        """The statements, with one remark for all checks that lack the same; one that was measured keeps its figure."""
+        lacking: dict[str, list[Finding]] = {}
+        for finding in self.findings:
+            if finding.verdict is not Verdict.OK:
+                is_unknown = finding.verdict is Verdict.NOT_JUDGED and finding.value is None and finding.missing
+                lacking.setdefault(finding.missing if is_unknown else finding.name, []).append(finding)
+        return self._with_corrections(
+            f"not judged: {', '.join(f.name for f in same)}: {missing}"
+            if len(same) > 1
+            else f"{same[0].name}: {same[0].sentence}"
+            for missing, same in lacking.items()
+        )
+
+    def _with_corrections(self, words: Iterable[str]) -> list[str]:
+        done = ", ".join(f"{name} by {in_words(name, value)}" for name, value in self.corrections.items())
+        said = f"corrected: {done}, as measured; robots that use this calibration file keep its error"
+        return [*words, said] if done else list(words)
 
 
 def fingerprint(calibration: RigCalibration) -> str:

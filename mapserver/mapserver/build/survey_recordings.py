@@ -38,7 +38,7 @@ from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyToo
 class Surveyed:
     """One recording and its survey.
 
-    map_from_survey (4, 4): by its position priors, None without any. findings: the doctor's remarks. calibration: what it says of
+    map_from_survey (4, 4): by its position priors, None without any. findings: the doctor's statements. calibration: what it says of
     the calibration. corrections: of that, by parameter. held_out: frames that the survey did not use.
     """
 
@@ -75,9 +75,9 @@ class Surveyed:
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """A recording fit to be surveyed: the doctor's remarks in words, the calibration to use, what was found of the given one."""
+    """A recording fit to be surveyed: every statement of the doctor, the calibration to use, what was found of the given one."""
 
-    remarks: tuple[str, ...]
+    statements: tuple[str, ...]
     rig: RigCalibration
     calibration: RigEvidence
     corrections: dict[str, float]
@@ -146,7 +146,7 @@ def _admission(
         result = checked(recording, executor=executor)
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
-        return Admission(tuple(result.remarks()), result.rig, result.calibration, result.corrections)
+        return Admission(tuple(result.statements()), result.rig, result.calibration, result.corrections)
 
 
 def survey_recording(
@@ -175,7 +175,7 @@ def survey_recording(
             truth=recording.ground_truth,
             survey=done,
             map_from_survey=map_from_survey,
-            findings=admission.remarks,
+            findings=admission.statements,
             calibration=admission.calibration,
             corrections=admission.corrections,
             held_out=held_out_of(recording, indices.tolist(), rectifier, done, options.settings.orb),

@@ -172,18 +172,14 @@ def _noise(adjusted: Sequence[Adjusted]) -> list[tuple[CalibrationParameter, flo
 
 def _judged(name: CalibrationParameter, estimate: float, sigma: float, sensors: Sensors) -> ParameterEstimate:
     limits = RANGES[name]
-    known = (
-        sensors.keyframes >= MIN_KEYFRAMES
-        and sigma <= limits.useful_sigma
-        and sigma <= _LARGEST_PRIOR_SHARE * limits.prior_sigma
-    )
-    reason = "" if known else _reason(name, sensors)
-    return ParameterEstimate(name, estimate, sigma, limits.unit, known, reason)
+    is_long = sensors.keyframes >= MIN_KEYFRAMES
+    is_sharp = sigma <= min(limits.useful_sigma, _LARGEST_PRIOR_SHARE * limits.prior_sigma)
+    short = f"too short: {sensors.keyframes} keyframes, {MIN_KEYFRAMES} are needed"
+    lacking = [*([] if is_long else [short]), *([] if is_sharp else [_reason(name, sensors)])]
+    return ParameterEstimate(name, estimate, sigma, limits.unit, not lacking, "; ".join(lacking))
 
 
 def _reason(name: CalibrationParameter, sensors: Sensors) -> str:
-    if sensors.keyframes < MIN_KEYFRAMES:
-        return f"too short: {sensors.keyframes} keyframes, {MIN_KEYFRAMES} are needed"
     if name in _PAIR and not sensors.has_pair:
         return "there is one camera"
     if name in _INERTIAL and not sensors.has_imu:

@@ -148,7 +148,7 @@ def _finding(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_
     verdict = Verdict.FAIL if sure > tolerance.fail_above else Verdict.WARN if is_bad else Verdict.OK
     words = f"{factor * value:+.{digits}f} {unit} from the calibration, sigma {factor * sigma_all:.{digits}f}"
     if not is_bad and abs(value) > tolerance.warn_above + sigma_all:  # dear if it is true: neither sure nor silent
-        return not_judged(name.value, f"{words}: that may be chance", _LONGER)
+        return replace(not_judged(name.value, f"{words}: that may be chance", _LONGER), value=value)
     if is_bad:
         words += "; calibrate again (`mapserver calibrate` writes what it finds), or name the matching file with --calibration"
     limits = f"warn {factor * tolerance.warn_above:g}, fail {factor * tolerance.fail_above:g} {unit} for sure"

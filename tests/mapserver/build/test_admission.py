@@ -10,7 +10,9 @@ from fleetmap.recordings import Recording, open_recording
 from mapserver.build import admission
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate
 from mapserver.calibration.parameters import COLUMNS, RANGES
+from mapserver.doctor import Finding, Verdict
 from mapserver.doctor.calibration import MeasuredCalibration, findings_of
+from mapserver.doctor.findings import not_judged
 from mapserver.doctor.run_checks import CheckResults
 from support.recordings.recording_samples import make_sample, write_euroc
 
@@ -65,10 +67,27 @@ def test_a_correction_that_the_second_look_denies_is_for_a_person(
     assert "after its correction" in found.calibration.doubted["pair geometry"]
 
 
+def test_checks_that_lack_the_same_are_one_remark(recording: Recording) -> None:
+    short, turns = "too short: 5 keyframes, 20 are needed", "drive turns"
+    chance = Finding("pair roll", Verdict.NOT_JUDGED, 0.002, "", f"not judged: +0.115 degrees; {short}", short)
+    unknown = [not_judged(name, "known to 9 % only", short) for name in ("baseline", "focal length")]
+    findings = [unknown[0], not_judged("pair yaw", "known to 1 degrees only", turns), unknown[1], chance]
+    findings += [Finding("gyro axes", Verdict.OK, 0.0, "", ""), Finding("sharpness", Verdict.WARN, 0.3, "", "blurred")]
+    found = admission.CheckedRecording(recording.calibration, findings, admission.rig_evidence("a", []), {})
+    assert found.remarks() == [
+        f"not judged: baseline, focal length: {short}",
+        f"pair yaw: not judged: known to 1 degrees only; {turns}",
+        f"pair roll: not judged: +0.115 degrees; {short}",  # one that was measured keeps its figure
+        "sharpness: blurred",
+    ]
+    assert len(found.statements()) == 5  # a report has each
+
+
 def test_a_good_calibration_is_left_alone(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     good = measured(P.BASELINE, 0.001)
     found = checked(recording, monkeypatch, good, good)
     assert found.rig is recording.calibration
     assert (found.corrections, found.remarks(), found.calibration.doubted) == ({}, [], {})
+    assert found.statements() == []
     other = replace(recording.calibration, base_from_body=2 * np.eye(4))
     assert found.calibration.rig == admission.fingerprint(recording.calibration) != admission.fingerprint(other)

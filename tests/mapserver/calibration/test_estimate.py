@@ -87,6 +87,9 @@ def test_a_short_stretch_says_nothing() -> None:
     assert found.keyframes < 20
     assert not any(p.is_judged for p in found.parameters)
     assert "too short" in found.get(P.FOCAL).reason
+    blind = estimated(short, {}, inertial=False, wheels=False).get(P.BASELINE).reason
+    assert blind.startswith("too short: ")
+    assert "neither an IMU nor wheels measure metres" in blind  # a longer drive alone would not help
 
 
 def test_wheels_alone_give_the_baseline_as_well_as_they_know_themselves(loop: Stretch) -> None:
