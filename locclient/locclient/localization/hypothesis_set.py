@@ -29,9 +29,8 @@ class HypothesisSet:
         self._disambiguated: PoseHypothesis | None = None
         self._abandoned: PoseHypothesis | None = None  # published as the robot's pose until fixes named another
         self._viewpoint_gate = ViewpointGate()
-        self.lookalike_recall: float | None = (
-            None  # that places outside the map may reach; None where nobody measured it
-        )
+        # That places outside the map may reach; None where nobody measured it
+        self.lookalike_recall: float | None = None
 
     def tracked(self) -> list[PoseHypothesis]:
         """All that must be propagated by the odometry."""
