@@ -84,8 +84,8 @@ class MeasuredCalibration:
     estimate: CalibrationEstimate | None
 
     def wrong(self) -> list[CalibrationParameter]:
-        """Parameters that are off by more than their error costs, for sure, and that a build may correct."""
-        bad = {f.name for f in self.findings if f.verdict is Verdict.WARN}
+        """Parameters that are off by more than their error costs, for sure, and by how much is known: those a build may correct."""
+        bad = {f.name for f in self.findings if f.verdict is Verdict.WARN and not f.missing}
         return [p for p in TOLERANCES if p.value in bad and TOLERANCES[p].correctable]
 
 
@@ -139,12 +139,12 @@ def _finding(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_
     name, tolerance = parameter.name, TOLERANCES[parameter.name]
     factor, unit, digits = _SHOWN[parameter.unit]
     value, own_sigma = _net(parameter, estimate, focal_px)
-    if not parameter.is_judged or own_sigma > tolerance.warn_above:
-        sigma = f"known to {factor * parameter.sigma:.{digits}f} {unit} only"
-        return not_judged(name.value, sigma, parameter.reason or _LONGER)
     sigma_all = float(np.hypot(own_sigma, tolerance.floor))
     sure = max(abs(value) - SURE_SIGMAS * sigma_all, 0.0)
-    is_bad = sure > tolerance.warn_above
+    is_bad, is_coarse = parameter.is_judged and sure > tolerance.warn_above, own_sigma > tolerance.warn_above
+    if not is_bad and (is_coarse or not parameter.is_judged):
+        sigma = f"known to {factor * parameter.sigma:.{digits}f} {unit} only"
+        return not_judged(name.value, sigma, parameter.reason or _LONGER)
     verdict = Verdict.FAIL if sure > tolerance.fail_above else Verdict.WARN if is_bad else Verdict.OK
     words = f"{factor * value:+.{digits}f} {unit} from the calibration, sigma {factor * sigma_all:.{digits}f}"
     if not is_bad and abs(value) > tolerance.warn_above + sigma_all:  # dear if it is true: neither sure nor silent
@@ -152,7 +152,7 @@ def _finding(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_
     if is_bad:
         words += "; calibrate again (`mapserver calibrate` writes what it finds), or name the matching file with --calibration"
     limits = f"warn {factor * tolerance.warn_above:g}, fail {factor * tolerance.fail_above:g} {unit} for sure"
-    return Finding(name.value, verdict, value, limits, words)
+    return Finding(name.value, verdict, value, limits, words, _LONGER if is_bad and is_coarse else "")
 
 
 def _net(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_px: float) -> tuple[float, float]:

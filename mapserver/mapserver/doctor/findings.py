@@ -19,8 +19,8 @@ class Verdict(StrEnum):
 class Finding:
     """One check: its name, what was measured against which limit (in words of the unit), and what to do next.
 
-    missing: for a check that is not judged, the motion or sensor that would make it observable. Such a check has a value only where
-    one was measured that may be chance.
+    missing: for a check that is not judged, or whose value is not known well enough to be corrected, the motion or sensor that would make
+    it observable. A check that is not judged has a value only where one was measured that may be chance.
     """
 
     name: str

@@ -2,29 +2,42 @@
 
 `python tests/benchmarks/survey/bench_calibration.py drives [--seed 300] [--count 12] [--draws 3]`: simulated drives without pictures, each
 under calibrations that are off at random. `... recordings RECORDING... [--focal 0.05 --baseline -0.05]`: recordings whose own
-calibration is the truth, spoiled by that much.
+calibration is the truth, spoiled by that much. `... good [--seed 400] [--count 90]`: what the doctor says of right calibrations, half a
+minute of each drive. `... faults [--seed 500] [--count 10]`: every fault in each of so many drives, through the doctor and a build's
+decision; `--images-only` leaves out IMU and wheels.
 """
 
 import argparse
 import json
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bench_calibration_faults import cost_cm
 
 from fleetmap.geometry import Array
 from fleetmap.recordings import open_recording
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import Rectifier
 from fleetsim.recorder import Order
+from mapserver.build.admission import rig_evidence
 from mapserver.calibration import CalibrationParameter, estimate_calibration, estimate_from
 from mapserver.calibration.parameters import COLUMNS, INDEX
+from mapserver.calibration.recordings import LONGEST_S
 from mapserver.config import survey_settings
-from support.worlds.calibration_scene import make_stretch, measured, true_corrections, with_errors
+from mapserver.doctor import Verdict
+from mapserver.doctor.calibration import MeasuredCalibration, corrected, findings_of
+from support.recordings.calibration_faults import standard_faults
+from support.worlds.calibration_scene import Stretch, make_stretch, measured, true_corrections, with_errors
 
 P = CalibrationParameter
 SCENARIOS = ("small-loop", "busy", "identical-aisles")
+JUDGED_SCENARIOS = ("small-loop", "busy", "identical-aisles", "five-aisles", "marked-ends")
+LOUD = (Verdict.WARN, Verdict.FAIL)
 DURATION_S = 60.0
 # Sigmas of the random errors that calibrations are given.
 ERRORS = {
@@ -96,19 +109,92 @@ def recording(path: Path, wrong: dict[CalibrationParameter, float]) -> dict[str,
     return {"recording": path.name, "cpu_s": round(cpu_s, 1), "keyframes": found.keyframes, "parameters": rows}
 
 
+def judged(stretch: Stretch, given: RigCalibration, draw: int, sensors: dict[str, bool]) -> MeasuredCalibration:
+    """What the doctor says of a calibration, without pictures."""
+    estimate = estimate_from([measured(stretch, given, draw, **sensors)])
+    return MeasuredCalibration(findings_of(estimate, Rectifier(given).camera.focal_px), estimate)
+
+
+def judged_drives(first_seed: int, count: int) -> Iterator[tuple[str, Stretch]]:
+    """Drives of all scenarios in turn, each as the doctor reads it: half a minute."""
+    for number in range(count):
+        scenario, seed = JUDGED_SCENARIOS[number % len(JUDGED_SCENARIOS)], first_seed + number
+        stretch = make_stretch(Order(scenario, seed=seed), 0.0, LONGEST_S, step_s=0.6, per_frame=80)
+        yield f"{scenario} {seed}", stretch
+
+
+def good(first_seed: int, count: int) -> dict[str, Any]:
+    """False alarms, and what was not judged, by parameter."""
+    alarms, unknown = [], Counter[str]()
+    for name, stretch in judged_drives(first_seed, count):
+        findings = judged(stretch, stretch.session.true, 0, {}).findings
+        loud = [f"{name}: {f.name}: {f.sentence}" for f in findings if f.verdict in LOUD]
+        unknown.update(f.name for f in findings if f.verdict is Verdict.NOT_JUDGED)
+        alarms += [loud] if loud else []
+        print(json.dumps({"drive": name, "alarms": loud}), flush=True)
+    return {"drives": count, "false_alarms": len(alarms), "alarms": alarms, "not_judged": dict(unknown)}
+
+
+def decision(
+    stretch: Stretch, given: RigCalibration, sensors: dict[str, bool]
+) -> tuple[list[str], str, RigCalibration]:
+    """What warns or fails, what a build does, and the calibration that it takes: as `mapserver.build.admission` decides."""
+    first = judged(stretch, given, 0, sensors)
+    loud = [f.name for f in first.findings if f.verdict in LOUD]
+    if any(f.verdict is Verdict.FAIL for f in first.findings):
+        return loud, "refused", given
+    rig, done = corrected(given, first)
+    again = [f for f in judged(stretch, rig, 1, sensors).findings if f.verdict in LOUD] if done else []
+    settled = [f for f in first.findings if f.name not in done or f.verdict is not Verdict.WARN]
+    evidence = rig_evidence("", [*settled, *again])
+    if evidence.doubted or evidence.unknown():
+        return loud, "held", rig
+    return loud, "corrected" if done else "passes", rig
+
+
+def faults(first_seed: int, count: int, *, is_images_only: bool) -> list[dict[str, Any]]:
+    """By fault: in how many drives it was found, what builds do, and the dearest error in cm before, and that goes out without a word."""
+    sensors = {"inertial": False, "wheels": False} if is_images_only else {}
+    drives_of = [stretch for _, stretch in judged_drives(first_seed, count)]
+    table = []
+    for fault in standard_faults():
+        if is_images_only and fault.needs_imu:
+            continue
+        found, done, costs, silent_cm = 0, Counter[str](), [], 0.0
+        for stretch in drives_of:
+            true = stretch.session.true
+            given = fault.change(true)
+            loud, does, rig = decision(stretch, given, sensors)
+            found, costs = found + bool(loud), [*costs, cost_cm(given, true)]
+            done[does] += 1
+            if does in ("passes", "corrected"):
+                silent_cm = max(silent_cm, cost_cm(rig, true))
+        row = {"fault": fault.name, "drives": count, "found": found, "build": dict(done)}
+        table.append(row | {"cost_cm": round(max(costs), 1), "goes_out_cm": round(silent_cm, 1)})
+        print(json.dumps(table[-1]), flush=True)
+    return table
+
+
 def main() -> None:
     """Runs one of the two sections."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("section", choices=("drives", "recordings"))
+    parser.add_argument("section", choices=("drives", "recordings", "good", "faults"))
     parser.add_argument("paths", nargs="*", type=Path)
     parser.add_argument("--seed", type=int, default=300)
     parser.add_argument("--count", type=int, default=12)
     parser.add_argument("--draws", type=int, default=3)
+    parser.add_argument("--images-only", action="store_true")
     for name in WRONG:
         parser.add_argument(f"--{name}", type=float, default=0.0)
     asked = parser.parse_args()
     if asked.section == "drives":
         print(json.dumps(drives(asked.seed, asked.count, asked.draws), indent=1))
+        return
+    if asked.section == "good":
+        print(json.dumps(good(asked.seed, asked.count), indent=1))
+        return
+    if asked.section == "faults":
+        faults(asked.seed, asked.count, is_images_only=asked.images_only)
         return
     wrong = {parameter: getattr(asked, name) for name, parameter in WRONG.items() if getattr(asked, name)}
     for path in asked.paths:

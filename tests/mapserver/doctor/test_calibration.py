@@ -1,5 +1,7 @@
 """Verdicts on measured calibrations, and what a build makes of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -66,6 +68,21 @@ def test_a_dear_error_that_may_be_chance_is_neither_ok_nor_a_fault() -> None:
     assert finding.verdict is Verdict.NOT_JUDGED
     assert "that may be chance" in finding.sentence
     assert "turns" in finding.missing
+
+
+def test_an_error_far_beyond_a_coarse_sigma_is_found_and_not_corrected() -> None:
+    """Twenty percent of baseline, known to half a percent: for sure wrong, too coarse to be mended."""
+    found = estimate(baseline=-0.17)
+    coarse = tuple(replace(p, sigma=0.005) if p.name is P.BASELINE else p for p in found.parameters)
+    (failed,) = [f for f in findings_of(replace(found, parameters=coarse), FOCAL_PX) if f.name == "baseline"]
+    assert failed.verdict is Verdict.FAIL
+    nearer = tuple(replace(p, estimate=-0.025) if p.name is P.BASELINE else p for p in coarse)
+    warned = measured(replace(found, parameters=nearer))
+    assert verdicts(replace(found, parameters=nearer))["baseline"] is Verdict.WARN
+    assert warned.wrong() == []
+    assert set(rig_evidence("a1", warned.findings).doubted) == {"metric scale"}
+    alike = tuple(replace(p, estimate=0.001) if p.name is P.BASELINE else p for p in coarse)
+    assert verdicts(replace(found, parameters=alike))["baseline"] is Verdict.NOT_JUDGED
 
 
 def test_a_shifted_principal_point_that_looks_like_a_turn_is_no_turn() -> None:
