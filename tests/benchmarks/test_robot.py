@@ -20,6 +20,7 @@ from benchmarks.robot import (
     bench_localization,
     bench_real_robots,
     bench_robot_memory,
+    bench_standing_starts,
 )
 from support.recordings.realdata import real_data
 
@@ -74,6 +75,13 @@ def test_memory_of_half_an_hour(work: Path, tmp_path: Path) -> None:
 def test_starts_among_identical_aisles(name: str, tmp_path: Path) -> None:
     found = results(tmp_path, "bench_aliased_starts.py", "--only", name)["figures"][name]
     assert not misses(found, bench_aliased_starts.PROMISES[name])
+
+
+@pytest.mark.parametrize("name", bench_standing_starts.PROMISES)
+def test_standing_starts_by_night(name: str, work: Path, tmp_path: Path) -> None:
+    """On a site that no development saw; also where the map lacks all around."""
+    found = results(tmp_path, "bench_standing_starts.py", "--pipeline", name, "--work", work)["figures"][name]
+    assert not misses(found, bench_standing_starts.PROMISES[name])
 
 
 def test_wrong_calibrations(work: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common import estimator_loop
+from benchmarks.robot.standing_robot import standing
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.messages import Status
@@ -18,6 +19,9 @@ from fleetsim.estimator.simulated_run import EstimatorSession, Found, Ids, Sight
 from fleetsim.recorder import Order, prepare
 from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings, TrackSettings
+from mapserver.build.draft_evidence import PROBES
+from mapserver.quality.probes import Probe
+from mapserver.quality.starts import starts_without_prior
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.landmark_budget import choose_landmarks
@@ -35,6 +39,7 @@ class RememberingSession(EstimatorSession):
         session = prepare(order)
         session.renderer.close()
         super().__init__(session, field=field)
+        self.field = field
         self._sightings: dict[int, Sighting] = {}
         self._found: dict[int, Found] = {}
 
@@ -72,23 +77,34 @@ class LateSession(EstimatorSession):
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A robot's drive, and the map of a survey that went through every aisle both ways."""
+    """A robot's drive, and the map of a survey. lookalike_recall: what its build would have measured, None where it did not."""
 
     robot: RememberingSession
     tile: Tile
     view: MapView
+    lookalike_recall: float | None = None
 
 
-def surveyed_site(scenario: str, seed: int) -> Site:
-    """The site of that seed, on the day of its survey."""
-    session = prepare(Order(scenario, seed=seed, robot="survey-both-ways"))
+def surveyed_site(scenario: str, seed: int, survey_run: str = "survey-both-ways") -> Site:
+    """The site of that seed, on the day of its survey, which went through every aisle both ways by default."""
+    session = prepare(Order(scenario, seed=seed, robot=survey_run))
     session.renderer.close()
     field = LandmarkField(session.world)
     survey = EstimatorSession(session, field=field)
     robot = RememberingSession(Order(scenario, seed=seed, robot="runner-1"), field)
     (whole_tile,), vocabulary = estimator_loop.survey_map(survey, np.random.default_rng(seed), every_m=_EVERY_M)
     tile = within_budget(whole_tile, survey.camera, survey.body_from_cam)
-    return Site(robot, tile, estimator_loop.map_view(robot, [tile], vocabulary))
+    view = estimator_loop.map_view(robot, [tile], vocabulary)
+    return Site(robot, tile, view, None if survey_run == "survey-both-ways" else measured_lookalikes(view, survey))
+
+
+def measured_lookalikes(view: MapView, survey: EstimatorSession) -> float | None:
+    """The look-alike recall of a map, by frames of its survey, as `mapserver build` measures it."""
+    numbers = np.linspace(0, len(survey) - 1, PROBES).round().astype(int).tolist()
+    places = [survey.map_from_body[number] @ survey.body_from_cam for number in numbers]
+    probes = [Probe(survey.camera, estimator_loop.seen(survey, n), at) for n, at in zip(numbers, places, strict=True)]
+    starts = starts_without_prior(view, probes)
+    return None if starts is None else starts.lookalike_recall
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +176,20 @@ def start_at(
     session = LateSession(site.robot, number)
     prior = None if prior_sigma_m is None else prior_at(session, prior_sigma_m, rng)
     count = int(np.searchsorted(session.stamps_ns, session.stamps_ns[0] + int(duration_s * 1e9)))
-    return judged(number, session, estimator_loop.run_localizer(session, site.view, prior, count, settings=settings))
+    known = estimator_loop.run_localizer(
+        session, site.view, prior, count, settings=settings, lookalike_recall=site.lookalike_recall
+    )
+    return judged(number, session, known)
+
+
+def standing_start_at(site: Site, number: int, duration_s: float) -> Start:
+    """The outcome of standing where a frame was taken, for so long, without a prior."""
+    drive = site.robot.session
+    stands = standing(drive, drive.frame_times_s[number], number, duration_s)
+    stands.renderer.close()
+    session = LateSession(EstimatorSession(stands, field=site.robot.field), 0)
+    known = estimator_loop.run_localizer(session, site.view, lookalike_recall=site.lookalike_recall)
+    return judged(number, session, known)
 
 
 def resolving_start_at(site: Site, number: int, beyond_m: float, settings: LocalizerSettings) -> Start:
@@ -183,14 +212,14 @@ def among_racks(session: EstimatorSession) -> NDArray[np.int64]:
 
 def part_of(tile: Tile, kept: NDArray[np.bool_], places: NDArray[np.bool_]) -> Tile:
     """Those landmarks and places alone."""
-    is_kept = dict(zip(tile.landmark_ids.tolist(), kept.tolist(), strict=True))
+    dropped = tile.landmark_ids[~kept]
     lists = [ids for ids, held in zip(tile.place_landmark_ids, places, strict=True) if held]
     return replace(
         tile, landmark_ids=tile.landmark_ids[kept], points_map=tile.points_map[kept], descriptors=tile.descriptors[kept],
         view_directions_map=tile.view_directions_map[kept], view_half_angle_rad=tile.view_half_angle_rad[kept],
         max_distance_m=tile.max_distance_m[kept], sigma_m=tile.sigma_m[kept], place_ids=tile.place_ids[places],
         map_from_cam=tile.map_from_cam[places],
-        place_landmark_ids=tuple(np.array([i for i in ids.tolist() if is_kept[i]], np.uint32) for ids in lists),
+        place_landmark_ids=tuple(ids[~np.isin(ids, dropped)] for ids in lists),
     )  # fmt: skip
 
 

@@ -2,9 +2,10 @@
 
 `PYTHONPATH=tests python tests/benchmarks/robot/bench_aliased_starts.py [--starts N] [--seeds N...] [--only NAME...] [--out FILE.json]`.
 Six aisles 5 m apart that were surveyed both ways, so that each has five twins; N starts (200) of each kind, shared among the sites
-of the seeds. With signs at the aisles' ends the starts are followed out of the racks. "whole site": the robot may take it that its own
-aisle is in the map. Where it may not, it must not be misled by signs out of an aisle that is not in the map, nor where two of five twins
-are not; from the only twin of an aisle that is not in the map nothing protects.
+of the seeds. With signs at the aisles' ends the starts are followed out of the racks. "surveyed one way": every aisle in one direction,
+with look-alikes measured as a build does it. "whole site": the robot may take it that its own aisle is in the map. Where it may not, it
+must not be misled by signs out of an aisle that is not in the map, nor where two of five twins are not; from the only twin of an aisle
+that is not in the map nothing protects.
 """
 
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
@@ -24,6 +25,7 @@ from benchmarks.robot.aliased_starts import (
     Start,
     among_racks,
     resolving_start_at,
+    standing_start_at,
     start_at,
     summary,
     surveyed_site,
@@ -39,8 +41,11 @@ _WHOLE = "no prior, whole site"
 _OUT, _OUT_M, _SPEED_MPS, _RATE_HZ = "out of the aisle, whole site", 8.0, 2.0, 15.0
 _FOREIGN, _FOREIGN_MAPPED = "out of an aisle that is not in the map", (0, 1, 3, 4, 5)
 _MAPPED = {"own aisle and all twins but one unmapped": (5,), "own aisle and two of five twins unmapped": (3, 4, 5)}
+_ONE_WAY, _ONE_WAY_STANDING = "no prior, surveyed one way", "no prior, surveyed one way, standing"
 PROMISES: dict[str, Promises] = {
     "no prior": _AMONG,
+    _ONE_WAY: _NEVER_WRONG,
+    _ONE_WAY_STANDING: _NEVER_WRONG,
     _WHOLE: _AMONG,
     "prior of 0.5 m": _NEVER_WRONG | {"right_in_time_share": (0.99, AT_LEAST)},
     "prior of 2 m": _NEVER_WRONG,
@@ -48,12 +53,14 @@ PROMISES: dict[str, Promises] = {
     _FOREIGN: _NEVER_WRONG,
     **dict(zip(_MAPPED, ({}, _NEVER_WRONG), strict=True)),
 }
-_PRIORS_M = {"no prior": None, _WHOLE: None, "prior of 0.5 m": 0.5, "prior of 2 m": 2.0}
+_PRIORS_M = {"no prior": None, _WHOLE: None, _ONE_WAY: None, "prior of 0.5 m": 0.5, "prior of 2 m": 2.0}
 
 
 def starts_of(name: str, site: Site, count: int, seed: int) -> list[Start]:
     """So many starts of one kind, spread over the drive."""
     rng, robot = np.random.default_rng([seed, 1]), site.robot
+    if name == _ONE_WAY_STANDING:
+        return [standing_start_at(site, n, _FOLLOWED_S) for n in _spread(30, len(robot) - 60, count)]
     if name in _PRIORS_M:
         settings = WHOLE_SITE if name == _WHOLE else LocalizerSettings()
         numbers = _spread(30, len(robot) - 60, count)
@@ -68,8 +75,10 @@ def starts_of(name: str, site: Site, count: int, seed: int) -> list[Start]:
     return [start_at(part, n, _FOLLOWED_S, None, rng) for n in _spread(frames[0], frames[-1] - 46, count)]
 
 
-def _site_of(name: str) -> str:
-    return "marked-ends" if name in (_OUT, _FOREIGN) else "identical-aisles"
+def _site_of(name: str) -> tuple[str, str]:
+    """Scenario and survey."""
+    scenario = "marked-ends" if name in (_OUT, _FOREIGN) else "identical-aisles"
+    return scenario, "survey" if name in (_ONE_WAY, _ONE_WAY_STANDING) else "survey-both-ways"
 
 
 def _spread(first: int, last: int, count: int) -> list[int]:
@@ -98,8 +107,10 @@ def main() -> None:
     found: dict[str, list[Start]] = {name: [] for name in arguments.only or PROMISES}
     for seed in arguments.seeds:
         begun_s = time.process_time()
-        sites = {name: surveyed_site(name, seed) for name in {_site_of(name) for name in found}}
+        sites = {of: surveyed_site(of[0], seed, of[1]) for of in {_site_of(name) for name in found}}
         print(f"seed {seed}: sites in {time.process_time() - begun_s:.0f} s", flush=True)
+        for of, site in sites.items():
+            print(f"  {of}: look-alike recall {site.lookalike_recall}", flush=True)
         for name, starts in found.items():
             begun_s = time.process_time()
             share = starts_of(name, sites[_site_of(name)], max(1, arguments.starts // len(arguments.seeds)), seed)

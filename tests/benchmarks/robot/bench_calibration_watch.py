@@ -9,14 +9,13 @@ import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
 import argparse
-import subprocess
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import SITE, kept_folder, recorded, tool, write_results
+from benchmarks.common.recorded_runs import SITE, kept_folder, recorded, surveyed, write_results
 from fleetmap.messages import Cause, Status
 from fleetmap.recordings import FrameSelection, Recording, open_recording
 from locclient.localization.settings import LocalizerSettings
@@ -106,13 +105,7 @@ def played(recording: Recording, store: Path, site: str, frames: str) -> ReplayR
 
 def held_out(work: Path) -> tuple[Path, Path]:
     """A robot's recording of a site with a held-out seed, and the store with the map of that site's survey."""
-    store = work / f"calibration-watch-{_SEED}"
-    if not (store / "built").exists():
-        survey = recorded(work, ("--seed", _SEED))
-        to_store = ["--site", SITE, "--store", str(store)]
-        subprocess.run([*tool("mapserver"), "build", str(survey), *to_store, "--frame-from-ground-truth"], check=True)
-        subprocess.run([*tool("mapserver"), "publish", *to_store], check=True)
-        (store / "built").touch()
+    store = surveyed(work, int(_SEED))
     return recorded(work, ("--seed", _SEED, "--robot", _ROBOT, "--frames", "450")), store
 
 

@@ -1,0 +1,185 @@
+"""Robots that are switched on where they stand, by night and without a prior: how soon each finds itself, and what its search costs.
+
+`PYTHONPATH=tests python tests/benchmarks/robot/bench_standing_starts.py [--seed N] [--starts N] [--pipeline NAME...] [--work FOLDER]
+[--out FILE.json]`. The map is that of `small-loop`'s survey by day; three days later, at places spread over another robot's drive, each
+robot stands and sees every frame with noise of its own. Every start is repeated with all within ELSEWHERE_M of it taken out of the map:
+what names a place then is wrong.
+"""
+
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.common.recorded_runs import (
+    AT_LEAST,
+    AT_MOST,
+    SITE,
+    Promises,
+    kept_folder,
+    show_against,
+    surveyed,
+    write_results,
+)
+from benchmarks.common.yardstick import at_reference, slowness
+from benchmarks.robot.aliased_starts import WRONG_M, part_of
+from benchmarks.robot.standing_robot import standing
+from fleetmap.geometry import Array
+from fleetmap.messages import Status
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import CameraFrame, wheel_between
+from fleetsim.imaging.pipelines import find_pipeline, process_frame
+from fleetsim.recorder import Order, Session, prepare
+from locclient.localization import localizer
+from locclient.localization.settings import LocalizerSettings
+from locclient.maps.connection import connected
+from locclient.maps.loaded_map import LoadedMap
+from locclient.replay.replay import load_map
+from locclient.robot.robot import Robot
+from locclient.robot.sensor_bundle import SensorBundle
+from locclient.robot.version_trial import TrialSettings
+
+WITHIN_S, ELSEWHERE_M = 1.0, 8.0
+_FOLLOWED_S, _LIGHT, _DAY, _ROBOT = 2.0, "night", 3, "runner-1"
+_SLICES = localizer._SLICES_WITHOUT_POSE
+_NEVER_WRONG: Promises = {"wrong_starts": (0, AT_MOST), "wrong_starts_unmapped": (0, AT_MOST)}
+PROMISES: dict[str, Promises] = {
+    "clean": _NEVER_WRONG | {"fix_in_time_share": (1.0, AT_LEAST)},
+    "night-gain": _NEVER_WRONG,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """How one start went: seconds until the first right fix, and until TRACKING at the right place, None for never; whether it was ever
+    TRACKING elsewhere; CPU milliseconds of each frame without a place after the first."""
+
+    fix_s: float | None
+    tracking_s: float | None
+    is_wrong: bool
+    lost_ms: tuple[float, ...]
+
+
+def without_around(loaded: LoadedMap, position_m: Array) -> LoadedMap:
+    """The map without the places within ELSEWHERE_M, and without what was seen from them alone."""
+    tiles = loaded.tiles
+    is_far = {
+        cell: np.linalg.norm(tile.map_from_cam[:, :3, 3] - position_m, axis=1) > ELSEWHERE_M
+        for cell, tile in tiles.items()
+    }
+    lists = [
+        ids
+        for cell, tile in tiles.items()
+        for ids, far in zip(tile.place_landmark_ids, is_far[cell], strict=True)
+        if far
+    ]
+    seen = np.unique(np.concatenate([np.zeros(0, np.uint32), *lists]))
+    left = {cell: part_of(tile, np.isin(tile.landmark_ids, seen), is_far[cell]) for cell, tile in tiles.items()}
+    return replace(loaded, tiles=left)
+
+
+def start(session: Session, frames: Sequence[CameraFrame], loaded: LoadedMap) -> Start:
+    """The outcome of waking up there."""
+    rectifier = Rectifier(session.nominal)
+    robot = Robot(session.nominal, rectifier, LocalizerSettings(), TrialSettings(), time.process_time)
+    robot.use(loaded)
+    truth_m = session.motion.map_from_body(np.zeros(1))[0][:3, 3]
+    fix_s = tracking_s = None
+    is_wrong, lost_ms, last_ns = False, [], 0
+    for number, frame in enumerate(frames):
+        until_ns = frame.stamp_ns + 1
+        bundle = SensorBundle(
+            frame, session.imu.between(last_ns, until_ns), list(wheel_between(session.wheel, last_ns, until_ns))
+        )
+        last_ns, outcome = until_ns, robot.handle(bundle)
+        assert outcome is not None
+        estimate, after_s = outcome.estimate, (frame.stamp_ns - frames[0].stamp_ns) * 1e-9
+        if estimate.fix is not None and fix_s is None:
+            seen_from_m = (estimate.fix.map_from_cam @ np.linalg.inv(rectifier.body_from_cam))[:3, 3]
+            fix_s = after_s if np.linalg.norm(seen_from_m - truth_m) <= WRONG_M else None
+        if estimate.status is Status.TRACKING and estimate.map_from_body is not None:
+            is_right = np.linalg.norm(estimate.map_from_body[:3, 3] - truth_m) <= WRONG_M
+            is_wrong |= not is_right
+            tracking_s = after_s if is_right and tracking_s is None else tracking_s
+        elif number:
+            lost_ms.append(1e3 * outcome.cpu_s)
+    return Start(fix_s, tracking_s, is_wrong, tuple(lost_ms))
+
+
+def figures(found: Sequence[Start], unmapped: Sequence[Start]) -> dict[str, float]:
+    """Shares over the starts."""
+
+    def in_time(seconds: Sequence[float | None]) -> float:
+        return float(np.mean([s is not None and s <= WITHIN_S for s in seconds]))
+
+    return {
+        "starts": len(found),
+        "fix_in_time_share": in_time([s.fix_s for s in found]),
+        "tracking_in_time_share": in_time([s.tracking_s for s in found]),
+        "tracking_share": float(np.mean([s.tracking_s is not None for s in found])),
+        "wrong_starts": sum(s.is_wrong for s in found),
+        "wrong_starts_unmapped": sum(s.is_wrong for s in unmapped),
+        "right_starts_unmapped": sum(s.tracking_s is not None for s in unmapped),
+    }
+
+
+def costs(lost: Sequence[Start], seen: Sequence[float | None]) -> dict[str, float | None]:
+    """CPU milliseconds of a frame of robots that search, as the reference machine would take."""
+    every = np.concatenate([s.lost_ms for s in lost])
+    percentiles = {f"p{q}_ms": float(np.percentile(every, q)) for q in (50, 99)}
+    return {key: at_reference(value, list(seen)) for key, value in percentiles.items()}
+
+
+def main() -> None:
+    """Prints the tables; writes them as JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=500)
+    parser.add_argument("--starts", type=int, default=30)
+    parser.add_argument("--pipeline", action="append", default=[], choices=list(PROMISES))
+    parser.add_argument("--work", type=Path, default=kept_folder())
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    cv2.setNumThreads(1)
+    with connected(
+        {"site": SITE, "store": surveyed(arguments.work, arguments.seed), "server": None, "robot": "bench"}
+    ) as link:
+        loaded = load_map(link.source)[0]
+    drive = prepare(Order("small-loop", seed=arguments.seed, day=_DAY, light=_LIGHT, robot=_ROBOT))
+    found: dict[str, tuple[list[Start], list[Start]]] = {name: ([], []) for name in arguments.pipeline or PROMISES}
+    lost: dict[int, list[Start]] = {1: [], _SLICES: []}
+    slow = [slowness()]
+    for number, time_s in enumerate(np.linspace(0.5, drive.motion.duration_s - 0.5, arguments.starts).tolist()):
+        session = standing(drive, time_s, number, _FOLLOWED_S)
+        frames = list(session.frames())
+        session.renderer.close()
+        rest = without_around(loaded, session.motion.map_from_body(np.zeros(1))[0][:3, 3])
+        for name, (mapped, unmapped) in found.items():
+            shown = [process_frame(frame, find_pipeline(name), number) for frame in frames]
+            mapped.append(start(session, shown, loaded))
+            unmapped.append(start(session, shown, rest))
+            print(f"{time_s:5.1f} s, {name:10} {replace(mapped[-1], lost_ms=())} {unmapped[-1].is_wrong}", flush=True)
+        lost[_SLICES].append(start(session, frames, rest) if "clean" not in found else found["clean"][1][-1])
+        localizer._SLICES_WITHOUT_POSE = 1
+        lost[1].append(start(session, frames, rest))
+        localizer._SLICES_WITHOUT_POSE = _SLICES
+        slow.append(slowness())
+    drive.renderer.close()
+    results = {name: figures(*starts) for name, starts in found.items()}
+    for name, row in results.items():
+        show_against(f"{name}, seed {arguments.seed}", row, PROMISES[name])
+    spent = {slices: costs(starts, slow) for slices, starts in lost.items()}
+    for slices, row in spent.items():
+        show_against(f"frames of a robot that searches, {slices} slices a frame", row, {})
+    write_results(arguments.out, {"figures": results, "costs": spent})
+
+
+if __name__ == "__main__":
+    main()

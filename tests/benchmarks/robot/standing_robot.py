@@ -1,0 +1,51 @@
+"""A robot that stands where a drive passes: its pictures and its other samples, with noise of its own."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from fleetsim.motion.body_motion import GRAVITY_MPS2
+from fleetsim.recorder import Session
+from fleetsim.render.renderer import RenderOptions, StereoRenderer
+from fleetsim.scenarios import find_scenario
+from fleetsim.sensors.measurements import measure_imu, measure_wheels, sample_times
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """A motion that is none; see `fleetsim.motion.body_motion.Motion`."""
+
+    map_from_standing: Array
+    duration_s: float
+
+    def map_from_body(self, times_s: Array) -> Array:
+        """(N, 4, 4), the same at all times."""
+        return np.tile(self.map_from_standing, (len(times_s), 1, 1))
+
+    def rates(self, times_s: Array) -> tuple[Array, Array]:
+        """No angular rate, and the specific force that holds the body, (N, 3) each."""
+        force = self.map_from_standing[:3, :3].T @ np.array([0.0, 0.0, GRAVITY_MPS2])
+        return np.zeros((len(times_s), 3)), np.tile(force, (len(times_s), 1))
+
+    def velocity_body(self, times_s: Array) -> Array:
+        """(N, 3) of nothing."""
+        return np.zeros((len(times_s), 3))
+
+
+def standing(drive: Session, time_s: float, number: int, duration_s: float, rate_hz: float = 15.0) -> Session:
+    """A session of the same robot that stands where the drive is at that time; its noise by the start's number.
+
+    Its pictures have threads of their own until `renderer.close`.
+    """
+    order = drive.order
+    kind, rng = find_scenario(order.scenario).run(order.robot)[1].kind, np.random.default_rng([order.seed, number])
+    motion = Standing(drive.motion.map_from_body(np.array([time_s]))[0], duration_s)
+    return replace(
+        drive,
+        motion=motion,
+        renderer=StereoRenderer(drive.world, drive.true, motion, RenderOptions(order.light, key=number)),
+        frame_times_s=tuple(float(t) for t in sample_times(duration_s, rate_hz)),
+        imu=measure_imu(motion, kind.imu, rng),
+        wheel=measure_wheels(motion, kind.body_height_m, kind.wheels, rng),
+    )
