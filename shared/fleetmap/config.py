@@ -13,6 +13,7 @@ import msgspec
 from fleetmap.errors import UsageError
 
 S = TypeVar("S", bound="Section")
+_MAX_FILE_BYTES = 1 << 20
 # By tier and section ("" is the top of the file), keys separated by spaces, or `*`.
 Tiers = Mapping[str, Mapping[str, str]]
 
@@ -47,11 +48,18 @@ def read_given(path: Path, file_type: type[Section]) -> dict[str, Any]:
 
 def _decoded(path: Path, kind: Any) -> Any:
     try:
-        return msgspec.toml.decode(path.read_bytes(), type=kind)
+        with path.open("rb") as file:
+            data = file.read(_MAX_FILE_BYTES + 1)
+        if len(data) > _MAX_FILE_BYTES:
+            raise UsageError(f"configuration file {path} has more than {_MAX_FILE_BYTES} bytes; is it another file?")
+        return msgspec.toml.decode(data, type=kind)
     except OSError as error:
         raise UsageError(f"configuration file {path} cannot be read ({error.strerror}); check the path") from error
-    except msgspec.MsgspecError as error:
-        raise UsageError(f"configuration file {path}: {error}; docs/settings.md lists the settings") from error
+    # tomllib's own errors for bytes that are no UTF-8, for impossible dates, and for deep nesting
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise UsageError(
+            f"configuration file {path}: {str(error)[:500]}; docs/settings.md lists the settings"
+        ) from error
 
 
 def settings_in(section: Section, name: str = "") -> Iterator[Setting]:

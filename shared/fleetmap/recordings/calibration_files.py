@@ -16,6 +16,7 @@ last bit.
 """
 
 import io
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +30,10 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+MAX_CALIBRATION_BYTES = 1 << 20  # a camchain of two cameras has 2 kB
+_MAX_WORD, _MAX_DEPTH, _MAX_EVENTS = 1000, 16, 20_000
+_WORDS = reprlib.Repr()
+_WORDS.maxlevel = 2
 _MODELS = {
     ("pinhole", "radial-tangential"): "radial-tangential",
     ("pinhole", "radtan"): "radial-tangential",
@@ -156,10 +161,8 @@ def matrix_4x4(value: object, where: str) -> Array:
     data = value.get("data") if isinstance(value, dict) else value
     try:
         matrix = np.array(data, dtype=np.float64).reshape(4, 4)
-    except (TypeError, ValueError):
-        raise CalibrationError(
-            f"{where}: {str(value)[:80]!r} is no 4x4 matrix; write four rows of four numbers"
-        ) from None
+    except (TypeError, ValueError, OverflowError):
+        raise CalibrationError(f"{where}: {_brief(value)} is no 4x4 matrix; write four rows of four numbers") from None
     rotation = matrix[:3, :3]
     is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=2e-3) and np.linalg.det(rotation) > 0
     if not (np.isfinite(matrix).all() and is_rotation and np.array_equal(matrix[3], [0, 0, 0, 1])):
@@ -214,7 +217,7 @@ def _imu_noise(values: Values, where: str) -> ImuNoise | None:
 
 
 def _model(camera_model: object, distortion_model: object, where: str) -> str:
-    pair = (str(camera_model).lower(), str(distortion_model).lower())
+    pair = (str(camera_model)[:80].lower(), str(distortion_model)[:80].lower())
     if pair not in _MODELS:
         known = ", ".join(f"{camera} with {lens}" for camera, lens in _MODELS)
         raise CalibrationError(
@@ -227,16 +230,16 @@ def _numbers(value: object, count: int | None, where: str) -> Array:
     try:
         # YAML 1.1 reads 1e-5 as text
         numbers = np.array([float(v) for v in value], np.float64)  # type: ignore[attr-defined]
-    except (TypeError, ValueError):
-        raise CalibrationError(f"{where}: {value!r} are not numbers") from None
+    except (TypeError, ValueError, OverflowError):
+        raise CalibrationError(f"{where}: {_brief(value)} are not numbers") from None
     if (count is not None and len(numbers) != count) or not np.isfinite(numbers).all():
-        raise CalibrationError(f"{where}: {value!r}; {count or 'finite'} numbers are expected")
+        raise CalibrationError(f"{where}: {_brief(value)}; {count or 'finite'} numbers are expected")
     return numbers
 
 
 def _need(values: Values, key: str, where: str) -> Any:
     if key not in values:
-        raise CalibrationError(f"{where}: {key} is missing; it holds {', '.join(map(str, values)) or 'nothing'}")
+        raise CalibrationError(f"{where}: {key} is missing; it holds {_brief(list(values))}")
     return values[key]
 
 
@@ -244,29 +247,58 @@ def _section(values: Values, name: str, where: str) -> Values:
     section = values[name]
     if not isinstance(section, dict):
         raise CalibrationError(
-            f"{where}: {name} is {section!r}; a mapping with camera_model, intrinsics, ... is expected"
+            f"{where}: {name} is {_brief(section)}; a mapping with camera_model, intrinsics, ... is expected"
         )
     return section
 
 
+def _brief(value: object) -> str:
+    """What a file said, in at most 80 signs."""
+    return _WORDS.repr(value)[:80]
+
+
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        with path.open("rb") as file:
+            data = file.read(MAX_CALIBRATION_BYTES + 1)
+        return data.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise CalibrationError(f"calibration file {path} cannot be read ({error}); check the path") from error
 
 
 def _parse_yaml(text: str, where: str) -> Values:
+    if len(text) > MAX_CALIBRATION_BYTES:
+        raise CalibrationError(f"{where} has more than {MAX_CALIBRATION_BYTES} bytes; a calibration has a few thousand")
     lines = text.replace("!!opencv-matrix", "").splitlines()
     if lines and lines[0].startswith("%YAML"):
         lines[0] = ""
+    plain = "\n".join(lines)
     try:
-        values = yaml.load("\n".join(lines), Loader=_LOADER)
-    except yaml.YAMLError as error:
-        raise CalibrationError(f"{where} is not YAML ({' '.join(str(error).split())}); check the file") from error
-    if not isinstance(values, dict):
-        raise CalibrationError(f"{where} holds {str(values)[:60]!r}; a calibration is a mapping of names to values")
+        _check_events(plain, where)
+        values = yaml.load(plain, Loader=_LOADER)
+    # The loader's own constructors raise ValueError for 2026-02-30.
+    except (yaml.YAMLError, ValueError) as error:
+        raise CalibrationError(f"{where} is not YAML ({' '.join(str(error).split())[:200]}); check the file") from error
+    if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
+        raise CalibrationError(f"{where} holds {_brief(values)}; a calibration is a mapping of names to values")
     return values
+
+
+def _check_events(text: str, where: str) -> None:
+    """CalibrationError for what no calibration has and what is dear to load: aliases, tags, deep nesting, long words."""
+    depth = 0
+    for count, event in enumerate(yaml.parse(text, Loader=_LOADER)):
+        if count > _MAX_EVENTS:
+            raise CalibrationError(f"{where} holds more than {_MAX_EVENTS} values; a calibration has some hundred")
+        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
+            raise CalibrationError(f"{where} uses YAML's aliases (& and *); write the values out")
+        if (tag := getattr(event, "tag", None)) is not None:
+            raise CalibrationError(f"{where} uses the YAML tag {_brief(tag)}; write plain values")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _MAX_DEPTH:
+            raise CalibrationError(f"{where} is nested deeper than {_MAX_DEPTH} levels; check the file")
+        if isinstance(event, yaml.ScalarEvent) and len(event.value) > _MAX_WORD:
+            raise CalibrationError(f"{where} holds a value of {len(event.value)} signs; the limit is {_MAX_WORD}")
 
 
 def _row(values: Array) -> str:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import AnyArray
+from fleetmap.recordings.image_header import image_size
 from fleetmap.sensors.samples import CameraFrame, Image
 
 RAW_ENCODINGS = {
@@ -29,6 +30,7 @@ _GREY_FROM = {
     "rgba8": cv2.COLOR_RGBA2GRAY,
     "bgra8": cv2.COLOR_BGRA2GRAY,
 }
+MAX_PIXELS = 64_000_000  # the largest sensors of machine vision have 150, those of robots 5
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 # Images with sensor noise have no repetitions worth a search: run-length coding is faster and, measured, smaller.
 _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
@@ -155,6 +157,9 @@ def _decode(stored: StoredImage) -> AnyArray:
             f"{stored.where}: {len(stored.data)} bytes for {stored.width_px}x{stored.height_px} {stored.encoding} in "
             f"rows of {step} bytes; the message is damaged"
         )
+    _check_size(stored.width_px, stored.height_px, stored.where)
+    if stored.height_px == 1:
+        step = row_bytes  # nothing says how long the only row is
     padded = stored.data[: step * stored.height_px].ljust(step * stored.height_px, b"\0")
     rows = np.frombuffer(padded, np.uint8).reshape(stored.height_px, step)[:, :row_bytes]
     pixels: AnyArray = np.ascontiguousarray(rows).view(wire_type).astype(dtype, copy=False)
@@ -171,9 +176,21 @@ def _decode_file(stored: StoredImage) -> AnyArray:
         raise RecordingError(
             f"{stored.where}: the {kind} image is cut off after {len(data)} bytes; remove it from the recording"
         )
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    size = image_size(data)
+    if size is not None:
+        _check_size(*size, stored.where)
+    pixels = None if size is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise RecordingError(
-            f"{stored.where}: {len(data)} bytes that OpenCV cannot read as an image; remove it from the recording"
+            f"{stored.where}: {len(data)} bytes that cannot be read as an image (JPEG, PNG, TIFF, BMP, PNM); "
+            "remove it from the recording"
         )
     return np.asarray(pixels)
+
+
+def _check_size(width_px: int, height_px: int, where: str) -> None:
+    if width_px * height_px > MAX_PIXELS:
+        raise RecordingError(
+            f"{where}: an image of {width_px}x{height_px}; the limit is {MAX_PIXELS // 1_000_000} megapixels, "
+            "remove it from the recording"
+        )

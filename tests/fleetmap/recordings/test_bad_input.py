@@ -95,7 +95,7 @@ def test_cut_image_is_refused_instead_of_filled_with_grey(tmp_path: Path, image_
 
 def test_image_that_is_none(euroc: Path) -> None:
     (euroc / "mav0/cam0/data/image2.png").write_bytes(b"this is no image at all")
-    with pytest.raises(RecordingError, match=r"image2\.png.*cannot read as an image"):
+    with pytest.raises(RecordingError, match=r"image2\.png.*cannot be read as an image"):
         open_recording(euroc).read_frame(2)
 
 

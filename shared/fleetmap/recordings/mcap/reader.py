@@ -185,6 +185,7 @@ def _collect(scan: McapScan, topics: Topics) -> dict[int, _Stream]:
         if type_name(channel) not in IMAGE_TYPES:
             # Lenses repeat with every image, one is enough
             if not (stream.messages and _is_lens(channel)):
+                scan.keep(len(data))
                 stream.messages.append(bytes(data))
             continue
         try:
@@ -192,6 +193,7 @@ def _collect(scan: McapScan, topics: Topics) -> dict[int, _Stream]:
         except ValueError:
             stream.damaged += 1
             continue
+        scan.keep(0)
         stream.stamps_ns.append(stamp_ns)
         stream.locations.append(location)
     return streams

@@ -1,11 +1,13 @@
 """Walks through an MCAP file as far as it is whole, with or without its index, chunked or not.
 
 Written for files that recorders left behind at a power loss: what does not fit is noted as a DataIssue, and where the
-file still has its index the walk goes on at the next chunk. Source of the layout: the MCAP specification (mcap.dev/spec).
+file still has its index the walk goes on at the next chunk. Files may be hostile: sizes are compared with limits before
+anything is read or unpacked. Source of the layout: the MCAP specification (mcap.dev/spec).
 """
 
 import struct
 import zlib
+from bisect import bisect_right
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +24,14 @@ _ATTACHMENT, _METADATA, _DATA_END = 9, 12, 15
 _RECORD_HEAD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _FOOTER_BYTES = 9 + 20 + len(MAGIC)
-_LARGEST_CHUNK_BYTES = 1 << 31
+_LARGEST_RECORD_BYTES = 1 << 31  # beyond it the bytes are no record at all
+MAX_CHUNK_BYTES = 64 << 20  # one raw image of 64 megapixels; recorders write chunks of 1 to 4 MiB
+MAX_ATTACHMENT_BYTES = 16 << 20
+_MAX_RECORD_BYTES = MAX_CHUNK_BYTES + (64 << 10)  # a chunk that is not compressed, with its head
+# What is kept of a file beside its images (schemas, metadata, IMU and the rest), by the size of the file. Messages of zeros are
+# the limit: zstd makes 1 of 8 bytes of recorded odometry, which is mostly empty covariances, and 1 of 30,000 zeros.
+_KEPT_BYTES, _KEPT_PER_FILE_BYTE = 64 << 20, 32
+_KEPT_RECORD_BYTES = 256  # of a record's place, stamp and object in memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +73,7 @@ class Damage:
     bad_chunks: int = 0
     bad_chunk_bytes: int = 0
     first_bad_chunk_at: int = -1
+    too_large: int = 0
 
     def chunk(self, at: int, size: int) -> None:
         """One chunk that is not what it was when it was written."""
@@ -73,12 +83,15 @@ class Damage:
 
     def all(self) -> list[DataIssue]:
         """Everything in words."""
-        if not self.bad_chunks:
-            return self.issues
-        detail = (
-            f"{self.bad_chunks} with {self.bad_chunk_bytes} bytes left out, the first at byte {self.first_bad_chunk_at}"
-        )
-        return [*self.issues, DataIssue("damaged chunks (checksum or compression)", detail)]
+        found = list(self.issues)
+        if self.too_large:
+            limits = f"{MAX_CHUNK_BYTES >> 20} MiB in a chunk, {MAX_ATTACHMENT_BYTES >> 20} MiB in an attachment"
+            found.append(DataIssue("records that are too large", f"{self.too_large} left out; the limits are {limits}"))
+        if self.bad_chunks:
+            detail = f"{self.bad_chunks} with {self.bad_chunk_bytes} bytes left out"
+            where = f"{detail}, the first at byte {self.first_bad_chunk_at}"
+            found.append(DataIssue("damaged chunks (checksum or compression)", where))
+        return found
 
 
 class McapScan:
@@ -92,7 +105,19 @@ class McapScan:
         self.metadata: dict[str, dict[str, str]] = {}
         self.damage = Damage()
         self._schemas: dict[int, Schema] = {}
+        self._chunk_starts: list[int] | None = None
+        self._kept_bytes = 0
         self._has_ended = False
+
+    def keep(self, size: int) -> None:
+        """Counts a record of `size` bytes that stays in memory; RecordingError where the file unpacks to more than a recording can."""
+        self._kept_bytes += size + _KEPT_RECORD_BYTES
+        limit = _KEPT_BYTES + _KEPT_PER_FILE_BYTE * self.size
+        if self._kept_bytes > limit:
+            raise RecordingError(
+                f"{self.path}: {self.size} bytes unpack to more than {limit} bytes beside the images; no recorder writes "
+                "that, leave the file out"
+            )
 
     def messages(self) -> Iterator[Message]:
         """Channel, log time in ns, place and bytes of every message that is whole, in file order."""
@@ -126,7 +151,7 @@ class McapScan:
             return None
         opcode, length = _RECORD_HEAD.unpack(head)
         start, rest = at + len(head), self.size - at - len(head)
-        if not _HEADER <= opcode < 0x80 or length > _LARGEST_CHUNK_BYTES:
+        if not _HEADER <= opcode < 0x80 or length > _LARGEST_RECORD_BYTES:
             self._note("not an MCAP record", f"{rest} bytes from byte {at} on are not readable in sequence")
             return None
         if length > rest:
@@ -135,10 +160,12 @@ class McapScan:
                 f"{length - rest} of {length} bytes of the record at byte {at} are missing",
             )
             if opcode == _CHUNK:
-                yield from self._chunk(start, self._file.read(rest), is_cut=True)
+                yield from self._chunk(start, self._file.read(min(rest, _MAX_RECORD_BYTES)), is_cut=True)
             return None
         if opcode in (_DATA_END, _FOOTER):
             self._has_ended = True
+        elif length > (MAX_ATTACHMENT_BYTES if opcode == _ATTACHMENT else _MAX_RECORD_BYTES):
+            self.damage.too_large += 1
         elif opcode == _CHUNK:
             yield from self._chunk(start, self._file.read(length), is_cut=False)
         elif opcode in (_SCHEMA, _CHANNEL, _MESSAGE, _ATTACHMENT, _METADATA):
@@ -158,6 +185,11 @@ class McapScan:
             if is_cut:
                 records = packed
             else:
+                if packed_size > len(packed):
+                    raise ValueError("the chunk holds more than its record")
+                if uncompressed_size > MAX_CHUNK_BYTES:
+                    self.damage.too_large += 1
+                    return
                 records = memoryview(decompress(compression, packed[:packed_size], uncompressed_size))
                 if len(records) != uncompressed_size or (crc and zlib.crc32(records) != crc):
                     raise ValueError("checksum")
@@ -196,6 +228,7 @@ class McapScan:
                 self._read_attachment(content)
             elif opcode == _METADATA:
                 name, at = _text(content, 0)
+                self.keep(4 * len(content))
                 self.metadata[name] = _text_map(content, at)
         except (struct.error, ValueError) as error:
             self._note("a damaged record", f"kind {opcode} at byte {location.at}: {error}")
@@ -205,12 +238,14 @@ class McapScan:
         name, at = _text(content, 2)
         encoding, at = _text(content, at)
         (length,) = struct.unpack_from("<I", content, at)
+        self.keep(len(content))
         self._schemas.setdefault(schema_id, Schema(name, encoding, bytes(content[at + 4 : at + 4 + length])))
 
     def _read_channel(self, content: memoryview) -> None:
         channel_id, schema_id = struct.unpack_from("<HH", content)
         topic, at = _text(content, 4)
         encoding, _ = _text(content, at)
+        self.keep(len(content))
         schema = self._schemas.get(schema_id, Schema("", "", b""))
         self.channels.setdefault(channel_id, Channel(channel_id, topic, encoding, schema))
 
@@ -221,27 +256,34 @@ class McapScan:
         data = bytes(content[at + 8 : at + 8 + length])
         (crc,) = struct.unpack_from("<I", content, at + 8 + length)
         if crc and zlib.crc32(content[: at + 8 + length]) != crc:
-            raise ValueError(f"the attachment {name!r} fails its checksum")
+            raise ValueError(f"the attachment {name[:80]!r} fails its checksum")
+        self.keep(length)
         self.attachments[name] = data
 
     def _next_indexed_chunk(self, after: int) -> int | None:
         """Start of the first chunk behind `after`, by the index at the file's end; None without one."""
+        if self._chunk_starts is None:
+            self._chunk_starts = sorted(self._indexed_chunks())
+        behind = bisect_right(self._chunk_starts, after)
+        return self._chunk_starts[behind] if behind < len(self._chunk_starts) else None
+
+    def _indexed_chunks(self) -> Iterator[int]:
         self._file.seek(max(0, self.size - _FOOTER_BYTES))
-        tail = self._file.read()
+        tail = self._file.read(_FOOTER_BYTES)
         if len(tail) < _FOOTER_BYTES or tail[0] != _FOOTER or not tail.endswith(MAGIC):
-            return None
+            return
         (summary_at,) = struct.unpack_from("<Q", tail, 9)
-        if not 0 < summary_at < self.size:
-            return None
-        self._file.seek(summary_at)
-        summary, position, found = self._file.read(), 0, []
-        while position + _RECORD_HEAD.size <= len(summary):
-            opcode, length = _RECORD_HEAD.unpack_from(summary, position)
-            if opcode == _CHUNK_INDEX and length >= 24:
-                found.append(struct.unpack_from("<Q", summary, position + _RECORD_HEAD.size + 16)[0])
-            position += _RECORD_HEAD.size + length
-        later = [int(chunk_at) for chunk_at in found if after < chunk_at < summary_at]
-        return min(later, default=None)
+        at = summary_at
+        while 0 < at <= self.size - _RECORD_HEAD.size:
+            self._file.seek(at)
+            head = self._file.read(_RECORD_HEAD.size + 24)
+            opcode, length = _RECORD_HEAD.unpack_from(head)
+            if opcode == _CHUNK_INDEX and length >= 24 and len(head) == _RECORD_HEAD.size + 24:
+                (chunk_at,) = struct.unpack_from("<Q", head, _RECORD_HEAD.size + 16)
+                if chunk_at < summary_at:
+                    self.keep(0)
+                    yield chunk_at
+            at += _RECORD_HEAD.size + length
 
     def _note(self, what: str, detail: str) -> None:
         if len(self.damage.issues) < 20:
@@ -249,21 +291,26 @@ class McapScan:
 
 
 def decompress(compression: str, packed: memoryview, uncompressed_size: int) -> bytes:
-    """The records of a chunk; ValueError for what cannot be decompressed."""
+    """The records of a chunk, at most one byte more than `uncompressed_size`; ValueError for what cannot be decompressed.
+
+    Never more than that is unpacked, whatever the compressed bytes say of themselves.
+    """
+    if uncompressed_size > MAX_CHUNK_BYTES:
+        raise ValueError(f"a chunk of {uncompressed_size} bytes; the limit is {MAX_CHUNK_BYTES}")
     if compression == "":
         return bytes(packed)
-    if uncompressed_size > _LARGEST_CHUNK_BYTES:
-        raise ValueError(f"a chunk of {uncompressed_size} bytes")
     if compression == "zstd":
-        return zstandard.ZstdDecompressor().decompress(packed, uncompressed_size)
+        unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES)
+        with unpacker.stream_reader(packed) as reader:
+            return bytes(reader.read(uncompressed_size + 1))
     if compression == "lz4":
-        import lz4.frame  # type: ignore[import-untyped]
+        from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 
         try:
-            return bytes(lz4.frame.decompress(packed))
+            return bytes(LZ4FrameDecompressor().decompress(packed, max_length=uncompressed_size + 1))
         except RuntimeError as error:
             raise ValueError(str(error)) from error
-    raise ValueError(f"chunk compression {compression!r} is not known; known are zstd, lz4 and none")
+    raise ValueError(f"chunk compression {compression[:80]!r} is not known; known are zstd, lz4 and none")
 
 
 class MessageReader:
@@ -294,7 +341,9 @@ class MessageReader:
             (packed_size,) = struct.unpack("<Q", self._file.read(8))
             while len(self._chunks) >= self._KEPT_CHUNKS:
                 del self._chunks[next(iter(self._chunks))]
-            self._chunks[at] = decompress(compression, memoryview(self._file.read(packed_size)), uncompressed_size)
+            self._chunks[at] = decompress(
+                compression, memoryview(self._file.read(min(packed_size, _MAX_RECORD_BYTES))), uncompressed_size
+            )
         return self._chunks[at]
 
 

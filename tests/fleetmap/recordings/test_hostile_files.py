@@ -1,0 +1,331 @@
+"""Files that are made to take a machine down: refused by what their headers say, within the project's own errors.
+
+Each has its control: what the undefended library does with the same bytes. Rows 25, 26 and 27 of docs/security.md.
+"""
+
+import struct
+import time
+import zlib
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import lz4.frame
+import numpy as np
+import pytest
+import yaml
+import zstandard
+
+from fleetmap.config import load_toml
+from fleetmap.errors import CalibrationError, RecordingError, UsageError
+from fleetmap.recordings import OpenOptions, open_recording
+from fleetmap.recordings.calibration_files import MAX_CALIBRATION_BYTES, parse_calibration, read_yaml
+from fleetmap.recordings.image_header import image_size
+from fleetmap.recordings.images import MAX_PIXELS, StoredImage, decode_grey
+from fleetmap.recordings.mcap.scan import MAGIC, MAX_ATTACHMENT_BYTES, MAX_CHUNK_BYTES, McapScan, decompress
+from mapserver.config import MapserverConfig
+from support.recordings.mcap_samples import foreign_messages, write_foreign
+from support.storage.memory_limit import memory_at_most
+
+BOMB_BYTES = 512 << 20
+MEMORY = 320 << 20
+_PIECE = bytes(1 << 20)
+
+
+@cache
+def zstd_bomb() -> bytes:
+    """A frame that does not say how much it unpacks to."""
+    packer = zstandard.ZstdCompressor(level=1).compressobj()
+    return b"".join([*(packer.compress(_PIECE) for _ in range(BOMB_BYTES >> 20)), packer.flush()])
+
+
+@cache
+def lz4_bomb() -> bytes:
+    packer = lz4.frame.LZ4FrameCompressor()
+    return b"".join([packer.begin(), *(packer.compress(_PIECE) for _ in range(BOMB_BYTES >> 20)), packer.flush()])
+
+
+BOMBS = {"zstd": zstd_bomb, "lz4": lz4_bomb}
+
+
+def undefended(kind: str, packed: bytes) -> int:
+    """The bytes that the library unpacks where nobody limits it."""
+    if kind == "lz4":
+        return len(lz4.frame.decompress(packed))
+    return len(zstandard.ZstdDecompressor().decompressobj().decompress(packed))
+
+
+def record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def chunk(compression: str, packed: bytes, uncompressed_size: int) -> bytes:
+    head = struct.pack("<QQQI", 0, 0, uncompressed_size, 0) + struct.pack("<I", len(compression)) + compression.encode()
+    return record(6, head + struct.pack("<Q", len(packed)) + packed)
+
+
+def footer() -> bytes:
+    return record(15, bytes(4)) + record(2, bytes(20)) + MAGIC
+
+
+def with_bomb(tmp_path: Path, bomb: bytes) -> Path:
+    """A sound recording with `bomb` put in before its first record."""
+    sound = write_foreign(tmp_path / "sound.mcap", foreign_messages()).read_bytes()
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(sound[: len(MAGIC)] + bomb + sound[len(MAGIC) :])
+    return path
+
+
+@pytest.mark.parametrize("kind", BOMBS)
+@pytest.mark.parametrize("stated", [BOMB_BYTES, 100])
+def test_a_chunk_unpacks_to_no_more_than_its_limit(tmp_path: Path, kind: str, stated: int) -> None:
+    packed = BOMBS[kind]()
+    assert len(packed) < BOMB_BYTES >> 7
+    with memory_at_most(MEMORY):
+        with open_recording(with_bomb(tmp_path, chunk(kind, packed, stated))) as recording:
+            assert len(recording) == 4, "what is sound behind it is read"
+            issues = recording.issues
+        with pytest.raises((MemoryError, RuntimeError)):  # the control; lz4 cannot resize its buffer
+            undefended(kind, packed)
+    what = "too large" if stated > MAX_CHUNK_BYTES else "damaged chunks"
+    assert any(what in issue.what for issue in issues)
+
+
+def test_a_chunk_of_the_largest_size_is_read() -> None:
+    data = bytes(MAX_CHUNK_BYTES)
+    assert decompress("zstd", memoryview(zstandard.compress(data, 1)), MAX_CHUNK_BYTES) == data
+    assert decompress("lz4", memoryview(lz4.frame.compress(data)), MAX_CHUNK_BYTES) == data
+    with pytest.raises(ValueError, match="limit"):
+        decompress("zstd", memoryview(b""), MAX_CHUNK_BYTES + 1)
+
+
+def test_a_frame_that_lies_about_its_size_gets_no_memory() -> None:
+    said = zstandard.ZstdCompressionParameters.from_level(1, window_log=20)
+    lying = bytearray(zstandard.ZstdCompressor(compression_params=said).compress(bytes(200_000)))
+    assert lying[4] & 0xC0, "the frame states its content's size behind the head"
+    lying[6:10] = struct.pack("<I", 0xFFFFFFF0)
+    with memory_at_most(MEMORY):
+        with pytest.raises((MemoryError, zstandard.ZstdError)):
+            zstandard.ZstdDecompressor().decompress(bytes(lying), 100)
+        assert len(decompress("zstd", memoryview(bytes(zstandard.compress(bytes(1 << 20)))), 100)) <= 101
+
+
+def test_many_chunks_that_each_obey_do_not_add_up(tmp_path: Path) -> None:
+    """IMU messages of zeros: each chunk is within its limit, all of them together would fill the memory."""
+    schema = record(3, struct.pack("<H", 1) + b"".join(_text(t) for t in ("sensor_msgs/msg/Imu", "ros2msg", "")))
+    channel = record(4, struct.pack("<HH", 1, 1) + _text("/imu") + _text("cdr") + struct.pack("<I", 0))
+    message = record(5, struct.pack("<HIQQ", 1, 0, 1, 1) + bytes(1 << 20))
+    content = message * 60
+    packed = zstandard.compress(content, 1)
+    path = tmp_path / "many.mcap"
+    path.write_bytes(MAGIC + schema + channel + 40 * chunk("zstd", packed, len(content)) + footer())
+    assert path.stat().st_size < 1_000_000
+    with memory_at_most(MEMORY + (128 << 20)):
+        with pytest.raises(RecordingError, match=r"many\.mcap: \d+ bytes unpack to more than"):
+            open_recording(path)
+        with pytest.raises(MemoryError), path.open("rb") as file:  # the control: a reader that keeps what it is given
+            _ = [bytes(data) for *_, data in McapScan(path, file).messages()]
+
+
+def _text(text: str) -> bytes:
+    return struct.pack("<I", len(text)) + text.encode()
+
+
+def test_records_are_measured_before_they_are_read(tmp_path: Path) -> None:
+    """A sparse file: 3 GB of zeros that take no disk."""
+    for opcode, size in ((9, MAX_ATTACHMENT_BYTES + 1), (5, 1 << 30), (6, 1 << 30), (12, 1 << 30)):
+        sound = write_foreign(tmp_path / "sound.mcap", foreign_messages()).read_bytes()
+        path = tmp_path / f"sparse-{opcode}.mcap"
+        with path.open("wb") as file:
+            file.write(MAGIC + struct.pack("<BQ", opcode, size))
+            file.seek(size, 1)
+            file.write(sound[len(MAGIC) :])
+        with memory_at_most(MEMORY), open_recording(path) as recording:
+            assert len(recording) == 4
+        assert any("1 left out" in issue.detail for issue in recording.issues if "too large" in issue.what)
+        if size == 1 << 30:
+            with memory_at_most(MEMORY), pytest.raises(MemoryError), path.open("rb") as file:
+                file.read(size)  # the control
+
+
+def test_an_index_that_points_at_the_whole_file_is_not_read_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "sparse.mcap"
+    with path.open("wb") as file:
+        file.write(MAGIC + b"\xff" * 9)
+        file.seek(1 << 30, 1)
+        file.write(record(2, struct.pack("<QQI", 8, 0, 0)) + MAGIC)
+    with memory_at_most(MEMORY), pytest.raises(RecordingError, match="no message that can be read"):
+        open_recording(path)
+
+
+# ------------------------------------------------------------------------------------------------------------- calibration
+
+
+def aliases(levels: int) -> str:
+    return "a0: &a0 [x]\n" + "".join(f"a{n}: &a{n} [{','.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, levels + 1))
+
+
+def test_nine_levels_of_aliases_are_refused_at_once() -> None:
+    text = aliases(9) + "cam0: {camera_model: pinhole, resolution: [4, 4], intrinsics: *a9}\n"
+    assert len(text) < 700
+    begun = time.process_time()
+    with pytest.raises(CalibrationError, match="aliases") as caught:
+        parse_calibration(text, "file")
+    assert time.process_time() - begun < 0.1
+    assert len(str(caught.value)) < 200
+    # The control: what the value says grows tenfold with every level.
+    sizes = [len(str(yaml.safe_load(aliases(levels))[f"a{levels}"])) for levels in (3, 4, 5)]
+    assert sizes[2] > 9 * sizes[1] > 80 * sizes[0]
+
+
+HOSTILE_YAML: dict[str, Any] = {
+    "a day that is none": "date: 2026-02-30",
+    "a tag": "cam0: !!int x",
+    "a tag of Python": "cam0: !!python/object/apply:os.system [true]",
+    "itself": "cam0: &a [*a]",
+    "nesting": "cam0: " + "[" * 100_000,
+    "nesting that ends": "cam0: " + "[" * 3000 + "]" * 3000,
+    "a number of 5000 digits": "cam0: " + "9" * 5000,
+    "a sexagesimal": "cam0: 1" + ":1" * 200_000,
+    "keys that are numbers": "1: 2",
+    "keys that are lists": "? [1]\n: 2",
+    "a merge of nothing": "<<: 3",
+    "a number beyond floats": "cam0: {camera_model: pinhole, resolution: [1"
+    + "0" * 400
+    + ", 4], intrinsics: [1, 1, 1, 1]}",
+    "many words": "cam0: {camera_model: pinhole, resolution: [" + "x, " * 100_000 + "], intrinsics: [1, 1, 1, 1]}",
+    "many keys": "cam0: {" + "".join(f"k{n}: 1, " for n in range(50_000)) + "}",
+    "a model of a kilobyte": "cam0: {camera_model: " + "x" * 900 + ", resolution: [4, 4]}",
+    "a file of two megabytes": "#" * (2 << 20),
+    "bytes that are no text": b"cam0: \xff\xfe",
+    "no mapping": "[" + "1," * 200_000 + "]",
+}
+
+
+@pytest.mark.parametrize("what", HOSTILE_YAML)
+def test_hostile_calibrations_get_a_short_error_of_ours(tmp_path: Path, what: str) -> None:
+    content = HOSTILE_YAML[what]
+    path = tmp_path / "camchain.yaml"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    recording = write_foreign(tmp_path / "sound.mcap", foreign_messages())
+    begun = time.process_time()
+    with pytest.raises(CalibrationError) as caught:
+        open_recording(recording, OpenOptions(calibration_file=path))
+    assert time.process_time() - begun < 2.0
+    assert len(str(caught.value)) < 600 + len(str(path))
+
+
+def test_the_loader_itself_raises_errors_of_python() -> None:
+    """The control of the above: why the events are looked at, and ValueError is caught."""
+    for text in ("date: 2026-02-30", "cam0: !!int x"):
+        with pytest.raises(ValueError, match=r"day|invalid"):
+            yaml.load(text, Loader=yaml.CSafeLoader)
+    assert isinstance(yaml.load("a: &a [*a]", Loader=yaml.CSafeLoader)["a"][0], list)
+
+
+def test_no_more_of_a_file_is_read_than_a_calibration_may_have(tmp_path: Path) -> None:
+    path = tmp_path / "sparse.yaml"
+    with path.open("wb") as file:
+        file.truncate(1 << 40)
+    with memory_at_most(MEMORY):
+        with pytest.raises(CalibrationError, match=str(MAX_CALIBRATION_BYTES)):
+            read_yaml(path)
+        with pytest.raises((MemoryError, OverflowError, OSError)):
+            path.read_text()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"site = '\xff'",
+        b"x = " + b"[" * 100_000,
+        b"x = 2026-02-30",
+        b"x = " + b"[" * 5000 + b"]" * 5000,
+        b" " * (2 << 20),
+    ],
+)
+def test_hostile_settings_get_an_error_of_ours(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "mapserver.toml"
+    path.write_bytes(content)
+    with pytest.raises(UsageError, match=r"mapserver\.toml") as caught:
+        load_toml(path, MapserverConfig)
+    assert len(str(caught.value)) < 800
+
+
+# ------------------------------------------------------------------------------------------------------------------ images
+
+
+def png_claiming(width: int, height: int) -> bytes:
+    def part(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    row = zlib.compress(bytes(100_000), 1)
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", header) + part(b"IDAT", row) + part(b"IEND", b"")
+
+
+def encoded(suffix: str, width: int, height: int) -> bytes:
+    return cv2.imencode(suffix, np.zeros((height, width), np.uint8))[1].tobytes()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff", ".bmp", ".pgm"])
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (321, 123), (3000, 7)])
+def test_the_header_says_what_opencv_decodes(suffix: str, width: int, height: int) -> None:
+    data = encoded(suffix, width, height)
+    assert image_size(data) == (width, height)
+    assert decode_grey(StoredImage("file", data)).shape == (height, width)
+    for cut in range(0, min(len(data), 60)):
+        assert image_size(data[:cut]) in (None, (width, height))
+
+
+def test_a_picture_of_900_megapixels_is_not_decoded() -> None:
+    bomb = png_claiming(30_000, 30_000)
+    assert len(bomb) < 1000
+    with memory_at_most(MEMORY):
+        with pytest.raises(RecordingError, match="30000x30000; the limit is 64 megapixels"):
+            decode_grey(StoredImage("file", bomb, "picture"))
+        with pytest.raises((cv2.error, MemoryError)):  # the control: OpenCV asks for 900 MB
+            cv2.imdecode(np.frombuffer(bomb, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".tiff", ".bmp", ".pgm"])
+def test_other_formats_are_measured_as_well(suffix: str) -> None:
+    data = bytearray(encoded(suffix, 321, 123))
+    if suffix == ".jpg":
+        at = data.index(b"\xff\xc0") + 5
+        data[at : at + 4] = struct.pack(">HH", 60_000, 60_000)
+    elif suffix == ".bmp":
+        data[18:26] = struct.pack("<ii", 60_000, -60_000)
+    elif suffix == ".pgm":
+        data = bytearray(bytes(data).replace(b"321 123", b"60000 60000"))
+    else:
+        (at,) = struct.unpack_from("<I", data, 4)
+        (count,) = struct.unpack_from("<H", data, at)
+        for entry in range(at + 2, at + 2 + 12 * count, 12):
+            if struct.unpack_from("<H", data, entry)[0] in (256, 257):
+                struct.pack_into("<HII", data, entry + 2, 4, 1, 60_000)
+    with pytest.raises(RecordingError, match="60000x60000"):
+        decode_grey(StoredImage("file", bytes(data)))
+
+
+def test_formats_that_nobody_measures_are_refused() -> None:
+    webp = encoded(".webp", 4, 4)
+    assert cv2.imdecode(np.frombuffer(webp, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (4, 4)
+    with pytest.raises(RecordingError, match="cannot be read as an image"):
+        decode_grey(StoredImage("file", webp))
+
+
+def test_raw_images_claim_no_more_than_they_bring() -> None:
+    with memory_at_most(MEMORY):
+        for height, step in ((1, 0xFFFFFFFF), (2, 0xFFFFFFFF), (0xFFFFFFFF, 4)):
+            stored = StoredImage("mono8", bytes(16), "image", 4, height, step)
+            if height == 1:
+                assert decode_grey(stored).shape == (1, 4)
+            else:
+                with pytest.raises(RecordingError, match="damaged"):
+                    decode_grey(stored)
+        with pytest.raises(MemoryError):
+            bytes(16).ljust(0xFFFFFFFF, b"\0")
+    with pytest.raises(RecordingError, match="limit"):
+        decode_grey(StoredImage("mono8", bytes(MAX_PIXELS + 8), "image", 8, MAX_PIXELS // 8 + 1, 8))
