@@ -220,7 +220,10 @@ class Localizer:
             result: _QueryResult = done.value._replace(fix_stamp_ns=self._query_frame.stamp_ns)
             self._work = self._query_frame = None
             if self._relocalizer is not None and self._query_input is not None and self._query_features is not None:
-                looked = FinishedQuery(*self._query_input, self._query_features, result.fix, self._relocalizer)
+                is_confirmed = self._confirmed is not None
+                looked = FinishedQuery(
+                    *self._query_input, self._query_features, result.fix, self._relocalizer, is_confirmed
+                )
                 self._calibration.add(looked)
             self._failed_queries = 0 if result.fix is not None else self._failed_queries + 1
             return result

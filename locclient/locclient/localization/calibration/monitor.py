@@ -27,17 +27,19 @@ _ORDER_CORNERS = 500
 
 @dataclass(frozen=True)
 class FinishedQuery:
-    """A look at the map that has ended, with or without a fix."""
+    """A look at the map that has ended, with or without a fix; whether the pose is confirmed."""
 
     frame: RectifiedFrame
     odometry: OdometryEstimate
     features: FrameFeatures
     fix: Fix | None
     relocalizer: Relocalizer
+    is_confirmed: bool
 
 
 class CalibrationMonitor:
-    """Holds what the localizer need not know of the watch. Its work is done in slices, in frames after the one that it is about."""
+    """Holds what the localizer need not know of the watch. Its work is done in slices, in frames after the one that it is about; but that
+    of the first confirmed pose is done at once, before it is published."""
 
     def __init__(self, rig: Mounting, settings: RelocalizerSettings, imu_minus_cam_s: float = 0.0) -> None:
         self._rig, self._settings = rig, settings
@@ -60,6 +62,8 @@ class CalibrationMonitor:
         """Takes a finished look at the map; a frame that agrees with nothing in it is looked for without its depth, from time to time."""
         if query.fix is not None:
             self._job = self._view(query)
+            if query.is_confirmed and not self.watch.has_confirmed:
+                self.work()
         elif self._job is None and query.frame.right is not None:
             stamp_ns = query.odometry.stamp_ns
             if self._searched_ns is None or (stamp_ns - self._searched_ns) * 1e-9 >= _WITHOUT_DEPTH_S:
@@ -76,7 +80,8 @@ class CalibrationMonitor:
         self._job = None
 
     def judged(self, estimate: Estimate, last_fix_ns: int | None, *, was_localized: bool) -> Estimate:
-        """The estimate with what is known of the calibration: where that is wrong, not TRACKING, and with a wider covariance.
+        """The estimate with what is known of the calibration: where that is wrong, not TRACKING, and with a wider covariance; with that
+        also where it may be wrong by more than may pass.
 
         last_fix_ns: of a confirmed pose. One that no fix holds is not published then, since the odometry is as wrong as the cameras.
         """
@@ -84,7 +89,7 @@ class CalibrationMonitor:
         if is_reversed:
             state = CalibrationState(text=REVERSED_TEXT)
         if not state.is_wrong:
-            return replace(estimate, calibration=state)
+            return replace(estimate, calibration=state, cov_rot_trans=self._widened(estimate, state))
         status = Status.DEGRADED if estimate.status is Status.TRACKING else estimate.status
         cause = Cause.CALIBRATION if estimate.cause in {Cause.NONE, Cause.UNMATCHED} else estimate.cause
         estimate = replace(estimate, status=status, cause=cause, calibration=state)
@@ -96,13 +101,13 @@ class CalibrationMonitor:
 
     def _widened(self, estimate: Estimate, state: CalibrationState) -> Array | None:
         covariance, map_from_body = estimate.cov_rot_trans, estimate.map_from_body
-        if covariance is None or map_from_body is None:
+        if covariance is None or map_from_body is None or state.cov_bias_cam is None:
             return covariance
         return covariance + state.cov_bias(map_from_body @ se3_inverse(self._rig.cam_from_body), map_from_body)
 
     def _view(self, query: FinishedQuery) -> TimeSliced[None]:
         assert query.fix is not None
-        self.watch.handle(MapQuery(query.frame, query.odometry, query.fix, query.relocalizer.view))
+        self.watch.handle(MapQuery(query.frame, query.odometry, query.fix, query.relocalizer.view, query.is_confirmed))
         yield
 
     def _search(self, query: FinishedQuery) -> TimeSliced[None]:

@@ -10,7 +10,8 @@ from locclient.localization.pose_covariance import transport_cov
 DRIFT_SIGMAS = 5.0
 """Of a parameter's sigma, beyond which it has drifted: p = 6e-7 for one test. Ten parameters and three windows, corrected for by
 Bonferroni's inequality, make at most 1.8e-5 for each independent window, some 30 m of driving: 3.3 % for a robot-day of 57 km, if the
-errors are normally distributed. That the drift must also be large makes it less."""
+errors are normally distributed. That the drift must also be large makes it less. The first view of a start is judged alone, by the six
+parameters of the images: 3.4e-6 for each start, 8e-5 for one in every hour of a day."""
 
 
 class Parameter(NamedTuple):
@@ -56,7 +57,8 @@ TILT, HEADING, HEIGHT = slice(6, 8), 8, 9
 COUNT = len(PARAMETERS)
 BIAS_LIMIT_M = 0.015
 """Error of the position at the depths that the robot sees. A robot may be 3 cm off without a word; half of that is the limit, because
-elsewhere the same parameter costs more."""
+elsewhere the same parameter costs more. Where the mean square of what all parameters may cost, by value and sigma, is below its square,
+more than 3 cm (two sigmas) are excluded; else the published covariance holds them."""
 
 
 class Drift(NamedTuple):
@@ -83,8 +85,8 @@ class Drift(NamedTuple):
 
 
 class CalibrationState(NamedTuple):
-    """What the watch knows: an estimate of each parameter that could be judged, and the covariance that a wrong calibration adds to the
-    pose (6, 6), rotation first, camera axes; None while nothing has drifted. text: what is wrong, the costliest first."""
+    """What the watch knows: an estimate of each parameter that could be judged, and the covariance that the calibration adds to the pose
+    (6, 6), rotation first, camera axes; None where an error of 3 cm is excluded. text: what is wrong, the costliest first."""
 
     drifts: tuple[Drift, ...] = ()
     cov_bias_cam: Array | None = None

@@ -36,7 +36,8 @@ from locclient.localization.pose_covariance import transport_cov
 
 _STEP_M, _FIRST_STEP_M, _STEP_RAD = 1.0, 0.5, 0.35  # between two views, and while they are few
 _MIN_NEW_SHARE = 0.1  # weight of a view that shows no landmark that was not in the window
-_WINDOW, _MIN_VIEWS = 40, 2  # views: of the window, and of a judgement
+# Views: of the window, and of a judgement. One is enough where its fix is a confirmed pose: a fix at a wrong place shows any parameter.
+_WINDOW, _MIN_VIEWS, _MIN_CONFIRMED_VIEWS = 40, 2, 1
 # Views of the window's end that show a sudden change, and of what they are held against.
 _RECENT, _MIN_BEFORE = (4, 10), 6
 _FEW = 10  # views, before which they are taken more often
@@ -67,12 +68,13 @@ class _View:
 
 @dataclass(frozen=True)
 class MapQuery:
-    """A look at the map that found a fix: the frame, the odometry there, the fix, and the map."""
+    """A look at the map that found a fix: the frame, the odometry there, the fix, and the map; whether the fix is of a confirmed pose."""
 
     frame: RectifiedFrame
     odometry: OdometryEstimate
     fix: Fix
     view: MapView
+    is_confirmed: bool = False
 
 
 class CalibrationWatch:
@@ -80,7 +82,7 @@ class CalibrationWatch:
 
     Each view is linearized about the calibration with a pose of its own, so that information adds up; a view counts by the share of
     its landmarks that no other of the window showed, because a landmark's error is the same in all views. A parameter's sigma is the
-    larger of what the information and what the scatter of the views says, and of its floor.
+    larger of what the information and what the scatter of the views says, and of its floor. One view has no scatter.
 
     Sources: Triggs et al. 2000 (self-calibration in bundle adjustment), Huber 1967 (covariance from the scatter of scores).
     """
@@ -93,6 +95,7 @@ class CalibrationWatch:
         self._last_map_from_cam: Array | None = None
         self._last_base: BasePose | None = None
         self.state = NOT_JUDGED
+        self.has_confirmed = False  # whether a view of a confirmed pose was taken
 
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
         """Wheel odometry newer than any before."""
@@ -101,8 +104,10 @@ class CalibrationWatch:
     def handle(self, query: MapQuery) -> None:
         """Takes a look at the map, where it is a new view."""
         fix, matched, frame = query.fix, query.fix.matched, query.frame
-        if matched is None or not self._is_new(fix.map_from_cam):
+        is_first = query.is_confirmed and not self.has_confirmed
+        if matched is None or not (is_first or self._is_new(fix.map_from_cam)):
             return
+        self.has_confirmed |= query.is_confirmed
         self._last_map_from_cam = fix.map_from_cam
         seen = None
         if frame.right is not None:
@@ -118,7 +123,7 @@ class CalibrationWatch:
         self._add_mounting(query, information, score)
         shift = np.zeros((6, IMAGE)) if seen is None else seen.pose_per_parameter
         self._views.append(_View(information, score, shift, ids))
-        state = self._judged()
+        state = self._judged(_MIN_CONFIRMED_VIEWS if query.is_confirmed else _MIN_VIEWS)
         self.state = state._replace(drifts=(*state.drifts, *self._time_offset(query.odometry)))
 
     def handle_unmatched(self, query: MapQuery) -> None:
@@ -175,10 +180,10 @@ class CalibrationWatch:
 
     # --- judgement ----------------------------------------------------------------------------------------------------
 
-    def _judged(self) -> CalibrationState:
+    def _judged(self, min_views: int) -> CalibrationState:
         """By the window. Views before a change that its end shows are dropped: knocks and repairs show at once."""
         views = list(self._views)
-        if len(views) < _MIN_VIEWS:
+        if len(views) < min_views:
             return NOT_JUDGED
         for recent in _RECENT:
             if len(views) >= recent + _MIN_BEFORE:
@@ -202,17 +207,18 @@ def _with_depth(matched: Correspondences, right_px: Array) -> Correspondences:
 
 
 def _estimate(views: Sequence[_View]) -> tuple[Array, Array]:
-    """Values and sigmas (COUNT,) of PARAMETERS by some views, infinite where nothing showed one."""
+    """Values and sigmas (COUNT,) of PARAMETERS by some views, infinite where nothing showed one; one view judges the images alone."""
     prior = np.array([_PRIOR_SIGMA] * COUNT + [_MAP_TILT_SIGMA_RAD] * 2) ** -2.0
     information = np.array([view.information for view in views])
     score = np.array([view.score for view in views])
     covariance = np.linalg.inv(information.sum(axis=0) + np.diag(prior))
     value = covariance @ score.sum(axis=0)
     off = (score - information @ value) @ covariance
-    scatter = np.sqrt((off**2).sum(axis=0) * len(views) / (len(views) - 1))
+    scatter = np.sqrt((off**2).sum(axis=0) * len(views) / max(len(views) - 1, 1))
     sigma = np.maximum(np.sqrt(np.diag(covariance)), scatter)[:COUNT]
     common = np.array([parameter.floor for parameter in PARAMETERS]) * np.sqrt(1.0 + _LOCAL_FLOORS**2 / len(views))
     is_shown = sigma < _JUDGED_SIGMA_SHARE * _PRIOR_SIGMA
+    is_shown[IMAGE:] &= len(views) >= _MIN_VIEWS
     return value[:COUNT], np.where(is_shown, np.hypot(sigma, common), np.inf)
 
 
@@ -229,25 +235,32 @@ def _state(views: Sequence[_View], value: Array, sigma: Array) -> CalibrationSta
         is_drifted = bool(is_large and abs(value[k]) > DRIFT_SIGMAS * sigma[k])
         drifts.append(Drift(parameter, float(value[k]), float(sigma[k]), costs_m, is_drifted))
     wrong = [drift for drift in drifts if drift.is_drifted]
+    cov_bias = max((_cov_bias(shifts[at], value, sigma) for at in (slice(None), slice(-1, None))), key=_squared_m)
     if not wrong:
-        return CalibrationState(tuple(drifts))
+        is_excluded = _squared_m(cov_bias) <= BIAS_LIMIT_M**2
+        return CalibrationState(tuple(drifts), None if is_excluded else cov_bias)
     wrong.sort(key=lambda drift: (-drift.bias_m, -abs(drift.value) / drift.sigma))
     text = "; ".join(drift.text for drift in wrong)
-    return CalibrationState(tuple(drifts), _cov_bias(shifts, value, sigma), text)
+    return CalibrationState(tuple(drifts), cov_bias + _cov_elsewhere(value, sigma), text)
+
+
+def _squared_m(covariance: Array) -> float:
+    """Mean square of a pose's position error."""
+    return float(np.trace(covariance[3:, 3:]))
 
 
 def _cov_bias(shifts: Array, value: Array, sigma: Array) -> Array:
-    """(6, 6) mean square of the poses' errors by all parameters, rotation first, camera axes: their values and their uncertainty.
-
-    Added is what they cost elsewhere: BIAS_LIMIT_M for each parameter at its limit, in any direction.
-    """
+    """(6, 6) mean square of the poses' errors by all parameters, rotation first, camera axes: their values and their uncertainty."""
     total = shifts @ value[:IMAGE]
     known = np.where(np.isfinite(sigma[:IMAGE]), sigma[:IMAGE], 0.0)
     covariance = (total[:, :, None] * total[:, None, :]).mean(axis=0)
-    covariance += (shifts * known**2 @ shifts.transpose(0, 2, 1)).mean(axis=0)
-    elsewhere = value[:IMAGE] / np.array([parameter.limit for parameter in PARAMETERS[:IMAGE]])
-    covariance[3:, 3:] += np.eye(3) * float((elsewhere**2).sum()) * BIAS_LIMIT_M**2
+    return np.asarray(covariance + (shifts * known**2 @ shifts.transpose(0, 2, 1)).mean(axis=0))
+
+
+def _cov_elsewhere(value: Array, sigma: Array) -> Array:
+    """(6, 6) what drifted parameters cost where the window has not been: BIAS_LIMIT_M for each at its limit, in any direction."""
+    share = value[:IMAGE] / np.array([parameter.limit for parameter in PARAMETERS[:IMAGE]])
     of_mount = np.where(np.isfinite(sigma[IMAGE:]), value[IMAGE:], 0.0)
-    covariance[:3, :3] += np.eye(3) * float((of_mount[:3] ** 2).sum())
-    covariance[3:, 3:] += np.eye(3) * float(of_mount[3] ** 2)
-    return np.asarray(covariance)
+    squared = [float((of_mount[:3] ** 2).sum())] * 3
+    squared += [float((share**2).sum()) * BIAS_LIMIT_M**2 + float(of_mount[3] ** 2)] * 3
+    return np.diag(squared)

@@ -10,11 +10,12 @@ import pytest
 from fleetmap.features.stereo import StereoSettings
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Cause, Status
+from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
-from fleetmap.relocalization.relocalizer import Fix
+from fleetmap.relocalization.relocalizer import Fix, Relocalizer
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame
-from locclient.localization.calibration.monitor import CalibrationMonitor
+from locclient.localization.calibration.monitor import CalibrationMonitor, FinishedQuery
 from locclient.localization.calibration.parameters import BASELINE, FOCAL, IMAGE, TILT, YAW
 from locclient.localization.calibration.watch import CalibrationWatch, MapQuery, Mounting
 from locclient.localization.estimate import Estimate
@@ -115,6 +116,49 @@ def test_turned_cameras_are_told_from_a_tilted_map() -> None:
 
 def published(watch: CalibrationMonitor, before: Estimate, last_fix_ns: int | None) -> Estimate:
     return watch.judged(before, last_fix_ns, was_localized=True)
+
+
+def first_look(parameters: Array) -> MapQuery:
+    return replace(look(0, parameters), is_confirmed=True)
+
+
+def test_one_view_of_a_confirmed_pose_finds_what_is_large() -> None:
+    watch = CalibrationWatch(RIG, StereoSettings())
+    watch.handle(look(0, parameters(focal=-0.05)))
+    assert not watch.state.drifts  # at a wrong place anything would show
+    watch.handle(first_look(parameters(focal=-0.05)))
+    assert drifted(watch) == ["focal_scale"]
+    alone = CalibrationWatch(RIG, StereoSettings())
+    alone.handle(first_look(parameters(focal=-0.05)))
+    assert drifted(alone) == ["focal_scale"]
+
+
+def test_what_one_view_does_not_exclude_is_held_by_the_covariance() -> None:
+    watch = CalibrationWatch(RIG, StereoSettings())
+    watch.handle(first_look(parameters(focal=-0.012)))
+    assert not watch.state.is_wrong
+    assert watch.state.cov_bias_cam is not None
+    (focal,) = [drift for drift in watch.state.drifts if drift.parameter.figure == "focal_scale"]
+    assert np.trace(watch.state.cov_bias_cam[3:, 3:]) > focal.bias_m**2 > 0.015**2
+
+
+def test_the_covariance_of_good_cameras_is_what_it_was_once_they_are_known() -> None:
+    watch = CalibrationWatch(RIG, StereoSettings())
+    watch.handle(first_look(parameters()))
+    for number in range(1, 40):
+        watch.handle(replace(look(number, parameters()), is_confirmed=True))
+        assert not watch.state.is_wrong
+    assert watch.state.cov_bias_cam is None
+
+
+def test_the_first_confirmed_pose_is_judged_before_it_is_published() -> None:
+    monitor = CalibrationMonitor(RIG, RelocalizerSettings())
+    query = first_look(parameters(focal=-0.05))
+    relocalizer = cast(Relocalizer, SimpleNamespace(view=query.view))
+    nothing = cast(FrameFeatures, None)
+    monitor.add(FinishedQuery(query.frame, query.odometry, nothing, query.fix, relocalizer, is_confirmed=True))
+    tracking = estimate(0.0)
+    assert published(monitor, tracking, tracking.stamp_ns).status is Status.DEGRADED
 
 
 def test_a_wrong_calibration_is_published() -> None:
