@@ -29,7 +29,13 @@ from mapserver.calibration.motion_rows import (
 )
 from mapserver.calibration.parameters import COLUMNS, INDEX, LENS_SIGMAS, RANGES, UNKNOWNS, CalibrationParameter
 from mapserver.calibration.problem import CalibrationData, MotionState
-from mapserver.calibration.schur_kernels import BorderedLandmarks, ImageRows, landmark_steps, reduce_landmarks
+from mapserver.calibration.schur_kernels import (
+    BorderedLandmarks,
+    ImageRows,
+    landmark_steps,
+    reduce_landmarks,
+    reduce_residuals,
+)
 
 _ROUNDS = 5  # in each the sizes of the errors are estimated anew, and the samples integrated at the new biases
 _MAX_STEPS = 12
@@ -194,13 +200,26 @@ class _Problem:
             info[at, at] += each.by_keyframes.T @ each.by_keyframes
             info[at, border:] += each.by_keyframes.T @ each.by_calibration
             info[border:, border:] += each.by_calibration.T @ each.by_calibration
-            rhs[at] -= each.by_keyframes.T @ each.residual
-            rhs[border:] -= each.by_calibration.T @ each.residual
+        self._add_edges(edges, rhs)
         return _System(info, rhs, images, edges, gone)
 
-    def solve(self, system: _System, damping: float = 0.0) -> tuple[Array, Array]:
+    def _add_edges(self, edges: list[Rows], rhs: Array) -> None:
+        for each in edges:
+            rhs[each.first * self.stride : (each.first + 2) * self.stride] -= each.by_keyframes.T @ each.residual
+            rhs[self.size - UNKNOWNS :] -= each.by_calibration.T @ each.residual
+
+    def _with_residuals(self, system: _System, images: Array, edges: list[Array]) -> _System:
+        """The system for other residuals (M, 4) of images and of each edge, with the same derivatives and without the gauge's pull."""
+        rows, rhs = system.images._replace(residuals=images), np.zeros(self.size)
+        gone = system.eliminated._replace(rhs=np.empty_like(system.eliminated.rhs))
+        reduce_residuals(rows, self.keyframes, self.starts, self.stride, rhs, gone)
+        others = [replace(each, residual=residual) for each, residual in zip(system.edges, edges, strict=True)]
+        self._add_edges(others, rhs)
+        return _System(system.information, rhs, rows, others, gone)
+
+    def solve(self, system: _System, factor: tuple[Array, bool]) -> tuple[Array, Array]:
         """Step of the unknowns (D,) and of the landmarks (N, 3)."""
-        step = scipy.linalg.cho_solve(self._factor(system, damping), system.rhs, check_finite=False)
+        step = scipy.linalg.cho_solve(factor, system.rhs, check_finite=False)
         moved = np.empty((len(self.starts) - 1, 3))
         border = self.size - UNKNOWNS
         by_keyframe = np.ascontiguousarray(step[:border].reshape(self.count, self.stride))
@@ -221,7 +240,8 @@ class _Problem:
             moved, gained = None, 0.0
             while moved is None and damping < 1e3:
                 try:
-                    step, points = self.solve(self.system(theta, state, damping), damping)
+                    system = self.system(theta, state, damping)
+                    step, points = self.solve(system, self._factor(system, damping))
                     tried = theta + step[self.size - UNKNOWNS :], self._moved(state, step, points)
                     new = self.cost(*tried)
                 except np.linalg.LinAlgError:
@@ -285,24 +305,20 @@ class _Problem:
         Random errors of the believed size are put in place of the residuals and the adjustment is solved for them.
         """
         rng, sums = np.random.default_rng(0), np.zeros((_DRAWS, 6))
-        images, edges = system.images, system.edges
+        images, factor = system.images, self._factor(system, 0.0)
         active = np.abs(images.by_keyframe).sum(axis=2) > 0
         border = self.size - UNKNOWNS
         for draw in range(_DRAWS):
-            drawn = images._replace(residuals=np.where(active, rng.standard_normal(active.shape), 0.0))
-            others = [replace(each, residual=rng.standard_normal(len(each.residual))) for each in edges]
-            random = self._reduced(drawn, others, 0.0)
-            random.information[np.diag_indices(self.size)] = system.information.diagonal()
-            step, points = self.solve(random)
+            drawn = np.where(active, rng.standard_normal(active.shape), 0.0)
+            edges = [rng.standard_normal(len(each.residual)) for each in system.edges]
+            random = self._with_residuals(system, drawn, edges)
+            step, points = self.solve(random, factor)
             by_keyframe = step[:border].reshape(self.count, self.stride)
-            left = (
-                drawn.residuals
-                + np.einsum("meij,mj->mei", images.by_point[:, None], points[self.data.obs_landmark])[:, 0]
-            )
+            left = drawn + np.einsum("meij,mj->mei", images.by_point[:, None], points[self.data.obs_landmark])[:, 0]
             left += np.einsum("mij,mj->mi", images.by_keyframe, by_keyframe[self.keyframes, :6])
             left += images.by_calibration @ step[border:]
             rest = []
-            for each in others:
+            for each in random.edges:
                 ends = by_keyframe[each.first : each.first + 2].ravel()
                 rest.append(
                     replace(

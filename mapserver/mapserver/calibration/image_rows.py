@@ -22,7 +22,7 @@ from mapserver.calibration.parameters import (
     right_camera,
 )
 from mapserver.calibration.problem import CalibrationData, MotionState
-from mapserver.calibration.schur_kernels import ImageRows
+from mapserver.calibration.schur_kernels import ImageRows, weigh
 
 P = CalibrationParameter
 _MIN_DEPTH_M = 0.05
@@ -233,8 +233,10 @@ def image_rows(
     by_calibration[:, 2:, INDEX[P.FOCAL_RATIO]] += (off[:, 2:] - off[:, :2]) / (1.0 + theta[INDEX[P.FOCAL_RATIO]])
     factor = np.sqrt(weight)[:, None] / np.where(np.isfinite(seen.row_sigmas), seen.row_sigmas * scales, np.inf)
     factor[view.in_left[:, 2] <= _MIN_DEPTH_M] = 0.0
-    weighted = (np.nan_to_num(by) * factor[:, :, None] for by in (by_keyframe, by_point, by_calibration))
-    return ImageRows(rows * np.sqrt(weight)[:, None], *(np.ascontiguousarray(by) for by in weighted))
+    derivatives = [np.ascontiguousarray(by) for by in (by_keyframe, by_point, by_calibration)]
+    for by in derivatives:
+        weigh(by, factor)
+    return ImageRows(rows * np.sqrt(weight)[:, None], *derivatives)
 
 
 def _by_baseline(by_calibration: Array, by_apart: Array, axes: RigAxes, theta: Array) -> None:

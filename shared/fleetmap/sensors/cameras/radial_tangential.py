@@ -3,8 +3,7 @@
 import numpy as np
 
 from fleetmap.geometry import Array
-
-_ITERATIONS = 12
+from fleetmap.sensors.cameras.radial_tangential_kernels import undistort
 
 
 def _coefficients(distortion: Array) -> tuple[float, float, float, float, float]:
@@ -48,16 +47,8 @@ def ray_from_pixel(intrinsics_px: Array, distortion: Array, pixels: Array) -> Ar
     """(N, 3) unit rays of pixels (N, 2). Newton's method with a numeric Jacobian; NaN where it does not come back to the pixel."""
     fx, fy, cx, cy = intrinsics_px
     goal_x, goal_y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
-    x, y = goal_x.copy(), goal_y.copy()
-    step = 1e-6
-    for _ in range(_ITERATIONS):
-        dx, dy = _distort(distortion, x, y)
-        dx_x, dy_x = _distort(distortion, x + step, y)
-        dx_y, dy_y = _distort(distortion, x, y + step)
-        a, b, c, d = (dx_x - dx) / step, (dx_y - dx) / step, (dy_x - dy) / step, (dy_y - dy) / step
-        det = a * d - b * c
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x, y = x + (d * (goal_x - dx) - b * (goal_y - dy)) / det, y + (a * (goal_y - dy) - c * (goal_x - dx)) / det
+    x, y = np.empty_like(goal_x), np.empty_like(goal_y)
+    undistort(_coefficients(distortion), (goal_x, goal_y), (x, y))
     back_x, back_y = _distort(distortion, x, y)
     missed = ~((np.hypot(back_x - goal_x, back_y - goal_y) < 1e-7) & (x * x + y * y < _radial_limit(distortion)))
     rays = np.stack([x, y, np.ones_like(x)], axis=1)
