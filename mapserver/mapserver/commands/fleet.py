@@ -39,7 +39,7 @@ def report(
 
     settings = settings_of(context)
     judged_by = SummarySettings(settings.canary, settings.resurvey)
-    with MapStore.open(store) as maps:
+    with MapStore.open(store, read_only=True) as maps:
         page = html_page(summarise(maps, site, hours, time.time_ns(), judged_by))
     with disk_errors(f"{out} cannot be written", "choose another place"):
         out.write_text(page, "utf-8")
@@ -66,7 +66,7 @@ def export(
     if chosen is None:
         raise UsageError(f"{out}: name it .jsonl or .mcap, or name --format")
     since_ns = None if hours is None else time.time_ns() - hours * 3_600_000_000_000
-    with MapStore.open(store) as maps:
+    with MapStore.open(store, read_only=True) as maps:
         if site is not None:
             maps.current(site)  # raises for an unknown site
         write = write_mcap if chosen is ExportFormat.MCAP else write_json_lines
@@ -91,7 +91,7 @@ def resurvey(
     from mapserver.store import MapStore
 
     settings = settings_of(context).resurvey
-    with MapStore.open(store) as maps:
+    with MapStore.open(store, read_only=True) as maps:
         found = resurvey_list(maps, site, settings, time.time_ns())
     if route is not None:
         _write_route(found, route)

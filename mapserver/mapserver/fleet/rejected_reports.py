@@ -5,10 +5,11 @@ from pathlib import Path
 
 import msgspec
 
-from fleetmap.errors import LinkError, UsageError
+from fleetmap.errors import LinkError, StoreError, UsageError
 from fleetmap.mapformat import check_name
 from fleetmap.mapformat.manifest import Name
 from fleetmap.messages import FailureAck
+from mapserver.store.files import check_no_link, make_folder, write_atomically
 
 _MAX_KEPT = 100
 _log = logging.getLogger(__name__)
@@ -37,14 +38,15 @@ class RejectedReports:
         """Keeps one."""
         _log.warning("a failure of robot %r of site %r is refused for good: %s", robot[:80], site[:80], reason)
         try:
-            self._folder.mkdir(exist_ok=True)
+            check_no_link(self._folder.parent, self._folder)
+            make_folder(self._folder)
             path = self._folder / f"{now_ns:020d}-{_sender(site, robot)}.msgpack"
-            path.write_bytes(payload)
-            path.with_suffix(".reason.txt").write_text(f"{reason}\n", "utf-8")
+            write_atomically(path, [payload])
+            write_atomically(path.with_suffix(".reason.txt"), [f"{reason}\n".encode("utf-8", "replace")])
             for old in sorted(self._folder.glob("*.msgpack"))[:-_MAX_KEPT]:
                 old.unlink()
                 old.with_suffix(".reason.txt").unlink(missing_ok=True)
-        except OSError as error:
+        except (OSError, StoreError) as error:
             _log.warning("it could not be kept in %s: %s", self._folder, error)
 
 

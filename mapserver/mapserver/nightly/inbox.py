@@ -9,6 +9,7 @@ Beside what is held or bad lies NAME.reason.txt.
 """
 
 import fcntl
+import hashlib
 import os
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from mapserver.store.files import make_folder, sync_folder, write_atomically
 
 DONE, HELD, BAD = "done", "held", "bad"
 _HASH_SIGNS = 12
+_MAX_NAME_BYTES = 200  # of 255: the hash goes before the name, a number too, and `.reason.txt` behind it
 _UNFINISHED = (".part", ".partial", ".filepart", ".crdownload", ".tmp")
 _REASON = ".reason.txt"
 
@@ -108,19 +110,36 @@ def _is_being_written(path: Path) -> bool:
 def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> Path:
     """Moves a recording into a folder of its inbox, the reason beside it; returns where it is now.
 
+    A name that `is_safe_name` refuses is replaced by one of its hash.
+
     Raises StoreError where the disk refuses; the recording is then where it was.
     """
     folder = path.parent / where
     prefix = "" if sha256 is None or path.name.startswith(sha256[:_HASH_SIGNS]) else f"{sha256[:_HASH_SIGNS]}-"
     with disk_errors(f"{path} cannot be moved to {folder}", "check the rights and space of the inbox"):
         make_folder(folder)
-        target = _free(folder, prefix + path.name)
+        target = _free(folder, prefix + (path.name if is_safe_name(path.name) else _safe_name(path)))
         if reason is not None:
-            write_atomically(folder / f"{target.name}{_REASON}", [f"{reason}\n".encode()])
+            write_atomically(folder / f"{target.name}{_REASON}", [f"{printable(reason)}\n".encode()])
         os.replace(path, target)  # noqa: PTH105
         sync_folder(folder)
         sync_folder(path.parent)
     return target
+
+
+def is_safe_name(name: str) -> bool:
+    """Whether a name can be shown, logged and kept in the database, and leaves room for what is put before and behind it."""
+    return name.isprintable() and len(os.fsencode(name)) <= _MAX_NAME_BYTES
+
+
+def printable(words: str) -> str:
+    """The words with everything that cannot be shown as Python escapes it: a name of a file may hold any byte."""
+    return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in words)
+
+
+def _safe_name(path: Path) -> str:
+    suffix = ".mcap" if path.suffix == ".mcap" else ""
+    return f"unnamed-{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:_HASH_SIGNS]}{suffix}"
 
 
 def _free(folder: Path, name: str) -> Path:

@@ -127,7 +127,7 @@ class _Night:
         here = boxes.arrivals(self._request.inbox, self._request.settle_s, self._request.now_ns)
         for path, reason in here.waiting:
             self._say(f"not yet: {path.name}: {reason}")
-            self._report.waiting.append({"name": path.name, "reason": reason})
+            self._report.waiting.append({"name": boxes.printable(path.name), "reason": boxes.printable(reason)})
         recordings = self._identified(here.complete)
         left = self._left_draft()
         if left is not None:
@@ -145,6 +145,9 @@ class _Night:
         found: dict[str, Recorded] = {}
         for path in paths:
             self._say(f"reading {path.name}")
+            if not boxes.is_safe_name(path.name):
+                self._put_away(path, boxes.BAD, None, f"its name {path.name} is no usable one; name it anew")
+                continue
             recorded = boxes.identify(path, self._request.calibration)
             if isinstance(recorded, str):
                 self._put_away(path, boxes.BAD, None, recorded)
@@ -237,14 +240,15 @@ class _Night:
     def _put_away(self, path: Path, where: str, sha256: str | None, reason: str) -> None:
         self._say(f"{where}: {path.name}: {reason}")
         boxes.put_away(path, where, sha256, None if where == boxes.DONE else reason)
-        self._report.recordings.append({"name": path.name, "sha256": sha256, "fate": where, "reason": reason})
+        told = {"name": boxes.printable(path.name), "reason": boxes.printable(reason)}
+        self._report.recordings.append({**told, "sha256": sha256, "fate": where})
 
     def _counts(self) -> str:
         fates = [recording["fate"] for recording in self._report.recordings]
         return ", ".join(f"{fates.count(where)} {where}" for where in (boxes.DONE, boxes.HELD, boxes.BAD))
 
     def _say(self, words: str) -> None:
-        self._console.print(words, markup=False, highlight=False)
+        self._console.print(boxes.printable(words), markup=False, highlight=False)
 
     def _actor(self) -> Actor:
         return Actor(JOB, f"nightly job {self._report.job}")

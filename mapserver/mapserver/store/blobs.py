@@ -1,19 +1,28 @@
 """The folder of files that are addressed by their content."""
 
+import errno
 import hashlib
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from fleetmap.errors import MapFormatError, disk_errors
+from fleetmap.errors import MapFormatError, StoreError, disk_errors
 from fleetmap.mapformat import blob_path, sha256_hex, verified
-from mapserver.store.files import TEMPORARY_SUFFIX, make_folder, read_chunks, sync_folder, write_atomically
+from mapserver.store.files import (
+    TEMPORARY_SUFFIX,
+    check_no_link,
+    is_plain_file,
+    make_folder,
+    read_chunks,
+    sync_folder,
+    write_atomically,
+)
 
 _FOLDER = "blobs"
 
 
 class BlobFolder:
-    """Bytes by their SHA-256, in files below the store's folder."""
+    """Bytes by their SHA-256, in files below the store's folder. No symbolic link there is followed."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
@@ -39,15 +48,17 @@ class BlobFolder:
         """The bytes of an address in pieces, unverified; raises StoreError for missing ones."""
         path = self.path(sha256)
         with disk_errors(f"{path} cannot be read", "the store is incomplete, restore it"):
+            self._check_plain(path)
             yield from read_chunks(path)
 
     def is_whole(self, sha256: str) -> bool:
         """Whether the bytes of an address are there and are what it says; reads them in pieces."""
         digest = hashlib.sha256()
         try:
+            self._check_plain(self.path(sha256))
             for chunk in read_chunks(self.path(sha256)):
                 digest.update(chunk)
-        except OSError:
+        except (OSError, StoreError):
             return False
         return digest.hexdigest() == sha256
 
@@ -66,6 +77,7 @@ class BlobFolder:
     def remove_file(self, path: Path) -> int:
         """Removes a file and returns its size; raises StoreError where the disk refuses."""
         with disk_errors(f"{path} cannot be removed", "check the folder's rights"):
+            check_no_link(self._root, path.parent)
             size = path.stat().st_size
             os.unlink(path)  # noqa: PTH108
         return size
@@ -73,8 +85,9 @@ class BlobFolder:
     def _keep(self, sha256: str, size_bytes: int, chunks: Iterable[bytes]) -> None:
         path = self.path(sha256)
         with disk_errors(f"{path} cannot be written", "check the disk's space and rights"):
+            check_no_link(self._root, path.parent)
             # A file of that name may be damaged; reading it costs less than writing it.
-            if path.is_file() and path.stat().st_size == size_bytes and self.is_whole(sha256):
+            if is_plain_file(path) and path.stat().st_size == size_bytes and self.is_whole(sha256):
                 # Who wrote it may have died before its name was on the disk.
                 sync_folder(path.parent)
                 chunks = ()
@@ -83,8 +96,28 @@ class BlobFolder:
             if chunks:
                 write_atomically(path, chunks)
 
+    def links(self) -> list[Path]:
+        """Symbolic links where files and folders should be."""
+        folder = self._root / _FOLDER
+        candidates = [folder] if folder.is_symlink() else [*folder.glob("*"), *self._inner(os.DirEntry.is_symlink)]
+        return sorted(path for path in candidates if path.is_symlink())
+
     def _files(self) -> Iterator[Path]:
-        return (path for path in (self._root / _FOLDER).glob("*/*") if path.is_file())
+        return self._inner(lambda entry: entry.is_file(follow_symlinks=False))
+
+    def _inner(self, wanted: "Callable[[os.DirEntry[str]], bool]") -> Iterator[Path]:
+        """What is in the folders of the folder, as far as they are folders and no links."""
+        top = self._root / _FOLDER
+        if top.is_symlink() or not top.is_dir():
+            return
+        for folder in os.scandir(top):
+            if folder.is_dir(follow_symlinks=False):
+                yield from (Path(entry.path) for entry in os.scandir(folder.path) if wanted(entry))
+
+    def _check_plain(self, path: Path) -> None:
+        check_no_link(self._root, path)
+        if not is_plain_file(path):
+            raise FileNotFoundError(errno.ENOENT, "no plain file", str(path))
 
 
 def _is_address(path: Path) -> bool:

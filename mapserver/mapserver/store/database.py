@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import quote
 
 from sqlite_utils import Database
 
@@ -24,15 +25,18 @@ class Transactions:
     """The database at a path, created or migrated as needed. Methods may be called from any thread.
 
     One connection writes and another one reads, each under a lock of its own: reading does not wait while a write is forced to the
-    disk. Within a transaction its own thread reads what it has written. Raises NewerFormatError for a database that a newer
-    fleetmap made, StoreError for one that cannot be opened or is another program's.
+    disk. Within a transaction its own thread reads what it has written. read_only: nothing is made or migrated.
+    Raises NewerFormatError for a database that a newer fleetmap made, StoreError for one that cannot be opened or is another program's.
     """
 
-    def __init__(self, path: Path, clock_ns: Callable[[], int]) -> None:
+    def __init__(self, path: Path, clock_ns: Callable[[], int], *, read_only: bool = False) -> None:
         self.now_ns = clock_ns
         self._path = path
         self._lock, self._reading = threading.RLock(), threading.Lock()
         self._writing_thread: int | None = None
+        if read_only:
+            self._database, self._reader = _opened_for_reading(path), _opened_for_reading(path)
+            return
         self._database = _opened(path, _prepare)
         try:
             self._reader = _opened(path, lambda reader, _: reader.conn.execute("PRAGMA query_only = ON"))
@@ -81,9 +85,15 @@ class Transactions:
         )
 
 
-def _opened(path: Path, prepare: Callable[[Database, Path], object]) -> Database:
+def _opened(path: Path, prepare: Callable[[Database, Path], object], options: str = "mode=rwc") -> Database:
     """A prepared connection, usable from any thread under one lock."""
-    connection = sqlite3.connect(path, timeout=_BUSY_TIMEOUT_MS / 1000, isolation_level=None, check_same_thread=False)
+    connection = sqlite3.connect(
+        f"file:{quote(str(path.absolute()))}?{options}",
+        timeout=_BUSY_TIMEOUT_MS / 1000,
+        isolation_level=None,
+        check_same_thread=False,
+        uri=True,
+    )
     try:
         database = Database(connection, execute_plugins=False)
         prepare(database, path)
@@ -91,6 +101,33 @@ def _opened(path: Path, prepare: Callable[[Database, Path], object]) -> Database
         connection.close()
         raise
     return database
+
+
+def _opened_for_reading(path: Path) -> Database:
+    """A connection that leaves the disk as it is.
+
+    Where nobody can write beside the database, SQLite reads it alone, which holds everything unless the last process that wrote
+    was killed. Raises StoreError in that case, for an older format, and for what is no database.
+    """
+    log = path.with_name(f"{path.name}-wal")
+    try:
+        try:
+            return _opened(path, _check_current, "mode=ro")
+        except sqlite3.OperationalError:
+            if log.is_file() and log.stat().st_size > 0:
+                raise
+            return _opened(path, _check_current, "mode=ro&immutable=1")
+    except sqlite3.Error as error:
+        raise StoreError(
+            f"the store {path.parent} cannot be read without writing ({error}); copy it to where it can be written"
+        ) from error
+
+
+def _check_current(database: Database, path: Path) -> None:
+    _check_ours(database.conn, path)
+    number = int(database.conn.execute("PRAGMA user_version").fetchone()[0])
+    if number < len(MIGRATIONS):
+        raise StoreError(f"{path} has the older store format {number}; open it once where it can be written")
 
 
 def _prepare(database: Database, path: Path) -> None:

@@ -1,8 +1,9 @@
-"""Files that survive a kill and a power cut. Every call goes through `os`, where tests make it fail."""
+"""Files that survive a kill and a power cut, for their owner alone. Every call goes through `os`, where tests make it fail."""
 
 import fcntl
 import os
 import secrets
+import stat
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -12,6 +13,8 @@ from fleetmap.errors import StoreError
 
 _CHUNK_BYTES = 1 << 20
 _LOCK_WITHIN_S = 60.0
+_OWN_FILE, _OWN_FOLDER = 0o600, 0o700  # maps, positions and pictures are nobody else's business on a shared machine
+_RESERVE_BYTES = 4 << 20  # what a transaction that removes some hundred versions writes
 TEMPORARY_SUFFIX = ".tmp"
 
 
@@ -23,7 +26,7 @@ def write_atomically(path: Path, chunks: Iterable[bytes]) -> None:
     Raises OSError where the disk refuses.
     """
     temporary = path.with_name(f".{path.name[:16]}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
-    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, _OWN_FILE)
     try:
         try:
             for chunk in chunks:
@@ -72,10 +75,53 @@ def make_folder(folder: Path) -> None:
     missing = missing[: next(i for i, parent in enumerate(missing) if parent.is_dir())]
     for parent in reversed(missing):
         with suppress(FileExistsError):
-            os.mkdir(parent)  # noqa: PTH102
+            os.mkdir(parent, _OWN_FOLDER)  # noqa: PTH102
         sync_folder(parent.parent)
     if not missing:
         sync_folder(folder.parent)
+
+
+def check_no_link(root: Path, path: Path) -> None:
+    """Raises StoreError where `path`, or a folder between it and `root`, is a symbolic link: a store follows none out of its folder."""
+    for part in (path, *path.parents):
+        if part == root:
+            return
+        if part.is_symlink():
+            raise StoreError(
+                f"{part} is a symbolic link, which a store does not follow; put what it names in its place"
+            )
+
+
+def is_plain_file(path: Path) -> bool:
+    """Whether it is a file, and no link, device or pipe."""
+    try:
+        return stat.S_ISREG(os.stat(path, follow_symlinks=False).st_mode)  # noqa: PTH116
+    except FileNotFoundError:
+        return False
+
+
+def make_own_file(path: Path) -> None:
+    """An empty file for its owner alone, unless there is one."""
+    os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, _OWN_FILE))
+
+
+def keep_reserve(root: Path) -> None:
+    """Space that `release_reserve` gives back on a full disk, so that garbage can be collected there. A full disk has none to keep."""
+    with suppress(OSError):
+        descriptor = os.open(root / "reserve", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, _OWN_FILE)
+        try:
+            os.posix_fallocate(descriptor, 0, _RESERVE_BYTES)
+        finally:
+            os.close(descriptor)
+
+
+def release_reserve(root: Path) -> bool:
+    """Gives the reserved space back; False where there was none."""
+    try:
+        os.unlink(root / "reserve")  # noqa: PTH108
+    except OSError:
+        return False
+    return True
 
 
 @contextmanager
@@ -84,7 +130,7 @@ def locked(path: Path, *, shared: bool) -> Iterator[None]:
 
     Raises StoreError when the lock is not free within a minute, OSError where the file cannot be made.
     """
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, _OWN_FILE)
     try:
         _take_lock(descriptor, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, path)
         yield

@@ -3,6 +3,7 @@
     DIR/store.sqlite3            sites, versions and their states, robots, jobs, events
     DIR/lock                     held alone while garbage is collected, shared while bytes come in that nothing mentions yet
     DIR/blobs/ab/<sha256>        tiles, manifests, vocabularies, archives, by content
+    DIR/reserve                  space that `gc` gives back to work on a full disk
     DIR/sites/<site>/current     the current manifest's address as text, for robots that read the folder; derived
 
 Bytes are on the disk before the transaction that mentions them, so a crash leaves at most files that nothing mentions.
@@ -17,7 +18,7 @@ from typing import Self
 
 import msgspec
 
-from fleetmap.errors import StateError, StoreError
+from fleetmap.errors import NewerFormatError, StateError, StoreError
 from fleetmap.mapformat import (
     BlobEntry,
     Manifest,
@@ -30,7 +31,18 @@ from fleetmap.mapformat import (
     encode_tile,
 )
 from mapserver.store.export_import import open_export, write_export
-from mapserver.store.files import locked, make_folder, read_file, sync_folder, write_atomically
+from mapserver.store.files import (
+    check_no_link,
+    is_plain_file,
+    keep_reserve,
+    locked,
+    make_folder,
+    make_own_file,
+    read_file,
+    release_reserve,
+    sync_folder,
+    write_atomically,
+)
 from mapserver.store.garbage_collection import Garbage, Retention, collect
 from mapserver.store.queries import StoreQueries
 from mapserver.store.rows import (
@@ -52,30 +64,48 @@ _USUAL_RETENTION = Retention()
 class MapStore(StoreQueries):
     """One open store. Methods may be called from any thread; every process opens its own."""
 
-    def __init__(self, root: Path, clock_ns: Callable[[], int]) -> None:
-        super().__init__(root, clock_ns)
+    def __init__(self, root: Path, clock_ns: Callable[[], int], *, read_only: bool = False) -> None:
+        super().__init__(root, clock_ns, read_only=read_only)
         try:
-            sync_folder(root)
-            self._repair_current_files()
+            if not read_only:
+                sync_folder(root)
+                self._repair_current_files()
         except BaseException:
             self._transactions.close()
             raise
 
     @classmethod
-    def open(cls, path: Path, *, create: bool = False, clock_ns: Callable[[], int] = time.time_ns) -> Self:
+    def open(
+        cls, path: Path, *, create: bool = False, read_only: bool = False, clock_ns: Callable[[], int] = time.time_ns
+    ) -> Self:
         """The store in folder `path`, which is made with `create`. What is derived is repaired here.
 
+        read_only: of a store that cannot be written, by its rights or because the disk is full, what is there is read.
         Raises StoreError where there is none or it cannot be opened, NewerFormatError for one made by a newer fleetmap.
         """
+        is_new = not (path / "store.sqlite3").is_file()
+        if is_new and not create:
+            raise StoreError(f"{path} holds no map store; check --store, or make one with `mapserver build`")
         try:
-            if not (path / "store.sqlite3").is_file() and not create:
-                raise StoreError(f"{path} holds no map store; check --store, or make one with `mapserver build`")
             make_folder(path / "sites")
-            store = cls(path, clock_ns)
-        except (OSError, sqlite3.Error) as error:
+            if is_new:
+                make_own_file(path / "store.sqlite3")
+                keep_reserve(path)
+            return cls(path, clock_ns)
+        except NewerFormatError:
+            raise
+        except (OSError, sqlite3.Error, StoreError) as error:
+            if read_only:
+                return cls(path, clock_ns, read_only=True)
+            if isinstance(error, StoreError):
+                raise
             reason = f"the store {path} cannot be opened ({error}); check the path, its rights and space"
             raise StoreError(reason) from error
-        return store
+
+    @classmethod
+    def release_reserve(cls, path: Path) -> bool:
+        """Gives back the space that the store in folder `path` holds for a full disk; False where there is none any more."""
+        return release_reserve(path)
 
     def close(self) -> None:
         """Closes the database; the store must not be used afterwards."""
@@ -156,8 +186,12 @@ class MapStore(StoreQueries):
         self, retention: Retention = _USUAL_RETENTION, *, dry_run: bool = False, actor: Actor = NOBODY
     ) -> Garbage:
         """Removes what is beyond retention and what nothing mentions; raises StoreError where the disk refuses."""
+        if dry_run:
+            return collect(self._transactions, self._blobs, retention, dry_run=True, actor=actor)
         with self._locked(shared=False):
-            return collect(self._transactions, self._blobs, retention, dry_run=dry_run, actor=actor)
+            garbage = collect(self._transactions, self._blobs, retention, dry_run=False, actor=actor)
+            keep_reserve(self._root)
+            return garbage
 
     def export_version(self, site: str, version: int, path: Path, *, archive: bool = True) -> int:
         """Writes a version into one file and returns its size; errors as of `manifest`, StoreError for the disk."""
@@ -227,7 +261,7 @@ class MapStore(StoreQueries):
     def _repair_current_files(self) -> None:
         for row in self._transactions.query("SELECT site, manifest_sha256 FROM versions WHERE state = 'current'"):
             path = self._root / current_path(row["site"])
-            if not path.is_file() or read_file(path) != f"{row['manifest_sha256']}\n".encode():
+            if not is_plain_file(path) or read_file(path) != f"{row['manifest_sha256']}\n".encode():
                 self._write_current_file(row["site"])
 
     def _write_current_file(self, site: str) -> None:
@@ -236,6 +270,7 @@ class MapStore(StoreQueries):
         with self._transactions.write(durable=False):
             current = self._current_row(site)
             assert current is not None
+            check_no_link(self._root, path.parent)
             try:
                 make_folder(path.parent)
                 write_atomically(path, [f"{current.manifest_sha256}\n".encode()])

@@ -33,11 +33,11 @@ _SERVED_KINDS = ("manifest", "tile", "vocabulary")
 class StoreQueries:
     """The part of an open store that changes no version."""
 
-    def __init__(self, root: Path, clock_ns: Callable[[], int]) -> None:
+    def __init__(self, root: Path, clock_ns: Callable[[], int], *, read_only: bool = False) -> None:
         self._root = root
         self._clock_ns = clock_ns
         self._blobs = BlobFolder(root)
-        self._transactions = Transactions(root / "store.sqlite3", clock_ns)
+        self._transactions = Transactions(root / "store.sqlite3", clock_ns, read_only=read_only)
         self.fleet = FleetQueries(self._transactions)
 
     @property

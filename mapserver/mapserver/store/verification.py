@@ -8,6 +8,7 @@ from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import Manifest, current_path, decode_manifest
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import Transactions
+from mapserver.store.files import is_plain_file
 from mapserver.store.rows import SiteReleases, VersionInfo
 from mapserver.store.version_rows import references, site_releases
 
@@ -16,7 +17,8 @@ from mapserver.store.version_rows import references, site_releases
 class StoreFindings:
     """What was found. faults: each a sentence, none in a sound store.
 
-    orphans and leftovers are files that nothing mentions, as a killed process leaves them; `gc` removes them.
+    orphans and leftovers are files that nothing mentions, as a killed process leaves them; `gc` removes them. open_to_others: whether
+    other users of the machine may look into the folder or its database.
     """
 
     sites: int = 0
@@ -25,6 +27,7 @@ class StoreFindings:
     blob_bytes: int = 0
     orphans: int = 0
     leftovers: int = 0
+    open_to_others: int = 0
     faults: list[str] = field(default_factory=list)
 
 
@@ -35,6 +38,8 @@ def verify(root: Path, transactions: Transactions, blobs: BlobFolder) -> StoreFi
     found.faults += [f"database: {text}" for text in integrity if text != "ok"]
     foreign = transactions.query("PRAGMA foreign_key_check")
     found.faults += [f"database: a row of {row['table']} refers to nothing" for row in foreign]
+    found.faults += [f"{path} is a symbolic link, which a store does not follow" for path in blobs.links()]
+    found.open_to_others = sum(bool(path.stat().st_mode & 0o077) for path in (root, *root.glob("store.sqlite3*")))
     sound = _check_blobs(transactions, blobs, found)
     sites = transactions.query("SELECT * FROM sites ORDER BY site")
     releases = [site_releases(transactions, row["site"]) for row in sites]
@@ -117,5 +122,5 @@ def _site_faults(transactions: Transactions, site: dict[str, Any], rows: SiteRel
 def _file_faults(root: Path, rows: SiteReleases) -> list[str]:
     path = root / current_path(rows.site)
     wanted = None if rows.current is None else f"{rows.current.manifest_sha256}\n"
-    text = path.read_text("ascii", "replace") if path.is_file() else None
+    text = path.read_bytes()[:100].decode("ascii", "replace") if is_plain_file(path) else None
     return [] if text == wanted else [f"{path} does not name the current version; open the store again to repair it"]

@@ -4,12 +4,14 @@ import fcntl
 import io
 import json
 import os
+import re
 import signal
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from rich.console import Console
@@ -196,6 +198,31 @@ def test_a_refused_night_keeps_the_last_version_and_holds_its_recordings(
     held = next(path for path in (hall / "inbox/held").iterdir() if path.is_dir())
     held.rename(hall / "inbox" / held.name)  # somebody looked at it, and wants it tried again
     assert "version 3 published" in spend(hall)
+
+
+HOSTILE_NAMES = {
+    "long": b"x" * 240 + b".mcap",
+    "no UTF-8": b"caf\xe9.mcap",
+    "a line of its own": b"tote\n2026-11-22 00:00:00 INFO all is well.mcap",
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE_NAMES)
+def test_a_name_that_cannot_be_used_goes_to_bad_and_the_night_goes_on(hall: Path, kind: str) -> None:
+    name = HOSTILE_NAMES[kind]
+    path = Path(os.fsdecode(os.fsencode(hall / "inbox") + b"/" + name))
+    path.write_bytes(b"x")
+    assert "2 done, 0 held, 1 bad" in spend(hall)
+    kept = sorted(found.name for found in (hall / "inbox/bad").iterdir())
+    assert re.fullmatch(r"unnamed-[0-9a-f]{12}\.mcap", kept[0])
+    assert kept[1] == f"{kept[0]}.reason.txt"
+    assert len((hall / "inbox/bad" / kept[1]).read_text("utf-8").splitlines()) == 1
+    assert states(hall) == [("current", ["monday", "tuesday"])]
+    # The control: what the night did with such a name before.
+    with pytest.raises((OSError, UnicodeEncodeError, AssertionError)):
+        (hall / f"{name.decode('utf-8', 'surrogateescape')}.reason.txt").write_text("why")
+        msgspec.json.encode({"name": path.name})
+        assert "\n" not in path.name
 
 
 def test_nothing_joined_is_a_failed_night(hall: Path) -> None:

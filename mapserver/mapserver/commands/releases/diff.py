@@ -22,7 +22,7 @@ def diff(
     from mapserver import releases
     from mapserver.store import MapStore
 
-    with MapStore.open(store) as maps:
+    with MapStore.open(store, read_only=True) as maps:
         found = releases.difference(maps, site, before, after)
     if json:
         print_json(found)

@@ -23,7 +23,7 @@ def inspect(
     """Show a version's manifest: tiles, sizes, recordings and the build's report."""
     from mapserver.store import MapStore
 
-    with MapStore.open(store) as maps:
+    with MapStore.open(store, read_only=True) as maps:
         info = _chosen(maps, site, version)
         manifest = maps.manifest(site, info.version)
         verdicts = maps.verdicts(site, info.version)

@@ -11,7 +11,7 @@ def versions(site: SiteName, store: StoreFolder, json: Json = False) -> None:
 
     from mapserver.store import MapStore
 
-    with MapStore.open(store) as maps:
+    with MapStore.open(store, read_only=True) as maps:
         infos = maps.versions(site)
     if json:
         print_json(infos)

@@ -23,7 +23,7 @@ def export(
         raise UsageError(f"{file}: name a file in a folder that exists")
     from mapserver.store import MapStore
 
-    with MapStore.open(store) as maps:
+    with MapStore.open(store, read_only=True) as maps:
         if version is None:
             current = maps.current(site)
             if current is None:

@@ -1,13 +1,17 @@
 """`mapserver gc`: removal of unused versions and files from a store."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fleetmap.cli_options import expand_options
+from fleetmap.errors import StoreError
 from mapserver.commands.options import ActorOptions, Json, StoreFolder
 from mapserver.commands.print_json import print_json
+
+if TYPE_CHECKING:
+    from mapserver.store.garbage_collection import Garbage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +40,16 @@ def gc(
     """
     from mapserver.store import MapStore, Retention
 
-    with MapStore.open(store) as maps:
-        garbage = maps.collect_garbage(Retention(**vars(retention)), dry_run=dry_run, actor=by.named())
+    def collect() -> "Garbage":
+        with MapStore.open(store, read_only=dry_run) as maps:
+            return maps.collect_garbage(Retention(**vars(retention)), dry_run=dry_run, actor=by.named())
+
+    try:
+        garbage = collect()
+    except StoreError:
+        if dry_run or not MapStore.release_reserve(store):
+            raise
+        garbage = collect()  # the disk was full
     if json:
         print_json(garbage)
         return

@@ -1,0 +1,272 @@
+"""A store's folder with links in it, on a full disk, read only, beside other users. docs/security.md, row 32."""
+
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from fleetmap.errors import StoreError
+from fleetmap.mapformat import blob_path, current_path
+from mapserver import cli
+from mapserver.store import MapStore, Retention
+from mapserver.store.files import keep_reserve, locked
+from support.storage.map_samples import publish_samples, save_sample_draft
+
+TESTS = Path(__file__).resolve().parents[2]
+NOBODY = 65534
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        publish_samples(store, 2)
+    return tmp_path / "store"
+
+
+def run(*arguments: object) -> None:
+    """A command in this process; SystemExit with its status."""
+    sys.argv = ["mapserver", *(str(argument) for argument in arguments)]
+    cli.main()
+
+
+# ------------------------------------------------------------------------------------------------------------------- links
+
+
+def test_nothing_outside_of_the_store_is_removed(root: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "letter.txt").write_text("mine")
+    (root / "blobs" / "zz").symlink_to(outside)
+    (root / "blobs" / "00").mkdir(exist_ok=True)
+    (root / "blobs" / "00" / "leftover").symlink_to(outside / "letter.txt")
+    with MapStore.open(root) as store:
+        found = [path for path in (root / "blobs").glob("*/*") if path.is_file()]
+        assert outside / "letter.txt" in [path.resolve() for path in found], "the control: who follows links finds it"
+        faults = store.verify().faults
+        store.collect_garbage(Retention(0, 0, 0, 0))
+    assert (outside / "letter.txt").read_text() == "mine"
+    assert {Path(fault.split()[0]).name for fault in faults} == {"zz", "leftover"}
+
+
+def test_nothing_outside_of_the_store_is_read(root: Path, tmp_path: Path) -> None:
+    with MapStore.open(root) as store:
+        tile = store.manifest("lab", 2).tiles[0].sha256
+        path = root / blob_path(tile)
+        moved = tmp_path / "moved"
+        path.rename(moved)
+        for kind in ("file", "folder", "pipe"):
+            if kind == "file":
+                path.symlink_to(moved)
+            elif kind == "folder":
+                path.unlink()
+                path.parent.rename(tmp_path / "away")
+                shutil.copy(moved, tmp_path / "away" / path.name)
+                path.parent.symlink_to(tmp_path / "away")
+            else:
+                path.parent.unlink()
+                path.parent.mkdir()
+                os.mkfifo(path)
+            if kind != "pipe":
+                assert path.read_bytes() == moved.read_bytes(), "the control: the system follows it"
+            with pytest.raises(StoreError, match=r"symbolic link|no plain file"):
+                store.export_version("lab", 2, tmp_path / "lab.fmex")
+            with pytest.raises(StoreError):
+                store.blob(tile)
+            assert any(tile[:2] in fault for fault in store.verify().faults)
+        assert not (tmp_path / "lab.fmex").exists()
+
+
+def test_nothing_outside_of_the_store_is_written(root: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    current = root / current_path("lab")
+    current.unlink()
+    current.parent.rmdir()
+    current.parent.symlink_to(outside)
+    with pytest.raises(StoreError, match="symbolic link"):
+        MapStore.open(root)
+    current.parent.unlink()
+    current.parent.mkdir()
+    (outside / "victim").write_text("mine")
+    current.symlink_to(outside / "victim")
+    with MapStore.open(root) as store:
+        assert store.verify().faults == []
+        for folder in (root / "blobs").iterdir():
+            folder.rename(outside / folder.name)
+            folder.symlink_to(outside / folder.name)
+        before = sorted(outside.rglob("*"))
+        for seed in range(10, 13):
+            try:
+                save_sample_draft(store, seed=seed)
+            except StoreError as error:
+                assert "symbolic link" in str(error)
+    assert [path for path in sorted(outside.rglob("*")) if path.parent.name != "blobs"] == before
+    assert (outside / "victim").read_text() == "mine"
+    (root / "lock").unlink()
+    (root / "lock").symlink_to(outside / "lock")
+    with pytest.raises(OSError, match="symbolic"), locked(root / "lock", shared=False):
+        pass
+    assert not (outside / "lock").exists()
+
+
+# ------------------------------------------------------------------------------------------------------------- rights, row 32
+
+
+def modes(folder: Path) -> set[str]:
+    return {oct(stat.S_IMODE(path.stat().st_mode)) for path in (folder, *folder.rglob("*"))}
+
+
+@pytest.mark.parametrize("umask", [0o022, 0])
+def test_a_store_is_for_its_owner_alone(tmp_path: Path, umask: int, capsys: pytest.CaptureFixture[str]) -> None:
+    before = os.umask(umask)
+    try:
+        plain = tmp_path / "plain"
+        plain.write_text("the control")
+        with MapStore.open(tmp_path / "store", create=True) as store:
+            publish_samples(store, 2)
+            store.record_robot_report("lab", "r1", {}, 2)
+            store.export_version("lab", 2, tmp_path / "lab.fmex")
+            assert modes(tmp_path / "store") == {"0o600", "0o700"}, "with the database's log beside it"
+        for command in (("verify",), ("gc",), ("versions", "--site", "lab")):
+            with pytest.raises(SystemExit):
+                run(*command, "--store", tmp_path / "store")
+        with pytest.raises(SystemExit):
+            run("import", tmp_path / "lab.fmex", "--store", tmp_path / "other")
+    finally:
+        os.umask(before)
+    assert modes(tmp_path / "store") == modes(tmp_path / "other") == {"0o600", "0o700"}
+    assert stat.S_IMODE(plain.stat().st_mode) & 0o044, "the control: others may read what is written without care"
+    assert "other users" not in capsys.readouterr().out
+    (tmp_path / "store" / "store.sqlite3").chmod(0o644)
+    with pytest.raises(SystemExit):
+        run("verify", "--store", tmp_path / "store")
+    assert "other users of this machine may read the store" in capsys.readouterr().out
+
+
+# --------------------------------------------------------------------------------------- read only, and a full disk
+
+
+@contextmanager
+def as_somebody_else() -> Iterator[None]:
+    """Without the rights of root, where the tests run as root."""
+    own = os.geteuid()
+    if own == 0:
+        os.seteuid(NOBODY)
+    try:
+        yield
+    finally:
+        os.seteuid(own)
+
+
+@pytest.fixture
+def read_only_root(root: Path) -> Iterator[Path]:
+    """A copy that everybody may read and nobody may write, where everybody may go to."""
+    folder = Path(tempfile.mkdtemp())
+    shutil.copytree(root, folder / "store")
+    for path in (folder, *folder.rglob("*")):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    yield folder / "store"
+    for path in (folder, *folder.rglob("*")):
+        path.chmod(0o700)
+    shutil.rmtree(folder)
+
+
+READING = (
+    ("versions", "--site", "lab"),
+    ("inspect", "--site", "lab", "--version", 1),
+    ("diff", "--site", "lab", 1, 2),
+    ("verify",),
+    ("gc", "--dry-run"),
+)
+
+
+@pytest.mark.parametrize("command", READING, ids=lambda command: command[0])
+def test_commands_that_read_work_where_nothing_may_be_written(
+    read_only_root: Path, command: tuple[object, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with as_somebody_else(), pytest.raises(SystemExit) as end:
+        run(*command, "--store", read_only_root)
+    told = capsys.readouterr()
+    assert not end.value.code, told.err
+    assert told.out
+    with as_somebody_else(), pytest.raises(StoreError, match="cannot be opened"):
+        MapStore.open(read_only_root)  # the control
+
+
+def test_what_was_opened_for_reading_is_not_written(read_only_root: Path) -> None:
+    with as_somebody_else(), MapStore.open(read_only_root, read_only=True) as store:
+        assert store.current("lab") is not None
+        with pytest.raises(StoreError, match="refuses to be written"):
+            store.record_robot_report("lab", "r1", {}, 2)
+    assert sorted(path.name for path in read_only_root.glob("store.sqlite3*")) == ["store.sqlite3"]
+
+
+ON_A_FULL_DISK = """
+import sys
+sys.path[:0] = sys.argv[1].split(":")
+from pathlib import Path
+from support.storage.faulty_disk import FullDisk, install
+from mapserver import cli
+store, reserve = Path(sys.argv[2]), sys.argv[3] == "with reserve"
+import mapserver.store.map_store, mapserver.commands.releases.diff, mapserver.releases, mapserver.store.archive
+if not reserve:
+    (store / "reserve").unlink()
+disk = FullDisk(str(store))
+disk.measure()
+install(disk)
+def run(*words):
+    sys.argv = ["mapserver", *words, "--store", str(store)]
+    try:
+        cli.main()
+    except SystemExit as end:
+        print(words[0], end.code or 0, flush=True)
+for command in (["versions", "--site", "lab"], ["inspect", "--site", "lab"], ["diff", "--site", "lab", "1", "2"], ["verify"]):
+    run(*command)
+run("gc", "--keep-versions", "0", "--keep-days", "0", "--keep-drafts", "0")
+"""
+
+
+@pytest.mark.parametrize("reserve", ["with reserve", "without"])
+def test_a_full_disk_can_be_read_and_cleared(root: Path, reserve: str) -> None:
+    """A process of its own, because what it does to `os` and SQLite cannot be undone."""
+    with MapStore.open(root) as store:
+        save_sample_draft(store, seed=5)
+        publish_samples(store, 1)
+    files = len([path for path in (root / "blobs").rglob("*") if path.is_file()])
+    paths = ":".join([str(TESTS), *sys.path])
+    done = subprocess.run(
+        [sys.executable, "-c", ON_A_FULL_DISK, paths, str(root), reserve],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    statuses = dict(
+        line.split()
+        for line in done.stdout.splitlines()
+        if line.split()[0] in {"versions", "inspect", "diff", "gc"} and len(line.split()) == 2
+    )
+    assert {name: statuses[name] for name in ("versions", "inspect", "diff")} == {
+        "versions": "0",
+        "inspect": "0",
+        "diff": "0",
+    }, done.stderr
+    assert "verify 0" in done.stdout
+    left = len([path for path in (root / "blobs").rglob("*") if path.is_file()])
+    if reserve == "with reserve":
+        assert statuses["gc"] == "0", done.stderr
+        assert left < files
+        with MapStore.open(root) as store:
+            assert store.verify().faults == []
+    else:  # the control
+        assert statuses["gc"] != "0"
+        assert left == files
+    keep_reserve(root)
+    assert (root / "reserve").stat().st_size == 4 << 20
