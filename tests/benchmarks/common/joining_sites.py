@@ -25,7 +25,7 @@ from mapserver.survey.bundle.odometry_factors import chain_edges
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import session_relocalization
 from mapserver.survey.merge.join_test import JoinTest, Visit
-from mapserver.survey.odometry_pass import _append, continued_covariances
+from mapserver.survey.odometry_pass import _Trajectory, continued_covariances
 
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 RATE_HZ = 7.5
@@ -136,11 +136,10 @@ def session(site: Site, day: int, route: Route, name: str, robot: str = "surveyo
 
 def drive(run: EstimatorSession) -> Drive:
     """The session as its odometry and features show it, a keyframe each 0.4 m or 0.2 rad."""
-    estimates: list[Any] = []
-    odom_from_body: list[Array] = []
+    trajectory = _Trajectory()
     for estimate in run_odometry(run):
-        _append(estimate, estimates, odom_from_body)
-    placed = np.array(odom_from_body)
+        trajectory.append(estimate)
+    placed = trajectory.odom_from_body()
     frames: list[int] = []
     for frame in range(len(run)):
         if not frames or is_new_place(placed[frames[-1]], placed[frame]):
@@ -148,7 +147,7 @@ def drive(run: EstimatorSession) -> Drive:
     guess: Any = SimpleNamespace(
         keyframes=[SimpleNamespace(frame_index=frame) for frame in frames],
         odom_from_body=placed,
-        covariances=continued_covariances(estimates),
+        covariances=continued_covariances(trajectory.estimates),
     )
     state: Any = SimpleNamespace(map_from_body=placed[frames])
     keyframes = [seen(run, frame) for frame in frames]

@@ -13,7 +13,7 @@ from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import Sighting, keyframe_features, match_keyframe, session_relocalizer
-from mapserver.survey.merge.join_test import JoinEvidence, JoinTest, JoinVerdict, NotJoined, Visit
+from mapserver.survey.merge.join_test import JoinEvidence, JoinTest, NotJoined, Visit, contradicts
 from mapserver.survey.merge.joint_adjustment import Joint, adjust_jointly
 from mapserver.survey.merge.landmark_persistence import count_landmarks, faded
 from mapserver.survey.merge.merge import SessionFrames, merged
@@ -74,7 +74,7 @@ def extend(
     if isinstance(located, NotJoined):
         return located
     refused = test.judged(located, located.seen)
-    if refused is not None and refused.verdict is JoinVerdict.FOREIGN:
+    if refused is not None and contradicts(located.seen):
         return refused
 
     def sightings(places_map_from_body: Array, radius_px: float) -> list[Sighting | None]:
