@@ -13,6 +13,7 @@ from mapserver.commands.convert import convert
 from mapserver.commands.doctor import doctor
 from mapserver.commands.evaluate import evaluate
 from mapserver.commands.fleet import FLEET
+from mapserver.commands.live import live
 from mapserver.commands.nightly import nightly
 from mapserver.commands.releases.diff import diff
 from mapserver.commands.releases.inspect import inspect
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 COMMANDS: Commands = {
     "build": build,
+    "live": live,
     "nightly": nightly,
     "publish": publish,
     "promote": promote,

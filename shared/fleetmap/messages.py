@@ -7,6 +7,7 @@ fleetmap/{site}/robots/{robot}/pose      published by the robot: PoseMessage
 fleetmap/{site}/robots/{robot}/estimate  published by the robot for every frame: EstimateMessage
 fleetmap/{site}/robots/{robot}/failures  asked by the robot, FailureReport: FailureAck, once the server has it on its disk
 fleetmap/{site}/robots/{robot}/alive     liveliness token of the robot
+fleetmap/{site}/live/survey              published by a survey under way: fleetmap.live_survey
 fleetmap/{site}/manifests/{version}      asked by the robot, ChunkRequest: Part of a manifest
 fleetmap/{site}/blobs/{sha256}           asked by the robot, ChunkRequest: Part of a tile, vocabulary or manifest
 fleetmap/{site}/patches/{base}-{sha256}  asked by the robot, ChunkRequest: Part of what makes a tile or manifest out of `base`
@@ -308,10 +309,10 @@ Message = (
     | FailureReport
     | FailureAck
 )
-M = TypeVar("M", bound=Message)
+M = TypeVar("M", bound=msgspec.Struct)
 
 
-def encode_message(message: Message) -> bytes:
+def encode_message(message: msgspec.Struct) -> bytes:
     """MessagePack of a message."""
     return msgspec.msgpack.encode(message)
 
@@ -362,10 +363,10 @@ def patch_key(site: str, base_sha256: str, sha256: str) -> str:
 
 
 def split_key(key: str) -> tuple[str, str, str]:
-    """Site, robot (or 'manifests', 'blobs', 'patches') and last chunk of a key made above; raises LinkError for any other."""
+    """Site, robot (or 'live', 'manifests', 'blobs', 'patches') and last chunk of a key made above; raises LinkError for any other."""
     chunks = key.split("/")
     if len(chunks) == 5 and chunks[0] == _ROOT and chunks[2] == "robots":
         return chunks[1], chunks[3], chunks[4]
-    if len(chunks) == 4 and chunks[0] == _ROOT and chunks[2] in {"manifests", "blobs", "patches"}:
+    if len(chunks) == 4 and chunks[0] == _ROOT and chunks[2] in {"live", "manifests", "blobs", "patches"}:
         return chunks[1], chunks[2], chunks[3]
     raise LinkError(f"key {key[:200]!r} is none of fleetmap's; its keys are listed in fleetmap.messages")

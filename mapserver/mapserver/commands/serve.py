@@ -93,7 +93,7 @@ def _run(
 
     api = ApiSettings(writers, settings.gate, settings.canary, settings.resurvey)
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
-    install_dashboard(app, maps, fleet, api)
+    install_dashboard(app, maps, fleet, api, bus_service.surveys)
     config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=_STOP_WITHIN_S)
     # uvicorn stops on these signals by itself and afterwards raises them again for the handlers that were there before:
     # the default ones would end the process with a status that says it was killed.

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from markupsafe import Markup
 
+from fleetmap.geometry import Array
 from mapserver.dashboard.markup import joined
 from mapserver.dashboard.plan import Plan
 
@@ -35,6 +36,7 @@ SHAPES = {
     "triangle": '<path d="M0-1.2L1.15.9H-1.15Z"/>',
     "cross": '<path class="stroke" d="M-1-1L1 1M-1 1L1-1"/>',
 }
+_WEAK = 0.5  # of the tracked points agree: below, a person should look
 _MARK_SHARE = 0.006  # of the plan's longer side: radius of a mark
 
 
@@ -113,6 +115,26 @@ def lines(found: Iterable[Line]) -> Markup:
         )
         for line in found
     )
+
+
+def dots(points_m: Array, size_m: float) -> Markup:
+    """Points (N, 2) as one path of round dots."""
+    steps = "".join(f"M{x:.2f} {-y:.2f}h0" for x, y in points_m.tolist())
+    return Markup('<path class="dots" d="{}" stroke-width="{:.3f}"/>').format(steps, size_m)
+
+
+def trail(path: Array, width_m: float) -> Markup:
+    """A way (N, 3) x, y and quality from 0 to 1: neighbouring stretches of one tone are one line."""
+    tones = ["bad" if q <= 0 else "warn" if q < _WEAK else "good" for q in path[:, 2].tolist()]
+    drawn, start = [], 1
+    for n in range(1, len(tones)):
+        if n + 1 == len(tones) or tones[n + 1] != tones[n]:
+            way = "L".join(f"{x:.3f} {-y:.3f}" for x, y, _ in path[start - 1 : n + 1].tolist())
+            drawn.append(
+                Markup('<path class="trail {}" d="M{}" stroke-width="{:.3f}"/>').format(tones[n], way, width_m)
+            )
+            start = n + 1
+    return joined(drawn)
 
 
 class Bar(NamedTuple):

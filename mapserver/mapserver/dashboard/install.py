@@ -14,22 +14,24 @@ from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.layout import Services
 from mapserver.dashboard.live import LiveRobots
-from mapserver.dashboard.pages import failure_page, fleet_page, map_page, survey_page
+from mapserver.dashboard.pages import failure_page, fleet_page, live_page, map_page, survey_page
 from mapserver.fleet.fleet import Fleet
+from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.store import MapStore
 
 PATH = "/dashboard"
 
 
-def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings) -> None:
+def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings, surveys: LiveSurveys) -> None:
     """Adds the pages to `app`. Once in a process: NiceGUI keeps its pages in the module."""
     services = Services(
         MapData(store, settings.gate, settings.canary.share),
         HealthData(store, settings.canary, settings.resurvey, time.time_ns),
         LiveRobots(fleet, time.monotonic),
         settings.writers,
+        surveys,
     )
-    for page in (fleet_page, map_page, failure_page, survey_page):
+    for page in (fleet_page, map_page, failure_page, survey_page, live_page):
         page.install(services)
     _install_pictures(services, store)
 

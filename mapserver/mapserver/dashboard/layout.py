@@ -19,10 +19,11 @@ from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
 from mapserver.dashboard.markup import address, joined, link
 from mapserver.dashboard.plan import Plan
+from mapserver.serving.live_surveys import LiveSurveys
 
 T = TypeVar("T")
 
-PAGES = {"": "Fleet", "map": "Map", "failures": "Failures", "surveys": "Surveys"}
+PAGES = {"": "Fleet", "map": "Map", "failures": "Failures", "surveys": "Surveys", "live": "Live"}
 RESPONSE_TIMEOUT_S = 30.0
 _LOOK_COOKIE = "fleetmap_look"
 _SWITCH_LOOK = (
@@ -34,12 +35,13 @@ _SWITCH_LOOK = (
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """Services of the pages: maps and surveys, fleet health, the robots now, and permission to change something."""
+    """Services of the pages: maps and surveys, fleet health, the robots now, permission to change something, surveys under way."""
 
     maps: MapData
     health: HealthData
     robots: LiveRobots
     writers: Writers
+    surveys: LiveSurveys
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,12 +75,19 @@ async def load(function: Callable[..., T], *arguments: object) -> T:
 async def show(
     services: Services, request: Request, page: str, site: str | None, build: Callable[[PageContext], Awaitable[None]]
 ) -> None:
-    """The layout of a page with the content of `build`; a FleetmapError becomes a notice in its place."""
+    """The layout of a page with the content of `build`; a FleetmapError becomes a notice in its place.
+
+    The live page knows sites of which the store has nothing yet: those that are being surveyed.
+    """
     root = str(request.scope.get("root_path", ""))
     _set_look(request)
     try:
         sites = await load(services.maps.sites)
-        context = PageContext(root, page, await load(services.maps.chosen_site, site))
+        under_way = services.surveys.sites() if page == "live" else []
+        if page == "live" and site is None and under_way:
+            site = under_way[0]
+        chosen = site if site in under_way else await load(services.maps.chosen_site, site)
+        sites, context = sorted({*sites, *under_way}), PageContext(root, page, chosen)
     except FleetmapError as error:
         _head(root, page, None, [])
         html(notice("bad", str(error)))

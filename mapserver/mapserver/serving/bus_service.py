@@ -9,6 +9,7 @@ from contextlib import suppress
 
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError
+from fleetmap.live_survey import LiveSurveyState, live_key
 from fleetmap.mapformat import check_name, decode_manifest, make_patch
 from fleetmap.messages import (
     PoseMessage,
@@ -25,6 +26,7 @@ from fleetmap.messages import (
 )
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.caches import AuthorizationCache, ByteCache
+from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.store import MapStore
 
 Count = Callable[[str, str, int], None]
@@ -54,6 +56,7 @@ class BusService:
         self._patches = ByteCache(_RECENT_PATCHES_BYTES)
         self._patching = threading.Lock()
         self._kinds = AuthorizationCache(store.served_kind)
+        self.surveys = LiveSurveys()
         self._handles: list[Handle] = [
             bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
             bus.queryable(robot_key("*", "*", "failures"), self._counted("failure", self._failure)),
@@ -61,6 +64,7 @@ class BusService:
             bus.queryable(blob_key("*", "*"), self._counted("blob", self._parts(self._blob))),
             bus.queryable(patch_key("*", "*", "*"), self._counted("patch", self._parts(self._patch))),
             *(bus.subscribe(robot_key("*", "*", what), self._hear) for what in ("ack", "health", "pose")),
+            bus.subscribe(live_key("*"), self._hear_survey),
         ]
 
     def announce_changes(self) -> list[str]:
@@ -190,8 +194,23 @@ class BusService:
             else:
                 self._fleet.take_pose(site, robot, decode_message(payload, PoseMessage))
         except FleetmapError as error:
-            # Published messages have no answer: the log and the metric show the refusal.
-            _log.warning("message under %s refused: %s", key, error)
-            self._count(what, "refused", 0)
+            self._refuse(key, what, error)
         else:
             self._count(what, "ok", 0)
+
+    def _hear_survey(self, key: str, payload: bytes) -> None:
+        try:
+            site, _, _ = split_key(key)
+            state = decode_message(payload, LiveSurveyState)
+            if state.site != check_name(site, "site"):
+                raise LinkError(f"a survey of {state.site[:64]!r} under the key of another site; look at who sends it")
+            self.surveys.take(state)
+        except FleetmapError as error:
+            self._refuse(key, "survey", error)
+        else:
+            self._count("survey", "ok", 0)
+
+    def _refuse(self, key: str, what: str, error: FleetmapError) -> None:
+        """Published messages have no answer: the log and the metric show the refusal."""
+        _log.warning("message under %s refused: %s", key, error)
+        self._count(what, "refused", 0)

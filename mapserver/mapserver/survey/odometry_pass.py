@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse
 from fleetmap.odometry import ContinuousFrame, OdometryEstimate, OdometryStatus, make_odometry
 from fleetmap.sensors.rectification import RectifiedFrame
-from fleetmap.sensors.samples import wheel_between
+from fleetmap.sensors.samples import CameraFrame, wheel_between
 from mapserver.survey.frame_tracks import FrameTracks
 from mapserver.survey.keyframes.keyframes import FrameSummary, Keyframe, KeyframePolicy, make_keyframes, sharpness
 from mapserver.survey.settings import SurveySettings
@@ -41,39 +41,65 @@ class OdometryPass:
     tracks: FrameTracks | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class TrackedFrame:
+    """One frame: its number, pictures and estimate; frame_from_body (4, 4) in the continuous frame; whether it becomes a keyframe."""
+
+    number: int
+    frame: RectifiedFrame
+    estimate: OdometryEstimate
+    frame_from_body: Array
+    is_keyframe: bool
+
+
+class OdometryRun:
+    """Odometry of a recording, one frame after the other, with the choice of keyframes."""
+
+    def __init__(self, inputs: SurveyInputs, settings: SurveySettings) -> None:
+        rectifier = inputs.rectifier
+        mounting = rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s
+        self._inputs, self._rectifier = inputs, rectifier
+        self._odometry = make_odometry(inputs.calibration, *mounting, settings.odometry, settings.stereo)
+        self._policy = KeyframePolicy(settings.keyframes)
+        self._fed_ns = -(2**62)
+        self.chain = FrameChain()
+
+    def handle(self, raw: CameraFrame | RectifiedFrame) -> TrackedFrame:
+        """The next frame, with the IMU and the wheels up to it."""
+        inputs, rectifier, odometry = self._inputs, self._rectifier, self._odometry
+        frame = raw if isinstance(raw, RectifiedFrame) else rectifier.rectify(raw)
+        until_ns = raw.stamp_ns + int(rectifier.imu_minus_cam_s * 1e9) + _LEAD_NS
+        odometry.handle_imu(inputs.imu.between(self._fed_ns, until_ns))
+        odometry.handle_wheel(wheel_between(inputs.wheel, self._fed_ns, until_ns))
+        self._fed_ns = until_ns
+        estimate = odometry.handle_stereo(frame)
+        number, frame_from_body = len(self.chain.estimates), self.chain.append(estimate)
+        wanted = self._policy.wants(_summary(frame, estimate, frame_from_body))
+        return TrackedFrame(number, frame, estimate, frame_from_body, wanted)
+
+
 def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> OdometryPass:
     """Feeds frames (in order), the IMU and the wheels up to each into the odometry.
 
     While the odometry goes on, the executor finds the features of the keyframes that it has chosen.
     """
-    rectifier, offset_s = inputs.rectifier, inputs.rectifier.imu_minus_cam_s
-    mounting = rectifier.camera, rectifier.body_from_cam, offset_s
-    odometry = make_odometry(inputs.calibration, *mounting, settings.odometry, settings.stereo)
-    policy = KeyframePolicy(settings.keyframes)
-    trajectory = _Trajectory()
+    rectifier, run = inputs.rectifier, OdometryRun(inputs, settings)
     seen: list[FrameTracks] = []
 
     def chosen() -> Iterator[tuple[int, RectifiedFrame]]:
-        fed_ns = -(2**62)
-        for number, raw in enumerate(inputs.frames):
-            frame = raw if isinstance(raw, RectifiedFrame) else rectifier.rectify(raw)
-            until_ns = raw.stamp_ns + int(offset_s * 1e9) + _LEAD_NS
-            odometry.handle_imu(inputs.imu.between(fed_ns, until_ns))
-            odometry.handle_wheel(wheel_between(inputs.wheel, fed_ns, until_ns))
-            fed_ns = until_ns
-            estimate = odometry.handle_stereo(frame)
-            seen.append(FrameTracks.of_frame(estimate))
-            frame_from_body = trajectory.append(estimate)
-            tools.progress("odometry", number + 1, inputs.frame_count)
-            if policy.wants(_summary(frame, estimate, frame_from_body)):
-                yield number, frame
+        for raw in inputs.frames:
+            tracked = run.handle(raw)
+            seen.append(FrameTracks.of_frame(tracked.estimate))
+            tools.progress("odometry", tracked.number + 1, inputs.frame_count)
+            if tracked.is_keyframe:
+                yield tracked.number, tracked.frame
 
     keyframes = list(make_keyframes(chosen(), rectifier.camera, settings, tools.images, tools.executor))
-    estimates = trajectory.estimates
+    estimates = run.chain.estimates
     inertial = bool(estimates) and inputs.calibration.imu is not None and estimates[-1].inertial
     done = OdometryPass(
         estimates,
-        trajectory.odom_from_body(),
+        run.chain.odom_from_body(),
         continued_covariances(estimates),
         np.array([e.status is not OdometryStatus.DEGRADED for e in estimates]),
         keyframes,
@@ -85,7 +111,7 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
     return done if rectifier.camera.baseline_m > 0 else longest_run(done, rectifier.body_from_cam)
 
 
-class _Trajectory:
+class FrameChain:
     """Estimates of all frames so far, and where each frame is in one continuous frame."""
 
     def __init__(self) -> None:
@@ -102,27 +128,42 @@ class _Trajectory:
             self.estimates[earlier] = replace(tracked, scale_known=estimate.scale_known)
         return self._frame_from_body[-1]
 
+    @property
+    def level_from_frame(self) -> Array:
+        """(3, 3) turn of the continuous frame that makes it upright, as far as gravity is known by now."""
+        return np.asarray(self._frame.frame_from_odom[:3, :3].T)
+
     def odom_from_body(self) -> Array:
         """(F, 4, 4) in the frame of the last estimate, by which gravity is known best."""
         return np.asarray(se3_inverse(self._frame.frame_from_odom) @ np.array(self._frame_from_body).reshape(-1, 4, 4))
 
 
-def continued_covariances(estimates: Sequence[OdometryEstimate]) -> Array:
-    """(F, 6, 6) covariances that continue across restarts of the odometry, whose own covariance is zero there.
+class ContinuedCovariance:
+    """Covariance (6, 6) that continues across restarts of the odometry, whose own covariance is zero there.
 
     A restart that loses gravity adds a wide one: the estimate before it is hardly worth more than that it did not jump.
     """
-    carried = np.zeros((6, 6))
-    covariances: list[Array] = []
-    for number, estimate in enumerate(estimates):
+
+    def __init__(self) -> None:
+        self._carried, self._last = np.zeros((6, 6)), np.zeros((6, 6))
+        self._begun = False
+
+    def handle(self, estimate: OdometryEstimate) -> Array:
+        """That of one more estimate, in its odom axes."""
         change = estimate.new_odom_from_old_odom
-        if number and change is not None:
+        if self._begun and change is not None:
             turn = np.kron(np.eye(2), change[:3, :3])
-            carried = turn @ covariances[-1] @ turn.T
+            self._carried = turn @ self._last @ turn.T
             if not estimate.inertial:
-                carried = carried + np.diag([_GIVEN_UP_RAD**2] * 3 + [_GIVEN_UP_M**2] * 3)
-        covariances.append(carried + estimate.cov_rot_trans)
-    return np.array(covariances)
+                self._carried = self._carried + np.diag([_GIVEN_UP_RAD**2] * 3 + [_GIVEN_UP_M**2] * 3)
+        self._begun, self._last = True, self._carried + estimate.cov_rot_trans
+        return self._last
+
+
+def continued_covariances(estimates: Sequence[OdometryEstimate]) -> Array:
+    """(F, 6, 6) of all estimates, as `ContinuedCovariance`."""
+    continued = ContinuedCovariance()
+    return np.array([continued.handle(estimate) for estimate in estimates])
 
 
 def _summary(frame: RectifiedFrame, estimate: OdometryEstimate, frame_from_body: Array) -> FrameSummary:

@@ -35,6 +35,7 @@ PAGES = {
     "failures": "Failures of hall",
     "failures/1": "Failure 1 of tug-7",
     "surveys": "Surveys of hall",
+    "live": "Survey of hall",
 }
 
 

@@ -61,11 +61,15 @@ def _factor(k: int, i_from_j: Array, covariance: Array) -> RelativeTerm:
 
 def edge_covariance(odometry: OdometryPass, a: int, b: int) -> Array:
     """(6, 6) of i_from_j between frames a and b, axes of a: what the odometry's uncertainty gained, with a floor."""
-    rotation = odometry.odom_from_body[a, :3, :3].T
-    gained = odometry.covariances[b] - odometry.covariances[a]
+    first, last = odometry.odom_from_body[[a, b]]
+    distance = float(np.linalg.norm(last[:3, 3] - first[:3, 3]))
+    return gained_covariance(odometry.covariances[b] - odometry.covariances[a], first[:3, :3], distance)
+
+
+def gained_covariance(gained: Array, odom_from_body: Array, distance: float) -> Array:
+    """The same from the difference (6, 6) of two covariances in odom axes, the rotation (3, 3) at the first and the way between."""
     values, vectors = np.linalg.eigh(0.5 * (gained + gained.T))
     gained = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    carry = np.kron(np.eye(2), rotation)
-    distance = float(np.linalg.norm(odometry.odom_from_body[b, :3, 3] - odometry.odom_from_body[a, :3, 3]))
+    carry = np.kron(np.eye(2), odom_from_body.T)
     floor = np.diag([0.004**2] * 3 + [(0.01 + 0.02 * distance) ** 2] * 3)
     return np.asarray(carry @ gained @ carry.T + floor)

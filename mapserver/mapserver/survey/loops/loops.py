@@ -1,12 +1,13 @@
 """Loop closure: candidates by bag of words, gated by position, verified by geometry and by their neighbours."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import PlaceIndex
+from fleetmap.bow import BowVector, PlaceIndex
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
@@ -83,7 +84,7 @@ class Loops:
 
 
 class LoopCloser:
-    """Searches a finished chain of keyframes for revisits; `marginals` narrows with every loop that is accepted."""
+    """Searches a chain of keyframes for revisits; `marginals` narrows with every loop that is accepted."""
 
     def __init__(
         self,
@@ -94,22 +95,31 @@ class LoopCloser:
         executor: Executor = SERIAL,
     ) -> None:
         """matched: pairs of keyframes that were matched as neighbours, and so are no loops."""
-        self._keyframes, self._camera = posed.keyframes, posed.camera
+        self._camera, self._vocabulary = posed.camera, options.vocabulary
         self._body_from_cam, self._cam_from_body = posed.body_from_cam, se3_inverse(posed.body_from_cam)
-        self._map_from_body = posed.map_from_body  # moved by every accepted loop
-        self._marginals, self._settings, self._zones = marginals, options.settings.loops, options.zones
-        vocabulary = options.vocabulary
-        self._vectors = [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in posed.keyframes]
+        self._settings, self._zones = options.settings.loops, options.zones
+        self._vectors: list[BowVector] = []
         self._neighbours: dict[int, list[int]] = {}
+        self._executor = executor
+        self._inputs = MatchInputs([], posed.camera, options.settings.pairs)
+        self._depths_m = np.zeros(0)
+        self._index = PlaceIndex(options.vocabulary.word_count)
+        self.loops = Loops()
+        self.learned: list[PoseEdge] = []  # loops by which the gate has narrowed
+        self.grow(posed, marginals, matched)
+
+    def grow(self, posed: PosedKeyframes, marginals: GraphMarginals, matched: Iterable[tuple[int, int]]) -> None:
+        """Takes a longer chain: all keyframes where they are now, those that are known first; `matched` adds to what was given."""
+        new = posed.keyframes[len(self._vectors) :]
+        self._keyframes, self._map_from_body, self._marginals = posed.keyframes, posed.map_from_body, marginals
+        vocabulary = self._vocabulary
+        self._vectors += [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in new]
         for i, j in sorted(matched):
             self._neighbours.setdefault(i, []).append(j)
             self._neighbours.setdefault(j, []).append(i)
-        self._executor = executor
-        bare = [without_pictures(k) for k in posed.keyframes]
-        self._inputs = MatchInputs(bare, posed.camera, options.settings.pairs)
-        self._depths_m = np.array([median_depth_m(keyframe) for keyframe in posed.keyframes])
-        self._index = PlaceIndex(vocabulary.word_count)
-        self.loops = Loops()
+        bare = [*self._inputs.keyframes, *(without_pictures(k) for k in new)]
+        self._inputs = replace(self._inputs, keyframes=bare)
+        self._depths_m = np.append(self._depths_m, [median_depth_m(keyframe) for keyframe in new])
 
     def close(self, i: int) -> None:
         """Looks for revisits of keyframe i among those before it, then adds it to the index. To be called in order."""
@@ -277,6 +287,7 @@ class LoopCloser:
             self.loops.edges.append(edge)
             if self._marginals.gain(edge, self._well_known()) > _WORTH_LEARNING:
                 self._marginals.add(edge)
+                self.learned.append(edge)
                 self._map_from_body = self._marginals.map_from_body
 
     def _well_known(self) -> Array:

@@ -1,0 +1,120 @@
+"""The live page: a survey while it drives, its path, landmarks and revisits, and whether tracking and mapping keep up."""
+
+import numpy as np
+from fastapi import Request
+from markupsafe import Markup
+from nicegui import ui
+
+from mapserver.dashboard import drawing, fleet_parts
+from mapserver.dashboard.drawing import Line, Mark
+from mapserver.dashboard.fleet_parts import Figure
+from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, notice, show
+from mapserver.dashboard.markup import facts, joined, link
+from mapserver.dashboard.plan import Plan
+from mapserver.serving.live_surveys import LiveSurvey
+
+_REFRESH_S = 0.5
+_MARGIN_M = 4.0
+_SHOWN_LANDMARKS = 4000
+_BEYOND_M = 12.0  # landmarks of far walls would shrink everything else
+_PHASES = {
+    "tracking": ("warn", "The survey drives."),
+    "adjusting": ("warn", "The drive is over; the finished map is made."),
+    "stored": ("good", "The finished map is stored as a draft."),
+    "failed": ("bad", "No map could be made of it."),
+}
+
+
+def install(services: Services) -> None:
+    """Adds the page."""
+
+    @ui.page("/live", title="Live – fleetmap", response_timeout=RESPONSE_TIMEOUT_S)
+    async def live_page(request: Request, site: str | None = None) -> None:
+        async def build(context: PageContext) -> None:
+            html(Markup("<h1>Survey of {}</h1>").format(context.site))
+            shown = services.surveys.of(context.site)
+            content = html(_content(context, shown))
+
+            def refresh() -> None:
+                nonlocal shown
+                found = services.surveys.of(context.site)
+                is_new = found is not None and (shown is None or found.state is not shown.state)
+                if is_new or (found is not None and shown is not None and found.is_silent != shown.is_silent):
+                    content.set_content(str(_content(context, found)))
+                shown = found
+
+            ui.timer(_REFRESH_S, refresh, immediate=False)
+
+        await show(services, request, "live", site, build)
+
+
+def _content(context: PageContext, survey: LiveSurvey | None) -> Markup:
+    if survey is None:
+        return Markup(
+            '<p class="quiet">No survey of this site was heard since the server started. '
+            "<code>mapserver live RECORDING --site {} --store DIR --server ENDPOINT</code> shows one here.</p>"
+        ).format(context.site)
+    return joined([_phase(context, survey), _figures(survey), _picture(survey), _refused(survey)])
+
+
+def _phase(context: PageContext, survey: LiveSurvey) -> Markup:
+    state = survey.state
+    if survey.is_silent:
+        return notice("bad", f"Nothing was heard of it for {survey.seconds_since:.0f} s; look at the survey robot.")
+    tone, words = _PHASES.get(state.phase, ("warn", state.phase))
+    more = Markup(" {}").format(state.words) if state.words else Markup("")
+    if state.phase == "stored" and state.version is not None:
+        more = Markup(" {}").format(link(context.to("map", version=state.version), f"Version {state.version}"))
+    return notice(tone, Markup("{}{}").format(words, more))
+
+
+def _figures(survey: LiveSurvey) -> Markup:
+    state = survey.state
+    way = state.path()
+    way_m = float(np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1).sum()) if len(way) > 1 else 0.0
+    answered = "as fast as it goes" if state.latency_ms is None else f"{state.latency_ms:.0f} ms"
+    late = f"{state.late_frames} of {state.frames} frames later than the next one"
+    return fleet_parts.figures(
+        [
+            Figure("Recorded", f"{state.seconds:.0f} s", f"{state.frames} frames, {way_m:.0f} m"),
+            Figure("Frames answered within", answered, late),
+            Figure("Keyframes", str(state.keyframes), f"{state.behind} wait to be mapped"),
+            Figure("Revisits", str(state.loops), f"{sum(state.refused.values())} candidates refused"),
+        ]
+    )
+
+
+def _picture(survey: LiveSurvey) -> Markup:
+    """Landmarks, revisits and the path, coloured by how well it was tracked."""
+    state = survey.state
+    way, marks, lines = state.path(), state.landmarks(), state.loop_lines()
+    if not len(way):
+        return Markup('<p class="quiet">No keyframe is mapped yet.</p>')
+    low, high = way[:, :2].min(axis=0) - _BEYOND_M, way[:, :2].max(axis=0) + _BEYOND_M
+    marks = marks[((marks > low) & (marks < high)).all(axis=1)][:: max(1, len(marks) // _SHOWN_LANDMARKS)]
+    seen = np.concatenate([way[:, :2], marks])
+    low, high = seen.min(axis=0) - _MARGIN_M, seen.max(axis=0) + _MARGIN_M
+    plan = Plan((float(low[0]), float(low[1])), (float(high[0]), float(high[1])), 1.0, (), len(way), b"", ())
+    size_m = max(plan.size_m) * 0.004
+    loops = drawing.lines(Line((a, b), (c, d), "accent", "revisit") for a, b, c, d in lines.tolist())
+    here = Mark(float(way[-1, 0]), float(way[-1, 1]), "good" if way[-1, 2] > 0 else "bad", "circle", "newest keyframe")
+    layers = [
+        drawing.dots(marks, size_m),
+        loops,
+        drawing.trail(way, size_m),
+        drawing.marks(plan, [here]),
+        drawing.scale_bar(plan),
+    ]
+    picture = drawing.svg(plan, f"Survey of {state.site} so far", layers)
+    return Markup(
+        '<div class="planbox">{}</div><p class="quiet">The way is green where tracking is good, yellow where half of the points disagree, '
+        "red where it was lost. Thin lines are revisits. The finished map is adjusted anew.</p>"
+    ).format(picture)
+
+
+def _refused(survey: LiveSurvey) -> Markup:
+    refused = survey.state.refused
+    if not refused:
+        return Markup("")
+    named = facts([(verdict.replace("_", " "), count) for verdict, count in sorted(refused.items())])
+    return Markup("<h2>Refused candidates for revisits</h2>{}").format(named)

@@ -1,0 +1,182 @@
+"""Mapping beside tracking: a process of its own, so that no frame waits for it. It takes every keyframe, in order."""
+
+import multiprocessing
+import queue
+import signal
+import threading
+from multiprocessing.connection import Connection
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import FleetmapError
+from fleetmap.geometry import Array
+from fleetmap.live_survey import MAX_ARRAY_BYTES
+from fleetmap.sensors.rectification import RectifiedFrame
+from mapserver.survey.live.live_map import LiveMap, LiveRig, NewKeyframe
+from mapserver.survey.survey_inputs import SurveyConfig
+
+_READY_WITHIN_S = 120.0  # a first start compiles kernels
+_STOP_WITHIN_S = 120.0  # for the keyframes that wait
+MOST_PLACES = MAX_ARRAY_BYTES // 8  # x and y as float32
+_MAX_WAITING = 256  # pictures of keyframes, 0.6 MB each
+
+
+class MapSketch(NamedTuple):
+    """The map after so many keyframes: their places (K, 2), landmarks (N, 2) thinned evenly, believed loops (L, 4), and how many
+    candidates were refused, by verdict.
+    """
+
+    keyframes: int
+    path_m: Array
+    landmarks_m: Array
+    loops_m: Array
+    loops: int
+    refused: dict[str, int]
+
+
+_NOTHING = MapSketch(0, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 4)), 0, {})
+
+
+class MappingProcess:
+    """The process and the threads that speak with it, from `with` until its end."""
+
+    def __init__(self, options: SurveyConfig, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...] = ()) -> None:
+        """warm_up: frames on which its kernels are loaded before the survey begins."""
+        context = multiprocessing.get_context("spawn")
+        self._ours, theirs = context.Pipe()
+        self._process = context.Process(target=_map, args=(theirs, options, rig, warm_up), daemon=True, name="mapping")
+        self._theirs = theirs
+        self._waiting: queue.Queue[tuple[RectifiedFrame, NewKeyframe] | None] = queue.Queue()
+        self._sent = 0
+        self._latest, self._failed = _NOTHING, ""
+        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._send, self._receive)]
+
+    def __enter__(self) -> Self:
+        self._process.start()
+        self._theirs.close()
+        if not self._ours.poll(_READY_WITHIN_S) or self._ours.recv() != "ready":
+            self._process.kill()
+            raise FleetmapError("mapping did not start; `mapserver prepare` compiles what it needs, then try again")
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.finish()
+
+    @property
+    def sketch(self) -> MapSketch:
+        """The map after the newest keyframe that was taken."""
+        return self._latest
+
+    @property
+    def behind(self) -> int:
+        """Keyframes that wait."""
+        return self._sent - self._latest.keyframes
+
+    @property
+    def failed(self) -> str:
+        """Why no more keyframes are taken; empty while all is well."""
+        return self._failed
+
+    def put(self, frame: RectifiedFrame, keyframe: NewKeyframe) -> None:
+        """One more keyframe; returns at once. A map that is too far behind is given up: the build at the end needs it not."""
+        if self._failed:
+            return
+        if self.behind >= _MAX_WAITING:
+            self._failed = (
+                f"mapping was {_MAX_WAITING} keyframes behind and was given up; the finished map is built all the same"
+            )
+            self._waiting.put(None)
+            return
+        self._sent += 1
+        self._waiting.put((frame, keyframe))
+
+    def finish(self) -> None:
+        """Waits for the keyframes that were put, at most some time, and ends the process."""
+        self._waiting.put(None)
+        for thread in self._threads:
+            if thread.ident is not None:
+                thread.join(_STOP_WITHIN_S)
+        self._process.join(1.0)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._ours.close()
+
+    def _send(self) -> None:
+        try:
+            while (item := self._waiting.get()) is not None:
+                self._ours.send(item)
+            self._ours.send(None)
+        except OSError:  # the process has ended: `_receive` knows why
+            pass
+
+    def _receive(self) -> None:
+        try:
+            while (answer := self._ours.recv()) is not None:
+                if isinstance(answer, str):
+                    self._failed = answer
+                    return
+                self._latest = answer
+        except (EOFError, OSError):
+            self._failed = self._failed or "the mapping process ended; the finished map is built all the same"
+
+
+def _map(pipe: Connection, options: SurveyConfig, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...]) -> None:
+    """The process: answers every keyframe with the map that it makes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the survey's own process says when it is over
+    _warm(options, rig, warm_up)
+    growing = LiveMap(options, rig)
+    try:
+        pipe.send("ready")
+        while (item := pipe.recv()) is not None:
+            frame, keyframe = item
+            growing.add(frame, keyframe)
+            pipe.send(sketch_of(growing))
+        pipe.send(None)
+    except (EOFError, OSError):  # the survey was killed
+        pass
+    except Exception as error:  # a fault here must not end the survey
+        pipe.send(f"mapping failed ({type(error).__name__}: {error}); the finished map is built all the same")
+
+
+def _warm(options: SurveyConfig, rig: LiveRig, frames: tuple[RectifiedFrame, ...]) -> None:
+    """Loads every kernel on some frames."""
+    scratch = LiveMap(options, rig)
+    step = np.diag([1e-4] * 6)
+    for number, frame in enumerate(frames):
+        still = np.zeros(3)
+        frame_from_body = np.eye(4)
+        frame_from_body[0, 3] = 0.01 * number
+        scratch.add(
+            frame, NewKeyframe(number, frame_from_body, np.eye(3), step if number else None, still, still, still)
+        )
+
+
+def sketch_of(growing: LiveMap) -> MapSketch:
+    """What of a map is shown while it grows; no array is larger than a message may hold."""
+    placed, found = growing.map_from_body, growing.loops()
+    ends = placed[found.believed][:, :, :2, 3].reshape(-1, 4)
+    return MapSketch(
+        len(growing),
+        thinned(placed[:, :2, 3], 2),
+        thinned(growing.points_map()[:, :2], 2),
+        thinned(ends, 4),
+        len(ends),
+        found.refused,
+    )
+
+
+def thinned(rows: Array, columns: int) -> Array:
+    """Rows that fit a message as float32, spread evenly over all; the last one is always among them."""
+    most = MAX_ARRAY_BYTES // (4 * columns)
+    return rows[thinning(len(rows), most)]
+
+
+def thinning(count: int, most: int) -> NDArray[np.int64]:
+    """At most `most` of `count` numbers, evenly, the last one included."""
+    step = max(1, -(-count // most))
+    return np.arange(count - 1, -1, -step)[::-1].astype(np.int64)

@@ -1,0 +1,93 @@
+"""Tracking of a survey under way: the survey's own odometry, frame by frame, and what the growing map needs of its keyframes."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.samples import CameraFrame
+from mapserver.survey.bundle.odometry_factors import gained_covariance
+from mapserver.survey.live.live_map import NewKeyframe
+from mapserver.survey.odometry_pass import ContinuedCovariance, OdometryRun
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyInputs
+
+_LEAD_NS = 100_000_000
+
+
+class Tracked(NamedTuple):
+    """One frame as tracking leaves it.
+
+    frame_from_body (4, 4); quality: share of its points that agree, 0 while the odometry is lost; keyframe: what the map takes of it,
+    None where it is none.
+    """
+
+    frame: RectifiedFrame
+    frame_from_body: Array
+    quality: float
+    keyframe: NewKeyframe | None
+
+
+class _Before(NamedTuple):
+    """The last keyframe: its covariance and rotation in odom axes, its place, and until when its IMU samples went."""
+
+    covariance: Array
+    odom_from_body: Array
+    position_m: Array
+    until_ns: int
+
+
+class LiveTracking:
+    """Takes every frame in turn."""
+
+    def __init__(self, inputs: SurveyInputs, settings: SurveySettings) -> None:
+        """inputs: its IMU and wheels up to each frame, its frames are not read."""
+        self._inputs, self._run = inputs, OdometryRun(inputs, settings)
+        self._continued = ContinuedCovariance()
+        self._before: _Before | None = None
+
+    def handle(self, raw: CameraFrame | RectifiedFrame) -> Tracked:
+        """The next frame."""
+        tracked = self._run.handle(raw)
+        estimate, covariance = tracked.estimate, self._continued.handle(tracked.estimate)
+        self._turn(estimate)
+        keyframe = None
+        if tracked.is_keyframe:
+            keyframe = self._keyframe(tracked.number, estimate, covariance, tracked.frame_from_body)
+        quality = 0.0 if estimate.status is OdometryStatus.DEGRADED else float(estimate.inlier_share)
+        return Tracked(tracked.frame, tracked.frame_from_body, quality, keyframe)
+
+    def _turn(self, estimate: OdometryEstimate) -> None:
+        """The last keyframe's values in the axes that odom has now."""
+        change = estimate.new_odom_from_old_odom
+        if change is not None and self._before is not None:
+            turn = np.kron(np.eye(2), change[:3, :3])
+            covariance = turn @ self._before.covariance @ turn.T
+            rotation = change[:3, :3] @ self._before.odom_from_body
+            self._before = self._before._replace(covariance=covariance, odom_from_body=rotation)
+
+    def _keyframe(
+        self, number: int, estimate: OdometryEstimate, covariance: Array, frame_from_body: Array
+    ) -> NewKeyframe:
+        before, step_cov, since_ns = self._before, None, -(2**62)
+        if before is not None:
+            way_m = float(np.linalg.norm(frame_from_body[:3, 3] - before.position_m))
+            step_cov = gained_covariance(covariance - before.covariance, before.odom_from_body, way_m)
+            since_ns = before.until_ns
+        offset_ns = int(self._inputs.rectifier.imu_minus_cam_s * 1e9)
+        until_ns = estimate.stamp_ns + offset_ns + _LEAD_NS
+        rotation = estimate.odom_from_body[:3, :3]
+        self._before = _Before(covariance, rotation, frame_from_body[:3, 3], until_ns)
+        return NewKeyframe(
+            number=number,
+            frame_from_body=frame_from_body,
+            level_from_frame=self._run.chain.level_from_frame,
+            step_cov=step_cov,
+            velocity_body_mps=rotation.T @ estimate.velocity_odom_mps,
+            gyro_bias_radps=estimate.gyro_bias_radps,
+            accel_bias_mps2=estimate.accel_bias_mps2,
+            inertial=estimate.inertial,
+            imu=self._inputs.imu.between(since_ns, until_ns),
+        )

@@ -1,0 +1,76 @@
+"""The message of a survey under way, and the key of the bus that carries it."""
+
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from fleetmap.errors import LinkError
+from fleetmap.geometry import Array
+from fleetmap.messages import Name, Text, Version
+
+MAX_ARRAY_BYTES = 64 << 10
+_Bytes = Annotated[bytes, msgspec.Meta(max_length=MAX_ARRAY_BYTES)]
+
+
+class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
+    """A survey under way, as of the frame at stamp_ns; coordinates are metres in its own upright frame.
+
+    phase: `tracking`, `adjusting` while the finished map is made, `stored` as draft `version`, or `failed`, why being in `words`.
+    seconds: of the recording so far. behind: keyframes that mapping has not taken yet. latency_ms: 0.99 of the frames were answered in
+    less, None where frames were not played at their own speed; late_frames: those that took longer than the time to the next one.
+    path_m (N, 2) and landmarks_m (M, 2), loops_m (L, 4) from and to: little-endian float32, thinned evenly. quality (N,): bytes, 0 where
+    tracking was lost, 255 where all points agreed. loops, refused: how many, and of which verdict.
+    """
+
+    site: Name
+    recording: Text
+    stamp_ns: int
+    phase: Name
+    seconds: float
+    frames: int
+    keyframes: int
+    behind: int = 0
+    latency_ms: float | None = None
+    late_frames: int = 0
+    path_m: _Bytes = b""
+    quality: _Bytes = b""
+    landmarks_m: _Bytes = b""
+    loops_m: _Bytes = b""
+    loops: int = 0
+    refused: Annotated[dict[Name, int], msgspec.Meta(max_length=16)] = {}
+    version: Version | None = None
+    words: Text = ""
+
+    def path(self) -> Array:
+        """(N, 3) x, y and quality from 0 to 1; raises LinkError where they do not fit each other."""
+        places, quality = _rows(self.path_m, 2, "path_m"), np.frombuffer(self.quality, np.uint8)
+        if len(places) != len(quality):
+            raise LinkError(
+                f"a survey of {len(places)} places has {len(quality)} qualities; does the sender run the same fleetmap?"
+            )
+        return np.column_stack([places, quality / 255.0])
+
+    def landmarks(self) -> Array:
+        """(M, 2); raises LinkError for bytes that are no places."""
+        return _rows(self.landmarks_m, 2, "landmarks_m")
+
+    def loop_lines(self) -> Array:
+        """(L, 4) x and y from and to; raises LinkError for bytes that are no lines."""
+        return _rows(self.loops_m, 4, "loops_m")
+
+
+def _rows(data: bytes, columns: int, name: str) -> Array:
+    if len(data) % (4 * columns):
+        raise LinkError(
+            f"{name} of {len(data)} bytes is no array of {columns} columns; does the sender run the same fleetmap?"
+        )
+    rows = np.frombuffer(data, "<f4").astype(np.float64).reshape(-1, columns)
+    if not np.isfinite(rows).all():
+        raise LinkError(f"{name} holds a number that is not finite; look at the survey's log")
+    return rows
+
+
+def live_key(site: str) -> str:
+    """Key of a site's survey under way; '*' for any."""
+    return f"fleetmap/{site}/live/survey"

@@ -1,0 +1,58 @@
+"""The live page in a real browser: a survey of a site that the store does not know yet, while it drives and after."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from playwright.sync_api import expect, sync_playwright
+
+from fleetmap.bus import ZenohBus
+from fleetmap.live_survey import LiveSurveyState, live_key
+from fleetmap.messages import encode_message
+from mapserver.store import MapStore
+from support.fleet.dashboard_scene import Served, chromium, serving, watch
+
+STATE = LiveSurveyState(
+    site="yard", recording="monday", stamp_ns=5, phase="tracking", seconds=12.0, frames=240, keyframes=40, latency_ms=17.2,
+    path_m=np.column_stack([np.linspace(0, 20, 40), np.zeros(40)]).astype("<f4").tobytes(),
+    quality=bytes([255] * 20 + [60] * 10 + [0] * 10),
+    landmarks_m=np.random.default_rng(1).uniform(-3, 22, (500, 2)).astype("<f4").tobytes(),
+    loops_m=np.array([[18.0, 0, 2, 0]], "<f4").tobytes(), loops=1, refused={"gated_out": 12}, words="<script>alert(1)</script>",
+)  # fmt: skip
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    MapStore.open(tmp_path / "store", create=True).close()
+    with serving(tmp_path / "store") as server:
+        yield server
+
+
+def test_a_survey_is_followed_to_its_end(served: Served) -> None:
+    path = chromium()
+    with sync_playwright() as playwright, ZenohBus.connect(served.zenoh) as bus:
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        page = browser.new_context(viewport={"width": 1280, "height": 900}).new_page()
+        seen = watch(page)
+        deadline_s = time.monotonic() + 20
+        while time.monotonic() < deadline_s:  # the subscription is known everywhere after a moment
+            bus.publish(live_key("yard"), encode_message(STATE))
+            page.goto(f"{served.http}/dashboard/live?site=yard")
+            if page.locator("h1").count() and page.locator("svg.plan").count():
+                break
+        expect(page.locator("h1")).to_have_text("Survey of yard")
+        page.wait_for_function("window.socket && window.socket.connected")
+        bus.publish(live_key("yard"), encode_message(msgspec.structs.replace(STATE, keyframes=41)))
+        expect(page.locator(".figures")).to_contain_text("41")
+        expect(page.locator(".figures")).to_contain_text("17 ms")
+        assert [page.locator(f"svg .trail.{tone}").count() for tone in ("good", "warn", "bad")] == [1, 1, 1]
+        assert page.locator("svg .line.accent").count() == 1
+        expect(page.locator("body")).to_contain_text("<script>alert(1)</script>")
+        finished = msgspec.structs.replace(STATE, phase="stored", version=1, words="")
+        bus.publish(live_key("yard"), encode_message(finished))
+        expect(page.locator(".notice")).to_contain_text("Version 1")
+        assert seen.faults == []
+        browser.close()

@@ -1,0 +1,115 @@
+"""A survey under way from end to end, on a small recording."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from fleetmap.errors import UsageError
+from fleetmap.live_survey import MAX_ARRAY_BYTES, LiveSurveyState
+from fleetmap.messages import MAX_MESSAGE_BYTES, encode_message
+from fleetmap.sensors.samples import SensorSet
+from mapserver.build.build import BuildOptions
+from mapserver.config import survey_settings
+from mapserver.library import build_map
+from mapserver.live import LiveRequest, LiveResult, run_live
+from mapserver.live.mapping_process import thinned, thinning
+from mapserver.store import MapStore
+from support.recordings.recording_samples import make_sample, write_euroc
+
+FRAMES = 24
+SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_euroc(tmp_path_factory.mktemp("recordings") / "walk", make_sample(FRAMES))
+
+
+@pytest.fixture(scope="module")
+def finished(
+    recording: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[LiveResult, list[LiveSurveyState], Path]:
+    """A whole drive at its own speed, all that was told of it, and its store."""
+    store, told = tmp_path_factory.mktemp("store") / "maps", list[LiveSurveyState]()
+    result = run_live(LiveRequest(recording, "lab", store, SETTINGS), told.append, lambda: False, QUIET)
+    return result, told, store
+
+
+def test_every_frame_is_tracked_and_every_keyframe_mapped(
+    finished: tuple[LiveResult, list[LiveSurveyState], Path],
+) -> None:
+    result, told, _ = finished
+    figures = result.figures
+    assert (figures.frames, figures.mapping_failed) == (FRAMES, "")
+    assert figures.seconds == pytest.approx((FRAMES - 1) * 0.05)
+    assert figures.latency_ms is not None
+    assert 0 < figures.latency_ms[0] <= figures.latency_ms[1]
+    last = told[-1]
+    assert len(last.path()) == last.keyframes == figures.keyframes > 2
+    assert last.behind == 0
+    assert (last.path()[:, 2] > 0.5).all()
+    assert len(last.landmarks()) > 100
+
+
+def test_its_phases_are_told_in_order_and_end_with_the_draft(
+    finished: tuple[LiveResult, list[LiveSurveyState], Path],
+) -> None:
+    result, told, _ = finished
+    phases = list(dict.fromkeys(state.phase for state in told))
+    assert phases[-2:] == ["adjusting", "stored"]
+    assert (told[-1].version, told[-1].words) == (1, result.built.sentence)
+    assert "live: 24 frames" in result.figures.words()
+
+
+def test_the_draft_is_what_a_build_makes_of_the_recording(
+    finished: tuple[LiveResult, list[LiveSurveyState], Path], recording: Path, tmp_path: Path
+) -> None:
+    result, _, store = finished
+    built = build_map(recording, tmp_path / "maps", "lab", BuildOptions(settings=SETTINGS))
+    assert result.built.trajectory.frame_from_body.tobytes() == built.trajectory.frame_from_body.tobytes()
+    with MapStore.open(store) as one, MapStore.open(tmp_path / "maps") as other:
+        assert [t.sha256 for t in one.manifest("lab", 1).tiles] == [t.sha256 for t in other.manifest("lab", 1).tiles]
+
+
+def test_a_drive_that_is_ended_early_is_built_as_far_as_it_went(recording: Path, tmp_path: Path) -> None:
+    seen: list[LiveSurveyState] = []
+    calls = iter(range(FRAMES))
+    request = LiveRequest(recording, "lab", tmp_path / "maps", SETTINGS, BuildOptions(), speed=0)
+    result = run_live(request, seen.append, lambda: next(calls) >= 18, QUIET)
+    assert result.figures.frames == 18
+    assert result.figures.latency_ms is None
+    assert len(result.built.trajectory) == 18
+    assert seen[-1].latency_ms is None
+
+
+def test_what_cannot_be_mapped_live_is_refused_before_it_begins(recording: Path, tmp_path: Path) -> None:
+    def told(options: BuildOptions, speed: float = 1.0) -> LiveRequest:
+        return LiveRequest(recording, "lab", tmp_path / "maps", SETTINGS, options, speed)
+
+    with pytest.raises(UsageError, match="one camera alone"):
+        run_live(told(BuildOptions(use=SensorSet.MONO)), print, lambda: False, QUIET)
+    with pytest.raises(UsageError, match="100:200"):
+        run_live(told(BuildOptions(frames="100:200")), print, lambda: False, QUIET)
+    for speed in (-1.0, float("nan")):
+        with pytest.raises(UsageError, match="--speed"):
+            run_live(told(BuildOptions(), speed), print, lambda: False, QUIET)
+    assert not (tmp_path / "maps").exists()
+
+
+def test_thinned_rows_fit_a_message_and_keep_the_last() -> None:
+    rows = np.arange(100_000.0).reshape(-1, 2)
+    kept = thinned(rows, 2)
+    assert 4 * kept.size <= MAX_ARRAY_BYTES
+    assert kept[-1].tolist() == rows[-1].tolist()
+    assert len({*np.diff(kept[:, 0])}) == 1
+    assert thinning(3, 10).tolist() == [0, 1, 2]
+    assert thinning(0, 10).tolist() == []
+    full = bytes(MAX_ARRAY_BYTES)
+    state = LiveSurveyState(
+        site="s" * 64, recording="r", stamp_ns=1, phase="tracking", seconds=1.0, frames=1, keyframes=1,
+        path_m=full, quality=full[: MAX_ARRAY_BYTES // 8], landmarks_m=full, loops_m=full,
+    )  # fmt: skip
+    assert len(encode_message(state)) < MAX_MESSAGE_BYTES

@@ -1,0 +1,89 @@
+"""Surveys under way, as the server hears of them over the bus."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from fleetmap.errors import LinkError
+from fleetmap.live_survey import LiveSurveyState, live_key
+from fleetmap.messages import encode_message
+from mapserver.serving.live_surveys import SILENT_S, LiveSurveys
+from support.fleet.served_world import World, served_world
+
+
+def state(site: str = "hall", **changed: object) -> LiveSurveyState:
+    """A survey of two keyframes."""
+    way = np.array([[0.0, 0.0], [1.0, 0.5]], "<f4").tobytes()
+    drive = LiveSurveyState(
+        site=site, recording="monday", stamp_ns=5, phase="tracking", seconds=2.0, frames=40, keyframes=2, path_m=way,
+        quality=bytes([255, 0]),
+    )  # fmt: skip
+    return msgspec.structs.replace(drive, **changed)
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with served_world(tmp_path) as made:
+        yield made
+
+
+def test_the_newest_state_of_a_site_is_kept(world: World) -> None:
+    for frames in (10, 20):
+        world.robot_bus.publish(live_key("hall"), encode_message(state(frames=frames)))
+    found = world.service.surveys.of("hall")
+    assert found is not None
+    assert found.state.frames == 20
+    np.testing.assert_allclose(found.state.path(), [[0, 0, 1], [1, 0.5, 0]])
+    assert world.service.surveys.of("lab") is None
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        state(site="other"),
+        state(quality=b"\x01"),
+        state(landmarks_m=b"12345"),
+        state(loops_m=np.array([0, 1, np.nan, 2], "<f4").tobytes()),
+    ],
+)
+def test_what_is_no_state_of_the_site_is_refused_and_counted(world: World, wrong: LiveSurveyState) -> None:
+    world.robot_bus.publish(live_key("hall"), encode_message(wrong))
+    world.robot_bus.publish(live_key("hall"), b"nonsense")
+    assert world.service.surveys.sites() == []
+    assert [(what, result) for what, result, _ in world.counts] == [("survey", "refused")] * 2
+
+
+def test_arrays_that_are_too_large_are_no_message(world: World) -> None:
+    world.robot_bus.publish(live_key("hall"), encode_message(state(landmarks_m=bytes(1 << 17))))
+    assert world.service.surveys.sites() == []
+
+
+def test_silence_is_seen_only_of_surveys_that_should_speak() -> None:
+    now_s = 0.0
+    surveys = LiveSurveys(lambda: now_s)
+    surveys.take(state())
+    now_s = SILENT_S + 1
+    found = surveys.of("hall")
+    assert found is not None
+    assert found.is_silent
+    surveys.take(state(phase="adjusting"))
+    now_s += 60
+    found = surveys.of("hall")
+    assert found is not None
+    assert not found.is_silent
+
+
+def test_the_number_of_sites_is_bounded() -> None:
+    surveys = LiveSurveys(lambda: 0.0)
+    for number in range(100):
+        surveys.take(state(f"site-{number}"))
+    surveys.take(state("site-80"))
+    assert len(surveys.sites()) == 32
+    assert surveys.of("site-80") is not None
+    assert surveys.of("site-1") is None
+    with pytest.raises(LinkError):
+        surveys.take(state("site-1", quality=b""))
+    assert surveys.of("site-1") is None
