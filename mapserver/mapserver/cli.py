@@ -15,6 +15,7 @@ from mapserver.commands.evaluate import evaluate
 from mapserver.commands.fleet import FLEET
 from mapserver.commands.live import live
 from mapserver.commands.nightly import nightly
+from mapserver.commands.prepare import prepare
 from mapserver.commands.releases.diff import diff
 from mapserver.commands.releases.inspect import inspect
 from mapserver.commands.releases.promote import promote
@@ -52,6 +53,7 @@ COMMANDS: Commands = {
     "evaluate": evaluate,
     "train-vocabulary": train_vocabulary,
     "fleet": FLEET,
+    "prepare": prepare,
     "config": CONFIG,
 }
 

@@ -66,6 +66,14 @@ def test_importing_is_light() -> None:
         _ = mapserver.nonsense
 
 
+def test_a_build_loads_no_library_that_it_does_not_need() -> None:
+    """scipy.stats alone takes half a second."""
+    unneeded = ("scipy.stats", "scipy.optimize", "matplotlib", "fastapi", "nicegui", "distributed", "zenoh")
+    script = f"import sys, mapserver.library; print([m for m in {unneeded!r} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
 def test_missing_libraries_are_named_with_the_extra_that_has_them() -> None:
     """As with `fleetmap[client]`: gtsam is not there."""
     script = "import sys; sys.modules['gtsam'] = None; from mapserver import build_map"

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, align_points, rotation_angle_rad, se3_inverse, transform_points
@@ -130,6 +129,8 @@ def best_clock_shift(
         true = np.column_stack([np.interp(own_s + shift_s, at_s, axis) for axis in truth.positions_m.T])
         frame_from_estimate, _ = align_points(true, positions, with_scale=False)
         return _rms(np.linalg.norm(transform_points(frame_from_estimate, positions) - true, axis=1))
+
+    from scipy.optimize import minimize_scalar  # a build does not need it
 
     # The error has one minimum for a smooth motion, but noise makes others: the best of a grid says around which to look.
     grid = np.linspace(-max_shift_s, max_shift_s, 21)

@@ -49,7 +49,7 @@ def disparities(
     prior = np.full(count, np.nan) if prior_px is None else np.asarray(prior_px, np.float64)
     # whole images are only searched at half size
     halves = (frame.left, frame.right) if np.isfinite(prior).all() else (halved(frame.left), halved(frame.right))
-    sought = np.asarray(pixels, np.float64), prior
+    sought = np.ascontiguousarray(pixels, np.float64), prior
     scores, windows = (settings.min_correlation, settings.uniqueness), (settings.wide_half_px, settings.narrow_half_px)
     images = frame.left, frame.right
     matched = match_rows(*images, *halves, *sought, max_disparity, *scores, *windows, settings.agreement_px)

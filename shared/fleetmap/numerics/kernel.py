@@ -1,23 +1,41 @@
 """Options of numba, in this one place: cached, without the GIL, and without fast-math so that bits repeat."""
 
+import os
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
 
+from fleetmap.errors import FleetmapError
+
 F = TypeVar("F", bound=Callable[..., object])
+
+KERNELS: list[Any] = []  # numba's dispatchers of all kernels that were imported
 
 
 def kernel(function: F) -> F:
     """`function` compiled on first call. Division by zero gives inf or NaN, as in numpy."""
-    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    return _cached(function)
 
 
 def inline_kernel(function: F) -> F:
     """As `kernel`, inlined into its callers: for the few-line helpers of inner loops."""
-    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")(function))
+    return _cached(function, inline="always")
 
 
 def inner_kernel(function: F) -> F:
     """As `kernel`, inlined by LLVM: for larger helpers of inner loops, which numba's own inlining would make slow to compile."""
-    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)(function))
+    return _cached(function, forceinline=True)
+
+
+def _cached(function: F, **options: Any) -> F:
+    try:
+        compiled = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+    except RuntimeError as error:  # numba found no folder
+        asked = os.environ.get("NUMBA_CACHE_DIR") or "the user's cache"
+        raise FleetmapError(
+            f"compiled kernels can be kept neither in {asked} nor beside {function.__code__.co_filename}; "
+            "set NUMBA_CACHE_DIR to a folder that this user may write"
+        ) from error
+    KERNELS.append(compiled)
+    return cast(F, compiled)

@@ -162,7 +162,9 @@ def _decode(stored: StoredImage) -> AnyArray:
         step = row_bytes  # nothing says how long the only row is
     padded = stored.data[: step * stored.height_px].ljust(step * stored.height_px, b"\0")
     rows = np.frombuffer(padded, np.uint8).reshape(stored.height_px, step)[:, :row_bytes]
-    pixels: AnyArray = np.ascontiguousarray(rows).view(wire_type).astype(dtype, copy=False)
+    pixels: AnyArray = (
+        rows.copy().view(wire_type).astype(dtype, copy=False)
+    )  # writable, as all images: one kind for kernels
     return pixels if channels == 1 else pixels.reshape(stored.height_px, stored.width_px, channels)
 
 

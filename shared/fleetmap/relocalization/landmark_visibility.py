@@ -59,7 +59,7 @@ def cones_of_tiles(tiles: Sequence[Tile]) -> ViewingCones:
     """The cones of all landmarks of the tiles, one tile after the other."""
     return ViewingCones(
         joined([tile.points_map for tile in tiles], (0, 3), np.float64),
-        joined([tile.view_directions_map for tile in tiles], (0, 3), np.float32),
+        np.ascontiguousarray(joined([tile.view_directions_map for tile in tiles], (0, 3), np.float32)),
         joined([tile.view_half_angle_rad for tile in tiles], (0,), np.float32),
         joined([tile.max_distance_m for tile in tiles], (0,), np.float32),
     )

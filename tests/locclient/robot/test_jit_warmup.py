@@ -1,9 +1,38 @@
 """What a robot does before its first frame so that no later one has to wait."""
 
 import gc
+import os
+import pickle
+import subprocess
+import sys
 import weakref
+from pathlib import Path
 
 from locclient.robot.jit_warmup import gc_frozen
+from mapserver.store import MapStore
+from support.worlds import robot_world
+
+DRIVE = """
+import pickle, sys, time
+from pathlib import Path
+from fleetmap.numerics.kernel import KERNELS
+from fleetmap.sensors.rectification import Rectifier
+from locclient.commands.prepare import _steps
+from locclient.localization.settings import LocalizerSettings
+from locclient.robot.robot import Robot
+from locclient.robot.version_trial import TrialSettings
+
+def compiled():
+    return {(kernel.py_func.__module__, kernel.py_func.__name__, str(s)) for kernel in KERNELS for s in kernel.signatures}
+
+for run in _steps().values():
+    run()
+prepared = compiled()
+rig, loaded, bundles = pickle.loads(Path(sys.argv[1]).read_bytes())
+robot = Robot(rig, Rectifier(rig), LocalizerSettings(), TrialSettings(), time.process_time)
+robot.use(loaded)
+print(sum(robot.handle(bundle).estimate.fix is not None for bundle in bundles) > 3, len(prepared) > 20, compiled() - prepared)
+"""
 
 
 class Ring:
@@ -26,3 +55,16 @@ def test_what_lived_before_is_left_alone_and_what_comes_later_is_not() -> None:
     gc.collect()
     assert of_before() is None
     assert gc.get_freeze_count() == 0
+
+
+def test_a_robot_that_drives_uses_no_kernel_that_prepare_left_out(tmp_path: Path) -> None:
+    """In a process of its own, where no other test has compiled anything."""
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        robot_world.save(store)
+        world = robot_world.calibration(), robot_world.loaded(store), list(robot_world.bundles(40))
+    (tmp_path / "world").write_bytes(pickle.dumps(world))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    command = [sys.executable, "-c", DRIVE, str(tmp_path / "world")]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "True True set()"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.stats import beta
+from scipy.special import betaincinv
 
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array
@@ -123,6 +123,6 @@ def _bounded(is_seen: NDArray[np.bool_], blocks: Array, error_rate: float) -> Co
     alone = share * (1.0 - share) / count
     effective = count * min(1.0, alone / clustered) if clustered > 0 else float(count)
     k = share * effective
-    low = float(beta.ppf(error_rate, k, effective - k + 1)) if k > 0 else 0.0
-    high = float(beta.ppf(1.0 - error_rate, k + 1, effective - k)) if k < effective else 1.0
+    low = float(betaincinv(k, effective - k + 1, error_rate)) if k > 0 else 0.0
+    high = float(betaincinv(k + 1, effective - k, 1.0 - error_rate)) if k < effective else 1.0
     return Confirmation(count, int(is_seen.sum()), len(off), low, high)

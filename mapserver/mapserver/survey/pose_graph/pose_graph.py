@@ -6,7 +6,7 @@ from typing import Literal
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_inverse, skew
@@ -84,7 +84,7 @@ def optimize_pose_graph(
     try:
         if robust and loops:
             graph = _graph(map_from_body, edges, fixed)
-            weights, begin = _believed(graph, loops, start, float(chi2.ppf(_INLIER_PROBABILITY, 6)), noise)
+            weights, begin = _believed(graph, loops, start, _chi_square(_INLIER_PROBABILITY), noise)
         believed = dict(zip(loops, weights >= 0.5, strict=True))
         kept = [edge for index, edge in enumerate(edges) if believed.get(index, True)]
         graph = _graph(map_from_body, kept, fixed)
@@ -215,4 +215,9 @@ def _with_noise(factor: gtsam.NonlinearFactor) -> gtsam.NoiseModelFactor:
 
 def _scale(loops: list[gtsam.NoiseModelFactor], values: gtsam.Values) -> float:
     """By how much the loops' squared residuals exceed what their covariances say, at a quantile that outliers spare."""
-    return max(float(np.quantile(squared_residuals(loops, values), _RIGHT_SHARE) / chi2.ppf(_RIGHT_SHARE, 6)), 1e-9)
+    return max(float(np.quantile(squared_residuals(loops, values), _RIGHT_SHARE) / _chi_square(_RIGHT_SHARE)), 1e-9)
+
+
+def _chi_square(probability: float) -> float:
+    """The quantile for the six freedoms of a pose."""
+    return float(2.0 * gammaincinv(3.0, probability))  # scipy.stats takes half a second to import

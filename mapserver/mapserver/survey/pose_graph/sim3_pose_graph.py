@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
@@ -154,7 +154,7 @@ def optimize_similarities(start: Similarities, edges: Sequence[SimilarityEdge], 
     weights = np.ones(len(edges))
     before = _cost(start, packed, weights)
     if is_loop.any():
-        limit = float(chi2.ppf(_INLIER_PROBABILITY, 7))
+        limit = float(2.0 * gammaincinv(3.5, _INLIER_PROBABILITY))  # chi-square of seven freedoms
         state = _solve(start, packed, weights, fixed, _MAX_ITERATIONS)
         squares = _squares(state, packed)[is_loop]
         control = max(2.0 * float(squares.max()) / limit, 1.0)

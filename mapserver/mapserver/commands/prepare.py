@@ -1,0 +1,78 @@
+"""`mapserver prepare`: the kernels of builds are compiled before the first recording comes."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import typer
+
+
+def prepare() -> None:
+    """Compile everything that `build`, `nightly`, `calibrate` and `doctor` compute with; at once where that was done before."""
+    import tempfile
+
+    import fleetmap
+    import mapserver
+    from fleetmap.preparation.kernel_cache import prepare_kernels
+
+    packages = [Path(package.__path__[0]) for package in (fleetmap, mapserver)]
+    with tempfile.TemporaryDirectory(prefix="fleetmap-") as folder:
+        prepare_kernels("mapserver", packages, lambda: _steps(Path(folder)), typer.echo)
+
+
+def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
+    """Surveys of a painted room, each with what it adds to those before it."""
+    import io
+    from contextlib import redirect_stderr
+
+    import cv2
+    import msgspec
+    import numpy as np
+
+    from fleetmap.bow import train_vocabulary
+    from fleetmap.preparation.painted_room import HEIGHT_PX, WIDTH_PX, Ride, write_ride
+    from fleetmap.recordings import open_recording
+    from fleetmap.sensors.samples import SensorSet
+    from mapserver import BuildOptions, build_map
+    from mapserver.config import survey_settings
+    from mapserver.store import Actor
+    from mapserver.survey.settings import SurveySettings
+
+    def build(site: str, sensors: SensorSet, settings: SurveySettings | None = None) -> None:
+        recording = folder / f"{site}-{sensors}.mcap"
+        write_ride(recording, Ride(), sensors)
+        with redirect_stderr(io.StringIO()):  # nobody needs to know what so short a survey lacks
+            built = build_map([recording], folder / "store", site, BuildOptions(settings=settings))
+            if sensors is not SensorSet.MONO:
+                built.publish(force=True, actor=Actor("prepare", "a map that nobody drives in"))
+
+    def build_as_large() -> None:
+        settings = survey_settings(None, SensorSet.STEREO)
+        solvers = ("bundle", "rough_bundle", "final_bundle")
+        large = {
+            name: msgspec.structs.replace(getattr(settings, name), dense_unknowns=0, sparse_couplings=0.0)
+            for name in solvers
+        }
+        build("large", SensorSet.STEREO, msgspec.structs.replace(settings, **large))
+
+    def register_depth() -> None:
+        scene, grey = folder / "scene", np.full((HEIGHT_PX, WIDTH_PX), 100, np.uint8)
+        scene.mkdir()
+        cv2.imwrite(str(scene / "frame-000000.color.png"), grey)
+        cv2.imwrite(str(scene / "frame-000000.depth.png"), grey.astype(np.uint16) * 20)
+        np.savetxt(scene / "frame-000000.pose.txt", np.eye(4))
+        with open_recording(scene) as recording:
+            recording.read_frame(0)
+
+    def train() -> None:
+        descriptors = np.random.default_rng(0).integers(0, 256, (200, 32), dtype=np.uint8)
+        train_vocabulary(descriptors, 4, 2, np.random.default_rng(0))
+
+    return {
+        "survey with a stereo camera and an IMU": lambda: build("room", SensorSet.STEREO_INERTIAL),
+        "second survey of the same place": lambda: build("room", SensorSet.STEREO),
+        "survey as large as a site": build_as_large,
+        "survey with one camera": lambda: build("mono", SensorSet.MONO),
+        "survey with a depth camera": lambda: build("depth", SensorSet.RGBD),
+        "depth images of another camera": register_depth,
+        "vocabulary": train,
+    }
