@@ -37,6 +37,7 @@ from mapserver.build.report import (
 )
 from mapserver.build.survey_recordings import (
     Admission,
+    OpenRecordings,
     RecordingOptions,
     Surveyed,
     admit_recordings,
@@ -115,6 +116,7 @@ class _Run:
     """One build under way, with what all of its steps need."""
 
     request: BuildRequest
+    reading: OpenRecordings
     settings: SurveySettings
     zones: Zones
     unusable: dict[Path, str] | None
@@ -159,29 +161,26 @@ def build_draft(
     """
     options, started_s = request.options, time.perf_counter()
     zones = Zones() if options.zones is None else read_zones(options.zones)
-    times = StageTimes(time.perf_counter)
-    run = _Run(request, settings, zones, unusable, Console(stderr=True), times, started_s)
-    times.begin("examination")
-    with open_executor(options.threads, None) as executor:
-        admitted = admit_recordings(
-            request.recordings,
-            options.reading,
-            run.console,
-            needs_truth=options.frame_from_ground_truth,
-            unusable=unusable,
-            executor=executor,
-        )
-    with (
-        MapStore.open(request.store, create=True) as maps,
-        recorded_job(maps, request.site, "build") if recorded else nullcontext(Job()) as job,
-    ):
-        parent = _parent(request, maps)
-        chosen = choose_vocabulary(maps, request.site, options.vocabulary)
-        built = _survey(run, admitted, None if parent is None else parent.survey, chosen)
-        draft = _keep(run, built, parent, maps)
-        draft = replace(draft, report=draft.report | {"loop_places": loop_places(built.taken, built.joined)})
-        job.message, job.report = draft.sentence, draft.report | {"version": draft.version}
-        return draft, built
+    times, console = StageTimes(time.perf_counter), Console(stderr=True)
+    with OpenRecordings(options.reading, request.store) as reading:
+        run = _Run(request, reading, settings, zones, unusable, console, times, started_s)
+        times.begin("examination")
+        truth = options.frame_from_ground_truth
+        with open_executor(options.threads, None) as executor:
+            admitted = admit_recordings(
+                request.recordings, reading, console, needs_truth=truth, unusable=unusable, executor=executor
+            )
+        with (
+            MapStore.open(request.store, create=True) as maps,
+            recorded_job(maps, request.site, "build") if recorded else nullcontext(Job()) as job,
+        ):
+            parent = _parent(request, maps)
+            chosen = choose_vocabulary(maps, request.site, options.vocabulary)
+            built = _survey(run, admitted, None if parent is None else parent.survey, chosen)
+            draft = _keep(run, built, parent, maps)
+            draft = replace(draft, report=draft.report | {"loop_places": loop_places(built.taken, built.joined)})
+            job.message, job.report = draft.sentence, draft.report | {"version": draft.version}
+            return draft, built
 
 
 def read_zones(path: Path) -> Zones:
@@ -228,7 +227,7 @@ def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, 
         tools = SurveyTools(progress, images, executor)
 
         def survey_one(path: Path, pinhole: StereoCamera | None) -> Surveyed:
-            return survey_recording(path, admitted[path], options.reading, pinhole, survey_options, tools)
+            return survey_recording(path, admitted[path], run.reading, pinhole, survey_options, tools)
 
         pinhole = None if base is None else base.camera
         surveyed = survey_all(list(admitted), survey_one, pinhole, run.unusable)

@@ -1,11 +1,12 @@
-"""Pictures of keyframes in one temporary file, the last ones used in memory: how a long survey stays small."""
+"""Pictures in temporary files: of keyframes, which keeps a long survey small, and of frames, which are decoded once."""
 
+import os
 import tempfile
 from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -13,23 +14,64 @@ from fleetmap.errors import StoreError, disk_errors
 from fleetmap.features.patch_align import half_pyramid
 from fleetmap.geometry import AnyArray
 from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.samples import CameraFrame
 from mapserver.survey.keyframes.keyframes import Pictures
 
+if TYPE_CHECKING:
+    import hashlib
+
+    from fleetmap.recordings import FrameSource, StoredFrame
+
 _HELD = 48  # more than the keyframes that one is compared with
+_KEPT_BYTES = 1_000_000_000  # all that an examination decodes of a pair of 1280 x 720
 
 
 @dataclass(frozen=True, slots=True)
 class _Place:
     stamp_ns: int
-    arrays: tuple[tuple[int, np.dtype[Any], tuple[int, ...]] | None, ...]  # left, right, disparity: offset, type, shape
+    arrays: tuple[tuple[int, np.dtype[Any], tuple[int, ...]] | None, ...]  # left, right, third: offset, type, shape
 
 
-class ImageSpill:
-    """An ImageStore over an unnamed file in `folder`, which the system removes with the process."""
+class _ArrayFile:
+    """Arrays one after the other in an unnamed file in `folder`, which the system removes with the process."""
 
     def __init__(self, folder: Path) -> None:
         with disk_errors(f"{folder} takes no temporary file", "check its rights and space"):
-            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed with the store
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed with its owner
+        self.size = 0
+
+    def close(self) -> None:
+        self._file.close()
+
+    def put(self, stamp_ns: int, arrays: tuple[AnyArray | None, ...]) -> _Place:
+        """Appends what there is; OSError where that does not go."""
+        return _Place(stamp_ns, tuple(self._write(array) for array in arrays))
+
+    def get(self, place: _Place) -> list[Any]:
+        """The arrays again, each its own memory: writable, so that numba compiles no second version for it."""
+        return [None if part is None else self._read(*part) for part in place.arrays]
+
+    def _write(self, array: AnyArray | None) -> tuple[int, np.dtype[Any], tuple[int, ...]] | None:
+        if array is None:
+            return None
+        offset, data, done = self.size, np.ascontiguousarray(array).data.cast("B"), 0
+        while done < len(data):
+            done += os.pwrite(self._file.fileno(), data[done:], offset + done)
+        self.size += len(data)
+        return offset, array.dtype, array.shape
+
+    def _read(self, offset: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Any:
+        array = np.empty(shape, dtype)
+        if os.preadv(self._file.fileno(), [array.data.cast("B")], offset) != array.nbytes:
+            raise StoreError("the survey's temporary pictures were cut short; is the disk full?")
+        return array
+
+
+class ImageSpill:
+    """An ImageStore over a temporary file in `folder`."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = _ArrayFile(folder)
         self._places: list[_Place] = []
         self._held: OrderedDict[int, Pictures] = OrderedDict()
 
@@ -44,7 +86,7 @@ class ImageSpill:
         frame, number = pictures.frame, len(self._places)
         parts = (frame.left, frame.right, frame.disparity_px)
         with disk_errors(f"picture {number} of the survey cannot be set aside", "make space beside the store"):
-            self._places.append(_Place(frame.stamp_ns, tuple(self._write(part) for part in parts)))
+            self._places.append(self._file.put(frame.stamp_ns, parts))
         self._hold(number, pictures)
         return number
 
@@ -52,8 +94,7 @@ class ImageSpill:
         """See ImageStore."""
         if number not in self._held:
             place = self._places[number]
-            left, right, disparity = (None if part is None else self._read(*part) for part in place.arrays)
-            assert left is not None
+            left, right, disparity = self._file.get(place)
             self._hold(number, Pictures(RectifiedFrame(place.stamp_ns, left, right, disparity), half_pyramid(left)))
         self._held.move_to_end(number)
         return self._held[number]
@@ -63,17 +104,44 @@ class ImageSpill:
         while len(self._held) > _HELD:
             self._held.popitem(last=False)
 
-    def _write(self, array: AnyArray | None) -> tuple[int, np.dtype[Any], tuple[int, ...]] | None:
-        if array is None:
-            return None
-        offset = self._file.seek(0, 2)
-        self._file.write(np.ascontiguousarray(array).data)
-        return offset, array.dtype, array.shape
 
-    def _read(self, offset: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Any:
-        self._file.seek(offset)
-        size = int(np.prod(shape)) * dtype.itemsize
-        data = self._file.read(size)
-        if len(data) != size:
-            raise StoreError("the survey's temporary pictures were cut short; is the disk full?")
-        return np.frombuffer(data, dtype).reshape(shape).copy()  # writable: numba compiles no second version for it
+class KeptFrames:
+    """Frames of another source. Those that are decoded while `keeps` holds are decoded once: a temporary file in `folder` has them."""
+
+    def __init__(self, source: "FrameSource", folder: Path) -> None:
+        self._source, self._folder = source, folder
+        self._file: _ArrayFile | None = None
+        self._places: dict[int, _Place] = {}
+        self.keeps = True
+
+    def stored(self, index: int) -> "StoredFrame":
+        """See FrameSource."""
+        return self._source.stored(index)
+
+    def frame(self, index: int) -> CameraFrame:
+        """See FrameSource."""
+        if self._file is not None and index in self._places:
+            place = self._places[index]
+            return CameraFrame(place.stamp_ns, *self._file.get(place))
+        frame = self._source.frame(index)
+        if self.keeps:
+            self._keep(index, frame)
+        return frame
+
+    def _keep(self, index: int, frame: CameraFrame) -> None:
+        try:
+            self._file = self._file or _ArrayFile(self._folder)
+            self._places[index] = self._file.put(frame.stamp_ns, (frame.left, frame.right, frame.depth_m))
+            self.keeps = self._file.size < _KEPT_BYTES
+        except (OSError, StoreError):  # no room: what is not kept is decoded again
+            self.keeps = False
+
+    def hash_into(self, digest: "hashlib._Hash") -> None:
+        """See FrameSource."""
+        self._source.hash_into(digest)
+
+    def close(self) -> None:
+        """See FrameSource."""
+        self._source.close()
+        if self._file is not None:
+            self._file.close()

@@ -1,16 +1,17 @@
 """Surveys of recordings: each is opened, checked, surveyed and closed, one after the other."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol, Self
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from fleetmap.errors import RecordingError, SurveyError
+from fleetmap.errors import FleetmapError, RecordingError, SurveyError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
@@ -19,6 +20,7 @@ from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import DataIssue, SensorSet, Trajectory
 from mapserver.build.admission import checked
 from mapserver.build.draft_evidence import HeldOut, held_out_of
+from mapserver.build.image_spill import KeptFrames
 from mapserver.build.report import check_truth
 from mapserver.build.sensor_subset import reduced
 from mapserver.build.trajectory_sources import trajectory_source
@@ -100,17 +102,75 @@ class RecordingOptions:
         source = trajectory_source(self.trajectory_source)
         return source(recording, recording.frame_stamps_ns[indices], self.initial_trajectory)
 
+    def opened(self, path: Path) -> tuple[Recording, NDArray[np.int64]]:
+        """The recording at `path`, to be closed, and the indices of its selected frames."""
+        whole = open_recording(path, OpenOptions(calibration_file=self.calibration))
+        try:
+            recording = reduced(whole, self.use)
+            return recording, FrameSelection.parse(self.frames).apply(recording)
+        except FleetmapError:
+            whole.close()
+            raise
+
     @contextmanager
     def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
-        """The recording at `path` and the indices of its selected frames."""
-        with open_recording(path, OpenOptions(calibration_file=self.calibration)) as opened:
-            recording = reduced(opened, self.use)
-            yield recording, FrameSelection.parse(self.frames).apply(recording)
+        """The recording at `path` while the block lasts, and the indices of its selected frames."""
+        recording, indices = self.opened(path)
+        with recording:
+            yield recording, indices
+
+
+class Reading(Protocol):
+    """How recordings are opened: `RecordingOptions` anew each time, `OpenRecordings` once."""
+
+    def given_trajectory(self, recording: Recording, indices: NDArray[np.int64]) -> Trajectory | None:
+        """See RecordingOptions."""
+
+    def open(self, path: Path) -> AbstractContextManager[tuple[Recording, NDArray[np.int64]]]:
+        """See RecordingOptions."""
+
+
+class OpenRecordings:
+    """Recordings opened as `options` say. The one used last stays open; frames that its first use decoded are decoded once.
+
+    folder: takes their temporary file, or the nearest folder above it that exists.
+    """
+
+    def __init__(self, options: RecordingOptions, folder: Path) -> None:
+        self._options = options
+        self._folder = next(each for each in (folder, *folder.absolute().parents) if each.is_dir())
+        self._path: Path | None = None
+        self._opened: tuple[Recording, NDArray[np.int64]]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._path is not None:
+            self._opened[0].close()
+            self._path = None
+
+    def given_trajectory(self, recording: Recording, indices: NDArray[np.int64]) -> Trajectory | None:
+        """See RecordingOptions."""
+        return self._options.given_trajectory(recording, indices)
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
+        """See RecordingOptions."""
+        if path != self._path:
+            self.__exit__()
+            recording, indices = self._options.opened(path)
+            self._opened = replace(recording, frames=KeptFrames(recording.frames, self._folder)), indices
+            self._path = path
+        yield self._opened
+        frames = self._opened[0].frames
+        assert isinstance(frames, KeptFrames)
+        frames.keeps = False
 
 
 def admit_recordings(
     paths: Sequence[Path],
-    options: RecordingOptions,
+    options: Reading,
     console: Console,
     *,
     needs_truth: bool,
@@ -134,9 +194,7 @@ def admit_recordings(
     return admitted
 
 
-def _admission(
-    path: Path, options: RecordingOptions, console: Console, needs_truth: bool, executor: Executor
-) -> Admission:
+def _admission(path: Path, options: Reading, console: Console, needs_truth: bool, executor: Executor) -> Admission:
     with options.open(path) as (recording, indices):
         for issue in recording.issues:
             console.print(f"issue: {issue.what}: {issue.detail}", markup=False)
@@ -152,7 +210,7 @@ def _admission(
 def survey_recording(
     path: Path,
     admission: Admission,
-    reading: RecordingOptions,
+    reading: Reading,
     pinhole: StereoCamera | None,
     options: SurveyConfig,
     tools: SurveyTools,
