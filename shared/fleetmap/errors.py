@@ -10,7 +10,8 @@ FleetmapError                      exit status 3
 │   └── NewerFormatError           made by a newer fleetmap; names the version that is needed
 ├── StoreError                     a store that cannot be opened, read or written
 ├── LinkError                      the other side cannot be reached, refuses or answers nonsense
-│   └── UnreachableError           nobody answered in time; asking again later may help
+│   ├── UnreachableError           nobody answered in time; asking again later may help
+│   └── UntrustedError             signed lists refuse it; begins with rollback:, freeze:, signature: or size:
 ├── GateRefusedError               exit status 4: the draft is not good enough to publish
 └── BusyError                      exit status 5: another process is at the same work
 
@@ -20,6 +21,7 @@ The message holds the offending value and the next step. Caught only in the comm
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Literal
 
 
 class FleetmapError(Exception):
@@ -68,6 +70,13 @@ class LinkError(FleetmapError):
 
 class UnreachableError(LinkError):
     """Nobody answered in time; asking again later may help."""
+
+
+class UntrustedError(LinkError):
+    """Something that the signed lists of maps do not allow. The message begins with the kind of attack that it would be."""
+
+    def __init__(self, kind: Literal["rollback", "freeze", "signature", "size"], words: object) -> None:
+        super().__init__(f"{kind}: {words}")
 
 
 class GateRefusedError(FleetmapError):

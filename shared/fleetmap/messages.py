@@ -11,6 +11,7 @@ fleetmap/{site}/live/survey              published by a survey under way: fleetm
 fleetmap/{site}/manifests/{version}      asked by the robot, ChunkRequest: Part of a manifest
 fleetmap/{site}/blobs/{sha256}           asked by the robot, ChunkRequest: Part of a tile, vocabulary or manifest
 fleetmap/{site}/patches/{base}-{sha256}  asked by the robot, ChunkRequest: Part of what makes a tile or manifest out of `base`
+fleetmap/{site}/trust/{file}             asked by the robot, ChunkRequest: Part of a file of the signed lists, empty where there is none
 """
 
 from enum import StrEnum
@@ -362,11 +363,16 @@ def patch_key(site: str, base_sha256: str, sha256: str) -> str:
     return f"{_ROOT}/{site}/patches/{base_sha256}-{sha256}" if base_sha256 != "*" else f"{_ROOT}/{site}/patches/*"
 
 
+def trust_key(site: str, file: str) -> str:
+    """Key of a file of the signed lists, such as `timestamp.json`; '*' for any."""
+    return f"{_ROOT}/{site}/trust/{file}"
+
+
 def split_key(key: str) -> tuple[str, str, str]:
-    """Site, robot (or 'live', 'manifests', 'blobs', 'patches') and last chunk of a key made above; raises LinkError for any other."""
+    """Site, robot (or 'live', 'manifests', 'blobs', 'patches', 'trust') and last chunk of a key; raises LinkError for any other."""
     chunks = key.split("/")
     if len(chunks) == 5 and chunks[0] == _ROOT and chunks[2] == "robots":
         return chunks[1], chunks[3], chunks[4]
-    if len(chunks) == 4 and chunks[0] == _ROOT and chunks[2] in {"live", "manifests", "blobs", "patches"}:
+    if len(chunks) == 4 and chunks[0] == _ROOT and chunks[2] in {"live", "manifests", "blobs", "patches", "trust"}:
         return chunks[1], chunks[2], chunks[3]
     raise LinkError(f"key {key[:200]!r} is none of fleetmap's; its keys are listed in fleetmap.messages")

@@ -2,7 +2,7 @@
 
 from fleetmap.bus.memory import MemoryBus, MemoryHub
 from fleetmap.bus.protocol import MAX_MESSAGE_BYTES, Answer, Bus, Handle, Listen, key_matches
-from fleetmap.bus.zenoh_bus import ZenohBus, check_endpoint
+from fleetmap.bus.zenoh_bus import ZenohBus, check_endpoint, is_loopback
 
 __all__ = [
     "MAX_MESSAGE_BYTES",
@@ -14,5 +14,6 @@ __all__ = [
     "MemoryHub",
     "ZenohBus",
     "check_endpoint",
+    "is_loopback",
     "key_matches",
 ]

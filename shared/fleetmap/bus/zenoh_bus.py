@@ -5,6 +5,7 @@ import socket
 import time
 from collections.abc import Callable
 from functools import partial
+from ipaddress import ip_address
 from typing import Any, Self
 
 import zenoh
@@ -162,6 +163,15 @@ def check_endpoint(endpoint: str) -> str:
     if int(port) > 65535:
         raise UsageError(f"endpoint {endpoint!r}: port {port} is above 65535")
     return endpoint
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Whether nobody but this machine is at an endpoint."""
+    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _with_free_port(endpoint: str) -> str:

@@ -1,0 +1,82 @@
+"""The signed list of one site as values: which versions robots may run. Whether its signatures hold is not looked at here. Pure."""
+
+from datetime import datetime
+from typing import Annotated, Literal
+
+import msgspec
+
+from fleetmap.errors import UntrustedError
+from fleetmap.mapformat.manifest import Positive, Sha256
+from fleetmap.mapformat.names import check_name
+
+
+class VersionState(msgspec.Struct, frozen=True, kw_only=True):
+    """The `custom` field of a target. state: what the version is for its site; archive: the whole survey, for the next build."""
+
+    version: Positive
+    state: Literal["current", "previous", "trial"]
+    vocabulary: Sha256
+    archive: Sha256 | None = None
+
+
+class _Hashes(msgspec.Struct, frozen=True):
+    sha256: Sha256
+
+
+class _Target(msgspec.Struct, frozen=True):
+    length: Positive
+    hashes: _Hashes
+    custom: VersionState
+
+
+class AdmittedVersion(msgspec.Struct, frozen=True):
+    """A version that robots may run: its manifest's address and size, and what the version is for its site."""
+
+    sha256: str
+    length: int
+    about: VersionState
+
+
+class _Signed(msgspec.Struct, frozen=True):
+    version: Positive
+    expires: datetime
+    targets: dict[Annotated[str, msgspec.Meta(max_length=256)], _Target]
+
+
+class _File(msgspec.Struct, frozen=True):
+    signed: _Signed
+
+
+class SiteList(msgspec.Struct, frozen=True):
+    """What the site's role signed. serial: counts its lists."""
+
+    serial: int
+    expires: datetime
+    admitted: tuple[AdmittedVersion, ...]
+
+    def state(self, name: str) -> AdmittedVersion | None:
+        """The version that is `current`, `previous` or on `trial`; None where none is."""
+        return next((entry for entry in self.admitted if entry.about.state == name), None)
+
+
+def site_role(site: str) -> str:
+    """Name of the role that signs a site's list. Not the bare name, because a site may be called `root` or `snapshot`."""
+    return f"site-{check_name(site, 'site')}"
+
+
+def manifest_target(site: str, version: int | str) -> str:
+    """Path of a version's manifest among what is signed; '*' for any version."""
+    return f"{site}/{version}/manifest.json"
+
+
+def read_site_list(data: bytes, site: str) -> SiteList:
+    """The list in the bytes of `N.site-SITE.json`; UntrustedError for one that names what no list of the site can."""
+    try:
+        signed = msgspec.json.decode(data, type=_File).signed
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise UntrustedError("signature", f"the list of site {site} cannot be read ({error})") from error
+    for path, target in signed.targets.items():
+        if path != manifest_target(site, target.custom.version):
+            raise UntrustedError("signature", f"the list of site {site} names {path[:80]!r} as {target.custom}")
+    entries = (AdmittedVersion(t.hashes.sha256, t.length, t.custom) for t in signed.targets.values())
+    return SiteList(signed.version, signed.expires, tuple(sorted(entries, key=lambda entry: entry.about.version)))

@@ -1,0 +1,182 @@
+"""The robot's side of signed lists: what may be run, how old the last word of the server is, and what a wrong clock may not change."""
+
+import fcntl
+import logging
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+
+from fleetmap.bus import Bus
+from fleetmap.errors import LinkError, StoreError, UntrustedError, disk_errors
+from fleetmap.mapformat.names import check_name
+from fleetmap.messages import ChunkRequest, Part, WantedVersion, decode_message, encode_message, trust_key
+from fleetmap.trust.site_list import AdmittedVersion, SiteList, read_site_list, site_role
+
+Ask = Callable[[str], bytes | None]
+"""The bytes of a file of the signed lists, None where the server says that it has none; UnreachableError where nobody answers."""
+
+FIRST_ROOT = "1.root.json"
+_MAX_ROOT_BYTES = 64_000
+_CLOCK_EVERY_S = 600.0  # how old the clock on the disk may become: it is not written at every question
+_log = logging.getLogger(__name__)
+
+
+class _Expiry(msgspec.Struct, frozen=True):
+    expires: datetime
+
+
+class _Expires(msgspec.Struct, frozen=True):
+    signed: _Expiry
+
+
+class TrustedMap:
+    """Which versions of a site may be run. `refresh` asks; without a fresh word nothing new may be run, and what runs goes on.
+
+    The folder belongs to one robot and site: files of python-tuf's client, and `clock`, the latest wall clock that was believed.
+    A clock before it cannot make expired lists valid again; one far ahead makes all lists expired, until it is right again.
+    """
+
+    def __init__(
+        self, folder: Path, site: str, root: bytes | None, ask: Ask, wall_s: Callable[[], float] = time.time
+    ) -> None:
+        """root: bytes of the trusted root; None pins the one that is met first, for a server on the same machine.
+
+        Raises StoreError where the folder cannot be used.
+        """
+        self._folder, self._site, self._ask, self._wall_s = folder, check_name(site, "site"), ask, wall_s
+        self._pinned_root = root
+        self._list: SiteList | None = None
+        self._fault: LinkError | StoreError | None = None
+        with disk_errors(f"the folder {folder} for signed lists cannot be used", "choose another cache"):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._kept_clock_s = self._clock_s = self._read_clock()
+
+    def refresh(self) -> None:
+        """Asks the server for its lists. Why they cannot be had or believed is raised by `admitted`, not here."""
+        try:
+            with disk_errors(f"the signed lists in {self._folder} cannot be written", "make space"), self._locked():
+                self._refresh()
+            self._fault = None
+        except (LinkError, StoreError) as error:
+            if str(error) != str(self._fault):
+                _log.warning("no fresh word on the maps of site %s: %s", self._site, error)
+            self._fault = error
+
+    def admitted(self, wanted: WantedVersion) -> AdmittedVersion:
+        """The entry of a version by its number and manifest's address.
+
+        Raises UntrustedError where the lists do not name it or are not fresh, UnreachableError where nobody answered for them.
+        """
+        if self._list is None and self._fault is None:
+            self.refresh()
+        if self._fault is not None:
+            raise self._fault
+        assert self._list is not None
+        for entry in self._list.admitted:
+            if (entry.about.version, entry.sha256) == (wanted.version, wanted.manifest_sha256):
+                return entry
+        numbers = [entry.about.version for entry in self._list.admitted]
+        is_old = bool(numbers) and wanted.version is not None and wanted.version < max(numbers)
+        words = (
+            f"version {wanted.version} ({str(wanted.manifest_sha256)[:12]}) of site {self._site} is not in signed list"
+        )
+        raise UntrustedError(
+            "rollback" if is_old else "signature", f"{words} {self._list.serial}, which admits {numbers or 'none'}"
+        )
+
+    @property
+    def word_hours(self) -> float | None:
+        """Hours since the server last proved what may be run; None if it never did."""
+        return None if self._clock_s == 0 else max(0.0, self._wall_s() - self._clock_s) / 3600
+
+    def _refresh(self) -> None:
+        from fleetmap.trust.tuf_client import update_lists
+
+        before = self._changing()
+        update_lists(self._folder, self._site, self._root(), self._ask)
+        now_s = max(self._wall_s(), self._clock_s)
+        files = ("root", "timestamp", "snapshot", "targets", site_role(self._site))
+        self._check_delegated()
+        for name in files:
+            expires = msgspec.json.decode((self._folder / f"{name}.json").read_bytes(), type=_Expires).signed.expires
+            if expires <= datetime.fromtimestamp(now_s, UTC):
+                raise UntrustedError("freeze", f"{name} expired at {expires:%Y-%m-%d %H:%M} UTC by the robot's clock")
+        self._list = read_site_list((self._folder / f"{files[-1]}.json").read_bytes(), self._site)
+        self._clock_s = now_s
+        if self._changing() != before or now_s > self._kept_clock_s + _CLOCK_EVERY_S:
+            self._write("clock", str(now_s).encode())
+            self._kept_clock_s = now_s
+            self._sync()
+
+    def _check_delegated(self) -> None:
+        """A site that nobody signs for any more keeps its last list in the folder, where python-tuf does not look at it."""
+        data = msgspec.json.decode((self._folder / "targets.json").read_bytes())
+        roles = (data["signed"].get("delegations") or {}).get("roles", [])
+        if site_role(self._site) not in {role["name"] for role in roles}:
+            raise UntrustedError("signature", f"no key may sign maps of site {self._site}")
+
+    def _root(self) -> bytes:
+        if self._pinned_root is None:
+            path = self._folder / "pinned.root.json"
+            if not path.is_file():
+                data = self._ask(FIRST_ROOT)
+                if data is None or len(data) > _MAX_ROOT_BYTES:
+                    raise UntrustedError("signature", "the server has no signed lists; update it, or serve it anew")
+                self._write(path.name, data)
+                self._sync()
+                _log.warning("first use: the keys of site %s are trusted from now on, pinned in %s", self._site, path)
+            self._pinned_root = path.read_bytes()
+        return self._pinned_root
+
+    def _changing(self) -> tuple[bytes, int]:
+        """Something that is another after anything changed: every change comes with a timestamp or a root."""
+        timestamp = self._folder / "timestamp.json"
+        roots = len(list(self._folder.glob("root_history/*.root.json")))
+        return timestamp.read_bytes() if timestamp.is_file() else b"", roots
+
+    def _read_clock(self) -> float:
+        try:
+            return max(0.0, float((self._folder / "clock").read_text("ascii")))
+        except (FileNotFoundError, ValueError):
+            return 0.0
+
+    def _write(self, name: str, data: bytes) -> None:
+        temporary = self._folder / f".{name}.tmp"
+        temporary.write_bytes(data)
+        temporary.replace(self._folder / name)
+
+    def _sync(self) -> None:
+        """python-tuf renames without fsync: after a power cut the guard against rollback would be gone."""
+        folders = [self._folder, self._folder / "root_history"]
+        files = [path for folder in folders for path in folder.glob("*") if path.is_file()]
+        for path in [*files, *(folder for folder in folders if folder.is_dir())]:
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Programs of one machine that share a cache take turns."""
+        with (self._folder / "lock").open("a") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
+
+def ask_over(bus: Bus, site: str, timeout_s: float = 5.0) -> Ask:
+    """Asks the server on a bus. A file must come in one answer, so that nobody can make a robot wait for it byte by byte."""
+
+    def ask(name: str) -> bytes | None:
+        answer = bus.get(trust_key(site, name), encode_message(ChunkRequest()), timeout_s=timeout_s)
+        part = decode_message(answer, Part)
+        if part.offset or part.total_bytes != len(part.data):
+            raise UntrustedError("size", f"{name} has {part.total_bytes} bytes, {len(part.data)} came in one answer")
+        return part.data or None
+
+    return ask

@@ -1,0 +1,84 @@
+"""Expired lists admit nothing new. Named after tuf-conformance; ours keeps the old map all the same."""
+
+import pytest
+
+from support.fleet.list_publisher import ROLE, ListPublisher, ListReader, days
+
+DAY_S = 86400.0
+
+
+def test_root_expired(publisher: ListPublisher, robot: ListReader) -> None:
+    publisher.publish("root")
+    assert robot.refused(1) == ""
+    publisher.root.expires = days(-1)
+    publisher.publish("root", "targets", "snapshot", "timestamp")
+    assert robot.refused(1).startswith("freeze: ")
+    assert [robot.number(role) for role in ("root", "timestamp", "snapshot")] == [3, 1, 1]
+    publisher.root.expires = days(700)  # signed again by the people who hold it
+    publisher.publish("root")
+    assert robot.refused(1) == ""
+
+
+@pytest.mark.parametrize(
+    ("role", "numbers"),
+    [("timestamp", [1, 1, 1, 1]), ("snapshot", [2, 1, 1, 1]), ("targets", [2, 2, 1, 1]), (ROLE, [2, 2, 1, 1])],
+)
+def test_role_expired(publisher: ListPublisher, robot: ListReader, role: str, numbers: list[int]) -> None:
+    assert robot.refused(1) == ""
+    publisher.signed(role).expires = days(-5)
+    chain = {"timestamp": (), "snapshot": (), "targets": ("snapshot",), ROLE: ("snapshot",)}[role]
+    publisher.publish(role, *chain, *([] if role == "timestamp" else ["timestamp"]))
+    assert robot.refused(1).startswith("freeze: ")
+    assert [robot.number(name) for name in ("timestamp", "snapshot", "targets", ROLE)] == numbers
+
+
+@pytest.mark.parametrize("role", ["root", "timestamp"])
+def test_expired_local_role(publisher: ListPublisher, robot: ListReader, role: str) -> None:
+    """What the robot holds has expired, what it is given has not."""
+    publisher.signed(role).expires = days(0.5)
+    publisher.publish(role)
+    assert robot.refused(1) == ""
+    robot.ahead_s = 0.75 * DAY_S
+    assert robot.refused(1).startswith("freeze: ")  # the control
+    publisher.signed(role).expires = days(2)
+    publisher.publish(role)
+    assert robot.refused(1) == ""
+
+
+def test_a_clock_far_ahead_makes_all_expired_until_it_is_right(publisher: ListPublisher, robot: ListReader) -> None:
+    assert robot.refused(1) == ""
+    robot.ahead_s = 30 * DAY_S
+    robot.start()
+    assert robot.refused(1).startswith("freeze: ")
+    robot.ahead_s = 0.0
+    robot.start()
+    assert robot.refused(1) == ""
+
+
+def test_a_clock_set_back_revives_nothing(publisher: ListPublisher, robot: ListReader) -> None:
+    """Believed at day 0.9; a timestamp that ended at day 0.5 stays expired although the clock says day 0 again."""
+    publisher.timestamp.expires = days(0.5)
+    publisher.publish("timestamp")
+    replayed = dict(publisher.files)
+    assert robot.refused(1) == ""  # the control: it is valid by the clock
+    publisher.timestamp.expires = days(2)
+    publisher.publish("timestamp")
+    robot.ahead_s = 0.9 * DAY_S
+    assert robot.refused(1) == ""
+    robot.ahead_s = 0.0
+    robot.start()
+    # Where robots forget a number, such as after another online key, only the clock stands against the replay.
+    (robot.folder / "timestamp.json").unlink()
+    publisher.files = replayed
+    assert robot.refused(1).startswith("freeze: timestamp expired")
+
+
+def test_it_says_how_old_the_last_word_is(publisher: ListPublisher, robot: ListReader) -> None:
+    assert robot.trust.word_hours is None
+    assert robot.refused(1) == ""
+    assert robot.trust.word_hours == pytest.approx(0.0, abs=0.01)
+    publisher.files.clear()
+    robot.ahead_s = 31 * 3600.0
+    robot.start()
+    assert robot.refused(1) != ""
+    assert robot.trust.word_hours == pytest.approx(31.0, abs=0.01)
