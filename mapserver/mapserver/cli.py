@@ -28,6 +28,7 @@ from mapserver.commands.store.gc import gc
 from mapserver.commands.store.import_ import import_
 from mapserver.commands.store.verify import verify
 from mapserver.commands.train_vocabulary import train_vocabulary
+from mapserver.commands.trust import TRUST
 
 if TYPE_CHECKING:
     from mapserver.config import MapserverConfig
@@ -54,6 +55,7 @@ COMMANDS: Commands = {
     "train-vocabulary": train_vocabulary,
     "fleet": FLEET,
     "prepare": prepare,
+    "trust": TRUST,
     "config": CONFIG,
 }
 

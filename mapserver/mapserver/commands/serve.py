@@ -45,12 +45,16 @@ def serve(
     check_endpoint(zenoh)
     from mapserver.api.writers import Writers, is_loopback_name
     from mapserver.store import MapStore
+    from mapserver.trust import prepare_lists
 
     writers = Writers(token, is_loopback_name(host))
     settings = settings_of(context)
     # The sockets come before the store is read, so that a wrong address is reported at once.
-    with _listening(host, port) as listener, MapStore.open(store) as maps, ZenohBus.listen(zenoh) as bus:
-        _run(maps, bus, listener, writers, settings)
+    with _listening(host, port) as listener, MapStore.open(store) as maps:
+        prepare_lists(maps, zenoh)
+        # The bus last: whoever answers before this program does could be heard in its place.
+        with ZenohBus.listen(zenoh) as bus:
+            _run(maps, bus, listener, writers, settings)
 
 
 def _run(

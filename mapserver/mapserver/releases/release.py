@@ -1,5 +1,7 @@
 """Releases of an open store: each is decided by `rules` within the one transaction that writes it, and is on the disk at its end."""
 
+from collections.abc import Callable
+
 from fleetmap.errors import UsageError
 from fleetmap.mapformat import decode_tile
 from mapserver.fleet_statistics.canary_test import threshold_for
@@ -7,6 +9,8 @@ from mapserver.quality.gate import GateSettings, judge
 from mapserver.releases import rules
 from mapserver.releases.version_diff import Difference, manifest_difference
 from mapserver.store import NOBODY, Actor, CanaryRow, MapStore, NewCanary, VerdictRow, VersionInfo
+from mapserver.store.rows import ReleaseChanges, SiteReleases
+from mapserver.trust.signing import try_update_lists
 
 _USUAL_GATE = GateSettings()
 _RECENT_NS = 2 * 86_400_000_000_000  # robots that are silent for longer are not chosen to try a version
@@ -32,7 +36,7 @@ def publish(
     if force and not (actor.name and actor.reason):
         raise UsageError("publishing by force needs who and why; name --reason")
     judged_against = _pass_gate(store, draft, actor, gate, force=force)
-    store.change_releases(site, lambda rows: rules.publication(rows, draft.version, judged_against, actor))
+    _change(store, site, lambda rows: rules.publication(rows, draft.version, judged_against, actor))
     return draft.version
 
 
@@ -42,7 +46,7 @@ def promote(store: MapStore, site: str, version: int, *, actor: Actor = NOBODY) 
     Raises UsageError for an unknown version, StateError for a draft, StoreError or MapFormatError for one whose bytes are not all there.
     """
     store.check_bytes(store.version(site, version))
-    store.change_releases(site, lambda rows: rules.promotion(rows, version, actor))
+    _change(store, site, lambda rows: rules.promotion(rows, version, actor))
 
 
 def roll_back(store: MapStore, site: str, *, actor: Actor = NOBODY) -> int:
@@ -59,7 +63,7 @@ def roll_back(store: MapStore, site: str, *, actor: Actor = NOBODY) -> int:
         return rows.canary.base_version
     if rows.rollback_target is not None:
         store.check_bytes(rows.versions[rows.rollback_target])
-    changes = store.change_releases(site, lambda rows: rules.rollback(rows, actor))
+    changes = _change(store, site, lambda rows: rules.rollback(rows, actor))
     return next(version for version, state in changes.states if state == "current")
 
 
@@ -80,7 +84,7 @@ def start_canary(
     recent_ns = store.now_ns() - _RECENT_NS
     robots = [robot.robot for robot in store.robots(site) if robot.last_seen_ns >= recent_ns]
     new = NewCanary(version, base, share, threshold_for(share, site, version, robots), actor)
-    store.change_releases(site, lambda rows: rules.canary_start(rows, new))
+    _change(store, site, lambda rows: rules.canary_start(rows, new))
     return store.canaries(site, running=True)[0]
 
 
@@ -92,9 +96,9 @@ def end_canary(store: MapStore, canary: CanaryRow, *, promote: bool, outcome: st
     if promote:
         store.check_bytes(store.version(canary.site, canary.version))
         who = Actor(actor.name, outcome)
-        store.change_releases(canary.site, lambda rows: rules.canary_promotion(rows, canary, who))
+        _change(store, canary.site, lambda rows: rules.canary_promotion(rows, canary, who))
     else:
-        store.change_releases(canary.site, lambda rows: rules.canary_withdrawal(rows, canary, outcome, actor))
+        _change(store, canary.site, lambda rows: rules.canary_withdrawal(rows, canary, outcome, actor))
 
 
 def difference(store: MapStore, site: str, before: int, after: int) -> Difference:
@@ -102,6 +106,13 @@ def difference(store: MapStore, site: str, before: int, after: int) -> Differenc
     manifests = (store.manifest(site, before), store.manifest(site, after))
     size = store.version(site, after).manifest_bytes
     return manifest_difference(*manifests, size, lambda sha256: decode_tile(store.blob(sha256)))
+
+
+def _change(store: MapStore, site: str, decide: Callable[[SiteReleases], ReleaseChanges]) -> ReleaseChanges:
+    """As `MapStore.change_releases`, and signs what robots may run now, if the keys are here."""
+    changes = store.change_releases(site, decide)
+    try_update_lists(store)
+    return changes
 
 
 def _pass_gate(store: MapStore, draft: VersionInfo, actor: Actor, gate: GateSettings, *, force: bool) -> int | None:

@@ -13,6 +13,7 @@ from mapserver.fleet.canary_controller import review
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
+from mapserver.trust import update_lists
 
 _ANNOUNCE_EVERY_S = 1.0
 _LOOK_EVERY_S = 0.2
@@ -36,6 +37,8 @@ def server_tasks(
     """All background tasks of a server."""
     ingest = settings.ingest
     return [
+        # Before the announcement: robots take only what the lists admit.
+        BackgroundTask("signing the lists of versions", _ANNOUNCE_EVERY_S, lambda: update_lists(store)),
         BackgroundTask("announcing versions", _ANNOUNCE_EVERY_S, bus_service.announce_changes),
         BackgroundTask("keeping reports", ingest.flush_every_s, fleet.flush),
         BackgroundTask("looking for robots", ingest.presence_every_s, bus_service.look_for_robots),

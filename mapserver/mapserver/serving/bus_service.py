@@ -23,11 +23,13 @@ from fleetmap.messages import (
     patch_key,
     robot_key,
     split_key,
+    trust_key,
 )
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.caches import AuthorizationCache, ByteCache
 from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.store import MapStore
+from mapserver.trust import SignedLists
 
 Count = Callable[[str, str, int], None]
 """Counts for metrics: (what, "ok" or "refused", bytes sent)."""
@@ -51,6 +53,7 @@ class BusService:
         self._fleet = fleet
         self._bus = bus
         self._count = count
+        self._lists = SignedLists(store.folder)
         self._announced: dict[tuple[str, str], str | None] = {}
         self._recent = ByteCache(_CACHED_BYTES)
         self._patches = ByteCache(_RECENT_PATCHES_BYTES)
@@ -63,6 +66,7 @@ class BusService:
             bus.queryable(manifest_key("*", "*"), self._counted("manifest", self._parts(self._manifest))),
             bus.queryable(blob_key("*", "*"), self._counted("blob", self._parts(self._blob))),
             bus.queryable(patch_key("*", "*", "*"), self._counted("patch", self._parts(self._patch))),
+            bus.queryable(trust_key("*", "*"), self._counted("trust", self._parts(self._list_file))),
             *(bus.subscribe(robot_key("*", "*", what), self._hear) for what in ("ack", "health", "pose")),
             bus.subscribe(live_key("*"), self._hear_survey),
         ]
@@ -75,7 +79,8 @@ class BusService:
         """
         changed, until_s = [], time.monotonic() + _PREPARE_S
         for info in self._store.sites():
-            robots = self._fleet.wanted_versions(info.site)
+            versions = self._fleet.wanted_versions(info.site)
+            robots = {robot: self._lists.admitted_or_current(wanted) for robot, wanted in versions.items()}
             moves = Counter((self._announced.get((info.site, robot)), w.manifest_sha256) for robot, w in robots.items())
             for (base, result), _ in moves.most_common():
                 if base is not None and result is not None and base != result:
@@ -115,7 +120,8 @@ class BusService:
 
     def _wanted(self, key: str, _: bytes) -> bytes:
         site, robot, _what = split_key(key)
-        return encode_message(self._fleet.take_question(site, check_name(robot, "robot")))
+        wanted = self._fleet.take_question(site, check_name(robot, "robot"))
+        return encode_message(self._lists.admitted_or_current(wanted))
 
     def _failure(self, key: str, payload: bytes) -> bytes:
         site, robot, _what = split_key(key)
@@ -132,6 +138,10 @@ class BusService:
         if info.state == "draft":
             raise LinkError(f"version {number} of site {site} is a draft; robots get published versions only")
         return self._read(info.manifest_sha256)
+
+    def _list_file(self, key: str) -> bytes:
+        site, _what, name = split_key(key)
+        return self._lists.file(check_name(site, "site"), name)
 
     def _blob(self, key: str) -> bytes:
         site, _what, sha256 = split_key(key)

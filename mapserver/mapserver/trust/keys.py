@@ -1,0 +1,107 @@
+"""Private keys as files: PKCS8 PEM, for their owner alone, encrypted where a person or systemd holds the passphrase."""
+
+import os
+import secrets
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fleetmap.errors import StoreError, UsageError, disk_errors
+from mapserver.store.files import make_folder, sync_folder
+
+if TYPE_CHECKING:
+    from securesystemslib.signer import CryptoSigner
+
+_LETTERS = "abcdefghijkmnpqrstuvwxyz23456789"  # 32 of them: five bits each, none that looks like another
+_GROUPS, _GROUP = 4, 4
+
+
+def make_passphrase() -> str:
+    """Eighty random bits. Made, not chosen: the encryption of a PEM file hashes it 2048 times only, too few for words of people."""
+    return "-".join("".join(secrets.choice(_LETTERS) for _ in range(_GROUP)) for _ in range(_GROUPS))
+
+
+def new_key() -> "CryptoSigner":
+    """An Ed25519 key."""
+    from securesystemslib.signer import CryptoSigner
+
+    return CryptoSigner.generate_ed25519()
+
+
+def save_key(path: Path, signer: "CryptoSigner", passphrase: str | None) -> None:
+    """Writes a key that must not be there yet; StoreError where that is not possible."""
+    from cryptography.hazmat.primitives import serialization as s
+
+    key = s.load_pem_private_key(signer.private_bytes, None)
+    how = s.NoEncryption() if passphrase is None else s.BestAvailableEncryption(passphrase.encode())
+    data = key.private_bytes(s.Encoding.PEM, s.PrivateFormat.PKCS8, how)
+    with disk_errors(f"the key {path} cannot be written", "check the folder; a key is never overwritten"):
+        make_folder(path.parent)
+        path.parent.chmod(0o700)
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(descriptor)
+        sync_folder(path.parent)
+
+
+def load_key(path: Path, passphrase: str | None) -> "CryptoSigner":
+    """A key; StoreError where its file cannot be read, UsageError for a wrong passphrase or something that is no key."""
+    from cryptography.exceptions import UnsupportedAlgorithm
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+    from securesystemslib.signer import CryptoSigner, SSlibKey
+
+    with disk_errors(f"the key {path} cannot be read", "check --keys and whose account this is"):
+        data = path.read_bytes()
+    try:
+        key = load_pem_private_key(data, None if passphrase is None else passphrase.encode())
+        return CryptoSigner(key, SSlibKey.from_crypto(key.public_key()))
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        raise UsageError(f"{path} is no key, or of another passphrase ({error})") from error
+
+
+class KeyFolder:
+    """Keys that this account can use without asking anybody, named by their role: `online`, `site-SITE`, and `root` on one machine.
+
+    The passphrase of NAME.pem is the file fleetmap-NAME in $CREDENTIALS_DIRECTORY, where systemd puts it; without it the key
+    is not encrypted.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def has(self, name: str) -> bool:
+        """Whether the key is here, for this account."""
+        return os.access(self._path(name), os.R_OK)
+
+    def signer(self, name: str) -> "CryptoSigner | None":
+        """A key, None where it is not here or not for this account; errors as of `load_key`."""
+        return load_key(self._path(name), _credential(name)) if self.has(name) else None
+
+    def make(self, name: str) -> "CryptoSigner":
+        """A new key of this name; StoreError where there is one already."""
+        signer = new_key()
+        save_key(self._path(name), signer, _credential(name))
+        return signer
+
+    def replace(self, name: str) -> "CryptoSigner":
+        """As `make`, in the place of a key that is kept under another name until it is removed by hand."""
+        path = self._path(name)
+        if path.exists():
+            with disk_errors(f"the key {path} cannot be moved", "check the folder's rights"):
+                path.replace(path.with_suffix(f".{secrets.token_hex(4)}.old"))
+        return self.make(name)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.pem"
+
+
+def _credential(name: str) -> str | None:
+    folder = os.environ.get("CREDENTIALS_DIRECTORY")
+    path = None if folder is None else Path(folder) / f"fleetmap-{name}"
+    if path is None or not path.is_file():
+        return None
+    try:
+        return path.read_text("utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise StoreError(f"the passphrase {path} cannot be read ({error}); check the unit's credentials") from error

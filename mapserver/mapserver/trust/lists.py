@@ -1,0 +1,112 @@
+"""The store's signed lists as files, as robots get them. Reads without tuf, because the server does so at every question.
+
+STORE/trust/1.root.json 2.root.json ...        which keys sign what; never removed, because robots follow them one by one
+STORE/trust/N.targets.json                     which keys sign the list of which site
+STORE/trust/N.site-SITE.json                   the versions of a site that robots may run
+STORE/trust/N.snapshot.json timestamp.json     which of these files are the present ones
+STORE/trust/staged/N.site-SITE.json            a list that waits for its last signature, or for the server
+"""
+
+import re
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fleetmap.errors import StoreError, UntrustedError
+from fleetmap.messages import WantedVersion
+from fleetmap.trust import SiteList, read_site_list, site_role
+
+TIMESTAMP = "timestamp"
+_NAME = re.compile(r"(?:(timestamp)|[0-9]{1,10}\.(root|targets|snapshot|site-[a-z0-9_-]{1,64}))\.json")
+_NUMBER = re.compile(r"([0-9]{1,10})\.")
+
+
+class _Signed(msgspec.Struct, frozen=True):
+    version: int
+    expires: datetime
+    meta: dict[str, dict[str, Any]] = {}
+    delegations: dict[str, Any] | None = None
+
+
+class _File(msgspec.Struct, frozen=True):
+    signed: _Signed
+
+
+class SignedLists:
+    """The folder of one store. For any thread; sees at once what other processes write."""
+
+    def __init__(self, store: Path) -> None:
+        self.folder = store / "trust"
+        self._known: tuple[object, dict[str, SiteList]] = (None, {})
+
+    @property
+    def are_there(self) -> bool:
+        """Whether the store's maps are signed at all."""
+        return (self.folder / "1.root.json").is_file()
+
+    def file(self, site: str, name: str) -> bytes:
+        """A file for the robots of a site; empty where they have none of that name."""
+        named = _NAME.fullmatch(name)
+        if named is None or ((named[2] or "").startswith("site-") and named[2] != site_role(site)):
+            return b""
+        try:
+            return (self.folder / name).read_bytes()
+        except OSError:
+            return b""
+
+    def newest(self, role: str) -> int:
+        """Number of the newest file of a role, 0 where there is none."""
+        found = (_NUMBER.match(path.name) for path in self.folder.glob(f"*.{role}.json"))
+        return max((int(number[1]) for number in found if number is not None), default=0)
+
+    def read(self, role: str, number: int | None = None) -> _Signed:
+        """What the newest file of a role says, or the file of this number; StoreError where it cannot be read."""
+        path = self.path(role, self.newest(role) if number is None else number)
+        try:
+            return msgspec.json.decode(path.read_bytes(), type=_File).signed
+        except (OSError, msgspec.MsgspecError) as error:
+            raise StoreError(f"{path} cannot be read ({error}); restore the store's folder trust") from error
+
+    def path(self, role: str, number: int) -> Path:
+        """The file of a role's number."""
+        return self.folder / (f"{TIMESTAMP}.json" if role == TIMESTAMP else f"{number}.{role}.json")
+
+    def site_list(self, site: str, number: int) -> SiteList:
+        """The list of this number; errors as of `read`."""
+        path = self.path(site_role(site), number)
+        try:
+            return read_site_list(path.read_bytes(), site)
+        except (OSError, UntrustedError) as error:
+            raise StoreError(f"{path} cannot be read ({error}); restore the store's folder trust") from error
+
+    def served(self, site: str) -> SiteList | None:
+        """The list that robots of a site get now; None before the first."""
+        try:
+            status = self.path(TIMESTAMP, 0).stat()
+        except FileNotFoundError:
+            return None
+        mark = (status.st_mtime_ns, status.st_ino)
+        if self._known[0] != mark:
+            self._known = (mark, {})
+        known = self._known[1]
+        if site not in known:
+            snapshot = self.read("snapshot", self.read(TIMESTAMP).meta["snapshot.json"]["version"])
+            entry = snapshot.meta.get(f"{site_role(site)}.json")
+            if entry is None:
+                return None
+            known[site] = self.site_list(site, entry["version"])
+        return known[site]
+
+    def admitted_or_current(self, wanted: WantedVersion) -> WantedVersion:
+        """The version that a robot is told to run: the wanted one where the list admits it, else the list's current one."""
+        if not self.are_there or wanted.version is None:
+            return wanted
+        found = self.served(wanted.site)
+        chosen = None if found is None else found.state("current")
+        if found is None or chosen is None:
+            return WantedVersion(site=wanted.site, version=None, manifest_sha256=None)
+        if any(wanted.manifest_sha256 == entry.sha256 for entry in found.admitted):
+            return wanted
+        return WantedVersion(site=wanted.site, version=chosen.about.version, manifest_sha256=chosen.sha256)

@@ -1,0 +1,165 @@
+"""When something is signed: after releases, at night, and every few hours, as far as the keys that this account can use go."""
+
+import logging
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING
+
+from fleetmap.bus import is_loopback
+from fleetmap.errors import FleetmapError, UsageError
+from fleetmap.trust import AdmittedVersion, site_role
+from fleetmap.trust.site_list import VersionState
+from mapserver.store import MapStore, VersionInfo
+from mapserver.store.files import locked
+from mapserver.store.rows import SiteReleases
+from mapserver.trust.keys import KeyFolder
+from mapserver.trust.lists import TIMESTAMP, SignedLists
+
+if TYPE_CHECKING:
+    from mapserver.trust.repository import ListRepository
+
+_RENEW_SITE = timedelta(days=13)  # of 14: every night
+_RENEW_TIMESTAMP = timedelta(hours=18)  # of 24: every six hours
+_RENEW_SNAPSHOT = timedelta(days=3)
+_log = logging.getLogger(__name__)
+
+
+def admitted_versions(rows: SiteReleases, previous: int) -> tuple[AdmittedVersion, ...]:
+    """What robots of a site may run. previous: 1 where the version before stays admitted, so that a rollback needs no key; else 0."""
+    states: dict[int, str] = {}
+    if previous and rows.rollback_target is not None:
+        states[rows.rollback_target] = "previous"
+    if rows.canary is not None:
+        states[rows.canary.version] = "trial"
+    if rows.current is not None:
+        states[rows.current.version] = "current"
+    return tuple(_entry(rows.versions[number], state) for number, state in sorted(states.items()))
+
+
+def update_lists(store: MapStore) -> None:
+    """Signs what releases changed and what expires soon. Nothing where the store has no lists, or the key is elsewhere.
+
+    Raises StoreError where the disk refuses or a key cannot be read, StateError for lists that robots would refuse.
+    """
+    lists = SignedLists(store.folder)
+    if not lists.are_there:
+        return
+    now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
+    keys = KeyFolder(store.folder / "keys")
+    if not _due(store, lists, keys, now):
+        return
+    from mapserver.trust.repository import ListRepository
+
+    with locked(lists.folder / "lock", shared=False):
+        repository = ListRepository(lists, now)
+        for info in store.sites():
+            _update_site(repository, keys, store.releases(info.site), now)
+        online = keys.signer("online")
+        if online is not None and _online_is_due(lists, now):
+            repository.sign_online(online)
+
+
+def try_update_lists(store: MapStore) -> None:
+    """As `update_lists`; what is in the way goes into the log, because a release stands in any case and the server tries again."""
+    try:
+        update_lists(store)
+    except FleetmapError as error:
+        _log.error("the lists of what robots may run are not signed: %s", error)
+
+
+def prepare_lists(store: MapStore, endpoint: str) -> None:
+    """Before a server listens at `endpoint`: makes the lists where only this machine can ask for them, and signs what is due.
+
+    Raises UsageError where a store without lists would be served to other machines.
+    """
+    if not SignedLists(store.folder).are_there:
+        if not is_loopback(endpoint):
+            raise UsageError(
+                f"the maps of {store.folder} are not signed, and robots on other machines can ask at {endpoint}; sign them "
+                f"first: `mapserver trust init --here --store {store.folder}`"
+            )
+        init_here(store)
+    try_update_lists(store)
+
+
+def init_here(store: MapStore) -> None:
+    """Signed lists with all keys on this machine, without passphrases: who takes the machine can publish.
+
+    Errors as of `update_lists`; StateError where there are lists already.
+    """
+    from mapserver.trust.repository import ListRepository
+
+    keys, lists = KeyFolder(store.folder / "keys"), SignedLists(store.folder)
+    now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
+    root, online = (keys.signer(name) or keys.make(name) for name in ("root", "online"))
+    ListRepository(lists, now).init([root], 1, online.public_key)
+    update_lists(store)
+
+
+def _entry(info: VersionInfo, state: str) -> AdmittedVersion:
+    about = VersionState(
+        version=info.version,
+        state=state,  # type: ignore[arg-type]
+        vocabulary=info.vocabulary_sha256,
+        archive=info.archive_sha256,
+    )
+    return AdmittedVersion(info.manifest_sha256, info.manifest_bytes, about)
+
+
+def _due(store: MapStore, lists: SignedLists, keys: KeyFolder, now: datetime) -> bool:
+    """Whether anything is to be signed that can be signed here; asked every second, so without tuf."""
+    if keys.has("online") and _online_is_due(lists, now):
+        return True
+    return any(
+        _site_is_due(lists, store.releases(info.site), now) and (keys.has(site_role(info.site)) or keys.has("root"))
+        for info in store.sites()
+    )
+
+
+def _online_is_due(lists: SignedLists, now: datetime) -> bool:
+    number = lists.newest("snapshot")
+    if not number or not lists.path(TIMESTAMP, 0).is_file():
+        return True
+    stamp, snapshot = lists.read(TIMESTAMP), lists.read("snapshot", number)
+    named = {name: entry["version"] for name, entry in snapshot.meta.items()}
+    present = {"targets.json": lists.newest("targets")}
+    present |= {f"{role}.json": newest for role in _delegated(lists) if (newest := lists.newest(role))}
+    return (
+        named != present
+        or stamp.meta["snapshot.json"]["version"] != number
+        or stamp.expires < now + _RENEW_TIMESTAMP
+        or snapshot.expires < now + _RENEW_SNAPSHOT
+    )
+
+
+def _site_is_due(lists: SignedLists, rows: SiteReleases, now: datetime) -> bool:
+    role = site_role(rows.site)
+    number, rules = lists.newest(role), _delegated(lists).get(role)
+    if rows.current is None:
+        return False
+    if not number or rules is None:
+        return True
+    last = lists.site_list(rows.site, number)
+    return last.admitted != admitted_versions(rows, rules) or last.expires < now + _RENEW_SITE
+
+
+def _delegated(lists: SignedLists) -> dict[str, int]:
+    """How many predecessors each site's role admits, by role."""
+    delegations = lists.read("targets").delegations or {}
+    return {role["name"]: int(role.get("previous", 1)) for role in delegations.get("roles", [])}
+
+
+def _update_site(repository: "ListRepository", keys: KeyFolder, rows: SiteReleases, now: datetime) -> None:
+    lists, role = repository.lists, site_role(rows.site)
+    if not _site_is_due(lists, rows, now):
+        return
+    if role not in _delegated(lists):
+        root = keys.signer("root")
+        if root is None:
+            return
+        signer = keys.signer(role) or keys.make(role)
+        repository.delegate(rows.site, [signer.public_key], [root])
+    site_key = keys.signer(role)
+    if site_key is None:
+        return
+    signed = repository.sign_site(rows.site, admitted_versions(rows, _delegated(lists)[role]), [site_key])
+    repository.accept_site(rows.site, signed)

@@ -1,0 +1,90 @@
+"""State of the signed lists: who holds what, how long it lasts, and which keys lie where a thief of the server finds them."""
+
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+import msgspec
+
+from fleetmap.errors import StateError
+from fleetmap.trust import site_role
+from mapserver.store import MapStore
+from mapserver.trust.keys import KeyFolder
+from mapserver.trust.lists import TIMESTAMP, SignedLists
+
+# Days before its end at which a role is to be signed again: by people, who must meet; by the builder, every night; by the server.
+_ENDS_SOON = {"root": 60, "targets": 30, "snapshot": 1, TIMESTAMP: 0.25}
+_SITE_ENDS_SOON = 7
+
+
+@dataclass(frozen=True)
+class RoleStatus:
+    """One role. number: of its newest file, 0 where there is none; keys: how many may sign, of which `threshold` are needed."""
+
+    role: str
+    number: int
+    keys: int
+    threshold: int
+    expires: str | None
+    days_left: float | None
+    fault: str = ""
+
+
+@dataclass
+class TrustStatus:
+    """All roles. faults: what stops robots from new maps, now or soon; risks: what a thief of this machine could do."""
+
+    roles: list[RoleStatus] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+    risks: list[str] = field(default_factory=list)
+
+
+def trust_status(store: MapStore) -> TrustStatus:
+    """What stands in the store's lists; StateError where it has none, StoreError where they cannot be read."""
+    lists, found = SignedLists(store.folder), TrustStatus()
+    if not lists.are_there:
+        raise StateError(
+            f"{store.folder} has no signed lists; `mapserver trust init --store {store.folder}` makes them"
+        )
+    now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
+    holders = _holders(lists)
+    for role, (keys, threshold) in holders.items():
+        found.roles.append(_role(lists, role, keys, threshold, now))
+    found.faults = [f"{status.role}: {status.fault}" for status in found.roles if status.fault]
+    own = KeyFolder(store.folder / "keys")
+    for info in store.sites():
+        role = site_role(info.site)
+        if role not in holders and info.current_version is not None:
+            found.faults.append(f"site {info.site}: no key may sign its maps; `mapserver trust admit {info.site}`")
+        elif own.has(role):
+            found.risks.append(f"{own.folder}/{role}.pem: who takes this machine can publish maps of {info.site}")
+    if own.has("root"):
+        found.risks.append(
+            f"{own.folder}/root.pem: who takes this machine can do everything, and nobody can take it back"
+        )
+    return found
+
+
+def _holders(lists: SignedLists) -> dict[str, tuple[int, int]]:
+    """Number of keys and threshold by role, the top ones first."""
+    path = lists.path("root", lists.newest("root"))
+    signed: dict[str, Any] = msgspec.json.decode(path.read_bytes())["signed"]
+    held = {role: (len(entry["keyids"]), int(entry["threshold"])) for role, entry in signed["roles"].items()}
+    top = {role: held[role] for role in ("root", "targets", "snapshot", TIMESTAMP)}
+    delegations = lists.read("targets").delegations or {}
+    sites = {role["name"]: (len(role["keyids"]), int(role["threshold"])) for role in delegations.get("roles", [])}
+    return top | sites
+
+
+def _role(lists: SignedLists, role: str, keys: int, threshold: int, now: datetime) -> RoleStatus:
+    number = lists.newest(role)
+    if role == TIMESTAMP and lists.path(role, 0).is_file():
+        number = lists.read(role).version
+    if not number:
+        return RoleStatus(role, 0, keys, threshold, None, None, "nothing was signed yet")
+    expires = lists.read(role).expires
+    days_left = (expires - now).total_seconds() / 86_400
+    fault = ""
+    if days_left < _ENDS_SOON.get(role, _SITE_ENDS_SOON):
+        fault = "expired: robots take no new map" if days_left <= 0 else f"ends in {days_left:.1f} days: sign it again"
+    return RoleStatus(role, number, keys, threshold, expires.isoformat(), round(days_left, 2), fault)

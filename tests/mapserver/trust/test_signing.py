@@ -1,0 +1,240 @@
+"""What a store signs: after each release, before something expires, never what robots would refuse; and what the server tells robots."""
+
+import stat
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from securesystemslib.signer import CryptoSigner
+
+from fleetmap.errors import StateError, StoreError, UsageError
+from fleetmap.messages import WantedVersion
+from mapserver import releases
+from mapserver.store import MapStore
+from mapserver.trust import KeyFolder, SignedLists, init_here, prepare_lists, update_lists
+from mapserver.trust.keys import load_key, make_passphrase, new_key, save_key
+from mapserver.trust.repository import ListRepository
+from mapserver.trust.signing import admitted_versions
+from mapserver.trust.status import trust_status
+from support.storage.map_samples import save_sample_draft
+
+HOUR_NS = 3_600_000_000_000
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_ns = 1_780_000_000_000_000_000
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
+    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as made:
+        publish(made, seed=1)
+        init_here(made)
+        yield made
+
+
+def publish(store: MapStore, seed: int) -> int:
+    save_sample_draft(store, seed=seed)
+    return releases.publish(store, "lab")
+
+
+def told(store: MapStore, version: int) -> int | None:
+    info = store.version("lab", version)
+    wanted = WantedVersion(site="lab", version=version, manifest_sha256=info.manifest_sha256)
+    return SignedLists(store.folder).admitted_or_current(wanted).version
+
+
+def states(store: MapStore) -> dict[int, str]:
+    found = SignedLists(store.folder).served("lab")
+    assert found is not None
+    return {entry.about.version: entry.about.state for entry in found.admitted}
+
+
+def test_every_release_is_signed_at_once(store: MapStore) -> None:
+    assert states(store) == {1: "current"}
+    assert publish(store, seed=2) == 2
+    assert states(store) == {1: "previous", 2: "current"}
+    save_sample_draft(store, seed=3)
+    canary = releases.start_canary(store, "lab", 3, 0.5)
+    assert states(store) == {1: "previous", 2: "current", 3: "trial"}
+    releases.end_canary(store, canary, promote=False, outcome="worse")
+    assert states(store) == {1: "previous", 2: "current"}
+    releases.roll_back(store, "lab")
+    assert states(store) == {1: "current"}  # the version that was taken back may not be run any more
+    releases.promote(store, "lab", 2)
+    assert states(store) == {1: "previous", 2: "current"}
+    found = SignedLists(store.folder).served("lab")
+    info = store.version("lab", 2)
+    assert found is not None
+    assert found.state("current").length == info.manifest_bytes
+    assert found.state("current").about.vocabulary == info.vocabulary_sha256
+
+
+def test_without_predecessors_a_rollback_needs_the_signer(store: MapStore) -> None:
+    publish(store, seed=2)
+    rows = store.releases("lab")
+    assert [entry.about.version for entry in admitted_versions(rows, 1)] == [1, 2]
+    assert [entry.about.version for entry in admitted_versions(rows, 0)] == [2]
+
+
+def test_robots_are_told_of_what_is_signed_alone(store: MapStore) -> None:
+    """The builder's key is elsewhere: what was published waits for it, and robots stay where they are."""
+    (store.folder / "keys" / "site-lab.pem").rename(store.folder / "elsewhere.pem")
+    (store.folder / "keys" / "root.pem").unlink()
+    assert publish(store, seed=2) == 2
+    assert states(store) == {1: "current"}
+    assert told(store, 2) == 1
+    (store.folder / "elsewhere.pem").rename(store.folder / "keys" / "site-lab.pem")
+    update_lists(store)
+    assert told(store, 2) == 2
+
+
+def test_nothing_is_told_before_the_first_list(tmp_path: Path, clock: Clock) -> None:
+    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as store:
+        save_sample_draft(store, seed=1)
+        releases.publish(store, "lab")
+        assert told(store, 1) == 1  # a store that is not signed serves as before
+        people = [CryptoSigner.generate_ed25519() for _ in range(3)]
+        online = KeyFolder(store.folder / "keys").make("online")
+        ListRepository(SignedLists(store.folder), datetime.now(UTC)).init(people, 2, online.public_key)
+        update_lists(store)
+        assert told(store, 1) is None
+        assert trust_status(store).faults == ["site lab: no key may sign its maps; `mapserver trust admit lab`"]
+
+
+def test_lists_are_signed_anew_before_they_end(store: MapStore, clock: Clock) -> None:
+    lists = SignedLists(store.folder)
+
+    def numbers() -> tuple[int, int, int]:
+        return lists.read("timestamp").version, lists.newest("snapshot"), lists.newest("site-lab")
+
+    before = numbers()
+    clock.now_ns += 5 * HOUR_NS
+    update_lists(store)
+    assert numbers() == before
+    clock.now_ns += 2 * HOUR_NS
+    update_lists(store)
+    assert numbers() == (before[0] + 1, *before[1:])
+    clock.now_ns += 20 * HOUR_NS  # a night later
+    update_lists(store)
+    assert numbers() == (before[0] + 2, before[1] + 1, before[2] + 1)
+    clock.now_ns += 5 * 24 * HOUR_NS
+    update_lists(store)
+    assert trust_status(store).faults == []
+    clock.now_ns += 2 * 24 * HOUR_NS
+    assert trust_status(store).faults[0].startswith("timestamp: expired")
+    update_lists(store)
+    assert trust_status(store).faults == []
+    clock.now_ns += 700 * 24 * HOUR_NS
+    update_lists(store)
+    assert [words.partition(":")[0] for words in trust_status(store).faults] == ["root", "targets"]
+
+
+def test_old_lists_are_removed_and_roots_are_not(store: MapStore) -> None:
+    for seed in range(2, 10):
+        publish(store, seed=seed)
+    names = [path.name for path in (store.folder / "trust").glob("*.json")]
+    assert sum(name.endswith(".site-lab.json") for name in names) == 5
+    assert "1.root.json" in names
+
+
+def test_the_server_takes_no_list_that_robots_would_refuse(store: MapStore, clock: Clock) -> None:
+    """Of a thief with another key, with a number that was there, or under a root that one of two people signed."""
+    lists, thief = SignedLists(store.folder), CryptoSigner.generate_ed25519()
+    repository = ListRepository(lists, datetime.fromtimestamp(clock() / 1e9, UTC))
+    admitted = admitted_versions(store.releases("lab"), 1)
+    with pytest.raises(StateError, match="not signed as robots demand"):
+        repository.accept_site("lab", repository.sign_site("lab", admitted, [thief]))
+    own = KeyFolder(store.folder / "keys").signer("site-lab")
+    signed = repository.sign_site("lab", admitted, [own])
+    repository.accept_site("lab", signed)  # the control
+    with pytest.raises(StateError, match="3 is the next"):
+        repository.accept_site("lab", signed)
+    with pytest.raises(StateError, match="not signed"):
+        repository.delegate("lab", [thief.public_key], [thief])
+    with pytest.raises(StateError, match="not signed"):
+        repository.replace_online(thief.public_key, [thief])
+    with pytest.raises(StateError, match="not signed"):
+        repository.sign_online(thief)
+    assert lists.newest("root") == 1
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../store.sqlite3", "keys/online.pem", "1.site-yard.json", "", "x" * 300, "lock", "2.root.json", "1.root.json.x"],
+)
+def test_nothing_but_the_sites_own_lists_is_given_out(store: MapStore, name: str) -> None:
+    (store.folder / "trust" / "1.site-yard.json").write_bytes(b"{}")
+    lists = SignedLists(store.folder)
+    assert lists.file("lab", name) == b""
+    assert lists.file("lab", "1.root.json") != b""
+    assert lists.file("yard", "1.site-yard.json") == b"{}"
+
+
+def test_beyond_loopback_a_store_must_be_signed_first(tmp_path: Path, clock: Clock) -> None:
+    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as store:
+        save_sample_draft(store, seed=1)
+        releases.publish(store, "lab")
+        with pytest.raises(UsageError, match="trust init --here"):
+            prepare_lists(store, "tls/0.0.0.0:7447")
+        prepare_lists(store, "tcp/127.0.0.1:7447")
+        assert states(store) == {1: "current"}
+        prepare_lists(store, "tls/0.0.0.0:7447")
+        with pytest.raises(StateError, match="already"):
+            init_here(store)
+
+
+def test_a_new_site_is_signed_for_by_itself_where_the_root_is_here(store: MapStore) -> None:
+    save_sample_draft(store, site="yard", seed=5)
+    releases.publish(store, "yard")
+    found = SignedLists(store.folder).served("yard")
+    assert found is not None
+    assert found.state("current").about.version == 1
+    assert len(trust_status(store).risks) == 3
+
+
+def test_keys_are_for_their_owner_and_encrypted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = make_passphrase()
+    assert len(words.replace("-", "")) * 5 == 80
+    key = new_key()
+    path = tmp_path / "keys" / "root-ada.pem"
+    save_key(path, key, words)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+    assert b"ENCRYPTED" in path.read_bytes()
+    assert load_key(path, words).public_key == key.public_key
+    for wrong in (None, make_passphrase()):
+        with pytest.raises(UsageError, match="passphrase"):
+            load_key(path, wrong)
+    with pytest.raises(StoreError, match="never overwritten"):
+        save_key(path, key, words)
+    (tmp_path / "credentials").mkdir()
+    (tmp_path / "credentials" / "fleetmap-online").write_text(words + "\n")
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path / "credentials"))
+    keys = KeyFolder(tmp_path / "keys")
+    made = keys.make("online")
+    assert b"ENCRYPTED" in (tmp_path / "keys" / "online.pem").read_bytes()
+    assert keys.signer("online").public_key == made.public_key
+    assert keys.signer("site-lab") is None
+    assert keys.replace("online").public_key != made.public_key
+    assert len(list((tmp_path / "keys").glob("online*.old"))) == 1
+
+
+def test_damaged_lists_do_not_undo_a_release(store: MapStore, caplog: pytest.LogCaptureFixture) -> None:
+    """Robots stay on the version before, and the server says why, at every attempt."""
+    (store.folder / "trust" / "timestamp.json").write_text("{")
+    assert publish(store, seed=2) == 2
+    assert "not signed" in caplog.text
+    assert store.current("lab").version == 2
+    with pytest.raises(StoreError, match="restore the store's folder trust"):
+        update_lists(store)
