@@ -18,7 +18,7 @@ from locclient.sensors.source import SourceSection
 TIERS = {
     "user": {
         "": "site store server",
-        "run": "server store site robot prior cache cache_bytes spool failures",
+        "run": "server store site robot prior cache cache_bytes root spool failures",
         "source": "kind calibration endpoint recording device",
         "output": "format endpoint",
         "topics": "*",
@@ -51,6 +51,7 @@ class RunSection(Section, frozen=True):
     prior: str | None = None
     cache: str | None = None
     cache_bytes: int = DEFAULT_MAX_BYTES
+    root: str | None = None
     spool: str | None = None
     spool_bytes: int = 50_000_000
     failures: str | None = None

@@ -22,6 +22,10 @@ class MapOptions:
     site: Annotated[str | None, typer.Option(help="Name of the site.")] = None
     robot: Annotated[str, typer.Option(help="Name under which the robot reports.")] = "replay"
     cache: Annotated[Path | None, typer.Option(help="Folder of the tile cache; default: the user's cache.")] = None
+    root: Annotated[
+        Path | None,
+        typer.Option(help="trust/1.root.json of the server's store; needed for a server on another machine."),
+    ] = None
     # As tile_cache.DEFAULT_MAX_BYTES, which is not imported, so that --help stays fast.
     cache_bytes: Annotated[int, typer.Option(min=0, help="Largest size of the tile cache.")] = 2_000_000_000
 

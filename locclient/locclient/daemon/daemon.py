@@ -18,7 +18,7 @@ from locclient.daemon.publishers import Publisher, open_publisher
 from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.outbox import Outbox
-from locclient.maps.connection import cache_folder, outbox_path
+from locclient.maps.connection import cache_folder, outbox_path, trusted_map
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
@@ -87,6 +87,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             # Two views of the same folder, because a cache is not for two threads; the second only reads.
             caches = tuple(TileCache(cache_folder(run.cache), max_bytes=run.cache_bytes) for _ in range(2))
             client = MapClient(bus, caches[0], site, name, patience_s=_PATIENCE_S)
+            client.require(trusted_map(bus, site, run.server or "", cache_folder(run.cache), run.root))
             maps, first = CachedMap(caches[1], site), client.active()
             server = ServerSync(client, outbox, retry_s=run.trial.retry_s)
         robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fleetmap.bus import ZenohBus
-from fleetmap.errors import FleetmapError, UnreachableError
+from fleetmap.errors import FleetmapError, LinkError, UnreachableError
 from fleetmap.features.orb import OrbSettings
 from fleetmap.recordings import StoredFrame
 from fleetmap.recordings.images import decode_frame
@@ -18,7 +18,7 @@ from locclient.config import LocclientConfig
 from locclient.daemon.daemon import check_run, configured_outbox
 from locclient.delivery.outbox import Outbox
 from locclient.localization.calibration.pair_order import REVERSED_TEXT, PairOrder, pair_order
-from locclient.maps.connection import cache_folder
+from locclient.maps.connection import cache_folder, trusted_map
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import LocalMapSource
 from locclient.maps.tile_cache import TileCache
@@ -211,7 +211,10 @@ def _cache_and_server(config: LocclientConfig) -> Iterator[Finding]:
         yield _pieces("cache", active.version, len(active.blobs) - damaged, reasons)
     bus = ZenohBus.connect(str(run.server))
     try:
-        wanted = MapClient(bus, cache, str(run.site), str(run.robot), timeout_s=_ANSWER_S).wanted()
+        client = MapClient(bus, cache, str(run.site), str(run.robot), timeout_s=_ANSWER_S)
+        trust = trusted_map(bus, str(run.site), str(run.server), folder, run.root)
+        client.require(trust)
+        wanted = client.wanted()
     except UnreachableError as error:
         hint = "" if active is None else f"; version {active.version} works without it"
         yield Finding(FAIL if active is None else WARN, "connection", f"{error}{hint}")
@@ -225,6 +228,12 @@ def _cache_and_server(config: LocclientConfig) -> Iterator[Finding]:
     is_here = active is not None and wanted == active.wanted(str(run.site))
     hint = ", which is here" if is_here else "; it is fetched when the robot runs"
     yield Finding(OK, "connection", f"{run.server} wants version {wanted.version}{hint}")
+    try:
+        trust.admitted(wanted)
+    except LinkError as error:
+        yield Finding(WARN if is_here else FAIL, "signed list", str(error))
+    else:
+        yield Finding(OK, "signed list", f"admits version {wanted.version}")
 
 
 def _pieces(what: str, version: int | None, good: int, refused: list[str]) -> Finding:

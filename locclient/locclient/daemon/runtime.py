@@ -169,7 +169,9 @@ class Runtime:
             "tiles_refused": sum(map(len, self._refused_tiles.values())),
             "cache_faults": self._count_cache_faults(),
         }
-        profile, more = self._parts.profile, {**counts, **spool, **tiles}
+        server = self._parts.server
+        word: dict[str, Figure] = {} if server is None else {"map_word_hours": server.client.word_hours}
+        profile, more = self._parts.profile, {**counts, **spool, **tiles, **word}
         return self._figures.report(profile.site, profile.robot, self._wall_ns(), more, is_silent)
 
     def _count_cache_faults(self) -> int:

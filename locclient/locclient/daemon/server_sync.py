@@ -5,7 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError
+from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
 from fleetmap.messages import RobotHealth, WantedVersion
 from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import deliver
@@ -96,7 +96,9 @@ class ServerSync:
                 self._ask_at_s = 0.0
                 raise
             self._not_before_s[sha256] = now_s + _ASK_EVERY_S
-            self._refuse(wanted, str(error))
+            self._refuse(wanted, str(error), isinstance(error, UntrustedError))
+            if isinstance(error, UntrustedError):
+                return None
             if self._running is not None:
                 return None
         # An incomplete first version is better than none; otherwise the last good one goes on.
@@ -134,10 +136,11 @@ class ServerSync:
             _log.warning("version %s runs but is not kept: %s", wanted.version, error)
         self._acknowledge()
 
-    def _refuse(self, wanted: WantedVersion, reason: str) -> None:
+    def _refuse(self, wanted: WantedVersion, reason: str, is_untrusted: bool = False) -> None:
+        """is_untrusted: the reason begins with the kind of attack, and so does what the server hears."""
         _log.warning("version %s is refused: %s", wanted.version, reason)
         running = None if self._running is None else self._running.version
-        self._last_ack = (running, f"version {wanted.version}: {reason}")
+        self._last_ack = (running, reason if is_untrusted else f"version {wanted.version}: {reason}")
         self._acknowledge()
 
     def _acknowledge_again(self) -> None:

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus, ZenohBus, is_loopback
+from fleetmap.errors import UsageError, disk_errors
+from fleetmap.trust import TrustedMap, ask_over
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
@@ -31,17 +33,35 @@ class MapConnection:
     outbox: Path | None = None
 
 
+def trusted_map(bus: Bus, site: str, server: str, cache: Path, root: str | Path | None) -> TrustedMap:
+    """The signed lists of a site. server: its endpoint; root: file of the root to trust, for servers on other machines.
+
+    Raises UsageError where a root is needed and not given, or cannot be read.
+    """
+    folder, data = cache / "trust" / site, None
+    if root is not None:
+        with disk_errors(f"the root {root} cannot be read", "copy 1.root.json of the server's store", UsageError):
+            data = Path(root).read_bytes()
+    elif not is_loopback(server):
+        raise UsageError(
+            f"whose maps may be trusted at {server}? Copy trust/1.root.json of the server's store to the robot and name it: root"
+        )
+    return TrustedMap(folder, site, data, ask_over(bus, site))
+
+
 @contextmanager
 def connected(options: dict[str, Any]) -> Iterator[MapConnection]:
-    """A connection for the options `server` or `store`, `site`, `robot`, `cache`, `cache_bytes`; closed afterwards."""
+    """A connection for the options `server` or `store`, `site`, `robot`, `cache`, `cache_bytes`, `root`; closed afterwards."""
     site, robot = options["site"], options["robot"]
     if options["store"] is not None:
         yield MapConnection(LocalMapSource(Path(options["store"]), site), None, site, robot)
         return
-    cache = TileCache(cache_folder(options["cache"]), max_bytes=options["cache_bytes"])
+    folder = cache_folder(options["cache"])
+    cache = TileCache(folder, max_bytes=options["cache_bytes"])
     bus = ZenohBus.connect(options["server"])
     try:
         client = MapClient(bus, cache, site, robot, patience_s=_PATIENCE_S)
+        client.require(trusted_map(bus, site, options["server"], folder, options.get("root")))
         client.announce_presence()
         yield MapConnection(client, client, site, robot, outbox_path(site, robot, options["cache"]))
         for fault in cache.take_faults():

@@ -27,6 +27,7 @@ from fleetmap.messages import (
     patch_key,
     robot_key,
 )
+from fleetmap.trust import TrustedMap
 from locclient.maps.chunked_download import ChunkReader
 from locclient.maps.map_source import (
     FetchedTiles,
@@ -56,6 +57,17 @@ class MapClient(MapSource):
         self._robot = check_name(robot, "robot")
         self._timeout_s = timeout_s
         self._chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
+        self._trust: TrustedMap | None = None
+        self._begun = ""  # the manifest's address of the version that was admitted last
+
+    def require(self, trust: TrustedMap) -> None:
+        """From now on takes only new versions that the site's signed list admits. What is active goes on in any case."""
+        self._trust = trust
+
+    @property
+    def word_hours(self) -> float | None:
+        """Hours since the server last proved what may be run; None if it never did, or need not."""
+        return None if self._trust is None else self._trust.word_hours
 
     @property
     def received_bytes(self) -> int:
@@ -73,6 +85,8 @@ class MapClient(MapSource):
         wanted = decode_message(self._bus.get(self._key("wanted"), timeout_s=self._timeout_s), WantedVersion)
         if wanted.site != self._site:
             raise LinkError(f"asked for site {self._site}, the server answered for {wanted.site[:80]!r}")
+        if self._trust is not None:
+            self._trust.refresh()
         return wanted
 
     def on_wanted(self, listener: Callable[[WantedVersion], None]) -> Handle:
@@ -113,6 +127,7 @@ class MapClient(MapSource):
         What came before an error stays in the cache, and the active version what it was. Raises UnreachableError where nobody
         answers, LinkError and MapFormatError for what cannot be had or is damaged, StoreError where the disk refuses.
         """
+        self._begun = ""
         manifest = self.manifest(wanted)
         self._cache.reserve(self._site, _addresses(manifest, wanted))
         self.vocabulary(manifest)
@@ -131,12 +146,14 @@ class MapClient(MapSource):
     def manifest(self, wanted: WantedVersion) -> Manifest:
         """The wanted version's manifest, from the cache or the server.
 
-        Raises LinkError where the site has no version or nobody answers, MapFormatError for bytes that are not the wanted ones.
+        Raises LinkError where the site has no version or nobody answers, UntrustedError where signed lists do not admit it,
+        MapFormatError for bytes that are not the wanted ones.
         """
         version, sha256 = address_of(wanted)
         active = self._cache.active(self._site)
         base = None if active is None else active.blobs[0]
-        return checked_manifest(self._blob(manifest_key(self._site, version), sha256, MAX_MANIFEST_BYTES, base), wanted)
+        max_bytes = MAX_MANIFEST_BYTES if sha256 == base else self._admitted_bytes(wanted, sha256)
+        return checked_manifest(self._blob(manifest_key(self._site, version), sha256, max_bytes, base), wanted)
 
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
         """The verified bytes of an address, from the cache or the server; errors as of `manifest`."""
@@ -161,6 +178,17 @@ class MapClient(MapSource):
                 raise
 
         return collect_tiles(manifest, cells, blob)
+
+    def _admitted_bytes(self, wanted: WantedVersion, sha256: str) -> int:
+        """The manifest's size by the signed list. All else of a version follows from its manifest, by hash and size.
+
+        A version whose fetch was admitted is finished, also where the list has gone on meanwhile.
+        """
+        if self._trust is None or sha256 == self._begun:
+            return MAX_MANIFEST_BYTES
+        length = self._trust.admitted(wanted).length
+        self._begun = sha256
+        return length
 
     def _bases(self) -> dict[tuple[int, int], str]:
         """The tiles of the active version, which others can be patched from; empty where its manifest is not to be had."""

@@ -1,0 +1,303 @@
+"""Attacks on a robot's map: by any participant of the bus, by a thief of the server, by replay. Each with its control."""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from tuf.api.metadata import MetaFile, Snapshot, Timestamp
+
+from fleetmap.bus import MemoryBus, MemoryHub
+from fleetmap.errors import LinkError, UntrustedError
+from fleetmap.messages import RobotAck, WantedVersion, decode_message, encode_message, manifest_key, part_of, robot_key
+from fleetmap.trust import TrustedMap, ask_over
+from locclient.daemon.server_sync import ServerSync
+from locclient.delivery.outbox import Outbox
+from locclient.maps.map_client import MapClient
+from locclient.maps.tile_cache import TileCache
+from locclient.robot.robot import Change, VersionChange
+from mapserver import releases
+from mapserver.fleet.fleet import Fleet
+from mapserver.serving.bus_service import BusService
+from mapserver.store import MapStore
+from mapserver.trust import KeyFolder, SignedLists, init_here, update_lists
+from mapserver.trust.repository import ListRepository
+from mapserver.trust.signing import admitted_versions
+from support.storage.map_samples import publish_samples, save_sample_draft
+
+SITE, ROBOT = "lab", "r1"
+
+
+@dataclass
+class World:
+    """An honest server, robots of its site, and whoever else takes part in the bus."""
+
+    folder: Path
+    hub: MemoryHub
+    stack: ExitStack
+    store: MapStore
+    fleet: Fleet
+    service: BusService
+    ahead_s: float = 0.0
+    buses: list[MemoryBus] = field(default_factory=list)
+
+    @property
+    def trust_folder(self) -> Path:
+        return self.store.folder / "trust"
+
+    def bus(self) -> MemoryBus:
+        return self.stack.enter_context(MemoryBus(self.hub))
+
+    def client(self, name: str = "cache", *, trusting: bool = True) -> MapClient:
+        """A robot with this cache, as after a restart."""
+        bus = self.bus()
+        client = MapClient(bus, TileCache(self.folder / name), SITE, ROBOT)
+        if trusting:
+            root = (self.trust_folder / "1.root.json").read_bytes()
+            ask, folder = ask_over(bus, SITE), self.folder / name / "trust" / SITE
+
+            def wall_s() -> float:
+                return datetime.now(UTC).timestamp() + self.ahead_s
+
+            client.require(TrustedMap(folder, SITE, root, ask, wall_s))
+        return client
+
+    def publish(self, seed: int) -> int:
+        save_sample_draft(self.store, seed=seed)
+        return releases.publish(self.store, SITE)
+
+    def repository(self) -> ListRepository:
+        return ListRepository(SignedLists(self.store.folder), datetime.now(UTC))
+
+    def attacker(self, versions: int = 3) -> BusService:
+        """Answers first, with maps and lists of its own; its version 3 is not the honest one."""
+        store = self.stack.enter_context(MapStore.open(self.folder / "evil", create=True))
+        for seed in range(100, 100 + versions):
+            save_sample_draft(store, seed=seed)
+            releases.publish(store, SITE)
+        init_here(store)
+        before = list(self.hub.queryables)
+        made = BusService(store, Fleet(store), self.bus(), lambda *_: None)
+        self.hub.queryables[:] = [entry for entry in self.hub.queryables if entry not in before] + before
+        return made
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    """Versions 1 (previous) and 2 (current), signed."""
+    hub = MemoryHub()
+    with ExitStack() as stack:
+        store = stack.enter_context(MapStore.open(tmp_path / "store", create=True))
+        publish_samples(store, 2)
+        init_here(store)
+        fleet = Fleet(store)
+        service = BusService(store, fleet, stack.enter_context(MemoryBus(hub)), lambda *_: None)
+        yield World(tmp_path, hub, stack, store, fleet, service)
+
+
+def want(world: World, version: int, sha256: str | None = None) -> None:
+    """Whoever answers `wanted` names this version, with the honest manifest's address unless another is given."""
+    address = world.store.version(SITE, version).manifest_sha256 if sha256 is None else sha256
+    answer = encode_message(WantedVersion(site=SITE, version=version, manifest_sha256=address))
+    world.hub.queryables.insert(0, (robot_key(SITE, ROBOT, "wanted"), lambda *_: answer))
+
+
+def running(client: MapClient) -> int | None:
+    active = client.active()
+    return None if active is None else active.version
+
+
+def test_row_1_a_forged_wanted_and_map(world: World) -> None:
+    """Any participant answers first, with a whole map of its own."""
+    assert world.client().ready().wanted.version == 2
+    world.attacker()
+    ready = world.client().ready()
+    assert (ready.wanted.version, running(world.client())) == (2, 2)
+    assert "version 2 goes on: signature: " in ready.note
+    with pytest.raises(UntrustedError, match=r"^signature: "):
+        fresh = world.client("fresh")
+        fresh.fetch(fresh.wanted())
+    victim = world.client("victim", trusting=False)
+    assert victim.ready().wanted.version == 3  # the control: it runs the stranger's map
+    assert running(victim) == 3
+
+
+def test_row_1_a_forged_wanted_alone(world: World) -> None:
+    """The lists are the honest ones, and name another manifest under that number."""
+    forged = world.folder / "forged"
+    with MapStore.open(forged, create=True) as other:
+        publish_samples(other, 1)
+        for seed in (7, 8):
+            save_sample_draft(other, seed=seed)
+            releases.publish(other, SITE)
+        want(world, 2, other.version(SITE, 2).manifest_sha256)
+    client = world.client()
+    with pytest.raises(UntrustedError, match=r"^signature: version 2 "):
+        client.fetch(client.wanted())
+    assert running(client) is None
+
+
+@pytest.mark.parametrize("attempt", ["forged", "old serial", "unlisted", "site list of the thief"])
+def test_row_4_a_thief_of_the_server_with_all_its_keys(world: World, attempt: str) -> None:
+    """The online key and the folder, but not the builder's key: nothing can be added to what the builder signed."""
+    world.publish(seed=2)
+    world.publish(seed=3)
+    client = world.client()
+    assert client.ready().wanted.version == 4
+    repository, lists = world.repository(), SignedLists(world.store.folder)
+    online = KeyFolder(world.store.folder / "keys").signer("online")
+    number = lists.newest("site-lab")
+    if attempt in ("forged", "site list of the thief"):
+        want(world, 4, "f" * 64)
+    if attempt == "unlisted":
+        want(world, 1)
+    if attempt == "site list of the thief":
+        number += 1
+        signed = repository.sign_site(SITE, admitted_versions(world.store.releases(SITE), 1), [online])
+        lists.path("site-lab", number).write_bytes(signed.to_bytes())
+    if attempt == "old serial":
+        want(world, 2)
+        number -= 1
+    meta = {"targets.json": MetaFile(lists.newest("targets")), "site-lab.json": MetaFile(number)}
+    repository._sign("snapshot", Snapshot(version=99, meta=meta), [online])
+    repository._sign("timestamp", Timestamp(version=99, snapshot_meta=MetaFile(99)), [online])
+    note = client.ready().note
+    kind = {"old serial": "rollback", "unlisted": "rollback"}.get(attempt, "signature")
+    assert f"version 4 goes on: {kind}: " in note
+    assert running(client) == 4
+
+
+def test_row_4_among_admitted_versions_the_server_chooses(world: World) -> None:
+    """The control, and what an operator's rollback without the signer needs."""
+    client = world.client()
+    assert client.ready().wanted.version == 2
+    want(world, 1)
+    assert client.ready().wanted.version == 1
+
+
+def test_row_10_mondays_folder_on_tuesday(world: World) -> None:
+    client = world.client()
+    assert client.ready().wanted.version == 2
+    shutil.copytree(world.trust_folder, world.folder / "monday")
+    world.publish(seed=2)
+    assert client.ready().wanted.version == 3
+    shutil.rmtree(world.trust_folder)
+    shutil.copytree(world.folder / "monday", world.trust_folder)
+    want(world, 1)
+    ready = client.ready()
+    assert "version 3 goes on: rollback: " in ready.note
+    late = world.client("late")  # the control: a robot that never saw Tuesday believes Monday
+    assert late.ready().wanted.version == 1
+
+
+def test_an_operators_rollback_works(world: World) -> None:
+    client = world.client()
+    world.publish(seed=2)
+    assert client.ready().wanted.version == 3
+    releases.roll_back(world.store, SITE)
+    assert client.ready().wanted.version == 2
+    want(world, 3)
+    assert "version 2 goes on: signature: version 3 " in client.ready().note
+
+
+def test_row_12_news_are_held_back(world: World) -> None:
+    """The server's folder stays as it was: robots take nothing new by it after a day, and say how old its word is."""
+    client = world.client()
+    assert client.ready().note == ""
+    world.ahead_s = 31 * 3600.0
+    want(world, 1)
+    ready = client.ready()
+    assert "version 2 goes on: freeze: " in ready.note
+    assert client.word_hours == pytest.approx(31.0, abs=0.05)
+    world.ahead_s = 20 * 3600.0  # the control: within its day it is believed
+    assert client.ready().wanted.version == 1
+
+
+def test_an_offline_day_changes_nothing(world: World) -> None:
+    client = world.client()
+    manifest = client.manifest(client.ready().wanted)
+    world.hub.reachable, world.ahead_s = False, 400 * 86_400.0
+    again = world.client()
+    ready = again.ready()
+    assert ready.wanted.version == 2
+    assert len(again.tiles(again.manifest(ready.wanted)).tiles) == len(manifest.tiles)
+    world.hub.reachable, world.ahead_s = True, 0.0
+    world.publish(seed=2)
+    assert again.ready().wanted.version == 3
+
+
+def test_row_14_a_manifest_larger_than_its_signed_size(world: World) -> None:
+    """The list says its size: not a part of a larger one is taken."""
+    client = world.client()
+    length = world.store.version(SITE, 2).manifest_bytes
+    info = world.store.version(SITE, 2)
+    data = world.store.blob(info.manifest_sha256) + b" "
+    world.hub.queryables.insert(0, (manifest_key(SITE, 2), lambda _, question: part_of(data, question)))
+    with pytest.raises(LinkError, match=f"has {length + 1} bytes where at most {length} are expected"):
+        client.fetch(client.wanted())
+
+
+def test_a_version_that_begins_to_be_run_is_finished(world: World) -> None:
+    """A trial takes seconds; what was admitted when it began is made active also where the list has gone on meanwhile."""
+    client = world.client()
+    first = client.wanted()
+    client.fetch(first)
+    world.publish(seed=2)
+    world.publish(seed=3)
+    client.wanted()
+    client.activate(client.manifest(first), first)
+    assert running(client) == 2
+    (world.folder / "cache" / "sites" / SITE / "active").unlink()
+    with pytest.raises(UntrustedError, match=r"^rollback: "):
+        world.client().manifest(first)  # the control: after a restart it would be new
+
+
+@pytest.mark.parametrize(("versions", "kind"), [(3, "signature: "), (1, "signature: ")])
+def test_the_server_hears_the_kind_of_attack(world: World, versions: int, kind: str) -> None:
+    client = world.client()
+    clock = {"s": 1000.0}
+    sync = ServerSync(
+        client, Outbox(world.folder / "outbox", max_bytes=10**6), retry_s=600.0, clock_s=lambda: clock["s"]
+    )
+    sync.step()
+    wanted = sync.fetched.popleft()
+    sync.changes.append(VersionChange(wanted, Change.ADOPTED))
+    sync.step()
+    world.attacker(versions)
+    heard = []
+    world.bus().subscribe(robot_key(SITE, ROBOT, "ack"), lambda _, payload: heard.append(payload))
+    clock["s"] += 61.0
+    sync.step()
+    last = decode_message(heard[-1], RobotAck)
+    assert last.version == 2
+    assert last.refused.startswith(kind)
+    assert not sync.fetched
+    sync.close()
+
+
+def test_a_robot_without_a_map_takes_no_strangers_either(world: World) -> None:
+    """Elsewhere an incomplete first version is better than none."""
+    world.attacker()
+    client = world.client("new")
+    sync = ServerSync(client, Outbox(world.folder / "outbox", max_bytes=10**6), retry_s=600.0)
+    sync.step()
+    assert (list(sync.fetched), running(client)) == ([], None)
+    sync.close()
+
+
+def test_a_server_without_lists_is_told_from_an_attack(tmp_path: Path) -> None:
+    hub = MemoryHub()
+    with MapStore.open(tmp_path / "store", create=True) as store, MemoryBus(hub) as bus, MemoryBus(hub) as robot_bus:
+        publish_samples(store, 1)
+        service = BusService(store, Fleet(store), bus, lambda *_: None)
+        client = MapClient(robot_bus, TileCache(tmp_path / "cache"), SITE, ROBOT)
+        client.require(TrustedMap(tmp_path / "trust", SITE, None, ask_over(robot_bus, SITE)))
+        with pytest.raises(UntrustedError, match="the server has no signed lists"):
+            client.fetch(client.wanted())
+        init_here(store)
+        update_lists(store)
+        client.fetch(client.wanted())  # the control: the same robot, once they are there
+        service.close()
