@@ -26,9 +26,9 @@ from mapserver.commands.serve import serve
 from mapserver.commands.store.export import export
 from mapserver.commands.store.gc import gc
 from mapserver.commands.store.import_ import import_
+from mapserver.commands.store.trust import TRUST
 from mapserver.commands.store.verify import verify
 from mapserver.commands.train_vocabulary import train_vocabulary
-from mapserver.commands.trust import TRUST
 
 if TYPE_CHECKING:
     from mapserver.config import MapserverConfig

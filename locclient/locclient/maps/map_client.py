@@ -60,8 +60,8 @@ class MapClient(MapSource):
         self._trust: TrustedMap | None = None
         self._begun = ""  # the manifest's address of the version that was admitted last
 
-    def require(self, trust: TrustedMap) -> None:
-        """From now on takes only new versions that the site's signed list admits. What is active goes on in any case."""
+    def require(self, trust: TrustedMap | None) -> None:
+        """From now on takes only new versions that the site's signed list admits; None: any. What is active goes on in any case."""
         self._trust = trust
 
     @property

@@ -3,13 +3,15 @@
 import os
 import secrets
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from fleetmap.errors import StoreError, UsageError, disk_errors
 from mapserver.store.files import make_folder, sync_folder
 
 if TYPE_CHECKING:
     from securesystemslib.signer import CryptoSigner
+
+Signer: TypeAlias = "CryptoSigner"
 
 _LETTERS = "abcdefghijkmnpqrstuvwxyz23456789"  # 32 of them: five bits each, none that looks like another
 _GROUPS, _GROUP = 4, 4

@@ -4,7 +4,7 @@ STORE/trust/1.root.json 2.root.json ...        which keys sign what; never remov
 STORE/trust/N.targets.json                     which keys sign the list of which site
 STORE/trust/N.site-SITE.json                   the versions of a site that robots may run
 STORE/trust/N.snapshot.json timestamp.json     which of these files are the present ones
-STORE/trust/staged/N.site-SITE.json            a list that waits for its last signature, or for the server
+STORE/trust/staged/site-SITE.json              a list that waits for another signature
 """
 
 import re
@@ -30,8 +30,22 @@ class _Signed(msgspec.Struct, frozen=True):
     delegations: dict[str, Any] | None = None
 
 
+class _Signature(msgspec.Struct, frozen=True):
+    keyid: str
+
+
 class _File(msgspec.Struct, frozen=True):
     signed: _Signed
+    signatures: tuple[_Signature, ...] = ()
+
+
+class SiteRole(msgspec.Struct, frozen=True):
+    """Who signs the lists of a site. previous: 1 where the version before stays admitted, else 0."""
+
+    name: str
+    keyids: tuple[str, ...]
+    threshold: int
+    previous: int = 1
 
 
 class SignedLists:
@@ -69,9 +83,33 @@ class SignedLists:
         except (OSError, msgspec.MsgspecError) as error:
             raise StoreError(f"{path} cannot be read ({error}); restore the store's folder trust") from error
 
+    def site_roles(self) -> dict[str, SiteRole]:
+        """Who signs for which site, by the role's name, as the newest targets say; errors as of `read`."""
+        roles = (self.read("targets").delegations or {}).get("roles", [])
+        return {role.name: role for role in msgspec.convert(roles, list[SiteRole])}
+
+    def is_signed(self, role: SiteRole) -> bool:
+        """Whether the newest list of a site bears the names of enough keys that may sign it now; no signature is verified."""
+        try:
+            file = msgspec.json.decode(self.path(role.name, self.newest(role.name)).read_bytes(), type=_File)
+        except (OSError, msgspec.MsgspecError):
+            return False
+        return len({signature.keyid for signature in file.signatures} & set(role.keyids)) >= role.threshold
+
     def path(self, role: str, number: int) -> Path:
         """The file of a role's number."""
         return self.folder / (f"{TIMESTAMP}.json" if role == TIMESTAMP else f"{number}.{role}.json")
+
+    def staged_path(self, site: str) -> Path:
+        """The file of a site's list that waits for more signatures."""
+        return self.folder / "staged" / f"{site_role(site)}.json"
+
+    def staged_list(self, site: str) -> SiteList | None:
+        """What waits for more signatures of a site; None where nothing does, or it is damaged."""
+        try:
+            return read_site_list(self.staged_path(site).read_bytes(), site)
+        except (OSError, UntrustedError):
+            return None
 
     def site_list(self, site: str, number: int) -> SiteList:
         """The list of this number; errors as of `read`."""

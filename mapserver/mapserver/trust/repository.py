@@ -1,5 +1,6 @@
 """Writing of signed lists with tuf. Every function takes the keys that it needs: who lacks them cannot call it with success."""
 
+import logging
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -30,6 +31,7 @@ DAYS = {"root": 730, "targets": 365, "site": 14, "snapshot": 7, TIMESTAMP: 1}
 RENEW_SNAPSHOT_DAYS = 3
 _MOST_FILES = 5  # of a role that robots ask for by number: one may have read the timestamp before the last change
 _ONLINE = ("snapshot", TIMESTAMP)
+_log = logging.getLogger(__name__)
 _COMPACT = JSONSerializer(compact=True)
 T = TypeVar("T", bound=Signed)
 
@@ -74,6 +76,17 @@ class ListRepository:
         self._sign("targets", targets, people)
         self._sign("root", root, people)
 
+    def check_people(self, people: Sequence[CryptoSigner]) -> None:
+        """Raises StateError where these are not enough for a root and targets, before half of a ceremony is done."""
+        root = self.root()
+        for name in ("root", "targets"):
+            role = root.roles[name]
+            known = {signer.public_key.keyid for signer in people} & set(role.keyids)
+            if len(known) < role.threshold:
+                raise StateError(
+                    f"{len(known)} of the {role.threshold} keys that {name} needs are here; bring the others too"
+                )
+
     def change_root(self, change: Callable[[Root], None], people: Sequence[CryptoSigner]) -> None:
         """The next root, with what `change` makes of the last one; StateError unless both roots' people signed it."""
         before, root = self.root(), self.root()
@@ -111,6 +124,12 @@ class ListRepository:
         targets.version += 1
         self._sign("targets", targets, people, (self.root(),))
 
+    def renew_targets(self, people: Sequence[CryptoSigner]) -> None:
+        """The same targets for another year; StateError unless enough people signed."""
+        targets = self.targets()
+        targets.version += 1
+        self._sign("targets", targets, people, (self.root(),))
+
     # --- by who builds a site's maps ----------------------------------------------------------------------------------
 
     def sign_site(
@@ -129,6 +148,42 @@ class ListRepository:
             metadata.sign(signer, append=True)
         return metadata
 
+    def staged(self, site: str) -> Metadata[Any] | None:
+        """The list of a site that waits for more signatures; None where none does. Raises StoreError for a damaged one."""
+        path = self.lists.staged_path(site)
+        try:
+            return Metadata.from_file(str(path)) if path.is_file() else None
+        except (RepositoryError, OSError) as error:
+            raise StoreError(f"{path} cannot be read ({error}); remove it, and sign anew") from error
+
+    def stage_site(self, site: str, metadata: Metadata[Any]) -> int:
+        """Puts a list among the others if enough keys of the site signed it, else aside; how many signatures it still needs."""
+        path = self.lists.staged_path(site)
+        result = self.targets().get_verification_result(site_role(site), metadata.signed_bytes, metadata.signatures)
+        missing = self._delegated(site).threshold - len(result.signed)
+        if missing <= 0:
+            self.accept_site(site, metadata)
+            path.unlink(missing_ok=True)
+            return 0
+        with disk_errors(f"{path} cannot be written", "make space, and run the command again"):
+            make_folder(path.parent)
+            write_atomically(path, [metadata.to_bytes(_COMPACT)])
+        return missing
+
+    def check_signer(self, site: str, signer: CryptoSigner) -> None:
+        """Raises StateError where a key may not sign the lists of a site."""
+        if signer.public_key.keyid not in self._delegated(site).keyids:
+            raise StateError(
+                f"this key may not sign maps of site {site}; `mapserver trust admit {site}` names those that may"
+            )
+
+    def _delegated(self, site: str) -> DelegatedRole:
+        delegations = self.targets().delegations
+        role = None if delegations is None else (delegations.roles or {}).get(site_role(site))
+        if role is None:
+            raise StateError(f"no key may sign maps of site {site}; `mapserver trust admit {site}` names one")
+        return role
+
     def accept_site(self, site: str, metadata: Metadata[Any]) -> None:
         """Puts a site's list among the others; StateError unless its keys signed it and its number is the next one."""
         name = site_role(site)
@@ -140,37 +195,56 @@ class ListRepository:
         _check(self.targets(), name, metadata)
         self._write(name, metadata)
 
+    def forget_site(self, site: str) -> None:
+        """Removes all lists of a site, so that its numbers begin anew; robots follow only after another online key."""
+        for path in [*self.lists.folder.glob(f"*.{site_role(site)}.json"), self.lists.staged_path(site)]:
+            path.unlink(missing_ok=True)
+
     # --- by the server ------------------------------------------------------------------------------------------------
 
     def sign_online(self, online: CryptoSigner) -> None:
-        """Snapshot, where something changed, and timestamp. Verifies first what it names, with the store's own root.
+        """Snapshot, where something changed, and timestamp. Names only what it has verified with the store's own root.
 
-        Raises StateError for lists that robots would refuse.
+        Raises StateError where root and targets do not let this key sign.
         """
         root, targets = self.root(), self.newest("targets")
         _check(root, "targets", targets)
         meta = {"targets.json": MetaFile(targets.signed.version)}
-        for name in _as(Targets, targets.signed).delegations.roles or {}:  # type: ignore[union-attr]
-            if number := self.lists.newest(name):
-                _check(_as(Targets, targets.signed), name, self.newest(name))
-                meta[f"{name}.json"] = MetaFile(number)
         number, stamped = self.lists.newest("snapshot"), 0
+        before = self._last_snapshot(root)
+        for name in self.lists.site_roles():
+            if newest := self.lists.newest(name):
+                entry = self._named(_as(Targets, targets.signed), name, newest, before)
+                meta |= {} if entry is None else {f"{name}.json": entry}
         if self.lists.path(TIMESTAMP, 0).is_file():
             stamped = self.newest(TIMESTAMP).signed.version
-        if number == 0 or not self._is_good_snapshot(root, meta):
+        if before is None or before.meta != meta or before.expires < self._now + timedelta(days=RENEW_SNAPSHOT_DAYS):
             number += 1
             self._sign("snapshot", Snapshot(version=number, meta=meta), [online])
         self._sign(TIMESTAMP, Timestamp(version=stamped + 1, snapshot_meta=MetaFile(number)), [online], (root,))
 
-    def _is_good_snapshot(self, root: Root, meta: dict[str, MetaFile]) -> bool:
-        """Whether the last one can stay. One that a replaced key signed cannot, although it says the same."""
+    def _last_snapshot(self, root: Root) -> Snapshot | None:
+        """The one that can stay, None where none can: one that a replaced key signed cannot, although it says the same."""
+        if not self.lists.newest("snapshot"):
+            return None
         last = self.newest("snapshot")
         try:
             root.verify_delegate("snapshot", last.signed_bytes, last.signatures)
         except UnsignedMetadataError:
-            return False
-        is_fresh = last.signed.expires > self._now + timedelta(days=RENEW_SNAPSHOT_DAYS)
-        return is_fresh and _as(Snapshot, last.signed).meta == meta
+            return None
+        return _as(Snapshot, last.signed)
+
+    def _named(self, targets: Targets, name: str, newest: int, before: Snapshot | None) -> MetaFile | None:
+        """What a snapshot says of a site: its newest list, or what it said before where other keys must sign first.
+
+        Robots refuse a snapshot that has lost a role, those of other sites too.
+        """
+        try:
+            _check(targets, name, self.newest(name))
+            return MetaFile(newest)
+        except StateError as error:
+            _log.warning("robots get no new list yet: %s", error)
+            return None if before is None else before.meta.get(f"{name}.json")
 
     # ------------------------------------------------------------------------------------------------------------------
 

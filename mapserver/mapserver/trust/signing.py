@@ -35,8 +35,10 @@ def admitted_versions(rows: SiteReleases, previous: int) -> tuple[AdmittedVersio
     return tuple(_entry(rows.versions[number], state) for number, state in sorted(states.items()))
 
 
-def update_lists(store: MapStore) -> None:
+def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
     """Signs what releases changed and what expires soon. Nothing where the store has no lists, or the key is elsewhere.
+
+    all_anew: snapshot and timestamp too, after another key or root.
 
     Raises StoreError where the disk refuses or a key cannot be read, StateError for lists that robots would refuse.
     """
@@ -45,7 +47,7 @@ def update_lists(store: MapStore) -> None:
         return
     now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
     keys = KeyFolder(store.folder / "keys")
-    if not _due(store, lists, keys, now):
+    if not all_anew and not _due(store, lists, keys, now):
         return
     from mapserver.trust.repository import ListRepository
 
@@ -54,7 +56,7 @@ def update_lists(store: MapStore) -> None:
         for info in store.sites():
             _update_site(repository, keys, store.releases(info.site), now)
         online = keys.signer("online")
-        if online is not None and _online_is_due(lists, now):
+        if online is not None and (all_anew or _online_is_due(lists, now)):
             repository.sign_online(online)
 
 
@@ -122,7 +124,7 @@ def _online_is_due(lists: SignedLists, now: datetime) -> bool:
     stamp, snapshot = lists.read(TIMESTAMP), lists.read("snapshot", number)
     named = {name: entry["version"] for name, entry in snapshot.meta.items()}
     present = {"targets.json": lists.newest("targets")}
-    present |= {f"{role}.json": newest for role in _delegated(lists) if (newest := lists.newest(role))}
+    present |= {f"{role}.json": newest for role in lists.site_roles() if (newest := lists.newest(role))}
     return (
         named != present
         or stamp.meta["snapshot.json"]["version"] != number
@@ -133,26 +135,29 @@ def _online_is_due(lists: SignedLists, now: datetime) -> bool:
 
 def _site_is_due(lists: SignedLists, rows: SiteReleases, now: datetime) -> bool:
     role = site_role(rows.site)
-    number, rules = lists.newest(role), _delegated(lists).get(role)
+    number, signed_by = lists.newest(role), lists.site_roles().get(role)
     if rows.current is None:
         return False
-    if not number or rules is None:
+    if signed_by is None:
         return True
-    last = lists.site_list(rows.site, number)
-    return last.admitted != admitted_versions(rows, rules) or last.expires < now + _RENEW_SITE
-
-
-def _delegated(lists: SignedLists) -> dict[str, int]:
-    """How many predecessors each site's role admits, by role."""
-    delegations = lists.read("targets").delegations or {}
-    return {role["name"]: int(role.get("previous", 1)) for role in delegations.get("roles", [])}
+    wanted = admitted_versions(rows, signed_by.previous)
+    last = lists.site_list(rows.site, number) if number else None
+    if (
+        last is not None
+        and last.admitted == wanted
+        and last.expires >= now + _RENEW_SITE
+        and lists.is_signed(signed_by)
+    ):
+        return False
+    staged = lists.staged_list(rows.site)
+    return staged is None or staged.admitted != wanted or staged.expires < now + _RENEW_SITE
 
 
 def _update_site(repository: "ListRepository", keys: KeyFolder, rows: SiteReleases, now: datetime) -> None:
     lists, role = repository.lists, site_role(rows.site)
     if not _site_is_due(lists, rows, now):
         return
-    if role not in _delegated(lists):
+    if role not in lists.site_roles():
         root = keys.signer("root")
         if root is None:
             return
@@ -161,5 +166,6 @@ def _update_site(repository: "ListRepository", keys: KeyFolder, rows: SiteReleas
     site_key = keys.signer(role)
     if site_key is None:
         return
-    signed = repository.sign_site(rows.site, admitted_versions(rows, _delegated(lists)[role]), [site_key])
-    repository.accept_site(rows.site, signed)
+    signed = repository.sign_site(rows.site, admitted_versions(rows, lists.site_roles()[role].previous), [site_key])
+    if repository.stage_site(rows.site, signed):
+        _log.warning("the list of site %s waits for another signature: `mapserver trust sign %s`", rows.site, rows.site)

@@ -71,9 +71,7 @@ def _holders(lists: SignedLists) -> dict[str, tuple[int, int]]:
     signed: dict[str, Any] = msgspec.json.decode(path.read_bytes())["signed"]
     held = {role: (len(entry["keyids"]), int(entry["threshold"])) for role, entry in signed["roles"].items()}
     top = {role: held[role] for role in ("root", "targets", "snapshot", TIMESTAMP)}
-    delegations = lists.read("targets").delegations or {}
-    sites = {role["name"]: (len(role["keyids"]), int(role["threshold"])) for role in delegations.get("roles", [])}
-    return top | sites
+    return top | {name: (len(role.keyids), role.threshold) for name, role in lists.site_roles().items()}
 
 
 def _role(lists: SignedLists, role: str, keys: int, threshold: int, now: datetime) -> RoleStatus:

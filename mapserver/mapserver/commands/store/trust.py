@@ -1,0 +1,215 @@
+"""`mapserver trust`: who may sign maps, and what is signed."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleetmap.cli_options import Group, expand_options
+from fleetmap.errors import UsageError
+from mapserver.commands.options import Json, StoreFolder
+from mapserver.commands.print_json import print_json
+
+if TYPE_CHECKING:
+    from mapserver.store import MapStore
+    from mapserver.trust.keys import Signer
+
+KeyFiles = Annotated[
+    list[str] | None, typer.Option(metavar="FILE", help="Key of a person, asked for its passphrase; repeat it.")
+]
+PublicKeys = Annotated[
+    list[str] | None,
+    typer.Option(metavar="FILE.pub", help="Public key that signs the site's lists; default: a new one in keys/."),
+]
+SiteArgument = Annotated[str, typer.Argument(metavar="SITE", help="Name of the site.")]
+
+
+class Rotated(StrEnum):
+    """What `trust rotate` replaces."""
+
+    ONLINE = "online"
+    ROOT = "root"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeopleOptions:
+    """Whose keys are here."""
+
+    store: StoreFolder
+    key: KeyFiles = None
+
+    def load(self, maps: "MapStore") -> "list[Signer]":
+        """The keys: the files named, each asked for its passphrase, else the one that `init --here` left in the store."""
+        from mapserver.trust import KeyFolder
+
+        root = None if self.key else KeyFolder(maps.folder / "keys").signer("root")
+        return [root] if root is not None else [_asked(Path(path)) for path in self.key or ()]
+
+
+def init(
+    store: StoreFolder,
+    here: Annotated[bool, typer.Option("--here", help="Keep all keys on this machine, without passphrases.")] = False,
+    stick: Annotated[list[str] | None, typer.Option(metavar="DIR", help="Folder for one root key; repeat it.")] = None,
+    threshold: Annotated[int, typer.Option(min=1, help="How many root keys are needed for a change.")] = 2,
+) -> None:
+    """Sign the maps of a store from now on; robots then run only what the signed lists admit."""
+    from mapserver.store import MapStore
+    from mapserver.trust import init_here
+    from mapserver.trust.ceremonies import init_with_people
+
+    if here == bool(stick):
+        raise UsageError(
+            "say where the keys are: --here for this machine, or --stick DIR for every person who holds a root key"
+        )
+    with MapStore.open(store) as maps:
+        passphrases = {} if here else init_with_people(maps, [Path(folder) for folder in stick or ()], threshold)
+        if here:
+            init_here(maps)
+    for path, passphrase in passphrases.items():
+        typer.echo(f"{path}: {passphrase}   (shown once: write it down, apart from the stick)")
+    typer.echo(f"signed; robots on other machines need {store / 'trust' / '1.root.json'}")
+
+
+def key(
+    file: Annotated[Path, typer.Argument(metavar="FILE.pem", help="File to write; FILE.pub is written beside it.")],
+) -> None:
+    """Make a key for a person who signs maps of a site; prints its passphrase once."""
+    from mapserver.trust.ceremonies import make_key_file
+    from mapserver.trust.keys import make_passphrase
+
+    passphrase = make_passphrase()
+    make_key_file(file, passphrase)
+    typer.echo(f"{file}: {passphrase}   (shown once: write it down)")
+
+
+@expand_options
+def admit(
+    site: SiteArgument,
+    people: PeopleOptions,
+    public: PublicKeys = None,
+    threshold: Annotated[int, typer.Option(min=1, help="How many of the site's keys must sign.")] = 1,
+    previous: Annotated[
+        int, typer.Option(min=0, max=1, help="Predecessors that stay admitted; with 0 a rollback needs a signature.")
+    ] = 1,
+) -> None:
+    """Name the keys that sign the lists of SITE, in the place of those that did."""
+    from mapserver.store import MapStore
+    from mapserver.trust import ceremonies
+
+    with MapStore.open(people.store) as maps:
+        keys = [ceremonies.public_key(Path(path)) for path in public or ()]
+        ceremonies.admit(maps, site, keys, people.load(maps), threshold=threshold, previous=previous)
+    typer.echo(f"site {site}: {max(1, len(keys))} keys may sign, {threshold} must")
+
+
+@expand_options
+def sign(site: SiteArgument, people: PeopleOptions) -> None:
+    """Show what the list of SITE would admit, and add a signature to it."""
+    from mapserver import releases
+    from mapserver.store import MapStore
+    from mapserver.trust import SignedLists
+    from mapserver.trust.ceremonies import sign_site
+
+    if not people.key:
+        raise UsageError("name the key that signs: --key FILE")
+    with MapStore.open(people.store) as maps:
+        rows, before = maps.releases(site), SignedLists(maps.folder).served(site)
+        served = None if before is None else before.state("current")
+        if rows.current is not None and served is not None and served.about.version != rows.current.version:
+            changed = releases.difference(maps, site, served.about.version, rows.current.version)
+            tiles = (
+                f"{changed.tiles_added} tiles added, {changed.tiles_removed} removed, {changed.tiles_changed} changed"
+            )
+            typer.echo(f"site {site}: version {served.about.version} becomes {rows.current.version}, {tiles}")
+            for verdict in maps.verdicts(site, rows.current.version)[-1:]:
+                typer.echo(f"the gate: {'; '.join(verdict.reasons) or 'accepted'}")
+        for path in people.key:
+            missing = sign_site(maps, site, _asked(Path(path)))
+    typer.echo(f"site {site}: {f'{missing} more signatures are needed' if missing else 'robots get it now'}")
+
+
+@expand_options
+def rotate(
+    what: Annotated[
+        Rotated, typer.Argument(help="online: the server's key; root: root and targets, for two and one more years.")
+    ],
+    people: PeopleOptions,
+    add: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for the root key of a person who comes.")
+    ] = None,
+    remove: Annotated[Path | None, typer.Option(metavar="FILE.pub", help="Public key of a person who leaves.")] = None,
+) -> None:
+    """Replace keys, or sign root and targets anew before they expire."""
+    from mapserver.store import MapStore
+    from mapserver.trust import ceremonies
+    from mapserver.trust.keys import make_passphrase
+
+    if what is Rotated.ONLINE and (add or remove):
+        raise UsageError("--add and --remove are for `trust rotate root`")
+    with MapStore.open(people.store) as maps:
+        signers = people.load(maps)
+        if what is Rotated.ONLINE:
+            ceremonies.rotate_online(maps, signers)
+        else:
+            removed = [] if remove is None else [ceremonies.public_key(remove)]
+            added, passphrase = [], make_passphrase()
+            if add is not None:
+                added.append(ceremonies.make_key_file(add / "root-new.pem", passphrase))
+                typer.echo(f"{add / 'root-new.pem'}: {passphrase}   (shown once: write it down, apart from the stick)")
+            ceremonies.rotate_root(maps, signers, removed=removed, added=added)
+    typer.echo("done; robots follow with their next question")
+
+
+@expand_options
+def revoke(site: SiteArgument, people: PeopleOptions, public: PublicKeys = None) -> None:
+    """Replace the keys of SITE and the server's together, after a theft of the key that signs its maps."""
+    from mapserver.store import MapStore
+    from mapserver.trust import ceremonies
+
+    with MapStore.open(people.store) as maps:
+        keys = [ceremonies.public_key(Path(path)) for path in public or ()]
+        ceremonies.revoke_site(maps, site, keys, people.load(maps))
+    typer.echo(f"site {site}: the old keys sign nothing any more; robots follow with their next question")
+
+
+def status(store: StoreFolder, json: Json = False) -> None:
+    """Show every role with its keys and the days that it lasts; status 1 where robots take no new maps, now or soon."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from mapserver.store import MapStore
+    from mapserver.trust.status import trust_status
+
+    with MapStore.open(store) as maps:
+        found = trust_status(maps)
+    if json:
+        print_json(found)
+    else:
+        table = Table("role", "number", "keys", "needed", "days left", "")
+        for role in found.roles:
+            left = "" if role.days_left is None else f"{role.days_left:.1f}"
+            table.add_row(role.role, str(role.number), str(role.keys), str(role.threshold), left, role.fault)
+        console = Console()
+        console.print(table)
+        for words in found.risks:
+            console.print(words, style="yellow", markup=False, highlight=False)
+        for words in found.faults:
+            console.print(words, style="red", markup=False, highlight=False)
+    if found.faults:
+        raise typer.Exit(1)
+
+
+def _asked(path: Path) -> "Signer":
+    import getpass
+
+    from mapserver.trust.keys import load_key
+
+    return load_key(path, getpass.getpass(f"passphrase of {path}: ").strip())
+
+
+TRUST = Group(
+    "Who may sign maps, and what is signed.",
+    {"init": init, "key": key, "admit": admit, "sign": sign, "rotate": rotate, "revoke": revoke, "status": status},
+)

@@ -1,0 +1,282 @@
+"""Thefts and recoveries with the programs: `serve` as a process, the ceremonies by their commands, a robot on the bus.
+
+Each drill shows first what the thief achieves, or tries, and then the way back.
+"""
+
+import getpass
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from securesystemslib.signer import CryptoSigner
+from tuf.api.metadata import MetaFile, Snapshot, Timestamp
+from typer.testing import CliRunner
+
+from fleetmap.bus import ZenohBus
+from fleetmap.errors import FleetmapError
+from fleetmap.messages import WantedVersion
+from fleetmap.trust import AdmittedVersion, TrustedMap, ask_over
+from fleetmap.trust.site_list import VersionState
+from locclient.maps.map_client import MapClient
+from locclient.maps.tile_cache import TileCache
+from mapserver import cli, releases
+from mapserver.store import MapStore
+from mapserver.trust import KeyFolder, SignedLists
+from mapserver.trust.ceremonies import init_with_people
+from mapserver.trust.repository import ListRepository
+from support.storage.map_samples import publish_samples, save_sample_draft
+
+SITE, YEAR_NS = "lab", 365 * 86_400_000_000_000
+FORGED = "f" * 64
+
+
+class Drill:
+    """A store of three root keys of which two are needed, its server, and a robot."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder, self.store, self.lists = folder, folder / "store", SignedLists(folder / "store")
+        self.sticks = [folder / name for name in ("ada", "bob", "cy")]
+        self.words: dict[str, str] = {}
+        self.robots: list[ZenohBus] = []
+        monkeypatch.setattr(getpass, "getpass", lambda prompt: self.words[prompt.split()[-1].rstrip(":")])
+
+    def run(self, *words: object, fails: str = "") -> str:
+        """`mapserver trust` with these words."""
+        result = CliRunner().invoke(cli.app, ["trust", *map(str, words), "--store", str(self.store)], obj=None)
+        if fails:
+            assert isinstance(result.exception, FleetmapError), result.output
+            assert fails in str(result.exception)
+        else:
+            assert result.exit_code == 0, (result.output, result.exception)
+        self.words |= dict(re.findall(r"(\S+\.pem): (\S+)", result.output))
+        return result.output
+
+    def keys(self, *numbers: int) -> list[object]:
+        """Options for root keys 1, 2 and 3."""
+        return [word for n in numbers for word in ("--key", self.sticks[n - 1] / f"root-{n}.pem")]
+
+    def robot(self, name: str) -> "Robot":
+        bus = ZenohBus.connect(self.endpoint)
+        self.robots.append(bus)
+        return Robot(self, bus, name)
+
+    def repository(self) -> ListRepository:
+        return ListRepository(self.lists, datetime.now(UTC))
+
+    def publish(self, seed: int) -> None:
+        with MapStore.open(self.store) as store:
+            save_sample_draft(store, seed=seed)
+            releases.publish(store, SITE)
+
+    def by_thief(self, act: Callable[[ListRepository], None]) -> Callable[[], None]:
+        """Lets a thief write into the server's folder of lists; the result puts it back as it was."""
+        before = self.folder / "before"
+        shutil.rmtree(before, ignore_errors=True)
+        shutil.copytree(self.lists.folder, before)
+        act(self.repository())
+
+        def restore() -> None:
+            shutil.rmtree(self.lists.folder)
+            shutil.copytree(before, self.lists.folder)
+
+        return restore
+
+
+class Robot:
+    """A robot that trusts the first root of the drill's store."""
+
+    def __init__(self, drill: Drill, bus: ZenohBus, name: str) -> None:
+        folder, root = drill.folder / name, (drill.lists.folder / "1.root.json").read_bytes()
+        self.client = MapClient(bus, TileCache(folder), SITE, name)
+        self.trust = TrustedMap(folder / "trust", SITE, root, ask_over(bus, SITE))
+        self.client.require(self.trust)
+
+    def ready(self) -> tuple[int | None, str]:
+        """The version that it runs now, and why not the wanted one."""
+        found = self.client.ready()
+        return found.wanted.version, found.note
+
+    def takes(self, version: int, sha256: str) -> bool:
+        self.trust.refresh()
+        try:
+            self.trust.admitted(WantedVersion(site=SITE, version=version, manifest_sha256=sha256))
+        except FleetmapError:
+            return False
+        return True
+
+
+@contextmanager
+def serving(drill: Drill) -> Iterator[None]:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    words = ["-m", "mapserver.cli", "serve", "--store", str(drill.store), "--http", "127.0.0.1:0"]
+    command = [sys.executable, *words, "--zenoh", "tcp/127.0.0.1:0"]
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+    try:
+        process.stdout.readline()
+        drill.endpoint = process.stdout.readline().split()[1]
+        assert process.stdout.readline() == "ready\n"
+        yield
+    finally:
+        for bus in drill.robots:
+            bus.close()
+        process.terminate()
+        process.wait(timeout=30)
+        process.stdout.close()
+
+
+@pytest.fixture
+def drill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Drill]:
+    """Versions 1 (previous) and 2 (current) of site lab."""
+    made = Drill(tmp_path, monkeypatch)
+    with MapStore.open(made.store, create=True) as store:
+        publish_samples(store, 2)
+    sticks = [word for stick in made.sticks for word in ("--stick", stick)]
+    made.run("init", *sticks, "--threshold", 2)
+    made.run("admit", SITE, *made.keys(1, 2))
+    with serving(made):
+        yield made
+
+
+def sign_online(repository: ListRepository, drill: Drill, number: int, site_list: int) -> None:
+    """Snapshot and timestamp of this number with the server's own key, as a thief of it can make them."""
+    online = KeyFolder(drill.store / "keys").signer("online")
+    meta = {"targets.json": MetaFile(drill.lists.newest("targets")), f"site-{SITE}.json": MetaFile(site_list)}
+    repository._sign("snapshot", Snapshot(version=number, meta=meta), [online])
+    repository._sign("timestamp", Timestamp(version=number, snapshot_meta=MetaFile(number)), [online])
+
+
+def test_the_online_key_is_stolen(drill: Drill) -> None:
+    robot = drill.robot("r1")
+    assert robot.ready() == (2, "")
+
+    def forge(repository: ListRepository) -> None:
+        sign_online(repository, drill, 100, drill.lists.newest("site-lab"))
+
+    restore = drill.by_thief(forge)
+    assert robot.ready() == (2, "")
+    assert not robot.takes(99, FORGED)
+    restore()
+    drill.publish(seed=2)
+    version, note = robot.ready()
+    assert version == 2  # it believed the thief's numbers, and refuses the honest server for it
+    assert "rollback: " in note
+    drill.run("rotate", "online", *drill.keys(3), fails="1 of the 2 keys that root needs are here")
+    assert robot.ready()[0] == 2
+    drill.run("rotate", "online", *drill.keys(1, 3))
+    assert robot.ready() == (3, "")
+
+
+def test_the_builders_key_is_stolen(drill: Drill) -> None:
+    robot = drill.robot("r1")
+    assert robot.ready() == (2, "")
+    number = 2**31 - 1
+
+    def forge(repository: ListRepository) -> None:
+        about = VersionState(version=99, state="current", vocabulary="0" * 64)
+        key = KeyFolder(drill.store / "keys").signer(f"site-{SITE}")
+        signed = repository.sign_site(SITE, [AdmittedVersion(FORGED, 500, about)], [])
+        signed.signed.version = number
+        signed.sign(key)
+        drill.lists.path(f"site-{SITE}", number).write_bytes(signed.to_bytes())
+        sign_online(repository, drill, 50, number)
+
+    restore = drill.by_thief(forge)
+    assert robot.takes(99, FORGED)  # nothing stops a thief of both: the control
+    restore()
+    drill.publish(seed=2)
+    assert "rollback: " in robot.ready()[1]
+    drill.run("admit", SITE, *drill.keys(1, 2))
+    assert "rollback: " in robot.ready()[1]  # another key of the site alone does not bring robots back
+    drill.run("revoke", SITE, *drill.keys(2), fails="1 of the 2 keys")
+    drill.run("revoke", SITE, *drill.keys(2, 3))
+    assert robot.ready() == (3, "")
+    assert not robot.takes(99, FORGED)
+    assert drill.robot("r2").ready() == (3, "")
+
+
+def test_one_root_key_is_stolen(drill: Drill) -> None:
+    robot, late = drill.robot("r1"), drill.robot("late")
+    assert robot.ready() == (2, "")
+    stolen = CryptoSigner.generate_ed25519()
+    drill.run("rotate", "online", *drill.keys(1), fails="1 of the 2 keys")
+    drill.run("admit", SITE, *drill.keys(1), fails="1 of the 2 keys")
+
+    def forge(repository: ListRepository) -> None:
+        root = repository.root()
+        root.version += 1
+        root.add_key(stolen.public_key, "root")
+        repository._sign("root", root, [stolen])
+
+    restore = drill.by_thief(forge)
+    robot.trust.refresh()
+    assert not robot.takes(2, FORGED)
+    assert "signature: " in str(robot.trust._fault)
+    restore()
+    assert robot.ready() == (2, "")
+    (drill.folder / "dan").mkdir()
+    leaves = drill.sticks[0] / "root-1.pub"
+    drill.run("rotate", "root", *drill.keys(2, 3), "--remove", leaves, "--add", drill.folder / "dan")
+    for _ in range(3):
+        drill.run("rotate", "root", *drill.keys(2), "--key", drill.folder / "dan" / "root-new.pem")
+    drill.run("rotate", "root", *drill.keys(1, 2), fails="1 of the 2 keys")  # who left counts no more
+    drill.publish(seed=2)
+    assert drill.lists.newest("root") == 5
+    assert robot.ready() == (3, "")
+    assert late.ready() == (3, "")  # it knows root 1 alone
+
+
+def test_the_root_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Made two years and a day ago, and nobody signed it in time."""
+    drill = Drill(tmp_path, monkeypatch)
+    before_ns = int(datetime.now(UTC).timestamp() * 1e9) - 2 * YEAR_NS - YEAR_NS // 365
+    with MapStore.open(drill.store, create=True, clock_ns=lambda: before_ns) as store:
+        publish_samples(store, 2)
+        drill.words = {str(path): words for path, words in init_with_people(store, drill.sticks, 2).items()}
+    drill.run("admit", SITE, *drill.keys(1, 2))
+    with serving(drill):
+        robot = drill.robot("r1")
+        robot.client.require(None)
+        assert robot.ready() == (2, "")  # what it has, from a time when all was valid
+        robot.client.require(robot.trust)
+        drill.publish(seed=2)
+        version, note = robot.ready()
+        assert version == 2
+        assert "version 2 goes on: freeze: " in note
+        result = CliRunner().invoke(cli.app, ["trust", "status", "--store", str(drill.store)])
+        assert result.exit_code == 1
+        assert "root: expired: robots take no new map" in result.output
+        drill.run("rotate", "root", *drill.keys(1, 2))
+        assert robot.ready() == (3, "")
+        assert CliRunner().invoke(cli.app, ["trust", "status", "--store", str(drill.store)]).exit_code == 0
+
+
+def test_two_people_sign_for_a_site(drill: Drill) -> None:
+    """With threshold 2 nothing reaches robots before the second has looked at it."""
+    robot = drill.robot("r1")
+    assert robot.ready() == (2, "")
+    for name in ("eve", "fay"):
+        result = CliRunner().invoke(cli.app, ["trust", "key", str(drill.folder / f"{name}.pem")])
+        drill.words |= dict(re.findall(r"(\S+\.pem): (\S+)", result.output))
+    both = [word for name in ("eve", "fay") for word in ("--public", drill.folder / f"{name}.pub")]
+    drill.run("admit", SITE, *drill.keys(1, 2), *both, "--threshold", 2, "--previous", 0)
+    drill.publish(seed=2)
+    assert robot.ready()[0] == 2
+    assert "1 more signatures are needed" in drill.run("sign", SITE, "--key", drill.folder / "eve.pem")
+    assert "1 more signatures" in drill.run("sign", SITE, "--key", drill.folder / "eve.pem")  # nobody counts twice
+    drill.run("sign", SITE, *drill.keys(3), fails="may not sign maps of site lab")
+    assert robot.ready()[0] == 2
+    told = drill.run("sign", SITE, "--key", drill.folder / "fay.pem")
+    assert "version 2 becomes 3" in told
+    assert "robots get it now" in told
+    assert robot.ready() == (3, "")
+    entry = drill.lists.served(SITE)
+    assert [version.about.version for version in entry.admitted] == [
+        3
+    ]  # without predecessors: a rollback is signed too
