@@ -6,6 +6,7 @@ import numpy as np
 
 from fleetmap.geometry import Array
 from fleetmap.numerics.time_sliced import TimeSliced
+from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.relocalization.relocalizer import Fix
 from locclient.localization import hypothesis_scoring as scoring
 from locclient.localization.alias_disambiguation import ViewpointGate
@@ -15,6 +16,7 @@ from locclient.localization.settings import TrackSettings
 
 # The fixes of one query, and each one's pose, propagated to the present.
 Observations = Sequence[tuple[Fix, PoseHypothesis]]
+_MAX_WRONG_SHARE = 0.05  # of unmapped places that may be believed by weak fixes of a robot that stands
 
 
 class HypothesisSet:
@@ -29,8 +31,7 @@ class HypothesisSet:
         self._disambiguated: PoseHypothesis | None = None
         self._abandoned: PoseHypothesis | None = None  # published as the robot's pose until fixes named another
         self._viewpoint_gate = ViewpointGate()
-        # That places outside the map may reach; None where nobody measured it
-        self.lookalike_recall: float | None = None
+        self.lookalikes: LookAlikes | None = None  # None where nobody measured them
 
     def tracked(self) -> list[PoseHypothesis]:
         """All that must be propagated by the odometry."""
@@ -66,14 +67,15 @@ class HypothesisSet:
 
     def may_be_lookalike(self, hypothesis: PoseHypothesis) -> bool:
         """Whether a place that is not in the map could look as much like the hypothesis: by its recall in all queries so far."""
-        return self.lookalike_recall is not None and 0.0 < self.lookalike_recall >= hypothesis.recall
+        return self.lookalikes is not None and 0.0 < self.lookalikes.recall >= hypothesis.recall
 
     def is_confirmed(self, hypothesis: PoseHypothesis, fixes: Sequence[Fix]) -> bool:
         """By enough fixes over enough distance, or as the only hypothesis by an unambiguous fix: a strong one, or one of enough that
-        agree where the map's look-alikes were measured, so that no distance needs to exclude them."""
+        agree where the map's look-alikes were measured well enough, so that no distance needs to exclude them."""
         if len(self.hypotheses) == len(fixes) == 1 and scoring.is_unambiguous(fixes[0], self._settings):
             has_enough = hypothesis.support >= self._settings.confirming_fixes
-            if fixes[0].inliers >= self._settings.strong_inliers or (has_enough and self.lookalike_recall is not None):
+            is_measured = self.lookalikes is not None and self.lookalikes.max_wrong_share <= _MAX_WRONG_SHARE
+            if fixes[0].inliers >= self._settings.strong_inliers or (has_enough and is_measured):
                 return True
         return scoring.is_supported(hypothesis, self._settings)
 

@@ -13,7 +13,7 @@ from fleetmap.messages import Cause, Status
 from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.odometry import Odometry, OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer, is_reliable
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
@@ -34,7 +34,9 @@ from locclient.localization.settings import LocalizerSettings
 
 _SPREAD_SHARE = 0.45  # of the interval of map queries: at a lower frame rate a query is not spread over frames
 _HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
-_SLICES_WITHOUT_POSE = 3  # of a query, in a frame: a robot that does not know its place waits for nothing else
+_SLICES_AT_REST = (
+    3  # of a search, in a frame: to a robot that stands where its last search began a late estimate costs nothing
+)
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
 
 
@@ -71,7 +73,7 @@ class Localizer:
         self._odometry = Odometry(*rig, settings.odometry, settings.stereo)
         self._relocalizer: Relocalizer | None = None
         self._map_version: int | None = None
-        self._lookalike_recall: float | None = None
+        self._lookalikes: LookAlikes | None = None
         self._prior: InitialPosePrior | None = None
         self._confirmed: PoseHypothesis | None = None
         self._candidates = HypothesisSet(settings.track)  # while none is confirmed
@@ -83,6 +85,7 @@ class Localizer:
         self._failed_queries = 0
         self._failed_places: list[Array] = []  # tried in vain from the viewpoint of the gate
         self._search_gate = ViewpointGate()
+        self._is_at_rest = False  # the search that goes on begins where the one before did
         self._image_monitor = ImageQualityMonitor(settings.sight)
         self._was_tracking = False
         mounting = Mounting(self._cam_from_body, calibration.base_from_body)
@@ -110,14 +113,13 @@ class Localizer:
         tiles: Iterable[Tile],
         vocabulary: Vocabulary,
         survey_focal_px: float,
-        lookalike_recall: float | None = None,
+        lookalikes: LookAlikes | None = None,
     ) -> None:
         """The tiles to use from now on, all of one version. A map query that goes on is given up.
 
-        lookalike_recall: the landmark recall that places which are not in the map may reach by their likeness to those that are; None
-        where nobody measured it.
+        lookalikes: what places that are not in the map have in common with it; None where nobody measured it.
         """
-        self._lookalike_recall = lookalike_recall
+        self._lookalikes = lookalikes
         self._map_version = version
         view = MapView(tiles, vocabulary, survey_focal_px)
         self._relocalizer = Relocalizer(view, self._camera, self._settings.relocalizer)
@@ -209,10 +211,13 @@ class Localizer:
             self._query_input, self._query_features = (frame, odometry), None
             for hypothesis in self._hypotheses():
                 hypothesis.mark_query()
+            self._is_at_rest = self._confirmed is None and not self._search_gate.is_new(odometry.odom_from_body)
+            if not self._is_at_rest:
+                self._failed_places.clear()
             self._work = self._query(frame, self._relocalizer)
         assert self._query_frame is not None
         try:
-            for _ in range(1 if self._confirmed else _SLICES_WITHOUT_POSE):
+            for _ in range(_SLICES_AT_REST if self._is_at_rest else 1):
                 next(self._work)
             while is_at_once:
                 next(self._work)
@@ -281,8 +286,6 @@ class Localizer:
         if len(candidates) == 1:
             rotation = (candidates[0].query_map_from_body @ self._body_from_cam)[:3, :3]
         near = None if self._prior is None else self._prior.is_near(relocalizer.view.map_from_cam[:, :3, 3])
-        if self._search_gate.is_new(self._odom_from_body()):
-            self._failed_places.clear()
         fixes = yield from relocalizer.anywhere(features, near, rotation, fixes, self._failed_places)
         fixes = [fix for fix in fixes if self._is_reliable(fix)]
         if self._prior is None:
@@ -366,8 +369,8 @@ class Localizer:
     def _update_candidates(self, fixes: list[Fix]) -> TimeSliced[_QueryResult]:
         """Updates the candidates, and confirms the one without competitors that has enough support or a tight prior."""
         candidates = self._candidates
-        is_excluded = self._lookalike_recall is not None and self._is_lookalike_excluded()
-        candidates.lookalike_recall = 0.0 if is_excluded else self._lookalike_recall
+        is_excluded = self._lookalikes is not None and self._is_lookalike_excluded()
+        candidates.lookalikes = LookAlikes(0.0, 0.0) if is_excluded else self._lookalikes
         yield from candidates.update(self._observations(fixes), self._odom_from_body())
         if not fixes:
             return _QueryResult(None, "nothing in the map agrees with this frame")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from fleetmap.bow import Vocabulary
 from fleetmap.mapformat import Manifest, Tile
 from fleetmap.messages import WantedVersion
+from fleetmap.relocalization.map_view import LookAlikes
 from locclient.maps.tile_selection import Cell
 
 
@@ -24,7 +25,10 @@ class LoadedMap:
         return self.manifest.version
 
     @property
-    def lookalike_recall(self) -> float | None:
-        """The landmark recall that places outside the map may reach by likeness; None where its build did not measure it."""
-        found = self.manifest.report.get("lookalike_recall")
-        return float(found) if isinstance(found, int | float) else None
+    def lookalikes(self) -> LookAlikes | None:
+        """What places outside the map have in common with it; None where its build did not measure it."""
+        recall, starts = self.manifest.report.get("lookalike_recall"), self.manifest.report.get("starts")
+        share = starts.get("max_wrong_share") if isinstance(starts, dict) else None
+        if not isinstance(recall, int | float):
+            return None
+        return LookAlikes(float(recall), float(share)) if isinstance(share, int | float) else LookAlikes(float(recall))

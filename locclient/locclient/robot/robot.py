@@ -216,10 +216,8 @@ class Robot:
         return FailureContext(failure, onset, unmatched, evidence, self.running)
 
     def _show(self, loaded: LoadedMap) -> None:
-        focal_px, lookalike_recall = loaded.manifest.camera.focal_px, loaded.lookalike_recall
-        self.localizer.handle_version(
-            loaded.version, loaded.tiles.values(), loaded.vocabulary, focal_px, lookalike_recall
-        )
+        focal_px, tiles = loaded.manifest.camera.focal_px, loaded.tiles.values()
+        self.localizer.handle_version(loaded.version, tiles, loaded.vocabulary, focal_px, loaded.lookalikes)
 
     def _new_trial(self) -> VersionTrial | None:
         """Begins at the last frame of the version before; None without one, then at the next frame."""

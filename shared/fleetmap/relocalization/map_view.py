@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,16 @@ class CovisibleLandmarks:
     points_map: Array
     descriptors: NDArray[np.uint8]
     is_found: NDArray[np.bool_]
+
+
+class LookAlikes(NamedTuple):
+    """What places outside a map have in common with it, as its build measured.
+
+    recall: the landmark recall that one of them exceeds with a probability of at most max_wrong_share, 0 where none was like the map.
+    """
+
+    recall: float
+    max_wrong_share: float = 1.0
 
 
 class MapView:

@@ -18,7 +18,7 @@ from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracking.tracker import MotionSince, Tracked, Tracker
 from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
@@ -220,14 +220,14 @@ class SessionRelocalizer(Relocalizer):
 def run_localizer(
     session: EstimatorSession, view: MapView, prior: PositionPrior | None = None, frames: int | None = None, *,
     has_wheels: bool = False, settings: LocalizerSettings = SETTINGS, until: Callable[[Estimate], bool] = lambda _: False,
-    lookalike_recall: float | None = None,
+    lookalikes: LookAlikes | None = None,
 ) -> list[Estimate]:  # fmt: skip
     """The localizer's estimates over a session in a map; the last one is that for which `until` holds."""
     nominal = session.session.nominal
     localizer = Localizer(nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s, settings)
     localizer._odometry._tracker = EstimatorTracker(session, session.camera, settings.odometry.tracker)
     localizer._relocalizer, localizer._map_version = SessionRelocalizer(view, session, settings), 1
-    localizer._lookalike_recall = lookalike_recall
+    localizer._lookalikes = lookalikes
     if prior is not None:
         localizer.handle_prior(prior)
     estimates, last_ns = [], 0

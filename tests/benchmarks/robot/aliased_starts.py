@@ -11,7 +11,7 @@ from benchmarks.robot.standing_robot import standing
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.messages import Status
-from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import PositionPrior, Trajectory
 from fleetsim.estimator.landmarks import LandmarkField
@@ -77,12 +77,12 @@ class LateSession(EstimatorSession):
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A robot's drive, and the map of a survey. lookalike_recall: what its build would have measured, None where it did not."""
+    """A robot's drive, and the map of a survey. lookalikes: what its build would have measured, None where it did not."""
 
     robot: RememberingSession
     tile: Tile
     view: MapView
-    lookalike_recall: float | None = None
+    lookalikes: LookAlikes | None = None
 
 
 def surveyed_site(scenario: str, seed: int, survey_run: str = "survey-both-ways") -> Site:
@@ -98,13 +98,13 @@ def surveyed_site(scenario: str, seed: int, survey_run: str = "survey-both-ways"
     return Site(robot, tile, view, None if survey_run == "survey-both-ways" else measured_lookalikes(view, survey))
 
 
-def measured_lookalikes(view: MapView, survey: EstimatorSession) -> float | None:
-    """The look-alike recall of a map, by frames of its survey, as `mapserver build` measures it."""
+def measured_lookalikes(view: MapView, survey: EstimatorSession) -> LookAlikes | None:
+    """The look-alikes of a map, by frames of its survey, as `mapserver build` measures it."""
     numbers = np.linspace(0, len(survey) - 1, PROBES).round().astype(int).tolist()
     places = [survey.map_from_body[number] @ survey.body_from_cam for number in numbers]
     probes = [Probe(survey.camera, estimator_loop.seen(survey, n), at) for n, at in zip(numbers, places, strict=True)]
     starts = starts_without_prior(view, probes)
-    return None if starts is None else starts.lookalike_recall
+    return None if starts is None else LookAlikes(starts.lookalike_recall, starts.max_wrong_share)
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +177,7 @@ def start_at(
     prior = None if prior_sigma_m is None else prior_at(session, prior_sigma_m, rng)
     count = int(np.searchsorted(session.stamps_ns, session.stamps_ns[0] + int(duration_s * 1e9)))
     known = estimator_loop.run_localizer(
-        session, site.view, prior, count, settings=settings, lookalike_recall=site.lookalike_recall
+        session, site.view, prior, count, settings=settings, lookalikes=site.lookalikes
     )
     return judged(number, session, known)
 
@@ -188,7 +188,7 @@ def standing_start_at(site: Site, number: int, duration_s: float) -> Start:
     stands = standing(drive, drive.frame_times_s[number], number, duration_s)
     stands.renderer.close()
     session = LateSession(EstimatorSession(stands, field=site.robot.field), 0)
-    known = estimator_loop.run_localizer(session, site.view, lookalike_recall=site.lookalike_recall)
+    known = estimator_loop.run_localizer(session, site.view, lookalikes=site.lookalikes)
     return judged(number, session, known)
 
 

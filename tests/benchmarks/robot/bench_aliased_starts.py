@@ -110,7 +110,7 @@ def main() -> None:
         sites = {of: surveyed_site(of[0], seed, of[1]) for of in {_site_of(name) for name in found}}
         print(f"seed {seed}: sites in {time.process_time() - begun_s:.0f} s", flush=True)
         for of, site in sites.items():
-            print(f"  {of}: look-alike recall {site.lookalike_recall}", flush=True)
+            print(f"  {of}: look-alikes {site.lookalikes}", flush=True)
         for name, starts in found.items():
             begun_s = time.process_time()
             share = starts_of(name, sites[_site_of(name)], max(1, arguments.starts // len(arguments.seeds)), seed)

@@ -48,7 +48,7 @@ from locclient.robot.version_trial import TrialSettings
 
 WITHIN_S, ELSEWHERE_M = 1.0, 8.0
 _FOLLOWED_S, _LIGHT, _DAY, _ROBOT = 2.0, "night", 3, "runner-1"
-_SLICES = localizer._SLICES_WITHOUT_POSE
+_SLICES = localizer._SLICES_AT_REST
 _NEVER_WRONG: Promises = {"wrong_starts": (0, AT_MOST), "wrong_starts_unmapped": (0, AT_MOST)}
 PROMISES: dict[str, Promises] = {
     "clean": _NEVER_WRONG | {"fix_in_time_share": (1.0, AT_LEAST)},
@@ -167,9 +167,9 @@ def main() -> None:
             unmapped.append(start(session, shown, rest))
             print(f"{time_s:5.1f} s, {name:10} {replace(mapped[-1], lost_ms=())} {unmapped[-1].is_wrong}", flush=True)
         lost[_SLICES].append(start(session, frames, rest) if "clean" not in found else found["clean"][1][-1])
-        localizer._SLICES_WITHOUT_POSE = 1
+        localizer._SLICES_AT_REST = 1
         lost[1].append(start(session, frames, rest))
-        localizer._SLICES_WITHOUT_POSE = _SLICES
+        localizer._SLICES_AT_REST = _SLICES
         slow.append(slowness())
     drive.renderer.close()
     results = {name: figures(*starts) for name, starts in found.items()}

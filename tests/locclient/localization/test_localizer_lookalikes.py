@@ -1,5 +1,6 @@
 """Starts in a map whose places look alike: a robot may be where nothing is mapped. Scripted odometry and fixes."""
 
+from collections.abc import Generator
 from dataclasses import replace
 
 import numpy as np
@@ -7,16 +8,19 @@ import pytest
 
 from fleetmap.geometry import Array
 from fleetmap.messages import Status
+from fleetmap.relocalization.map_view import LookAlikes
+from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import PositionPrior
-from support.fleet.scripted_robot import TRUE, Robot, off
+from support.fleet import scripted_robot
+from support.fleet.scripted_robot import NO_FIX, TRUE, Robot, off
 
-LOOKALIKE_RECALL = 0.4
+LOOK_ALIKES = LookAlikes(0.4, 1 / 41)
 
 
 @pytest.fixture
 def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
     """One without a prior, which sees less than what look-alikes of this map may show; its fixes are strong."""
-    found = Robot(monkeypatch).load(lookalike_recall=LOOKALIKE_RECALL)
+    found = Robot(monkeypatch).load(lookalikes=LOOK_ALIKES)
     found.inliers, found.landmark_recall = 100, 0.3
     return found
 
@@ -56,7 +60,7 @@ def test_a_map_without_look_alikes_takes_no_more_than_before(monkeypatch: pytest
 
 
 def test_where_the_whole_site_is_mapped_there_is_no_unmapped_look_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    robot = Robot(monkeypatch, is_whole_site_mapped=True).load(lookalike_recall=LOOKALIKE_RECALL)
+    robot = Robot(monkeypatch, is_whole_site_mapped=True).load(lookalikes=LOOK_ALIKES)
     robot.landmark_recall = 0.3
     assert robot.ride(4, 0.5)[-1].status is Status.TRACKING
 
@@ -90,9 +94,35 @@ def test_a_robot_that_was_carried_away_is_not_believed_at_a_look_alike(robot: Ro
 def test_fixes_that_agree_confirm_a_standing_robot_where_look_alikes_were_measured(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Weak ones, as by night; where nobody measured, a metre of motion must exclude a look-alike."""
-    for lookalike_recall, last in ((0.2, Status.TRACKING), (0.0, Status.TRACKING), (None, Status.INITIALISING)):
-        robot = Robot(monkeypatch).load(lookalike_recall=lookalike_recall)
+    """Weak ones, as by night; where nobody measured, or by too few frames, a metre of motion must exclude a look-alike."""
+    for lookalikes, last in (
+        (LookAlikes(0.2, 1 / 41), Status.TRACKING),
+        (LookAlikes(0.0, 1 / 20), Status.TRACKING),
+        (LookAlikes(0.0, 1 / 19), Status.INITIALISING),
+        (None, Status.INITIALISING),
+    ):
+        robot = Robot(monkeypatch).load(lookalikes=lookalikes)
         robot.landmark_recall = 0.25
         said = [robot.go(0.0, turn_rad=0.0).status for _ in range(3)]
         assert said == [Status.INITIALISING, Status.INITIALISING, last]
+
+
+def test_a_search_takes_more_of_a_frame_where_the_robot_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen: driving where nothing agreed, 12.6 ms a frame and 22.7 in one of a hundred; 10 and 20 are promised."""
+    monkeypatch.setattr(scripted_robot, "FRAME_NS", 66_666_667)
+    for step_m, most in ((0.0, 3), (0.1, 1)):
+        robot = Robot(monkeypatch).load()
+        taken = [0]
+
+        def anywhere(*_: object, taken: list[int] = taken) -> Generator[None, None, list[Fix]]:
+            for _ in range(30):
+                taken[-1] += 1
+                yield
+            return []
+
+        monkeypatch.setattr(robot.relocalizer, "anywhere", anywhere)
+        for _ in range(40):
+            assert robot.go(step_m, NO_FIX).map_from_body is None
+            taken.append(0)
+        assert taken[0] == 30, "the first search waits for nothing"
+        assert max(taken[1:]) == most
