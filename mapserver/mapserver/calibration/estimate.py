@@ -70,15 +70,19 @@ class CalibrationEstimate:
         return next(p for p in self.parameters if p.name is name)
 
     def corrections(self) -> Array:
-        """(C,) corrections of the judged parameters, given that the others keep their values: those are zero."""
+        """(C,) corrections of the judged parameters, given that the rest of the rig keeps its values: those are zero.
+
+        The wheels are no part of the rig: whatever their error is, it stays as uncertain as it is.
+        """
         theta = np.array([p.estimate for p in self.parameters[: len(COLUMNS)]])
         judged = np.array([p.is_judged for p in self.parameters[: len(COLUMNS)]])
         kept = ~judged
+        kept[INDEX[P.WHEEL_SCALE]] = False
         if kept.any() and judged.any():
             across = self.covariance[np.ix_(judged, kept)]
             theta[judged] -= across @ np.linalg.solve(self.covariance[np.ix_(kept, kept)], theta[kept])
         theta[kept] = 0.0
-        theta[INDEX[P.WHEEL_SCALE]] = 0.0  # no part of a rig's calibration
+        theta[INDEX[P.WHEEL_SCALE]] = 0.0
         return theta
 
     def corrected(self, rig: RigCalibration) -> RigCalibration:

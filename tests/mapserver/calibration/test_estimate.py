@@ -1,5 +1,7 @@
 """Recovery of calibrations from a simulated drive without pictures: landmarks with known errors, IMU and wheels."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -98,6 +100,18 @@ def test_wheels_alone_give_the_baseline_as_well_as_they_know_themselves(loop: St
     assert baseline.is_judged
     assert 0.004 < baseline.sigma < 0.008
     assert abs(baseline.estimate - (1.0 / 0.95 - 1.0)) < 3.0 * baseline.sigma
+
+
+def test_a_corrected_baseline_does_not_take_over_the_error_of_the_wheels(loop: Stretch) -> None:
+    """Also where nothing but the baseline is corrected, as a build does."""
+    found = estimated(loop, {P.BASELINE: 0.02})
+    wheels, baseline = found.get(P.WHEEL_SCALE), found.get(P.BASELINE)
+    across = found.covariance[INDEX[P.WHEEL_SCALE], INDEX[P.BASELINE]]
+    only = replace(found, parameters=tuple(replace(p, is_judged=p.name is P.BASELINE) for p in found.parameters))
+    correction = only.corrections()[INDEX[P.BASELINE]]
+    assert abs(across) > 0.5 * wheels.sigma * baseline.sigma  # they would, if the wheels were taken to be right
+    assert abs(wheels.estimate) > wheels.sigma
+    assert correction == pytest.approx(baseline.estimate, abs=0.5 * baseline.sigma)
 
 
 def test_two_drives_say_more_than_one(loop: Stretch) -> None:
