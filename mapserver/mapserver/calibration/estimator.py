@@ -27,7 +27,7 @@ from mapserver.calibration.motion_rows import (
     wheel_edges,
     wheel_rows,
 )
-from mapserver.calibration.parameters import COLUMNS, INDEX, LENS_SIGMAS, RANGES, UNKNOWNS, CalibrationParameter
+from mapserver.calibration.parameters import COLUMNS, INDEX, RANGES, UNKNOWNS, CalibrationParameter
 from mapserver.calibration.problem import CalibrationData, MotionState
 from mapserver.calibration.schur_kernels import (
     BorderedLandmarks,
@@ -65,7 +65,8 @@ class ErrorScales:
 
 @dataclass(frozen=True)
 class Adjusted:
-    """The optimum: theta (C,) with information (C, C), priors included; the state; the scales of the errors, and their sigmas' shares."""
+    """The optimum: theta (C,) with information (C, C), priors included; the state; the scales of the errors, and
+    their sigmas' shares; lens (UNKNOWNS - C,): corrections of the distortion."""
 
     theta: Array
     information: Array
@@ -74,6 +75,7 @@ class Adjusted:
     gyro_sigma: float
     accel_sigma: float
     observations: int
+    lens: Array
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ def adjust(data: CalibrationData) -> Adjusted:
     problem = _Problem(data)
     theta, state = np.zeros(UNKNOWNS), data.start
     scales = problem.first_scales(theta, state)
-    information, sigmas = np.diag(_prior()), (np.inf, np.inf)
+    information, sigmas = np.diag(problem.prior), (np.inf, np.inf)
     for round_number in range(_ROUNDS):
         problem.prepare(state, theta, scales)
         theta, state = problem.descend(theta, state)
@@ -106,7 +108,7 @@ def adjust(data: CalibrationData) -> Adjusted:
     own = len(COLUMNS)
     lens = np.linalg.solve(information[own:, own:], information[own:, :own])
     reported = information[:own, :own] - information[:own, own:] @ lens
-    return Adjusted(theta[:own], reported, state, scales, *sigmas, seen)
+    return Adjusted(theta[:own], reported, state, scales, *sigmas, seen, theta[own:])
 
 
 def prior_information() -> Array:
@@ -114,16 +116,12 @@ def prior_information() -> Array:
     return np.array([RANGES[p].prior_sigma ** -2 for p in COLUMNS])
 
 
-def _prior() -> Array:
-    """(UNKNOWNS,) the same with the lenses' errors."""
-    return np.concatenate([prior_information(), LENS_SIGMAS**-2.0])
-
-
 class _Problem:
     """One stretch, with the samples integrated at some biases and the scales of the errors."""
 
     def __init__(self, data: CalibrationData) -> None:
         self.data, self.seen = data, Observations.of(data)
+        self.prior = np.concatenate([prior_information(), data.lens_sigmas**-2.0])
         self.stride = 15 if data.is_inertial else 6
         self.count = len(data.stamps_ns)
         self.size = self.stride * self.count + UNKNOWNS
@@ -164,7 +162,7 @@ class _Problem:
         """Half the robust sum of squares, priors included."""
         rows, _ = image_residuals(self.seen, self.data, self._at_exposure(theta, state), theta, self.scales.images)
         edges = sum(float(each.residual @ each.residual) for each in self._edges(theta, state))
-        return robust_cost(rows) + 0.5 * (edges + float(_prior() @ theta**2) + self._held(state)[2])
+        return robust_cost(rows) + 0.5 * (edges + float(self.prior @ theta**2) + self._held(state)[2])
 
     def system(self, theta: Array, state: MotionState, damping: float = 0.0) -> _System:
         """The normal equations at theta and `state`."""
@@ -173,8 +171,8 @@ class _Problem:
         images = image_rows(self.seen, self.data, (exposed, theta), self.scales.images, fixed)
         system = self._reduced(images, self._edges(theta, state), damping)
         diagonal, rhs, _ = self._held(state)
-        system.information[np.diag_indices(self.size)] += np.concatenate([diagonal, _prior()])
-        system.rhs[:] += np.concatenate([rhs, -_prior() * theta])
+        system.information[np.diag_indices(self.size)] += np.concatenate([diagonal, self.prior])
+        system.rhs[:] += np.concatenate([rhs, -self.prior * theta])
         return system
 
     def _held(self, state: MotionState) -> tuple[Array, Array, float]:

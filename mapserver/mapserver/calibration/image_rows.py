@@ -14,6 +14,7 @@ from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.calibration.parameters import (
     COLUMNS,
+    DISTORTION,
     INDEX,
     UNKNOWNS,
     CalibrationParameter,
@@ -27,7 +28,10 @@ from mapserver.calibration.schur_kernels import ImageRows, weigh
 P = CalibrationParameter
 _MIN_DEPTH_M = 0.05
 _LENS = [INDEX[P.FOCAL], INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y]]
-_STEP_PX = 0.01
+_COMMON = slice(len(COLUMNS), len(COLUMNS) + DISTORTION)
+_APART = slice(_COMMON.stop, _COMMON.stop + DISTORTION)
+_RIGHT_CENTRE = slice(_APART.stop, UNKNOWNS)
+_STEP_PX, _STEP_DISTORTION = 0.01, 1e-5
 HUBER_SIGMAS, CUTOFF_SIGMAS = 3.0, 8.0  # of an observation's four rows together
 
 
@@ -62,13 +66,10 @@ class Observations:
         rig = corrected_rig(self.calibration, self.axes, theta)
         views = self.views(theta)
         left = _pixels(rig.cameras[0].ray_from_pixel(self.left_px) @ self.axes.rect_from_cam[0].T, views[0])
-        common, apart = theta[len(COLUMNS) :].reshape(2, 4)
-        left += _lens_terms(left, views[0]) @ (common - 0.5 * apart)
         if self.axes.baseline_m == 0:
             return np.column_stack([left, np.zeros_like(left)])
         rect_from_right, _ = right_camera(self.axes, theta)
         right = _pixels(rig.cameras[1].ray_from_pixel(self.right_px) @ rect_from_right.T, views[1])
-        right += _lens_terms(right, views[1]) @ (common + 0.5 * apart)
         return np.column_stack([left, left - right])
 
     def views(self, theta: Array) -> tuple[StereoCamera, StereoCamera]:
@@ -88,9 +89,8 @@ class Observations:
         left = _pixel_slopes(rig.cameras[0], self.left_px, self.axes.rect_from_cam[0], views[0])
         slopes[:, :2, _LENS] = _by_lens(rig.cameras[0], self.left_px, left)
         slopes[:, :2, INDEX[P.FOCAL]] /= 1.0 + theta[INDEX[P.FOCAL]]
-        rays = rig.cameras[0].ray_from_pixel(self.left_px) @ self.axes.rect_from_cam[0].T
-        terms, lens = _lens_terms(_pixels(rays, views[0]), views[0]), len(COLUMNS)
-        slopes[:, :2, lens : lens + 4], slopes[:, :2, lens + 4 :] = terms, -0.5 * terms
+        by_lens = _by_distortion(rig.cameras[0], self.left_px, self.axes.rect_from_cam[0], views[0])
+        slopes[:, :2, _COMMON], slopes[:, :2, _APART] = by_lens, -0.5 * by_lens
         if self.axes.baseline_m == 0:
             return slopes
         rect_from_right, _ = right_camera(self.axes, theta)
@@ -101,9 +101,10 @@ class Observations:
         by_right[:, :, 0] /= 1.0 + theta[INDEX[P.FOCAL]]
         slopes[:, 2:, _LENS] -= by_right
         rays = rig.cameras[1].ray_from_pixel(self.right_px) @ rect_from_right.T
-        terms = _lens_terms(_pixels(rays, views[1]), views[1])
-        slopes[:, 2:, lens : lens + 4] -= terms
-        slopes[:, 2:, lens + 4 :] -= 0.5 * terms
+        by_lens = _by_distortion(rig.cameras[1], self.right_px, rect_from_right, views[1])
+        slopes[:, 2:, _COMMON] -= by_lens
+        slopes[:, 2:, _APART] -= 0.5 * by_lens
+        slopes[:, 2:, _RIGHT_CENTRE] = right
         for axis, parameter in enumerate((P.PAIR_PITCH, P.PAIR_YAW, P.PAIR_ROLL)):
             turned = np.cross(np.eye(3)[axis], rays)
             slopes[:, 2:, INDEX[parameter]] = -_projected(rays, turned) * views[1].focal_px
@@ -134,13 +135,16 @@ def _by_lens(camera: CameraCalibration, pixels: Array, slopes: Array) -> Array:
     return np.concatenate([by_focal[:, :, None], -slopes], axis=2)
 
 
-def _lens_terms(pixels: Array, view: StereoCamera) -> Array:
-    """(M, 2, 4) pixels by which radial (r^2, r^4) and tangential terms of a lens move pixels (M, 2). Source: Brown 1966."""
-    x, y = ((pixels - [view.cx_px, view.cy_px]) / view.focal_px).T
-    squared = x**2 + y**2
-    across = [x * squared, x * squared**2, 2.0 * x * y, squared + 2.0 * x**2]
-    down = [y * squared, y * squared**2, squared + 2.0 * y**2, 2.0 * x * y]
-    return np.asarray(np.stack([np.stack(across, axis=1), np.stack(down, axis=1)], axis=1) * view.focal_px)
+def _by_distortion(camera: CameraCalibration, pixels: Array, rect_from_cam: Array, view: StereoCamera) -> Array:
+    """(M, 2, 4) how the rectified pixel changes with the lens's distortion, by central differences."""
+    columns = []
+    for step in np.eye(DISTORTION) * _STEP_DISTORTION:
+        ends = []
+        for change in (step, -step):
+            other = replace(camera, distortion=camera.distortion + change)
+            ends.append(_pixels(other.ray_from_pixel(pixels) @ rect_from_cam.T, view))
+        columns.append((ends[0] - ends[1]) / (2.0 * _STEP_DISTORTION))
+    return np.stack(columns, axis=2)
 
 
 def _projected(rays: Array, change: Array) -> Array:

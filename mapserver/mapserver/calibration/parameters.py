@@ -42,10 +42,11 @@ class CalibrationParameter(StrEnum):
 P = CalibrationParameter
 # The noise scales are no columns of the adjustment: they follow from its residuals.
 COLUMNS: tuple[CalibrationParameter, ...] = tuple(p for p in P if p not in (P.GYRO_NOISE, P.ACCEL_NOISE))
-# Errors of the lens model take part and are not reported: radial and tangential terms of both lenses, and the right one's difference.
+# Errors of the lens model take part and are not reported: distortion of both lenses, and the right one's difference and principal point.
 # Their size is what is left of a board's calibration, 0.3 px at the corner of a wide image: no other parameter is to take them up.
 # Tangential terms look like a principal point beside its place: left wide, they take up errors of the images.
-LENS_SIGMAS = np.array([1e-3, 1e-3, 5e-5, 5e-5] * 2)
+DISTORTION = 4
+LENS_SIGMAS = np.array([1e-3, 1e-3, 5e-5, 5e-5] * 2 + [1e-3] * 2)
 UNKNOWNS = len(COLUMNS) + len(LENS_SIGMAS)
 INDEX: dict[CalibrationParameter, int] = {p: n for n, p in enumerate(COLUMNS)}
 
@@ -107,7 +108,7 @@ class RigAxes:
 
 
 def corrected_rig(rig: RigCalibration, axes: RigAxes, theta: Array) -> RigCalibration:
-    """`rig` with corrections theta: lenses, the pair's shape, its mounting on the IMU, the clocks. The first len(COLUMNS) of them count."""
+    """`rig` with corrections theta: lenses, the pair's shape, its mounting on the IMU, the clocks. A theta (UNKNOWNS,) holds distortion."""
     left = _camera(rig.cameras[0], theta, 0)
     body_from_rect = axes.body_from_rect @ so3_exp(theta[INDEX[P.CAMERA_IMU_X] : INDEX[P.CAMERA_IMU_Z] + 1])
     shift = theta[INDEX[P.CAMERA_POSITION_X] : INDEX[P.CAMERA_POSITION_Z] + 1]
@@ -131,6 +132,11 @@ def right_camera(axes: RigAxes, theta: Array) -> tuple[Array, Array]:
 def _camera(camera: CameraCalibration, theta: Array, number: int) -> CameraCalibration:
     zoom = (1.0 + theta[INDEX[P.FOCAL]]) * (1.0 + theta[INDEX[P.FOCAL_RATIO]] if number else 1.0)
     shift = theta[[INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y]]]
+    distortion, lens = camera.distortion, theta[len(COLUMNS) :]
+    if len(lens):
+        distortion = np.pad(distortion, (0, DISTORTION - len(distortion))) + lens[:DISTORTION]
+        distortion = distortion + (number - 0.5) * lens[DISTORTION : 2 * DISTORTION]
+        shift = shift + number * lens[2 * DISTORTION :]
     intrinsics = np.concatenate([camera.intrinsics_px[:2] * zoom, camera.intrinsics_px[2:] + shift])
     offset_s = camera.imu_minus_cam_s + float(theta[INDEX[P.TIME_OFFSET]])
-    return replace(camera, intrinsics_px=intrinsics, imu_minus_cam_s=offset_s)
+    return replace(camera, intrinsics_px=intrinsics, distortion=distortion, imu_minus_cam_s=offset_s)

@@ -1,7 +1,7 @@
 """Values that a calibration is estimated from: keyframes, landmarks, inertial samples, wheels."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from fleetmap.geometry import AnyArray, Array
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample
+from mapserver.calibration.parameters import LENS_SIGMAS
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class CalibrationData:
     stamps_ns (K,) on the cameras' clock. Observations are sorted by landmark: obs_keyframe, obs_landmark (M,); obs_pixels (M, 4) of
     the rectified pair: u_left, v_left, u_right, v_right, the last two NaN where the right image shows nothing. obs_sigma_px (M, 3): of the
     left pixel, of the disparity, of the row difference. imu: empty without one. bias_px: error that pixels and disparities may have in
-    common, which no number of them averages out.
+    common, which no number of them averages out. lens_sigmas: of the distortion that was given.
     """
 
     calibration: RigCalibration
@@ -45,6 +46,7 @@ class CalibrationData:
     imu: ImuSamples
     wheel: Sequence[WheelSample] = ()
     bias_px: float = 0.0
+    lens_sigmas: Array = field(default_factory=lambda: LENS_SIGMAS)
 
     @property
     def is_inertial(self) -> bool:

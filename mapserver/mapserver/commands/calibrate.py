@@ -26,13 +26,24 @@ def calibrate(
         typer.Option(metavar="FILE.yaml", help="Write the corrected calibration here, as a Kalibr camchain."),
     ] = None,
     calibration: Calibration = None,
+    guess_size: Annotated[
+        str | None,
+        typer.Option(metavar="WxH", help="No calibration is at hand: size of the raw images, such as 752x480."),
+    ] = None,
+    guess_baseline: Annotated[
+        float | None, typer.Option(metavar="M", help="With --guess-size: metres between the cameras, measured by hand.")
+    ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Measure the calibration of cameras, IMU and wheels from recordings with turns, and write it.
 
-    What the recordings do not show keeps its value.
+    What the recordings do not show keeps its value. With --guess-size and --guess-baseline nothing else is known: lenses and the pair's
+    angles are found from focal length = image width, by the images alone.
     """
     check_output("--out", out)
+    if guess_size is not None or guess_baseline is not None:
+        _from_guess(recordings, out, (guess_size, guess_baseline), config_path(context))
+        return
     from rich.console import Console
     from rich.progress import Progress
 
@@ -65,6 +76,47 @@ def calibrate(
     with disk_errors(f"--out {out} cannot be written", "check folder and space", UsageError):
         out.write_text(corrected_file(estimate, rig, [source.name for source in sources]), encoding="utf-8")
     typer.echo(f"{out}: written; check it with `mapserver doctor RECORDING --calibration {out}`")
+
+
+def _from_guess(
+    recordings: list[Path], out: Path | None, guess: tuple[str | None, float | None], config: Path | None
+) -> None:
+    import re
+    from tempfile import TemporaryDirectory
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from fleetmap.errors import UsageError, disk_errors
+    from fleetmap.recordings import OpenOptions, format_calibration, open_recording
+    from mapserver.calibration.calibration_file import guessed_file, guessed_in_words
+    from mapserver.calibration.from_guess import calibration_from_guess, first_rig
+    from mapserver.config import survey_settings
+    from mapserver.survey.survey_inputs import SurveyTools
+
+    size = re.fullmatch(r"([1-9]\d{1,4})x([1-9]\d{1,4})", guess[0] or "")
+    baseline_m = guess[1] or 0.0
+    if size is None or not 0.001 < baseline_m < 10.0 or len(recordings) != 1:
+        raise UsageError(
+            f"--guess-size {guess[0]} --guess-baseline {guess[1]} for {len(recordings)} recordings: give both, such as --guess-size "
+            "752x480 --guess-baseline 0.11, and one recording"
+        )
+    with TemporaryDirectory() as folder, Progress(console=Console(stderr=True), transient=True) as progress:
+        first = Path(folder) / "guess.yaml"
+        rig = first_rig(int(size[1]), int(size[2]), baseline_m)
+        first.write_text(format_calibration(rig), encoding="utf-8")
+        task = progress.add_task("", total=None)
+        tools = SurveyTools(
+            progress=lambda stage, done, of: progress.update(task, description=stage, completed=done, total=of)
+        )
+        with open_recording(recordings[0], OpenOptions(calibration_file=first)) as recording:
+            found = calibration_from_guess(recording, survey_settings(config, recording.sensor_set), tools)
+            name = recording.name
+    typer.echo("\n".join(guessed_in_words(found)))
+    if out is not None:
+        with disk_errors(f"--out {out} cannot be written", "check folder and space", UsageError):
+            out.write_text(guessed_file(found, name), encoding="utf-8")
+        typer.echo(f"{out}: written; add how the IMU is mounted, then calibrate again with --calibration {out}")
 
 
 def _print(console: "Console", estimate: "CalibrationEstimate") -> None:

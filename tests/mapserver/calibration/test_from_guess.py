@@ -1,0 +1,95 @@
+"""Lenses from a guess: matches without pictures, seen through lenses that nobody described."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import RecordingError
+from fleetmap.geometry import Array, se3_inverse, so3_exp, so3_log
+from fleetmap.sensors.calibration import RigCalibration
+from fleetsim.recorder import Order
+from mapserver.calibration.epipolar_guess import RawMatches, guessed_rig
+from mapserver.calibration.estimator import adjust
+from mapserver.calibration.from_guess import first_rig
+from mapserver.calibration.parameters import DISTORTION
+from support.worlds.calibration_scene import Stretch, make_stretch, measured
+
+DISTORTED = np.array([-0.28, 0.07, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def loop() -> Stretch:
+    """The turns of a loop."""
+    return make_stretch(Order("small-loop", seed=1), 5.0, 18.0, step_s=0.4, per_frame=80)
+
+
+def bent(rig: RigCalibration) -> RigCalibration:
+    """The rig with the lenses of a wide camera, its right camera turned."""
+    left, right = (replace(camera, distortion=DISTORTED) for camera in rig.cameras)
+    turned = right.body_from_cam.copy()
+    turned[:3, :3] = turned[:3, :3] @ so3_exp(np.radians([0.8, 0.0, -0.4]))
+    return replace(rig, cameras=(left, replace(right, body_from_cam=turned)))
+
+
+def raw_pixels(stretch: Stretch, rig: RigCalibration, seed: int) -> tuple[Array, Array]:
+    """(M, 2) of both cameras, with errors."""
+    body = stretch.map_from_body[stretch.obs_keyframe]
+    points = stretch.points_map[stretch.obs_landmark] - body[:, :3, 3]
+    in_body = np.einsum("mji,mj->mi", body[:, :3, :3], points)
+    sides = [c.pixel_from_ray((in_body - c.body_from_cam[:3, 3]) @ c.body_from_cam[:3, :3]) for c in rig.cameras]
+    rng = np.random.default_rng(seed)
+    left, right = (side + rng.normal(0.0, 0.4, side.shape) for side in sides)
+    return left, right
+
+
+def matches(stretch: Stretch, rig: RigCalibration, keyframes: range, seed: int) -> RawMatches:
+    left, right = raw_pixels(stretch, rig, seed)
+    motions = []
+    for k in keyframes:
+        first, second = (np.flatnonzero(stretch.obs_keyframe == n) for n in (k, k + 1))
+        _, a, b = np.intersect1d(stretch.obs_landmark[first], stretch.obs_landmark[second], return_indices=True)
+        if len(a) >= 20:
+            motions.append(np.column_stack([left[first[a]], left[second[b]]]))
+    return RawMatches(np.column_stack([left, right])[:2000], motions)
+
+
+def test_lenses_are_found_from_a_focal_length_of_the_image_width(loop: Stretch) -> None:
+    """Truth: 420 of 640 px, a third less than the guess, and a distortion of 20 % at the corner."""
+    true = bent(loop.session.true)
+    found = guessed_rig(first_rig(640, 480, 0.12), matches(loop, true, range(0, 40, 3), 1))
+    left, right = found.cameras
+    assert left.intrinsics_px[0] == pytest.approx(420.0, rel=0.1)
+    assert left.distortion[0] == pytest.approx(-0.28, abs=0.08)
+    turn = np.degrees(so3_log((se3_inverse(left.body_from_cam) @ right.body_from_cam)[:3, :3]))
+    assert turn[0] == pytest.approx(0.8, abs=0.6)
+    assert np.linalg.norm(right.body_from_cam[:3, 3] - left.body_from_cam[:3, 3]) == pytest.approx(0.12)
+
+
+def test_a_drive_without_turns_shows_no_focal_length(loop: Stretch) -> None:
+    straight = make_stretch(Order("small-loop", seed=1), 3.0, 2.0, step_s=0.3, per_frame=80)
+    seen = matches(straight, straight.session.true, range(0, 6), 1)
+    with pytest.raises(RecordingError, match="turns"):
+        guessed_rig(first_rig(640, 480, 0.12), seen)
+
+
+def test_too_few_matches_are_refused() -> None:
+    with pytest.raises(RecordingError, match="too few to guess"):
+        guessed_rig(first_rig(640, 480, 0.12), RawMatches(np.zeros((20, 4)), []))
+
+
+def test_the_adjustment_finds_distortion_where_it_is_left_open(loop: Stretch) -> None:
+    """Of a rig whose lenses are said to be ideal."""
+    true = loop.session.true
+    lens = np.array([-0.02, 0.004, 0.0, 0.0])
+    rig = replace(true, cameras=tuple(replace(c, distortion=lens) for c in true.cameras))
+    exact = [
+        c.pixel_from_ray(c0.ray_from_pixel(px))
+        for c, c0, px in zip(rig.cameras, true.cameras, (loop.left_px, loop.right_px), strict=True)
+    ]
+    bent_stretch = replace(loop, left_px=exact[0], right_px=exact[1])
+    data = measured(bent_stretch, true, 1)
+    wide = np.array([0.3, 0.3, 1e-3, 1e-3] + [1e-2, 1e-2, 1e-3, 1e-3] + [15.0] * 2)
+    found = adjust(replace(data, lens_sigmas=wide)).lens
+    assert found[0] == pytest.approx(-0.02, abs=0.005)
+    assert found[DISTORTION : 2 * DISTORTION] == pytest.approx(0.0, abs=0.01)
