@@ -26,23 +26,23 @@ def calibrate(
         typer.Option(metavar="FILE.yaml", help="Write the corrected calibration here, as a Kalibr camchain."),
     ] = None,
     calibration: Calibration = None,
-    guess_size: Annotated[
+    guess: Annotated[
         str | None,
-        typer.Option(metavar="WxH", help="No calibration is at hand: size of the raw images, such as 752x480."),
-    ] = None,
-    guess_baseline: Annotated[
-        float | None, typer.Option(metavar="M", help="With --guess-size: metres between the cameras, measured by hand.")
+        typer.Option(
+            metavar="WxH:M",
+            help="No calibration is at hand: size of the raw images and metres between the cameras, 752x480:0.11.",
+        ),
     ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Measure the calibration of cameras, IMU and wheels from recordings with turns, and write it.
 
-    What the recordings do not show keeps its value. With --guess-size and --guess-baseline nothing else is known: lenses and the pair's
+    What the recordings do not show keeps its value. With --guess nothing else is known: lenses and the pair's
     angles are found from focal length = image width, by the images alone.
     """
     check_output("--out", out)
-    if guess_size is not None or guess_baseline is not None:
-        _from_guess(recordings, out, (guess_size, guess_baseline), config_path(context))
+    if guess is not None:
+        _from_guess(recordings, out, guess, config_path(context))
         return
     from rich.console import Console
     from rich.progress import Progress
@@ -78,9 +78,7 @@ def calibrate(
     typer.echo(f"{out}: written; check it with `mapserver doctor RECORDING --calibration {out}`")
 
 
-def _from_guess(
-    recordings: list[Path], out: Path | None, guess: tuple[str | None, float | None], config: Path | None
-) -> None:
+def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Path | None) -> None:
     import re
     from tempfile import TemporaryDirectory
 
@@ -94,16 +92,16 @@ def _from_guess(
     from mapserver.config import survey_settings
     from mapserver.survey.survey_inputs import SurveyTools
 
-    size = re.fullmatch(r"([1-9]\d{1,4})x([1-9]\d{1,4})", guess[0] or "")
-    baseline_m = guess[1] or 0.0
-    if size is None or not 0.001 < baseline_m < 10.0 or len(recordings) != 1:
+    known = re.fullmatch(r"([1-9]\d{1,4})x([1-9]\d{1,4}):(\d*\.?\d+)", guess)
+    baseline_m = float(known[3]) if known else 0.0
+    if known is None or not 0.001 < baseline_m < 10.0 or len(recordings) != 1:
         raise UsageError(
-            f"--guess-size {guess[0]} --guess-baseline {guess[1]} for {len(recordings)} recordings: give both, such as --guess-size "
-            "752x480 --guess-baseline 0.11, and one recording"
+            f"--guess {guess} for {len(recordings)} recordings: give the size of the raw images and the metres between the cameras, such "
+            "as --guess 752x480:0.11, and one recording"
         )
     with TemporaryDirectory() as folder, Progress(console=Console(stderr=True), transient=True) as progress:
         first = Path(folder) / "guess.yaml"
-        rig = first_rig(int(size[1]), int(size[2]), baseline_m)
+        rig = first_rig(int(known[1]), int(known[2]), baseline_m)
         first.write_text(format_calibration(rig), encoding="utf-8")
         task = progress.add_task("", total=None)
         tools = SurveyTools(

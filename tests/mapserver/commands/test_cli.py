@@ -68,7 +68,7 @@ def test_exit_statuses(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: 
     assert status(monkeypatch, "calibrate") == 2
     assert status(monkeypatch, "calibrate", tmp_path / "none.mcap") == 3
     assert status(monkeypatch, "calibrate", tmp_path / "none.mcap", "--out", tmp_path / "no" / "o.yaml") == 2
-    assert status(monkeypatch, "calibrate", tmp_path / "none.mcap", "--guess-size", "752") == 2
+    assert status(monkeypatch, "calibrate", tmp_path / "none.mcap", "--guess", "752:0.1") == 2
     assert status(monkeypatch, "no-such-command") == 2
     assert status(monkeypatch, "versions", "--site", "unknown", *to_store) == 2
     capsys.readouterr()
