@@ -5,6 +5,7 @@
 #   make test                  every test
 #   make check                 format, lint, types, import contracts
 #   make bench                 how fast and how exact, in numbers
+#   make conformance SUITE=DIR robots' client of signed lists against a checkout of tuf-conformance (needs faketime)
 #   make clean                 remove everything that the other verbs made
 
 PYTHON ?= python3
@@ -23,7 +24,7 @@ INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-recording test check bench clean
+.PHONY: help demo demo-recording test check bench conformance clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -46,6 +47,11 @@ check: $(DEV_STAMP)
 
 bench: $(DEV_STAMP)
 	$(BIN)/python -m pytest $(BENCHMARKS) -s $(PYTEST_ARGS)
+
+conformance: $(DEV_STAMP)
+	@test -d "$(SUITE)/tuf_conformance" || { echo "SUITE=DIR: a checkout of tuf-conformance"; exit 2; }
+	PYTHONPATH=shared:$(SUITE) $(BIN)/python -m pytest -p no:cacheprovider -c $(SUITE)/pyproject.toml --rootdir $(SUITE) \
+		$(SUITE)/tuf_conformance --entrypoint "$(CURDIR)/$(BIN)/python $(CURDIR)/tests/support/fleet/conformance_client.py" $(PYTEST_ARGS)
 
 clean:
 	rm -rf $(VENV) out dist build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.fleet import bench_service
+from benchmarks.fleet import bench_service, bench_trust
 from benchmarks.maps import bench_map_budget, bench_map_fuzz
 from benchmarks.survey import bench_nights
 from support.recordings.realdata import real_data
@@ -28,6 +28,14 @@ def test_three_hundred_robots_fetch_a_site_and_a_delta() -> None:
     # Once the server's caches are full, another 15 GB cost hardly more memory: what is freed is not all given back.
     assert rows["whole again"]["rss_max_mb"] < 1.25 * rows["whole again"]["rss_begin_mb"]
     assert rows["whole again"]["rss_max_mb"] < 500
+
+
+def test_signed_lists_cost_little(tmp_path: Path) -> None:
+    memory, robot = bench_trust.import_cost(), bench_trust.robot_costs(tmp_path)
+    print(json.dumps({"robot": robot, "import": memory, "server": bench_trust.server_costs(tmp_path)}))
+    assert memory["mib"] <= 20
+    assert robot["first contact"]["bytes"] <= 4000
+    assert max(costs["cpu_ms"] for costs in robot.values()) <= 10
 
 
 def test_a_hundred_thousand_hostile_inputs() -> None:

@@ -21,6 +21,7 @@ from locclient.maps.tile_cache import TileCache
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
+from mapserver.trust import init_here
 from support.recordings.recording_samples import Sample, write_euroc
 from support.worlds import robot_world
 
@@ -109,6 +110,7 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
 
         fleet = Fleet(store)
         with ZenohBus.listen(endpoint) as bus:
+            init_here(store)
             service = BusService(store, fleet, bus, lambda *_: None)
             bus.queryable(robot_key("*", "*", "failures"), take)
             light_walk = write_walk(tmp_path / "light", 70, range(0))

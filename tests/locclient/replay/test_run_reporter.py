@@ -20,6 +20,7 @@ from locclient.sensors.replay_source import ReplaySource
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import FailureFilter, MapStore
+from mapserver.trust import init_here
 from support.recordings.recording_samples import Sample, write_euroc
 from support.worlds import robot_world
 
@@ -39,6 +40,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
     with MapStore.open(tmp_path / "store", create=True) as store, ZenohBus.listen("tcp/127.0.0.1:0") as bus:
         robot_world.save(store)
         fleet = Fleet(store)
+        init_here(store)
         service = BusService(store, fleet, bus, lambda *_: None)
         yield Server(bus.endpoint, store, fleet, service)
         service.close()
