@@ -48,7 +48,8 @@ def __getattr__(name: str) -> Any:
         if (error.name or "").split(".")[0] in ("fleetmap", "mapserver"):
             raise
         raise FleetmapError(
-            f"mapserver.{name} needs {error.name}, which is not installed; pip install 'fleetmap[server]'"
+            f"mapserver.{name} needs {error.name}, which is not installed; "
+            "pip install '.[server]' in fleetmap's source folder"
         ) from error
 
 

@@ -26,6 +26,7 @@ from mapserver.commands.serve import serve
 from mapserver.commands.store.export import export
 from mapserver.commands.store.gc import gc
 from mapserver.commands.store.import_ import import_
+from mapserver.commands.store.robots import ROBOTS
 from mapserver.commands.store.trust import TRUST
 from mapserver.commands.store.verify import verify
 from mapserver.commands.train_vocabulary import train_vocabulary
@@ -54,6 +55,7 @@ COMMANDS: Commands = {
     "evaluate": evaluate,
     "train-vocabulary": train_vocabulary,
     "fleet": FLEET,
+    "robots": ROBOTS,
     "prepare": prepare,
     "trust": TRUST,
     "config": CONFIG,

@@ -21,7 +21,10 @@ def run_cli(app: Callable[[], object]) -> None:
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in {"fleetmap", "fleetsim", "mapserver", "locclient"}:
             raise
-        print(f"error: {error.name} is not installed; pip install 'fleetmap[server]' brings it", file=sys.stderr)
+        print(
+            f"error: {error.name} is not installed; pip install '.[server]' in fleetmap's source folder brings it",
+            file=sys.stderr,
+        )
         sys.exit(FleetmapError.exit_status)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

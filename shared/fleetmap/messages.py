@@ -31,7 +31,7 @@ _ROOT = "fleetmap"
 Name = Annotated[str, msgspec.Meta(max_length=64)]
 Text = Annotated[str, msgspec.Meta(max_length=2000)]
 Version = Annotated[int, msgspec.Meta(ge=1, le=(1 << 31))]
-Metrics = Annotated[dict[Name, float | int | str | bool | None], msgspec.Meta(max_length=256)]
+Metrics = Annotated[dict[Name, float | int | Text | bool | None], msgspec.Meta(max_length=256)]
 Flags = Annotated[tuple[Name, ...], msgspec.Meta(max_length=64)]
 
 

@@ -14,7 +14,7 @@ def failing(error: BaseException) -> None:
     ("error", "status", "words"),
     [
         (GateRefusedError("worse than before"), 4, "worse than before"),
-        (ModuleNotFoundError("No module named 'gtsam'", name="gtsam"), 3, "pip install 'fleetmap[server]'"),
+        (ModuleNotFoundError("No module named 'gtsam'", name="gtsam"), 3, "pip install '.[server]'"),
         (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )

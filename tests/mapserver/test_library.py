@@ -80,4 +80,4 @@ def test_missing_libraries_are_named_with_the_extra_that_has_them() -> None:
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith("fleetmap.errors.FleetmapError: mapserver.build_map needs gtsam")
-    assert "pip install 'fleetmap[server]'" in done.stderr
+    assert "pip install '.[server]'" in done.stderr

@@ -15,9 +15,9 @@ def run(
     import logging
     import signal
 
-    logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
-    )
+    from fleetmap.log_lines import log_to_stderr
+
+    log_to_stderr(logging.INFO if verbose else logging.WARNING, "%(levelname)s %(name)s: %(message)s")
     settings = context.obj.read_config(config)[0]
     from locclient.daemon.daemon import check_run, daemon_parts
 

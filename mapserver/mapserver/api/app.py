@@ -5,7 +5,9 @@ from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from http import HTTPMethod
 from importlib import metadata
+from itertools import accumulate
 
+import msgspec
 from fastapi import FastAPI, Request, Response
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -13,6 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from fleetmap.bus import Bus
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT
 from mapserver.api import describe, problems
+from mapserver.api.body_limit import BodyLimit
 from mapserver.api.bytes_response import bytes_response
 from mapserver.api.fleet_routes import install_fleet_routes
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
@@ -33,6 +36,7 @@ from mapserver.store import JobInfo, MapStore, VersionInfo
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
 USUAL_SETTINGS = ApiSettings()
+_MAX_PAGE_BYTES = 4_000_000
 
 
 def create_app(
@@ -54,8 +58,9 @@ def create_app(
         responses=problems.PROBLEM_RESPONSES,
     )
     problems.install(app)
+    app.add_middleware(BodyLimit)
     app.add_middleware(_Measured, metrics=metrics)
-    _install_service_routes(app, store, metrics, bus)
+    _install_service_routes(app, store, fleet, metrics, bus)
     _install_list_routes(app, store, fleet)
     _install_map_routes(app, store)
     install_version_routes(app, store, settings)
@@ -72,7 +77,7 @@ def fleetmap_version() -> str:
         return "not installed"  # run from a source tree
 
 
-def _install_service_routes(app: FastAPI, store: MapStore, metrics: Metrics, bus: Bus | None) -> None:
+def _install_service_routes(app: FastAPI, store: MapStore, fleet: Fleet, metrics: Metrics, bus: Bus | None) -> None:
     @app.get("/healthz")
     def healthz() -> ServiceState:
         """The process runs."""
@@ -80,8 +85,10 @@ def _install_service_routes(app: FastAPI, store: MapStore, metrics: Metrics, bus
 
     @app.get("/readyz")
     def readyz() -> ServiceState:
-        """The store answers and the bus is open."""
+        """The store answers, robots' reports can be stored, and the bus is open."""
         store.sites()
+        if fleet.storage_fault:
+            raise HTTPException(503, f"reports of robots cannot be stored: {fleet.storage_fault}")
         if bus is not None and bus.closed():
             raise HTTPException(503, "the bus is closed; the server is stopping")
         return ServiceState("ok")
@@ -131,10 +138,18 @@ def _install_list_routes(app: FastAPI, store: MapStore, fleet: Fleet) -> None:
 
     @app.get("/v1/robots")
     def robots(site: SiteFilter = None, limit: Limit = 100, cursor: NameCursor = None) -> RobotList:
-        """Robots (of a site) by site and name: the version that each runs and should run, and its last messages."""
+        """Robots (of a site) by site and name: the version that each runs and should run, and its last messages.
+
+        A page ends early where these are long.
+        """
         found = [robot for robot in fleet.robots(site) if cursor is None or f"{robot.site}/{robot.robot}" > cursor]
         found.sort(key=lambda robot: f"{robot.site}/{robot.robot}")
-        return RobotList(*page(found, limit, lambda robot: f"{robot.site}/{robot.robot}"))
+        shown, following = page(found, limit, lambda robot: f"{robot.site}/{robot.robot}")
+        sizes = accumulate(len(msgspec.json.encode(robot)) for robot in shown)
+        fitting = max(1, sum(size <= _MAX_PAGE_BYTES for size in sizes))
+        if fitting < len(shown):
+            return RobotList(*page(shown, fitting, lambda robot: f"{robot.site}/{robot.robot}"))
+        return RobotList(shown, following)
 
 
 def _install_map_routes(app: FastAPI, store: MapStore) -> None:

@@ -6,6 +6,9 @@ from fastapi import Request, Response
 
 from mapserver.api.problems import problem
 
+PICTURE_HEADERS = {"X-Content-Type-Options": "nosniff", "Content-Security-Policy": "default-src 'none'; sandbox"}
+"""Of pictures whose bytes robots send: a browser must not take them for anything but a picture, nor run what is in them."""
+
 _RANGE = re.compile(r"^bytes=(\d{0,18})-(\d{0,18})$")
 
 

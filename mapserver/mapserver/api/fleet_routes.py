@@ -6,6 +6,7 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query, Response
 
 from fleetmap.messages import report_dict
+from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.parameters import (
     Axis,
     FailureQuery,
@@ -72,7 +73,7 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
     @app.get("/v1/failures/{number}/pictures/{place}", response_class=Response)
     def picture(number: Number, place: PictureNumber) -> Response:
         """A picture of a failure, as JPEG."""
-        headers = {"Cache-Control": "private, max-age=86400", "X-Content-Type-Options": "nosniff"}
+        headers = {"Cache-Control": "private, max-age=86400", **PICTURE_HEADERS}
         return Response(store.fleet.picture(number, place), media_type="image/jpeg", headers=headers)
 
     @app.get("/v1/sites/{site}/resurvey")

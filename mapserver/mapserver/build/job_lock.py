@@ -83,7 +83,7 @@ def _path(store: Path, job: int) -> Path:
 @contextmanager
 def _opened(path: Path) -> Iterator[int]:
     with disk_errors(f"{path} cannot be made", "check the store's rights and space"):
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     try:
         yield descriptor
     finally:

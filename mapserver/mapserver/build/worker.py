@@ -1,16 +1,20 @@
-"""Executors for surveys: threads of this process, or processes of a dask cluster, embedded or elsewhere.
+"""Executors for surveys: threads of this process, processes of this machine, or those of a dask cluster elsewhere.
 
 Two cores are served best by threads: the kernels run without the interpreter's lock, and nothing is copied. Processes take over
-where there are many cores, or several machines.
+where there are many cores, or several machines. What travels between them are pickles, which run code where they are opened:
+processes of this machine are reached by pipes that only their parent holds, a cluster by TLS with certificates on both sides.
 """
 
 import os
 import pickle
 import secrets
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
+from multiprocessing import get_context
+from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
@@ -35,6 +39,33 @@ class Threads:
     ) -> Iterator[Result]:
         """See Executor."""
         return _in_order(lambda batch: self._pool.submit(function, shared, batch), Future.result, batches, self._ahead)
+
+
+class Processes:
+    """An executor of processes of this machine; `folder` holds what they share."""
+
+    def __init__(self, pool: ProcessPoolExecutor, count: int, folder: Path) -> None:
+        self._pool, self._ahead, self._folder = pool, _AHEAD * count, folder
+        self._shared: Any = None
+        self._files: list[
+            Path
+        ] = []  # of what is shared now, and of what was before: its results may still be on their way
+
+    def map(
+        self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
+    ) -> Iterator[Result]:
+        """See Executor."""
+        if self._shared is not shared or not self._files:
+            for old in self._files[:-1]:
+                old.unlink()
+            self._shared, self._files = shared, [*self._files[-1:], self._folder / secrets.token_hex(8)]
+            self._files[-1].write_bytes(pickle.dumps(shared, protocol=5))
+        there = self._files[-1]
+
+        def submit(batch: Batch) -> Any:
+            return self._pool.submit(_do_shared, function, there, pickle.dumps(batch, protocol=5))
+
+        return _in_order(submit, lambda future: pickle.loads(future.result()), batches, self._ahead)
 
 
 class Cluster:
@@ -77,6 +108,12 @@ def _do(function: Callable[[Any, Any], Any], packed: tuple[str, bytes], batch: b
     return pickle.dumps(function(_unpacked[name], pickle.loads(batch)), protocol=5)
 
 
+def _do_shared(function: Callable[[Any, Any], Any], shared: Path, batch: bytes) -> bytes:
+    """One batch in a process of this machine."""
+    packed = (shared.name, b"" if shared.name in _unpacked else shared.read_bytes())
+    return _do(function, packed, batch)
+
+
 def _in_order(
     submit: Callable[[Any], Any], result: Callable[[Any], Any], batches: Iterable[Any], ahead: int
 ) -> Iterator[Any]:
@@ -92,13 +129,19 @@ def _in_order(
 
 @contextmanager
 def open_executor(threads: int | None, scheduler: str | None) -> Iterator[Executor]:
-    """Threads (as many as there are cores, without a number), or the cluster of a scheduler; `local` makes one of processes here.
+    """Threads (as many as there are cores, without a number), processes of this machine (`local`), or the cluster of a scheduler.
 
-    Raises UsageError where the scheduler does not answer.
+    Raises UsageError for a scheduler that is not reached by TLS, or that does not answer.
     """
     count = threads or len(os.sched_getaffinity(0))
-    if scheduler is not None:
-        with _client(scheduler, count) as client:
+    if scheduler == EMBEDDED:
+        with (
+            tempfile.TemporaryDirectory(prefix="fleetmap-") as folder,
+            ProcessPoolExecutor(count, mp_context=get_context("spawn")) as processes,
+        ):
+            yield Processes(processes, count, Path(folder))
+    elif scheduler is not None:
+        with _client(scheduler) as client:
             yield Cluster(client)
     elif count == 1:
         yield SERIAL
@@ -119,21 +162,19 @@ def _opencv_alone() -> Iterator[None]:
 
 
 @contextmanager
-def _client(scheduler: str, count: int) -> Iterator[Any]:
-    from distributed import Client, LocalCluster
-
-    if scheduler == EMBEDDED:
-        cluster = LocalCluster(  # type: ignore[no-untyped-call]
-            n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None
+def _client(scheduler: str) -> Iterator[Any]:
+    if not scheduler.startswith("tls://"):
+        raise UsageError(
+            f"--scheduler {scheduler}: whoever reaches a scheduler without TLS runs code in it; name one by "
+            f"tls://HOST:PORT, with its certificates in dask's configuration, or say `{EMBEDDED}`"
         )
-        with cluster, Client(cluster, set_as_default=False) as client:  # type: ignore[no-untyped-call]
-            yield client
-        return
+    from distributed import Client
+
     try:
         client = Client(scheduler, timeout=_CONNECT_WITHIN_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TypeError) as error:
         raise UsageError(
-            f"--scheduler {scheduler} does not answer ({error}); start it with `dask scheduler`, or say `{EMBEDDED}`"
+            f"--scheduler {scheduler} does not answer ({error}); start it with `dask scheduler --tls-...`, or say `{EMBEDDED}`"
         ) from error
     with client:
         yield client

@@ -67,7 +67,9 @@ def _run(
 
     import uvicorn
 
+    from fleetmap.log_lines import log_to_stderr
     from mapserver.api.app import create_app
+    from mapserver.api.body_limit import MAX_BODY_BYTES
     from mapserver.api.metrics import Metrics
     from mapserver.api.version_routes import ApiSettings
     from mapserver.dashboard.install import install_dashboard
@@ -77,7 +79,7 @@ def _run(
 
     # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    log_to_stderr(logging.INFO)
     fleet = Fleet(maps, settings=settings.ingest)
     metrics = Metrics(maps, fleet)
     bus_service = BusService(maps, fleet, bus, metrics.count_bus)
@@ -98,7 +100,14 @@ def _run(
     api = ApiSettings(writers, settings.gate, settings.canary, settings.resurvey)
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
     install_dashboard(app, maps, fleet, api, bus_service.surveys)
-    config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=_STOP_WITHIN_S)
+    config = uvicorn.Config(
+        app,
+        log_config=None,
+        log_level="warning",
+        access_log=False,
+        timeout_graceful_shutdown=_STOP_WITHIN_S,
+        ws_max_size=MAX_BODY_BYTES,
+    )
     # uvicorn stops on these signals by itself and afterwards raises them again for the handlers that were there before:
     # the default ones would end the process with a status that says it was killed.
     for number in (signal.SIGTERM, signal.SIGINT):

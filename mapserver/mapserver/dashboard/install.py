@@ -8,6 +8,7 @@ from nicegui import app as pages
 from nicegui import ui
 
 from fleetmap.errors import FleetmapError
+from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.version_routes import ApiSettings
 from mapserver.dashboard.compression_cache import CompressionCache
 from mapserver.dashboard.data import MapData
@@ -73,7 +74,4 @@ def _install_pictures(services: Services, store: MapStore) -> None:
 
 
 def _picture(data: bytes, media_type: str, cache_control: str) -> Response:
-    # Robots send the bytes: a browser must not take them for anything but a picture.
-    return Response(
-        data, media_type=media_type, headers={"Cache-Control": cache_control, "X-Content-Type-Options": "nosniff"}
-    )
+    return Response(data, media_type=media_type, headers={"Cache-Control": cache_control, **PICTURE_HEADERS})

@@ -3,13 +3,15 @@
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from fleetmap.errors import LinkError, UsageError
+from fleetmap.errors import LinkError, StoreError, UsageError
 from fleetmap.mapformat import check_name
 from fleetmap.messages import (
+    MAX_THUMBNAIL_BYTES,
     FailureAck,
     FailureReport,
     PoseMessage,
@@ -20,6 +22,7 @@ from fleetmap.messages import (
     report_dict,
 )
 from mapserver.fleet.ingest import Ingest, IngestSettings
+from mapserver.fleet.rate_limit import RateLimit
 from mapserver.fleet.rejected_reports import RejectedReports, rejection
 from mapserver.fleet.version_assignment import VersionAssignment, read_assignment
 from mapserver.fleet_statistics.clock_skew import ClockSkew
@@ -27,6 +30,10 @@ from mapserver.store import MapStore
 
 MAX_ROBOTS = 10_000
 MAX_STAMP_NS = 1 << 62  # what the store can hold
+MAX_FAILURE_BYTES = 4 * MAX_THUMBNAIL_BYTES + (128 << 10)  # four pictures, and twenty fixes with their words
+# A robot that fails more often than once a minute is broken; 60 are what one brings back from an hour without a network.
+FAILURE_BURST, FAILURES_PER_S = 60, 1 / 60
+_FORGET_AFTER_NS = 600_000_000_000
 _USUAL = IngestSettings()
 
 
@@ -60,14 +67,15 @@ class _Robot:
     last_estimate: PoseMessage | None = None
     skew: ClockSkew = field(default_factory=ClockSkew)
     is_present: bool | None = None
+    is_stored: bool = False
 
 
 class Fleet:
     """Takes the robots' messages from any thread.
 
     Acknowledgements and failures are on the disk when the method returns, health with the next `flush`; of poses the last one
-    is in memory. Messages for sites that the store does not have are refused, as are more than MAX_ROBOTS robots, so that
-    invented names cannot fill the disk.
+    is in memory. `storage_fault` says why reports cannot be stored now, if so. Messages for sites that the store does not have are
+    refused, as are more than MAX_ROBOTS robots, so that invented names cannot fill the disk.
     """
 
     def __init__(
@@ -78,10 +86,12 @@ class Fleet:
         self._lock = threading.Lock()
         self._ingest = Ingest(store, settings)
         self._rejected = RejectedReports(store.folder / "refused")
+        self._failures = RateLimit(FAILURE_BURST, FAILURES_PER_S, clock_ns)
         self._robots: dict[tuple[str, str], _Robot] = {}
+        self.storage_fault = ""
         for info in store.robots():
             skew = ClockSkew(info.last_report.get("clock_ahead_s"))
-            robot = _Robot(info.version, info.last_seen_ns, dict(info.last_report), skew=skew)
+            robot = _Robot(info.version, info.last_seen_ns, dict(info.last_report), skew=skew, is_stored=True)
             self._robots[info.site, info.robot] = robot
 
     def wanted_version(self, site: str, robot: str) -> WantedVersion:
@@ -112,7 +122,8 @@ class Fleet:
             entry = self._entry(site, robot, now_ns, ack.version)
             entry.report["ack"] = report_dict(ack)
             report, version = dict(entry.report), entry.version
-        self._store.record_robot_report(site, robot, report, version)
+        with self._storing():
+            self._store.record_robot_report(site, robot, report, version)
 
     def take_health(self, site: str, robot: str, health: RobotHealth) -> None:
         """Counts a report and keeps it until the next `flush`; raises LinkError for one in another robot's name."""
@@ -147,15 +158,23 @@ class Fleet:
                 ahead_s = self._entry(site, robot, now_ns, None).skew.ahead_s
         except (LinkError, UsageError) as error:
             return FailureAck(id=report.id, refused=str(error)[:2000])
-        self._ingest.take_failure(report, now_ns, ahead_s)
+        with self._storing():
+            self._ingest.take_failure(report, now_ns, ahead_s)
         return FailureAck(id=report.id)
 
     def take_failure_bytes(self, site: str, robot: str, payload: bytes) -> FailureAck:
         """As `take_failure`, of an encoded report. One that is refused for good is set aside in the store's folder.
 
-        Raises LinkError for bytes that do not even say which report they are, StoreError where it may be kept later.
+        Raises LinkError for bytes that do not even say which report they are, and where the robot sends more than it may: it asks
+        again later; StoreError where it may be kept later.
         """
+        if not self._failures.admits((site, robot)):
+            raise LinkError(
+                f"later: robot {robot[:80]!r} sent {FAILURE_BURST} failures, and now one a minute is taken; it keeps the others"
+            )
         try:
+            if len(payload) > MAX_FAILURE_BYTES:
+                raise LinkError(f"a failure of {len(payload)} bytes; the limit is {MAX_FAILURE_BYTES}")
             ack = self.take_failure(site, robot, decode_message(payload, FailureReport))
         except LinkError as error:
             ack = rejection(payload, str(error))
@@ -166,13 +185,22 @@ class Fleet:
     def take_presence(self, present: Iterable[tuple[str, str]]) -> None:
         """Notes which robots (site, name) show their liveliness token now; those that were never heard stay unknown."""
         there = set(present)
+        stored = self._store.robot_names()
+        now_ns = self._clock_ns()
         with self._lock:
-            for key, robot in self._robots.items():
+            for key, robot in list(self._robots.items()):
                 robot.is_present = key in there
+                # Removed by a command, or a name that only ever asked.
+                gone = robot.is_stored or (not robot.is_present and now_ns - robot.seen_ns > _FORGET_AFTER_NS)
+                if key not in stored and gone:
+                    del self._robots[key]
+                robot.is_stored = key in stored
 
     def flush(self) -> None:
         """Brings what was counted to the disk; raises StoreError where it refuses, and keeps it for the next time."""
-        self._ingest.flush()
+        if self._ingest.has_counted():
+            with self._storing():
+                self._ingest.flush()
 
     def prune(self) -> int:
         """Removes reports from the store that are too old or too many; returns how many rows went."""
@@ -193,6 +221,16 @@ class Fleet:
             if key[0] not in assignments:
                 assignments[key[0]] = read_assignment(self._store, key[0])
         return [_status(key, robot, assignments[key[0]], now_ns) for key, robot in chosen]
+
+    @contextmanager
+    def _storing(self) -> Iterator[None]:
+        """Notes in `storage_fault` why reports cannot be stored; empty since the last one that was."""
+        try:
+            yield
+        except StoreError as error:
+            self.storage_fault = str(error)
+            raise
+        self.storage_fault = ""
 
     def _entry(self, site: str, robot: str, now_ns: int, version: int | None) -> _Robot:
         """The robot, seen now; `version` is what it says it runs. The caller holds the lock."""
@@ -245,3 +283,5 @@ def _check_failure(report: FailureReport) -> None:
         raise LinkError(f"failure {report.id!r} began at {report.wall_ns} ns for {report.duration_s} s; that cannot be")
     if any(abs(thumbnail.stamp_ns) > MAX_STAMP_NS for thumbnail in report.thumbnails):
         raise LinkError(f"failure {report.id!r} has a picture of an impossible time")
+    if not all(thumb.jpeg.startswith(b"\xff\xd8") and thumb.jpeg.endswith(b"\xff\xd9") for thumb in report.thumbnails):
+        raise LinkError(f"failure {report.id!r} has a picture that does not begin and end as a JPEG does")

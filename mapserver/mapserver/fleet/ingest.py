@@ -22,6 +22,7 @@ OUTSIDE = "outside"
 """Key of the tiles of positions that no tile of the version covers."""
 
 _CANARIES_KEPT_NS = 1_000_000_000
+_LEAST_BETWEEN_TRACES_NS = 900_000_000
 _MAX_CAUSES = 64
 _MAX_KEPT_TRACES = 200_000
 _DAY_NS = 86_400_000_000_000
@@ -36,13 +37,15 @@ class IngestSettings(Section, frozen=True):
     trace_rows: PositiveInt = 3_000_000  # whole hours are deleted, the oldest first
     tally_days: Positive = 400.0
     failure_days: Positive = 400.0
-    picture_bytes: PositiveInt = 1_000_000_000
+    picture_bytes: PositiveInt = 1_000_000_000  # the oldest pictures go as new ones come
+    failures_per_robot: PositiveInt = 5000  # twelve a day for 400 days
     prune_every_s: Positive = 600.0  # between deletions of old rows
     presence_every_s: Positive = 5.0  # between looks at the robots on the bus
 
     def retention(self) -> FleetRetention:
         """What stays in the store."""
-        return FleetRetention(self.tally_days, self.failure_days, self.picture_bytes, self.trace_days, self.trace_rows)
+        days = (self.tally_days, self.failure_days)
+        return FleetRetention(*days, self.picture_bytes, self.trace_days, self.trace_rows, self.failures_per_robot)
 
 
 @dataclass(slots=True)
@@ -134,7 +137,13 @@ class Ingest:
         if grid is not None and report.tile is not None:
             keys.append(("tile", grid.cell_key(report.tile)))
         counters: dict[CounterKey, Counters] = {(report.site, *key, hour_of(happened_ns)): counts for key in keys}
-        return self._store.fleet.add_failure(report, received_ns=now_ns, happened_ns=happened_ns, counters=counters)
+        times_ns = (now_ns, happened_ns)
+        return self._store.fleet.add_failure(report, times_ns, counters, self._settings.retention())
+
+    def has_counted(self) -> bool:
+        """Whether there is something to bring to the disk."""
+        with self._lock:
+            return bool(self._batch.counters or self._batch.last_reports)
 
     def flush(self) -> None:
         """Brings what was counted to the disk. Raises StoreError, and keeps it for the next time."""
@@ -163,8 +172,10 @@ class Ingest:
         batch.traces = list(kept)
 
     def _is_trace_due(self, stream: _Stream, health: RobotHealth, now_ns: int) -> bool:
-        """Thinned by time; a changed status is always kept."""
-        due = now_ns - stream.trace_ns >= self._settings.trace_every_s * 1e9 or health.status != stream.status
+        """Thinned by time; a changed status is kept, but no more than one a second."""
+        quiet_ns = now_ns - stream.trace_ns
+        is_changed = health.status != stream.status and quiet_ns >= _LEAST_BETWEEN_TRACES_NS
+        due = quiet_ns >= self._settings.trace_every_s * 1e9 or is_changed
         if due:
             stream.trace_ns, stream.status = now_ns, health.status
         return due

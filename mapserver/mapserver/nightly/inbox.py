@@ -17,6 +17,7 @@ from itertools import chain, count
 from pathlib import Path
 
 from fleetmap.errors import RecordingError, UsageError, disk_errors
+from fleetmap.log_lines import printable
 from fleetmap.recordings import OpenOptions, open_recording
 from mapserver.store.files import make_folder, sync_folder, write_atomically
 
@@ -130,11 +131,6 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
 def is_safe_name(name: str) -> bool:
     """Whether a name can be shown, logged and kept in the database, and leaves room for what is put before and behind it."""
     return name.isprintable() and len(os.fsencode(name)) <= _MAX_NAME_BYTES
-
-
-def printable(words: str) -> str:
-    """The words with everything that cannot be shown as Python escapes it: a name of a file may hold any byte."""
-    return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in words)
 
 
 def _safe_name(path: Path) -> str:

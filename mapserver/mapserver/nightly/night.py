@@ -14,6 +14,7 @@ from typing import Any
 from rich.console import Console
 
 from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, SurveyError
+from fleetmap.log_lines import printable
 from mapserver import releases
 from mapserver.build.build import BuildOptions, BuildRequest, build_draft
 from mapserver.build.job_lock import INTERRUPTED, end_interrupted, held, only_one
@@ -127,7 +128,7 @@ class _Night:
         here = boxes.arrivals(self._request.inbox, self._request.settle_s, self._request.now_ns)
         for path, reason in here.waiting:
             self._say(f"not yet: {path.name}: {reason}")
-            self._report.waiting.append({"name": boxes.printable(path.name), "reason": boxes.printable(reason)})
+            self._report.waiting.append({"name": printable(path.name), "reason": printable(reason)})
         recordings = self._identified(here.complete)
         left = self._left_draft()
         if left is not None:
@@ -240,7 +241,7 @@ class _Night:
     def _put_away(self, path: Path, where: str, sha256: str | None, reason: str) -> None:
         self._say(f"{where}: {path.name}: {reason}")
         boxes.put_away(path, where, sha256, None if where == boxes.DONE else reason)
-        told = {"name": boxes.printable(path.name), "reason": boxes.printable(reason)}
+        told = {"name": printable(path.name), "reason": printable(reason)}
         self._report.recordings.append({**told, "sha256": sha256, "fate": where})
 
     def _counts(self) -> str:
@@ -248,7 +249,7 @@ class _Night:
         return ", ".join(f"{fates.count(where)} {where}" for where in (boxes.DONE, boxes.HELD, boxes.BAD))
 
     def _say(self, words: str) -> None:
-        self._console.print(boxes.printable(words), markup=False, highlight=False)
+        self._console.print(printable(words), markup=False, highlight=False)
 
     def _actor(self) -> Actor:
         return Actor(JOB, f"nightly job {self._report.job}")

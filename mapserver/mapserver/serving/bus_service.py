@@ -10,6 +10,7 @@ from contextlib import suppress
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError
 from fleetmap.live_survey import LiveSurveyState, live_key
+from fleetmap.log_lines import LogLimit
 from fleetmap.mapformat import check_name, decode_manifest, make_patch
 from fleetmap.messages import (
     PoseMessage,
@@ -26,15 +27,19 @@ from fleetmap.messages import (
     trust_key,
 )
 from mapserver.fleet.fleet import Fleet
+from mapserver.fleet.rate_limit import RateLimit
 from mapserver.serving.caches import AuthorizationCache, ByteCache
 from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.store import MapStore
 from mapserver.trust import SignedLists
 
 Count = Callable[[str, str, int], None]
-"""Counts for metrics: (what, "ok" or "refused", bytes sent)."""
+"""Counts for metrics: (what, "ok", "refused" or "dropped", bytes sent)."""
 
 _log = logging.getLogger(__name__)
+MAX_REPORT_BYTES = 16 << 10  # a health report with everything in it has 3 kB, a pose 0.5 kB
+# What a robot may publish, at once and in a second: robots send health once a second, poses with every frame, an ack with a version.
+REPORT_RATES = {"ack": (20, 1.0), "health": (20, 4.0), "pose": (80, 60.0)}
 _CACHED_BYTES = 64_000_000
 _RECENT_PATCHES_BYTES = 32_000_000
 _PATCH_SHARE = 0.7  # of the whole, above which a patch is not worth its work
@@ -53,6 +58,8 @@ class BusService:
         self._fleet = fleet
         self._bus = bus
         self._count = count
+        self._refusals = LogLimit(_log)
+        self._rates = {what: RateLimit(burst, per_s, store.now_ns) for what, (burst, per_s) in REPORT_RATES.items()}
         self._lists = SignedLists(store.folder)
         self._announced: dict[tuple[str, str], str | None] = {}
         self._recent = ByteCache(_CACHED_BYTES)
@@ -197,6 +204,14 @@ class BusService:
         try:
             site, robot, _ = split_key(key)
             check_name(robot, "robot")
+            if not self._rates[what].admits((site, robot)):
+                self._count(what, "dropped", 0)
+                self._refusals.warning(
+                    key, "more messages come under %r than are taken; the rest is dropped", key[:200]
+                )
+                return
+            if len(payload) > MAX_REPORT_BYTES:
+                raise LinkError(f"{len(payload)} bytes; the limit is {MAX_REPORT_BYTES}")
             if what == "ack":
                 self._fleet.take_ack(site, robot, decode_message(payload, RobotAck))
             elif what == "health":
@@ -222,5 +237,5 @@ class BusService:
 
     def _refuse(self, key: str, what: str, error: FleetmapError) -> None:
         """Published messages have no answer: the log and the metric show the refusal."""
-        _log.warning("message under %s refused: %s", key, error)
+        self._refusals.warning(key, "message under %r refused: %s", key[:200], error)
         self._count(what, "refused", 0)

@@ -16,6 +16,7 @@ from mapserver.store.rows import LogEntry
 
 APPLICATION_ID = 0x464D4150  # "FMAP": says whose file this is
 _BUSY_TIMEOUT_MS = 30_000
+_INCREMENTAL = 2
 
 
 Row = TypeVar("Row")
@@ -72,6 +73,23 @@ class Transactions:
                 return list(self._reader.query(sql, values))
         except sqlite3.Error as error:
             raise StoreError(f"the store {self._path} cannot be read ({error}); check its disk") from error
+
+    def shrink(self, pages: int) -> None:
+        """Gives at most so many unused pages of the file back to the disk; none of a file that is not `make_shrinkable`."""
+        with self._lock, suppress(sqlite3.Error):  # a busy file is shrunk the next time
+            # `execute` takes one step, which frees one page
+            self._database.conn.executescript(f"PRAGMA incremental_vacuum({pages:d})")
+
+    def make_shrinkable(self) -> None:
+        """Writes the whole file anew, once, so that `shrink` works; needs as much space again. Raises StoreError where there is none."""
+        with self._lock:
+            if self._database.conn.execute("PRAGMA auto_vacuum").fetchone()[0] == _INCREMENTAL:
+                return
+            try:
+                self._database.conn.execute(f"PRAGMA auto_vacuum = {_INCREMENTAL}")
+                self._database.conn.execute("VACUUM")
+            except sqlite3.Error as error:
+                raise StoreError(f"the store {self._path} cannot be written anew ({error}); make space") from error
 
     def rows(self, kind: Callable[..., Row], sql: str, values: tuple[object, ...] = ()) -> list[Row]:
         """The rows, each as a `kind` with a field for every column. Raises StoreError where the disk refuses."""
@@ -132,6 +150,7 @@ def _check_current(database: Database, path: Path) -> None:
 
 def _prepare(database: Database, path: Path) -> None:
     _check_ours(database.conn, path)
+    database.conn.execute(f"PRAGMA auto_vacuum = {_INCREMENTAL}")  # of a file that is still empty
     database.conn.execute("PRAGMA journal_mode = WAL")
     database.conn.execute("PRAGMA foreign_keys = ON")
     _migrate(database)

@@ -21,6 +21,9 @@ LastReports = dict[tuple[str, str], tuple[int | None, int, dict[str, Any]]]
 """By (site, robot): the version that it runs, None where it did not say, when it was heard, and its last report."""
 
 _DAY_NS = 86_400_000_000_000
+_USUAL_RETENTION = FleetRetention()
+_PRUNED_SHARE = 0.95  # of the bytes that pictures may have: they are added up again after so many new ones, not at each
+_SHRINK_PAGES = 20_000  # 80 MB, so that nobody waits long
 _SUMS = ", ".join(f"sum(t.{name}) {name}" for name in COUNTER_COLUMNS)
 _SUMS_OF_WINDOW = _SUMS.replace("sum(t.continued)", "sum(CASE WHEN t.hour = ?4 THEN t.continued ELSE 0 END)")
 _COUNTED = """FROM tally_keys k JOIN tallies t ON t.key_id = k.id
@@ -51,6 +54,7 @@ class FleetQueries:
     def __init__(self, transactions: Transactions) -> None:
         self._transactions = transactions
         self._key_ids: dict[tuple[str, str, str], int] = {}
+        self._picture_bytes = -(1 << 62)  # looked up at the first failure
 
     def add(self, batch: FleetBatch) -> None:
         """Keeps a batch in one transaction. A power cut may lose the last ones, never failures."""
@@ -68,9 +72,18 @@ class FleetQueries:
         self._key_ids |= ids  # only what was committed
 
     def add_failure(
-        self, report: FailureReport, *, received_ns: int, happened_ns: int, counters: Mapping[CounterKey, Counters]
+        self,
+        report: FailureReport,
+        times_ns: tuple[int, int],
+        counters: Mapping[CounterKey, Counters],
+        retention: FleetRetention = _USUAL_RETENTION,
     ) -> bool:
-        """Keeps a failure and its sums, durably; False (and nothing done) for one that is known already."""
+        """Keeps a failure and its sums, durably; False (and nothing done) for one that is known already.
+
+        times_ns: when it was received and when it happened. Older failures of the robot, and the oldest pictures of all, go where
+        there are too many.
+        """
+        received_ns, happened_ns = times_ns
         x_map_m, y_map_m = (None, None) if report.map_from_base is None else report.map_from_base.position_m[:2]
         row = {
             **{name: getattr(report, name) for name in _REPORT_COLUMNS},
@@ -89,6 +102,11 @@ class FleetQueries:
                 "INSERT INTO failure_pictures VALUES (?, ?, ?, ?, ?)",
                 [(done.lastrowid, n, t.kind, t.stamp_ns, t.jpeg) for n, t in enumerate(report.thumbnails)],
             )
+            _prune_failures(connection, (report.site, report.robot), retention.failures_per_robot)
+            self._picture_bytes += sum(len(thumbnail.jpeg) for thumbnail in report.thumbnails)
+            if not 0 <= self._picture_bytes <= retention.picture_bytes:
+                _prune_pictures(connection, _PRUNED_SHARE * retention.picture_bytes)
+                self._picture_bytes = _sum_of_pictures(connection)
             _add_counters(connection, self._ids(connection, [key[:3] for key in counters]), counters)
         return True
 
@@ -161,7 +179,10 @@ class FleetQueries:
             gone += connection.execute("DELETE FROM traces WHERE hour < ?", (hour_of(traces_ns),)).rowcount
             gone += _prune_traces(connection, retention.trace_rows)
             gone += connection.execute("DELETE FROM failures WHERE happened_ns < ?", (failures_ns,)).rowcount
-            return gone + _prune_pictures(connection, retention.picture_bytes)
+            gone += _prune_pictures(connection, retention.picture_bytes)
+            self._picture_bytes = _sum_of_pictures(connection)
+        self._transactions.shrink(_SHRINK_PAGES)
+        return gone
 
     def _ids(
         self, connection: sqlite3.Connection, keys: Iterable[tuple[str, str, str]]
@@ -214,7 +235,20 @@ def _prune_traces(connection: sqlite3.Connection, keep: int) -> int:
     return connection.execute("DELETE FROM traces WHERE hour <= ?", (last,)).rowcount
 
 
-def _prune_pictures(connection: sqlite3.Connection, keep_bytes: int) -> int:
+def _prune_failures(connection: sqlite3.Connection, robot: tuple[str, str], keep: int) -> None:
+    """The oldest failures of a robot go until `keep` stay; their pictures go with them."""
+    (count,) = connection.execute("SELECT count(*) FROM failures WHERE site = ? AND robot = ?", robot).fetchone()
+    if count <= keep:
+        return
+    oldest = "SELECT number FROM failures WHERE site = ? AND robot = ? ORDER BY number LIMIT ?"
+    connection.execute(f"DELETE FROM failures WHERE number IN ({oldest})", (*robot, count - keep))
+
+
+def _sum_of_pictures(connection: sqlite3.Connection) -> int:
+    return int(connection.execute("SELECT coalesce(sum(length(jpeg)), 0) FROM failure_pictures").fetchone()[0])
+
+
+def _prune_pictures(connection: sqlite3.Connection, keep_bytes: float) -> int:
     sizes = connection.execute(
         "SELECT number, sum(length(jpeg)) FROM failure_pictures GROUP BY number ORDER BY number DESC"
     ).fetchall()

@@ -12,7 +12,7 @@ Bytes are on the disk before the transaction that mentions them, so a crash leav
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Self
 
@@ -190,6 +190,9 @@ class MapStore(StoreQueries):
             return collect(self._transactions, self._blobs, retention, dry_run=True, actor=actor)
         with self._locked(shared=False):
             garbage = collect(self._transactions, self._blobs, retention, dry_run=False, actor=actor)
+            with suppress(StoreError):  # the next time, when there is space
+                self._transactions.make_shrinkable()
+            self._transactions.shrink(1 << 30)
             keep_reserve(self._root)
             return garbage
 

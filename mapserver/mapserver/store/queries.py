@@ -1,7 +1,7 @@
 """Queries of a store, and rows that change no version: robots' reports, jobs, events."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,12 @@ from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import Transactions
 from mapserver.store.fleet_queries import FleetQueries, keep_last_reports
 from mapserver.store.rows import (
+    NOBODY,
+    Actor,
     CanaryRow,
     Event,
     JobInfo,
+    LogEntry,
     RobotInfo,
     SiteInfo,
     SiteReleases,
@@ -48,6 +51,25 @@ class StoreQueries:
     def now_ns(self) -> int:
         """The store's clock, nanoseconds since 1970."""
         return self._clock_ns()
+
+    def robot_names(self) -> set[tuple[str, str]]:
+        """Site and name of every robot that is kept."""
+        return {(row["site"], row["robot"]) for row in self._transactions.query("SELECT site, robot FROM robots")}
+
+    def remove_robots(self, site: str, robots: Sequence[str], *, actor: Actor = NOBODY) -> list[str]:
+        """Forgets what robots of a site said last, and returns those that were known; their counts and failures stay.
+
+        Raises UsageError for a site that is not known, StoreError where the disk refuses.
+        """
+        self._check_site(site)
+        removed = []
+        with self._transactions.write() as connection:
+            for robot in robots:
+                done = connection.execute("DELETE FROM robots WHERE site = ? AND robot = ?", (site, robot))
+                if done.rowcount:
+                    removed.append(robot)
+                    self._transactions.log(connection, site, LogEntry("robot removed", robot, None, actor))
+        return removed
 
     def sites(self) -> list[SiteInfo]:
         """All sites by name."""

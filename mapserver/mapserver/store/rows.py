@@ -291,10 +291,13 @@ class ReleaseChanges:
 
 @dataclass(frozen=True, slots=True)
 class FleetRetention:
-    """What stays of the fleet's reports: sums and failures by age, pictures also by size, traces by age and count."""
+    """What stays of the fleet's reports: sums and failures by age, failures also by count of each robot, pictures by size, traces by age
+    and count.
+    """
 
     tally_days: float = 400.0
     failure_days: float = 400.0
     picture_bytes: int = 1_000_000_000
     trace_days: float = 2.0
     trace_rows: int = 3_000_000
+    failures_per_robot: int = 5000

@@ -111,7 +111,7 @@ def answer_query(answer: Answer, key: str, payload: bytes) -> tuple[bytes | None
     except FleetmapError as error:
         return None, str(error)
     except Exception as error:
-        _log.exception("answering %s failed", key)
+        _log.exception("answering %r failed", key[:200])
         return None, f"internal error of the other side ({type(error).__name__}); its log says more"
 
 
@@ -129,7 +129,7 @@ def deliver(listen: Listen, key: str, payload: bytes) -> None:
     try:
         listen(key, payload)
     except Exception:
-        _log.exception("the subscriber for %s failed", key)
+        _log.exception("the subscriber for %r failed", key[:200])
 
 
 def no_answer(key: str, timeout_s: float) -> UnreachableError:

@@ -10,7 +10,9 @@ from typing import Any, Self
 
 import zenoh
 
+from fleetmap.bus.fair_queue import FairQueue, sender_of
 from fleetmap.bus.protocol import (
+    MAX_MESSAGE_BYTES,
     Answer,
     Bus,
     Handle,
@@ -25,13 +27,18 @@ from fleetmap.errors import LinkError, UsageError
 
 _RETRY_S = 0.05
 _MAX_ALIVE = 1 << 17
+_BUSY = b"later: too much of this sender is waiting already"
 
 
 class ZenohBus(Bus):
-    """A zenoh session with explicit endpoints only: no multicast, no gossip, nothing found by itself."""
+    """A zenoh session with explicit endpoints only: no multicast, no gossip, nothing found by itself.
 
-    def __init__(self, session: Any, endpoint: str) -> None:
+    What a server hears passes a `FairQueue`: one sender who floods is dropped. Whoever connects hears all that he asked for.
+    """
+
+    def __init__(self, session: Any, endpoint: str, *, is_server: bool = False) -> None:
         self._session = session
+        self._is_server = is_server
         self.endpoint = endpoint
         # What is declared lives as long as its object: without this list a token would vanish with an ignored handle.
         self._handles: list[Handle] = []
@@ -46,7 +53,7 @@ class ZenohBus(Bus):
         for attempt in range(5):
             actual = _with_free_port(wanted)
             try:
-                return cls(_open("router", listen=actual), actual)
+                return cls(_open("router", listen=actual), actual, is_server=True)
             except zenoh.ZError as error:
                 # Between finding a free port and listening on it another process may take it.
                 if actual == wanted or attempt == 4:
@@ -64,18 +71,28 @@ class ZenohBus(Bus):
     def queryable(self, key_expr: str, answer: Answer) -> Handle:
         """See Bus."""
 
-        def reply(query: Any) -> None:
+        def reply(query: Any, key: str) -> None:
             # Leaving the block ends the question: without it the asker would wait for its timeout.
             with query:
-                key = str(query.key_expr)
                 payload = b"" if query.payload is None else query.payload.to_bytes()
                 data, reason = answer_query(answer, key, payload)
                 if data is None:
-                    query.reply_err(reason.encode())
+                    query.reply_err(reason.encode("utf-8", "replace"))
                 else:
                     query.reply(key, data)
 
-        return self._handle(lambda: self._session.declare_queryable(key_expr, reply, complete=True))
+        def take(query: Any) -> None:
+            key, size = str(query.key_expr), 0 if query.payload is None else len(query.payload)
+            if not queue.put(sender_of(key), size, partial(reply, query, key)):
+                with query:
+                    query.reply_err(_BUSY)
+
+        if not self._is_server:
+            plain = lambda query: reply(query, str(query.key_expr))  # noqa: E731
+            return self._handle(lambda: self._session.declare_queryable(key_expr, plain, complete=True))
+        queue = FairQueue(f"answers {key_expr}")
+        direct = zenoh.handlers.Callback(take, queue.close, indirect=False)
+        return self._handle(lambda: self._session.declare_queryable(key_expr, direct, complete=True))
 
     def get(self, key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
         """See Bus. Asks again until the time is over, because before a connection stands zenoh answers with silence."""
@@ -106,9 +123,16 @@ class ZenohBus(Bus):
         """See Bus."""
 
         def take(sample: Any) -> None:
-            deliver(listen, str(sample.key_expr), sample.payload.to_bytes())
+            key = str(sample.key_expr)
+            if len(sample.payload) <= MAX_MESSAGE_BYTES:
+                queue.put(sender_of(key), len(sample.payload), lambda: deliver(listen, key, sample.payload.to_bytes()))
 
-        return self._handle(lambda: self._session.declare_subscriber(key_expr, take))
+        if not self._is_server:
+            plain = lambda sample: deliver(listen, str(sample.key_expr), sample.payload.to_bytes())  # noqa: E731
+            return self._handle(lambda: self._session.declare_subscriber(key_expr, plain))
+        queue = FairQueue(f"hears {key_expr}")
+        direct = zenoh.handlers.Callback(take, queue.close, indirect=False)
+        return self._handle(lambda: self._session.declare_subscriber(key_expr, direct))
 
     def declare_alive(self, key: str) -> Handle:
         """See Bus."""

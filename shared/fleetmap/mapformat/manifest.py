@@ -10,8 +10,9 @@ from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
 MANIFEST_FORMAT = 1
 MAX_MANIFEST_BYTES = 64 << 20
 
-Sha256 = Annotated[str, msgspec.Meta(pattern=SHA256_PATTERN)]
-Name = Annotated[str, msgspec.Meta(pattern=NAME_PATTERN)]
+# As `check_name` and `check_sha256`: Python's $ stands before a last line break too.
+Sha256 = Annotated[str, msgspec.Meta(pattern=SHA256_PATTERN.replace("$", r"\Z"))]
+Name = Annotated[str, msgspec.Meta(pattern=NAME_PATTERN.replace("$", r"\Z"))]
 Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 62))]
 Positive = Annotated[int, msgspec.Meta(ge=1, le=(1 << 62))]
 

@@ -1,7 +1,9 @@
 """Manifests as canonical JSON."""
 
 import json
+from typing import Annotated
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,13 +17,19 @@ from fleetmap.mapformat import (
     TileEntry,
     blob_path,
     check_name,
+    check_sha256,
     current_path,
     decode_manifest,
     encode_manifest,
     sha256_hex,
     verified,
 )
+from fleetmap.mapformat.manifest import Name
+from fleetmap.mapformat.names import NAME_PATTERN
+from mapserver.store.export_import import ExportHead
+from support.fleet.contracts_documents import REPOSITORY
 
+GOLDEN = REPOSITORY / "tests" / "golden"
 MANIFEST = Manifest(
     site="hall-3",
     version=2,
@@ -112,3 +120,34 @@ def test_names_and_addresses() -> None:
     assert verified(b"x", sha256_hex(b"x")) == b"x"
     with pytest.raises(MapFormatError, match="damaged"):
         verified(b"y", sha256_hex(b"x"))
+
+
+WORDS = st.text(alphabet=st.characters(codec="utf-8"), max_size=70) | st.sampled_from(
+    ["hall\n", "hall\r\n", "../hall", "hall/..", ".", "-hall", "hall\0", "HALL", "a" * 65, "hall ", "hàll"]
+)
+
+
+@given(site=WORDS | st.from_regex(r"[a-z0-9][a-z0-9_-]{0,63}\n?", fullmatch=True), end=st.sampled_from(["", "\n", " "]))
+def test_whatever_decodes_has_names_that_fit_paths(site: str, end: str) -> None:
+    """Row 17 of docs/security.md."""
+    content = msgspec.json.decode((GOLDEN / "manifest-1.json").read_bytes())
+    content["site"] = site
+    content["vocabulary"]["sha256"] += end
+    try:
+        manifest = decode_manifest(msgspec.json.encode(content))
+    except MapFormatError:
+        return
+    assert check_name(manifest.site, "site") == site
+    assert check_sha256(manifest.vocabulary.sha256)
+    assert all(check_sha256(tile.sha256) for tile in manifest.tiles)
+
+
+def test_a_pattern_that_ends_in_a_dollar_lets_a_line_break_through() -> None:
+    """The control: why the patterns of the formats end otherwise."""
+    loose = Annotated[str, msgspec.Meta(pattern=NAME_PATTERN)]
+    assert msgspec.json.decode(b'"hall\\n"', type=loose) == "hall\n"
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.json.decode(b'"hall\\n"', type=Name)
+    head = {"site": "hall\n", "version": 1, "blobs": []}
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.json.decode(msgspec.json.encode(head), type=ExportHead)

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
+from fleetmap.errors import StoreError
 from fleetmap.mapformat import TILE_FORMAT, blob_path, decode_manifest, decode_tile, sha256_hex
 from fleetmap.messages import RobotAck, RobotHealth
+from mapserver.api import app as app_module
+from mapserver.api import body_limit
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.api.version_routes import ApiSettings
@@ -160,6 +163,57 @@ def test_service_endpoints(server: Server) -> None:
     assert server.client.get("/version").json()["tile_format"] == TILE_FORMAT
     server.bus.close()
     check_problem(server.client.get("/readyz"), 503, "bus")
+
+
+def test_readyz_says_when_reports_cannot_be_stored(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise StoreError("no space left on device")
+
+    server.fleet.take_health("lab", "r1", RobotHealth(site="lab", robot="r1", stamp_ns=1, version=1, status="LOST"))
+    with monkeypatch.context() as full:
+        full.setattr(server.store.fleet, "add", refuse)
+        with pytest.raises(StoreError):
+            server.fleet.flush()
+        check_problem(server.client.get("/readyz"), 503, "no space left on device")
+    server.fleet.flush()
+    assert server.client.get("/readyz").status_code == 200
+    with monkeypatch.context() as full:
+        full.setattr(server.store, "record_robot_report", refuse)
+        server.fleet.flush()  # nothing to write says nothing
+        with pytest.raises(StoreError):
+            server.fleet.take_ack("lab", "r1", RobotAck(site="lab", robot="r1", stamp_ns=1, version=1))
+        server.fleet.flush()
+        check_problem(server.client.get("/readyz"), 503, "cannot be stored")
+
+
+def test_a_page_of_robots_has_a_bounded_size(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    metrics = {f"m{n}": "x" * 2000 for n in range(25)}
+    for number in range(120):
+        name = f"r{number:03d}"
+        report = RobotHealth(site="lab", robot=name, stamp_ns=1, version=1, status="LOST", metrics=metrics)
+        server.fleet.take_health("lab", name, report)
+    names, cursor, pages = [], "", 0
+    while cursor is not None:
+        answer = server.client.get("/v1/robots?limit=1000" + (f"&cursor={cursor}" if cursor else ""))
+        assert len(answer.content) < 4_500_000
+        names += [robot["robot"] for robot in answer.json()["robots"]]
+        cursor, pages = answer.json()["next"], pages + 1
+    assert names == [f"r{number:03d}" for number in range(120)]
+    assert pages == 2
+    monkeypatch.setattr(app_module, "_MAX_PAGE_BYTES", 1 << 40)
+    assert len(server.client.get("/v1/robots?limit=1000").content) > 6_000_000, "the control"
+
+
+def test_a_body_is_measured_before_it_is_read(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    address, content = "/v1/sites/lab/rollback", b" " * 2_000_000 + b"{"
+    check_problem(server.client.post(address, content=content), 413, "1048576 bytes")
+
+    def pieces() -> Iterator[bytes]:
+        yield from (b" " * 100_000 for _ in range(20))
+
+    check_problem(server.client.post(address, content=pieces()), 413, "1048576 bytes")
+    monkeypatch.setattr(body_limit, "MAX_BODY_BYTES", 1 << 40)
+    assert server.client.post(address, content=content).status_code == 422, "the control: it is read, and is no JSON"
 
 
 def test_metrics(server: Server) -> None:

@@ -23,7 +23,7 @@ def failure(number: int, **changes: object) -> FailureReport:
         FailureReport(
             site="lab", robot="r1", id=f"f{number}", stamp_ns=5, wall_ns=time.time_ns(), duration_s=2.5, kind="blind",
             status="LOST", cause="dark", version=1, tile=(0, 0),
-            thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"\xff\xd8picture"),),
+            thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"\xff\xd8picture\xff\xd9"),),
         ),
         **changes,
     )  # fmt: skip
@@ -49,7 +49,9 @@ def test_failures_are_found_by_what_they_are(server: Server) -> None:
     one = server.client.get("/v1/failures/2").json()
     assert (one["failure"]["cause"], one["report"]["id"], one["pictures"][0]["kind"]) == ("blur", "f2", "frame")
     picture = server.client.get("/v1/failures/2/pictures/0")
-    assert (picture.content, picture.headers["content-type"]) == (b"\xff\xd8picture", "image/jpeg")
+    assert (picture.content, picture.headers["content-type"]) == (b"\xff\xd8picture\xff\xd9", "image/jpeg")
+    assert picture.headers["content-security-policy"] == "default-src 'none'; sandbox"
+    assert picture.headers["x-content-type-options"] == "nosniff"
     check_problem(server.client.get("/v1/failures/9"), 404, "no failure 9")
     check_problem(server.client.get("/v1/failures/2/pictures/7"), 404, "no picture 7")
 

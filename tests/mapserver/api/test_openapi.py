@@ -25,7 +25,7 @@ FAILURE = FailureReport(
     site="hall", robot="r1", id="f1", stamp_ns=5, wall_ns=6, duration_s=2.5, kind="blind", status="LOST", cause="dark",
     version=1, tile=(0, 0), innovation=float("nan"), radius_95_m=float("inf"),
     map_from_base=Placement(position_m=(float("nan"), 1.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0)),
-    thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"jpeg"),),
+    thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"\xff\xd8\xff\xd9"),),
 )  # fmt: skip
 
 

@@ -49,7 +49,7 @@ class Robot(threading.Thread):
                 report = FailureReport(
                     site="lab", robot=self._name, id=f"f{number}", stamp_ns=number, wall_ns=time.time_ns(), duration_s=3.0,
                     kind="blind", status="LOST", cause="dark", version=1, tile=(0, 0),
-                    thumbnails=(Thumbnail(stamp_ns=number, kind="frame", jpeg=bytes(20_000)),),
+                    thumbnails=(Thumbnail(stamp_ns=number, kind="frame", jpeg=b"\xff\xd8" + bytes(20_000) + b"\xff\xd9"),),
                 )  # fmt: skip
                 while (self._name, report.id) not in self._acknowledged:
                     try:

@@ -282,7 +282,7 @@ def test_a_report_that_cannot_be_read_is_refused_for_good_and_set_aside(world: W
     assert kept.read_bytes() == payload
     assert ack.refused in kept.with_suffix(".reason.txt").read_text()
     for number in range(120):
-        world.fleet.take_failure_bytes("lab", "r1", msgspec.msgpack.encode({"id": f"g-{number}"}))
+        world.fleet.take_failure_bytes("lab", f"r{number % 3}", msgspec.msgpack.encode({"id": f"g-{number}"}))
     assert len(list((world.folder / "refused").iterdir())) <= 200
     assert world.store.verify().faults == []
 
@@ -291,7 +291,7 @@ def test_bad_messages_are_counted_and_change_nothing(world: World, caplog: pytes
     bus = world.robot_bus
     bus.publish(robot_key("lab", "r1", "ack"), b"nonsense")
     stolen = RobotAck(site="lab", robot="r2", stamp_ns=1, version=1)
-    bus.publish(robot_key("lab", "r1", "ack"), encode_message(stolen))
+    bus.publish(robot_key("lab", "r3", "ack"), encode_message(stolen))
     bus.publish(
         robot_key("nowhere", "r1", "health"),
         encode_message(RobotHealth(site="nowhere", robot="r1", stamp_ns=1, version=None, status="LOST")),
@@ -301,6 +301,29 @@ def test_bad_messages_are_counted_and_change_nothing(world: World, caplog: pytes
     ]
     assert world.fleet.robots() == []
     assert "speaks for 'r2'" in caplog.text
+
+
+def test_reports_have_a_size_and_a_rate(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    def report(stamp_ns: int, words: dict[str, object]) -> bytes:
+        fields = {"site": "lab", "robot": "r1", "stamp_ns": stamp_ns, "version": 1, "status": "LOST", "metrics": words}
+        return msgspec.msgpack.encode(fields)
+
+    key = robot_key("lab", "r1", "health")
+    many = {f"m{n}": "x" * 1900 for n in range(10)}
+    for words in (many, {"one": "x" * 3000}):
+        world.robot_bus.publish(key, report(1, words))
+        assert world.counts[-1] == ("health", "refused", 0)
+    assert world.fleet.robots() == []
+    monkeypatch.setattr(bus_service, "MAX_REPORT_BYTES", 1 << 20)
+    world.robot_bus.publish(key, report(1, many))
+    assert world.counts[-1] == ("health", "ok", 0), "the control"
+    for number in range(100):
+        world.robot_bus.publish(key, report(number, {}))
+    assert [event for event in world.counts if event[:2] == ("health", "dropped")]
+    taken = len([event for event in world.counts if event == ("health", "ok", 0)])
+    assert 15 <= taken <= 25
+    world.robot_bus.publish(robot_key("lab", "r2", "health"), report(1, {}).replace(b"r1", b"r2"))
+    assert world.counts[-1] == ("health", "ok", 0), "another robot has a rate of its own"
 
 
 def test_presence_and_names(world: World) -> None:

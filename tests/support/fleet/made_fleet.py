@@ -115,7 +115,7 @@ class MadeRobot:
             status="LOST" if kind == "blind" else "TRACKING", cause=self._cause, version=self.version, tile=self._place[0],
             map_from_base=Placement(position_m=(self._place[1], 1.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0)),
             innovation=30.0, inliers=12, fixes=(FixNote(stamp_ns=begun_ns, status="TRACKING", inliers=40),),
-            thumbnails=(Thumbnail(stamp_ns=begun_ns, kind="frame", jpeg=b"\xff\xd8 not quite a picture"),),
+            thumbnails=(Thumbnail(stamp_ns=begun_ns, kind="frame", jpeg=b"\xff\xd8 not quite a picture \xff\xd9"),),
         )  # fmt: skip
 
     def _estimate(self, stamp_ns: int, dt_s: float) -> PoseMessage:

@@ -1,0 +1,39 @@
+"""Token buckets: how often something may happen for each of many keys."""
+
+import threading
+from collections.abc import Callable, Hashable
+
+_MAX_KEYS = 20_000
+
+
+class RateLimit:
+    """`burst` at once for each key, then `per_s` in a second; methods may be called from any thread.
+
+    Keys whose bucket is full again are forgotten; of more keys than that none is admitted.
+    """
+
+    def __init__(self, burst: float, per_s: float, clock_ns: Callable[[], int]) -> None:
+        self._burst, self._per_ns, self._clock_ns = burst, per_s * 1e-9, clock_ns
+        self._lock = threading.Lock()
+        self._buckets: dict[Hashable, tuple[float, int]] = {}
+
+    def admits(self, key: Hashable) -> bool:
+        """Whether it may happen now; counts it if so."""
+        now_ns = self._clock_ns()
+        with self._lock:
+            if key not in self._buckets and len(self._buckets) >= _MAX_KEYS:
+                self._forget(now_ns)
+                if len(self._buckets) >= _MAX_KEYS:
+                    return False
+            level, then_ns = self._buckets.get(key, (self._burst, now_ns))
+            level = min(self._burst, level + max(0, now_ns - then_ns) * self._per_ns)
+            self._buckets[key] = (max(0.0, level - 1.0) if level >= 1.0 else level, now_ns)
+            return level >= 1.0
+
+    def _forget(self, now_ns: int) -> None:
+        """Without a key a bucket is full: those that are full again need none."""
+        self._buckets = {
+            key: (level, then_ns)
+            for key, (level, then_ns) in self._buckets.items()
+            if level + (now_ns - then_ns) * self._per_ns < self._burst
+        }

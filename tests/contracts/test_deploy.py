@@ -1,0 +1,66 @@
+"""What is deployed: a file and no name of an index, rights for one user, memory that ends; pickles in one module alone. Rows 28, 31, 32."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from support.fleet.contracts_documents import REPOSITORY
+
+UNITS = sorted((REPOSITORY / "deploy").glob("*.service"))
+TEXTS = [path for path in REPOSITORY.rglob("*.md") if ".venv" not in path.parts]
+PACKAGES = [REPOSITORY / "shared", REPOSITORY / "mapserver", REPOSITORY / "locclient"]
+BY_NAME = re.compile(r"pip install(?:\s+-\S+(?:\s+\S+)?)*\s+[\"']?fleetmap(?:\[|\s|\"|'|$)")
+
+
+def by_name(text: str) -> list[str]:
+    """Installations of the project by its bare name, which any index may give to somebody else."""
+    return [match[0] for match in BY_NAME.finditer(text)]
+
+
+def test_a_bare_name_is_found() -> None:
+    assert by_name('/opt/fleetmap/bin/pip install "fleetmap[server]"')
+    assert by_name("pip install fleetmap")
+    assert not by_name("pip install '.[server,client,sim]'")
+    assert not by_name('pip install -c constraints.txt "./dist/fleetmap-0.1.0-py3-none-any.whl[server]"')
+
+
+@pytest.mark.parametrize("path", [*UNITS, *TEXTS], ids=lambda path: path.name)
+def test_nothing_says_to_install_the_project_by_its_name(path: Path) -> None:
+    assert by_name(path.read_text("utf-8")) == []
+
+
+def test_the_program_does_not_say_so_either() -> None:
+    found = {str(path): by_name(path.read_text("utf-8")) for folder in PACKAGES for path in folder.rglob("*.py")}
+    assert {path: words for path, words in found.items() if words} == {}
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda path: path.name)
+def test_units_keep_what_they_write_to_their_user(unit: Path) -> None:
+    settings = dict(line.split("=", 1) for line in unit.read_text("utf-8").splitlines() if re.match(r"\w+=", line))
+    assert settings["UMask"] == "0077"
+    assert settings["StateDirectoryMode"] == "0700"
+    assert settings["MemoryMax"]
+    assert settings["NoNewPrivileges"] == "yes"
+
+
+def opens_pickles(path: Path) -> bool:
+    """Whether a module imports what runs code where it is opened."""
+    names = {
+        name.name.partition(".")[0]
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.Import)
+        for name in node.names
+    } | {
+        (node.module or "").partition(".")[0]
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.ImportFrom)
+    }
+    return bool(names & {"pickle", "cloudpickle", "shelve", "marshal", "dill", "joblib"})
+
+
+def test_pickles_are_opened_in_one_module_alone() -> None:
+    found = [path.name for folder in PACKAGES for path in folder.rglob("*.py") if opens_pickles(path)]
+    assert found == ["worker.py"]
+    assert opens_pickles(Path(__file__).parents[1] / "support/storage/store_faults.py"), "the control"

@@ -1,0 +1,223 @@
+"""Nothing that robots send grows without bound: failures in rate, size and number, pictures in bytes, traces, robots. Rows 8, 9, 23."""
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from fleetmap.errors import LinkError, UsageError
+from fleetmap.messages import FailureReport, RobotHealth, Thumbnail, encode_message
+from mapserver import releases
+from mapserver.fleet import fleet as fleet_module
+from mapserver.fleet.fleet import MAX_FAILURE_BYTES, Fleet
+from mapserver.fleet.ingest import IngestSettings
+from mapserver.fleet.rate_limit import RateLimit
+from mapserver.store import Actor, FailureFilter, MapStore, Retention
+from support.fleet.contracts_documents import REPOSITORY
+from support.storage.map_samples import save_sample_draft
+
+SECOND_NS = 10**9
+
+
+@dataclass
+class Clock:
+    now_ns: int = 10**18
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
+    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as made:
+        save_sample_draft(made)
+        releases.publish(made, "lab")
+        yield made
+
+
+@pytest.fixture
+def fleet(store: MapStore, clock: Clock) -> Fleet:
+    return Fleet(store, clock_ns=clock)
+
+
+def failure(clock: Clock, number: int, robot: str = "r1", jpeg: bytes = b"") -> FailureReport:
+    return FailureReport(
+        site="lab", robot=robot, id=f"f{number}", stamp_ns=1, wall_ns=clock.now_ns, duration_s=1.0, kind="blind", status="LOST",
+        cause="dark", version=1, thumbnails=(Thumbnail(stamp_ns=1, kind="frame", jpeg=jpeg),) if jpeg else (),
+    )  # fmt: skip
+
+
+def send(fleet: Fleet, clock: Clock, number: int, robot: str = "r1", jpeg: bytes = b"") -> bool:
+    """Whether it was taken; False for later."""
+    try:
+        ack = fleet.take_failure_bytes("lab", robot, encode_message(failure(clock, number, robot, jpeg)))
+    except LinkError as error:
+        assert str(error).startswith("later")
+        return False
+    assert ack.refused == ""
+    return True
+
+
+def test_failures_of_a_robot_come_at_a_rate(
+    fleet: Fleet, store: MapStore, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert [send(fleet, clock, number) for number in range(100)] == [True] * 60 + [False] * 40
+    assert send(fleet, clock, 0, "r2"), "another robot is not in its way"
+    clock.now_ns += 180 * SECOND_NS
+    assert [send(fleet, clock, number) for number in range(60, 65)] == [True] * 3 + [False] * 2
+    assert len(store.fleet.failures(FailureFilter(robot="r1"))) == 63
+    assert not (store.folder / "refused").exists(), "later is no refusal"
+    monkeypatch.setattr(fleet_module, "FAILURE_BURST", 1e9)
+    assert all(send(Fleet(store, clock_ns=clock), clock, number, "r3") for number in range(100)), "the control"
+
+
+def test_rates_forget_nobody_who_floods(clock: Clock) -> None:
+    limit = RateLimit(2, 1.0, clock)
+    assert [limit.admits("a") for _ in range(3)] == [True, True, False]
+    for number in range(19_999):
+        limit.admits(number)
+    assert not limit.admits("one more")
+    assert not limit.admits("a")
+    clock.now_ns += 3 * SECOND_NS
+    assert limit.admits("one more")
+    assert [limit.admits("a") for _ in range(3)] == [True, True, False]
+    clock.now_ns -= 100 * SECOND_NS  # a clock that is set back gives nothing
+    assert not limit.admits("a")
+
+
+def test_a_failure_has_a_size(fleet: Fleet, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    large = msgspec.msgpack.encode({**msgspec.to_builtins(failure(clock, 1)), "more": "x" * MAX_FAILURE_BYTES})
+    assert "the limit is" in fleet.take_failure_bytes("lab", "r1", large).refused
+    monkeypatch.setattr(fleet_module, "MAX_FAILURE_BYTES", 1 << 30)
+    assert fleet.take_failure_bytes("lab", "r1", large).refused == "", "the control"
+
+
+@pytest.mark.parametrize(
+    "jpeg",
+    [b"<html><script>alert(1)</script>", b"<svg/>", b"\x89PNG", b"\xff\xd8 cut"],
+)
+def test_pictures_that_are_none_are_refused(fleet: Fleet, store: MapStore, clock: Clock, jpeg: bytes) -> None:
+    ack = fleet.take_failure_bytes("lab", "r1", encode_message(failure(clock, 1, jpeg=jpeg)))
+    assert "does not begin and end as a JPEG" in ack.refused
+    assert store.fleet.failures(FailureFilter()) == []
+    store.fleet.add_failure(failure(clock, 1, jpeg=jpeg), (1, 1), {})
+    assert store.fleet.picture(1, 0) == jpeg, "the control: the store itself gives back what it was given"
+
+
+def test_pictures_have_a_bound_at_once(store: MapStore, clock: Clock) -> None:
+    picture = b"\xff\xd8" + bytes(10_000) + b"\xff\xd9"
+    fleet = Fleet(store, clock_ns=clock, settings=IngestSettings(picture_bytes=100_000))
+    for number in range(50):
+        assert send(fleet, clock, number, jpeg=picture)
+        kept = store._transactions.query("SELECT sum(length(jpeg)) size, max(number) last FROM failure_pictures")[0]
+        assert kept["size"] <= 100_000
+        assert kept["last"] == number + 1, "the oldest go"
+    assert len(store.fleet.failures(FailureFilter())) == 50
+    other = Fleet(store, clock_ns=clock)
+    assert all(send(other, clock, number, "r2", picture) for number in range(50))
+    assert store._transactions.query("SELECT sum(length(jpeg)) size FROM failure_pictures")[0]["size"] > 500_000, (
+        "the control"
+    )
+    again = Fleet(store, clock_ns=clock, settings=IngestSettings(picture_bytes=100_000))
+    send(again, clock, 0, "r3", picture)
+    assert store._transactions.query("SELECT sum(length(jpeg)) size FROM failure_pictures")[0]["size"] <= 100_000
+
+
+def test_failures_of_a_robot_have_a_number(store: MapStore, clock: Clock) -> None:
+    fleet = Fleet(store, clock_ns=clock, settings=IngestSettings(failures_per_robot=20))
+    send(fleet, clock, 0, "calm")
+    for number in range(50):
+        assert send(fleet, clock, number)
+    assert [row.failure_id for row in store.fleet.failures(FailureFilter(robot="r1"))] == [
+        f"f{n}" for n in range(49, 29, -1)
+    ]
+    assert len(store.fleet.failures(FailureFilter(robot="calm"))) == 1
+    counted = store.fleet.counters("lab", "robot")
+    assert counted["lab", "r1"].failures == 50, "the counts stay"
+
+
+def test_a_status_that_changes_all_the_time_makes_a_trace_a_second(store: MapStore, fleet: Fleet, clock: Clock) -> None:
+    begun_ns = clock.now_ns
+    for number in range(400):
+        clock.now_ns = begun_ns + number * SECOND_NS // 20
+        status = ("LOST", "TRACKING")[number % 2]
+        fleet.take_health(
+            "lab", "r1", RobotHealth(site="lab", robot="r1", stamp_ns=clock.now_ns, version=1, status=status)
+        )
+    fleet.flush()
+    assert 15 <= len(store.fleet.trace("lab", "r1")) <= 22, "in 20 s; 400 without the bound"
+
+
+def test_a_robot_that_is_removed_is_forgotten(store: MapStore, fleet: Fleet, clock: Clock) -> None:
+    for robot in ("r1", "r2"):
+        fleet.take_health("lab", robot, RobotHealth(site="lab", robot=robot, stamp_ns=1, version=1, status="LOST"))
+    fleet.flush()
+    fleet.take_question("lab", "asked")
+    fleet.take_presence([])
+    assert fleet.known_robots("lab") == ["asked", "r1", "r2"]
+    assert store.remove_robots("lab", ["r2", "nobody"], actor=Actor("ada", "sold")) == ["r2"]
+    fleet.take_presence([])
+    assert fleet.known_robots("lab") == ["asked", "r1"]
+    assert [robot.robot for robot in store.robots("lab")] == ["r1"]
+    event = store.events("lab")[-1]
+    assert (event.kind, event.detail, event.actor, event.reason) == ("robot removed", "r2", "ada", "sold")
+    clock.now_ns += 3600 * SECOND_NS
+    fleet.take_presence([("lab", "asked")])
+    assert fleet.known_robots("lab") == ["asked", "r1"]
+    fleet.take_presence([])
+    assert fleet.known_robots("lab") == ["r1"], "a name that only asked is not kept for ever"
+    fleet.take_health("lab", "r2", RobotHealth(site="lab", robot="r2", stamp_ns=2, version=1, status="LOST"))
+    assert fleet.known_robots("lab") == ["r1", "r2"]
+    with pytest.raises(UsageError, match="no site"):
+        store.remove_robots("other", ["r1"])
+
+
+def test_the_database_shrinks_again(tmp_path: Path, clock: Clock) -> None:
+    picture = b"\xff\xd8" + bytes(60_000) + b"\xff\xd9"
+    root = tmp_path / "store"
+
+    def pages() -> int:
+        return sum(path.stat().st_size for path in root.glob("store.sqlite3")) // 4096
+
+    with MapStore.open(root, create=True, clock_ns=clock) as store:
+        save_sample_draft(store)
+        releases.publish(store, "lab")
+        fleet = Fleet(store, clock_ns=clock, settings=IngestSettings(failure_days=1.0))
+        for number in range(50):
+            assert send(fleet, clock, number, jpeg=picture)
+    full = pages()
+    assert full > 700
+    clock.now_ns += 2 * 86_400 * SECOND_NS
+    with MapStore.open(root, clock_ns=clock) as store:
+        store._transactions.shrink = lambda _: None  # type: ignore[method-assign]  # the control
+        Fleet(store, clock_ns=clock, settings=IngestSettings(failure_days=1.0)).prune()
+    assert pages() >= full
+    with MapStore.open(root, clock_ns=clock) as store:
+        Fleet(store, clock_ns=clock).prune()
+    assert pages() < full / 4
+
+
+def test_an_older_database_shrinks_after_gc(tmp_path: Path) -> None:
+    """It was made without the setting, as all before this version: gc writes it anew, once."""
+    golden = REPOSITORY / "tests" / "golden"
+    newest = sorted(golden.glob("store-*.sqlite3"))[-1]
+    root = tmp_path / "store"
+    root.mkdir()
+    shutil.copy(newest, root / "store.sqlite3")
+    shutil.copytree(golden / "store-blobs", root / "blobs")
+    with MapStore.open(root) as store:
+        before = store.versions("lab")
+        assert store._transactions.query("PRAGMA auto_vacuum") == [{"auto_vacuum": 0}]
+        store.collect_garbage(Retention(100, 100, 1e6))
+    with MapStore.open(root) as store:
+        assert store._transactions.query("PRAGMA auto_vacuum") == [{"auto_vacuum": 2}]
+        assert [info.version for info in store.versions("lab")] == [info.version for info in before]
+        assert store.verify().faults == []

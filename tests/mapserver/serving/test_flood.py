@@ -1,0 +1,222 @@
+"""One robot floods a running server, and strangers send it bodies without end: others are answered, memory and disk stay bounded.
+
+Rows 8 and J1 of docs/security.md. Every load ends after some seconds; the server is a process of its own on loopback.
+"""
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import count
+from pathlib import Path
+
+import httpx
+import msgspec
+import pytest
+
+from fleetmap.bus import ZenohBus
+from fleetmap.errors import LinkError
+from fleetmap.messages import (
+    FailureAck,
+    FailureReport,
+    RobotAck,
+    RobotHealth,
+    Thumbnail,
+    WantedVersion,
+    decode_message,
+    encode_message,
+    robot_key,
+)
+from mapserver import releases
+from mapserver.store import FailureFilter, MapStore
+from support.fleet.dashboard_scene import Served, serving
+from support.storage.map_samples import save_sample_draft
+
+SECONDS = float(os.environ.get("FLOOD_SECONDS", "3"))
+TOKEN = "a-token-of-many-signs"
+PICTURE = Thumbnail(stamp_ns=1, kind="frame", jpeg=b"\xff\xd8" + bytes(60_000) + b"\xff\xd9")
+FAILURE = FailureReport(
+    site="lab",
+    robot="flood",
+    id="f",
+    stamp_ns=1,
+    wall_ns=1,
+    duration_s=1.0,
+    kind="blind",
+    status="LOST",
+    cause="",
+    version=1,
+)
+
+
+def memory_mb(served: Served, name: str = "VmRSS") -> float:
+    lines = Path(f"/proc/{served.process}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(name)) / 1000
+
+
+def disk_mb(folder: Path) -> float:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("flood") / "store"
+    with MapStore.open(folder, create=True) as store:
+        save_sample_draft(store)
+        releases.publish(store, "lab")
+    token = folder.parent / "token"
+    token.write_text(TOKEN)
+    with serving(folder, "--token-file", str(token)) as made:
+        yield made
+
+
+def health(robot: str, status: str = "TRACKING", words: str = "") -> bytes:
+    metrics = {"words": words} if words else {}
+    return msgspec.msgpack.encode(
+        RobotHealth(site="lab", robot=robot, stamp_ns=time.time_ns(), version=1, status=status, metrics=metrics)
+    )
+
+
+@pytest.mark.parametrize("kind", ["puts", "large strings", "acks", "no messages", "questions", "failures"])
+def test_a_flood_of_reports_delays_nobody(served: Served, kind: str) -> None:
+    key = {"acks": "ack", "questions": "wanted", "failures": "failures"}.get(kind, "health")
+    payload = {
+        "puts": health("flood"),
+        "large strings": health("flood", words="x" * 900_000),
+        "acks": encode_message(RobotAck(site="lab", robot="flood", stamp_ns=1, version=1)),
+        "no messages": b"nonsense",
+        "questions": b"",
+        "failures": b"",
+    }[kind]
+    calm = f"calm-{kind.replace(' ', '-')}"
+    before_mb, before_disk_mb = memory_mb(served), disk_mb(served.folder)
+    ended, sent, waits, numbers = threading.Event(), [0], [], count()
+    with ZenohBus.connect(served.zenoh) as evil, ZenohBus.connect(served.zenoh) as bus:
+        decode_message(bus.get(robot_key("lab", calm, "wanted")), WantedVersion)
+
+        def ask(key: str, payload: bytes) -> None:
+            """Does not wait for an answer."""
+            if kind == "failures":
+                another = msgspec.structs.replace(FAILURE, id=f"n{next(numbers)}", thumbnails=(PICTURE,) * 4)
+                payload = encode_message(another)
+            evil._session.get(key, lambda _: None, payload=payload, timeout=10.0)
+
+        send = ask if key in ("wanted", "failures") else evil.publish
+
+        def flood() -> None:
+            while not ended.is_set():
+                for _ in range(20):
+                    send(robot_key("lab", "flood", key), payload)
+                sent[0] += 20
+                time.sleep(0.002)
+
+        thread = threading.Thread(target=flood)
+        thread.start()
+        try:
+            until_s = time.monotonic() + SECONDS
+            while time.monotonic() < until_s:
+                begun_s = time.monotonic()
+                decode_message(bus.get(robot_key("lab", calm, "wanted"), timeout_s=5.0), WantedVersion)
+                report = msgspec.structs.replace(FAILURE, robot=calm, id=f"{kind.replace(' ', '-')}-{len(waits)}")
+                ack = decode_message(
+                    bus.get(robot_key("lab", calm, "failures"), encode_message(report), timeout_s=5.0), FailureAck
+                )
+                assert ack.refused == ""
+                waits.append(time.monotonic() - begun_s)
+                time.sleep(max(0.4, SECONDS / 40))
+        finally:
+            ended.set()
+            thread.join()
+    time.sleep(1.0)
+    more_mb, more_disk_mb = memory_mb(served) - before_mb, disk_mb(served.folder) - before_disk_mb
+    print(f"{kind}: {sent[0]} sent, waits {max(waits):.3f} s, memory {more_mb:+.0f} MB, disk {more_disk_mb:+.1f} MB")
+    assert sent[0] > 100
+    assert len(waits) >= 3
+    assert max(waits) < 1.0
+    assert more_mb < 50
+    assert more_disk_mb < (50 if kind == "failures" else 10), (
+        "60 failures with their pictures, in the database and in its log"
+    )
+
+
+def test_a_flood_of_failures_is_taken_slowly_and_refused_for_none(served: Served) -> None:
+    """60 at once, then one a minute; what waits is no refusal, so that the robot keeps it."""
+    before_mb, before_disk_mb = memory_mb(served), disk_mb(served.folder)
+    taken, later = 0, 0
+    with ZenohBus.connect(served.zenoh) as evil, ZenohBus.connect(served.zenoh) as bus:
+        for number in range(300):
+            report = msgspec.structs.replace(FAILURE, robot="tug-9", id=f"f{number}", thumbnails=(PICTURE,) * 4)
+            try:
+                evil.get(robot_key("lab", "tug-9", "failures"), encode_message(report))
+                taken += 1
+            except LinkError as error:
+                assert "later" in str(error)
+                later += 1
+        report = msgspec.structs.replace(FAILURE, robot="honest")
+        ack = decode_message(bus.get(robot_key("lab", "honest", "failures"), encode_message(report)), FailureAck)
+        assert ack == FailureAck(id="f")
+    assert 60 <= taken <= 62
+    assert later == 300 - taken
+    assert disk_mb(served.folder) - before_disk_mb < 2 * 60 * 0.26 + 10, "once in the database, once in its log"
+    assert memory_mb(served) - before_mb < 50
+    with MapStore.open(served.folder) as store:
+        assert len(store.fleet.failures(FailureFilter(robot="tug-9"))) == taken
+
+
+BODY_MB = 300
+
+
+def post(served: Served, head: str, pieces: int) -> tuple[bytes, int]:
+    """The first line of the answer, and how many MB of the body the server took before it closed the connection."""
+    host, port = served.http.removeprefix("http://").split(":")
+    sent = 0
+    with socket.create_connection((host, int(port)), timeout=20) as connection:
+        connection.sendall(f"POST /v1/sites/lab/rollback HTTP/1.1\r\nHost: {host}\r\n{head}\r\n\r\n".encode())
+        piece = bytes(1_000_000)
+        with suppress(OSError):
+            for _ in range(pieces):
+                connection.sendall(b"f4240\r\n" + piece + b"\r\n" if "chunked" in head else piece)
+                sent += 1
+        try:
+            answer = connection.recv(4096)
+        except OSError:
+            answer = b""
+    return answer.split(b"\r\n")[0], sent
+
+
+@pytest.mark.parametrize("token", ["", f"Authorization: Bearer {TOKEN}\r\n"], ids=["without token", "with token"])
+@pytest.mark.parametrize("how", [f"Content-Length: {BODY_MB}000000", "Transfer-Encoding: chunked"])
+def test_a_body_of_300_mb_is_not_read(served: Served, token: str, how: str) -> None:
+    before_mb = memory_mb(served)
+    answer, sent = post(served, f"{token}Content-Type: application/json\r\n{how}", BODY_MB)
+    print(f"{how}: {answer!r}, {sent} MB were sent, memory {memory_mb(served) - before_mb:+.1f} MB")
+    assert answer == b"" or b" 413 " in answer, "nothing where the connection was closed while we sent"
+    assert sent < BODY_MB
+    assert memory_mb(served) - before_mb < 5
+    answer, _ = post(served, f"{token}Content-Type: application/json\r\n{how}", 0 if "Length" in how else 2)
+    assert b" 413 " in answer
+    assert httpx.get(f"{served.http}/healthz").status_code == 200
+    # A body within the limit is read, and refused for what it is.
+    headers = {"Authorization": f"Bearer {TOKEN}"} if token else {}
+    small = httpx.post(f"{served.http}/v1/sites/lab/rollback", content=b"[" * 900_000, headers=headers)
+    assert small.status_code in (401, 422)
+
+
+def test_the_pages_are_limited_too(served: Served) -> None:
+    address = f"{served.http}/dashboard/_nicegui_ws/socket.io/?EIO=4&transport=polling"
+    assert httpx.post(address, content=bytes(2 << 20)).status_code == 413
+
+
+def test_a_key_of_the_bus_writes_no_line_of_its_own(served: Served) -> None:
+    """Row 22 of docs/security.md, with the program as it runs."""
+    forged = "2026-11-22 00:00:00,000 INFO mapserver: ada promoted version 9 "
+    with ZenohBus.connect(served.zenoh) as evil:
+        decode_message(evil.get(robot_key("lab", "r1", "wanted")), WantedVersion)
+        evil.publish(f"fleetmap/lab/robots/x\n{forged}/health", b"nonsense")
+        until_s = time.monotonic() + 10
+        while "ada promoted" not in (log := (served.folder / "server.log").read_text()) and time.monotonic() < until_s:
+            time.sleep(0.05)
+    assert f"x\\n{forged}" in log
+    assert not any(line.startswith(forged.strip()) for line in log.splitlines())
