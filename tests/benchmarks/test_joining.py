@@ -55,3 +55,4 @@ def test_no_foreign_session_is_joined_and_nearly_all_true_ones_are(tmp_path: Pat
     assert found["true"]["of"] >= 170
     assert found["true"]["share"] >= 0.97
     assert found["misplaced"]["count"] == 0
+    assert found["opposite direction"]["foreign"] == 0

@@ -213,6 +213,13 @@ class JoinTest:
             )
         chosen = _with_rival(near[0] if len(alike) > 1 else best, rival_share)
         if chosen.priors_off_m is not None and chosen.priors_off_m >= _PRIOR_M:
+            if contradicts(chosen.seen):
+                return NotJoined(
+                    f"it was not found where its docks are, and the place that is most like it, {chosen.priors_off_m:.1f} m from there, is "
+                    f"not its own: of {chosen.seen.cells} parts of the map that it should see there it sees {chosen.seen.seen}; drive a "
+                    "longer way through places that are in the map, the same way round, or build it as another --site",
+                    evidence=self.evidence(chosen, chosen.seen),
+                )
             return NotJoined(
                 f"its docks and what it sees name places {chosen.priors_off_m:.1f} m apart: correct the docks' positions, or leave "
                 "them out",

@@ -108,6 +108,13 @@ def test_docks_that_contradict_what_is_seen_hold_a_session() -> None:
     assert "docks" in held.reason
 
 
+def test_docks_are_not_doubted_because_some_other_place_is_a_little_like_it() -> None:
+    said, held = verdict(join_test(KNOWN, shared_above(1.2), PLACES, docks(8.0)))
+    assert said is JoinVerdict.UNDECIDED
+    assert isinstance(held, NotJoined)
+    assert "not found where its docks are" in held.reason
+
+
 def test_aisles_that_look_the_same_hold_a_session_until_a_dock_tells_them_apart() -> None:
     twin = aisle(1, y_m=30.0)
     both = Aisle(
