@@ -25,7 +25,7 @@ from mapserver.survey.bundle.odometry_factors import chain_edges
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import session_relocalization
 from mapserver.survey.merge.join_test import JoinTest, Visit
-from mapserver.survey.odometry_pass import _Trajectory, continued_covariances
+from mapserver.survey.odometry_pass import FrameChain, continued_covariances
 
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 RATE_HZ = 7.5
@@ -136,7 +136,7 @@ def session(site: Site, day: int, route: Route, name: str, robot: str = "surveyo
 
 def drive(run: EstimatorSession) -> Drive:
     """The session as its odometry and features show it, a keyframe each 0.4 m or 0.2 rad."""
-    trajectory = _Trajectory()
+    trajectory = FrameChain()
     for estimate in run_odometry(run):
         trajectory.append(estimate)
     placed = trajectory.odom_from_body()
