@@ -85,6 +85,11 @@ def test_standing_starts_by_night(name: str, work: Path, tmp_path: Path) -> None
 
 
 def test_wrong_calibrations(work: Path, tmp_path: Path) -> None:
-    """Every fault is found within 30 s or costs at most 3 cm, and the good robot is not found fault with."""
+    """Nothing beyond 3 cm goes out as TRACKING unless the covariance says so, and what is named is what is wrong."""
     found = results(tmp_path, "bench_calibration_watch.py", "--work", work)["faults"]
     assert [fault["fault"] for fault in found if not fault["is_right"]] == []
+
+
+def test_good_calibrations(work: Path, tmp_path: Path) -> None:
+    starts = results(tmp_path, "bench_calibration_watch.py", "--good", "12", "--work", work)["good"]
+    assert [start["begin"] for start in starts if not start["is_right"]] == []

@@ -44,6 +44,7 @@ _FEW = 10  # views, before which they are taken more often
 # Of a parameter's floor: what a view shares with its neighbours, which few views do not show by their scatter.
 _LOCAL_FLOORS = 2.0
 _MAP_TILT_SIGMA_RAD = 0.05  # of a map whose survey had no IMU: it is levelled by its cameras
+_GRAVITY_MPS2, _UNHELD_S = 9.81, 0.9  # the age of a fix, beyond which no pose is TRACKING
 _PRIOR_SIGMA = 10.0  # of a parameter: none, but what nothing shows must not make the equations singular
 _JUDGED_SIGMA_SHARE = 0.5  # a parameter known no better than this share of the prior was not judged
 
@@ -237,11 +238,29 @@ def _state(views: Sequence[_View], value: Array, sigma: Array) -> CalibrationSta
     wrong = [drift for drift in drifts if drift.is_drifted]
     cov_bias = max((_cov_bias(shifts[at], value, sigma) for at in (slice(None), slice(-1, None))), key=_squared_m)
     if not wrong:
+        cov_bias += np.diag([0.0] * 3 + [_in_bends_m(_tilt_in_doubt(views, value, sigma)) ** 2] * 3)
         is_excluded = _squared_m(cov_bias) <= BIAS_LIMIT_M**2
         return CalibrationState(tuple(drifts), None if is_excluded else cov_bias)
     wrong.sort(key=lambda drift: (-drift.bias_m, -abs(drift.value) / drift.sigma))
     text = "; ".join(drift.text for drift in wrong)
     return CalibrationState(tuple(drifts), cov_bias + _cov_elsewhere(value, sigma), text)
+
+
+def _tilt_in_doubt(views: Sequence[_View], value: Array, sigma: Array) -> float:
+    """The turn of the cameras about the body's x or y, rad, that gravity shows unless the map is tilted; 0 where turns have excluded it."""
+    information = sum((view.information[TILT, TILT] for view in views), 1e-9 * np.eye(2))
+    covariance = np.linalg.inv(information)
+    in_level_map = np.abs(covariance @ sum(view.score[TILT] for view in views))
+    floor, limit = np.array([(PARAMETERS[k].floor, PARAMETERS[k].limit) for k in range(TILT.start, TILT.stop)]).T
+    common = floor * np.sqrt(1.0 + _LOCAL_FLOORS**2 / len(views))
+    is_odd = in_level_map > np.maximum(limit, DRIFT_SIGMAS * np.hypot(np.sqrt(np.diag(covariance)), common))
+    is_open = np.abs(value[TILT]) + 2.0 * sigma[TILT] > limit
+    return float(np.max(in_level_map, where=is_odd & is_open, initial=0.0))
+
+
+def _in_bends_m(tilt_rad: float) -> float:
+    """Error of odometry since a fix, after a bend in which gravity and the accelerometer's bias, which hid a tilt, come apart."""
+    return 0.5 * _GRAVITY_MPS2 * tilt_rad * _UNHELD_S**2
 
 
 def _squared_m(covariance: Array) -> float:
@@ -262,5 +281,6 @@ def _cov_elsewhere(value: Array, sigma: Array) -> Array:
     share = value[:IMAGE] / np.array([parameter.limit for parameter in PARAMETERS[:IMAGE]])
     of_mount = np.where(np.isfinite(sigma[IMAGE:]), value[IMAGE:], 0.0)
     squared = [float((of_mount[:3] ** 2).sum())] * 3
-    squared += [float((share**2).sum()) * BIAS_LIMIT_M**2 + float(of_mount[3] ** 2)] * 3
+    in_bends_m = _in_bends_m(float(np.linalg.norm(of_mount[:2])))
+    squared += [float((share**2).sum()) * BIAS_LIMIT_M**2 + float(of_mount[3] ** 2) + in_bends_m**2] * 3
     return np.diag(squared)

@@ -27,10 +27,10 @@ NO_IMAGE = np.zeros((480, 640), np.uint8)
 LEVEL = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # map_from_cam of a camera that looks along the map's x
 
 
-def look(number: int, parameters: Array, turn: Array | None = None) -> MapQuery:
+def look(number: int, parameters: Array, turn: Array | None = None, yaw_rad: float = 0.2) -> MapQuery:
     """The fix of one frame, a metre after the one before, by cameras whose true parameters differ so much from the calibration."""
     matched, map_from_cam, _ = seen_with(parameters, 1000 + number)
-    level = se3(so3_exp(np.array([0, 0, 0.2 * number])) @ LEVEL, np.array([1.1 * number, 0.0, 0.4]))
+    level = se3(so3_exp(np.array([0, 0, yaw_rad * number])) @ LEVEL, np.array([1.1 * number, 0.0, 0.4]))
     points_map = (matched.points_source - map_from_cam[:3, 3]) @ map_from_cam[:3, :3] @ level[:3, :3].T + level[:3, 3]
     ids = np.arange(120) + 60 * number  # half of what is seen was seen from the place before
     fix = Fix(level, np.diag([1e-6] * 3 + [1e-4] * 3), 120, 20, matched=replace(matched, points_source=points_map))
@@ -112,6 +112,21 @@ def test_turned_cameras_are_told_from_a_tilted_map() -> None:
     assert TILT.start == IMAGE
     assert said["camera_roll_deg"].is_drifted
     assert abs(np.degrees(said["camera_roll_deg"].value) - 2.0) < 0.6
+
+
+@pytest.mark.parametrize(("roll_deg", "is_held"), [(0.2, False), (1.2, True)])
+def test_a_tilt_that_a_straight_drive_does_not_explain_is_held_by_the_covariance(
+    roll_deg: float, is_held: bool
+) -> None:
+    watch = CalibrationWatch(RIG, StereoSettings())
+    turn = np.array([np.radians(roll_deg), 0.0, 0.0])
+    for number in range(25):
+        watch.handle(replace(look(number, parameters(), turn, yaw_rad=0.0), is_confirmed=True))
+    assert not watch.state.is_wrong  # the map may be tilted as well
+    assert (watch.state.cov_bias_cam is not None) == is_held
+    if watch.state.cov_bias_cam is not None:
+        in_bends_m = 0.5 * 9.81 * np.radians(roll_deg) * 0.9**2
+        assert np.sqrt(watch.state.cov_bias_cam[5, 5]) == pytest.approx(in_bends_m, rel=0.2)
 
 
 def published(watch: CalibrationMonitor, before: Estimate, last_fix_ns: int | None) -> Estimate:
