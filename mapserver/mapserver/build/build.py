@@ -60,6 +60,7 @@ from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.landmark_budget import choose_landmarks
 from mapserver.tiles.tiling import TILE_SIZE_M, tiles_from_survey
+from mapserver.trust.signing import check_base
 
 _NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled", "directions", "starts")
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fleetmap")
@@ -202,6 +203,7 @@ def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
             f"site {site} has version {current.version}, whose frame stays; build without --frame-from-ground-truth, "
             "or name another --site"
         )
+    check_base(maps, current)
     archive = maps.archive(site, current.version)
     if archive is None:
         raise StoreError(

@@ -1,12 +1,13 @@
 """When something is signed: after releases, at night, and every few hours, as far as the keys that this account can use go."""
 
 import logging
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
 
 from fleetmap.bus import is_loopback
-from fleetmap.errors import FleetmapError, UsageError
-from fleetmap.trust import AdmittedVersion, site_role
+from fleetmap.errors import FleetmapError, StateError, UsageError
+from fleetmap.trust import AdmittedVersion, SiteList, site_role
 from fleetmap.trust.site_list import VersionState
 from mapserver.store import MapStore, VersionInfo
 from mapserver.store.files import locked
@@ -97,6 +98,31 @@ def init_here(store: MapStore) -> None:
     update_lists(store)
 
 
+def check_base(store: MapStore, info: VersionInfo) -> None:
+    """Raises StateError where the database names other bytes for a version, its archive too, than the last signed list.
+
+    The next map is built on it: otherwise whoever writes into the database decides what is built.
+    """
+    lists = SignedLists(store.folder)
+    number = lists.newest(site_role(info.site)) if lists.are_there else 0
+    if number:
+        _check_unchanged(info.site, lists.site_list(info.site, number), [_entry(info, "current")])
+
+
+def _check_unchanged(site: str, last: SiteList, entries: Sequence[AdmittedVersion]) -> None:
+    """A version is never another one afterwards; only its archive may be removed."""
+    known = {entry.about.version: entry for entry in last.admitted}
+    for entry in entries:
+        before = known.get(entry.about.version, entry)
+        archives = {before.about.archive, entry.about.archive} - {None}
+        same = (before.sha256, before.length, before.about.vocabulary)
+        if same != (entry.sha256, entry.length, entry.about.vocabulary) or len(archives) > 1:
+            raise StateError(
+                f"the database names other bytes for version {entry.about.version} of site {site} than its signed list; "
+                "restore the database, or find out who wrote into it"
+            )
+
+
 def _entry(info: VersionInfo, state: str) -> AdmittedVersion:
     about = VersionState(
         version=info.version,
@@ -166,6 +192,9 @@ def _update_site(repository: "ListRepository", keys: KeyFolder, rows: SiteReleas
     site_key = keys.signer(role)
     if site_key is None:
         return
-    signed = repository.sign_site(rows.site, admitted_versions(rows, lists.site_roles()[role].previous), [site_key])
+    admitted = admitted_versions(rows, lists.site_roles()[role].previous)
+    if number := lists.newest(role):
+        _check_unchanged(rows.site, lists.site_list(rows.site, number), admitted)
+    signed = repository.sign_site(rows.site, admitted, [site_key])
     if repository.stage_site(rows.site, signed):
         _log.warning("the list of site %s waits for another signature: `mapserver trust sign %s`", rows.site, rows.site)

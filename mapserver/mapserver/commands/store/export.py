@@ -17,11 +17,15 @@ def export(
     without_archive: Annotated[
         bool, typer.Option("--without-archive", help="Leave out the data that only later surveys need.")
     ] = False,
+    with_trust: Annotated[
+        bool, typer.Option("--with-trust", help="Write FILE.trust beside it: the signed lists, for `import --root`.")
+    ] = False,
 ) -> None:
     """Write a version into FILE, which `mapserver import` takes into another store."""
     if file.is_dir() or not file.parent.is_dir():
         raise UsageError(f"{file}: name a file in a folder that exists")
     from mapserver.store import MapStore
+    from mapserver.trust.carried_lists import carry_lists
 
     with MapStore.open(store, read_only=True) as maps:
         if version is None:
@@ -29,5 +33,7 @@ def export(
             if current is None:
                 raise UsageError(f"site {site} has no current version; name one with --version")
             version = current.version
+        if with_trust:
+            carry_lists(maps.folder, site, file)
         size = maps.export_version(site, version, file, archive=not without_archive)
     typer.echo(f"site {site}: version {version} is in {file} ({size} bytes)")

@@ -182,7 +182,7 @@ def status(store: StoreFolder, json: Json = False) -> None:
     from mapserver.store import MapStore
     from mapserver.trust.status import trust_status
 
-    with MapStore.open(store) as maps:
+    with MapStore.open(store, read_only=True) as maps:
         found = trust_status(maps)
     if json:
         print_json(found)
