@@ -41,6 +41,8 @@ _WINDOW, _MIN_VIEWS, _MIN_CONFIRMED_VIEWS = 40, 2, 1
 # Views of the window's end that show a sudden change, and of what they are held against.
 _RECENT, _MIN_BEFORE = (4, 10), 6
 _FEW = 10  # views, before which they are taken more often
+# A stand: so slow for so long. Odometry that has begun in motion may take it for a stand, and what hides that for gravity.
+_STOOD_M, _STOOD_S = 0.03, 0.35
 # Of a parameter's floor: what a view shares with its neighbours, which few views do not show by their scatter.
 _LOCAL_FLOORS = 2.0
 _MAP_TILT_SIGMA_RAD = 0.05  # of a map whose survey had no IMU: it is levelled by its cameras
@@ -95,6 +97,8 @@ class CalibrationWatch:
         self._wheels = WheelTravel()
         self._last_map_from_cam: Array | None = None
         self._last_base: BasePose | None = None
+        self._stood_from: tuple[int, Array] | None = None  # the oldest look from so near
+        self._has_stood = False
         self.state = NOT_JUDGED
         self.has_confirmed = False  # whether a view of a confirmed pose was taken
 
@@ -105,6 +109,7 @@ class CalibrationWatch:
     def handle(self, query: MapQuery) -> None:
         """Takes a look at the map, where it is a new view."""
         fix, matched, frame = query.fix, query.fix.matched, query.frame
+        self._look_for_a_stand(query.odometry.stamp_ns, fix.map_from_cam[:3, 3])
         is_first = query.is_confirmed and not self.has_confirmed
         if matched is None or not (is_first or self._is_new(fix.map_from_cam)):
             return
@@ -146,6 +151,11 @@ class CalibrationWatch:
         step_m = _STEP_M if len(self._views) >= _FEW else _FIRST_STEP_M
         return moved_m > step_m or rotation_angle_rad(last[:3, :3].T @ map_from_cam[:3, :3]) > _STEP_RAD
 
+    def _look_for_a_stand(self, stamp_ns: int, place_m: Array) -> None:
+        if self._stood_from is None or np.linalg.norm(place_m - self._stood_from[1]) > _STOOD_M:
+            self._stood_from = stamp_ns, place_m
+        self._has_stood |= (stamp_ns - self._stood_from[0]) * 1e-9 >= _STOOD_S
+
     def _new_share(self, ids: frozenset[int]) -> float:
         """Share of landmarks that no view of the window has shown."""
         known = frozenset[int]().union(*(ids & view.ids for view in self._views))
@@ -153,7 +163,7 @@ class CalibrationWatch:
 
     def _add_mounting(self, query: MapQuery, information: Array, score: Array) -> None:
         fix, odometry = query.fix, query.odometry
-        if odometry.inertial:
+        if odometry.inertial and self._has_stood:
             jacobian, measured = mounting.tilt(fix, self._rig.cam_from_body, odometry)
             at = np.r_[TILT, COUNT : COUNT + 2]
             information[np.ix_(at, at)] += jacobian.T @ jacobian

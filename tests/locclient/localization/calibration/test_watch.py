@@ -101,8 +101,23 @@ def test_a_robot_that_stands_learns_nothing() -> None:
     assert not watch.state.drifts
 
 
+def stood(watch: CalibrationWatch) -> CalibrationWatch:
+    """The watch after half a second at the first place."""
+    first = look(0, parameters())
+    watch.handle(first)
+    watch.handle(replace(first, odometry=replace(first.odometry, stamp_ns=first.odometry.stamp_ns + 500_000_000)))
+    return watch
+
+
+def test_gravity_is_not_believed_before_the_robot_has_stood() -> None:
+    watch = CalibrationWatch(RIG, StereoSettings())
+    for number in range(30):
+        watch.handle(look(number, parameters(), np.radians([2.0, 0.0, 0.0])))
+    assert not watch.state.is_wrong
+
+
 def test_turned_cameras_are_told_from_a_tilted_map() -> None:
-    watch = CalibrationWatch(Mounting(np.eye(4), np.eye(4)), StereoSettings())
+    watch = stood(CalibrationWatch(RIG, StereoSettings()))
     turn = np.zeros(3)
     turn[0] = np.radians(2.0)
     for number in range(30):
@@ -118,7 +133,7 @@ def test_turned_cameras_are_told_from_a_tilted_map() -> None:
 def test_a_tilt_that_a_straight_drive_does_not_explain_is_held_by_the_covariance(
     roll_deg: float, is_held: bool
 ) -> None:
-    watch = CalibrationWatch(RIG, StereoSettings())
+    watch = stood(CalibrationWatch(RIG, StereoSettings()))
     turn = np.array([np.radians(roll_deg), 0.0, 0.0])
     for number in range(25):
         watch.handle(replace(look(number, parameters(), turn, yaw_rad=0.0), is_confirmed=True))
