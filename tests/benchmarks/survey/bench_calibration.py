@@ -129,9 +129,10 @@ def good(first_seed: int, count: int) -> dict[str, Any]:
     for name, stretch in judged_drives(first_seed, count):
         findings = judged(stretch, stretch.session.true, 0, {}).findings
         loud = [f"{name}: {f.name}: {f.sentence}" for f in findings if f.verdict in LOUD]
-        unknown.update(f.name for f in findings if f.verdict is Verdict.NOT_JUDGED)
+        lacking = [f.name for f in findings if f.verdict is Verdict.NOT_JUDGED]
+        unknown.update(lacking)
         alarms += [loud] if loud else []
-        print(json.dumps({"drive": name, "alarms": loud}), flush=True)
+        print(json.dumps({"drive": name, "alarms": loud, "not_judged": lacking}), flush=True)
     return {"drives": count, "false_alarms": len(alarms), "alarms": alarms, "not_judged": dict(unknown)}
 
 
