@@ -8,12 +8,12 @@ import msgspec
 from fleetmap.cli_options import Commands, Options, command_defaults, file_type
 from fleetmap.config import Section, read_given, refuse_internal
 from fleetmap.recordings import Topics
+from fleetmap.sources.source import SourceSection
 from locclient.daemon.publishers import OutputSection
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
 from locclient.maps.tile_selection import TileSelectionSettings
 from locclient.robot.version_trial import TrialSettings
-from locclient.sensors.source import SourceSection
 
 TIERS = {
     "user": {

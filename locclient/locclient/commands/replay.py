@@ -96,11 +96,11 @@ def _run(
 
     from fleetmap.recordings import FrameSelection, OpenOptions, open_recording
     from fleetmap.recordings.tum import write_tum
+    from fleetmap.sources.replay_source import ReplaySource
     from locclient.maps.connection import connected
     from locclient.prior_option import parse_prior
     from locclient.replay.replay import ReplayOptions
     from locclient.replay.replay import replay as play
-    from locclient.sensors.replay_source import ReplaySource
 
     prior = parse_prior(playback.prior, "--prior")
     selection = FrameSelection.parse(playback.frames)

@@ -13,6 +13,8 @@ from fleetmap.errors import LinkError, UsageError
 from fleetmap.mapformat import check_name
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sources.intake import Intake
+from fleetmap.sources.source import open_source
 from locclient.config import LocclientConfig, RunSection
 from locclient.daemon.publishers import Publisher, open_publisher
 from locclient.daemon.runtime import RuntimeParts
@@ -27,8 +29,6 @@ from locclient.prior_option import parse_prior
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.jit_warmup import gc_frozen, warm_up_kernels
 from locclient.robot.robot import Robot
-from locclient.sensors.intake import Intake
-from locclient.sensors.source import open_source
 
 _PATIENCE_S = 120.0  # in the middle of fetching a version; from the next part on it goes on where it was
 _log = logging.getLogger(__name__)

@@ -14,6 +14,8 @@ from fleetmap.recordings.images import decode_frame
 from fleetmap.sensors.calibration import RigCalibration, stereo_baseline_m
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
+from fleetmap.sources.intake import Intake
+from fleetmap.sources.source import Source, open_source
 from locclient.config import LocclientConfig
 from locclient.daemon.daemon import check_run, configured_outbox
 from locclient.delivery.outbox import Outbox
@@ -22,8 +24,6 @@ from locclient.maps.connection import cache_folder, trusted_map
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import LocalMapSource
 from locclient.maps.tile_cache import TileCache
-from locclient.sensors.intake import Intake
-from locclient.sensors.source import Source, open_source
 
 OK, WARN, FAIL = "ok", "warn", "fail"
 _ANSWER_S = 5.0

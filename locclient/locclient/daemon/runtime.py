@@ -12,6 +12,8 @@ from pathlib import Path
 
 from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.messages import RobotHealth, WantedVersion, encode_message
+from fleetmap.sources.intake import Intake
+from fleetmap.sources.source import Source
 from locclient.daemon.publishers import Publisher
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.systemd_notify import ServiceManager
@@ -24,8 +26,6 @@ from locclient.maps.tile_selection import Cell, PositionBound, PositionBoundTrac
 from locclient.robot.failure_report import RobotProfile, failure_report
 from locclient.robot.health_report import Figure, HealthFigures
 from locclient.robot.robot import FailureContext, Outcome, Robot
-from locclient.sensors.intake import Intake
-from locclient.sensors.source import Source
 
 _TAKE_S, _IDLE_S = 0.2, 0.1
 _HEALTH_EVERY_S, _POSE_EVERY_NS = 1.0, 500_000_000

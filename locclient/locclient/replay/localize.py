@@ -9,12 +9,12 @@ import cv2
 
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
 from fleetmap.sensors.samples import PositionPrior
+from fleetmap.sources.replay_source import ReplaySource
 from locclient.maps.connection import connected
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
 from locclient.replay.replay import ReplayOptions, load_map, replay
 from locclient.replay.run_result import ReplayResult
-from locclient.sensors.replay_source import ReplaySource
 
 _ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws|unixsock-stream)/")
 

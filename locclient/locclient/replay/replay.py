@@ -11,6 +11,8 @@ from fleetmap.errors import LinkError
 from fleetmap.geometry import Array, rotation_angle_rad
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import PositionPrior, SensorSet
+from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import MapConnection
 from locclient.maps.loaded_map import LoadedMap
@@ -21,9 +23,7 @@ from locclient.replay.run_result import ReplayResult
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.jit_warmup import gc_frozen
 from locclient.robot.robot import Outcome, Robot
-from locclient.robot.sensor_bundle import SensorBundle
 from locclient.robot.version_trial import TrialSettings
-from locclient.sensors.replay_source import ReplaySource
 
 TRUTH_FLAG = "frame_from_ground_truth"  # key of the configuration: the map lies in the frame of the recordings' truth
 

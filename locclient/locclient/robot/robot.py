@@ -11,6 +11,7 @@ from fleetmap.messages import Cause, PoseMessage, Status, WantedVersion
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
@@ -19,7 +20,6 @@ from locclient.robot.continuous_odom import ContinuousOdom, PublishedPose
 from locclient.robot.dock_check import DockCheck
 from locclient.robot.failure_monitor import Failure, FailureMonitor
 from locclient.robot.failure_onset import Evidence, Onset, OnsetRecorder, refined_cause
-from locclient.robot.sensor_bundle import SensorBundle
 from locclient.robot.speed import SpeedGauge
 from locclient.robot.version_trial import TrialSettings, TrialVerdict, VersionTrial
 

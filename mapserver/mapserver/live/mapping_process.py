@@ -4,6 +4,8 @@ import multiprocessing
 import queue
 import signal
 import threading
+import time
+from collections import deque
 from multiprocessing.connection import Connection
 from typing import NamedTuple, Self
 
@@ -36,7 +38,7 @@ class MapSketch(NamedTuple):
     refused: dict[str, int]
 
 
-_NOTHING = MapSketch(0, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 4)), 0, {})
+NO_SKETCH = MapSketch(0, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 4)), 0, {})
 
 
 class MappingProcess:
@@ -50,7 +52,9 @@ class MappingProcess:
         self._theirs = theirs
         self._waiting: queue.Queue[tuple[RectifiedFrame, NewKeyframe] | None] = queue.Queue()
         self._sent = 0
-        self._latest, self._failed = _NOTHING, ""
+        self._latest, self._failed = NO_SKETCH, ""
+        self._put_s: deque[float] = deque()
+        self.longest_lag_s = 0.0  # from a keyframe to the sketch that holds it
         self._threads = [threading.Thread(target=work, daemon=True) for work in (self._send, self._receive)]
 
     def __enter__(self) -> Self:
@@ -92,6 +96,7 @@ class MappingProcess:
             self._waiting.put(None)
             return
         self._sent += 1
+        self._put_s.append(time.monotonic())
         self._waiting.put((frame, keyframe))
 
     def finish(self) -> None:
@@ -121,6 +126,7 @@ class MappingProcess:
                     self._failed = answer
                     return
                 self._latest = answer
+                self.longest_lag_s = max(self.longest_lag_s, time.monotonic() - self._put_s.popleft())
         except (EOFError, OSError):
             self._failed = self._failed or "the mapping process ended; the finished map is built all the same"
 

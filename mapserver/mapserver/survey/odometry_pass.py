@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse
 from fleetmap.odometry import ContinuousFrame, OdometryEstimate, OdometryStatus, make_odometry
-from fleetmap.sensors.rectification import RectifiedFrame
-from fleetmap.sensors.samples import CameraFrame, wheel_between
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between
 from mapserver.survey.frame_tracks import FrameTracks
 from mapserver.survey.keyframes.keyframes import FrameSummary, Keyframe, KeyframePolicy, make_keyframes, sharpness
 from mapserver.survey.settings import SurveySettings
@@ -53,29 +54,35 @@ class TrackedFrame:
 
 
 class OdometryRun:
-    """Odometry of a recording, one frame after the other, with the choice of keyframes."""
+    """Odometry of a recording or of sensors, one frame after the other, with the choice of keyframes."""
 
-    def __init__(self, inputs: SurveyInputs, settings: SurveySettings) -> None:
-        rectifier = inputs.rectifier
+    def __init__(self, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings) -> None:
         mounting = rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s
-        self._inputs, self._rectifier = inputs, rectifier
-        self._odometry = make_odometry(inputs.calibration, *mounting, settings.odometry, settings.stereo)
+        self._odometry = make_odometry(calibration, *mounting, settings.odometry, settings.stereo)
         self._policy = KeyframePolicy(settings.keyframes)
-        self._fed_ns = -(2**62)
         self.chain = FrameChain()
 
-    def handle(self, raw: CameraFrame | RectifiedFrame) -> TrackedFrame:
-        """The next frame, with the IMU and the wheels up to it."""
-        inputs, rectifier, odometry = self._inputs, self._rectifier, self._odometry
-        frame = raw if isinstance(raw, RectifiedFrame) else rectifier.rectify(raw)
-        until_ns = raw.stamp_ns + int(rectifier.imu_minus_cam_s * 1e9) + _LEAD_NS
-        odometry.handle_imu(inputs.imu.between(self._fed_ns, until_ns))
-        odometry.handle_wheel(wheel_between(inputs.wheel, self._fed_ns, until_ns))
-        self._fed_ns = until_ns
-        estimate = odometry.handle_stereo(frame)
+    def handle(self, frame: RectifiedFrame, imu: ImuSamples, wheel: Sequence[WheelSample]) -> TrackedFrame:
+        """The next frame, with the samples of the IMU and the wheels up to it that were not given before."""
+        self._odometry.handle_imu(imu)
+        self._odometry.handle_wheel(wheel)
+        estimate = self._odometry.handle_stereo(frame)
         number, frame_from_body = len(self.chain.estimates), self.chain.append(estimate)
         wanted = self._policy.wants(_summary(frame, estimate, frame_from_body))
         return TrackedFrame(number, frame, estimate, frame_from_body, wanted)
+
+
+class SampleFeed:
+    """The IMU and the wheels of a recording, frame by frame."""
+
+    def __init__(self, imu: ImuSamples, wheel: Sequence[WheelSample], imu_minus_cam_s: float) -> None:
+        self._imu, self._wheel, self._offset_ns = imu, wheel, int(imu_minus_cam_s * 1e9)
+        self._fed_ns = -(2**62)
+
+    def until(self, stamp_ns: int) -> tuple[ImuSamples, Sequence[WheelSample]]:
+        """What came since the last call, up to a frame."""
+        since_ns, self._fed_ns = self._fed_ns, stamp_ns + self._offset_ns + _LEAD_NS
+        return self._imu.between(since_ns, self._fed_ns), wheel_between(self._wheel, since_ns, self._fed_ns)
 
 
 def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> OdometryPass:
@@ -83,12 +90,15 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
 
     While the odometry goes on, the executor finds the features of the keyframes that it has chosen.
     """
-    rectifier, run = inputs.rectifier, OdometryRun(inputs, settings)
+    rectifier = inputs.rectifier
+    run = OdometryRun(inputs.calibration, rectifier, settings)
+    feed = SampleFeed(inputs.imu, inputs.wheel, rectifier.imu_minus_cam_s)
     seen: list[FrameTracks] = []
 
     def chosen() -> Iterator[tuple[int, RectifiedFrame]]:
         for raw in inputs.frames:
-            tracked = run.handle(raw)
+            frame = raw if isinstance(raw, RectifiedFrame) else rectifier.rectify(raw)
+            tracked = run.handle(frame, *feed.until(frame.stamp_ns))
             seen.append(FrameTracks.of_frame(tracked.estimate))
             tools.progress("odometry", tracked.number + 1, inputs.frame_count)
             if tracked.is_keyframe:

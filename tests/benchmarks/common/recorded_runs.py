@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from fleetmap.recordings import FrameSelection, open_recording
+from fleetmap.sources.replay_source import ReplaySource
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import connected
 from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_result import ReplayResult
-from locclient.sensors.replay_source import ReplaySource
 
 SITE = "hall"
 LIBRARIES = ("numpy", "numba", "opencv-python-headless")

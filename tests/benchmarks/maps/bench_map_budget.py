@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from fleetmap.mapformat import Manifest, Tile, decode_tile, encode_tile
 from fleetmap.messages import WantedVersion
 from fleetmap.recordings import FrameSelection, open_recording
+from fleetmap.sources.replay_source import ReplaySource
 from locclient.maps.connection import MapConnection
 from locclient.maps.map_source import FetchedTiles, ReadyVersion
 from locclient.replay.replay import ReplayOptions, replay
-from locclient.sensors.replay_source import ReplaySource
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
 from mapserver.survey.settings import BudgetSettings

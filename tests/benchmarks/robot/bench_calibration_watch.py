@@ -22,11 +22,11 @@ from fleetmap.geometry import se3_inverse
 from fleetmap.messages import Cause, Status
 from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.sensors.samples import PositionPrior, wheel_between
+from fleetmap.sources.replay_source import ReplaySource
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import connected
 from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_result import ReplayResult
-from locclient.sensors.replay_source import ReplaySource
 from support.recordings.calibration_faults import AXES, IMAGE_FAULTS, another_robots_file, standard_faults, unlike_robot
 
 GOOD = "none"

@@ -32,10 +32,10 @@ from benchmarks.common.yardstick import at_reference, mean_of, slowness
 from fleetmap.odometry import Odometry
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sources.replay_source import ReplaySource
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from locclient.replay.run_result import ReplayResult
-from locclient.sensors.replay_source import ReplaySource
 
 
 @dataclass(frozen=True, slots=True)

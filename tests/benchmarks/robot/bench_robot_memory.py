@@ -35,15 +35,15 @@ from benchmarks.common.recorded_runs import (
 )
 from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.map_source import LocalMapSource
 from locclient.maps.tile_loader import TileLoader
 from locclient.maps.tile_selection import PositionBound, PositionBoundTracker, TileSelectionSettings
 from locclient.robot.health_report import HealthFigures
 from locclient.robot.robot import Robot
-from locclient.robot.sensor_bundle import SensorBundle
 from locclient.robot.version_trial import TrialSettings
-from locclient.sensors.replay_source import ReplaySource
 
 PROMISES: Promises = {"resident_mb": (320, AT_MOST), "anonymous_mb": (200, AT_MOST), "growth_mb": (5, AT_MOST)}
 _RUNNER = ("--robot", "runner-1", "--day", "1")

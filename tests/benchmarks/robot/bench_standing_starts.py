@@ -35,6 +35,7 @@ from fleetmap.geometry import Array
 from fleetmap.messages import Status
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, wheel_between
+from fleetmap.sources.sensor_bundle import SensorBundle
 from fleetsim.imaging.pipelines import find_pipeline, process_frame
 from fleetsim.recorder import Order, Session, prepare
 from locclient.localization import localizer
@@ -43,7 +44,6 @@ from locclient.maps.connection import connected
 from locclient.maps.loaded_map import LoadedMap
 from locclient.replay.replay import load_map
 from locclient.robot.robot import Robot
-from locclient.robot.sensor_bundle import SensorBundle
 from locclient.robot.version_trial import TrialSettings
 
 WITHIN_S, ELSEWHERE_M = 1.0, 8.0

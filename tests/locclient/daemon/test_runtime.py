@@ -12,6 +12,8 @@ import pytest
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import RecordingError
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
+from fleetmap.sources.intake import Intake
+from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.daemon.runtime import Runtime, RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.systemd_notify import ServiceManager
@@ -25,8 +27,6 @@ from locclient.maps.tile_selection import PositionBound, TileSelectionSettings
 from locclient.robot.continuous_odom import PublishedPose
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.robot import Robot
-from locclient.robot.sensor_bundle import SensorBundle
-from locclient.sensors.intake import Intake
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore

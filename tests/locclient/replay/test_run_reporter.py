@@ -10,13 +10,13 @@ import pytest
 
 from fleetmap.bus import ZenohBus
 from fleetmap.recordings import FrameSelection, open_recording
+from fleetmap.sources.replay_source import ReplaySource
 from locclient.delivery.outbox import Outbox
 from locclient.maps import connection
 from locclient.maps.connection import connected
 from locclient.maps.map_client import MapClient
 from locclient.replay import run_reporter
 from locclient.replay.replay import ReplayOptions, replay
-from locclient.sensors.replay_source import ReplaySource
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import FailureFilter, MapStore

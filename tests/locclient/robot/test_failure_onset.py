@@ -12,12 +12,12 @@ from fleetmap import failure_definition
 from fleetmap.geometry import se3
 from fleetmap.messages import Cause, FailureKind, FailureReport, Status
 from fleetmap.odometry import OdometryStatus
+from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate, Hypothesis
 from locclient.localization.image_quality import ImageQuality
 from locclient.robot.failure_onset import Evidence, OnsetRecorder, refined_cause
 from locclient.robot.failure_report import RobotProfile, failure_report
 from locclient.robot.robot import FailureContext
-from locclient.robot.sensor_bundle import SensorBundle
 from mapserver.store import MapStore
 from support.fleet.estimates import estimate
 from support.worlds import robot_world

@@ -1,19 +1,27 @@
 """A survey under way from end to end, on a small recording."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
 from fleetmap.errors import UsageError
 from fleetmap.live_survey import MAX_ARRAY_BYTES, LiveSurveyState
 from fleetmap.messages import MAX_MESSAGE_BYTES, encode_message
+from fleetmap.recordings import Topics, open_recording
+from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.samples import SensorSet
+from fleetmap.sources.playback import RecordingSource
 from mapserver.build.build import BuildOptions
+from mapserver.build.survey_recordings import RecordingOptions
+from mapserver.cli import app
 from mapserver.config import survey_settings
 from mapserver.library import build_map
-from mapserver.live import LiveRequest, LiveResult, run_live
+from mapserver.live import LiveRequest, LiveResult, RecordedDrive, SensorDrive, run_live
 from mapserver.live.mapping_process import thinned, thinning
 from mapserver.store import MapStore
 from support.recordings.recording_samples import make_sample, write_euroc
@@ -28,13 +36,22 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_euroc(tmp_path_factory.mktemp("recordings") / "walk", make_sample(FRAMES))
 
 
+@contextmanager
+def played(
+    recording: Path, frames: str = "::", speed: float = 1.0, use: SensorSet | None = None
+) -> Iterator[RecordedDrive]:
+    with RecordingOptions(frames, use=use).open(recording) as (opened, indices):
+        yield RecordedDrive(recording, opened, indices, frames, speed)
+
+
 @pytest.fixture(scope="module")
 def finished(
     recording: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[LiveResult, list[LiveSurveyState], Path]:
     """A whole drive at its own speed, all that was told of it, and its store."""
     store, told = tmp_path_factory.mktemp("store") / "maps", list[LiveSurveyState]()
-    result = run_live(LiveRequest(recording, "lab", store, SETTINGS), told.append, lambda: False, QUIET)
+    with played(recording) as drive:
+        result = run_live(LiveRequest("lab", store, SETTINGS), drive, told.append, lambda: False, QUIET)
     return result, told, store
 
 
@@ -77,8 +94,9 @@ def test_the_draft_is_what_a_build_makes_of_the_recording(
 def test_a_drive_that_is_ended_early_is_built_as_far_as_it_went(recording: Path, tmp_path: Path) -> None:
     seen: list[LiveSurveyState] = []
     calls = iter(range(FRAMES))
-    request = LiveRequest(recording, "lab", tmp_path / "maps", SETTINGS, BuildOptions(), speed=0)
-    result = run_live(request, seen.append, lambda: next(calls) >= 18, QUIET)
+    with played(recording, speed=0) as drive:
+        request = LiveRequest("lab", tmp_path / "maps", SETTINGS)
+        result = run_live(request, drive, seen.append, lambda: next(calls) >= 18, QUIET)
     assert result.figures.frames == 18
     assert result.figures.latency_ms is None
     assert len(result.built.trajectory) == 18
@@ -86,17 +104,61 @@ def test_a_drive_that_is_ended_early_is_built_as_far_as_it_went(recording: Path,
 
 
 def test_what_cannot_be_mapped_live_is_refused_before_it_begins(recording: Path, tmp_path: Path) -> None:
-    def told(options: BuildOptions, speed: float = 1.0) -> LiveRequest:
-        return LiveRequest(recording, "lab", tmp_path / "maps", SETTINGS, options, speed)
-
-    with pytest.raises(UsageError, match="one camera alone"):
-        run_live(told(BuildOptions(use=SensorSet.MONO)), print, lambda: False, QUIET)
-    with pytest.raises(UsageError, match="100:200"):
-        run_live(told(BuildOptions(frames="100:200")), print, lambda: False, QUIET)
+    request = LiveRequest("lab", tmp_path / "maps", SETTINGS)
+    with pytest.raises(UsageError, match="one camera alone"), played(recording, use=SensorSet.MONO) as drive:
+        run_live(request, drive, print, lambda: False, QUIET)
+    with pytest.raises(UsageError, match="100:200"), played(recording, "100:200"):
+        pass
     for speed in (-1.0, float("nan")):
-        with pytest.raises(UsageError, match="--speed"):
-            run_live(told(BuildOptions(), speed), print, lambda: False, QUIET)
+        with pytest.raises(UsageError, match="--speed"), played(recording, speed=speed):
+            pass
     assert not (tmp_path / "maps").exists()
+
+
+def test_sensors_are_recorded_while_they_are_mapped(recording: Path, tmp_path: Path) -> None:
+    """A recording takes the place of the sensors: what comes out must hold all that went in."""
+    source = RecordingSource(open_recording(recording), speed=0)
+    drive = SensorDrive(source, tmp_path / "drive.mcap", Topics())
+    result = run_live(LiveRequest("lab", tmp_path / "maps", SETTINGS), drive, lambda _state: None, lambda: False, QUIET)
+    assert (result.figures.frames, result.figures.dropped) == (FRAMES, 0)
+    with open_recording(recording) as given, open_recording(tmp_path / "drive.mcap") as kept:
+        assert kept.frame_stamps_ns.tolist() == given.frame_stamps_ns.tolist()
+        np.testing.assert_array_equal(kept.read_frame(5).left, given.read_frame(5).left)
+        inside = given.imu.between(0, int(kept.imu.stamps_ns[-1]) + 1)
+        np.testing.assert_array_equal(kept.imu.gyro_radps, inside.gyro_radps)
+        assert kept.imu.stamps_ns[-1] >= given.frame_stamps_ns[-1]
+    assert len(result.built.trajectory) == FRAMES
+    with pytest.raises(UsageError, match="--record"):
+        SensorDrive(source, tmp_path / "drive.mcap", Topics())
+
+
+def test_what_a_killed_survey_has_recorded_can_be_read(recording: Path, tmp_path: Path) -> None:
+    path = tmp_path / "drive.mcap"
+    with open_recording(recording) as given:
+        writer = McapRecordingWriter(path, given.calibration, in_place=True)
+        for number in range(20):
+            writer.write_imu(
+                given.imu.between(
+                    0 if not number else int(given.frame_stamps_ns[number - 1]), int(given.frame_stamps_ns[number])
+                )
+            )
+            writer.write_frame(given.stored_frame(number))
+        with open_recording(path) as kept:  # nobody has closed the file
+            assert 10 <= len(kept) <= 20
+            assert any("end" in issue.detail or "end" in issue.what for issue in kept.issues), kept.issues
+            np.testing.assert_array_equal(kept.read_frame(3).right, given.read_frame(3).right)
+        writer.close()
+        with open_recording(path) as kept:
+            assert len(kept) == 20
+
+
+@pytest.mark.parametrize(
+    "given", [[], ["a.mcap", "--sensors", "s.toml", "--record", "r.mcap"], ["--sensors", "s.toml"]]
+)
+def test_one_source_must_be_named(given: list[str], tmp_path: Path) -> None:
+    said = CliRunner().invoke(app, ["live", *given, "--site", "lab", "--store", str(tmp_path / "maps")])
+    assert isinstance(said.exception, UsageError)
+    assert "--sensors FILE" in str(said.exception)
 
 
 def test_thinned_rows_fit_a_message_and_keep_the_last() -> None:

@@ -14,10 +14,10 @@ from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples
+from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap
 from locclient.robot.robot import Robot
-from locclient.robot.sensor_bundle import SensorBundle
 from locclient.robot.version_trial import TrialSettings
 from mapserver import releases
 from mapserver.store import DraftContent, MapStore

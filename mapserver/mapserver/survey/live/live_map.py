@@ -201,7 +201,7 @@ class LiveMap:
         velocities = np.array([new.velocity_body_mps for new in news])
         motion = KeyframeMotion(
             inertial=inertial,
-            imu=_joined([new.imu for new in news]),
+            imu=joined_imu([new.imu for new in news]),
             noise=rig.imu_noise,
             imu_minus_cam_s=rig.imu_minus_cam_s,
             velocities_mps=np.einsum("kij,kj->ki", level_from_body[:, :3, :3], velocities),
@@ -265,7 +265,8 @@ class LiveMap:
             self._believed = [e for e, w in zip(edges, solved.loop_weights, strict=True) if w >= 0.5]
 
 
-def _joined(parts: Sequence[ImuSamples]) -> ImuSamples:
+def joined_imu(parts: Sequence[ImuSamples]) -> ImuSamples:
+    """Samples of parts that follow each other."""
     return ImuSamples(
         np.concatenate([part.stamps_ns for part in parts]),
         np.concatenate([part.gyro_radps for part in parts]),

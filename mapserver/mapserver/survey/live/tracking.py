@@ -1,20 +1,19 @@
 """Tracking of a survey under way: the survey's own odometry, frame by frame, and what the growing map needs of its keyframes."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from fleetmap.geometry import Array
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
-from fleetmap.sensors.rectification import RectifiedFrame
-from fleetmap.sensors.samples import CameraFrame
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetmap.sensors.samples import ImuSamples, WheelSample
 from mapserver.survey.bundle.odometry_factors import gained_covariance
-from mapserver.survey.live.live_map import NewKeyframe
+from mapserver.survey.live.live_map import NewKeyframe, joined_imu
 from mapserver.survey.odometry_pass import ContinuedCovariance, OdometryRun
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.survey_inputs import SurveyInputs
-
-_LEAD_NS = 100_000_000
 
 
 class Tracked(NamedTuple):
@@ -31,26 +30,26 @@ class Tracked(NamedTuple):
 
 
 class _Before(NamedTuple):
-    """The last keyframe: its covariance and rotation in odom axes, its place, and until when its IMU samples went."""
+    """The last keyframe: its covariance and rotation in odom axes, and its place."""
 
     covariance: Array
     odom_from_body: Array
     position_m: Array
-    until_ns: int
 
 
 class LiveTracking:
     """Takes every frame in turn."""
 
-    def __init__(self, inputs: SurveyInputs, settings: SurveySettings) -> None:
-        """inputs: its IMU and wheels up to each frame, its frames are not read."""
-        self._inputs, self._run = inputs, OdometryRun(inputs, settings)
+    def __init__(self, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings) -> None:
+        self._run = OdometryRun(calibration, rectifier, settings)
         self._continued = ContinuedCovariance()
         self._before: _Before | None = None
+        self._imu: list[ImuSamples] = []
 
-    def handle(self, raw: CameraFrame | RectifiedFrame) -> Tracked:
-        """The next frame."""
-        tracked = self._run.handle(raw)
+    def handle(self, frame: RectifiedFrame, imu: ImuSamples, wheel: Sequence[WheelSample]) -> Tracked:
+        """The next frame, with the samples of the IMU and the wheels up to it that were not given before."""
+        tracked = self._run.handle(frame, imu, wheel)
+        self._imu.append(imu)
         estimate, covariance = tracked.estimate, self._continued.handle(tracked.estimate)
         self._turn(estimate)
         keyframe = None
@@ -71,15 +70,13 @@ class LiveTracking:
     def _keyframe(
         self, number: int, estimate: OdometryEstimate, covariance: Array, frame_from_body: Array
     ) -> NewKeyframe:
-        before, step_cov, since_ns = self._before, None, -(2**62)
+        before, step_cov, imu = self._before, None, joined_imu(self._imu)
         if before is not None:
             way_m = float(np.linalg.norm(frame_from_body[:3, 3] - before.position_m))
             step_cov = gained_covariance(covariance - before.covariance, before.odom_from_body, way_m)
-            since_ns = before.until_ns
-        offset_ns = int(self._inputs.rectifier.imu_minus_cam_s * 1e9)
-        until_ns = estimate.stamp_ns + offset_ns + _LEAD_NS
         rotation = estimate.odom_from_body[:3, :3]
-        self._before = _Before(covariance, rotation, frame_from_body[:3, 3], until_ns)
+        self._before = _Before(covariance, rotation, frame_from_body[:3, 3])
+        self._imu = []
         return NewKeyframe(
             number=number,
             frame_from_body=frame_from_body,
@@ -89,5 +86,5 @@ class LiveTracking:
             gyro_bias_radps=estimate.gyro_bias_radps,
             accel_bias_mps2=estimate.accel_bias_mps2,
             inertial=estimate.inertial,
-            imu=self._inputs.imu.between(since_ns, until_ns),
+            imu=imu,
         )

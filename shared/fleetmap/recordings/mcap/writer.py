@@ -30,13 +30,21 @@ class McapRecordingWriter:
 
     Samples of one kind must come in the order of their stamps; kinds may interleave in any way, ROS tools like them
     roughly in order. name: what the recording is called when it is opened again, the file's stem unless given.
+    in_place: for sensors, whose samples come once: the file is there from the beginning, and what was written of it can be read even
+    where nobody closed it.
     """
 
     def __init__(
-        self, path: Path, calibration: RigCalibration, *, topics: Topics | None = None, name: str = ""
+        self,
+        path: Path,
+        calibration: RigCalibration,
+        *,
+        topics: Topics | None = None,
+        name: str = "",
+        in_place: bool = False,
     ) -> None:
         self._path = path
-        self._part = path.with_name(path.name + ".part")
+        self._part = path if in_place else path.with_name(path.name + ".part")
         self._calibration = calibration
         self._topics = topics or Topics()
         self._channels: dict[str, int] = {}

@@ -16,7 +16,8 @@ from fleetmap.sensors.samples import ImuSamples, SensorSet
 from mapserver.config import survey_settings
 from mapserver.survey.live.live_map import LiveMap, LiveRig
 from mapserver.survey.live.tracking import LiveTracking
-from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
+from mapserver.survey.odometry_pass import SampleFeed
+from mapserver.survey.survey_inputs import SurveyConfig
 from support.worlds.inertial_motion import analytic_motion
 from support.worlds.point_world import noisy_imu
 from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, HALF_SIZE_M, black_frame, rig, stereo_frame
@@ -51,12 +52,12 @@ def follow(frames: Iterable[RectifiedFrame], imu: ImuNoise | None) -> Followed:
     if imu is not None:
         samples = noisy_imu(np.random.default_rng(1), 6.5, imu, np.array([0.01, -0.02, 0.015]), np.full(3, 0.03))
     mounting: Any = SimpleNamespace(camera=CAMERA, body_from_cam=BODY_FROM_CAM, imu_minus_cam_s=0.0, has_depth=False)
-    tracking = LiveTracking(SurveyInputs((), 0, samples, calibration, mounting), SETTINGS)
+    tracking, feed = LiveTracking(calibration, mounting, SETTINGS), SampleFeed(samples, (), 0.0)
     followed = Followed(
         LiveMap(SurveyConfig(SETTINGS, default_vocabulary()), LiveRig(CAMERA, BODY_FROM_CAM, calibration.imu))
     )
     for frame in frames:
-        tracked = tracking.handle(frame)
+        tracked = tracking.handle(frame, *feed.until(frame.stamp_ns))
         followed.qualities.append(tracked.quality)
         if tracked.keyframe is not None:
             followed.growing.add(frame, tracked.keyframe)

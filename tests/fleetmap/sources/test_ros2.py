@@ -18,9 +18,9 @@ from fleetmap.recordings.ros2.messages import (
     encode_prior,
 )
 from fleetmap.sensors.samples import PositionPrior, WheelSample
-from locclient.sensors.intake import Intake
-from locclient.sensors.ros2 import Ros2Source
-from locclient.sensors.stereo_pairs import StereoPairs
+from fleetmap.sources.intake import Intake
+from fleetmap.sources.ros2 import Ros2Source
+from fleetmap.sources.stereo_pairs import StereoPairs
 from support.recordings.recording_samples import calibration
 
 TOPICS = Topics(left="/rig/left/image_raw", right="/rig/right/image_raw", imu="/rig/imu")

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
-from locclient.sensors.intake import Intake
+from fleetmap.sources.intake import Intake
 
 MS = 1_000_000
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import FrameSelection, Recording
 from fleetmap.sensors.samples import SensorSet
-from locclient.sensors.intake import Intake
-from locclient.sensors.replay_source import ReplaySource
+from fleetmap.sources.intake import Intake
+from fleetmap.sources.replay_source import ReplaySource
 
 _ROOM_WAIT_S = 0.1
 

@@ -11,10 +11,10 @@ from fleetmap.config import Section
 from fleetmap.errors import UsageError
 from fleetmap.recordings import OpenOptions, Topics, open_recording, read_calibration
 from fleetmap.sensors.calibration import RigCalibration
-from locclient.sensors.intake import Intake
-from locclient.sensors.playback import RecordingSource
-from locclient.sensors.ros2 import Ros2Source
-from locclient.sensors.uvc import UvcSource, VideoMode
+from fleetmap.sources.intake import Intake
+from fleetmap.sources.playback import RecordingSource
+from fleetmap.sources.ros2 import Ros2Source
+from fleetmap.sources.uvc import UvcSource, VideoMode
 
 
 class SourceSection(Section, frozen=True):

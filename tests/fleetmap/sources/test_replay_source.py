@@ -8,7 +8,7 @@ import pytest
 from fleetmap.errors import UsageError
 from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.sensors.samples import ImuSamples
-from locclient.sensors.replay_source import ReplaySource
+from fleetmap.sources.replay_source import ReplaySource
 from support.recordings.recording_samples import FRAME_NS, make_sample, write_euroc
 
 LEAD_NS = 10_000_000

@@ -11,7 +11,7 @@ import numpy as np
 
 from fleetmap.recordings import StoredFrame
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
-from locclient.robot.sensor_bundle import SensorBundle
+from fleetmap.sources.sensor_bundle import SensorBundle
 
 _IMU_LEAD_NS = 10_000_000  # a frame is handled when the IMU has come a little past it
 _STALE_NS = 60_000_000_000  # inertial samples integrated for longer without an image are useless

@@ -10,8 +10,8 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame
-from locclient.sensors.intake import Intake
-from locclient.sensors.ros2 import Ros2Source
+from fleetmap.sources.intake import Intake
+from fleetmap.sources.ros2 import Ros2Source
 
 _REOPEN_S = 1.0
 _CLOCKS_AGREE_S = 1.0

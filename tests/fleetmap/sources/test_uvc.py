@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import RecordingError
-from locclient.sensors.intake import Intake
-from locclient.sensors.uvc import UvcSource, VideoMode, split_frame
+from fleetmap.sources.intake import Intake
+from fleetmap.sources.uvc import UvcSource, VideoMode, split_frame
 from support.recordings.recording_samples import calibration
 
 

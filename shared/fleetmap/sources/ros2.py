@@ -10,8 +10,8 @@ from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.keys import ros_key_expr, type_of_key
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
-from locclient.sensors.intake import Intake
-from locclient.sensors.stereo_pairs import StereoPairs
+from fleetmap.sources.intake import Intake
+from fleetmap.sources.stereo_pairs import StereoPairs
 
 _IDLE_S = 1.0
 Take = Callable[[Intake, str, bytes], None]

@@ -1,1 +1,0 @@
-"""Sensor sources of a running robot, and the queue between them and the localizer."""
