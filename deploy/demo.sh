@@ -15,6 +15,7 @@ ROBOTS=(tote-1 tote-2)
 READY_WITHIN_S=60
 server_pid=
 robots_pid=
+prepare_pid=
 publish_options=()
 
 say() { printf '\n== %s (%d s)\n' "$*" "$SECONDS"; }
@@ -58,7 +59,7 @@ if [[ ${1:-} == --check ]]; then
 fi
 recording=${1:-}
 check_recording "$recording"
-trap 'stop_server || true; [[ -z $robots_pid ]] || kill "$robots_pid" 2>/dev/null || true' EXIT
+trap 'stop_server || true; kill $robots_pid $prepare_pid 2>/dev/null || true' EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM
 rm -rf "$OUT"
@@ -101,8 +102,11 @@ half_of() {
 
 warehouse() {
   local robot
-  say "a survey robot drives through a simulated warehouse (first run: the painter is compiled)"
+  say "a survey robot drives through a simulated warehouse; meanwhile the kernels are compiled, the first time"
+  ("$BIN/mapserver" prepare && "$BIN/locclient" prepare) >"$OUT/prepare.log" 2>&1 &
+  prepare_pid=$!
   record survey 0
+  wait "$prepare_pid" || { cat "$OUT/prepare.log" >&2; fail "compiling the kernels failed"; }
   say "building a map of the survey; meanwhile it is the next day and two robots drive, stock has moved"
   (for robot in "${ROBOTS[@]}"; do record "$robot" 1; done) >"$OUT/robots.log" 2>&1 &
   robots_pid=$!

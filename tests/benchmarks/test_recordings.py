@@ -9,6 +9,7 @@ from benchmarks.survey import (
     bench_build,
     bench_calibration_faults,
     bench_image_pipelines,
+    bench_prepare,
     bench_real_pairs,
     bench_survey,
 )
@@ -72,3 +73,13 @@ def test_the_scale_error_of_v101_is_a_factor_of_its_rig() -> None:
     assert min(factors) > 0.5 * abs(found.scale_error)
     assert max(factors) - min(factors) < 0.3 * abs(found.scale_error)
     assert max(abs(line.offset_px) for line in found.lines) < 0.06
+
+
+@pytest.mark.timeout(3600)
+def test_prepare_leaves_no_kernel_to_a_build_or_a_replay() -> None:
+    """With an empty cache; the kernels of a build and a replay are those that `prepare` compiled."""
+    found = bench_prepare.measured(None)
+    print(found)
+    assert found["kernels"] > 100
+    assert found["left out"] == []
+    assert found["mapserver prepare again"]["cpu_s"] < 0.1 * found["mapserver prepare"]["cpu_s"]

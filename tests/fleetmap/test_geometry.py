@@ -13,6 +13,7 @@ from fleetmap.geometry import (
     Array,
     align_points,
     interpolate_se3,
+    length,
     quat_wxyz_from_rotation,
     rotation_angle_rad,
     rotation_between_vectors,
@@ -143,3 +144,17 @@ def test_rotation_to_the_opposite_direction_is_a_half_turn(source: Array) -> Non
     rotation = rotation_between_vectors(source, -source)
     np.testing.assert_allclose(rotation @ source, -source, atol=1e-12)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+
+
+@given(arrays(np.float64, st.integers(1, 6), elements=st.floats(-1e6, 1e6)))
+def test_length_is_the_norm_to_the_bit(vector: Array) -> None:
+    padded = np.zeros((len(vector), 4))
+    padded[:, 3] = vector  # a column, as of a transform
+    assert length(vector) == np.linalg.norm(vector)
+    assert length(padded[:, 3]) == np.linalg.norm(padded[:, 3])
+
+
+@given(tangents)
+def test_one_inverse_is_that_of_a_stack_to_the_bit(tangent: Array) -> None:
+    a_from_b = se3_exp(tangent)
+    np.testing.assert_array_equal(se3_inverse(a_from_b), se3_inverse(np.stack([a_from_b, a_from_b]))[1])

@@ -6,7 +6,7 @@ Furgale 2014 for compounding, Hertzberg et al. 2013 for boxplus and boxminus.
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
+from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log, turn_both
 
 
 def boxminus(measured: Array, predicted: Array) -> Array:
@@ -21,16 +21,15 @@ def boxplus(map_from_body: Array, rot_trans: Array) -> Array:
 
 def transport_cov(cov_rot_trans: Array, lever_m: Array) -> Array:
     """The covariance about a point at `lever_m` (map axes) from the one that `cov_rot_trans` is about, on the same rigid body."""
-    x, y, z = lever_m
-    adjoint = np.eye(6)  # [[I, 0], [-[lever]x, I]]
-    adjoint[3:, :3] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    adjoint = np.eye(6)
+    adjoint[3:, :3] = -skew(lever_m)
     return np.asarray(adjoint @ cov_rot_trans @ adjoint.T)
 
 
 def compose_cov(map_from_body: Array, covariance: Array, body_from_next: Array, cov_step: Array) -> tuple[Array, Array]:
     """map_from_next and its covariance. cov_step: of the step, a left perturbation in the body's axes about the body."""
     rotation = map_from_body[:3, :3]
-    turn = np.kron(np.eye(2), rotation)
+    turn = turn_both(rotation)
     total = covariance + turn @ cov_step @ turn.T
     return map_from_body @ body_from_next, transport_cov(total, rotation @ body_from_next[:3, 3])
 
@@ -39,7 +38,7 @@ def compose_end_cov(
     map_from_body: Array, covariance: Array, body_from_next: Array, cov_next: Array
 ) -> tuple[Array, Array]:
     """As `compose_cov`, with the step's covariance about its end: as of a hypothesis whose map is that body."""
-    turn = np.kron(np.eye(2), map_from_body[:3, :3])
+    turn = turn_both(map_from_body[:3, :3])
     lever_m = map_from_body[:3, :3] @ body_from_next[:3, 3]
     return map_from_body @ body_from_next, transport_cov(covariance, lever_m) + turn @ cov_next @ turn.T
 
@@ -49,7 +48,7 @@ def compose_inverse_cov(
 ) -> tuple[Array, Array]:
     """map_from_earlier and its covariance, the inverse of `compose_end_cov`. cov_body: of earlier_from_body, as there."""
     map_from_earlier = map_from_body @ se3_inverse(earlier_from_body)
-    turn = np.kron(np.eye(2), map_from_earlier[:3, :3])
+    turn = turn_both(map_from_earlier[:3, :3])
     lever_m = map_from_earlier[:3, 3] - map_from_body[:3, 3]
     cov_way = turn @ transport_cov(cov_body, -earlier_from_body[:3, 3]) @ turn.T
     return map_from_earlier, transport_cov(covariance, lever_m) + cov_way

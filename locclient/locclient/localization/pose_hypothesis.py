@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, length
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
 from locclient.localization.alias_disambiguation import ObservationHistory
 from locclient.localization.pose_covariance import compose_cov, compose_end_cov
@@ -99,7 +99,7 @@ class PoseHypothesis:
 
         Moves to the present frame before the odometry forgets its own.
         """
-        step_m = float(np.linalg.norm(step[:3, 3]))
+        step_m = length(step[:3, 3])
         self.travelled_m += step_m
         motion = tracker.motion_since(self.frame_index)
         if motion is None:
@@ -109,7 +109,7 @@ class PoseHypothesis:
             self.now_map_from_body, self.now_cov = compose_cov(self.now_map_from_body, self.now_cov, step, cov_step)
         else:
             body_from_now, cov_motion = motion
-            distance_m = float(np.linalg.norm(body_from_now[:3, 3]))
+            distance_m = length(body_from_now[:3, 3])
             drift = (0.0, settings.drift_floor_m, settings.drift_share) if odometry.inertial else _VISION_ONLY
             cov_motion = cov_motion + _step_cov(drift, distance_m)
             now = compose_cov(self.map_from_body, self.cov_rot_trans, body_from_now, cov_motion)

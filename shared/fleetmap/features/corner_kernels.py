@@ -80,6 +80,21 @@ def select_spread(
 
 
 @kernel
+def clear_discs(free: NDArray[np.uint8], taken: NDArray[np.float32], radius_px: float) -> None:
+    """Sets pixels nearer than radius_px to one of `taken` (M, 2) in the image to 0, a ring of up to 1.5 px at the edge left out."""
+    height, width = free.shape
+    reach = radius_px - 0.75  # from the nearest whole pixel
+    size = int(reach)
+    for n in range(len(taken)):
+        x, y = int(np.floor(taken[n, 0] + 0.5)), int(np.floor(taken[n, 1] + 0.5))
+        if x < 0 or y < 0 or x >= width or y >= height:
+            continue
+        for dv in range(-min(size, y), min(size, height - 1 - y) + 1):
+            half = int(np.sqrt(reach * reach - dv * dv))
+            free[y + dv, max(x - half, 0) : min(x + half + 1, width)] = 0
+
+
+@kernel
 def centroid_angles_deg(image: NDArray[np.uint8], pixels: NDArray[np.float32], radius: int) -> NDArray[np.float32]:
     """(N,) direction in degrees [0, 360) from each pixel to the intensity centroid of its disc.
 

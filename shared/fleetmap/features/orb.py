@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fleetmap.config import Section
 from fleetmap.features.corner_kernels import centroid_angles_deg, min_eigenvalue_scores, select_spread
-from fleetmap.features.corners import fast_corners
+from fleetmap.features.corners import corner_candidates
 from fleetmap.geometry import Array
 from fleetmap.numerics.time_sliced import TimeSliced, finished
 from fleetmap.sensors.samples import Image
@@ -130,16 +130,7 @@ def _detect_level(image: Image, level: int, quota: int, settings: OrbSettings) -
         if level == 0
         else np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
     )
-    candidates = fast_corners(scaled, settings.fast_threshold)
-    if len(candidates) < 2 * quota:
-        candidates = fast_corners(scaled, max(settings.fast_threshold // 2, 4))
-    inside = (
-        (candidates[:, 0] >= _BORDER_PX)
-        & (candidates[:, 1] >= _BORDER_PX)
-        & (candidates[:, 0] < width - _BORDER_PX)
-        & (candidates[:, 1] < height - _BORDER_PX)
-    )
-    candidates = candidates[inside]
+    candidates = corner_candidates(scaled, 2 * quota, settings.fast_threshold, _BORDER_PX)
     scores = min_eigenvalue_scores(scaled, candidates, 3)
     order = np.argsort(-scores, kind="stable")
     nothing = np.zeros((0, 2), np.float32)

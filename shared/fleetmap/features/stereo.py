@@ -1,13 +1,11 @@
 """Sub-pixel disparities of features in a rectified pair."""
 
-import cv2
 import numpy as np
 
 from fleetmap.config import Section
 from fleetmap.features.stereo_kernels import match_rows
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
-from fleetmap.sensors.samples import Image
 
 
 class StereoSettings(Section, frozen=True):
@@ -23,13 +21,6 @@ class StereoSettings(Section, frozen=True):
     # The random error of a structured-light sensor's depth is 1.4e-3 z^2 in metres (Khoshelham and Elberink, 2012): this much
     # disparity over the base of 0.08 m that stands for such a sensor, with f = 525 px.
     depth_sigma_px: float = 0.06
-
-
-def halved(image: Image) -> Image:
-    """The image at half size, smoothed."""
-    return np.asarray(
-        cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA), np.uint8
-    )
 
 
 def disparities(
@@ -48,7 +39,7 @@ def disparities(
     max_disparity = min(camera.focal_px * camera.baseline_m / settings.min_depth_m, 0.6 * camera.width_px)
     prior = np.full(count, np.nan) if prior_px is None else np.asarray(prior_px, np.float64)
     # whole images are only searched at half size
-    halves = (frame.left, frame.right) if np.isfinite(prior).all() else (halved(frame.left), halved(frame.right))
+    halves = (frame.left, frame.right) if np.isfinite(prior).all() else (frame.half_left, frame.half_right)
     sought = np.ascontiguousarray(pixels, np.float64), prior
     scores, windows = (settings.min_correlation, settings.uniqueness), (settings.wide_half_px, settings.narrow_half_px)
     images = frame.left, frame.right

@@ -81,6 +81,10 @@ class Mode(ABC):
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """As `Odometry.motion_since`."""
 
+    def body_since(self, frame_index: int) -> Array | None:
+        """The transform of `motion_since` alone."""
+        return None
+
     @abstractmethod
     def will_forget(self, frame_index: int) -> bool:
         """As `Odometry.will_forget`."""
@@ -107,6 +111,10 @@ class WindowMode(Mode):
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """See Mode."""
         return self.window.motion_since(frame_index)
+
+    def body_since(self, frame_index: int) -> Array | None:
+        """See Mode."""
+        return self.window.body_since(frame_index)
 
     def will_forget(self, frame_index: int) -> bool:
         """See Mode."""

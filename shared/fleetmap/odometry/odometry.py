@@ -69,8 +69,8 @@ class Odometry:
         step = mode.process(frame_index, tracked)
         self._mode, self._frame_index = step.mode, frame_index + 1
         estimate = self._mode.estimate(frame.stamp_ns, frame_index, tracked, step)
-        motion = self._mode.motion_since(frame_index - 1) if frame_index else None
-        return estimate if motion is None else replace(estimate, previous_from_body=motion[0])
+        previous_from_body = self._mode.body_since(frame_index - 1) if frame_index else None
+        return estimate if previous_from_body is None else replace(estimate, previous_from_body=previous_from_body)
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance.

@@ -6,6 +6,7 @@ single camera has baseline 0.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -58,7 +59,7 @@ class StereoCamera:
             )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class RectifiedFrame:
     """A CameraFrame seen by the StereoCamera. disparity_px (H, W) float32 (NaN unknown) only with a depth sensor."""
 
@@ -66,6 +67,22 @@ class RectifiedFrame:
     left: Image
     right: Image | None
     disparity_px: NDArray[np.float32] | None
+
+    @cached_property
+    def half_left(self) -> Image:
+        """The left image at half size, smoothed; made once."""
+        return _halved(self.left)
+
+    @cached_property
+    def half_right(self) -> Image:
+        """The right one of a pair."""
+        assert self.right is not None
+        return _halved(self.right)
+
+
+def _halved(image: Image) -> Image:
+    size = image.shape[1] // 2, image.shape[0] // 2
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 class Rectifier:

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fleetmap.features.corner_kernels import centroid_angles_deg, min_eigenvalue_scores, select_spread
-from fleetmap.features.corners import spread_corners
+from fleetmap.features.corner_kernels import centroid_angles_deg, clear_discs, min_eigenvalue_scores, select_spread
+from fleetmap.features.corners import fast_corners, spread_corners
 from fleetmap.geometry import Array
 from support.worlds.synthetic_texture import picture, pixel_grid, smooth_texture
 
@@ -91,3 +91,44 @@ def test_corners_keep_their_distance_and_stay_off_the_border(image: NDArray[np.u
 
 def test_a_plain_picture_has_no_corners() -> None:
     assert spread_corners(np.full((HEIGHT, WIDTH), 90, np.uint8), 40, min_distance_px=9.0).shape == (0, 2)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([4.0, 9.5, 22.0]))
+def test_cleared_discs_hold_nothing_that_suppression_would_leave(seed: int, radius_px: float) -> None:
+    rng = np.random.default_rng(seed)
+    taken = rng.uniform([-3, -3], [WIDTH + 3, HEIGHT + 3], (12, 2)).astype(np.float32)
+    free = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    clear_discs(free, taken, radius_px)
+    u, v = pixel_grid(WIDTH, HEIGHT)
+    nearest = np.min([np.hypot(u - x, v - y) for x, y in taken.astype(float)], axis=0)
+    assert (nearest[free == 0] < radius_px).all()
+    inside = taken[(taken >= 0).all(axis=1) & (taken < [WIDTH - 0.5, HEIGHT - 0.5]).all(axis=1)].astype(float)
+    core = np.min([np.hypot(u - x, v - y) for x, y in inside] or [np.full(u.shape, np.inf)], axis=0)
+    assert (free[core < radius_px - 2.5] == 0).all()
+
+
+@pytest.mark.parametrize("taken_count", [0, 3, 40])
+@pytest.mark.parametrize("count", [10, 300])  # 300: too plain an image, the threshold is halved
+def test_corners_are_those_of_the_whole_image(image: NDArray[np.uint8], taken_count: int, count: int) -> None:
+    """Found in a part of it, and without what is taken: to the bit as if all were found, and what is not wanted left out."""
+    rng, border_px, distance_px = np.random.default_rng(taken_count), 8, 9.0
+    taken = rng.uniform(0, [WIDTH, HEIGHT], (taken_count, 2)).astype(np.float32)
+    everywhere = fast_corners(image, 12)
+    if len(everywhere) < 2 * count:
+        everywhere = fast_corners(image, 6)
+    size = np.array([WIDTH, HEIGHT])
+    found = everywhere[((everywhere >= border_px) & (everywhere < size - border_px)).all(axis=1)]
+    scores = min_eigenvalue_scores(image, found, 3)
+    order = np.argsort(-scores, kind="stable")
+    order = order[scores[order] > 0]
+    expected = found[select_spread(found, order, taken, distance_px, count, WIDTH, HEIGHT)]
+    chosen = spread_corners(image, count, min_distance_px=distance_px, taken=taken, border_px=border_px)
+    np.testing.assert_array_equal(chosen, expected)
+    assert len(chosen) > 5
+    np.testing.assert_array_equal(
+        fast_corners(image, 12, border_px),
+        fast_corners(image, 12)[
+            ((fast_corners(image, 12) >= border_px) & (fast_corners(image, 12) < size - border_px)).all(axis=1)
+        ],
+    )

@@ -6,7 +6,6 @@ import numpy as np
 
 from fleetmap.features import extract, orb
 from fleetmap.features.matching import match_mutual
-from fleetmap.features.stereo import halved
 from fleetmap.sensors.rectification import RectifiedFrame
 
 REVERSED_TEXT = (
@@ -35,7 +34,7 @@ def pair_order(frame: RectifiedFrame, settings: orb.OrbSettings) -> PairOrder:
     """The order that one frame shows, at half its size; UNKNOWN for a single camera, and where too little is seen or all of it is far."""
     if frame.right is None:
         return PairOrder.UNKNOWN
-    left, right = extract(halved(frame.left), settings), extract(halved(frame.right), settings)
+    left, right = extract(frame.half_left, settings), extract(frame.half_right, settings)
     pairs = match_mutual(left.descriptors, right.descriptors, _MAX_BITS, _RATIO)
     offsets = left.pixels[pairs[:, 0]] - right.pixels[pairs[:, 1]]
     height, width = (size // 2 for size in frame.left.shape)

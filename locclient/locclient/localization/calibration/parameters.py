@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, turn_both
 from locclient.localization.pose_covariance import transport_cov
 
 DRIFT_SIGMAS = 5.0
@@ -101,7 +101,7 @@ class CalibrationState(NamedTuple):
         """(6, 6) what the wrong parameters add to a pose's covariance: map axes, rotation first, about the body."""
         if self.cov_bias_cam is None:
             return np.zeros((6, 6))
-        turn = np.kron(np.eye(2), map_from_cam[:3, :3])
+        turn = turn_both(map_from_cam[:3, :3])
         return transport_cov(turn @ self.cov_bias_cam @ turn.T, map_from_body[:3, 3] - map_from_cam[:3, 3])
 
     @property

@@ -211,4 +211,4 @@ class KeyframePolicy:
 
 def sharpness(frame: RectifiedFrame) -> float:
     """Variance of the Laplacian at half size: falls with motion blur. Source: Pech-Pacheco et al. 2000."""
-    return float(cv2.Laplacian(stereo.halved(frame.left), cv2.CV_32F).var())
+    return float(cv2.Laplacian(frame.half_left, cv2.CV_32F).var())

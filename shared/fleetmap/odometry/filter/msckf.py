@@ -6,7 +6,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_log
+from fleetmap.geometry import Array, se3, se3_adjoint, se3_inverse, skew, so3_log
 from fleetmap.inertial import GRAVITY_MAP, imu_intervals
 from fleetmap.odometry.filter import msckf_kernels, propagation_kernels
 from fleetmap.odometry.filter.measurements import CONSIDERED, LinearMeasurement
@@ -273,6 +273,10 @@ class InvariantFilter:
         for wide in (self.covariance, self.true_error_cov[CONSIDERED:, CONSIDERED:]):
             wide[3:6, 3:6] += sigma_mps**2 * np.eye(3)
 
+    def body_since(self, clone_id: int) -> Array:
+        """earlier_from_now (4, 4) between a clone and the newest one."""
+        return np.asarray(se3_inverse(self.odom_from_clone(clone_id)) @ self.odom_from_clone(self.clone_ids[-1]))
+
     def motion_since(self, clone_id: int) -> tuple[Array, Array]:
         """earlier_from_now (4, 4) between a clone and the newest one, and its covariance (6, 6).
 
@@ -284,13 +288,8 @@ class InvariantFilter:
         c = self.true_error_cov[CONSIDERED:, CONSIDERED:]
         difference = c[newest : newest + 6, newest : newest + 6] + c[at : at + 6, at : at + 6]
         difference = difference - c[newest : newest + 6, at : at + 6] - c[at : at + 6, newest : newest + 6]
-        earlier_from_odom = se3_inverse(self.odom_from_clone(clone_id))
-        rotation = earlier_from_odom[:3, :3]
-        carry = np.zeros((6, 6))
-        carry[:3, :3] = carry[3:, 3:] = rotation
-        carry[3:, :3] = skew(earlier_from_odom[:3, 3]) @ rotation
-        now = self.odom_from_clone(self.clone_ids[-1])
-        return np.asarray(earlier_from_odom @ now), np.asarray(carry @ difference @ carry.T)
+        carry = se3_adjoint(se3_inverse(self.odom_from_clone(clone_id)))
+        return self.body_since(clone_id), np.asarray(carry @ difference @ carry.T)
 
     @property
     def offset_sigma_s(self) -> float:

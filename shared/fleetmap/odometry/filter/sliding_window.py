@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, rotation_angle_rad, se3_adjoint, se3_inverse
+from fleetmap.geometry import Array, length, rotation_angle_rad, se3_adjoint, se3_inverse
 from fleetmap.odometry.checks.zero_velocity import middle
 from fleetmap.odometry.filter.msckf import InvariantFilter
 from fleetmap.odometry.filter.nav_state import NavState
@@ -63,16 +63,25 @@ class SlidingWindow:
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """As `Odometry.motion_since`."""
+        kept, frame_from_kept = self._kept(frame_index)
+        if kept not in self.filter.clone_ids:
+            return None
+        kept_from_now, covariance = self.filter.motion_since(kept)
+        carry = se3_adjoint(frame_from_kept)
+        return frame_from_kept @ kept_from_now, carry @ covariance @ carry.T
+
+    def body_since(self, frame_index: int) -> Array | None:
+        """The transform of `motion_since` alone."""
+        kept, frame_from_kept = self._kept(frame_index)
+        return frame_from_kept @ self.filter.body_since(kept) if kept in self.filter.clone_ids else None
+
+    def _kept(self, frame_index: int) -> tuple[int, Array]:
+        """The frame that stands for one that was dropped, and frame_from_kept (4, 4); for any other that frame itself."""
         kept_from_frame = np.eye(4)
         while frame_index in self._merged:
             frame_index, kept_from_earlier = self._merged[frame_index]
             kept_from_frame = kept_from_earlier @ kept_from_frame
-        if frame_index not in self.filter.clone_ids:
-            return None
-        kept_from_now, covariance = self.filter.motion_since(frame_index)
-        frame_from_kept = se3_inverse(kept_from_frame)
-        carry = se3_adjoint(frame_from_kept)
-        return frame_from_kept @ kept_from_now, carry @ covariance @ carry.T
+        return frame_index, se3_inverse(kept_from_frame)
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
         """(4, 4) from a frame's camera to the one at the state; None where the frame is not kept."""
@@ -152,7 +161,7 @@ class SlidingWindow:
             ids = self.filter.clone_ids
             earlier, candidate = self.filter.odom_from_clone(ids[-3]), self.filter.odom_from_clone(ids[-2])
             motion = se3_inverse(earlier) @ candidate
-            parallax = float(np.linalg.norm(motion[:3, 3])) / self.scene_depth_m
+            parallax = length(motion[:3, 3]) / self.scene_depth_m
             is_still = (
                 rotation_angle_rad(motion[:3, :3]) < settings.keyframe_rotation_rad
                 and parallax < settings.keyframe_parallax
