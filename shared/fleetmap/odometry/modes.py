@@ -81,10 +81,6 @@ class Mode(ABC):
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """As `Odometry.motion_since`."""
 
-    def body_since(self, frame_index: int) -> Array | None:
-        """The transform of `motion_since` alone."""
-        return None
-
     @abstractmethod
     def will_forget(self, frame_index: int) -> bool:
         """As `Odometry.will_forget`."""
@@ -111,10 +107,6 @@ class WindowMode(Mode):
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """See Mode."""
         return self.window.motion_since(frame_index)
-
-    def body_since(self, frame_index: int) -> Array | None:
-        """See Mode."""
-        return self.window.body_since(frame_index)
 
     def will_forget(self, frame_index: int) -> bool:
         """See Mode."""
@@ -147,6 +139,7 @@ class WindowMode(Mode):
             imu_minus_cam_s=offset_s,
             imu_minus_cam_sigma_s=window_filter.offset_sigma_s if self.inertial else np.inf,
             track_pixels=tracked.pixels,
+            previous_from_body=self.window.body_since(frame_index - 1) if frame_index else None,
         )
 
 

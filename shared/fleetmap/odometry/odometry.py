@@ -4,7 +4,6 @@ Never touches a file, a socket or a clock.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -68,9 +67,7 @@ class Odometry:
         tracked = self._tracker.track(frame, mode.cam_from_earlier, mode.rotation_sigma_rad)
         step = mode.process(frame_index, tracked)
         self._mode, self._frame_index = step.mode, frame_index + 1
-        estimate = self._mode.estimate(frame.stamp_ns, frame_index, tracked, step)
-        previous_from_body = self._mode.body_since(frame_index - 1) if frame_index else None
-        return estimate if previous_from_body is None else replace(estimate, previous_from_body=previous_from_body)
+        return self._mode.estimate(frame.stamp_ns, frame_index, tracked, step)
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance.

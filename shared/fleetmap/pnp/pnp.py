@@ -66,25 +66,11 @@ def refine_pnp(
         1.0 / np.ascontiguousarray(matches.sigmas_px, np.float64),
     )
     lens, hessian, squared = matches.camera.lens, np.empty((6, 6)), np.empty(len(points))
-    solved = pnp_kernels.refine(
-        rotation, translation, points, measured, weights, lens, _WIDTH, prior, _ITERATIONS, hessian, squared
-    )
-    if not solved:
+    limits = _WIDTH, GATE_SQUARED, prior, (_ITERATIONS, _ITERATIONS_ON_INLIERS)
+    if not pnp_kernels.refine_twice(rotation, translation, points, measured, weights, lens, *limits, hessian, squared):
         return None
-    inliers = squared < GATE_SQUARED
-    if inliers.sum() >= 4:  # once more on the inliers alone, so that no outlier biases the result
-        kept, again = (points[inliers], measured[inliers], weights[inliers]), np.empty(int(inliers.sum()))
-        solved = pnp_kernels.refine(
-            rotation, translation, *kept, lens, _WIDTH, prior, _ITERATIONS_ON_INLIERS, hessian, again
-        )
-        if not solved:
-            return None
-        pnp_kernels.linearize(
-            rotation, translation, points, measured, weights, lens, _WIDTH, np.empty((6, 6)), np.empty(6), squared
-        )
-        inliers = squared < GATE_SQUARED
     covariance = np.asarray(np.linalg.inv(hessian + prior + 1e-9 * np.eye(6)))
-    return PnpResult(se3(rotation, translation), covariance, inliers, squared)
+    return PnpResult(se3(rotation, translation), covariance, squared < GATE_SQUARED, squared)
 
 
 def ransac_pnp(

@@ -158,6 +158,39 @@ def refine(
 
 
 @kernel
+def refine_twice(
+    rotation: Array,
+    translation: Array,
+    points: Array,
+    pixels: Array,
+    weights: Array,
+    camera: Array,
+    width: float,
+    gate_squared: float,
+    prior: Array,
+    iterations: tuple[int, int],
+    hessian: Array,
+    squared: Array,
+) -> bool:
+    """`refine`, and once more on the inliers alone, so that no outlier biases the result; squared residuals are of all points."""
+    if not refine(
+        rotation, translation, points, pixels, weights, camera, width, prior, iterations[0], hessian, squared
+    ):
+        return False
+    inliers = squared < gate_squared
+    count = int(inliers.sum())
+    if count < 4:
+        return True
+    kept, again = (points[inliers], pixels[inliers], weights[inliers]), np.empty(count)
+    if not refine(
+        rotation, translation, kept[0], kept[1], kept[2], camera, width, prior, iterations[1], hessian, again
+    ):
+        return False
+    linearize(rotation, translation, points, pixels, weights, camera, width, np.empty((6, 6)), np.empty(6), squared)
+    return True
+
+
+@kernel
 def search_translation(
     rotation: Array, points: Array, seen_points: Array, pixels: Array, camera: Array, threshold_px: float, best: Array
 ) -> int:
