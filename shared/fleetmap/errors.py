@@ -76,6 +76,7 @@ class UntrustedError(LinkError):
     """Something that the signed lists of maps do not allow. The message begins with the kind of attack that it would be."""
 
     def __init__(self, kind: Literal["rollback", "freeze", "signature", "size"], words: object) -> None:
+        self.kind, self.words = kind, str(words)
         super().__init__(f"{kind}: {words}")
 
 

@@ -49,7 +49,7 @@ class TrustedMap:
         Raises StoreError where the folder cannot be used.
         """
         self._folder, self._site, self._ask, self._wall_s = folder, check_name(site, "site"), ask, wall_s
-        self._pinned_root = root
+        self._pinned_root, self._is_first_use = root, root is None
         self._list: SiteList | None = None
         self._fault: LinkError | StoreError | None = None
         with disk_errors(f"the folder {folder} for signed lists cannot be used", "choose another cache"):
@@ -63,9 +63,12 @@ class TrustedMap:
                 self._refresh()
             self._fault = None
         except (LinkError, StoreError) as error:
-            if str(error) != str(self._fault):
-                _log.warning("no fresh word on the maps of site %s: %s", self._site, error)
-            self._fault = error
+            fault = self._with_next_step(error) if isinstance(error, UntrustedError) else error
+            if str(fault) != str(self._fault):
+                hours = self.word_hours
+                age = "" if hours is None else f", last word {hours:.1f} h ago"
+                _log.warning("no fresh word on the maps of site %s%s: %s", self._site, age, fault)
+            self._fault = fault
 
     def admitted(self, wanted: WantedVersion) -> AdmittedVersion:
         """The entry of a version by its number and manifest's address.
@@ -86,13 +89,20 @@ class TrustedMap:
             f"version {wanted.version} ({str(wanted.manifest_sha256)[:12]}) of site {self._site} is not in signed list"
         )
         raise UntrustedError(
-            "rollback" if is_old else "signature", f"{words} {self._list.serial}, which admits {numbers or 'none'}"
+            "rollback" if is_old else "signature",
+            f"{words} {self._list.serial}, which admits {numbers or 'none'}; `mapserver trust status` on the server shows why",
         )
 
     @property
     def word_hours(self) -> float | None:
         """Hours since the server last proved what may be run; None if it never did."""
         return None if self._clock_s == 0 else max(0.0, self._wall_s() - self._clock_s) / 3600
+
+    def _with_next_step(self, error: UntrustedError) -> UntrustedError:
+        step = "look at `mapserver trust status` on the server, and at both clocks"
+        if error.kind == "signature" and self._is_first_use:
+            step = f"if the server's store was made anew, remove {self._folder}; else somebody answers in its place"
+        return UntrustedError(error.kind, f"{error.words}; {step}")
 
     def _refresh(self) -> None:
         from fleetmap.trust.tuf_client import update_lists
