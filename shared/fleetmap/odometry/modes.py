@@ -17,7 +17,7 @@ from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.init.dynamic_initialization import dynamic_initialization
 from fleetmap.odometry.init.initial_state import InitialState
-from fleetmap.odometry.init.static_initialization import is_steady, static_initialization
+from fleetmap.odometry.init.static_initialization import is_steady, polynomial_rate, static_initialization
 from fleetmap.odometry.sensor_buffer import SensorBuffer
 from fleetmap.odometry.tracking.tracker import Tracked
 from fleetmap.sensors.calibration import ImuNoise
@@ -224,7 +224,10 @@ class StartingMode(VisualMode):
         """See Mode; switches to stereo-inertial once gravity is known, which redefines `odom`."""
         step = super().process(frame_index, tracked)
         stamp_ns, old_odom_from_body = self.stamp_ns, self.window.filter.state.odom_from_body
-        start = self._static_start(stamp_ns) or self._dynamic_start(stamp_ns, old_odom_from_body, tracked.lost)
+        if tracked.lost:
+            self._trajectory.clear()
+        self._trajectory.append((stamp_ns, old_odom_from_body))
+        start = self._static_start(stamp_ns) or self._dynamic_start()
         if start is None:
             return step
         mode = InertialMode.started(self.window, self._imu, start)
@@ -235,13 +238,24 @@ class StartingMode(VisualMode):
 
     def _static_start(self, stamp_ns: int) -> InitialState | None:
         since = self._imu.samples.imu.between(self.not_before_ns, stamp_ns + 1)
-        return static_initialization(since, stamp_ns, self._rig.settings)
+        start = static_initialization(since, stamp_ns, self._rig.settings)
+        return None if start is None or self._accelerates_until(start.stamp_ns) else start
 
-    def _dynamic_start(self, stamp_ns: int, odom_from_body: Array, lost: bool) -> InitialState | None:
+    def _accelerates_until(self, end_ns: int) -> bool:
+        """Whether wheels or pictures say that the speed changed in the steady window before end_ns.
+
+        An even acceleration is as steady as rest: to an IMU alone it is a tilt, of 5 degrees for 0.8 m/s^2.
+        """
         settings = self._rig.settings.start
-        if lost:
-            self._trajectory.clear()
-        self._trajectory.append((stamp_ns, odom_from_body))
+        begin_ns = end_ns - int(settings.steady_window_s * 1e9)
+        wheel = self._imu.samples.wheel_between(begin_ns, end_ns)
+        rolled = [(s.stamp_ns, s.velocity_base_mps) for s in wheel]
+        seen = [(stamp, placed[:3, 3]) for stamp, placed in self._trajectory if begin_ns <= stamp <= end_ns]
+        found = [polynomial_rate(samples, degree) for samples, degree in ((rolled, 1), (seen, 2))]
+        return any(rate is not None and np.linalg.norm(rate) > settings.steady_accel_sigma_mps2 for rate in found)
+
+    def _dynamic_start(self) -> InitialState | None:
+        settings = self._rig.settings.start
         recent = self._trajectory[-settings.moving_frames :]
         stamps = np.array([stamp for stamp, _ in recent], np.int64)
         if (

@@ -28,16 +28,23 @@ class SensorBuffer:
         self._wheel.extend(samples)
 
     def absorb(self, needed_from_ns: int, memory_s: float) -> None:
-        """Appends what came; drops IMU samples older than memory_s before needed_from_ns once they are many, and wheel samples that
-        serve no frame from needed_from_ns on."""
+        """Appends what came; drops IMU samples older than memory_s before needed_from_ns once they are many, and wheel samples as old.
+
+        Without an IMU wheels serve no start: all go that serve no frame from needed_from_ns on.
+        """
         if self._pending:
             self.imu = without_spikes(self.imu, joined(self._pending))
             self._pending.clear()
         oldest = needed_from_ns - int(memory_s * 1e9)
         if len(self.imu) and self.imu.stamps_ns[0] < oldest - int(0.4e9 * memory_s):
             self.imu = self.imu.between(oldest, int(self.imu.stamps_ns[-1]) + 1)
-        if self._wheel and self._wheel[0].stamp_ns < needed_from_ns - _WHEEL_REACH_NS:
-            self._wheel = [s for s in self._wheel if s.stamp_ns >= needed_from_ns - _WHEEL_REACH_NS]
+        serves_ns = oldest if len(self.imu) else needed_from_ns - _WHEEL_REACH_NS
+        if self._wheel and self._wheel[0].stamp_ns < serves_ns:
+            self._wheel = [s for s in self._wheel if s.stamp_ns >= serves_ns]
+
+    def wheel_between(self, start_ns: int, end_ns: int) -> list[WheelSample]:
+        """The wheel samples from start_ns until end_ns that are still there; none is taken."""
+        return [sample for sample in self._wheel if start_ns <= sample.stamp_ns <= end_ns]
 
     def take_wheel(self, stamp_ns: int) -> tuple[WheelSample, Array] | None:
         """The wheel sample nearest to a moment with the mean gyro (3,) around it; None where none is near.

@@ -1,5 +1,7 @@
 """Static initialization: gravity, tilt and gyro bias from a steady IMU."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from fleetmap.geometry import Array, rotation_between_vectors
@@ -11,6 +13,7 @@ from fleetmap.odometry.settings import FilterSettings, OdometrySettings, StartSe
 from fleetmap.sensors.samples import ImuSamples
 
 _MAX_LOOK_BACK_S = 20.0
+_JUDGED_NS = 500_000_000
 
 
 def static_initialization(imu: ImuSamples, until_ns: int, settings: OdometrySettings) -> InitialState | None:
@@ -33,6 +36,18 @@ def is_steady(window: ImuSamples, settings: StartSettings) -> bool:
     Standing still and rolling at constant speed look alike here; gravity can be read in both, so the speed stays open.
     """
     return static_initialization_kernels.is_steady(window.gyro_radps, window.accel_mps2, _limits(settings))
+
+
+def polynomial_rate(samples: Sequence[tuple[int, Array]], degree: int) -> Array | None:
+    """Acceleration (3,) of samples (stamp, value (3,)): speeds for degree 1, places for degree 2; None for less than half a second of them.
+
+    By the polynomial of that degree that fits them best.
+    """
+    if len(samples) < 2 * degree + 3 or samples[-1][0] - samples[0][0] < _JUDGED_NS:
+        return None
+    times_s = (np.array([stamp for stamp, _ in samples], np.float64) - samples[0][0]) * 1e-9
+    fitted = np.polynomial.polynomial.polyfit(times_s, np.array([value for _, value in samples]), degree)
+    return np.asarray(degree * fitted[degree], np.float64)
 
 
 def _limits(settings: StartSettings) -> Array:

@@ -1,0 +1,82 @@
+"""Starts under an even acceleration, which an IMU alone takes for a tilt."""
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, se3
+from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
+from fleetmap.odometry.init.static_initialization import polynomial_rate
+from fleetmap.odometry.modes import StartingMode
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.samples import ImuSamples, WheelSample
+from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, rig, view
+
+IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
+SPEEDING_UP_MPS2 = 0.8  # as a tote robot drives off
+FRAME_NS, IMU_NS, FRAMES = 50_000_000, 5_000_000, 28
+_RIGHT_FROM_LEFT = se3(np.eye(3), np.array([CAMERA.baseline_m, 0.0, 0.0]))
+
+
+def placed(time_s: float) -> Array:
+    """The body on its way along x."""
+    return np.asarray(se3(np.eye(3), np.array([-1.0 + 0.5 * SPEEDING_UP_MPS2 * time_s**2, 0.2, 0.1])))
+
+
+def frame(number: int) -> RectifiedFrame:
+    left = placed(number * FRAME_NS * 1e-9) @ BODY_FROM_CAM
+    return RectifiedFrame(number * FRAME_NS, view(left), view(left @ _RIGHT_FROM_LEFT), None)
+
+
+def started(*, wheels: bool, imu_from_ns: int) -> list[OdometryEstimate]:
+    """Estimates of a robot that speeds up all the time; of its IMU, and its wheels, from imu_from_ns on."""
+    odometry = Odometry(rig(IMU), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    rng = np.random.default_rng(2)
+    stamps_ns = np.arange(imu_from_ns, (FRAMES + 1) * FRAME_NS, IMU_NS)
+    gyro = rng.normal(0, 2e-4 * np.sqrt(200), (len(stamps_ns), 3))
+    accel = np.array([SPEEDING_UP_MPS2, 0.0, 9.81]) + rng.normal(0, 2e-3 * np.sqrt(200), (len(stamps_ns), 3))
+    samples, fed_ns, estimates = ImuSamples(stamps_ns, gyro, accel), imu_from_ns, []
+    for number in range(1, FRAMES + 1):
+        until_ns = number * FRAME_NS + 1
+        odometry.handle_imu(samples.between(fed_ns, until_ns))
+        if wheels:
+            rolled = range(-(-fed_ns // 20_000_000) * 20_000_000, until_ns, 20_000_000)
+            speeds = [3.0 + SPEEDING_UP_MPS2 * stamp * 1e-9 for stamp in rolled]
+            odometry.handle_wheel(
+                [WheelSample(s, np.array([v, 0.0, 0.0]), 0.0, 0.02, 0.02) for s, v in zip(rolled, speeds, strict=True)]
+            )
+        fed_ns = until_ns
+        estimates.append(odometry.handle_stereo(frame(number)))
+    return estimates
+
+
+def tilt_deg(estimate: OdometryEstimate) -> float:
+    return float(np.degrees(np.arccos(np.clip(estimate.odom_from_body[2, 2], -1.0, 1.0))))
+
+
+def test_pictures_tell_it_from_a_tilt(monkeypatch: pytest.MonkeyPatch) -> None:
+    inertial = [e for e in started(wheels=False, imu_from_ns=0) if e.inertial]
+    assert len(inertial) > 3
+    assert max(map(tilt_deg, inertial)) < 1.0
+    monkeypatch.setattr(StartingMode, "_accelerates_until", lambda *_: False)
+    wrong = next(e for e in started(wheels=False, imu_from_ns=0) if e.inertial)
+    assert tilt_deg(wrong) > 3.5  # the danger that the check averts
+
+
+def test_wheels_tell_it_before_the_first_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    before_ns = -1_000_000_000
+    assert not started(wheels=True, imu_from_ns=before_ns)[0].inertial
+    monkeypatch.setattr(StartingMode, "_accelerates_until", lambda *_: False)
+    assert tilt_deg(started(wheels=True, imu_from_ns=before_ns)[0]) > 3.5
+
+
+@pytest.mark.parametrize(("degree", "value"), [(1, 0.8), (2, 0.8), (1, 0.0), (2, 0.0)])
+def test_rates_are_those_of_the_polynomial(degree: int, value: float) -> None:
+    times_s = np.arange(20) * 0.05
+    along = value * times_s if degree == 1 else 0.5 * value * times_s**2 + 2.0 * times_s
+    samples = [(int(t * 1e9), np.array([x, 1.0, -2.0])) for t, x in zip(times_s, along, strict=True)]
+    rate = polynomial_rate(samples, degree)
+    assert rate is not None
+    np.testing.assert_allclose(rate, [value, 0.0, 0.0], atol=1e-6)
+    assert polynomial_rate(samples[:6], degree) is None  # too short to say
+    assert polynomial_rate([], degree) is None
