@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
 
-from fleetmap.bus import is_loopback
 from fleetmap.errors import FleetmapError, StateError, UsageError
 from fleetmap.trust import AdmittedVersion, SiteList, site_role
 from fleetmap.trust.site_list import VersionState
@@ -74,6 +73,8 @@ def prepare_lists(store: MapStore, endpoint: str) -> None:
 
     Raises UsageError where a store without lists would be served to other machines.
     """
+    from fleetmap.bus import is_loopback  # late: zenoh comes with it, and builds need none
+
     if not SignedLists(store.folder).are_there:
         if not is_loopback(endpoint):
             raise UsageError(

@@ -8,14 +8,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
-from fleetmap.bus import Bus
 from fleetmap.errors import LinkError, StoreError, UntrustedError, disk_errors
 from fleetmap.mapformat.names import check_name
 from fleetmap.messages import ChunkRequest, Part, WantedVersion, decode_message, encode_message, trust_key
 from fleetmap.trust.site_list import AdmittedVersion, SiteList, read_site_list, site_role
+
+if TYPE_CHECKING:
+    from fleetmap.bus import Bus
 
 Ask = Callable[[str], bytes | None]
 """The bytes of a file of the signed lists, None where the server says that it has none; UnreachableError where nobody answers."""
@@ -179,7 +182,7 @@ class TrustedMap:
             yield
 
 
-def ask_over(bus: Bus, site: str, timeout_s: float = 5.0) -> Ask:
+def ask_over(bus: "Bus", site: str, timeout_s: float = 5.0) -> Ask:
     """Asks the server on a bus. A file must come in one answer, so that nobody can make a robot wait for it byte by byte."""
 
     def ask(name: str) -> bytes | None:
