@@ -25,6 +25,7 @@ from fleetmap.sensors.samples import Trajectory
 
 _GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of freedom
 _ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
+_NEAR_REST_MPS = 0.2  # a fifth of what the first speed may be off by: the filter finds it
 _IMU_GAP_NS = 50_000_000  # a longer time without samples is bridged as without an IMU
 
 
@@ -239,20 +240,30 @@ class StartingMode(VisualMode):
     def _static_start(self, stamp_ns: int) -> InitialState | None:
         since = self._imu.samples.imu.between(self.not_before_ns, stamp_ns + 1)
         start = static_initialization(since, stamp_ns, self._rig.settings)
-        return None if start is None or self._accelerates_until(start.stamp_ns) else start
+        return None if start is None else self._moving_evenly(start)
 
-    def _accelerates_until(self, end_ns: int) -> bool:
-        """Whether wheels or pictures say that the speed changed in the steady window before end_ns.
+    def _moving_evenly(self, start: InitialState) -> InitialState | None:
+        """The start with the speed that wheels or pictures saw in its steady window; None where they saw the speed change.
 
-        An even acceleration is as steady as rest: to an IMU alone it is a tilt, of 5 degrees for 0.8 m/s^2.
+        An even acceleration is as steady as rest: to an IMU alone it is a tilt, of 5 degrees for 0.8 m/s^2. A speed that is far from zero
+        would be taken for outliers of everything that measures it.
         """
-        settings = self._rig.settings.start
-        begin_ns = end_ns - int(settings.steady_window_s * 1e9)
-        wheel = self._imu.samples.wheel_between(begin_ns, end_ns)
-        rolled = [(s.stamp_ns, s.velocity_base_mps) for s in wheel]
-        seen = [(stamp, placed[:3, 3]) for stamp, placed in self._trajectory if begin_ns <= stamp <= end_ns]
-        found = [polynomial_rate(samples, degree) for samples, degree in ((rolled, 1), (seen, 2))]
-        return any(rate is not None and np.linalg.norm(rate) > settings.steady_accel_sigma_mps2 for rate in found)
+        settings, base_from_body = self._rig.settings.start, self._rig.base_from_body
+        begin_ns = start.stamp_ns - int(settings.steady_window_s * 1e9)
+        seen = [(stamp, placed) for stamp, placed in self._trajectory if begin_ns <= stamp <= start.stamp_ns]
+        places = [(stamp, placed[:3, 3]) for stamp, placed in seen]
+        speeds = [(s.stamp_ns, s.velocity_base_mps) for s in self._imu.samples.wheel_between(begin_ns, start.stamp_ns)]
+        rates = polynomial_rate(places, 2), polynomial_rate(speeds, 1)
+        if any(rate is not None and np.linalg.norm(rate) > settings.steady_accel_sigma_mps2 for rate in rates):
+            return None
+        velocity_body, by_pictures = np.zeros(3), polynomial_rate(places, 1)
+        if by_pictures is not None:
+            velocity_body = seen[-1][1][:3, :3].T @ by_pictures
+        elif rates[1] is not None:
+            velocity_body = base_from_body[:3, :3].T @ np.mean([speed for _, speed in speeds], axis=0)
+        if np.linalg.norm(velocity_body) > _NEAR_REST_MPS:
+            start.state.velocity_mps = start.state.rotation @ velocity_body
+        return start
 
     def _dynamic_start(self) -> InitialState | None:
         settings = self._rig.settings.start

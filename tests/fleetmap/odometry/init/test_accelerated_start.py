@@ -18,35 +18,38 @@ FRAME_NS, IMU_NS, FRAMES = 50_000_000, 5_000_000, 28
 _RIGHT_FROM_LEFT = se3(np.eye(3), np.array([CAMERA.baseline_m, 0.0, 0.0]))
 
 
-def placed(time_s: float) -> Array:
+def placed(time_s: float, speed_mps: float, speeding_up_mps2: float) -> Array:
     """The body on its way along x."""
-    return np.asarray(se3(np.eye(3), np.array([-1.0 + 0.5 * SPEEDING_UP_MPS2 * time_s**2, 0.2, 0.1])))
+    way_m = speed_mps * time_s + 0.5 * speeding_up_mps2 * time_s**2
+    return np.asarray(se3(np.eye(3), np.array([-2.0 + way_m, 0.2, 0.1])))
 
 
-def frame(number: int) -> RectifiedFrame:
-    left = placed(number * FRAME_NS * 1e-9) @ BODY_FROM_CAM
+def frame(number: int, speed_mps: float, speeding_up_mps2: float) -> RectifiedFrame:
+    left = placed(number * FRAME_NS * 1e-9, speed_mps, speeding_up_mps2) @ BODY_FROM_CAM
     return RectifiedFrame(number * FRAME_NS, view(left), view(left @ _RIGHT_FROM_LEFT), None)
 
 
-def started(*, wheels: bool, imu_from_ns: int) -> list[OdometryEstimate]:
-    """Estimates of a robot that speeds up all the time; of its IMU, and its wheels, from imu_from_ns on."""
+def started(
+    *, wheels: bool, imu_from_ns: int, speed_mps: float = 0.0, speeding_up_mps2: float = SPEEDING_UP_MPS2
+) -> list[OdometryEstimate]:
+    """Estimates of a robot that speeds up evenly; its IMU, and its wheels, speak from imu_from_ns on."""
     odometry = Odometry(rig(IMU), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
     rng = np.random.default_rng(2)
     stamps_ns = np.arange(imu_from_ns, (FRAMES + 1) * FRAME_NS, IMU_NS)
     gyro = rng.normal(0, 2e-4 * np.sqrt(200), (len(stamps_ns), 3))
-    accel = np.array([SPEEDING_UP_MPS2, 0.0, 9.81]) + rng.normal(0, 2e-3 * np.sqrt(200), (len(stamps_ns), 3))
+    accel = np.array([speeding_up_mps2, 0.0, 9.81]) + rng.normal(0, 2e-3 * np.sqrt(200), (len(stamps_ns), 3))
     samples, fed_ns, estimates = ImuSamples(stamps_ns, gyro, accel), imu_from_ns, []
     for number in range(1, FRAMES + 1):
         until_ns = number * FRAME_NS + 1
         odometry.handle_imu(samples.between(fed_ns, until_ns))
         if wheels:
             rolled = range(-(-fed_ns // 20_000_000) * 20_000_000, until_ns, 20_000_000)
-            speeds = [3.0 + SPEEDING_UP_MPS2 * stamp * 1e-9 for stamp in rolled]
+            speeds = [speed_mps + speeding_up_mps2 * stamp * 1e-9 for stamp in rolled]
             odometry.handle_wheel(
                 [WheelSample(s, np.array([v, 0.0, 0.0]), 0.0, 0.02, 0.02) for s, v in zip(rolled, speeds, strict=True)]
             )
         fed_ns = until_ns
-        estimates.append(odometry.handle_stereo(frame(number)))
+        estimates.append(odometry.handle_stereo(frame(number, speed_mps, speeding_up_mps2)))
     return estimates
 
 
@@ -58,7 +61,7 @@ def test_pictures_tell_it_from_a_tilt(monkeypatch: pytest.MonkeyPatch) -> None:
     inertial = [e for e in started(wheels=False, imu_from_ns=0) if e.inertial]
     assert len(inertial) > 3
     assert max(map(tilt_deg, inertial)) < 1.0
-    monkeypatch.setattr(StartingMode, "_accelerates_until", lambda *_: False)
+    monkeypatch.setattr(StartingMode, "_moving_evenly", lambda _mode, start: start)
     wrong = next(e for e in started(wheels=False, imu_from_ns=0) if e.inertial)
     assert tilt_deg(wrong) > 3.5  # the danger that the check averts
 
@@ -66,8 +69,26 @@ def test_pictures_tell_it_from_a_tilt(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_wheels_tell_it_before_the_first_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     before_ns = -1_000_000_000
     assert not started(wheels=True, imu_from_ns=before_ns)[0].inertial
-    monkeypatch.setattr(StartingMode, "_accelerates_until", lambda *_: False)
+    monkeypatch.setattr(StartingMode, "_moving_evenly", lambda _mode, start: start)
     assert tilt_deg(started(wheels=True, imu_from_ns=before_ns)[0]) > 3.5
+
+
+@pytest.mark.parametrize(("wheels", "imu_from_ns"), [(False, 0), (True, -1_000_000_000)])
+def test_the_speed_of_an_even_drive_is_known_at_once(
+    wheels: bool, imu_from_ns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By pictures where they were there, else by wheels; else the filter would take what measures it for outliers."""
+
+    def inertial() -> list[tuple[int, OdometryEstimate]]:
+        found = started(wheels=wheels, imu_from_ns=imu_from_ns, speed_mps=2.0, speeding_up_mps2=0.0)
+        return [(n, estimate) for n, estimate in enumerate(found) if estimate.inertial]
+
+    (a, first), *_, (b, last) = inertial()
+    way_m = np.linalg.norm(last.odom_from_body[:3, 3] - first.odom_from_body[:3, 3])
+    assert np.linalg.norm(first.velocity_odom_mps) == pytest.approx(2.0, abs=0.1)
+    assert way_m == pytest.approx(2.0 * (b - a) * FRAME_NS * 1e-9, abs=0.04)
+    monkeypatch.setattr(StartingMode, "_moving_evenly", lambda _mode, start: start)
+    assert np.linalg.norm(inertial()[0][1].velocity_odom_mps) < 0.1
 
 
 @pytest.mark.parametrize(("degree", "value"), [(1, 0.8), (2, 0.8), (1, 0.0), (2, 0.0)])
