@@ -11,8 +11,9 @@ from fleetmap.sensors.rectification import StereoCamera
 
 _WIDTH = 4.0  # of the robust weight (Geman-McClure), in sigmas
 _CONFIDENCE = 0.999  # that no camera has more votes than the one that was found
-_ITERATIONS, _ITERATIONS_ON_INLIERS = 10, 5
 GATE_SQUARED = 11.345  # 0.99 of chi-square with 3 degrees of freedom: u, v, disparity
+ITERATIONS = 10, 5  # on all, and on the inliers
+REFINEMENT = _WIDTH, GATE_SQUARED, ITERATIONS
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +67,7 @@ def refine_pnp(
         1.0 / np.ascontiguousarray(matches.sigmas_px, np.float64),
     )
     lens, hessian, squared = matches.camera.lens, np.empty((6, 6)), np.empty(len(points))
-    limits = _WIDTH, GATE_SQUARED, prior, (_ITERATIONS, _ITERATIONS_ON_INLIERS)
+    limits = _WIDTH, GATE_SQUARED, prior, ITERATIONS
     if not pnp_kernels.refine_twice(rotation, translation, points, measured, weights, lens, *limits, hessian, squared):
         return None
     covariance = np.asarray(np.linalg.inv(hessian + prior + 1e-9 * np.eye(6)))

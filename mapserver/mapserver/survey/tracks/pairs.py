@@ -6,15 +6,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features.matching import Projected, match_by_projection, match_mutual
+from fleetmap.features.matching import match_mutual, packed
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.pnp.pnp import Correspondences, PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
+from fleetmap.pnp.pnp import REFINEMENT, Correspondences, PnpResult, pnp_with_rotation, ransac_pnp
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.settings import PairSettings
-from mapserver.survey.tracks.pairs_kernels import predict_features, share_in_view
+from mapserver.survey.tracks.pairs_kernels import Guidance, PairFeatures, follow_motion, match_both_ways, share_in_view
 
 Indices = NDArray[np.int64]
+_SCALES = 1.2 ** np.minimum(np.arange(128), 4).astype(np.float64)  # of the pixels on an octave
+_PROJECTED_SHARE = 0.4  # of the matches near their prediction: fewer, and the prediction was wrong
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +53,40 @@ class PredictedMotion(NamedTuple):
 
 def match_pair(i: int, j: int, inputs: MatchInputs, predicted: PredictedMotion | None = None) -> PairMatch | None:
     """The verified match of two keyframes, None where too little agrees."""
-    found = None
+    a, b, settings = _features(inputs.keyframes[i]), _features(inputs.keyframes[j]), inputs.settings
+    guidance, radius_px = _guidance(inputs), settings.guided_radius_px
+    steps, done, motion, hessian = 2, 0, np.empty((4, 4)), np.empty((6, 6))
     if predicted is not None and predicted.is_known:
-        found = _from_projection(inputs.keyframes[i], inputs.keyframes[j], inputs, predicted.j_from_i)
-    if found is None:
+        motion, radii_px = (
+            np.array(predicted.j_from_i, np.float64, order="C"),
+            np.array([settings.search_px, radius_px, radius_px]),
+        )
+        done, forward = follow_motion(
+            a, b, guidance, radii_px, (settings.min_inliers, _PROJECTED_SHARE), (motion, hessian)
+        )
+        steps = 3
+    if done == 0:
         found = _from_descriptors(inputs.keyframes[i], inputs.keyframes[j], inputs, predicted)
-    return None if found is None else _complete(i, j, inputs, found)
+        if found is None:
+            return None
+        motion, radii_px, steps = found.cam_from_source, np.full(2, radius_px), 2
+        done, forward = follow_motion(a, b, guidance, radii_px, (settings.min_inliers, 0.0), (motion, hessian))
+    if done < steps:
+        return None
+    features = match_both_ways(a, b, guidance, se3_inverse(motion), radius_px, forward)
+    return PairMatch(i, j, features, motion, np.asarray(np.linalg.inv(hessian + 1e-9 * np.eye(6))))
+
+
+def _features(keyframe: Keyframe) -> PairFeatures:
+    own = keyframe.features
+    pixels, octaves = np.ascontiguousarray(own.pixels, np.float64), np.ascontiguousarray(own.octaves, np.int8)
+    places = np.ascontiguousarray(keyframe.disparities), np.ascontiguousarray(keyframe.points_cam)
+    return PairFeatures(pixels, octaves, packed(own.descriptors), *places, not keyframe.from_views)
+
+
+def _guidance(inputs: MatchInputs) -> Guidance:
+    settings, camera = inputs.settings, inputs.camera
+    return Guidance(_lens(camera), camera.lens, _SCALES, settings.match_sigma_px, REFINEMENT, settings.guided_distance)
 
 
 def _measured(keyframe: Keyframe, index: Indices) -> Array:
@@ -66,7 +96,7 @@ def _measured(keyframe: Keyframe, index: Indices) -> Array:
 
 
 def _sigmas(keyframe: Keyframe, index: Indices, settings: PairSettings) -> Array:
-    scale = 1.2 ** np.minimum(keyframe.features.octaves[index], 4).astype(np.float64)
+    scale = _SCALES[keyframe.features.octaves[index]]
     return np.column_stack([settings.match_sigma_px * scale, np.maximum(settings.match_sigma_px, scale)])
 
 
@@ -97,48 +127,8 @@ def _from_descriptors(
     return found if found is not None and found.inliers.sum() >= 0.2 * len(pairs) else None
 
 
-def _project_match(a: Keyframe, b: Keyframe, inputs: MatchInputs, b_from_a: Array, radius_px: float) -> Indices:
-    """(P, 2) matches of a's features with depth into b by projection."""
-    own, disparities = a.features, a.disparities[:, 0]
-    predicted, radius, span = np.empty((len(own), 2)), np.empty(len(own)), np.zeros((len(own), 2), np.int64)
-    lens, output = _lens(inputs.camera), (predicted, radius, span)
-    predict_features(b_from_a, a.points_cam, disparities, own.octaves, lens, radius_px, *output)
-    projected = Projected(predicted, radius, own.descriptors, span)
-    found, _ = match_by_projection(projected, b.features, inputs.settings.guided_distance, 0.95)
-    hit = np.flatnonzero(found >= 0)
-    return np.column_stack([hit, found[hit]])
-
-
 def _lens(camera: StereoCamera) -> Array:
     return np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px], np.float64)
-
-
-def _from_projection(a: Keyframe, b: Keyframe, inputs: MatchInputs, b_from_a: Array) -> PnpResult | None:
-    settings = inputs.settings
-    pairs = _project_match(a, b, inputs, b_from_a, settings.search_px)
-    if len(pairs) < settings.min_inliers:
-        return None
-    found = refine_pnp(_correspondences(a, b, inputs, pairs), b_from_a)
-    return found if found is not None and found.inliers.sum() >= max(settings.min_inliers, 0.4 * len(pairs)) else None
-
-
-def _complete(i: int, j: int, inputs: MatchInputs, found: PnpResult) -> PairMatch | None:
-    """All matches that fit the motion, looked for in both directions, and the motion from all of them."""
-    a, b, settings = inputs.keyframes[i], inputs.keyframes[j], inputs.settings
-    for _ in range(2):
-        forward = _project_match(a, b, inputs, found.cam_from_source, settings.guided_radius_px)
-        if len(forward) < settings.min_inliers:
-            return None
-        again = refine_pnp(_correspondences(a, b, inputs, forward), found.cam_from_source)
-        if again is None or again.inliers.sum() < settings.min_inliers:
-            return None
-        found = again
-    forward = forward[found.inliers]
-    j_from_i = found.cam_from_source
-    backward = _project_match(b, a, inputs, se3_inverse(j_from_i), settings.guided_radius_px)[:, ::-1]
-    fresh = ~np.isin(backward[:, 0], forward[:, 0]) & ~np.isin(backward[:, 1], forward[:, 1])
-    features = np.vstack([forward, backward[fresh]]).astype(np.int32)  # a long survey has ten million
-    return PairMatch(i, j, features, found.cam_from_source, found.cov_rot_trans)
 
 
 def view_overlap(a: Keyframe, camera: StereoCamera, b_from_a: Array) -> float:
