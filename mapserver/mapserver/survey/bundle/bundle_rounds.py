@@ -108,29 +108,62 @@ def state_of(state: SurveyState, chosen: NDArray[np.bool_]) -> SurveyState:
 def local_windows(state: SurveyState, settings: SurveySettings) -> SurveyState:
     """Local bundle adjustment: overlapping windows in order, all else held; drift of the whole is left to the loops."""
     count, window = len(state.stamps_ns), settings.local_window
+    marks = state.landmarks
+    index = (
+        ObservationIndex.of(marks.obs_keyframe, count),
+        ObservationIndex.of(marks.obs_landmark, len(marks.points_map)),
+    )
     for start in range(0, max(count - window // 2, 1), window // 2):
         free = np.zeros(count, bool)
         free[start : start + window] = True
         if free.all():
             break
-        state = _local(state, settings, free)
+        state = _local(state, settings, free, index)
     return state
 
 
-def _local(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_]) -> SurveyState:
-    """One window with the earlier keyframes that see the same landmarks held; landmarks seen from elsewhere alone stay."""
-    marks = state.landmarks
-    inside = free[marks.obs_keyframe]
-    touched = np.zeros(len(marks.points_map), bool)
-    touched[marks.obs_landmark[inside]] = True
-    first, last = np.flatnonzero(free)[[0, -1]]
+@dataclass(frozen=True, slots=True)
+class ObservationIndex:
+    """Observations by what they belong to: rows (M,), those of number n from starts[n] to starts[n + 1]."""
+
+    rows: NDArray[np.int64]
+    starts: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, owners: NDArray[np.int32], count: int) -> "ObservationIndex":
+        """The index of owners (M,), which are numbers below `count`."""
+        rows = np.argsort(owners, kind="stable")
+        return cls(rows, np.searchsorted(owners[rows], np.arange(count + 1)))
+
+    def of_all(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The rows of some owners, rising."""
+        counts = self.starts[numbers + 1] - self.starts[numbers]
+        first = np.repeat(self.starts[numbers] - np.cumsum(counts) + counts, counts)
+        return np.sort(self.rows[np.arange(len(first)) + first])
+
+
+def _local(
+    state: SurveyState,
+    settings: SurveySettings,
+    free: NDArray[np.bool_],
+    index: tuple[ObservationIndex, ObservationIndex],
+) -> SurveyState:
+    """One window with the earlier keyframes that see the same landmarks held; landmarks seen from elsewhere alone stay.
+
+    index: the observations by keyframe and by landmark, so that a window costs what it holds.
+    """
+    marks, (by_keyframe, by_landmark) = state.landmarks, index
+    inside = np.flatnonzero(free)
+    first, last = inside[[0, -1]]
+    touched = np.unique(marks.obs_landmark[by_keyframe.of_all(inside)]).astype(np.int64)
+    rows = by_landmark.of_all(touched)
     # Later keyframes are where odometry left them: held, they would pull the window back to the drift.
-    rows = np.flatnonzero(touched[marks.obs_landmark] & (marks.obs_keyframe <= last))
+    rows = rows[marks.obs_keyframe[rows] <= last]
     used = np.zeros(len(free), bool)
     used[marks.obs_keyframe[rows]] = True
     used[max(first - 1, 0) : last + 1] = True
     keyframe = (np.cumsum(used) - 1)[marks.obs_keyframe[rows]].astype(np.int32)
-    landmark = (np.cumsum(touched) - 1)[marks.obs_landmark[rows]].astype(np.int32)
+    landmark = np.searchsorted(touched, marks.obs_landmark[rows]).astype(np.int32)
     seen = marks.obs_feature[rows], marks.obs_pixels[rows], marks.obs_sigma_px[rows]
     part = replace(
         state,
@@ -144,9 +177,9 @@ def _local(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_]
 
 
 def with_keyframes_of(
-    state: SurveyState, used: NDArray[np.bool_], part: SurveyState, touched: NDArray[np.bool_] | None = None
+    state: SurveyState, used: NDArray[np.bool_], part: SurveyState, touched: NDArray[np.int64] | None = None
 ) -> SurveyState:
-    """`state` with the used keyframes (K,) and the touched landmarks (N,), none by default, as they are in `part`."""
+    """`state` with the used keyframes (K,) and the touched landmarks (n,), none by default, as they are in `part`."""
     motion, own, marks = state.motion, part.motion, state.landmarks
     if touched is not None:
         marks = replace(marks, points_map=_put(marks.points_map, touched, part.landmarks.points_map))
@@ -160,7 +193,7 @@ def with_keyframes_of(
     return replace(state, map_from_body=map_from_body, motion=motion, landmarks=marks)
 
 
-def _put(values: Array, chosen: NDArray[np.bool_], new: Array) -> Array:
+def _put(values: Array, chosen: NDArray[np.bool_] | NDArray[np.int64], new: Array) -> Array:
     values = values.copy()
     values[chosen] = new
     return values

@@ -164,7 +164,9 @@ def _observe(
     keyframes, map_from_cam, is_reference = posed.keyframes, posed.map_from_cam, _is_first(table)
     reference_row = np.maximum.accumulate(np.where(is_reference, np.arange(len(table)), 0))
     groups = in_batches(np.unique(table[:, 0]).tolist(), _BATCH)
-    rows_of = [np.flatnonzero(np.isin(table[:, 0], group)) for group in groups]
+    by_keyframe = np.argsort(table[:, 0], kind="stable")
+    firsts = np.searchsorted(table[by_keyframe, 0], [group[0] for group in groups])
+    rows_of = [np.sort(rows) for rows in np.split(by_keyframe, firsts[1:])]
 
     def batches() -> Iterator[_ObservationBatch]:
         for group, rows in zip(groups, rows_of, strict=True):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import se3_inverse
-from mapserver.survey.bundle.bundle_rounds import bundle_rounds, local_windows
+from mapserver.survey.bundle.bundle_rounds import ObservationIndex, bundle_rounds, local_windows
 from mapserver.survey.settings import NoiseSettings, SurveySettings
 from support.worlds.corridor_scene import BODY_FROM_CAM, neighbour_errors_m, scene
 
@@ -89,3 +89,14 @@ def test_cameras_see_each_other_through_the_mounting() -> None:
     given = scene(3, 9, drift=0.02)
     expected = se3_inverse(given.state.map_from_body[2] @ BODY_FROM_CAM) @ given.state.map_from_body[0] @ BODY_FROM_CAM
     np.testing.assert_allclose(given.state.cam_from_cam(2, 0), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_index_finds_the_observations_that_masks_find(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 60))
+    owners = rng.integers(0, count, int(rng.integers(0, 900))).astype(np.int32)
+    index = ObservationIndex.of(owners, count)
+    for size in {0, 1, count // 3, count}:
+        chosen = np.sort(rng.permutation(count)[:size]).astype(np.int64)
+        np.testing.assert_array_equal(index.of_all(chosen), np.flatnonzero(np.isin(owners, chosen)))
