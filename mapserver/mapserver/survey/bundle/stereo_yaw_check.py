@@ -12,7 +12,7 @@ import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
-from mapserver.survey.bundle.bundle_adjustment import BundleResult, BundleSettings, optimize
+from mapserver.survey.bundle.bundle_adjustment import BundleProblem, BundleResult, BundleSettings, optimize
 from mapserver.survey.bundle.bundle_rounds import SurveyState, bundle_problem
 from mapserver.survey.bundle.measured_noise import measured_sigmas
 from mapserver.survey.settings import SurveySettings
@@ -63,13 +63,13 @@ def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings) -> StereoY
     measured = np.isfinite(state.landmarks.obs_pixels[:, 2])
     if measured.sum() < _MIN_DISPARITIES or state.is_depth_camera:
         return NO_YAW
-    sigmas = measured_sigmas(bundle_problem(state, settings, None), settings.final_bundle.huber_sigmas)
-    state = replace(state, landmarks=replace(state.landmarks, obs_sigma_px=sigmas))
-    slope = _slope(state, 0.0, settings)
+    problem = bundle_problem(state, settings, None)
+    problem = replace(problem, obs_sigma_px=measured_sigmas(problem, settings.final_bundle.huber_sigmas))
+    slope = _slope(problem, state.landmarks, 0.0, settings)
     shift, curvature = 0.0, 0.0
     step = _FIRST_TRY_PX if slope < 0 else -_FIRST_TRY_PX
     for _ in range(_MAX_STEPS):
-        moved = _slope(state, shift + step, settings)
+        moved = _slope(problem, state.landmarks, shift + step, settings)
         curvature = (moved - slope) / step
         if not curvature > 0.0:
             return NO_YAW
@@ -82,17 +82,15 @@ def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings) -> StereoY
     return StereoYaw(float(shift), sigma, corrected=abs(shift) > settings.noise.turn_sigmas * sigma)
 
 
-def _slope(state: SurveyState, shift_px: float, settings: SurveySettings) -> float:
+def _slope(problem: BundleProblem, marks: Landmarks, shift_px: float, settings: SurveySettings) -> float:
     """Derivative of the adjusted cost by the shift, everything else at its optimum for this shift."""
-    camera = state.camera
-    moved = replace(state, landmarks=without_stereo_yaw(state.landmarks, camera, shift_px))
-    result = optimize(bundle_problem(moved, settings, None), settings.final_bundle)
-    marks = moved.landmarks
-    ahead = se3_inverse(result.map_from_body @ state.body_from_cam)[marks.obs_keyframe, 2]
+    camera, marks = problem.camera, without_stereo_yaw(marks, problem.camera, shift_px)
+    result = optimize(replace(problem, obs_pixels=marks.obs_pixels), settings.final_bundle)
+    ahead = se3_inverse(result.map_from_body @ problem.body_from_cam)[marks.obs_keyframe, 2]
     points = result.points_map[marks.obs_landmark]
     depth = np.einsum("mj,mj->m", ahead[:, :3], points) + ahead[:, 3]
     off = marks.obs_pixels[:, 0] - marks.obs_pixels[:, 2] - camera.focal_px * camera.baseline_m / depth
-    pull = _weights(result, settings.final_bundle) * off / marks.obs_sigma_px[:, 1] ** 2
+    pull = _weights(result, settings.final_bundle) * off / problem.obs_sigma_px[:, 1] ** 2
     return -float(np.nansum(pull * disparity_shift(camera, marks.obs_pixels)))
 
 
