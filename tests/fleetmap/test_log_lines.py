@@ -26,7 +26,12 @@ def lines(request: pytest.FixtureRequest) -> Iterator[tuple[logging.Logger, io.S
     log.propagate = True
 
 
-@pytest.mark.parametrize("words", [FORGED, "a\rb", "a\x1b[2Jb", "a\u2028b", "a\x00b", "a\ud800b"])
+FORGERIES = {
+    "line": FORGED, "return": "a\rb", "terminal": "a\x1b[2Jb", "separator": "a\u2028b", "zero": "a\x00b", "surrogate": "a\ud800b",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", FORGERIES.values(), ids=FORGERIES)  # names that every runner can print
 def test_nobody_forges_a_line(lines: tuple[logging.Logger, io.StringIO, bool], words: str) -> None:
     log, out, is_ours = lines
     log.warning("message under %s refused", words)
