@@ -9,6 +9,7 @@ from benchmarks.survey import (
     bench_build,
     bench_calibration_faults,
     bench_image_pipelines,
+    bench_live,
     bench_prepare,
     bench_real_pairs,
     bench_survey,
@@ -49,6 +50,16 @@ def test_build_speed_and_memory() -> None:
     bench_build.show(rows, len(os.sched_getaffinity(0)))
     assert rows["10 minutes"]["peak_rss_mb"] <= bench_build.MEMORY_LIMIT_MB
     assert rows["five aisles"]["times_20_hz"] >= bench_build.SPEED_LIMIT
+
+
+@pytest.mark.parametrize("name", ["euroc_mh01_start", "7scenes_redkitchen_200"])
+def test_a_survey_keeps_up_while_it_drives(name: str) -> None:
+    """No frame is dropped, and the map is never long behind; on a machine that does nothing else."""
+    (row,) = bench_live.bench([real_data(name)])
+    print(row)
+    assert (row["dropped"], row["mapping_failed"]) == (0, "")
+    assert row["latency_ms"][1] <= bench_live.LATENCY_LIMIT_MS
+    assert row["lag_s"] <= bench_live.LAG_LIMIT_S
 
 
 @pytest.mark.timeout(7200)
