@@ -34,7 +34,9 @@ FORGERIES = {
 @pytest.mark.parametrize("words", FORGERIES.values(), ids=FORGERIES)  # names that every runner can print
 def test_nobody_forges_a_line(lines: tuple[logging.Logger, io.StringIO, bool], words: str) -> None:
     log, out, is_ours = lines
-    log.warning("message under %s refused", words)
+    record = log.makeRecord(log.name, logging.WARNING, "here", 1, "message under %s refused", (words,), None)
+    # By its own handler alone: the runner's may not know what to do with a surrogate.
+    next(h for h in log.handlers if isinstance(h, logging.StreamHandler) and h.stream is out).handle(record)
     text = out.getvalue()
     assert text.removesuffix("\n").isprintable() is is_ours
     assert len(text.splitlines()) == 1 or not is_ours
