@@ -60,7 +60,7 @@ class MappingProcess:
     def __enter__(self) -> Self:
         self._process.start()
         self._theirs.close()
-        if not self._ours.poll(_READY_WITHIN_S) or self._ours.recv() != "ready":
+        if not self._is_ready():
             self._process.kill()
             raise FleetmapError("mapping did not start; `mapserver prepare` compiles what it needs, then try again")
         for thread in self._threads:
@@ -110,6 +110,12 @@ class MappingProcess:
             self._process.kill()
             self._process.join()
         self._ours.close()
+
+    def _is_ready(self) -> bool:
+        try:
+            return self._ours.poll(_READY_WITHIN_S) and self._ours.recv() == "ready"
+        except EOFError:  # it ended before it began
+            return False
 
     def _send(self) -> None:
         try:

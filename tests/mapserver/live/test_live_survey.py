@@ -3,13 +3,14 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from fleetmap.errors import UsageError
+from fleetmap.errors import FleetmapError, UsageError
 from fleetmap.live_survey import MAX_ARRAY_BYTES, LiveSurveyState
 from fleetmap.messages import MAX_MESSAGE_BYTES, encode_message
 from fleetmap.recordings import Topics, open_recording
@@ -22,7 +23,7 @@ from mapserver.cli import app
 from mapserver.config import survey_settings
 from mapserver.library import build_map
 from mapserver.live import LiveRequest, LiveResult, RecordedDrive, SensorDrive, run_live
-from mapserver.live.mapping_process import thinned, thinning
+from mapserver.live.mapping_process import MappingProcess, thinned, thinning
 from mapserver.store import MapStore
 from support.recordings.recording_samples import make_sample, write_euroc
 
@@ -159,6 +160,12 @@ def test_one_source_must_be_named(given: list[str], tmp_path: Path) -> None:
     said = CliRunner().invoke(app, ["live", *given, "--site", "lab", "--store", str(tmp_path / "maps")])
     assert isinstance(said.exception, UsageError)
     assert "--sensors FILE" in str(said.exception)
+
+
+def test_mapping_that_does_not_start_is_an_error_with_a_next_step() -> None:
+    broken: Any = None  # settings without which the process ends before it is ready
+    with pytest.raises(FleetmapError, match="mapserver prepare"), MappingProcess(broken, broken):
+        pass
 
 
 def test_thinned_rows_fit_a_message_and_keep_the_last() -> None:
