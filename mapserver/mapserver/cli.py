@@ -23,9 +23,11 @@ from mapserver.commands.releases.publish import publish
 from mapserver.commands.releases.rollback import rollback
 from mapserver.commands.releases.versions import versions
 from mapserver.commands.serve import serve
+from mapserver.commands.store.audit import audit
 from mapserver.commands.store.export import export
 from mapserver.commands.store.gc import gc
 from mapserver.commands.store.import_ import import_
+from mapserver.commands.store.operators import OPERATORS
 from mapserver.commands.store.robots import ROBOTS
 from mapserver.commands.store.trust import TRUST
 from mapserver.commands.store.verify import verify
@@ -56,6 +58,8 @@ COMMANDS: Commands = {
     "train-vocabulary": train_vocabulary,
     "fleet": FLEET,
     "robots": ROBOTS,
+    "operators": OPERATORS,
+    "audit": audit,
     "prepare": prepare,
     "trust": TRUST,
     "config": CONFIG,

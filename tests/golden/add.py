@@ -44,7 +44,7 @@ def write_store(folder: Path) -> None:
         store.update_job(store.begin_job("lab", "nightly"), "done", "version 2 is published", {"drafts": 1})
         report = FailureReport(
             site="lab", robot="r1", id="f1", stamp_ns=5, wall_ns=6, duration_s=2.5, kind="blind", status="LOST", cause="dark",
-            version=1, tile=(0, 0), thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"jpeg"),),
+            version=1, tile=(0, 0), thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"\xff\xd8jpeg\xff\xd9"),),
         )  # fmt: skip
         Fleet(store, clock_ns=lambda: 1_767_323_045_000_000_000).take_failure("lab", "r1", report)
 

@@ -1,5 +1,7 @@
 """Maps on the disk: content-addressed files and one SQLite database. SQL lives here alone."""
 
+from mapserver.store.access.chain import AuditLine, AuditMark, chain_faults
+from mapserver.store.access.operators import OperatorQueries, OperatorRow, TokenRow
 from mapserver.store.fleet_queries import CounterKey, FleetBatch, tile_key
 from mapserver.store.garbage_collection import Retention
 from mapserver.store.map_store import MapStore
@@ -26,6 +28,8 @@ from mapserver.store.rows import (
 __all__ = [
     "NOBODY",
     "Actor",
+    "AuditLine",
+    "AuditMark",
     "CanaryRow",
     "CounterKey",
     "DraftContent",
@@ -39,11 +43,15 @@ __all__ = [
     "JobInfo",
     "MapStore",
     "NewCanary",
+    "OperatorQueries",
+    "OperatorRow",
     "PictureRow",
     "Retention",
     "SiteInfo",
+    "TokenRow",
     "TraceRow",
     "VerdictRow",
     "VersionInfo",
+    "chain_faults",
     "tile_key",
 ]

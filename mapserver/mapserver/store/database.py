@@ -11,6 +11,7 @@ from urllib.parse import quote
 from sqlite_utils import Database
 
 from fleetmap.errors import NewerFormatError, StoreError
+from mapserver.store.access.chain import COLUMNS, AuditLine, last_sha256, line_sha256
 from mapserver.store.migrations import MIGRATIONS
 from mapserver.store.rows import LogEntry
 
@@ -96,11 +97,23 @@ class Transactions:
         return [kind(**row) for row in self.query(sql, values)]
 
     def log(self, connection: sqlite3.Connection, site: str, entry: LogEntry) -> None:
-        """One line of a site's history, within a transaction."""
+        """One line of the log, chained to the one before it, within a transaction; site: empty where it is about none."""
+        actor = entry.actor
+        last = connection.execute("SELECT id, sha256 FROM events ORDER BY id DESC LIMIT 1").fetchone() or (0, "")
+        before = last[1] or last_sha256(self.audit_lines())
+        values: tuple[object, ...] = (last[0] + 1, self.now_ns(), site, entry.kind, entry.detail, entry.version)
+        values += (actor.name, actor.reason, actor.operator, actor.address)
         connection.execute(
-            "INSERT INTO events (stamp_ns, site, kind, detail, version, actor, reason) VALUES (?, ?, ?, ?, ?, ?, ?)",
-            (self.now_ns(), site, entry.kind, entry.detail, entry.version, entry.actor.name, entry.actor.reason),
+            f"INSERT INTO events ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            (*values, line_sha256(before, values)),
         )
+
+    def audit_lines(self, last: int | None = None) -> list[AuditLine]:
+        """The whole log, oldest line first, or the last lines of it."""
+        rows = self.rows(
+            AuditLine, f"SELECT {COLUMNS} FROM events ORDER BY id DESC LIMIT ?", (-1 if last is None else last,)
+        )
+        return rows[::-1]
 
 
 def _opened(path: Path, prepare: Callable[[Database, Path], object], options: str = "mode=rwc") -> Database:

@@ -11,6 +11,8 @@ import msgspec
 from fleetmap.errors import UsageError
 from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest
 from mapserver.quality.figures import Evidence
+from mapserver.store.access.chain import AuditLine, AuditMark
+from mapserver.store.access.operators import OperatorQueries
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import Transactions
 from mapserver.store.fleet_queries import FleetQueries, keep_last_reports
@@ -30,6 +32,7 @@ from mapserver.store.rows import (
 from mapserver.store.version_rows import canaries, site_releases
 
 JOB_STATES = ("running", "done", "failed")
+_EVENT = "id, stamp_ns, site, kind, detail, version, actor, reason"
 _SERVED_KINDS = ("manifest", "tile", "vocabulary")
 
 
@@ -42,6 +45,7 @@ class StoreQueries:
         self._blobs = BlobFolder(root)
         self._transactions = Transactions(root / "store.sqlite3", clock_ns, read_only=read_only)
         self.fleet = FleetQueries(self._transactions)
+        self.operators = OperatorQueries(self._transactions)
 
     @property
     def folder(self) -> Path:
@@ -167,8 +171,22 @@ class StoreQueries:
     def events(self, site: str, *, after: int = 0, limit: int = -1) -> list[Event]:
         """A site's history, oldest first, behind event `after`."""
         return self._transactions.rows(
-            Event, "SELECT * FROM events WHERE site = ? AND id > ? ORDER BY id LIMIT ?", (site, after, limit)
+            Event, f"SELECT {_EVENT} FROM events WHERE site = ? AND id > ? ORDER BY id LIMIT ?", (site, after, limit)
         )
+
+    def audit(self, kind: str, detail: str, *, actor: Actor = NOBODY, site: str = "") -> None:
+        """One line of the log about something that no other method writes, such as an enrolment, a signature or a refusal."""
+        with self._transactions.write() as connection:
+            self._transactions.log(connection, site, LogEntry(kind, detail, None, actor))
+
+    def audit_lines(self, last: int | None = None) -> list[AuditLine]:
+        """The log of all sites and of the store itself, oldest line first, or the last lines of it."""
+        return self._transactions.audit_lines(last)
+
+    def audit_mark(self) -> AuditMark | None:
+        """The end of the log, to be kept where nobody who writes the log can change it; None before the first chained line."""
+        last = self.audit_lines(1)
+        return AuditMark(last[0].id, last[0].sha256) if last and last[0].sha256 else None
 
     def canaries(self, site: str | None = None, *, running: bool = False) -> list[CanaryRow]:
         """Versions that some robots (of a site) tried first, the last one first; those that run alone with `running`."""
@@ -177,7 +195,7 @@ class StoreQueries:
     def last_events(self, site: str, limit: int) -> list[Event]:
         """The last of a site's history, newest first."""
         return self._transactions.rows(
-            Event, "SELECT * FROM events WHERE site = ? ORDER BY id DESC LIMIT ?", (site, limit)
+            Event, f"SELECT {_EVENT} FROM events WHERE site = ? ORDER BY id DESC LIMIT ?", (site, limit)
         )
 
     def robots(self, site: str | None = None) -> list[RobotInfo]:

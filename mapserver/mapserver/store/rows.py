@@ -62,10 +62,15 @@ class RobotInfo:
 
 @dataclass(frozen=True, slots=True)
 class Actor:
-    """Who acts, and why; empty where the program acts by itself."""
+    """Who acts, and why; empty where the program acts by itself.
+
+    operator: the name that was proved by a session or token, empty where `name` was only written; address: where the request came from.
+    """
 
     name: str = ""
     reason: str = ""
+    operator: str = ""
+    address: str = ""
 
 
 NOBODY = Actor()

@@ -17,6 +17,7 @@ import msgspec
 from fleetmap.errors import StoreError, UntrustedError
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import SiteList, read_site_list, site_role
+from mapserver.store import AuditMark
 
 TIMESTAMP = "timestamp"
 _NAME = re.compile(r"(?:(timestamp)|[0-9]{1,10}\.(root|targets|snapshot|site-[a-z0-9_-]{1,64}))\.json")
@@ -28,6 +29,7 @@ class _Signed(msgspec.Struct, frozen=True):
     expires: datetime
     meta: dict[str, dict[str, Any]] = {}
     delegations: dict[str, Any] | None = None
+    audit: AuditMark | None = None
 
 
 class _Signature(msgspec.Struct, frozen=True):
@@ -37,6 +39,16 @@ class _Signature(msgspec.Struct, frozen=True):
 class _File(msgspec.Struct, frozen=True):
     signed: _Signed
     signatures: tuple[_Signature, ...] = ()
+
+
+def audit_mark(path: Path) -> AuditMark | None:
+    """The line of the log that a timestamp names; None where it names none or is not there. Raises StoreError for what is none."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=_File).signed.audit
+    except FileNotFoundError:
+        return None
+    except (OSError, msgspec.MsgspecError) as error:
+        raise StoreError(f"{path} cannot be read as a timestamp ({error}); check the path") from error
 
 
 class SiteRole(msgspec.Struct, frozen=True):

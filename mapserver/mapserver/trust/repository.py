@@ -24,6 +24,7 @@ from tuf.api.serialization.json import JSONSerializer
 
 from fleetmap.errors import StateError, StoreError, disk_errors
 from fleetmap.trust import AdmittedVersion, manifest_target, site_role
+from mapserver.store import AuditMark
 from mapserver.store.files import make_folder, write_atomically
 from mapserver.trust.lists import TIMESTAMP, SignedLists
 
@@ -202,8 +203,10 @@ class ListRepository:
 
     # --- by the server ------------------------------------------------------------------------------------------------
 
-    def sign_online(self, online: CryptoSigner) -> None:
+    def sign_online(self, online: CryptoSigner, audit: AuditMark | None = None) -> None:
         """Snapshot, where something changed, and timestamp. Names only what it has verified with the store's own root.
+
+        audit: the end of the store's log, which robots then keep with the timestamp.
 
         Raises StateError where root and targets do not let this key sign.
         """
@@ -221,7 +224,10 @@ class ListRepository:
         if before is None or before.meta != meta or before.expires < self._now + timedelta(days=RENEW_SNAPSHOT_DAYS):
             number += 1
             self._sign("snapshot", Snapshot(version=number, meta=meta), [online])
-        self._sign(TIMESTAMP, Timestamp(version=stamped + 1, snapshot_meta=MetaFile(number)), [online], (root,))
+        stamp = Timestamp(version=stamped + 1, snapshot_meta=MetaFile(number))
+        if audit is not None:
+            stamp.unrecognized_fields["audit"] = list(audit)
+        self._sign(TIMESTAMP, stamp, [online], (root,))
 
     def _last_snapshot(self, root: Root) -> Snapshot | None:
         """The one that can stay, None where none can: one that a replaced key signed cannot, although it says the same."""

@@ -57,7 +57,7 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
             _update_site(repository, keys, store.releases(info.site), now)
         online = keys.signer("online")
         if online is not None and (all_anew or _online_is_due(lists, now)):
-            repository.sign_online(online)
+            repository.sign_online(online, store.audit_mark())
 
 
 def try_update_lists(store: MapStore) -> None:

@@ -1,0 +1,134 @@
+"""`mapserver operators`: the people and programs that a server answers."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleetmap.cli_options import Group, expand_options
+from fleetmap.errors import UsageError
+from mapserver.commands.options import ActorOptions, Json, StoreFolder
+from mapserver.commands.print_json import print_json
+from mapserver.operators.roles import Role, Scope
+
+if TYPE_CHECKING:
+    from mapserver.store import MapStore
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the operator.")]
+NewRole = Annotated[Role, typer.Option(help="viewer: reads; operator: changes versions too; admin: everything.")]
+Asked = Annotated[bool, typer.Option("--ask", help="Ask for a password instead of making one.")]
+
+
+@expand_options
+def add(name: Name, store: StoreFolder, by: ActorOptions, role: NewRole = Role.VIEWER, ask: Asked = False) -> None:
+    """Name an operator; prints the password once. From the first one on, a server answers only who signs in."""
+    from mapserver.operators import Operators
+    from mapserver.store import MapStore
+
+    with MapStore.open(store) as maps:
+        password, shown = _password(ask=ask)
+        Operators(maps).add(name, role.value, password, by.named())
+    typer.echo(f"operator {name} is a {role.value}{shown}")
+
+
+@expand_options
+def password(name: Name, store: StoreFolder, by: ActorOptions, ask: Asked = False) -> None:
+    """Give an operator another password, a disabled one too; ends the sessions that there are."""
+    from mapserver.operators import Operators
+    from mapserver.store import MapStore
+
+    with MapStore.open(store) as maps:
+        _check_person(maps, name)
+        made, shown = _password(ask=ask)
+        Operators(maps).set_password(name, made, by.named())
+    typer.echo(f"operator {name} has another password{shown}")
+
+
+@expand_options
+def role(
+    name: Name,
+    role: Annotated[Role, typer.Argument(metavar="ROLE", help="viewer, operator or admin.")],
+    store: StoreFolder,
+    by: ActorOptions,
+) -> None:
+    """Give an operator another role, at once."""
+    from mapserver.store import MapStore
+
+    with MapStore.open(store) as maps:
+        _check_person(maps, name)
+        maps.operators.set_role(name, role.value, by.named())
+    typer.echo(f"operator {name} is a {role.value}")
+
+
+@expand_options
+def disable(name: Name, store: StoreFolder, by: ActorOptions) -> None:
+    """End the sessions and tokens of a name at once, and let nobody sign in by it."""
+    from mapserver.store import MapStore
+
+    with MapStore.open(store) as maps:
+        maps.operators.disable(name, by.named())
+    typer.echo(f"operator {name} is disabled")
+
+
+@expand_options
+def token(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of an operator, or of a program.")],
+    store: StoreFolder,
+    by: ActorOptions,
+    scope: Annotated[list[str] | None, typer.Option(metavar="SCOPE", help="What it may; repeat it.")] = None,
+    days: Annotated[float, typer.Option(min=0.01, max=400, help="Days after which it ends.")] = 90,
+) -> None:
+    """Make a token for a program, which shows it as `Authorization: Bearer TOKEN`; prints it once."""
+    from mapserver.operators import Operators
+    from mapserver.store import MapStore
+
+    wrong = [word for word in scope or () if word not in set(Scope)]
+    if wrong or not scope:
+        raise UsageError(f"--scope {wrong[0] if wrong else ''}: say what the token may: {', '.join(Scope)}")
+    with MapStore.open(store) as maps:
+        made = Operators(maps).make_token(name, scope, days, by.named())
+    typer.echo(made)
+
+
+def list_(store: StoreFolder, json: Json = False) -> None:
+    """List operators and programs with their roles, sessions and tokens."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from mapserver.store import MapStore
+
+    with MapStore.open(store, read_only=True) as maps:
+        found = maps.operators.all(maps.now_ns())
+    if json:
+        shown = ("name", "role", "is_disabled", "sessions", "tokens")
+        print_json([{name: getattr(row, name) for name in shown} for row in found])
+        return
+    table = Table("name", "role", "sessions", "tokens", "")
+    for row in found:
+        table.add_row(row.name, row.role, str(row.sessions), str(row.tokens), "disabled" if row.is_disabled else "")
+    Console().print(table)
+
+
+def _check_person(maps: "MapStore", name: str) -> None:
+    row = maps.operators.find(name)
+    if row is not None and row.role == "program":
+        raise UsageError(f"{name} is a program, which has tokens alone; choose another name for a person")
+
+
+def _password(*, ask: bool) -> tuple[str, str]:
+    """A password, and the words that show one that was made."""
+    from mapserver.operators.operators import MAX_PASSWORD, MIN_PASSWORD
+    from mapserver.trust.keys import make_passphrase
+
+    if not ask:
+        made = make_passphrase()
+        return made, f"; password (shown once): {made}"
+    chosen: str = typer.prompt("password", hide_input=True, confirmation_prompt=True)
+    if not MIN_PASSWORD <= len(chosen) <= MAX_PASSWORD:
+        raise UsageError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} signs; leave --ask out to have one made")
+    return chosen, ""
+
+
+OPERATORS = Group(
+    "The people and programs that a server answers.",
+    {"add": add, "password": password, "role": role, "disable": disable, "token": token, "list": list_},
+)

@@ -1,0 +1,164 @@
+"""Sign-in of operators, and who a request comes from.
+
+Passwords are hashed by argon2 with the low-memory profile of RFC 9106, section 4, one at a time: each takes 64 MiB. Sessions and tokens are
+256 random bits, of which the store keeps the SHA-256.
+"""
+
+import hashlib
+import secrets
+import threading
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+from mapserver.fleet.rate_limit import RateLimit
+from mapserver.operators.roles import SCOPES, Identity, check_operator_name
+from mapserver.store import Actor, MapStore, TokenRow
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from argon2 import PasswordHasher
+
+IDLE_S, LIFE_S = 3600, 12 * 3600
+TRIES, TRY_EVERY_S = 5, 12
+MIN_PASSWORD, MAX_PASSWORD = 12, 1000
+MAX_TOKEN_DAYS = 400
+_WAITING = 4  # sign-ins that may wait for their turn: more would hold the threads that answer everybody else
+_NOTE_USE_EVERY_S = 60
+_NOTES, _NOTE_EVERY_S = 60, 60  # refusals in the log, which is never shortened
+_LOOK_EVERY_S = 1
+
+
+@dataclass(frozen=True, slots=True)
+class SignIn:
+    """How a sign-in ended: the session's secret, or a refusal and the seconds after which to try again."""
+
+    session: str = ""
+    refusal: str = ""
+    retry_s: int = 0
+
+
+class Operators:
+    """The operators of an open store. For any thread."""
+
+    def __init__(self, store: MapStore) -> None:
+        self._store, self._now_ns = store, store.now_ns
+        self._verifying, self._waiting = threading.Lock(), threading.BoundedSemaphore(_WAITING)
+        self._tries = RateLimit(TRIES, 1 / TRY_EVERY_S, self._now_ns)
+        self._notes = RateLimit(_NOTES, 1 / _NOTE_EVERY_S, self._now_ns)
+        self._unnoted = 0
+        self._are_there, self._looked_ns = False, -(10**18)
+
+    @property
+    def is_sign_in_on(self) -> bool:
+        """Whether anybody was ever named; from then on every request needs a session or a token."""
+        if not self._are_there and self._now_ns() - self._looked_ns > _LOOK_EVERY_S * 1e9:
+            self._looked_ns, self._are_there = self._now_ns(), self._store.operators.are_there()
+        return self._are_there
+
+    def add(self, name: str, role: str, password: str, actor: Actor) -> None:
+        """A new operator; UsageError for a name that is taken or cannot be one."""
+        self._store.operators.add(check_operator_name(name), role, _hasher().hash(password), actor)
+
+    def set_password(self, name: str, password: str, actor: Actor) -> None:
+        """Another password, which ends all sessions; UsageError for an unknown name."""
+        self._store.operators.set_password(name, _hasher().hash(password), actor)
+
+    def make_token(self, name: str, scopes: "Iterable[str]", days: float, actor: Actor) -> str:
+        """A token that is shown once; of a name that is no operator's it is a program's. UsageError for a name that cannot be one."""
+        token, ends_ns = secrets.token_urlsafe(32), self._now_ns() + int(days * 86_400e9)
+        row = TokenRow(check_operator_name(name), "", " ".join(sorted(set(scopes))), ends_ns)
+        self._store.operators.add_token(_digest(token), row, actor)
+        return token
+
+    def sign_in(self, name: str, password: str, address: str) -> SignIn:
+        """A session for a name and password, or a refusal that does not say which of the two is wrong."""
+        if not self._waiting.acquire(blocking=False):
+            return SignIn(refusal="Too many people sign in at the moment. Try again.", retry_s=2)
+        try:
+            return self._sign_in(name, password, address)
+        finally:
+            self._waiting.release()
+
+    def _sign_in(self, name: str, password: str, address: str) -> SignIn:
+        name = ascii(name[:64])[1:-1]  # as names are, or else nobody's
+        who = Actor(name, address=address)
+        if not self._tries.admits((name, address)):
+            self.note("sign-in refused", "too many tries", who)
+            return SignIn(refusal="Too many tries. Wait before the next one.", retry_s=TRY_EVERY_S)
+        row = self._store.operators.find(name)
+        stored = None if row is None or row.is_disabled else row.password
+        with self._verifying:
+            # Unknown names take as long as known ones.
+            is_right = _verified(stored or _dummy(), password[:MAX_PASSWORD])
+        if stored is None or not is_right:
+            self.note("sign-in refused", "wrong name or password", who)
+            return SignIn(refusal="Wrong name or password.")
+        session = secrets.token_urlsafe(32)
+        self._store.operators.begin_session(_digest(session), name, Actor(name, "", name, address))
+        now_ns = self._now_ns()
+        self._store.operators.remove_ended(
+            begun_before_ns=now_ns - LIFE_S * 10**9, used_before_ns=now_ns - IDLE_S * 10**9
+        )
+        return SignIn(session)
+
+    def sign_out(self, who: Identity) -> None:
+        """Ends the session that a request came with."""
+        if who.proof:
+            self._store.operators.end_session(who.proof, who.actor())
+
+    def identify(self, session: str, authorization: str, address: str, *, uses: bool = True) -> Identity | None:
+        """Who shows this cookie or this `Authorization`; None for nobody that may. uses: whether this keeps the session from ending."""
+        scheme, _, token = authorization.partition(" ")
+        if scheme.lower() == "bearer":
+            return self._by_token(token.strip(), address)
+        if not session:
+            return None
+        sha256, now_ns = _digest(session), self._now_ns()
+        row = self._store.operators.session(sha256)
+        if row is None or now_ns - row.begun_ns > LIFE_S * 1e9 or now_ns - row.used_ns > IDLE_S * 1e9:
+            return None
+        if uses and now_ns - row.used_ns > _NOTE_USE_EVERY_S * 1e9:
+            self._store.operators.use_session(sha256, now_ns)
+        return Identity(row.name, row.role, SCOPES[row.role], address, sha256)
+
+    def note(self, kind: str, detail: str, actor: Actor) -> None:
+        """One line of the log about something that strangers can cause: after the first 60 one a minute, with the number left out."""
+        if not self._notes.admits("notes"):
+            self._unnoted += 1
+            return
+        more, self._unnoted = self._unnoted, 0
+        self._store.audit(kind, f"{detail} (and {more} lines left out)" if more else detail, actor=actor)
+
+    def _by_token(self, token: str, address: str) -> Identity | None:
+        row = self._store.operators.token(_digest(token))
+        if row is None or row.ends_ns <= self._now_ns():
+            return None
+        return Identity(row.name, row.role, SCOPES[row.role] & set(row.scopes.split()), address)
+
+
+def _digest(secret: str) -> str:
+    return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _verified(stored: str, password: str) -> bool:
+    from argon2.exceptions import InvalidHashError, VerificationError
+
+    try:
+        return _hasher().verify(stored, password)
+    except (VerificationError, InvalidHashError, UnicodeError):
+        return False
+
+
+@cache
+def _hasher() -> "PasswordHasher":
+    from argon2 import PasswordHasher
+    from argon2.profiles import RFC_9106_LOW_MEMORY
+
+    return PasswordHasher.from_parameters(RFC_9106_LOW_MEMORY)
+
+
+@cache
+def _dummy() -> str:
+    return _hasher().hash(secrets.token_urlsafe())

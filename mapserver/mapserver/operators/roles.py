@@ -1,0 +1,61 @@
+"""Roles and what they allow."""
+
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+
+from fleetmap.errors import UsageError
+from mapserver.store import Actor
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9._@+-]{0,63}")
+
+
+class Scope(StrEnum):
+    """What a request may be allowed to do."""
+
+    READ = "read"
+    METRICS = "metrics"
+    CHANGE = "change"
+    ROBOTS = "robots"
+    OPERATORS = "operators"
+
+
+class Role(StrEnum):
+    """What a person is to the fleet."""
+
+    VIEWER = "viewer"
+    OPERATOR = "operator"
+    ADMIN = "admin"
+
+
+SCOPES: dict[str, frozenset[Scope]] = {
+    Role.VIEWER: frozenset({Scope.READ}),
+    Role.OPERATOR: frozenset({Scope.READ, Scope.METRICS, Scope.CHANGE}),
+    Role.ADMIN: frozenset(Scope),
+    # A name that is nobody's: it has tokens alone, each with the scopes that it was made with.
+    "program": frozenset(Scope),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who sends a request, as a session or a token has proved it. proof: the hash of a session, empty for a token."""
+
+    name: str
+    role: str
+    scopes: frozenset[str]
+    address: str
+    proof: str = ""
+
+    def actor(self, reason: str = "") -> Actor:
+        """As the store keeps who acts."""
+        return Actor(self.name, reason, self.name if self.proof else f"token of {self.name}", self.address)
+
+
+def check_operator_name(name: str) -> str:
+    """The name; UsageError for one that nobody can have."""
+    if not _NAME.fullmatch(name):
+        raise UsageError(
+            f"{name[:80]!r} is no operator's name; use up to 64 small letters, digits and . _ @ + -, such as ada"
+        )
+    return name

@@ -1,0 +1,1 @@
+"""Who may do what, as rows, and the chain that makes changes to the log visible."""

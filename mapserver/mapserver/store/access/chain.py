@@ -1,0 +1,72 @@
+"""The chain of the log: the hash of a line covers the line and the hash of the line before it. Pure.
+
+Lines of a store from before the chain have no hash of their own; the first chained line covers them all.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple, dataclass
+from typing import NamedTuple
+
+COLUMNS = "id, stamp_ns, site, kind, detail, version, actor, reason, operator, address, sha256"
+
+
+@dataclass(frozen=True, slots=True)
+class AuditLine:
+    """One line of the log. operator: the name that was proved, empty where nothing was; address: where a request came from."""
+
+    id: int
+    stamp_ns: int
+    site: str
+    kind: str
+    detail: str
+    version: int | None
+    actor: str
+    reason: str
+    operator: str
+    address: str
+    sha256: str
+
+
+class AuditMark(NamedTuple):
+    """The last line when something was signed; whoever keeps it witnesses all lines up to there."""
+
+    line: int
+    sha256: str
+
+
+def line_sha256(before: str, values: Sequence[object]) -> str:
+    """The hash of a line with these columns, all but the hash, behind one of hash `before` (empty for the first)."""
+    return hashlib.sha256(json.dumps([before, *values], separators=(",", ":")).encode()).hexdigest()
+
+
+def last_sha256(lines: Iterable[AuditLine]) -> str:
+    """The hash behind all these lines, oldest first."""
+    before = ""
+    for line in lines:
+        before = line.sha256 or line_sha256(before, astuple(line)[:-1])
+    return before
+
+
+def chain_faults(lines: Iterable[AuditLine], witnesses: Sequence[tuple[str, AuditMark]] = ()) -> list[str]:
+    """What does not fit in the log, oldest line first; empty where nothing was changed. witnesses: marks by who keeps them."""
+    faults: list[str] = []
+    before, number, is_chained = "", 0, False
+    marked = {mark.line: "" for _, mark in witnesses}
+    for line in lines:
+        if line.id != number + 1:
+            faults.append(f"lines {number + 1} to {line.id - 1} are missing")
+        expected = line_sha256(before, astuple(line)[:-1])
+        if line.sha256 != expected and (line.sha256 or is_chained):
+            faults.append(f"line {line.id} was changed, or stands behind one that was removed")
+        is_chained |= bool(line.sha256)
+        before, number = line.sha256 or expected, line.id
+        if number in marked:
+            marked[number] = before
+    for name, mark in witnesses:
+        if mark.line > number:
+            faults.append(f"{name} knows line {mark.line}, and the log ends at line {number}")
+        elif marked[mark.line] != mark.sha256:
+            faults.append(f"{name} knows another line {mark.line}: the log was written anew")
+    return faults

@@ -1,0 +1,164 @@
+"""Operators, their sessions and tokens. Of secrets only hashes are kept; every change stands in the log."""
+
+import sqlite3
+from dataclasses import dataclass
+
+from fleetmap.errors import UsageError
+from mapserver.store.database import Transactions
+from mapserver.store.rows import Actor, LogEntry
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorRow:
+    """One operator. role: viewer, operator, admin, or program for a name that has tokens alone; password: its argon2 hash."""
+
+    name: str
+    role: str
+    password: str | None
+    is_disabled: int
+    tokens: int = 0
+    sessions: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class SessionRow:
+    """A session, with the role that its operator has now."""
+
+    name: str
+    role: str
+    begun_ns: int
+    used_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class TokenRow:
+    """A token: whose it is, what it may (words of scopes) and when it ends."""
+
+    name: str
+    role: str
+    scopes: str
+    ends_ns: int
+
+
+class OperatorQueries:
+    """The part of a store that knows operators. Raises StoreError where the disk refuses."""
+
+    def __init__(self, transactions: Transactions) -> None:
+        self._transactions = transactions
+
+    def are_there(self) -> bool:
+        """Whether anybody was ever named; operators are disabled, never removed."""
+        return bool(self._transactions.query("SELECT 1 FROM operators LIMIT 1"))
+
+    def find(self, name: str) -> OperatorRow | None:
+        """One operator, disabled or not."""
+        found = self._transactions.rows(
+            OperatorRow, "SELECT name, role, password, is_disabled FROM operators WHERE name = ?", (name,)
+        )
+        return found[0] if found else None
+
+    def all(self, now_ns: int) -> list[OperatorRow]:
+        """All by name, with the tokens and sessions that have not ended."""
+        return self._transactions.rows(
+            OperatorRow,
+            """SELECT name, role, password, is_disabled,
+               (SELECT count(*) FROM tokens t WHERE t.name = o.name AND ends_ns > ?) tokens,
+               (SELECT count(*) FROM sessions s WHERE s.name = o.name) sessions FROM operators o ORDER BY name""",
+            (now_ns,),
+        )
+
+    def add(self, name: str, role: str, password: str | None, actor: Actor) -> None:
+        """A new operator; UsageError where the name is taken."""
+        with self._transactions.write() as connection:
+            values = (name, role, password)
+            done = connection.execute(
+                "INSERT OR IGNORE INTO operators (name, role, password, is_disabled) VALUES (?, ?, ?, 0)", values
+            )
+            if not done.rowcount:
+                raise UsageError(
+                    f"there is an operator {name} already; `mapserver operators role` or `password` changes it"
+                )
+            self._transactions.log(connection, "", LogEntry("operator added", f"{name}, {role}", None, actor))
+
+    def set_role(self, name: str, role: str, actor: Actor) -> None:
+        """Another role, from the next request on. UsageError for an unknown name."""
+        with self._transactions.write() as connection:
+            _change(connection, "UPDATE operators SET role = ? WHERE name = ?", role, name)
+            self._transactions.log(connection, "", LogEntry("operator's role", f"{name}, {role}", None, actor))
+
+    def set_password(self, name: str, password: str, actor: Actor) -> None:
+        """Another password, also for a disabled operator, who may sign in again; sessions end. UsageError for an unknown name."""
+        with self._transactions.write() as connection:
+            _change(connection, "UPDATE operators SET password = ?, is_disabled = 0 WHERE name = ?", password, name)
+            connection.execute("DELETE FROM sessions WHERE name = ?", (name,))
+            self._transactions.log(connection, "", LogEntry("operator's password", name, None, actor))
+
+    def disable(self, name: str, actor: Actor) -> None:
+        """Ends sessions and tokens of a name at once, and lets nobody sign in by it. UsageError for an unknown name."""
+        with self._transactions.write() as connection:
+            _change(connection, "UPDATE operators SET is_disabled = 1 WHERE name = ?", name)
+            for table in ("sessions", "tokens"):
+                connection.execute(f"DELETE FROM {table} WHERE name = ?", (name,))
+            self._transactions.log(connection, "", LogEntry("operator disabled", name, None, actor))
+
+    def begin_session(self, sha256: str, name: str, actor: Actor) -> None:
+        """A new session of an operator who has just signed in."""
+        now_ns = self._transactions.now_ns()
+        with self._transactions.write() as connection:
+            values = (sha256, name, now_ns, now_ns)
+            connection.execute("INSERT INTO sessions (sha256, name, begun_ns, used_ns) VALUES (?, ?, ?, ?)", values)
+            self._transactions.log(connection, "", LogEntry("signed in", name, None, actor))
+
+    def session(self, sha256: str) -> SessionRow | None:
+        """The session of this hash, unless its operator is disabled; its age is judged elsewhere."""
+        found = self._transactions.rows(
+            SessionRow,
+            """SELECT name, role, begun_ns, used_ns FROM sessions JOIN operators USING (name)
+               WHERE sha256 = ? AND is_disabled = 0""",
+            (sha256,),
+        )
+        return found[0] if found else None
+
+    def use_session(self, sha256: str, now_ns: int) -> None:
+        """Notes that a session was used."""
+        with self._transactions.write(durable=False) as connection:
+            connection.execute("UPDATE sessions SET used_ns = ? WHERE sha256 = ?", (now_ns, sha256))
+
+    def end_session(self, sha256: str, actor: Actor) -> None:
+        """Ends a session that its operator signs out of."""
+        with self._transactions.write() as connection:
+            connection.execute("DELETE FROM sessions WHERE sha256 = ?", (sha256,))
+            self._transactions.log(connection, "", LogEntry("signed out", actor.name, None, actor))
+
+    def remove_ended(self, *, begun_before_ns: int, used_before_ns: int) -> None:
+        """Removes sessions that are too old, and tokens that have ended."""
+        with self._transactions.write(durable=False) as connection:
+            connection.execute(
+                "DELETE FROM sessions WHERE begun_ns < ? OR used_ns < ?", (begun_before_ns, used_before_ns)
+            )
+            connection.execute("DELETE FROM tokens WHERE ends_ns < ?", (self._transactions.now_ns(),))
+
+    def add_token(self, sha256: str, token: TokenRow, actor: Actor) -> None:
+        """A new token; a name that is not known yet becomes that of a program."""
+        with self._transactions.write() as connection:
+            connection.execute(
+                "INSERT OR IGNORE INTO operators (name, role, is_disabled) VALUES (?, 'program', 0)", (token.name,)
+            )
+            values = (sha256, token.name, token.scopes, token.ends_ns)
+            connection.execute("INSERT INTO tokens (sha256, name, scopes, ends_ns) VALUES (?, ?, ?, ?)", values)
+            self._transactions.log(connection, "", LogEntry("token made", f"{token.name}: {token.scopes}", None, actor))
+
+    def token(self, sha256: str) -> TokenRow | None:
+        """The token of this hash, unless its operator is disabled; its end is judged elsewhere."""
+        found = self._transactions.rows(
+            TokenRow,
+            """SELECT name, role, scopes, ends_ns FROM tokens JOIN operators USING (name)
+               WHERE sha256 = ? AND is_disabled = 0""",
+            (sha256,),
+        )
+        return found[0] if found else None
+
+
+def _change(connection: sqlite3.Connection, sql: str, *values: str) -> None:
+    if not connection.execute(sql, values).rowcount:
+        raise UsageError(f"there is no operator {values[-1]}; `mapserver operators list` names those there are")

@@ -1,0 +1,223 @@
+"""Sign-in, sessions and tokens; guessing of passwords (row 36 of docs/security.md)."""
+
+import sqlite3
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from argon2 import PasswordHasher
+
+from fleetmap.errors import UsageError
+from mapserver.operators import HttpBinding, Operators, binding_fault
+from mapserver.operators import operators as module
+from mapserver.operators.operators import IDLE_S, LIFE_S, TRIES, TRY_EVERY_S
+from mapserver.store import Actor, MapStore
+
+PASSWORD = "ada has a long password"
+ADMIN = Actor("root")
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.s = 1_800_000_000.0
+
+    def __call__(self) -> int:
+        return int(self.s * 1e9)
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+QUICK = PasswordHasher(time_cost=1, memory_cost=64, parallelism=1)
+
+
+@pytest.fixture(autouse=True)
+def quick(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cheap hash for all tests but those of time."""
+    if request.node.get_closest_marker("slow") is None:
+        monkeypatch.setattr(module, "_hasher", lambda: QUICK)
+        monkeypatch.setattr(module, "_dummy", lambda: QUICK.hash("nobody"))
+
+
+@pytest.fixture
+def operators(tmp_path: Path, clock: Clock) -> Iterator[Operators]:
+    with MapStore.open(tmp_path, create=True, clock_ns=clock) as store:
+        made = Operators(store)
+        made.add("ada", "operator", PASSWORD, ADMIN)
+        yield made
+
+
+def lines(operators: Operators) -> list[str]:
+    return [f"{line.kind}: {line.detail}" for line in operators._store.audit_lines()]
+
+
+def test_a_session_names_its_operator_and_ends(operators: Operators, clock: Clock) -> None:
+    session = operators.sign_in("ada", PASSWORD, "10.0.0.1").session
+    who = operators.identify(session, "", "10.0.0.1")
+    assert (who.name, who.role, sorted(who.scopes)) == ("ada", "operator", ["change", "metrics", "read"])
+    assert who.actor("why") == Actor("ada", "why", "ada", "10.0.0.1")
+    assert operators.identify("another", "", "") is operators.identify("", "", "") is None
+    operators.sign_out(who)
+    assert operators.identify(session, "", "") is None
+
+    idle = operators.sign_in("ada", PASSWORD, "").session
+    clock.s += IDLE_S - 1
+    assert operators.identify(idle, "", "", uses=False)
+    clock.s += 2
+    assert operators.identify(idle, "", "") is None
+
+    used = operators.sign_in("ada", PASSWORD, "").session
+    for _ in range(LIFE_S // 1800):
+        assert operators.identify(used, "", "")
+        clock.s += 1800
+    clock.s += 1
+    assert operators.identify(used, "", "") is None
+
+
+def test_a_role_or_session_taken_away_is_gone_at_once(operators: Operators) -> None:
+    session = operators.sign_in("ada", PASSWORD, "").session
+    token = operators.make_token("ada", ["change", "operators"], 1, ADMIN)
+    assert operators.identify("", f"Bearer {token}", "").scopes == {"change"}, "no more than its operator may"
+    operators._store.operators.set_role("ada", "viewer", ADMIN)
+    assert operators.identify(session, "", "").scopes == {"read"}
+    assert operators.identify("", f"Bearer {token}", "").scopes == frozenset()
+    operators._store.operators.disable("ada", ADMIN)
+    assert operators.identify(session, "", "") is operators.identify("", f"Bearer {token}", "") is None
+    assert operators.sign_in("ada", PASSWORD, "").refusal == "Wrong name or password."
+    operators.set_password("ada", "another long password", ADMIN)
+    assert operators.sign_in("ada", "another long password", "").session
+
+
+def test_a_token_has_its_scopes_and_an_end(operators: Operators, clock: Clock) -> None:
+    token = operators.make_token("prometheus", ["metrics"], 90, ADMIN)
+    who = operators.identify("", f"Bearer {token}", "10.0.0.9")
+    assert (who.name, who.role, who.scopes) == ("prometheus", "program", {"metrics"})
+    assert who.actor().operator == "token of prometheus"
+    assert operators.identify("", "Bearer guessed", "") is operators.identify("", token, "") is None
+    assert operators.sign_in("prometheus", "", "").refusal, "a program has no password, not even an empty one"
+    clock.s += 90 * 86_400
+    assert operators.identify("", f"Bearer {token}", "") is None
+
+
+def test_the_store_keeps_no_secret(operators: Operators, tmp_path: Path) -> None:
+    secrets = [PASSWORD, operators.sign_in("ada", PASSWORD, "").session, operators.make_token("ci", ["read"], 1, ADMIN)]
+    for path in tmp_path.rglob("*"):
+        if path.is_file():
+            assert not any(secret.encode() in path.read_bytes() for secret in secrets), path
+
+
+def test_guesses_are_few_and_say_nothing(operators: Operators, clock: Clock) -> None:
+    answers = [operators.sign_in("ada", f"guess {n}", "10.0.0.66") for n in range(TRIES + 3)]
+    assert [answer.retry_s for answer in answers] == [0] * TRIES + [TRY_EVERY_S] * 3
+    assert operators.sign_in("ada", PASSWORD, "10.0.0.66").retry_s, "not even the right one"
+    assert operators.sign_in("ada", PASSWORD, "10.0.0.1").session, "somebody else is not locked out"
+    clock.s += TRY_EVERY_S
+    assert operators.sign_in("ada", PASSWORD, "10.0.0.66").session
+    refused = {operators.sign_in(name, "guess", "10.0.0.7").refusal for name in ("ada", "nobody")}
+    assert refused == {"Wrong name or password."}
+
+
+def test_without_the_bucket_a_guess_arrives(operators: Operators, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The control of the test above."""
+    monkeypatch.setattr(operators, "_tries", type("Open", (), {"admits": lambda *_: True})())
+    guesses = [f"guess {n}" for n in range(TRIES + 3)] + [PASSWORD]
+    assert operators.sign_in("ada", guesses[0], "x").refusal
+    assert [bool(operators.sign_in("ada", guess, "x").session) for guess in guesses][-1]
+
+
+@pytest.mark.slow
+def test_an_unknown_name_takes_as_long(operators: Operators, monkeypatch: pytest.MonkeyPatch) -> None:
+    def took_s(name: str) -> float:
+        begun = time.process_time()
+        operators.sign_in(name, "guess", name)
+        return time.process_time() - begun
+
+    took_s("warm-up")
+    known, unknown = min(took_s("ada") for _ in range(2)), min(took_s(f"nobody-{n}") for n in range(2))
+    assert 0.5 < unknown / known < 2
+    monkeypatch.setattr(module, "_dummy", lambda: "no hash")  # the control: without a dummy it shows
+    assert min(took_s(f"nobody-{n}") for n in range(3, 5)) < known / 4
+
+
+@pytest.mark.slow
+def test_many_at_once_do_not_wait_for_ever(operators: Operators) -> None:
+    answers = []
+    threads = [
+        threading.Thread(target=lambda n=n: answers.append(operators.sign_in(f"nobody-{n}", "x", "")))
+        for n in range(12)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+    busy = [answer for answer in answers if answer.retry_s]
+    assert len(answers) == 12 and 1 <= len(busy) <= 8
+
+
+def test_a_flood_of_refusals_does_not_fill_the_log(operators: Operators, clock: Clock) -> None:
+    for n in range(500):
+        operators.note("refused", f"number {n}", Actor("eve"))
+    assert 60 <= len(lines(operators)) <= 65
+    clock.s += 61
+    operators.note("refused", "the last", Actor("eve"))
+    assert lines(operators)[-1] == "refused: the last (and 440 lines left out)"
+
+
+def test_names_that_cannot_be(operators: Operators) -> None:
+    for name in ("", "Ada", "ada\n", "a" * 65, "<b>", "ada bob"):
+        with pytest.raises(UsageError, match="no operator's name"):
+            operators.add(name, "viewer", PASSWORD, ADMIN)
+    with pytest.raises(UsageError, match="there is an operator ada already"):
+        operators.add("ada", "viewer", PASSWORD, ADMIN)
+    with pytest.raises(UsageError, match="no operator bob"):
+        operators._store.operators.disable("bob", ADMIN)
+    assert operators.sign_in("\ud800" * 99, "\ud800", "").refusal
+    assert [line for line in lines(operators) if "disabled" in line] == []
+
+
+def test_sign_in_is_on_from_the_first_name_to_the_end_of_days(tmp_path: Path, clock: Clock) -> None:
+    with MapStore.open(tmp_path, create=True, clock_ns=clock) as store:
+        operators = Operators(store)
+        assert not operators.is_sign_in_on
+        operators.make_token("ci", ["read"], 1, ADMIN)
+        clock.s += 2
+        assert operators.is_sign_in_on
+        store.operators.disable("ci", ADMIN)
+        assert Operators(store).is_sign_in_on
+
+
+def test_a_damaged_hash_lets_nobody_in(operators: Operators, tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / "store.sqlite3") as connection:
+        connection.execute("UPDATE operators SET password = 'nonsense'")
+    assert operators.sign_in("ada", PASSWORD, "").refusal
+    assert operators.sign_in("ada", "nonsense", "").refusal
+
+
+BEYOND = {"address": "0.0.0.0:8080", "host": "0.0.0.0"}
+LOCAL = {"address": "127.0.0.1:8080", "host": "127.0.0.1"}
+
+
+@pytest.mark.parametrize(
+    ("binding", "words"),
+    [
+        (HttpBinding(**LOCAL), []),
+        (HttpBinding(address="localhost:1", host="localhost"), []),
+        (HttpBinding(address="[::1]:1", host="::1"), []),
+        (HttpBinding(**LOCAL, names=("localhost",)), []),
+        (HttpBinding(**LOCAL, names=("maps.example",)), ["--http-name maps.example", "operators add"]),
+        (HttpBinding(**LOCAL, names=("maps.example",), has_operators=True), []),
+        (HttpBinding(**BEYOND), ["--http 0.0.0.0:8080", "--http-cert", "operators add", "--insecure"]),
+        (HttpBinding(**BEYOND, has_operators=True), ["--http-cert"]),
+        (HttpBinding(**BEYOND, has_tls=True), ["operators add"]),
+        (HttpBinding(**BEYOND, has_tls=True, has_operators=True), []),
+        (HttpBinding(address="maps.example:1", host="maps.example"), ["--http-cert"]),
+    ],
+)
+def test_where_http_may_be_served(binding: HttpBinding, words: list[str]) -> None:
+    fault = binding_fault(binding)
+    assert bool(fault) is bool(words)
+    assert all(word in fault for word in words)
