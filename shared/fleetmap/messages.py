@@ -27,6 +27,7 @@ MAX_MESSAGE_BYTES = 1 << 20
 PART_BYTES = 256 << 10  # small enough to come within seconds over a poor radio, and to be asked for again
 MAX_THUMBNAIL_BYTES = 64 << 10  # four of them and the rest of a failure's report stay far below a message's limit
 _ROOT = "fleetmap"
+_MAX_KEY = 256  # two names and two addresses of bytes
 
 Name = Annotated[str, msgspec.Meta(max_length=64)]
 Text = Annotated[str, msgspec.Meta(max_length=2000)]
@@ -370,7 +371,7 @@ def trust_key(site: str, file: str) -> str:
 
 def split_key(key: str) -> tuple[str, str, str]:
     """Site, robot (or 'live', 'manifests', 'blobs', 'patches', 'trust') and last chunk of a key; raises LinkError for any other."""
-    chunks = key.split("/")
+    chunks = key.split("/") if len(key) <= _MAX_KEY else []
     if len(chunks) == 5 and chunks[0] == _ROOT and chunks[2] == "robots":
         return chunks[1], chunks[3], chunks[4]
     if len(chunks) == 4 and chunks[0] == _ROOT and chunks[2] in {"live", "manifests", "blobs", "patches", "trust"}:

@@ -5,6 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
+from fleetmap.bus import ZenohBus
 from fleetmap.bus.fair_queue import SHARED, FairQueue, sender_of
 
 
@@ -82,3 +83,40 @@ def test_jobs_of_one_sender_keep_their_order() -> None:
     assert [n for n in found if n % 2] == list(range(1, 30, 2))
     assert [n for n in found if n % 2 == 0] == list(range(0, 30, 2))
     queue.close()
+
+
+def test_jobs_without_bytes_are_bounded_too() -> None:
+    """Under invented names a flood of empty messages would else keep a million of them."""
+    queue, gate = FairQueue("test"), threading.Event()
+    taken = sum(queue.put(f"robot {n % 10_000}", 0, gate.wait) for n in range(50_000))
+    assert taken < 35_000
+    gate.set()
+    queue.close()
+
+
+def test_what_comes_beside_a_payload_counts() -> None:
+    """An attachment is kept with its message: one byte with a megabyte beside it is a megabyte."""
+    gate, begun, heard = threading.Event(), threading.Event(), []
+
+    def listen(key: str, payload: bytes) -> None:
+        heard.append(payload)
+        begun.set()
+        gate.wait(20)
+
+    with ZenohBus.listen("tcp/127.0.0.1:0") as server, ZenohBus.connect(server.endpoint) as evil:
+        server.subscribe("fleetmap/*/robots/*/health", listen)
+        until_s = time.monotonic() + 20
+        while not begun.is_set() and time.monotonic() < until_s:
+            evil.publish("fleetmap/hall/robots/r1/health", b"first")
+            begun.wait(0.1)
+        assert begun.is_set()
+        before = len(heard)
+        for _ in range(20):
+            evil.publish("fleetmap/hall/robots/r1/health", b"x", attachment=bytes(900_000))
+        evil.publish("fleetmap/hall/robots/r2/health", b"last", attachment=b"small")
+        time.sleep(0.5)
+        gate.set()
+        while b"last" not in heard and time.monotonic() < until_s:
+            time.sleep(0.02)
+    assert b"last" in heard
+    assert heard[before:].count(b"x") <= 2

@@ -194,6 +194,7 @@ class Fleet:
                 gone = robot.is_stored or (not robot.is_present and now_ns - robot.seen_ns > _FORGET_AFTER_NS)
                 if key not in stored and gone:
                     del self._robots[key]
+                    self._ingest.forget(key)
                 robot.is_stored = key in stored
 
     def flush(self) -> None:

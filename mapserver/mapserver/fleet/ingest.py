@@ -94,6 +94,11 @@ class Ingest:
         with self._lock:
             self._streams.setdefault((site, robot), _Stream()).health.take_pose(message)
 
+    def forget(self, robot: tuple[str, str]) -> None:
+        """Drops what was kept of a robot (site, name) that went."""
+        with self._lock:
+            self._streams.pop(robot, None)
+
     def take_health(
         self,
         health: RobotHealth,

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable, Hashable
 
 _MAX_KEYS = 20_000
+_SEARCHED_EVERY_NS = 1_000_000_000
 
 
 class RateLimit:
@@ -16,13 +17,16 @@ class RateLimit:
         self._burst, self._per_ns, self._clock_ns = burst, per_s * 1e-9, clock_ns
         self._lock = threading.Lock()
         self._buckets: dict[Hashable, tuple[float, int]] = {}
+        self._searched_ns: int | None = None
 
     def admits(self, key: Hashable) -> bool:
         """Whether it may happen now; counts it if so."""
         now_ns = self._clock_ns()
         with self._lock:
             if key not in self._buckets and len(self._buckets) >= _MAX_KEYS:
-                self._forget(now_ns)
+                if self._searched_ns is None or abs(now_ns - self._searched_ns) >= _SEARCHED_EVERY_NS:
+                    self._searched_ns = now_ns
+                    self._forget(now_ns)
                 if len(self._buckets) >= _MAX_KEYS:
                     return False
             level, then_ns = self._buckets.get(key, (self._burst, now_ns))

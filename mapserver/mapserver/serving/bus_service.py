@@ -84,7 +84,7 @@ class BusService:
         The first call tells all of them, because they may have missed what happened while no server ran. Patches are made before
         the announcement, for at most `_PREPARE_S`, because all robots ask for them at once.
         """
-        changed, until_s = [], time.monotonic() + _PREPARE_S
+        changed, known, until_s = [], set(), time.monotonic() + _PREPARE_S
         for info in self._store.sites():
             versions = self._fleet.wanted_versions(info.site)
             robots = {robot: self._lists.admitted_or_current(wanted) for robot, wanted in versions.items()}
@@ -94,10 +94,12 @@ class BusService:
                     self._prepare(info.site, base, result, until_s)
             for robot, wanted in robots.items():
                 key, address = (info.site, robot), wanted.manifest_sha256
+                known.add(key)
                 if key not in self._announced or self._announced[key] != address:
                     self._bus.publish(robot_key(info.site, robot, "wanted"), encode_message(wanted))
                     self._announced[key] = address
                     changed.append(info.site)
+        self._announced = {key: address for key, address in self._announced.items() if key in known}
         return sorted(set(changed))
 
     def look_for_robots(self) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 _MAX_SENDERS = 20_000
 _MAX_BYTES = 32 << 20  # of all senders together
+_JOB_BYTES = 1000  # what a job takes beside its bytes, so that empty ones are bounded too
 SHARED = ""
 """The sender of what names no robot: questions for bytes of maps, which all robots ask at once."""
 
@@ -41,13 +42,13 @@ class FairQueue:
                 waiting = self._jobs[sender] = deque()
             own = self._bytes.get(sender, 0) + size
             most, most_bytes = _LIMITS[sender == SHARED]
-            is_full = len(waiting) >= most or own > most_bytes or self._all_bytes + size > _MAX_BYTES
+            is_full = len(waiting) >= most or own > most_bytes or self._all_bytes + size + _JOB_BYTES > _MAX_BYTES
             if is_full or self._is_closed:
                 if not waiting:
                     del self._jobs[sender]
                 return False
             waiting.append((size, job))
-            self._bytes[sender], self._all_bytes = own, self._all_bytes + size
+            self._bytes[sender], self._all_bytes = own, self._all_bytes + size + _JOB_BYTES
             self._ready.notify()
             return True
 
@@ -68,7 +69,7 @@ class FairQueue:
                 sender = next(iter(self._jobs))
                 waiting = self._jobs.pop(sender)
                 size, job = waiting.popleft()
-                self._all_bytes -= size
+                self._all_bytes -= size + _JOB_BYTES
                 if waiting:
                     self._jobs[sender] = waiting  # behind the others
                     self._bytes[sender] -= size

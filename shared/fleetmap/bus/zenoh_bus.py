@@ -82,7 +82,8 @@ class ZenohBus(Bus):
                     query.reply(key, data)
 
         def take(query: Any) -> None:
-            key, size = str(query.key_expr), 0 if query.payload is None else len(query.payload)
+            key = str(query.key_expr)
+            size = _size(query, key) + len(str(query.parameters))
             if not queue.put(sender_of(key), size, partial(reply, query, key)):
                 with query:
                     query.reply_err(_BUSY)
@@ -124,8 +125,9 @@ class ZenohBus(Bus):
 
         def take(sample: Any) -> None:
             key = str(sample.key_expr)
-            if len(sample.payload) <= MAX_MESSAGE_BYTES:
-                queue.put(sender_of(key), len(sample.payload), lambda: deliver(listen, key, sample.payload.to_bytes()))
+            size = _size(sample, key)
+            if size <= MAX_MESSAGE_BYTES:
+                queue.put(sender_of(key), size, lambda: deliver(listen, key, sample.payload.to_bytes()))
 
         if not self._is_server:
             plain = lambda sample: deliver(listen, str(sample.key_expr), sample.payload.to_bytes())  # noqa: E731
@@ -196,6 +198,12 @@ def is_loopback(endpoint: str) -> bool:
         return host == "localhost" or ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def _size(message: Any, key: str) -> int:
+    """What a sample or question keeps in memory while it waits: what came beside its payload too."""
+    parts = (message.payload, message.attachment)
+    return len(key) + sum(len(part) for part in parts if part is not None)
 
 
 def _with_free_port(endpoint: str) -> str:

@@ -6,15 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
+from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import LinkError, UsageError
-from fleetmap.messages import FailureReport, RobotHealth, Thumbnail, encode_message
+from fleetmap.messages import FailureReport, PoseMessage, RobotHealth, Thumbnail, encode_message
 from mapserver import releases
 from mapserver.fleet import fleet as fleet_module
 from mapserver.fleet.fleet import MAX_FAILURE_BYTES, Fleet
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet.rate_limit import RateLimit
+from mapserver.serving.bus_service import BusService
 from mapserver.store import Actor, FailureFilter, MapStore, Retention
 from support.fleet.contracts_documents import REPOSITORY
 from support.storage.map_samples import save_sample_draft
@@ -91,6 +94,52 @@ def test_rates_forget_nobody_who_floods(clock: Clock) -> None:
     assert [limit.admits("a") for _ in range(3)] == [True, True, False]
     clock.now_ns -= 100 * SECOND_NS  # a clock that is set back gives nothing
     assert not limit.admits("a")
+
+
+def test_a_full_table_of_rates_is_not_searched_at_every_message(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Invented names would else cost milliseconds each, and everybody waits for them."""
+    limit, searched, search = RateLimit(2, 1.0, clock), [0], RateLimit._forget
+
+    def counted(self: RateLimit, now_ns: int) -> None:
+        searched[0] += 1
+        search(self, now_ns)
+
+    monkeypatch.setattr(RateLimit, "_forget", counted)
+    for number in range(20_000):
+        limit.admits(number)
+    for number in range(1000):
+        assert not limit.admits(f"invented {number}")
+    assert searched[0] == 1
+    clock.now_ns += 3 * SECOND_NS
+    assert limit.admits("invented 1")
+
+
+def test_names_that_went_leave_nothing_behind(store: MapStore, fleet: Fleet, clock: Clock) -> None:
+    with MemoryBus(MemoryHub()) as bus:
+        service = BusService(store, fleet, bus, lambda *_: None)
+        for number in range(50):
+            message = PoseMessage.of(1, np.eye(4), np.eye(6), "LOST", 1)
+            fleet.take_pose("lab", f"x{number}", message)
+        service.announce_changes()
+        clock.now_ns += 3600 * SECOND_NS
+        fleet.take_presence([])
+        service.announce_changes()
+        assert fleet.known_robots("lab") == []
+        assert (len(fleet._ingest._streams), len(service._announced)) == (0, 0)
+        service.close()
+
+
+def test_a_long_key_is_kept_nowhere(store: MapStore, fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
+    """Of 64 kB in the place of a site: no rate is kept for it, and the log shows its beginning."""
+    with MemoryBus(MemoryHub()) as bus:
+        service = BusService(store, fleet, bus, lambda *_: None)
+        service._hear(f"fleetmap/{'x' * 60_000}/robots/r1/health", b"nonsense")
+        with pytest.raises(LinkError):
+            service._failure(f"fleetmap/lab/robots/{'x' * 60_000}/failures", b"nonsense")
+        assert [rate._buckets for rate in (*service._rates.values(), fleet._failures)] == [{}] * 4
+        assert "refused" in caplog.text
+        assert len(caplog.text) < 2000
+        service.close()
 
 
 def test_a_failure_has_a_size(fleet: Fleet, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
