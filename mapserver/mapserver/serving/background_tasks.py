@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fleetmap.errors import FleetmapError
+from fleetmap.log_lines import LogLimit
 from mapserver.build.job_lock import end_interrupted
 from mapserver.config import MapserverConfig
 from mapserver.fleet.canary_controller import review
@@ -54,6 +55,7 @@ def server_tasks(
 
 async def run_background_tasks(tasks: list[BackgroundTask]) -> None:
     """Runs them in turn, in a thread, until it is cancelled. One that fails is tried again at its next time."""
+    refusals = LogLimit(_log)  # a fault that stays would fill the log, once a second
     while True:
         for task in tasks:
             if time.monotonic() < task.due_s:
@@ -62,7 +64,7 @@ async def run_background_tasks(tasks: list[BackgroundTask]) -> None:
                 await asyncio.to_thread(task.act)
             except FleetmapError as error:
                 # A store that is busy for a moment must not stop the server; robots also ask by themselves.
-                _log.warning("%s failed: %s", task.name, error)
+                refusals.warning(task.name, "%s failed: %s", task.name, error)
             except Exception:
                 # A fault in one task must not end the others.
                 _log.exception("%s failed", task.name)

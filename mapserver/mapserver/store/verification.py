@@ -38,7 +38,10 @@ def verify(root: Path, transactions: Transactions, blobs: BlobFolder) -> StoreFi
     found.faults += [f"database: {text}" for text in integrity if text != "ok"]
     foreign = transactions.query("PRAGMA foreign_key_check")
     found.faults += [f"database: a row of {row['table']} refers to nothing" for row in foreign]
-    found.faults += [f"{path} is a symbolic link, which a store does not follow" for path in blobs.links()]
+    found.faults += [
+        f"{path} is a symbolic link, which a store does not follow"
+        for path in (*blobs.links(), *_links(root / "trust"))
+    ]
     found.open_to_others = sum(bool(path.stat().st_mode & 0o077) for path in (root, *root.glob("store.sqlite3*")))
     sound = _check_blobs(transactions, blobs, found)
     sites = transactions.query("SELECT * FROM sites ORDER BY site")
@@ -53,6 +56,10 @@ def verify(root: Path, transactions: Transactions, blobs: BlobFolder) -> StoreFi
         if any(info.state != "draft" and info.manifest_sha256 not in sound for info in rows.versions.values()):
             found.faults.append(f"site {rows.site}: a published version has no whole manifest")
     return found
+
+
+def _links(folder: Path) -> list[Path]:
+    return sorted(path for path in (folder, *folder.rglob("*")) if path.is_symlink())
 
 
 def _check_blobs(transactions: Transactions, blobs: BlobFolder, found: StoreFindings) -> set[str]:

@@ -55,4 +55,13 @@ def check_carried(export: Path, root: Path) -> None:
     with open_export(export) as reader, tempfile.TemporaryDirectory() as folder:
         head = reader.head
         trust = TrustedMap(Path(folder), head.site, trusted, files.get)
-        trust.admitted(WantedVersion(site=head.site, version=head.version, manifest_sha256=head.blobs[0].sha256))
+        found = trust.admitted(
+            WantedVersion(site=head.site, version=head.version, manifest_sha256=head.blobs[0].sha256)
+        )
+        archive = head.archive()
+        if archive is not None and archive.sha256 != found.about.archive:
+            raise UntrustedError(
+                "signature",
+                f"the archive in {export} is not that of the signed list, and the next map would be built on it; "
+                "ask the sender for another file, or for one `--without-archive`",
+            )

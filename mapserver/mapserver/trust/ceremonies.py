@@ -82,9 +82,9 @@ def admit(
     Raises StateError unless enough people signed, UsageError for a threshold that the keys cannot meet.
     """
     with _ceremony(store, people) as repository:
+        if not 1 <= threshold <= max(1, len(keys)):
+            raise UsageError(f"--threshold {threshold}: {max(1, len(keys))} keys cannot meet it")
         own = list(keys) or [_keys(store).replace(site_role(site)).public_key]
-        if not 1 <= threshold <= len(own):
-            raise UsageError(f"--threshold {threshold}: {len(own)} keys cannot meet it")
         repository.delegate(site, own, people, threshold=threshold, previous=previous)
 
 
@@ -115,9 +115,14 @@ def rotate_root(
     people: Sequence["CryptoSigner"],
     *,
     removed: Sequence["Key"] = (),
-    added: Sequence["CryptoSigner"] = (),
-) -> None:
-    """The next root and targets, with other people or the same: also before they expire. StateError unless enough signed."""
+    add: Path | None = None,
+) -> dict[Path, str]:
+    """The next root and targets, with other people or the same: also before they expire. StateError unless enough signed.
+
+    add: folder for the key of a person who comes; its file and passphrase are returned. UsageError for a `removed` key that is none.
+    """
+    passphrases: dict[Path, str] = {}
+    added: list[CryptoSigner] = []
 
     def change(root: "Root") -> None:
         for role in ("root", "targets"):
@@ -127,9 +132,16 @@ def rotate_root(
                 root.add_key(signer.public_key, role)
 
     with _ceremony(store, people) as repository:
+        known = set(repository.root().roles["root"].keyids)
+        if not {key.keyid for key in removed} <= known:
+            raise UsageError("the person whose key is to be removed holds no root key; `trust status` counts them")
+        if add is not None:
+            passphrases[add / "root-new.pem"] = make_passphrase()
+            added.append(make_key_file(add / "root-new.pem", passphrases[add / "root-new.pem"]))
         repository.change_root(change, [*people, *added])
         stay = [s for s in [*people, *added] if s.public_key.keyid in repository.root().roles["targets"].keyids]
         repository.renew_targets(stay)
+    return passphrases
 
 
 def sign_site(store: MapStore, site: str, signer: "CryptoSigner") -> int:
@@ -144,7 +156,9 @@ def sign_site(store: MapStore, site: str, signer: "CryptoSigner") -> int:
         waiting, metadata = repository.lists.staged_list(site), repository.staged(site)
         if not wanted:
             raise StateError(f"site {site} has no current version; publish one first")
-        if waiting is None or metadata is None or waiting.admitted != wanted:
+        next_number = repository.lists.newest(site_role(site)) + 1
+        is_usable = waiting is not None and waiting.admitted == wanted and waiting.serial == next_number
+        if metadata is None or not is_usable or metadata.signed.is_expired(repository.now):
             metadata = repository.sign_site(site, wanted, [signer])
         else:
             metadata.sign(signer, append=True)

@@ -38,7 +38,6 @@ def save_key(path: Path, signer: "CryptoSigner", passphrase: str | None) -> None
     data = key.private_bytes(s.Encoding.PEM, s.PrivateFormat.PKCS8, how)
     with disk_errors(f"the key {path} cannot be written", "check the folder; a key is never overwritten"):
         make_folder(path.parent)
-        path.parent.chmod(0o700)
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)

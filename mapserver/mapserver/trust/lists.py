@@ -8,7 +8,7 @@ STORE/trust/staged/site-SITE.json              a list that waits for another sig
 """
 
 import re
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,13 @@ from fleetmap.errors import StoreError, UntrustedError
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import SiteList, read_site_list, site_role
 from mapserver.store import AuditMark
+from mapserver.store.files import is_plain_file
 
 TIMESTAMP = "timestamp"
+DAYS = {"root": 730, "targets": 365, "site": 14, "snapshot": 7, TIMESTAMP: 1}
+_RENEWED_DAYS_BEFORE = {"site": 13, "snapshot": 3, TIMESTAMP: 0.75}  # every night, every four days, every six hours
 _NAME = re.compile(r"(?:(timestamp)|[0-9]{1,10}\.(root|targets|snapshot|site-[a-z0-9_-]{1,64}))\.json")
-_NUMBER = re.compile(r"([0-9]{1,10})\.")
+_NUMBERED = re.compile(r"([0-9]{1,10})\.([a-z0-9_-]+)\.json")
 
 
 class _Signed(msgspec.Struct, frozen=True):
@@ -60,6 +63,14 @@ class SiteRole(msgspec.Struct, frozen=True):
     previous: int = 1
 
 
+def is_fresh(role: str, expires: datetime, now: datetime) -> bool:
+    """Whether a list (of `site`, `snapshot` or `timestamp`) need not be signed anew.
+
+    One that lasts for longer than any was signed while the clock was ahead: it would be believed until then, whoever shows it.
+    """
+    return now + timedelta(days=_RENEWED_DAYS_BEFORE[role]) <= expires <= now + timedelta(days=DAYS[role], hours=1)
+
+
 class SignedLists:
     """The folder of one store. For any thread; sees at once what other processes write."""
 
@@ -77,15 +88,20 @@ class SignedLists:
         named = _NAME.fullmatch(name)
         if named is None or ((named[2] or "").startswith("site-") and named[2] != site_role(site)):
             return b""
+        path = self.folder / name
         try:
-            return (self.folder / name).read_bytes()
+            return path.read_bytes() if is_plain_file(path) else b""
         except OSError:
             return b""
 
     def newest(self, role: str) -> int:
         """Number of the newest file of a role, 0 where there is none."""
-        found = (_NUMBER.match(path.name) for path in self.folder.glob(f"*.{role}.json"))
-        return max((int(number[1]) for number in found if number is not None), default=0)
+        return max(self.numbers(role), default=0)
+
+    def numbers(self, role: str) -> list[int]:
+        """Numbers of a role's files, in order."""
+        found = (_NUMBERED.fullmatch(path.name) for path in self.folder.glob(f"*.{role}.json"))
+        return sorted(int(name[1]) for name in found if name is not None and name[2] == role)
 
     def read(self, role: str, number: int | None = None) -> _Signed:
         """What the newest file of a role says, or the file of this number; StoreError where it cannot be read."""

@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from typing import Any, TypeVar
 
 from securesystemslib.signer import CryptoSigner, Key
@@ -26,10 +25,8 @@ from fleetmap.errors import StateError, StoreError, disk_errors
 from fleetmap.trust import AdmittedVersion, manifest_target, site_role
 from mapserver.store import AuditMark
 from mapserver.store.files import make_folder, write_atomically
-from mapserver.trust.lists import TIMESTAMP, SignedLists
+from mapserver.trust.lists import DAYS, TIMESTAMP, SignedLists, is_fresh
 
-DAYS = {"root": 730, "targets": 365, "site": 14, "snapshot": 7, TIMESTAMP: 1}
-RENEW_SNAPSHOT_DAYS = 3
 _MOST_FILES = 5  # of a role that robots ask for by number: one may have read the timestamp before the last change
 _ONLINE = ("snapshot", TIMESTAMP)
 _log = logging.getLogger(__name__)
@@ -41,7 +38,7 @@ class ListRepository:
     """The signed lists of one store, for writing. now: the moment that times of expiry are counted from."""
 
     def __init__(self, lists: SignedLists, now: datetime) -> None:
-        self.lists, self._now = lists, now.astimezone(UTC).replace(microsecond=0)
+        self.lists, self.now = lists, now.astimezone(UTC).replace(microsecond=0)
 
     def newest(self, role: str) -> Metadata[Any]:
         """The newest file of a role; StoreError where there is none or it cannot be read."""
@@ -186,13 +183,15 @@ class ListRepository:
         return role
 
     def accept_site(self, site: str, metadata: Metadata[Any]) -> None:
-        """Puts a site's list among the others; StateError unless its keys signed it and its number is the next one."""
+        """Puts a site's list among the others; StateError unless its keys signed it, its number is the next one and it lasts."""
         name = site_role(site)
         expected = self.lists.newest(name) + 1
         if metadata.signed.version != expected:
             raise StateError(
                 f"list {metadata.signed.version} of site {site} comes where {expected} is the next; sign anew"
             )
+        if metadata.signed.is_expired(self.now):
+            raise StateError(f"list {expected} of site {site} expired at {metadata.signed.expires}; sign anew")
         _check(self.targets(), name, metadata)
         self._write(name, metadata)
 
@@ -221,7 +220,7 @@ class ListRepository:
                 meta |= {} if entry is None else {f"{name}.json": entry}
         if self.lists.path(TIMESTAMP, 0).is_file():
             stamped = self.newest(TIMESTAMP).signed.version
-        if before is None or before.meta != meta or before.expires < self._now + timedelta(days=RENEW_SNAPSHOT_DAYS):
+        if before is None or before.meta != meta or not is_fresh("snapshot", before.expires, self.now):
             number += 1
             self._sign("snapshot", Snapshot(version=number, meta=meta), [online])
         stamp = Timestamp(version=stamped + 1, snapshot_meta=MetaFile(number))
@@ -255,7 +254,7 @@ class ListRepository:
     # ------------------------------------------------------------------------------------------------------------------
 
     def _expiry(self, role: str) -> datetime:
-        return self._now + timedelta(days=DAYS[role])
+        return self.now + timedelta(days=DAYS[role])
 
     def _sign(self, role: str, signed: Signed, signers: Sequence[CryptoSigner], judges: Sequence[Root] = ()) -> None:
         signed.expires = self._expiry(role)
@@ -273,12 +272,11 @@ class ListRepository:
             make_folder(path.parent)
             write_atomically(path, [metadata.to_bytes(_COMPACT)])
             if role not in ("root", TIMESTAMP):
-                self._remove_old(role, path)
+                self._remove_old(role)
 
-    def _remove_old(self, role: str, newest: Path) -> None:
-        numbered = [(int(path.name.partition(".")[0]), path) for path in newest.parent.glob(f"*.{role}.json")]
-        for _, path in sorted(numbered)[:-_MOST_FILES]:
-            path.unlink(missing_ok=True)
+    def _remove_old(self, role: str) -> None:
+        for number in self.lists.numbers(role)[:-_MOST_FILES]:
+            self.lists.path(role, number).unlink(missing_ok=True)
 
 
 def _fields(entry: AdmittedVersion) -> dict[str, object]:

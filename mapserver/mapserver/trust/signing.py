@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from fleetmap.errors import FleetmapError, StateError, UsageError
@@ -12,14 +12,11 @@ from mapserver.store import MapStore, VersionInfo
 from mapserver.store.files import locked
 from mapserver.store.rows import SiteReleases
 from mapserver.trust.keys import KeyFolder
-from mapserver.trust.lists import TIMESTAMP, SignedLists
+from mapserver.trust.lists import TIMESTAMP, SignedLists, is_fresh
 
 if TYPE_CHECKING:
     from mapserver.trust.repository import ListRepository
 
-_RENEW_SITE = timedelta(days=13)  # of 14: every night
-_RENEW_TIMESTAMP = timedelta(hours=18)  # of 24: every six hours
-_RENEW_SNAPSHOT = timedelta(days=3)
 _log = logging.getLogger(__name__)
 
 
@@ -53,11 +50,17 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
 
     with locked(lists.folder / "lock", shared=False):
         repository = ListRepository(lists, now)
+        faults = []
         for info in store.sites():
-            _update_site(repository, keys, store.releases(info.site), now)
+            try:
+                _update_site(repository, keys, store.releases(info.site), now)
+            except FleetmapError as error:  # of one site: the others' robots, and the timestamp, must not wait for it
+                faults.append(error)
         online = keys.signer("online")
         if online is not None and (all_anew or _online_is_due(lists, now)):
             repository.sign_online(online, store.audit_mark())
+    if faults:
+        raise faults[0]
 
 
 def try_update_lists(store: MapStore) -> None:
@@ -151,12 +154,16 @@ def _online_is_due(lists: SignedLists, now: datetime) -> bool:
     stamp, snapshot = lists.read(TIMESTAMP), lists.read("snapshot", number)
     named = {name: entry["version"] for name, entry in snapshot.meta.items()}
     present = {"targets.json": lists.newest("targets")}
-    present |= {f"{role}.json": newest for role in lists.site_roles() if (newest := lists.newest(role))}
+    for name, role in lists.site_roles().items():
+        if newest := lists.newest(name):
+            # One that waits for other keys is named as before, or not at all.
+            number_now = newest if lists.is_signed(role) else named.get(f"{name}.json", 0)
+            present |= {f"{name}.json": number_now} if number_now else {}
     return (
         named != present
         or stamp.meta["snapshot.json"]["version"] != number
-        or stamp.expires < now + _RENEW_TIMESTAMP
-        or snapshot.expires < now + _RENEW_SNAPSHOT
+        or not is_fresh(TIMESTAMP, stamp.expires, now)
+        or not is_fresh("snapshot", snapshot.expires, now)
     )
 
 
@@ -172,12 +179,12 @@ def _site_is_due(lists: SignedLists, rows: SiteReleases, now: datetime) -> bool:
     if (
         last is not None
         and last.admitted == wanted
-        and last.expires >= now + _RENEW_SITE
+        and is_fresh("site", last.expires, now)
         and lists.is_signed(signed_by)
     ):
         return False
     staged = lists.staged_list(rows.site)
-    return staged is None or staged.admitted != wanted or staged.expires < now + _RENEW_SITE
+    return staged is None or staged.admitted != wanted or not is_fresh("site", staged.expires, now)
 
 
 def _update_site(repository: "ListRepository", keys: KeyFolder, rows: SiteReleases, now: datetime) -> None:

@@ -54,6 +54,13 @@ def trust_status(store: MapStore) -> TrustStatus:
     own = KeyFolder(store.folder / "keys")
     for info in store.sites():
         role = site_role(info.site)
+        signer = lists.site_roles().get(role)
+        if signer is not None and lists.newest(role) and not lists.is_signed(signer):
+            found.faults.append(
+                f"{role}: a signature of its present keys is missing; `mapserver trust sign {info.site}`"
+            )
+        if lists.staged_path(info.site).is_file():
+            found.faults.append(f"{role}: a list waits for another signature; `mapserver trust sign {info.site}`")
         if role not in holders and info.current_version is not None:
             found.faults.append(f"site {info.site}: no key may sign its maps; `mapserver trust admit {info.site}`")
         elif own.has(role):

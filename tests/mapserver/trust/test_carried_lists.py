@@ -94,3 +94,19 @@ def test_an_archive_that_gc_removed_is_no_attack(store: MapStore) -> None:
         connection.execute("UPDATE versions SET archive_sha256 = NULL WHERE version = 2")
     check_base(store, store.current("lab"))
     update_lists(store)
+
+
+def test_row_34_another_archive_in_an_export(store: MapStore, tmp_path: Path) -> None:
+    """Robots would not notice it, and the next map would be built on it."""
+    with MapStore.open(tmp_path / "evil", create=True) as evil:
+        publish_samples(evil, 2)
+        other = evil._blobs.put(b"a survey of somebody else")
+        with evil._transactions.write() as connection:
+            connection.execute("UPDATE versions SET archive_sha256 = ?", (other,))
+    file = tmp_path / "lab.fmex"
+    run("export", file, "--site", "lab", "--store", tmp_path / "evil")
+    lists_path(exported(store.folder, tmp_path / "honest.fmex")).rename(lists_path(file))
+    with pytest.raises(UntrustedError, match="archive"):
+        run("import", file, "--store", tmp_path / "there", "--root", store.folder / "trust" / "1.root.json")
+    run("export", file, "--site", "lab", "--store", tmp_path / "evil", "--without-archive")
+    run("import", file, "--store", tmp_path / "there", "--root", store.folder / "trust" / "1.root.json")  # the control

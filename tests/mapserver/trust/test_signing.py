@@ -1,8 +1,9 @@
 """What a store signs: after each release, before something expires, never what robots would refuse; and what the server tells robots."""
 
+import os
 import stat
 from collections.abc import Iterator
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from fleetmap.errors import StateError, StoreError, UsageError
 from fleetmap.messages import WantedVersion
 from mapserver import releases
 from mapserver.store import MapStore
-from mapserver.trust import KeyFolder, SignedLists, init_here, prepare_lists, update_lists
+from mapserver.trust import KeyFolder, SignedLists, ceremonies, init_here, prepare_lists, update_lists
 from mapserver.trust.keys import load_key, make_passphrase, new_key, save_key
 from mapserver.trust.repository import ListRepository
 from mapserver.trust.signing import admitted_versions
@@ -238,3 +239,117 @@ def test_damaged_lists_do_not_undo_a_release(store: MapStore, caplog: pytest.Log
     assert store.current("lab").version == 2
     with pytest.raises(StoreError, match="restore the store's folder trust"):
         update_lists(store)
+
+
+def test_one_sites_fault_does_not_stop_the_others(store: MapStore, clock: Clock) -> None:
+    """Somebody wrote into the database: the other sites' lists and the timestamp are signed all the same."""
+    save_sample_draft(store, site="yard", seed=5)
+    releases.publish(store, "yard")
+    lists = SignedLists(store.folder)
+    with store._transactions.write() as connection:
+        connection.execute("UPDATE versions SET vocabulary_sha256 = ? WHERE site = 'lab'", ("0" * 64,))
+    before = lists.newest("site-lab"), lists.newest("site-yard"), lists.read("timestamp").version
+    clock.now_ns += 30 * HOUR_NS
+    with pytest.raises(StateError, match="names other bytes for version 1 of site lab"):
+        update_lists(store)
+    after = lists.newest("site-lab"), lists.newest("site-yard"), lists.read("timestamp").version
+    assert after == (before[0], before[1] + 1, before[2] + 1)
+
+
+def test_a_ceremony_that_cannot_be_finished_changes_no_key(store: MapStore) -> None:
+    people = [KeyFolder(store.folder / "keys").signer("root")]
+    before = (store.folder / "keys" / "site-lab.pem").read_bytes()
+    with pytest.raises(UsageError, match="--threshold 2"):
+        ceremonies.admit(store, "lab", [], people, threshold=2, previous=1)
+    assert (store.folder / "keys" / "site-lab.pem").read_bytes() == before
+    with pytest.raises(UsageError, match="holds no root key"):
+        ceremonies.rotate_root(store, people, removed=[new_key().public_key])
+    publish(store, seed=2)
+    assert states(store) == {1: "previous", 2: "current"}
+
+
+def test_a_list_that_waited_too_long_is_signed_anew(store: MapStore, clock: Clock) -> None:
+    """The first person's signature is of a list that is over when the second comes: robots would refuse it."""
+    people, (ada, bob) = [KeyFolder(store.folder / "keys").signer("root")], [new_key(), new_key()]
+    ceremonies.admit(store, "lab", [ada.public_key, bob.public_key], people, threshold=2, previous=1)
+    (store.folder / "keys" / "site-lab.pem").unlink()
+    publish(store, seed=2)
+    assert ceremonies.sign_site(store, "lab", ada) == 1
+    clock.now_ns += 15 * 24 * HOUR_NS
+    assert ceremonies.sign_site(store, "lab", bob) == 1, "it begins anew"
+    assert ceremonies.sign_site(store, "lab", ada) == 0
+    now = datetime.fromtimestamp(clock() / 1e9, UTC)
+    assert SignedLists(store.folder).served("lab").expires > now
+    # A list that was put back from a copy: its number was used meanwhile.
+    repository = ListRepository(SignedLists(store.folder), now)
+    publish(store, seed=3)
+    stale = repository.sign_site("lab", admitted_versions(store.releases("lab"), 1), [ada])
+    stale.signed.version -= 1
+    repository.lists.staged_path("lab").write_bytes(stale.to_bytes())
+    assert [ceremonies.sign_site(store, "lab", key) for key in (ada, bob)] == [1, 0]
+    assert states(store) == {2: "previous", 3: "current"}
+
+
+def test_an_expired_list_is_not_accepted(store: MapStore, clock: Clock) -> None:
+    repository = ListRepository(SignedLists(store.folder), datetime.fromtimestamp(clock() / 1e9, UTC))
+    key = KeyFolder(store.folder / "keys").signer("site-lab")
+    old = repository.sign_site("lab", admitted_versions(store.releases("lab"), 1), [])
+    old.signed.expires -= timedelta(days=15)
+    old.sign(key)
+    with pytest.raises(StateError, match="expired"):
+        repository.accept_site("lab", old)
+
+
+def test_a_site_that_waits_for_other_keys_is_no_reason_to_sign_every_second(store: MapStore, clock: Clock) -> None:
+    people, other = [KeyFolder(store.folder / "keys").signer("root")], new_key()
+    ceremonies.admit(store, "lab", [other.public_key], people, threshold=1, previous=1)
+    ceremonies.rotate_online(store, people)
+    (store.folder / "keys" / "site-lab.pem").unlink()
+    before = SignedLists(store.folder).read("timestamp").version
+    for _ in range(3):
+        clock.now_ns += 10**9
+        update_lists(store)
+    assert SignedLists(store.folder).read("timestamp").version == before
+    assert any("lab" in words and "signature" in words for words in trust_status(store).faults)
+    assert ceremonies.sign_site(store, "lab", other) == 0
+    assert states(store) == {1: "current"}
+
+
+def test_lists_of_a_clock_that_was_ahead_are_signed_anew(store: MapStore, clock: Clock) -> None:
+    """Else a timestamp of that day would be believed for years, whoever shows it."""
+    clock.now_ns += 3650 * 24 * HOUR_NS
+    update_lists(store)
+    clock.now_ns -= 3650 * 24 * HOUR_NS
+    update_lists(store)
+    lists, now = SignedLists(store.folder), datetime.fromtimestamp(clock() / 1e9, UTC)
+    for role, days in (("timestamp", 1), ("snapshot", 7), ("site-lab", 14)):
+        assert now < lists.read(role).expires <= now + timedelta(days=days), role
+
+
+def test_what_else_lies_in_the_folder_of_lists(store: MapStore, tmp_path: Path) -> None:
+    """A copy that somebody made by hand does not end signing; a link to elsewhere is not read for anybody."""
+    folder, lists = store.folder / "trust", SignedLists(store.folder)
+    (folder / "old.7.site-lab.json").write_text("{}")
+    publish(store, seed=2)
+    assert states(store) == {1: "previous", 2: "current"}
+    (tmp_path / "secret").write_text("{}")
+    (folder / "77.root.json").symlink_to(tmp_path / "secret")
+    (folder / "pipe").mkdir()
+    assert lists.file("lab", "77.root.json") == b""
+    os.mkfifo(folder / "78.root.json")
+    assert lists.file("lab", "78.root.json") == b"", "a pipe would stop the server"
+    (folder / "77.root.json").unlink()
+    assert any("trust" in fault and "symbolic link" in fault for fault in verify_with_link(store, tmp_path))
+
+
+def verify_with_link(store: MapStore, tmp_path: Path) -> list[str]:
+    (store.folder / "trust" / "9.snapshot.json").symlink_to(tmp_path / "secret")
+    return store.verify().faults
+
+
+def test_a_key_does_not_close_a_folder_that_was_there(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    save_key(tmp_path / "ada.pem", new_key(), None)
+    assert stat.S_IMODE(tmp_path.stat().st_mode) == 0o755
+    save_key(tmp_path / "made" / "ada.pem", new_key(), None)
+    assert stat.S_IMODE((tmp_path / "made").stat().st_mode) == 0o700

@@ -144,7 +144,6 @@ def rotate(
     """Replace keys, or sign root and targets anew before they expire."""
     from mapserver.store import MapStore
     from mapserver.trust import ceremonies
-    from mapserver.trust.keys import make_passphrase
 
     if what is Rotated.ONLINE and (add or remove):
         raise UsageError("--add and --remove are for `trust rotate root`")
@@ -154,11 +153,8 @@ def rotate(
             ceremonies.rotate_online(maps, signers)
         else:
             removed = [] if remove is None else [ceremonies.public_key(remove)]
-            added, passphrase = [], make_passphrase()
-            if add is not None:
-                added.append(ceremonies.make_key_file(add / "root-new.pem", passphrase))
-                typer.echo(f"{add / 'root-new.pem'}: {passphrase}   (shown once: write it down, apart from the stick)")
-            ceremonies.rotate_root(maps, signers, removed=removed, added=added)
+            for path, passphrase in ceremonies.rotate_root(maps, signers, removed=removed, add=add).items():
+                typer.echo(f"{path}: {passphrase}   (shown once: write it down, apart from the stick)")
     typer.echo("done; robots follow with their next question")
 
 
