@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
+from dataclasses import replace
 from http import HTTPMethod
 from importlib import metadata
 from itertools import accumulate
@@ -18,6 +19,7 @@ from mapserver.api import describe, problems
 from mapserver.api.body_limit import BodyLimit
 from mapserver.api.bytes_response import bytes_response
 from mapserver.api.fleet_routes import install_fleet_routes
+from mapserver.api.guard import Guard
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
 from mapserver.api.parameters import Limit, NameCursor, Number, NumberCursor, Sha256, Site, SiteFilter, Version, page
 from mapserver.api.version_routes import ApiSettings, install_version_routes
@@ -32,6 +34,7 @@ from mapserver.api.views import (
     VersionView,
 )
 from mapserver.fleet.fleet import Fleet
+from mapserver.operators import Operators
 from mapserver.store import JobInfo, MapStore, VersionInfo
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
@@ -58,6 +61,8 @@ def create_app(
         responses=problems.PROBLEM_RESPONSES,
     )
     problems.install(app)
+    guard = settings.guard
+    app.add_middleware(Guard, settings=guard if guard.operators else replace(guard, operators=Operators(store)))
     app.add_middleware(BodyLimit)
     app.add_middleware(_Measured, metrics=metrics)
     _install_service_routes(app, store, fleet, metrics, bus)

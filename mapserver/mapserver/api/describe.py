@@ -64,13 +64,16 @@ def _described(app: FastAPI) -> dict[str, Any]:
     for name in ("HTTPValidationError", "ValidationError"):
         schemas.pop(name, None)
     schemas["Problem"] = Problem.model_json_schema()
-    found["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
+    found["components"]["securitySchemes"] = {
+        "token": {"type": "http", "scheme": "bearer"},
+        "session": {"type": "apiKey", "in": "cookie", "name": "__Host-fleetmap"},
+    }
     for path, operations in found["paths"].items():
-        for method, operation in operations.items():
+        for operation in operations.values():
             operation["responses"].pop("422", None)  # one of 4XX
             answer = operation["responses"].get("200", {}).get("content", {}).get("application/json")
             if answer is not None and path in _ANSWER_EXAMPLES:
                 answer["example"] = _ANSWER_EXAMPLES[path]
-            if method == "post":
-                operation["security"] = [{}, {"token": []}]
+            if path not in ("/healthz", "/readyz"):
+                operation["security"] = [{}, {"token": []}, {"session": []}]
     return found

@@ -3,13 +3,13 @@
 import time
 from typing import NamedTuple
 
-from fastapi import Depends, FastAPI
+from fastapi import FastAPI, Request
 from starlette.exceptions import HTTPException
 
 from mapserver import releases
+from mapserver.api.guard import GuardSettings, actor_of
 from mapserver.api.parameters import Site, Version
 from mapserver.api.views import Act, CanaryAct, CanaryView, PublishAct, QualityView, VersionView
-from mapserver.api.writers import Writers
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet_statistics.canary_test import CanarySettings, number_of
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings
@@ -19,17 +19,16 @@ from mapserver.store import CanaryRow, MapStore, VersionInfo
 
 
 class ApiSettings(NamedTuple):
-    """Who may change something, and how drafts, canaries and tiles are judged."""
+    """Who is let in, and how drafts, canaries and tiles are judged."""
 
-    writers: Writers = Writers()
+    guard: GuardSettings = GuardSettings()
     gate: GateSettings = GateSettings()
     canary: CanarySettings = CanarySettings()
     resurvey: ResurveySettings = ResurveySettings()
 
 
 def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings) -> None:
-    """Adds the endpoints; those that change something ask the writers."""
-    allowed = [Depends(settings.writers.check)]
+    """Adds the endpoints; the guard lets those change something who may."""
 
     @app.get("/v1/sites/{site}/versions/{version}/quality")
     def quality(site: Site, version: Version) -> QualityView:
@@ -43,22 +42,24 @@ def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings)
         """What changed between two versions: tiles, landmarks, bytes to fetch, quality side by side."""
         return releases.difference(store, site, before, after)
 
-    @app.post("/v1/sites/{site}/versions/{version}/publish", dependencies=allowed, response_model=VersionView)
-    def publish(site: Site, version: Version, act: PublishAct) -> VersionInfo:
+    @app.post("/v1/sites/{site}/versions/{version}/publish", response_model=VersionView)
+    def publish(request: Request, site: Site, version: Version, act: PublishAct) -> VersionInfo:
         """Takes a draft through the gate and makes it current."""
-        releases.publish(store, site, version, actor=act.who(), force=act.force, gate=settings.gate)
+        releases.publish(
+            store, site, version, actor=actor_of(request, act.actor, act.reason), force=act.force, gate=settings.gate
+        )
         return store.version(site, version)
 
-    @app.post("/v1/sites/{site}/versions/{version}/promote", dependencies=allowed, response_model=VersionView)
-    def promote(site: Site, version: Version, act: Act) -> VersionInfo:
+    @app.post("/v1/sites/{site}/versions/{version}/promote", response_model=VersionView)
+    def promote(request: Request, site: Site, version: Version, act: Act) -> VersionInfo:
         """Makes a version that was published before the current one."""
-        releases.promote(store, site, version, actor=act.who())
+        releases.promote(store, site, version, actor=actor_of(request, act.actor, act.reason))
         return store.version(site, version)
 
-    @app.post("/v1/sites/{site}/rollback", dependencies=allowed, response_model=VersionView)
-    def rollback(site: Site, act: Act) -> VersionInfo:
+    @app.post("/v1/sites/{site}/rollback", response_model=VersionView)
+    def rollback(request: Request, site: Site, act: Act) -> VersionInfo:
         """Makes the version current that was so before; the current one retires."""
-        return store.version(site, releases.roll_back(store, site, actor=act.who()))
+        return store.version(site, releases.roll_back(store, site, actor=actor_of(request, act.actor, act.reason)))
 
     @app.get("/v1/sites/{site}/canary")
     def canary(site: Site) -> CanaryView:
@@ -69,14 +70,16 @@ def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings)
             raise HTTPException(404, f"site {site} never had a canary; `mapserver promote --canary 5%` begins one")
         return _view(store, found[0], settings.canary)
 
-    @app.post("/v1/sites/{site}/versions/{version}/canary", dependencies=allowed)
-    def start_canary(site: Site, version: Version, act: CanaryAct) -> CanaryView:
+    @app.post("/v1/sites/{site}/versions/{version}/canary")
+    def start_canary(request: Request, site: Site, version: Version, act: CanaryAct) -> CanaryView:
         """Lets a share of the robots run a version before the others; a draft goes through the gate first.
 
         `rollback` takes it back, promoting it ends it early; otherwise the server decides by the failures of both sides.
         """
         share = settings.canary.share if act.share is None else act.share
-        begun = releases.start_canary(store, site, version, share, actor=act.who(), gate=settings.gate)
+        begun = releases.start_canary(
+            store, site, version, share, actor=actor_of(request, act.actor, act.reason), gate=settings.gate
+        )
         return _view(store, begun, settings.canary)
 
 

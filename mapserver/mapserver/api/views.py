@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 from mapserver.fleet.fleet import RobotStatus
 from mapserver.fleet_statistics.canary_test import CanaryFinding
 from mapserver.fleet_statistics.kpis import Kpis
-from mapserver.store import Actor, CanaryRow, Event, FailureRow, JobInfo, PictureRow, SiteInfo, VerdictRow
+from mapserver.store import CanaryRow, Event, FailureRow, JobInfo, PictureRow, SiteInfo, VerdictRow
 
 
 class VersionView(BaseModel):
@@ -144,15 +144,11 @@ def _body(**example: JsonValue) -> ConfigDict:
 
 
 class Act(BaseModel):
-    """Who changes something, and why."""
+    """Why something is changed, and by whom; the name is that of the session or token where there is one."""
 
     model_config = _body(actor="ada", reason="robots lose themselves in aisle 3")
-    actor: Annotated[str, Field(min_length=1, max_length=200)]
+    actor: Annotated[str | None, Field(min_length=1, max_length=200)] = None
     reason: Annotated[str, Field(max_length=2000)] = ""
-
-    def who(self) -> Actor:
-        """As the store keeps it."""
-        return Actor(self.actor, self.reason)
 
 
 class PublishAct(Act):

@@ -1,12 +1,15 @@
 """`mapserver serve`: a store on HTTP and on the bus."""
 
+import ssl
 from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, settings_of
+from fleetmap.cli_options import ConfigFile, expand_options, settings_of
 from mapserver.commands.options import StoreFolder
 
 if TYPE_CHECKING:
@@ -15,51 +18,123 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
     from fleetmap.bus import ZenohBus
-    from mapserver.api.writers import Writers
+    from mapserver.api.guard import GuardSettings
     from mapserver.config import MapserverConfig
     from mapserver.store import MapStore
+    from mapserver.trust.http_certificate import HttpCertificate
 
 _STOP_WITHIN_S = 5
-_MIN_TOKEN = 16
 _SWITCH_INTERVAL_S = 0.001
+_RENEW_EVERY_S = 30.0
+_INSECURE = (
+    "This server was started with --insecure. Whoever reaches it may read everything and change the maps of the robots."
+)
+_NO_TLS = "This server was started with --insecure. Passwords and sessions can be read on their way to it."
 
 
+@dataclass(frozen=True, kw_only=True)
+class HttpOptions:
+    """Where HTTP is served, and by which names."""
+
+    http: Annotated[str, typer.Option(help="HTTP address to listen on; port 0 picks a free port.")] = "127.0.0.1:8080"
+    http_cert: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="PEM certificate for HTTPS; taken anew when it is renewed.")
+    ] = None
+    http_key: Annotated[Path | None, typer.Option(metavar="FILE", help="PEM key of --http-cert.")] = None
+    http_name: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Host name that a proxy passes on; repeat it.")
+    ] = None
+    insecure: Annotated[
+        bool,
+        typer.Option("--insecure", help="Serve other machines without TLS and operators, and say so on every page."),
+    ] = False
+
+    def host_and_port(self) -> tuple[str, int]:
+        """Where to listen; UsageError for what is no address."""
+        from fleetmap.errors import UsageError
+
+        host, _, port = self.http.rpartition(":")
+        if not host or not port.isdecimal() or int(port) > 65535:
+            raise UsageError(f"--http {self.http!r}: write it like 127.0.0.1:8080")
+        return host.strip("[]"), int(port)
+
+    def load_certificate(self) -> "HttpCertificate | None":
+        """The certificate, None without one; UsageError for half of a pair, and as `HttpCertificate`."""
+        from fleetmap.errors import UsageError
+        from mapserver.trust.http_certificate import HttpCertificate
+
+        if (self.http_cert is None) != (self.http_key is None):
+            raise UsageError("--http-cert and --http-key belong together; give both")
+        if self.http_cert is None or self.http_key is None:
+            return None
+        return HttpCertificate(self.http_cert, self.http_key)
+
+    def guard(self, store: "MapStore", certificate: "HttpCertificate | None") -> "GuardSettings":
+        """Who is let in; UsageError where the server must not be reached like this."""
+        from fleetmap.errors import UsageError
+        from mapserver.api.guard import GuardSettings
+        from mapserver.dashboard.layout import HANDLERS
+        from mapserver.operators import HttpBinding, Operators, binding_fault
+        from mapserver.operators.binding import is_loopback_name
+
+        given, host = tuple(name.lower() for name in self.http_name or ()), self.host_and_port()[0]
+        fault = binding_fault(
+            HttpBinding(
+                address=self.http,
+                host=host,
+                names=given,
+                has_tls=certificate is not None,
+                has_operators=store.operators.may_sign_in(),
+            )
+        )
+        if fault and not self.insecure:
+            raise UsageError(fault)
+        names = {host.lower(), *given} | (certificate.names() if certificate else frozenset())
+        return GuardSettings(
+            names=frozenset(names),
+            operators=Operators(store),
+            must_sign_in=not fault and not is_loopback_name(host),
+            handlers=HANDLERS,
+            warning=(_NO_TLS if store.operators.may_sign_in() else _INSECURE) if fault else "",
+        )
+
+
+@expand_options
 def serve(
     context: typer.Context,
     store: StoreFolder,
-    http: Annotated[str, typer.Option(help="HTTP address to listen on; port 0 picks a free port.")] = "127.0.0.1:8080",
+    at: HttpOptions,
     zenoh: Annotated[
         str, typer.Option(help="zenoh endpoint to listen on; port 0 picks a free port.")
     ] = "tcp/127.0.0.1:7447",
-    token_file: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="File with the token that HTTP requests need to change anything."),
-    ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Serve maps to robots and operators; prints the addresses when ready, ends with status 0 on SIGTERM or SIGINT."""
-    host, port = _host_and_port(http)
-    token = None if token_file is None else _token(token_file)
+    host, port = at.host_and_port()
     from fleetmap.bus import ZenohBus, check_endpoint
 
     check_endpoint(zenoh)
-    from mapserver.api.writers import Writers, is_loopback_name
     from mapserver.store import MapStore
     from mapserver.trust import prepare_lists
 
-    writers = Writers(token, is_loopback_name(host))
-    settings = settings_of(context)
+    certificate, settings = at.load_certificate(), settings_of(context)
     # The sockets come before the store is read, so that a wrong address is reported at once.
     with _listening(host, port) as listener, MapStore.open(store) as maps:
+        guard = at.guard(maps, certificate)
         prepare_lists(maps, zenoh)
         # The bus last: whoever answers before this program does could be heard in its place.
         with ZenohBus.listen(zenoh) as bus:
-            _run(maps, bus, listener, writers, settings)
+            _run(maps, bus, _Http(listener, guard, certificate, bool(at.http_name)), settings)
 
 
-def _run(
-    maps: "MapStore", bus: "ZenohBus", listener: "socket.socket", writers: "Writers", settings: "MapserverConfig"
-) -> None:
+class _Http(NamedTuple):
+    listener: "socket.socket"
+    guard: "GuardSettings"
+    certificate: "HttpCertificate | None"
+    is_behind_proxy: bool
+
+
+def _run(maps: "MapStore", bus: "ZenohBus", http: _Http, settings: "MapserverConfig") -> None:
     import logging
     import signal
     import sys
@@ -74,30 +149,33 @@ def _run(
     from mapserver.api.version_routes import ApiSettings
     from mapserver.dashboard.install import install_dashboard
     from mapserver.fleet.fleet import Fleet
-    from mapserver.serving.background_tasks import run_background_tasks, server_tasks
+    from mapserver.serving.background_tasks import BackgroundTask, run_background_tasks, server_tasks
     from mapserver.serving.bus_service import BusService
 
     # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     log_to_stderr(logging.INFO)
+    if http.guard.warning:
+        logging.getLogger(__name__).warning("%s", http.guard.warning)
     fleet = Fleet(maps, settings=settings.ingest)
     metrics = Metrics(maps, fleet)
     bus_service = BusService(maps, fleet, bus, metrics.count_bus)
+    tasks = server_tasks(maps, fleet, bus_service, settings)
 
     @asynccontextmanager
     async def lifespan(_: "FastAPI") -> AsyncIterator[None]:
         import asyncio
 
-        background = asyncio.create_task(run_background_tasks(server_tasks(maps, fleet, bus_service, settings)))
-        host, port = listener.getsockname()[:2]
-        typer.echo(f"http: http://{f'[{host}]' if ':' in host else host}:{port}")
+        background = asyncio.create_task(run_background_tasks(tasks))
+        host, port = http.listener.getsockname()[:2]
+        typer.echo(f"http: {'https' if http.certificate else 'http'}://{f'[{host}]' if ':' in host else host}:{port}")
         typer.echo(f"zenoh: {bus.endpoint}")
         typer.echo("ready")
         yield
         background.cancel()
         await asyncio.gather(background, return_exceptions=True)
 
-    api = ApiSettings(writers, settings.gate, settings.canary, settings.resurvey)
+    api = ApiSettings(http.guard, settings.gate, settings.canary, settings.resurvey)
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
     install_dashboard(app, maps, fleet, api, bus_service.surveys)
     config = uvicorn.Config(
@@ -107,39 +185,25 @@ def _run(
         access_log=False,
         timeout_graceful_shutdown=_STOP_WITHIN_S,
         ws_max_size=MAX_BODY_BYTES,
+        # Where no proxy is named, anybody on this machine could write another address into the log.
+        proxy_headers=http.is_behind_proxy,
+        ssl_certfile=None if http.certificate is None else http.certificate.certificate,
+        ssl_keyfile=None if http.certificate is None else http.certificate.key,
     )
+    config.load()
+    if http.certificate is not None and config.ssl is not None:
+        config.ssl.minimum_version = ssl.TLSVersion.TLSv1_2
+        renew = partial(http.certificate.renew, config.ssl)
+        tasks.append(BackgroundTask("renewing the certificate of HTTP", _RENEW_EVERY_S, renew))
     # uvicorn stops on these signals by itself and afterwards raises them again for the handlers that were there before:
     # the default ones would end the process with a status that says it was killed.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: None)
     try:
-        uvicorn.Server(config).run(sockets=[listener])
+        uvicorn.Server(config).run(sockets=[http.listener])
     finally:
         bus_service.close()
         fleet.flush()
-
-
-def _host_and_port(address: str) -> tuple[str, int]:
-    from fleetmap.errors import UsageError
-
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or int(port) > 65535:
-        raise UsageError(f"--http {address!r}: write it like 127.0.0.1:8080")
-    return host.strip("[]"), int(port)
-
-
-def _token(path: Path) -> str:
-    from fleetmap.errors import UsageError
-
-    try:
-        token = path.read_text("utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"--token-file {path} cannot be read ({error}); check the path and its rights") from error
-    if len(token) < _MIN_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
-        raise UsageError(
-            f"--token-file {path}: a token is one line of at least {_MIN_TOKEN} ASCII characters without spaces"
-        )
-    return token
 
 
 def _listening(host: str, port: int) -> "socket.socket":

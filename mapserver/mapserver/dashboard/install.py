@@ -15,7 +15,7 @@ from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.layout import Services
 from mapserver.dashboard.live import LiveRobots
-from mapserver.dashboard.pages import failure_page, fleet_page, live_page, map_page, survey_page
+from mapserver.dashboard.pages import failure_page, fleet_page, live_page, map_page, sign_in_page, survey_page
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.store import MapStore
@@ -29,11 +29,12 @@ def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: Api
         MapData(store, settings.gate, settings.canary.share),
         HealthData(store, settings.canary, settings.resurvey, time.time_ns),
         LiveRobots(fleet, time.monotonic),
-        settings.writers,
+        settings.guard,
         surveys,
     )
     for page in (fleet_page, map_page, failure_page, survey_page, live_page):
         page.install(services)
+    sign_in_page.install(app, settings.guard)
     _install_pictures(services, store)
 
     @app.get("/", include_in_schema=False)

@@ -12,7 +12,7 @@ from markupsafe import Markup, escape
 from nicegui import ui
 
 from fleetmap.errors import FleetmapError, UsageError
-from mapserver.api.writers import Writers
+from mapserver.api.guard import SIGN_IN, SIGN_OUT, GuardSettings
 from mapserver.dashboard import drawing
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
@@ -31,16 +31,20 @@ _SWITCH_LOOK = (
     f"document.cookie = '{_LOOK_COOKIE}=' + (dark ? 'dark' : 'light') + ';path=/;max-age=31536000;samesite=strict';"
     "setDark(dark)"
 )
+_CHOOSE_SITE = "this.form.submit()"
+HANDLERS = (_SWITCH_LOOK, _CHOOSE_SITE)
+"""The code of all event handlers in markup; the guard's policy lets browsers run no other."""
+_SESSION_EVERY_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """Services of the pages: maps and surveys, fleet health, the robots now, permission to change something, surveys under way."""
+    """Services of the pages: maps and surveys, fleet health, the robots now, who is let in, surveys under way."""
 
     maps: MapData
     health: HealthData
     robots: LiveRobots
-    writers: Writers
+    guard: GuardSettings
     surveys: LiveSurveys
 
 
@@ -89,10 +93,11 @@ async def show(
         chosen = site if site in under_way else await load(services.maps.chosen_site, site)
         sites, context = sorted({*sites, *under_way}), PageContext(root, page, chosen)
     except FleetmapError as error:
-        _head(root, page, None, [])
+        _head(services, request, page, None, [])
         html(notice("bad", str(error)))
         return
-    _head(root, page, context.site, sites)
+    _head(services, request, page, context.site, sites)
+    _end_with_session(services, request)
     try:
         await build(context)
     except FleetmapError as error:
@@ -133,7 +138,32 @@ def _set_look(request: Request) -> None:
         ui.dark_mode(look == "dark")
 
 
-def _head(root: str, page: str, site: str | None, sites: list[str]) -> None:
+def _end_with_session(services: Services, request: Request) -> None:
+    """Leaves the page when the session has ended that opened it: an open page must not outlive it."""
+    if getattr(request.state, "operator", None) is None:
+        return
+    client = ui.context.client
+
+    async def look() -> None:
+        if await load(lambda: services.guard.identify(request.scope, uses=False)) is None:
+            ui.navigate.to(SIGN_IN)
+            client.content.clear()  # for one that does not follow
+
+    ui.timer(_SESSION_EVERY_S, look)
+
+
+def _person(request: Request) -> Markup:
+    """Who is signed in, and the way out."""
+    who = getattr(request.state, "operator", None)
+    if who is None:
+        return Markup("")
+    return Markup(
+        '<form method="post" action="{}"><span class="quiet">{} ({})</span> <button class="plain" type="submit">Sign out</button></form>'
+    ).format(SIGN_OUT, who.name, who.role)
+
+
+def _head(services: Services, request: Request, page: str, site: str | None, sites: list[str]) -> None:
+    root = str(request.scope.get("root_path", ""))
     links = joined(
         Markup('<a href="{}"{}>{}</a>').format(
             address(f"{root}/{path}", site=site), Markup(' aria-current="page"') if path == page else "", name
@@ -145,14 +175,16 @@ def _head(root: str, page: str, site: str | None, sites: list[str]) -> None:
         for name in sites
     )
     chooser = Markup(
-        '<form method="get" action="{}"><label>Site <select name="site" onchange="this.form.submit()">{}</select></label></form>'
-    ).format(f"{root}/{page}", options)
+        '<form method="get" action="{}"><label>Site <select name="site" onchange="{}">{}</select></label></form>'
+    ).format(f"{root}/{page}", _CHOOSE_SITE, options)
     html(
         Markup(
             '<nav class="top"><strong>fleetmap</strong>{}<span class="space"></span>{}'
-            '<button class="plain" type="button" onclick="{}">Light or dark</button></nav>'
-        ).format(links, chooser if sites else "", _SWITCH_LOOK)
+            '<button class="plain" type="button" onclick="{}">Light or dark</button>{}</nav>'
+        ).format(links, chooser if sites else "", _SWITCH_LOOK, _person(request))
     )
+    if services.guard.warning:
+        html(notice("bad", services.guard.warning))
 
 
 def back_link(context: PageContext, path: str, words: str) -> Markup:

@@ -5,17 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fastapi.testclient import TestClient
 
 from fleetmap.errors import StoreError
 from fleetmap.mapformat import TILE_FORMAT, blob_path, decode_manifest, decode_tile, sha256_hex
 from fleetmap.messages import RobotAck, RobotHealth
 from mapserver.api import app as app_module
 from mapserver.api import body_limit
-from mapserver.api.app import create_app
-from mapserver.api.metrics import Metrics
-from mapserver.api.version_routes import ApiSettings
-from mapserver.api.writers import Writers
 from mapserver.store import DraftContent
 from support.fleet.served_api import Server, check_problem, served_api
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
@@ -303,33 +298,6 @@ def test_a_difference_names_bytes_and_quality(server: Server) -> None:
     assert (found["tiles_changed"], found["tiles_kept"]) == (2, 0)
     assert found["fetch_bytes"] + 250 == found["full_bytes"]  # all but the vocabulary
     assert found["quality"] == {"path_m": {"before": 12.5, "after": 12.5}}
-
-
-TOKEN = "a-token-of-some-length"
-
-
-@pytest.mark.parametrize(
-    ("writers", "headers", "status"),
-    [
-        (Writers(), {}, 200),
-        (Writers(), {"Host": "rebound.example"}, 403),
-        (Writers(), {"Host": "[::1]:8080"}, 200),
-        (Writers(None, is_loopback=False), {}, 403),
-        (Writers(TOKEN, is_loopback=False), {}, 401),
-        (Writers(TOKEN), {"Authorization": "Bearer wrong"}, 401),
-        (Writers(TOKEN), {"Authorization": f"Bearer {TOKEN}"}, 200),
-        (Writers(TOKEN, is_loopback=False), {"Authorization": f"Bearer {TOKEN}", "Host": "maps.example"}, 200),
-    ],
-)
-def test_only_those_write_who_may(server: Server, writers: Writers, headers: dict[str, str], status: int) -> None:
-    app = create_app(
-        server.store, server.fleet, Metrics(server.store, server.fleet), None, settings=ApiSettings(writers)
-    )
-    with TestClient(app, "http://127.0.0.1") as client:
-        response = client.post("/v1/sites/lab/versions/2/publish", json=ADA, headers=headers)
-        assert response.status_code == status
-        assert server.store.current("lab").version == (2 if status == 200 else 1)
-        assert client.get("/v1/sites", headers={"Host": "maps.example"}).status_code == 200
 
 
 def test_the_document_has_examples(server: Server) -> None:

@@ -26,6 +26,7 @@ from mapserver import cli, releases
 from mapserver.commands.serve import serve
 from mapserver.config import MapserverConfig
 from mapserver.store import DraftContent, MapStore
+from support.fleet.dashboard_scene import serving as scene_serving
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
 PROGRAM = ("-m", "mapserver.cli", "serve")
@@ -119,18 +120,26 @@ def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path
 
 def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:
     context = typer.Context(typer.main.get_command(cli.app), obj=Program({}, lambda _: (MapserverConfig(), {})))
+
+    def serve_at(http: str, zenoh: str, **more: object) -> None:
+        options = {"http_cert": None, "http_key": None, "http_name": None, "insecure": False}
+        serve(context=context, store=tmp_path, http=http, zenoh=zenoh, config=None, **options | more)
+
     with pytest.raises(UsageError, match="--http 'nonsense'"):
-        serve(context, tmp_path, "nonsense", "tcp/127.0.0.1:0")
+        serve_at("nonsense", "tcp/127.0.0.1:0")
     with pytest.raises(UsageError, match="endpoint"):
-        serve(context, tmp_path, "127.0.0.1:0", "nonsense")
+        serve_at("127.0.0.1:0", "nonsense")
     with pytest.raises(StoreError, match="no map store"):
-        serve(context, tmp_path, "127.0.0.1:0", "tcp/127.0.0.1:0")
+        serve_at("127.0.0.1:0", "tcp/127.0.0.1:0")
     with pytest.raises(UsageError, match="cannot listen"):
-        serve(context, tmp_path, "192.0.2.1:80", "tcp/127.0.0.1:0")
-    (tmp_path / "token").write_text("short")
-    for file, words in ((tmp_path / "token", "at least 16"), (tmp_path / "nothing", "cannot be read")):
+        serve_at("192.0.2.1:80", "tcp/127.0.0.1:0")
+    (tmp_path / "no.pem").write_text("no certificate")
+    for options, words in (
+        ({"http_cert": tmp_path / "no.pem"}, "belong together"),
+        ({"http_cert": tmp_path / "no.pem", "http_key": tmp_path / "no.pem"}, "cannot be served"),
+    ):
         with pytest.raises(UsageError, match=words):
-            serve(context, tmp_path, "127.0.0.1:0", "tcp/127.0.0.1:0", file)
+            serve_at("127.0.0.1:0", "tcp/127.0.0.1:0", **options)
 
 
 def run(*arguments: str) -> str:
@@ -169,3 +178,21 @@ def test_an_empty_draft_ends_with_the_gates_status(tmp_path: Path) -> None:
         run("publish", "--site", "lab", "--store", str(tmp_path))
     assert refusal.value.exit_status == 4
     assert json.loads(run("inspect", "--site", "lab", "--store", str(tmp_path), "--json"))["bytes_per_m"] is None
+
+
+def test_beyond_the_machine_http_is_refused_until_it_is_protected(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True):
+        pass
+    arguments = ["--store", str(tmp_path), "--zenoh", "tcp/127.0.0.1:0", "--http", "0.0.0.0:0"]
+    for more, words in (
+        ([], "--http-cert and --http-key, and name who may sign in"),
+        (["--http", "127.0.0.1:0", "--http-name", "maps.example"], "--http-name maps.example is reached from other"),
+    ):
+        refused = CliRunner().invoke(cli.app, ["serve", *arguments, *more])
+        assert isinstance(refused.exception, UsageError) and words in str(refused.exception)
+    with scene_serving(tmp_path, "--insecure", http="0.0.0.0:0") as served:
+        address = served.http.replace("0.0.0.0", "127.0.0.1")
+        assert httpx.get(f"{address}/v1/sites").status_code == 200
+        page = httpx.get(f"{address}/dashboard/", headers={"Accept": "text/html"})
+        assert "started with --insecure" in page.text
+    assert [line for line in served.log if "WARNING" in line and "started with --insecure" in line]

@@ -1,4 +1,4 @@
-"""Changes to the store: a button, a dialog that explains the change and asks for name and reason, then the change."""
+"""Changes to the store: a button, a dialog that explains the change and asks for reason and, without sign-in, name; then the change."""
 
 from collections.abc import Callable
 
@@ -8,6 +8,7 @@ from starlette.exceptions import HTTPException
 
 from fleetmap.errors import FleetmapError
 from mapserver.dashboard.layout import Services, html, load, notice
+from mapserver.operators import Identity, Scope
 from mapserver.store import Actor
 
 _MAX_NAME, _MAX_REASON = 200, 2000
@@ -16,25 +17,22 @@ _MAX_NAME, _MAX_REASON = 200, 2000
 def change_button(services: Services, words: str, explanation: str, act: Callable[[Actor], str]) -> None:
     """A button that asks before it acts; the page is reloaded afterwards.
 
-    act: the change, in the name of an actor; its FleetmapError is shown and changes nothing.
+    act: the change, in the name of an actor; its FleetmapError is shown and changes nothing. Who may only look gets no button.
     """
+    who: Identity | None = getattr(ui.context.client.request.state, "operator", None)
+    if who is not None and Scope.CHANGE not in who.scopes:
+        return
     with ui.dialog() as dialog, ui.column().classes("ask-box"):
         html(Markup("<h2>{}</h2><p>{}</p>").format(f"{words}?", explanation))
-        name = (
-            ui.input("Your name")
-            .props(f"outlined maxlength={_MAX_NAME} autofocus")
-            .classes("w-full")
-            .style("width:100%")
-        )
+        name = None
+        if who is None:
+            name = ui.input("Your name").props(f"outlined maxlength={_MAX_NAME} autofocus").style("width:100%")
         reason = ui.input("Reason (kept in the history)").props(f"outlined maxlength={_MAX_REASON}").style("width:100%")
-        token = None
-        if services.writers.token is not None:
-            token = ui.input("The server's token", password=True).props("outlined").style("width:100%")
         message = html("")
         with ui.row().classes("actions"):
 
             async def confirmed() -> None:
-                refusal = await _try(services, act, name.value, reason.value, None if token is None else token.value)
+                refusal = await _try(services, act, None if name is None else name.value, reason.value)
                 if refusal is None:
                     ui.navigate.reload()
                 else:
@@ -47,15 +45,14 @@ def change_button(services: Services, words: str, explanation: str, act: Callabl
     ui.button(words, on_click=dialog.open, color=None).props("no-caps flat").classes("plain")
 
 
-async def _try(
-    services: Services, act: Callable[[Actor], str], name: str | None, reason: str | None, token: str | None
-) -> str | None:
-    """The reason for a refusal, None after the change."""
-    who = Actor((name or "").strip()[:_MAX_NAME], (reason or "").strip()[:_MAX_REASON])
-    if not who.name:
+async def _try(services: Services, act: Callable[[Actor], str], name: str | None, reason: str | None) -> str | None:
+    """The reason for a refusal, None after the change. Who acts is asked anew: the page may have been open since yesterday."""
+    typed = (name or "").strip()[:_MAX_NAME]
+    if name is not None and not typed:
         return "Please enter your name; it is kept in the history."
+    request, words = ui.context.client.request, (reason or "").strip()[:_MAX_REASON]
     try:
-        services.writers.check_shown(ui.context.client.request, f"Bearer {token or ''}")
+        who = await load(lambda: services.guard.acting(request, typed, words))
         await load(act, who)
     except HTTPException as error:
         return str(error.detail)

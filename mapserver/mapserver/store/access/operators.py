@@ -50,6 +50,12 @@ class OperatorQueries:
         """Whether anybody was ever named; operators are disabled, never removed."""
         return bool(self._transactions.query("SELECT 1 FROM operators LIMIT 1"))
 
+    def may_sign_in(self) -> bool:
+        """Whether there is anybody who can sign in."""
+        return bool(
+            self._transactions.query("SELECT 1 FROM operators WHERE password IS NOT NULL AND is_disabled = 0 LIMIT 1")
+        )
+
     def find(self, name: str) -> OperatorRow | None:
         """One operator, disabled or not."""
         found = self._transactions.rows(

@@ -1,0 +1,278 @@
+"""The guard around the whole server, its mounted pages and their socket: host names, pages from elsewhere, who asks, headers. Plain ASGI.
+
+Every request but those of `_OPEN` needs a scope, where sign-in is on; what is not named here needs the strongest that its method may be.
+"""
+
+import base64
+import hashlib
+import re
+import secrets
+from dataclasses import dataclass
+from ipaddress import ip_address
+from typing import Any
+from urllib.parse import quote, urlsplit
+
+from anyio import to_thread
+from fastapi import Request
+from starlette.exceptions import HTTPException
+from starlette.requests import cookie_parser
+from starlette.responses import RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from mapserver.api.problems import problem
+from mapserver.operators import Identity, Operators
+from mapserver.operators import Scope as Right
+from mapserver.operators.operators import LIFE_S
+from mapserver.store import Actor
+
+SIGN_IN, SIGN_OUT = "/sign-in", "/sign-out"
+_OPEN = {"/healthz", "/readyz", SIGN_IN}
+_SOCKET = "/_nicegui_ws/"
+_SCRIPT = re.compile(rb"<script\b(?![^>]*\bnonce=)")
+_FIXED = [
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"same-origin"),
+    (b"x-frame-options", b"DENY"),
+    (b"cross-origin-opener-policy", b"same-origin"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    (b"permissions-policy", b"camera=(), microphone=(), geolocation=()"),
+]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GuardSettings:
+    """What the guard knows of a server.
+
+    names: host names that it goes by, beside localhost and addresses. operators: who may sign in; None: those of the application's store.
+    must_sign_in: also before anybody is named. handlers: code of the event handlers in its pages. warning: a sentence for every page.
+    """
+
+    names: frozenset[str] = frozenset()
+    operators: Operators | None = None
+    must_sign_in: bool = False
+    handlers: tuple[str, ...] = ()
+    warning: str = ""
+
+    @property
+    def is_sign_in_on(self) -> bool:
+        """Whether a request must show who it comes from."""
+        return self.must_sign_in or (self.operators is not None and self.operators.is_sign_in_on)
+
+    def identify(self, scope: Scope, *, uses: bool = True) -> Identity | None:
+        """Who sent a request, by what the store knows now. uses: whether that keeps a session from ending."""
+        if self.operators is None:
+            return None
+        headers = _headers(scope)
+        session = cookie_parser(headers.get("cookie", "")).get(cookie_name(scope), "")
+        return self.operators.identify(session, headers.get("authorization", ""), address_of(scope), uses=uses)
+
+    def acting(self, request: Request, typed: str, reason: str) -> Actor:
+        """Who acts by a page that was opened with `request`, asked anew; typed: the name where nobody signs in.
+
+        Raises HTTPException for a session that has ended or may not change anything.
+        """
+        if not self.is_sign_in_on:
+            return _typed(request, typed, reason)
+        who = self.identify(request.scope)
+        if who is None:
+            raise HTTPException(401, "your session has ended; load the page again and sign in")
+        if Right.CHANGE not in who.scopes:
+            raise HTTPException(
+                403, f"{who.name} is a {who.role} and may not change versions; an admin can change that"
+            )
+        return who.actor(reason)
+
+
+def actor_of(request: Request, typed: str | None, reason: str) -> Actor:
+    """Who acts by a request of the API: the operator whom it proved; `typed` where nobody signs in."""
+    who: Identity | None = getattr(request.state, "operator", None)
+    if who is None:
+        return _typed(request, typed or "", reason)
+    if typed and typed != who.name:
+        raise HTTPException(403, f"the request comes from {who.name} and names {typed[:80]!r}; leave `actor` out")
+    return who.actor(reason)
+
+
+def _typed(request: Request, name: str, reason: str) -> Actor:
+    if not name:
+        raise HTTPException(422, "`actor` is missing: say who acts")
+    return Actor(name, reason, "", address_of(request.scope))
+
+
+def cookie_name(scope: Scope) -> str:
+    """The name of the session's cookie. Under TLS browsers take one of this name from nobody but this host, by TLS alone."""
+    return "__Host-fleetmap" if _is_secure(scope) else "fleetmap"
+
+
+def set_session(response: Response, scope: Scope, session: str) -> None:
+    """Gives a browser its session; an empty one takes it away."""
+    secure, age_s = _is_secure(scope), LIFE_S if session else 0
+    response.set_cookie(cookie_name(scope), session, age_s, secure=secure, httponly=True, samesite="strict", path="/")
+
+
+def address_of(scope: Scope) -> str:
+    """The address that a request comes from."""
+    client = scope.get("client")
+    return str(client[0]) if client else ""
+
+
+class Guard:
+    """Refuses what must not reach the application, tells it in `request.state.operator` who asks, and adds headers to its answers."""
+
+    def __init__(self, app: ASGIApp, settings: GuardSettings) -> None:
+        self._app, self._settings = app, settings
+        hashes = (base64.b64encode(hashlib.sha256(code.encode()).digest()).decode() for code in settings.handlers)
+        self._hashes = " ".join(f"'sha256-{digest}'" for digest in hashes)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request, or one socket."""
+        if scope["type"] not in {"http", "websocket"}:
+            return await self._app(scope, receive, send)
+        refusal = self._refused_place(scope) or await to_thread.run_sync(self._refused_person, scope)
+        if scope["type"] == "websocket":
+            if refusal is not None:
+                await receive()
+                return await send({"type": "websocket.close", "code": 4403})
+            return await self._app(scope, receive, send)
+        answer = _Answer(scope, send, self._hashes)
+        if refusal is None:
+            await self._app(answer.scope, receive, answer.send)
+        else:
+            await refusal(scope, receive, answer.send)
+        return None
+
+    def _refused_place(self, scope: Scope) -> Response | None:
+        """Refuses other names of the server (DNS rebinding) and requests that pages from elsewhere send."""
+        headers = _headers(scope)
+        host = headers.get("host", "").lower()
+        if not self._is_ours(host):
+            return _refuse(scope, 403, f"this server is not called {host[:80]!r}; name it with --http-name")
+        if scope["type"] == "http" and scope["method"] in {"GET", "HEAD", "OPTIONS"} and _SOCKET not in scope["path"]:
+            return None
+        origin, site = headers.get("origin"), headers.get("sec-fetch-site")
+        if site not in {None, "same-origin", "none"} or (origin is not None and _netloc(origin) != host):
+            return _refuse(scope, 403, "a page from elsewhere sent this request")
+        return None
+
+    def _is_ours(self, host: str) -> bool:
+        try:
+            name = (urlsplit(f"//{host}").hostname or "").removesuffix(".")
+        except ValueError:
+            return False
+        if name == "localhost" or name in self._settings.names:
+            return True
+        try:
+            # Nobody can point an address elsewhere: a page under it comes from this server.
+            return bool(ip_address(name))
+        except ValueError:
+            return False
+
+    def _refused_person(self, scope: Scope) -> Response | None:
+        """Refuses requests without a session or token, or with one that does not allow them."""
+        right = _needed(scope)
+        if right is None or not self._settings.is_sign_in_on:
+            return None
+        who = self._settings.identify(scope)
+        if who is None:
+            if scope["type"] == "http" and scope["method"] == "GET" and _wants_page(scope):
+                asked = scope["path"] + (f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else "")
+                return RedirectResponse(f"{SIGN_IN}?next={quote(asked, safe='')}", 303)
+            return _refuse(scope, 401, "sign in, or show a token that has not ended", {"WWW-Authenticate": "Bearer"})
+        if right not in who.scopes:
+            words = f"this needs the right to {right.value!r}, which {who.name} ({who.role}) does not have"
+            if self._settings.operators is not None:
+                self._settings.operators.note(
+                    "refused", f"{scope.get('method', 'socket')} {scope['path'][:200]!r}", who.actor()
+                )
+            return _refuse(scope, 403, words)
+        scope.setdefault("state", {})["operator"] = who
+        return None
+
+
+class _Answer:
+    """The way back of one answer: headers, and in pages a number used once in front of each script."""
+
+    def __init__(self, scope: Scope, send: Send, hashes: str) -> None:
+        self._send, self._hashes, self._nonce = send, hashes, secrets.token_urlsafe(16)
+        self._is_secure, self._is_private = _is_secure(scope), "operator" in scope.get("state", {})
+        self._start: Message | None = None
+        self._body = b""
+        # The pages' own compression comes first, and scripts could not be found in what it makes.
+        self.scope = scope
+        if _wants_page(scope):
+            kept = [(name, value) for name, value in scope["headers"] if name != b"accept-encoding"]
+            self.scope = {**scope, "headers": kept}
+
+    async def send(self, message: Message) -> None:
+        """One message of the application."""
+        if message["type"] == "http.response.start":
+            message = {**message, "headers": self._added(message["headers"])}
+            if dict(message["headers"]).get(b"content-type", b"").startswith(b"text/html"):
+                self._start = message
+                return
+        elif message["type"] == "http.response.body" and self._start is not None:
+            self._body += message.get("body", b"")
+            if message.get("more_body"):
+                return
+            body = _SCRIPT.sub(b'<script nonce="%s"' % self._nonce.encode(), self._body)
+            headers = [(name, value) for name, value in self._start["headers"] if name != b"content-length"]
+            # An answer to HEAD has the length of a body that is not there.
+            headers = [*headers, (b"content-length", b"%d" % len(body))] if body else self._start["headers"]
+            await self._send({**self._start, "headers": headers})
+            self._start, message = None, {"type": "http.response.body", "body": body}
+        await self._send(message)
+
+    def _added(self, headers: Any) -> list[tuple[bytes, bytes]]:
+        fixed = [*_FIXED, *([(b"strict-transport-security", b"max-age=31536000")] if self._is_secure else [])]
+        names = {name for name, _ in fixed}
+        kept = [(name.lower(), value) for name, value in headers if name.lower() not in names]
+        if self._is_private:
+            kept = [(n, v.replace(b"public", b"private") if n == b"cache-control" else v) for n, v in kept]
+        if b"content-security-policy" not in dict(kept):  # pictures have a stricter one
+            kept.append((b"content-security-policy", self._policy().encode()))
+        return kept + fixed
+
+    def _policy(self) -> str:
+        """NiceGUI compiles templates and handlers in the browser, hence 'unsafe-eval'; what is written into a page does not run."""
+        hashes = f" 'unsafe-hashes' {self._hashes}" if self._hashes else ""
+        return (
+            f"default-src 'none'; script-src 'self' 'nonce-{self._nonce}' 'unsafe-eval'{hashes}; "
+            "style-src 'self' 'unsafe-inline'; img-src 'self' data:; font-src 'self' data:; connect-src 'self'; base-uri 'none'; "
+            "form-action 'self'; frame-ancestors 'none'; object-src 'none'; manifest-src 'self'"
+        )
+
+
+def _needed(scope: Scope) -> Right | None:
+    path = scope["path"]
+    if path in _OPEN:
+        return None
+    if path == "/metrics":
+        return Right.METRICS
+    # Acts of the pages come by the socket and are asked for one by one.
+    is_reading = scope["type"] == "websocket" or scope["method"] in {"GET", "HEAD", "OPTIONS"}
+    return Right.READ if is_reading or _SOCKET in path or path == SIGN_OUT else Right.CHANGE
+
+
+def _refuse(scope: Scope, status: int, words: str, headers: dict[str, str] | None = None) -> Response:
+    is_read = scope.get("method", "GET") in {"GET", "HEAD"}
+    more = {} if is_read else {"Connection": "close"}  # the body is not read
+    return problem(status, words, scope["path"], {**(headers or {}), **more})
+
+
+def _headers(scope: Scope) -> dict[str, str]:
+    return {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+
+
+def _netloc(origin: str) -> str:
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return ""
+
+
+def _wants_page(scope: Scope) -> bool:
+    return scope["type"] == "http" and "text/html" in _headers(scope).get("accept", "")
+
+
+def _is_secure(scope: Scope) -> bool:
+    return scope.get("scheme") in {"https", "wss"}

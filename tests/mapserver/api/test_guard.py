@@ -1,0 +1,252 @@
+"""The guard: pages from elsewhere, other names, and requests without a name; rows 18, 19, 20 and 24 of docs/security.md.
+
+Each attack also runs against the same application without the guard, where it works.
+"""
+
+import base64
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from mapserver.api.app import create_app
+from mapserver.api.guard import Guard, GuardSettings, set_session
+from mapserver.api.metrics import Metrics
+from mapserver.api.version_routes import ApiSettings
+from mapserver.operators import Operators
+from mapserver.store import Actor
+from support.fleet.served_api import Server, check_problem, served_api
+
+PASSWORD = "a password of the test"
+ROLES = {"vic": "viewer", "olga": "operator", "ada": "admin"}
+EVIL = "http://evil.example"
+ACT = {"actor": "ada", "reason": "monday"}
+PUBLISH = "/v1/sites/lab/versions/2/publish"
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    with served_api(tmp_path) as made:
+        yield made
+
+
+@contextmanager
+def client_of(server: Server, *, is_guarded: bool = True, **settings: object) -> Iterator[TestClient]:
+    """A client of an application with these settings of the guard, or without it."""
+    guard = GuardSettings(operators=Operators(server.store), **settings)
+    app = create_app(server.store, server.fleet, Metrics(server.store, server.fleet), None, None, ApiSettings(guard))
+
+    @app.websocket("/dashboard/_nicegui_ws/socket.io/")
+    async def socket(websocket: WebSocket) -> None:
+        await websocket.accept()
+        await websocket.send_text("in")
+
+    if not is_guarded:
+        app.user_middleware = [layer for layer in app.user_middleware if layer.cls is not Guard]
+    with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False, follow_redirects=False) as client:
+        yield client
+
+
+def named(server: Server) -> dict[str, dict[str, str]]:
+    """A session of each role, as headers."""
+    operators = Operators(server.store)
+    for name, role in ROLES.items():
+        operators.add(name, role, PASSWORD, Actor("root"))
+    return {name: {"Cookie": f"fleetmap={operators.sign_in(name, PASSWORD, name).session}"} for name in ROLES}
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Origin": EVIL},
+        {"Origin": EVIL, "Sec-Fetch-Site": "cross-site"},
+        {"Sec-Fetch-Site": "cross-site"},
+        {"Sec-Fetch-Site": "same-site"},
+        {"Origin": "null"},
+        {"Origin": "http://127.0.0.1:9999"},
+        {"Origin": "http://127.0.0.1.evil.example"},
+        {"Origin": "http://[::1", "Sec-Fetch-Site": "none"},
+    ],
+)
+def test_a_page_from_elsewhere_changes_nothing(server: Server, headers: dict[str, str]) -> None:
+    """Row 18."""
+    with client_of(server) as client:
+        check_problem(client.post(PUBLISH, json=ACT, headers=headers), 403, "a page from elsewhere")
+        assert server.store.current("lab").version == 1
+        assert client.get("/v1/sites", headers=headers).status_code == 200, "what it reads its browser keeps from it"
+        form = client.post(PUBLISH, content=b"actor=ada", headers={"Content-Type": "text/plain"})
+        assert form.status_code == 422
+    with client_of(server, is_guarded=False) as client:
+        assert client.post(PUBLISH, json=ACT, headers=headers).status_code == 200
+
+
+@pytest.mark.parametrize("headers", [{}, {"Origin": "http://127.0.0.1", "Sec-Fetch-Site": "same-origin"}])
+def test_programs_and_the_pages_themselves_do(server: Server, headers: dict[str, str]) -> None:
+    with client_of(server) as client:
+        assert client.post(PUBLISH, json=ACT, headers=headers).status_code == 200
+        assert server.store.last_events("lab", 1)[0].actor == "ada"
+        check_problem(client.post("/v1/sites/lab/rollback", json={}, headers=headers), 422, "say who acts")
+
+
+def paths_of(client: TestClient) -> list[tuple[str, str]]:
+    """Every method and path of the document, with something in the place of parameters."""
+    values = {
+        "site": "lab",
+        "version": "1",
+        "before": "1",
+        "after": "2",
+        "sha256": "5e" * 32,
+        "job": "1",
+        "number": "1",
+    }
+    paths = client.app.openapi()["paths"]
+    return [
+        (method.upper(), path.format(**values, place="0"))
+        for path, operations in paths.items()
+        for method in operations
+    ]
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:8080", "127.0.0.1.evil.example", "", "[::1", "a b"])
+def test_under_another_name_nothing_answers(server: Server, host: str) -> None:
+    """Row 19: a page from elsewhere whose name leads here."""
+    with client_of(server) as client:
+        for method, path in paths_of(client):
+            check_problem(client.request(method, path, headers={"Host": host}), 403, "is not called")
+    with client_of(server, is_guarded=False) as client:
+        assert client.get("/v1/robots", headers={"Host": host}).status_code == 200
+
+
+def test_names_that_are_ours(server: Server) -> None:
+    with client_of(server, names=frozenset({"maps.example"})) as client:
+        for host in (
+            "maps.example",
+            "MAPS.example:8443",
+            "maps.example.",
+            "localhost",
+            "127.0.0.1",
+            "[::1]:80",
+            "10.0.0.7:8080",
+        ):
+            assert client.get("/v1/sites", headers={"Host": host}).status_code == 200, host
+
+
+def test_without_a_name_nothing_answers(server: Server) -> None:
+    """Row 24."""
+    with client_of(server) as client:
+        assert client.get("/v1/robots").status_code == 200, "the control: nobody is named yet"
+        sessions = named(server)
+        paths = paths_of(client)
+        assert len(paths) > 20
+    with client_of(server) as client:
+        for method, path in [
+            *paths,
+            ("GET", "/openapi.json"),
+            ("GET", "/dashboard/"),
+            ("POST", "/anything"),
+            ("GET", "/"),
+        ]:
+            if path in ("/healthz", "/readyz"):
+                assert client.request(method, path).status_code == 200
+                continue
+            for headers in ({}, {"Cookie": "fleetmap=guess"}, {"Authorization": "Bearer guess"}):
+                answer = client.request(method, path, headers=headers)
+                check_problem(answer, 401, "sign in")
+                assert answer.headers["www-authenticate"] == "Bearer"
+            assert client.request(method, path, headers=sessions["ada"]).status_code not in (401, 403), path
+        assert client.get("/dashboard/map?site=lab", headers={"Accept": "text/html"}).headers["location"] == (
+            "/sign-in?next=%2Fdashboard%2Fmap%3Fsite%3Dlab"
+        )
+    with client_of(server, is_guarded=False) as client:
+        assert client.get("/v1/robots").status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("name", "reads", "sees_metrics", "changes"),
+    [("vic", 200, 403, 403), ("olga", 200, 200, 200), ("ada", 200, 200, 200)],
+)
+def test_each_role_may_what_it_may(server: Server, name: str, reads: int, sees_metrics: int, changes: int) -> None:
+    headers = named(server)[name]
+    with client_of(server) as client:
+        assert client.get("/v1/sites", headers=headers).status_code == reads
+        assert client.get("/metrics", headers=headers).status_code == sees_metrics
+        assert client.post(PUBLISH, json={"reason": "monday"}, headers=headers).status_code == changes
+        last = server.store.audit_lines()[-1]
+        expected = ("published", name, name) if changes == 200 else ("refused", name, name)
+        assert (last.kind, last.actor, last.operator, last.address) == (*expected, "testclient")
+        forged = client.post("/v1/sites/lab/rollback", json={"actor": "bob"}, headers=headers)
+        check_problem(forged, 403, "")
+        assert [event for event in server.store.events("lab") if event.actor == "bob"] == []
+
+
+def test_a_token_does_what_it_was_made_for(server: Server) -> None:
+    operators = Operators(server.store)
+    token = operators.make_token("prometheus", ["metrics"], 1, Actor("root"))
+    with client_of(server) as client:
+        headers = {"Authorization": f"Bearer {token}"}
+        assert client.get("/metrics", headers=headers).status_code == 200
+        check_problem(client.get("/v1/sites", headers=headers), 403, "'read', which prometheus (program)")
+        server.store.operators.disable("prometheus", Actor("root"))
+        assert client.get("/metrics", headers=headers).status_code == 401
+
+
+def test_a_server_that_must_ask_does_without_anybody_named(server: Server) -> None:
+    with client_of(server, must_sign_in=True) as client:
+        assert client.get("/v1/sites").status_code == 401
+
+
+@pytest.mark.parametrize(
+    ("headers", "is_named"),
+    [({"Origin": EVIL}, False), ({"Host": "evil.example"}, False), ({}, True), ({"Origin": EVIL}, True)],
+)
+def test_the_pages_socket_opens_to_nobody_else(server: Server, headers: dict[str, str], is_named: bool) -> None:
+    """Row 20: another origin, another name, no session."""
+    sessions = named(server) if is_named else {}
+    address = "/dashboard/_nicegui_ws/socket.io/"
+    with client_of(server) as client:
+        with pytest.raises(WebSocketDisconnect), client.websocket_connect(address, headers=dict(headers)):
+            pass
+        polling = client.get(f"{address}?EIO=4&transport=polling", headers=headers)
+        assert polling.status_code == (401 if headers == {} else 403)
+        ours = sessions.get("vic", {}) | {"Origin": "http://127.0.0.1", "Host": "127.0.0.1"}
+        with client.websocket_connect(address, headers=ours) as socket:
+            assert socket.receive_text() == "in"
+    with (
+        client_of(server, is_guarded=False) as client,
+        client.websocket_connect(address, headers=dict(headers)) as socket,
+    ):
+        assert socket.receive_text() == "in"
+
+
+def test_every_answer_has_the_headers(server: Server) -> None:
+    with client_of(server, handlers=("alert()",)) as client:
+        for path in ("/v1/sites", "/nothing", "/v1/sites/lab/versions/x"):
+            headers = client.get(path).headers
+            assert headers["x-content-type-options"] == "nosniff"
+            assert headers["x-frame-options"] == "DENY"
+            assert headers["referrer-policy"] == headers["cross-origin-opener-policy"] == "same-origin"
+            policy = headers["content-security-policy"]
+            assert "default-src 'none'" in policy and "'unsafe-inline' 'unsafe-eval'" not in policy
+            digest = base64.b64encode(hashlib.sha256(b"alert()").digest()).decode()
+            assert f"'unsafe-hashes' 'sha256-{digest}'" in policy
+            assert "strict-transport-security" not in headers
+        assert client.get(f"/v1/tiles/{server.tile}").headers["cache-control"].startswith("public")
+    session = named(server)["vic"]
+    with client_of(server) as client:
+        assert client.get(f"/v1/tiles/{server.tile}", headers=session).headers["cache-control"].startswith("private")
+
+
+def test_the_cookie_is_for_this_host_and_tls_where_there_is_some() -> None:
+    from starlette.responses import Response
+
+    for scheme, words in (
+        ("https", "__Host-fleetmap=s3cret; HttpOnly; Max-Age=43200; Path=/; SameSite=strict; Secure"),
+        ("http", "fleetmap=s3cret; HttpOnly; Max-Age=43200; Path=/; SameSite=strict"),
+    ):
+        response = Response()
+        set_session(response, {"type": "http", "scheme": scheme}, "s3cret")
+        assert response.headers["set-cookie"] == words

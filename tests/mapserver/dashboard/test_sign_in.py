@@ -1,0 +1,236 @@
+"""Sign-in in a real browser, and what the policy of the pages keeps from running (row 21 of docs/security.md)."""
+
+import datetime
+import ipaddress
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
+
+from mapserver.operators import Operators
+from mapserver.store import Actor, MapStore
+from support.fleet.dashboard_scene import SITE, Served, chromium, failure, fill_store, serving, watch
+
+PASSWORD = "a password of the test"
+PAGES = ("", "map", "failures", "failures/1", "surveys", "live")
+SCRIPT = "<img src=x onerror='window.injected = 1'>"
+
+
+def make_certificate(folder: Path, number: int) -> tuple[str, str]:
+    """A certificate for localhost that signs itself, and its key, at the same paths for every number."""
+    key, name = ec.generate_private_key(ec.SECP256R1()), x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "x")])
+    now = datetime.datetime.now(datetime.UTC)
+    names = [x509.DNSName("localhost"), x509.DNSName("maps.example"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
+    builder = x509.CertificateBuilder(name, name, key.public_key(), number, now, now + datetime.timedelta(days=2))
+    made = builder.add_extension(x509.SubjectAlternativeName(names), critical=False).sign(key, hashes.SHA256())
+    how = (serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    (folder / "http.pem").write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    (folder / "http.key").write_bytes(key.private_bytes(*how))
+    return str(folder / "http.pem"), str(folder / "http.key")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
+        yield started
+        started.close()
+
+
+@pytest.fixture(scope="module")
+def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A server beyond loopback, with TLS and three operators."""
+    folder = tmp_path_factory.mktemp("store")
+    fill_store(folder)
+    with MapStore.open(folder) as store:
+        from mapserver.fleet.fleet import Fleet
+
+        assert not Fleet(store).take_failure(SITE, "tug-9", failure("tug-9", "f3", cause=SCRIPT)).refused
+        for name, role in {"vic": "viewer", "olga": "operator", "ada": "admin"}.items():
+            Operators(store).add(name, role, PASSWORD, Actor("root"))
+    certificate, key = make_certificate(folder, 1)
+    with serving(folder, "--http-cert", certificate, "--http-key", key, http="0.0.0.0:0") as server:
+        server.http = server.http.replace("0.0.0.0", "127.0.0.1")
+        assert server.http.startswith("https://")
+        yield server
+    assert [line for line in server.log if "ERROR" in line or "Traceback" in line] == []
+
+
+@pytest.fixture
+def page(browser: Browser) -> Iterator[Page]:
+    context = browser.new_context(ignore_https_errors=True, viewport={"width": 1280, "height": 900})
+    yield context.new_page()
+    context.close()
+
+
+def sign_in(page: Page, served: Served, name: str, path: str = "/dashboard/") -> None:
+    page.goto(f"{served.http}{path}")
+    page.get_by_label("Name").fill(name)
+    page.get_by_label("Password").fill(PASSWORD)
+    page.get_by_role("button", name="Sign in").click()
+    page.wait_for_url(re.compile("/dashboard/"))
+
+
+def is_live(page: Page) -> None:
+    expect(page.locator("h1")).to_be_visible(timeout=20_000)
+    page.wait_for_function("window.socket && window.socket.connected")
+
+
+def test_a_browser_signs_in_and_out(page: Page, served: Served) -> None:
+    page.goto(f"{served.http}/dashboard/map?site=hall")
+    assert page.url.endswith("/sign-in?next=%2Fdashboard%2Fmap%3Fsite%3Dhall")
+    page.get_by_label("Name").fill("olga")
+    page.get_by_label("Password").fill("a wrong password")
+    page.get_by_role("button", name="Sign in").click()
+    expect(page.get_by_role("alert")).to_have_text("Wrong name or password.")
+    page.get_by_label("Password").fill(PASSWORD)
+    page.get_by_role("button", name="Sign in").click()
+    page.wait_for_url(re.compile(r"/dashboard/map\?site=hall"))
+    is_live(page)
+    (cookie,) = [
+        found for found in page.context.cookies() if "fleetmap" in found["name"] and "look" not in found["name"]
+    ]
+    assert (cookie["name"], cookie["secure"], cookie["httpOnly"], cookie["sameSite"]) == (
+        "__Host-fleetmap",
+        True,
+        True,
+        "Strict",
+    )
+    expect(page.locator("nav.top")).to_contain_text("olga (operator)")
+    page.get_by_role("button", name="Sign out").click()
+    expect(page.get_by_role("button", name="Sign in")).to_be_visible()
+    page.context.add_cookies([cookie])
+    page.goto(f"{served.http}/dashboard/")
+    expect(page.get_by_role("button", name="Sign in")).to_be_visible()
+
+
+def test_the_sign_in_page_leads_nowhere_else(page: Page, served: Served) -> None:
+    for then in ("https://evil.example/", "//evil.example", "/\\evil.example", "javascript:alert()", "/sign-out"):
+        with httpx.Client(base_url=served.http, verify=False) as client:
+            answer = client.post("/sign-in", data={"name": "vic", "password": PASSWORD, "next": then})
+            assert (answer.status_code, answer.headers["location"]) == (303, "/")
+    page.goto(f'{served.http}/sign-in?next="><script>window.injected=1</script>')
+    assert page.evaluate("window.injected") is None
+
+
+def test_every_page_and_every_act_runs_under_the_policy(page: Page, served: Served) -> None:
+    sign_in(page, served, "olga")
+    seen = watch(page)
+    for path in PAGES:
+        answer = page.goto(f"{served.http}/dashboard/{path}")
+        assert "'unsafe-eval'" in answer.headers["content-security-policy"]
+        assert "script-src 'self' 'nonce-" in answer.headers["content-security-policy"]
+        is_live(page)
+    page.goto(f"{served.http}/dashboard/map")
+    is_live(page)
+    page.get_by_role("button", name="Light or dark").click()
+    assert page.evaluate("document.body.classList.contains('body--dark')")
+    for words, version in (("Roll back to version 1", 1), ("Promote version 2", 2), ("Publish draft 3", 3)):
+        page.get_by_role("button", name=words, exact=True).click()
+        dialog = page.locator(".q-dialog")
+        expect(dialog.get_by_label("Your name")).to_have_count(0)
+        dialog.get_by_label("Reason").fill("robots lose themselves in aisle 3")
+        dialog.get_by_role("button", name=f"Yes: {words}").click()
+        expect(page.locator(".nicegui-content")).to_contain_text(
+            f"Robots should use version {version}.", timeout=20_000
+        )
+    assert seen.faults == []
+    with MapStore.open(served.folder) as store:
+        last = store.audit_lines()[-1]
+        assert (last.actor, last.operator, last.address) == ("olga", "olga", "127.0.0.1")
+        assert last.reason == "robots lose themselves in aisle 3"
+
+
+def test_a_viewer_has_no_buttons_and_a_session_that_is_gone_changes_nothing(page: Page, served: Served) -> None:
+    sign_in(page, served, "vic", "/dashboard/map")
+    is_live(page)
+    expect(page.get_by_role("button", name=re.compile("Roll back|Promote|Publish|Try"))).to_have_count(0)
+    page.context.clear_cookies()
+    sign_in(page, served, "ada", "/dashboard/map")
+    is_live(page)
+    button = page.get_by_role("button", name=re.compile("^(Roll back|Promote|Publish)")).first
+    words = button.inner_text()
+    button.click()
+    with MapStore.open(served.folder) as store:
+        before = store.current(SITE).version
+        store.operators.set_role("ada", "viewer", Actor("root"))
+        page.get_by_role("button", name=f"Yes: {words}").click()
+        expect(page.locator(".q-dialog .notice")).to_contain_text("may not change versions")
+        store.operators.disable("ada", Actor("root"))
+        page.get_by_role("button", name=f"Yes: {words}").click()
+        expect(page.locator(".q-dialog .notice")).to_contain_text("session has ended")
+        assert store.current(SITE).version == before
+        # An open page does not outlive its session either.
+        page.wait_for_url(re.compile("/sign-in"), timeout=25_000)
+        store.operators.set_role("ada", "admin", Actor("root"))
+        Operators(store).set_password("ada", PASSWORD, Actor("root"))
+
+
+def injected(context: BrowserContext, served: Served) -> bool:
+    """Whether a failure's words run as a script where a page forgets to escape them."""
+    page = context.new_page()
+    sign_in(page, served, "vic", "/dashboard/failures")
+    is_live(page)
+    expect(page.locator(".nicegui-content")).to_contain_text("onerror")
+    assert page.evaluate("window.injected") is None, "pages escape them"
+    page.evaluate(
+        """async () => {
+        const words = (await (await fetch('/v1/failures')).json()).failures.map(failure => failure.cause).join();
+        const box = document.createElement('div'); box.innerHTML = words; document.body.append(box);
+        const script = document.createElement('script'); script.textContent = 'window.written = 1'; document.body.append(script);
+        }"""
+    )
+    page.wait_for_timeout(500)
+    return bool(page.evaluate("window.injected === 1 || window.written === 1"))
+
+
+@pytest.mark.parametrize("is_policy_off", [False, True])
+def test_a_script_in_a_failures_words_does_not_run(browser: Browser, served: Served, is_policy_off: bool) -> None:
+    context = browser.new_context(ignore_https_errors=True, bypass_csp=is_policy_off)
+    try:
+        assert injected(context, served) is is_policy_off
+    finally:
+        context.close()
+
+
+def test_a_renewed_certificate_is_taken_while_the_server_runs(tmp_path: Path) -> None:
+    import ssl
+
+    from mapserver.trust.http_certificate import HttpCertificate
+
+    certificate, key = (Path(path) for path in make_certificate(tmp_path, 1))
+    held, context = HttpCertificate(certificate, key), ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    assert held.names() == {"localhost", "maps.example"}
+    context.load_cert_chain(certificate, key)
+
+    def shown() -> int:
+        """The number of the certificate that a new connection gets."""
+        inward, outward, client = ssl.MemoryBIO(), ssl.MemoryBIO(), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
+        ends = [client.wrap_bio(inward, outward), context.wrap_bio(outward, inward, server_side=True)]
+        for _ in range(6):
+            for end in ends:
+                try:
+                    end.do_handshake()
+                except ssl.SSLWantReadError:
+                    continue
+        return x509.load_der_x509_certificate(ends[0].getpeercert(binary_form=True)).serial_number
+
+    assert shown() == 1
+    time.sleep(0.01)
+    old_key = key.read_bytes()
+    make_certificate(tmp_path, 2)
+    new_key = key.read_bytes()
+    key.write_bytes(old_key)
+    held.renew(context)
+    assert shown() == 1, "half of a new pair is not taken"
+    key.write_bytes(new_key)
+    held.renew(context)
+    assert shown() == 2
