@@ -54,7 +54,7 @@ _END_M = 2.7  # how far from the end walls the robots drive
 def _loop(layout: Layout, first: int, last: int, *, overlap_m: float = 8.0, shift_m: float = 0.0) -> Route:
     """Up one aisle, down another, and on along the first again."""
     y0, y1 = layout.aisle_y_m(first) + shift_m, layout.aisle_y_m(last) + shift_m
-    left, right = _END_M, layout.length_m - _END_M
+    left, right = layout.dock_m + _END_M, layout.length_m - _END_M
     return Route(((left, y0), (right, y0), (right, y1), (left, y1), (left, y0), (left + overlap_m, y0)))
 
 
@@ -185,6 +185,54 @@ def _site() -> Scenario:
     return Scenario("the whole site: 44 aisles on 200 m x 200 m", layout, runs)
 
 
+def _block_drive(layout: Layout, aisles: range, *, is_reversed: bool) -> Route:
+    """Along a block's ends on the docks' side and back, which ties its aisles together, then every aisle once.
+
+    The way back is a cross aisle, for the reversed drive the other ends; that one enters even aisles from there. Blocks overlap by
+    two aisles.
+    """
+    left, right = layout.dock_m + _END_M, layout.length_m - _END_M
+    first, last = aisles[0], aisles[-1]
+    before, behind = max(first - 2, 0), min(last + 2, layout.aisles - 1)
+    y = [layout.aisle_y_m(aisle) for aisle in range(layout.aisles)]
+    points = [(left, y[before]), (left, y[behind])]
+    if is_reversed:
+        points += [(right, y[behind]), (right, y[first])]
+    else:
+        across = layout.bay_x_m(layout.cross_bays[0]) + layout.bay_m / 2
+        points += [(across, y[behind]), (across, y[first + 1]), (left, y[first + 1]), (left, y[first])]
+    for number, aisle in enumerate(aisles):
+        ends = (left, right) if (number % 2 == 0) != is_reversed else (right, left)
+        points += [(end, y[aisle]) for end in ends if points[-1] != (end, y[aisle])]
+    return Route(tuple(points))
+
+
+def _whole_drive(layout: Layout) -> Route:
+    """Around the site, then through every aisle: up with the turns of the first side, down again with those of the other side."""
+    left, right = layout.dock_m + _END_M, layout.length_m - _END_M
+    y = [layout.aisle_y_m(aisle) for aisle in range(layout.aisles)]
+    points = [(left, y[0]), (left, y[-1]), (right, y[-1]), (right, y[0]), (left, y[0])]
+    order = [*range(1, layout.aisles - 2), *range(layout.aisles - 1, -1, -1)]
+    for number, aisle in enumerate(order):
+        points += [(end, y[aisle]) for end in ((left, right) if number % 2 == 0 else (right, left))]
+    return Route(tuple(points))
+
+
+def _fulfilment_centre() -> Scenario:
+    layout = Layout(aisles=60, bays=33, aisle_width_m=2.3, dock_m=46.2, cross_bays=(11, 22), are_aisles_identical=True)
+    blocks = {"south": range(30), "north": range(30, 60)}
+    drives = [(name, block, is_back) for is_back in (False, True) for name, block in blocks.items()]
+    runs = {
+        f"survey-{name}" + ("-back" if is_back else ""): Run(
+            "surveyor", (_block_drive(layout, block, is_reversed=is_back),), is_sharp=True, zone_period_s=20.0
+        )
+        for name, block, is_back in drives
+    }
+    runs["survey-whole"] = Run("surveyor", (_whole_drive(layout),), is_sharp=True, zone_period_s=20.0)
+    runs["tote-1"] = Run("tote", (_loop(layout, 28, 31, shift_m=0.2),), zone_period_s=20.0)
+    return Scenario("a centre of 40,000 m2: 60 like aisles, cross aisles, packing; four surveys see all", layout, runs)
+
+
 # Functions, so that listing them builds nothing.
 SCENARIOS = {
     "clip": _clip,
@@ -195,6 +243,7 @@ SCENARIOS = {
     "identical-aisles": _identical,
     "marked-ends": _marked_ends,
     "site": _site,
+    "fulfilment-centre": _fulfilment_centre,
 }
 
 

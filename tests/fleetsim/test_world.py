@@ -86,3 +86,24 @@ def test_mixing_is_even_and_repeats() -> None:
     assert mix(7, 5) == mix(7, 5) != mix(5, 7)
     ones = np.array([int((bits >> np.uint64(place) & np.uint64(1)).sum()) for place in range(64)])
     assert (np.abs(ones - 2000) < 200).all()
+
+
+def test_a_cross_aisle_is_free_and_its_sides_are_guarded() -> None:
+    layout = Layout(aisles=1, bays=5, cross_bays=(2,), dock_m=10.0)
+    assert layout.rack_runs == [(0, 2), (3, 5)]
+    world = World(layout, seed=5)
+    boxes = np.concatenate([world.detailed_faces(column, 0).boxes for column in range(layout.chunk_counts[0])])
+    x, half = boxes[:, 0], boxes[:, 3]
+    start, end = layout.bay_x_m(2) + 0.3, layout.bay_x_m(3) - 0.3
+    inside = (x + half > start) & (x - half < end)
+    assert not (inside & (boxes[:, 2] < 3.0)).any()
+    guards = np.abs(boxes[:, 2] - 0.25) < 1e-6
+    for place in (
+        layout.bay_x_m(0) - 0.12,
+        layout.bay_x_m(2) + 0.12,
+        layout.bay_x_m(3) - 0.12,
+        layout.bay_x_m(5) + 0.12,
+    ):
+        assert (guards & (np.abs(x - place) < 1e-6)).sum() == 2, place
+    assert len(layout.packing_stations_m()) == 2
+    assert (x < layout.dock_m).any()

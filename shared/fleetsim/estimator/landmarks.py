@@ -1,5 +1,6 @@
 """The landmarks of a world, chunk by chunk, and those that each stretch of a drive can see."""
 
+from collections import OrderedDict
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ CELLS_M = np.array([0.08, 0.16, 0.32, 0.64, 1.28])  # lattice spacings: with dis
 _LARGEST = 1.4  # of the size drawn for a cell, see seed_landmarks
 _OCTAVE_SPAN = 1.2**8
 _GRID_M = 0.7
+_MOST_CHUNKS, _MOST_GRIDS = 160, 32  # that are kept: an aisle of a large site with those around it takes 75 chunks
 _RICH_CONTRAST = 9.0  # grey steps per centimetre from which on every cell holds a corner
 
 
@@ -48,9 +50,9 @@ class LandmarkField:
     def __init__(self, world: World) -> None:
         self._world = world
         self._weights = _texture_weights(world)
-        self._chunks: dict[tuple[int, int], Landmarks] = {}
+        self._chunks: OrderedDict[tuple[int, int], Landmarks] = OrderedDict()
         self._bounds: dict[tuple[int, int], Array] = {}
-        self._grids: dict[tuple[int, int], tuple[list[tuple[int, int]], BoxGrid]] = {}
+        self._grids: OrderedDict[tuple[int, int], tuple[list[tuple[int, int]], BoxGrid]] = OrderedDict()
 
     def chunk(self, column: int, row: int) -> Landmarks:
         """All landmarks of a chunk."""
@@ -63,6 +65,9 @@ class LandmarkField:
             points, normals, sizes, keys = (np.concatenate(column) for column in zip(*parts, strict=True))
             self._chunks[key] = Landmarks(points, normals, sizes, keys, firsts)
             self._bounds[key] = faces.bounds_m()
+            if len(self._chunks) > _MOST_CHUNKS:
+                self._chunks.popitem(last=False)
+        self._chunks.move_to_end(key)
         return self._chunks[key]
 
     def seen_from(self, map_from_cam: Array, focal_px: float, widest: Array) -> Landmarks:
@@ -100,6 +105,8 @@ class LandmarkField:
             near_low = np.maximum(-1.0, np.append(centre[:2] - 40.0, -1.0))
             near_high = np.minimum(high, np.append(centre[:2] + 40.0, high[2]))
             self._grids[middle] = keys, box_grid(boxes, near_low, near_high, _GRID_M)
+            if len(self._grids) > _MOST_GRIDS:
+                self._grids.popitem(last=False)
         return self._grids[middle]
 
 

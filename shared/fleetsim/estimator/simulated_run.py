@@ -172,12 +172,12 @@ class EstimatorSession:
 
     def _landmarks(self, frame: int) -> Landmarks:
         """Those that the frame's station can see; a station is the middle of a short stretch of the drive."""
-        station = self._stations[frame]
+        station = int(self._stations[frame])
         if self._held is None or self._held[0] != station:
             half = (self.camera.width_px / 2, self.camera.height_px / 2)
             widest = np.array(half) / self.camera.focal_px + _CONE_MARGIN
-            members = np.flatnonzero(np.array(self._stations) == station)
-            middle = self.map_from_body[members[len(members) // 2]]
+            first, end = np.searchsorted(self._stations, [station, station + 1])
+            middle = self.map_from_body[first + (end - first) // 2]
             seen = self._field.seen_from(middle @ self.body_from_cam, self.camera.focal_px, widest)
             self._held = station, seen
         return self._held[1]
@@ -195,9 +195,9 @@ def _rectified_from_body(body_from_nominal: Array, body_from_true: Array, body_f
     return se3_inverse(placed)
 
 
-def _stations(map_from_body: Array) -> list[int]:
-    """The station of each frame: a new one after _STATION_M or _STATION_RAD."""
-    stations, begun = [0] * len(map_from_body), 0
+def _stations(map_from_body: Array) -> NDArray[np.int64]:
+    """(F,) the station of each frame, its first frame: a new one after _STATION_M or _STATION_RAD."""
+    stations, begun = np.zeros(len(map_from_body), np.int64), 0
     for frame in range(1, len(map_from_body)):
         since = se3_inverse(map_from_body[begun]) @ map_from_body[frame]
         turned = np.linalg.norm(since[:3, :3] - np.eye(3)) / np.sqrt(2.0)

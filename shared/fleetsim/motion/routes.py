@@ -1,5 +1,6 @@
 """Routes over the floor: way points rounded, timed within a robot's limits, checked against solid things."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,11 +98,12 @@ def time_path(route: Route, limits: Limits) -> TimedPath:
     }
     for index in stops:
         speed[index] = _CREEP_MPS
-    gain = 2 * limits.accel_mps2 * STEP_M
-    for index in range(1, len(speed)):
-        speed[index] = min(speed[index], float(np.sqrt(speed[index - 1] ** 2 + gain)))
-    for index in range(len(speed) - 2, -1, -1):
-        speed[index] = min(speed[index], float(np.sqrt(speed[index + 1] ** 2 + gain)))
+    gain, swept = 2 * limits.accel_mps2 * STEP_M, speed.tolist()
+    for _ in range(2):  # forward, then backward
+        for index in range(1, len(swept)):
+            swept[index] = min(swept[index], math.sqrt(swept[index - 1] ** 2 + gain))
+        swept.reverse()
+    speed = np.array(swept)
     durations = np.concatenate([[route.rest_s], STEP_M / (0.5 * (speed[1:] + speed[:-1]))])
     for index, wait_s in stops.items():
         durations[index] += wait_s

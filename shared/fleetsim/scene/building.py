@@ -87,7 +87,7 @@ class HallMaker:
         """Lane lines along the racks, a stop line across each aisle mouth; 2 mm above the floor."""
         layout, (x_min, _, x_max, _) = self._layout, self.rectangle(column, row)
         y, half = layout.aisle_y_m(row), layout.aisle_width_m / 2 - 0.15
-        x_first, x_last = layout.end_m - 0.5, layout.bay_x_m(layout.bays) + 0.5
+        x_first, x_last = layout.bay_x_m(0) - 0.5, layout.bay_x_m(layout.bays) + 0.5
         start, end = max(x_min, x_first), min(x_max, x_last)
         if end > start:
             for side in (-half, half):
@@ -207,6 +207,6 @@ class HallMaker:
     def _add_signs(self, builder: FaceBuilder, column: int, row: int) -> None:
         """The aisle's number, hanging over both of its mouths."""
         layout, sign = self._layout, Surface(self._textures.signs[row])
-        for x in (layout.end_m - 0.6, layout.bay_x_m(layout.bays) + 0.6):
+        for x in (layout.bay_x_m(0) - 0.6, layout.bay_x_m(layout.bays) + 0.6):
             if layout.chunk_at(x, layout.aisle_y_m(row))[0] == column:
                 builder.add_box((x, layout.aisle_y_m(row), 4.6), (0.03, 0.32, 0.32), sign)

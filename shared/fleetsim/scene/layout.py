@@ -1,5 +1,6 @@
 """The plan of a warehouse: sizes, counts, rates and positions."""
 
+from itertools import pairwise
 from typing import ClassVar
 
 from fleetmap.config import Section
@@ -9,6 +10,9 @@ Rectangle = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max in m
 
 class Layout(Section, frozen=True):
     """Parallel aisles along x, rack rows on both sides of each, open ground at both ends.
+
+    dock_m: further ground at low x, with packing stations between the docks and the racks. cross_bays: bays that every row leaves
+    out, so that they make cross aisles.
 
     has_landmarks: posters, columns with signs, marked docks, all different. are_aisles_identical: stock, labels and
     floor repeat from aisle to aisle (until a slot is restocked), so that only geometry and context tell them apart.
@@ -20,6 +24,8 @@ class Layout(Section, frozen=True):
     levels: int = 4
     aisle_width_m: float = 2.8
     end_m: float = 6.0
+    dock_m: float = 0.0
+    cross_bays: tuple[int, ...] = ()
     has_landmarks: bool = True
     are_aisles_identical: bool = False
     restock_per_day: float = 0.125
@@ -40,7 +46,7 @@ class Layout(Section, frozen=True):
     @property
     def length_m(self) -> float:
         """Of the hall, along x."""
-        return 2 * self.end_m + self.bays * self.bay_m
+        return self.dock_m + 2 * self.end_m + self.bays * self.bay_m
 
     @property
     def width_m(self) -> float:
@@ -68,7 +74,13 @@ class Layout(Section, frozen=True):
 
     def bay_x_m(self, bay: int) -> float:
         """Low x of a bay."""
-        return self.end_m + bay * self.bay_m
+        return self.dock_m + self.end_m + bay * self.bay_m
+
+    @property
+    def rack_runs(self) -> list[tuple[int, int]]:
+        """What lies between cross aisles of a rack row: its first bay, and the bay behind its last one."""
+        edges = pairwise((-1, *sorted(self.cross_bays), self.bays))
+        return [(before + 1, behind) for before, behind in edges if behind > before + 1]
 
     @property
     def chunk_length_m(self) -> float:
@@ -88,12 +100,19 @@ class Layout(Section, frozen=True):
         return min(max(column, 0), columns - 1), min(max(row, 0), rows - 1)
 
     def solid_rectangles(self) -> list[Rectangle]:
-        """Ground that no robot may enter: rack rows with their end guards, columns."""
-        x_first, x_last = self.end_m - 0.2, self.bay_x_m(self.bays) + 0.2
+        """Ground that no robot may enter: rack rows with their end guards, columns, pallets, packing stations."""
+        runs = [(self.bay_x_m(first) - 0.2, self.bay_x_m(behind) + 0.2) for first, behind in self.rack_runs]
         half = self.rack_depth_m / 2
-        racks = [(x_first, self.row_y_m(row) - half, x_last, self.row_y_m(row) + half) for row in range(self.rows)]
+        rows_m = [self.row_y_m(row) for row in range(self.rows)]
+        racks = [(start, y - half, end, y + half) for y in rows_m for start, end in runs]
         columns = [(x - 0.2, y - 0.2, x + 0.2, y + 0.2) for x, y in self.columns_m()]
-        return racks + columns + [(x - 0.45, y - 0.65, x + 0.45, y + 0.65) for x, y in self.parked_pallets_m()]
+        pallets = [(x - 0.45, y - 0.65, x + 0.45, y + 0.65) for x, y in self.parked_pallets_m()]
+        return racks + columns + pallets + [(x - 0.5, y - 1.0, x + 0.5, y + 1.0) for x, y in self.packing_stations_m()]
+
+    def packing_stations_m(self) -> list[tuple[float, float]]:
+        """Centres of the packing stations, in two lines along the racks on the docks' side."""
+        lines = [share * self.dock_m for share in (0.55, 0.8)] if self.dock_m > 0 else []
+        return [(x, self.aisle_y_m(aisle)) for x in lines for aisle in range(self.aisles)]
 
     def parked_pallets_m(self) -> list[tuple[float, float]]:
         """Centres of the pallets along the end walls, two beside each aisle's line; none without landmarks."""

@@ -17,9 +17,9 @@ class RackMaker:
         self._layout, self._textures, self._seed, self._day = layout, textures, seed, day
 
     def add_bay(self, builder: FaceBuilder, row: int, bay: int) -> None:
-        """Everything of one bay: the frame at its low x (and high x for the last one), shelves, labels, goods."""
+        """Everything of one bay: the frame at its low x (and high x for the last one of a run), shelves, labels, goods."""
         self._add_frame(builder, row, bay)
-        if bay == self._layout.bays - 1:
+        if bay == self._layout.bays - 1 or bay + 1 in self._layout.cross_bays:
             self._add_frame(builder, row, bay + 1)
         for level in range(self._layout.levels):
             if level:
@@ -47,19 +47,45 @@ class RackMaker:
             surface = Surface(sku.front, scramble=mix(self._seed, row, bay, level) >> 40)
             builder.add_box(centre, half, surface, sides=NO_BOTTOM, is_solid=False)
 
-    def add_end_guards(self, builder: FaceBuilder, row: int, *, is_far_end: bool) -> None:
-        """The hazard-striped guard at a row's end, with a poster on the frame where the site has landmarks."""
+    def add_end_guards(self, builder: FaceBuilder, row: int, bay: int, *, is_far_end: bool) -> None:
+        """The hazard-striped guard where a run ends, at the low x of a bay, with a poster on the frame where the site has landmarks."""
         layout, textures = self._layout, self._textures
-        x = layout.bay_x_m(layout.bays) + 0.12 if is_far_end else layout.end_m - 0.12
+        x = layout.bay_x_m(bay) + (0.12 if is_far_end else -0.12)
         y, half = layout.row_y_m(row), layout.rack_depth_m / 2
-        scramble = self._scramble(_TAG_RACK, row, 900 + is_far_end)
+        inner = bay if 0 < bay < layout.bays else 0
+        scramble = self._scramble(_TAG_RACK, row, 900 + is_far_end + 2 * inner)
         guard = Surface(textures.hazard, scramble=scramble)
         builder.add_box((x, y, 0.25), (0.06, half, 0.25), guard, sides=NO_BOTTOM)
         if layout.has_landmarks:
             side, plate = 0.275, x + (0.095 if is_far_end else -0.095)
             sign = 1.0 if is_far_end else -1.0
-            poster = Surface(textures.posters[(row * 2 + is_far_end) % len(textures.posters)], scramble=scramble)
+            poster = Surface(
+                textures.posters[(row * 2 + is_far_end + 5 * inner) % len(textures.posters)], scramble=scramble
+            )
             builder.add_quad((plate, y - sign * side, 2.0), (0, sign * 2 * side, 0), (0, 0, -2 * side), poster)
+
+    def add_packing_station(self, builder: FaceBuilder, number: int, x_m: float, y_m: float) -> None:
+        """A bench with a shelf above it, and the day's cartons on both."""
+        textures = self._textures
+        rng = slot_generator(self._layout, self._seed, self._day, Slot(self._layout.rows + 1000 + number, 0, 0))
+        wood, grey = Surface(textures.wood, scramble=int(rng.integers(0, 1 << 24))), Surface(textures.grey)
+        builder.add_box((x_m, y_m, 0.87), (0.4, 0.9, 0.03), wood)
+        builder.add_box((x_m - 0.3, y_m, 1.6), (0.1, 0.9, 0.02), grey)
+        for side in (-0.85, 0.85):
+            builder.add_box((x_m, y_m + side, 0.42), (0.38, 0.03, 0.42), grey)
+            builder.add_box((x_m - 0.35, y_m + side, 1.25), (0.03, 0.03, 0.38), grey)
+        for base_m in (0.9, 1.62):
+            y = y_m - 0.8
+            while True:
+                sku = textures.skus[int(rng.integers(0, len(textures.skus)))]
+                if y + sku.width_m > y_m + 0.8:
+                    break
+                half = (0.15, sku.width_m / 2, sku.height_m / 2)
+                sides = {"x": sku.front, "X": sku.front, "y": sku.side, "Y": sku.side, "z": sku.top, "Z": sku.top}
+                surface = Surface(sides, rng.uniform(0.8, 1.2), int(rng.integers(0, 1 << 24)))
+                centre = (x_m - 0.2, y + half[1], base_m + half[2])
+                builder.add_box(centre, half, surface, yaw_rad=rng.normal(0, 0.03))
+                y += sku.width_m + rng.uniform(0.05, 0.4)
 
     def add_parked_pallet(self, builder: FaceBuilder, number: int, x_m: float, y_m: float) -> None:
         """A pallet with a stack of cartons on the floor by an end wall; changes as often as a slot does."""

@@ -120,20 +120,28 @@ class World:
         column, row = key
         self._hall.add_chunk(builder, column, row)
         add = self._racks.add_plain_bay if is_plain else self._racks.add_bay
-        bays = [bay for bay in range(layout.bays) if self._column_of(layout.bay_x_m(bay) + layout.bay_m / 2) == column]
+        runs = [
+            (first, behind, [bay for bay in range(first, behind) if self._column_of_bay(bay) == column])
+            for first, behind in layout.rack_runs
+        ]
         for rack_row in (2 * row, 2 * row + 1):
-            for bay in bays:
-                add(builder, rack_row, bay)
-            for is_far_end, bay in ((False, 0), (True, layout.bays - 1)):
-                if bay in bays:
-                    self._racks.add_end_guards(builder, rack_row, is_far_end=is_far_end)
+            for first, behind, bays in runs:
+                for bay in bays:
+                    add(builder, rack_row, bay)
+                if first in bays:
+                    self._racks.add_end_guards(builder, rack_row, first, is_far_end=False)
+                if behind - 1 in bays:
+                    self._racks.add_end_guards(builder, rack_row, behind, is_far_end=True)
         for number, (x, y) in enumerate(layout.parked_pallets_m()):
             if layout.chunk_at(x, y) == key:
                 self._racks.add_parked_pallet(builder, number, x, y)
+        for number, (x, y) in enumerate(layout.packing_stations_m()):
+            if layout.chunk_at(x, y) == key:
+                self._racks.add_packing_station(builder, number, x, y)
         return builder.finish()
 
-    def _column_of(self, x_m: float) -> int:
-        return self.layout.chunk_at(x_m, 0.0)[0]
+    def _column_of_bay(self, bay: int) -> int:
+        return self.layout.chunk_at(self.layout.bay_x_m(bay) + self.layout.bay_m / 2, 0.0)[0]
 
     def _neighbours(self, key: tuple[int, int], columns: int, rows: int) -> list[tuple[int, int]]:
         return [other for other in self._keys if abs(other[0] - key[0]) <= columns and abs(other[1] - key[1]) <= rows]
