@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from fleetmap.bow import place_index_kernels
 from fleetmap.bow.vocabulary import BowVector
 
+_FIRST_CAPACITY = 64
 _SMALLEST_TAIL = 64
 _TAIL_SHARE = 8  # the tail is sorted in when it holds more than an eighth of the places
 
@@ -20,7 +21,7 @@ class PlaceIndex:
     def __init__(self, word_count: int) -> None:
         """An empty index for the words of one vocabulary."""
         self._word_count = word_count
-        self._place_ids: list[int] = []
+        self._place_ids, self._count = np.zeros(_FIRST_CAPACITY, np.int64), 0
         self._known: set[int] = set()
         self._starts = np.zeros(word_count + 1, np.int64)
         self._slots = np.zeros(0, np.int32)
@@ -30,19 +31,22 @@ class PlaceIndex:
         self._flat_tail: _Flat | None = None
 
     def __len__(self) -> int:
-        return len(self._place_ids)
+        return self._count
 
     @property
     def place_ids(self) -> NDArray[np.int64]:
         """(P,) ids in the order in which they were added: what a candidates mask goes along."""
-        return np.array(self._place_ids, np.int64)
+        return self._place_ids[: self._count]
 
     def add(self, place_id: int, vector: BowVector) -> None:
         """Adds a place; its id must be new."""
         assert place_id not in self._known, place_id
         assert len(vector) == 0 or vector.word_ids[-1] < self._word_count
         self._known.add(place_id)
-        self._place_ids.append(place_id)
+        if self._count == len(self._place_ids):
+            self._place_ids = np.concatenate([self._place_ids, np.zeros_like(self._place_ids)])
+        self._place_ids[self._count] = place_id
+        self._count += 1
         self._tail.append(vector)
         self._flat_tail = None
         if len(self._tail) > max(_SMALLEST_TAIL, self._sorted_places // _TAIL_SHARE):

@@ -10,7 +10,13 @@ from fleetmap.inertial import preintegrate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
-from mapserver.survey.bundle.bundle_adjustment import BundleProblem, BundleResult, InertialTerms, RelativeTerm, optimize
+from mapserver.survey.bundle.bundle_adjustment import (
+    BundleProblem,
+    BundleResult,
+    InertialTerms,
+    RelativeTerm,
+    optimize,
+)
 from mapserver.survey.bundle.measured_noise import measured_sigmas
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.tracks.tracks import Landmarks
@@ -108,17 +114,32 @@ def state_of(state: SurveyState, chosen: NDArray[np.bool_]) -> SurveyState:
 def local_windows(state: SurveyState, settings: SurveySettings) -> SurveyState:
     """Local bundle adjustment: overlapping windows in order, all else held; drift of the whole is left to the loops."""
     count, window = len(state.stamps_ns), settings.local_window
-    marks = state.landmarks
-    index = (
+    if count <= window:
+        return state
+    marks, motion, relative = state.landmarks, state.motion, dict[int, list[RelativeTerm]]()
+    for term in motion.relative:
+        relative.setdefault(term.i, []).append(term)
+    index = _WindowIndex(
         ObservationIndex.of(marks.obs_keyframe, count),
         ObservationIndex.of(marks.obs_landmark, len(marks.points_map)),
+        relative,
+    )
+    # Windows write into these arrays: a copy for each would cost the whole survey.
+    state = replace(
+        state,
+        map_from_body=state.map_from_body.copy(),
+        landmarks=replace(marks, points_map=marks.points_map.copy()),
+        motion=replace(
+            motion,
+            velocities_mps=motion.velocities_mps.copy(),
+            gyro_bias_radps=motion.gyro_bias_radps.copy(),
+            accel_bias_mps2=motion.accel_bias_mps2.copy(),
+        ),
     )
     for start in range(0, max(count - window // 2, 1), window // 2):
         free = np.zeros(count, bool)
         free[start : start + window] = True
-        if free.all():
-            break
-        state = _local(state, settings, free, index)
+        _adjust_window(state, settings, free, index)
     return state
 
 
@@ -142,26 +163,31 @@ class ObservationIndex:
         return np.sort(self.rows[np.arange(len(first)) + first])
 
 
-def _local(
-    state: SurveyState,
-    settings: SurveySettings,
-    free: NDArray[np.bool_],
-    index: tuple[ObservationIndex, ObservationIndex],
-) -> SurveyState:
+@dataclass(frozen=True, slots=True)
+class _WindowIndex:
+    """Observations by keyframe and by landmark, relative terms by their first keyframe: a window costs what it holds."""
+
+    by_keyframe: ObservationIndex
+    by_landmark: ObservationIndex
+    relative: dict[int, list[RelativeTerm]]
+
+
+def _adjust_window(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_], index: _WindowIndex) -> None:
     """One window with the earlier keyframes that see the same landmarks held; landmarks seen from elsewhere alone stay.
 
-    index: the observations by keyframe and by landmark, so that a window costs what it holds.
+    The arrays of `state` are written to.
     """
-    marks, (by_keyframe, by_landmark) = state.landmarks, index
+    marks, motion = state.landmarks, state.motion
     inside = np.flatnonzero(free)
     first, last = inside[[0, -1]]
-    touched = np.unique(marks.obs_landmark[by_keyframe.of_all(inside)]).astype(np.int64)
-    rows = by_landmark.of_all(touched)
+    touched = np.unique(marks.obs_landmark[index.by_keyframe.of_all(inside)]).astype(np.int64)
+    rows = index.by_landmark.of_all(touched)
     # Later keyframes are where odometry left them: held, they would pull the window back to the drift.
     rows = rows[marks.obs_keyframe[rows] <= last]
     used = np.zeros(len(free), bool)
     used[marks.obs_keyframe[rows]] = True
     used[max(first - 1, 0) : last + 1] = True
+    relative = [term for k in np.flatnonzero(used).tolist() for term in index.relative.get(k, ())]
     keyframe = (np.cumsum(used) - 1)[marks.obs_keyframe[rows]].astype(np.int32)
     landmark = np.searchsorted(touched, marks.obs_landmark[rows]).astype(np.int32)
     seen = marks.obs_feature[rows], marks.obs_pixels[rows], marks.obs_sigma_px[rows]
@@ -169,20 +195,19 @@ def _local(
         state,
         stamps_ns=state.stamps_ns[used],
         map_from_body=state.map_from_body[used],
-        motion=state.motion.of(used),
+        motion=replace(motion, relative=relative).of(used),
         landmarks=Landmarks(marks.points_map[touched], keyframe, landmark, *seen),
     )
     result = optimize(bundle_problem(part, settings, free[used]), settings.rough_bundle)
-    return with_keyframes_of(state, used, apply_result(part, result), touched)
+    part = apply_result(part, result)
+    state.map_from_body[used], marks.points_map[touched] = part.map_from_body, part.landmarks.points_map
+    motion.velocities_mps[used], motion.gyro_bias_radps[used] = part.motion.velocities_mps, part.motion.gyro_bias_radps
+    motion.accel_bias_mps2[used] = part.motion.accel_bias_mps2
 
 
-def with_keyframes_of(
-    state: SurveyState, used: NDArray[np.bool_], part: SurveyState, touched: NDArray[np.int64] | None = None
-) -> SurveyState:
-    """`state` with the used keyframes (K,) and the touched landmarks (n,), none by default, as they are in `part`."""
-    motion, own, marks = state.motion, part.motion, state.landmarks
-    if touched is not None:
-        marks = replace(marks, points_map=_put(marks.points_map, touched, part.landmarks.points_map))
+def with_keyframes_of(state: SurveyState, used: NDArray[np.bool_], part: SurveyState) -> SurveyState:
+    """`state` with the used keyframes (K,) as they are in `part`."""
+    motion, own = state.motion, part.motion
     motion = replace(
         motion,
         velocities_mps=_put(motion.velocities_mps, used, own.velocities_mps),
@@ -190,10 +215,10 @@ def with_keyframes_of(
         accel_bias_mps2=_put(motion.accel_bias_mps2, used, own.accel_bias_mps2),
     )
     map_from_body = _put(state.map_from_body, used, part.map_from_body)
-    return replace(state, map_from_body=map_from_body, motion=motion, landmarks=marks)
+    return replace(state, map_from_body=map_from_body, motion=motion)
 
 
-def _put(values: Array, chosen: NDArray[np.bool_] | NDArray[np.int64], new: Array) -> Array:
+def _put(values: Array, chosen: NDArray[np.bool_], new: Array) -> Array:
     values = values.copy()
     values[chosen] = new
     return values

@@ -14,8 +14,8 @@ def frame_trajectory(
     odom_from_body (F, 4, 4): the motion; keyframe_frames (K,) frame numbers, rising; map_from_body (K, 4, 4).
     """
     out = np.empty((len(frame_stamps_ns), 4, 4))
-    for f in range(len(frame_stamps_ns)):
-        after = int(np.searchsorted(keyframe_frames, f))
+    afters = np.searchsorted(keyframe_frames, np.arange(len(out))).tolist()
+    for f, after in enumerate(afters):
         if after < len(keyframe_frames) and keyframe_frames[after] == f:
             out[f] = map_from_body[after]
             continue

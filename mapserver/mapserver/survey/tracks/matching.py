@@ -15,6 +15,7 @@ from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotio
 _NEAR_CANDIDATES = 40
 _BATCH = 16  # pairs: a tenth of a second of work, so that handing it out costs nothing
 _MAX_VIEW_ANGLE_DEG = 75.0
+_WIDE = 2  # cells to each side that are looked at for what is near
 
 
 class PairFinder:
@@ -40,14 +41,16 @@ class PairFinder:
         """
         map_from_cam = map_from_body @ self._body_from_cam
         positions, axes = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]
-        settings = self._settings
+        settings, reach_m = self._settings, 2.0 * self._depths_m
+        around = None if only_near is not None else NearPlaces(positions, reach_m)
         found: list[tuple[int, int]] = []
         for j in range(1, len(map_from_cam)):
             first = 0 if only_near is None else max(0, j - only_near)
             chosen = set(range(max(first, j - previous), j))
-            earlier = np.arange(first, max(j - previous, first))
+            until = max(j - previous, first)
+            earlier = np.arange(first, until) if around is None else around.before(j, until)
             distance = np.linalg.norm(positions[earlier] - positions[j], axis=1)
-            near = (distance < 2.0 * np.maximum(self._depths_m[earlier], self._depths_m[j])) & (
+            near = (distance < np.maximum(reach_m[earlier], reach_m[j])) & (
                 axes[earlier] @ axes[j] > np.cos(np.radians(_MAX_VIEW_ANGLE_DEG))
             )
             closest = earlier[near][np.argsort(distance[near], kind="stable")][:_NEAR_CANDIDATES]
@@ -86,6 +89,38 @@ class PairFinder:
                 progress(number)
                 number += 1
         return matches
+
+
+class NearPlaces:
+    """Places (K, 3) that one of two can reach, by reaches (K,): a keyframe costs what stands around it, not the whole site."""
+
+    def __init__(self, positions_m: Array, reach_m: Array) -> None:
+        self._positions_m, self._reach_m = positions_m, reach_m
+        self._cells: dict[
+            tuple[int, int], list[int]
+        ] = {}  # of how many keyframes, so that none is asked that comes later
+        self._size_m = max(float(np.median(reach_m)), 1e-3)
+        self._far: list[int] = []  # what reaches over more cells than are looked at
+        self._filled = 0
+
+    def before(self, j: int, until: int) -> NDArray[np.int64]:
+        """Numbers below `until`, rising, of all that may reach j or be reached from it. `until` must not fall from call to call."""
+        for k in range(self._filled, until):
+            if self._reach_m[k] > _WIDE * self._size_m:
+                self._far.append(k)
+            else:
+                self._cells.setdefault(self._cell(k), []).append(k)
+        self._filled = max(self._filled, until)
+        if self._reach_m[j] > _WIDE * self._size_m:
+            return np.arange(until)
+        x, y = self._cell(j)
+        steps = range(-_WIDE, _WIDE + 1)
+        found = [k for dx in steps for dy in steps for k in self._cells.get((x + dx, y + dy), ())]
+        return np.array(sorted([*found, *self._far]), np.int64)
+
+    def _cell(self, k: int) -> tuple[int, int]:
+        x, y = np.floor(self._positions_m[k, :2] / self._size_m).astype(np.int64).tolist()
+        return x, y
 
 
 _Prediction = tuple[int, int, PredictedMotion]

@@ -9,7 +9,13 @@ from fleetmap.geometry import Array, se3, se3_exp, so3_exp
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.survey.keyframes.keyframes import Keyframe, make_keyframe
 from mapserver.survey.settings import PairSettings, SurveySettings
-from mapserver.survey.tracks.matching import PairFinder, drift_allowance_m, fixed_allowance_m, median_depth_m
+from mapserver.survey.tracks.matching import (
+    NearPlaces,
+    PairFinder,
+    drift_allowance_m,
+    fixed_allowance_m,
+    median_depth_m,
+)
 from mapserver.survey.tracks.pairs import view_overlap
 from support.recordings.recording_samples import calibration
 from support.worlds.box_room import out_and_back, stereo_pair
@@ -118,3 +124,19 @@ def test_depth_and_overlap_against_the_room() -> None:
     assert view_overlap(keyframes[0], rectifier.camera, behind) == 0.0
     aside = se3(so3_exp(np.array([0, np.radians(38.6), 0])), np.zeros(3))  # half of the picture's angle
     assert 0.2 < view_overlap(keyframes[0], rectifier.camera, aside) < 0.6
+
+
+def test_near_places_hold_all_that_reach_each_other() -> None:
+    rng = np.random.default_rng(4)
+    positions, reach = rng.uniform(0.0, 80.0, (400, 3)), rng.uniform(4.0, 9.0, 400)
+    reach[::23] *= 5.0  # wider than the cells that are looked at
+    around = NearPlaces(positions, reach)
+    looked = 0
+    for j in range(1, 400):
+        until = max(j - 6, 0)
+        found = around.before(j, until)
+        apart = np.linalg.norm(positions[:until] - positions[j], axis=1)
+        assert np.isin(np.flatnonzero(apart < np.maximum(reach[:until], reach[j])), found).all()
+        assert (np.diff(found) > 0).all() and (found < until).all()
+        looked += len(found)
+    assert looked < 0.6 * 400 * 399 / 2
