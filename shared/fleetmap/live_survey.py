@@ -4,13 +4,24 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.errors import LinkError
 from fleetmap.geometry import Array
 from fleetmap.messages import Name, Text, Version
 
 MAX_ARRAY_BYTES = 64 << 10
+NO_PART = 255
 _Bytes = Annotated[bytes, msgspec.Meta(max_length=MAX_ARRAY_BYTES)]
+
+
+class LivePart(msgspec.Struct, frozen=True, kw_only=True):
+    """Keyframes that are known to lie to each other, from start_s to end_s of the recording; is_map: it has most of them."""
+
+    start_s: float
+    end_s: float
+    keyframes: int
+    is_map: bool
 
 
 class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
@@ -20,7 +31,9 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     seconds: of the recording so far. behind: keyframes that mapping has not taken yet. latency_ms: 0.99 of the frames were answered in
     less, None where frames were not played at their own speed; late_frames: those that took longer than the time to the next one.
     path_m (N, 2) and landmarks_m (M, 2), loops_m (L, 4) from and to: little-endian float32, thinned evenly. quality (N,): bytes, 0 where
-    tracking was lost, 255 where all points agreed. loops, refused: how many, and of which verdict.
+    tracking was lost, 255 where all points agreed. part (N,): bytes, the number in `parts`, NO_PART where too little was seen to belong
+    to any. More than one part: the survey lost itself, and no sure revisit has joined them yet. loops, refused: how many, and of which
+    verdict.
     """
 
     site: Name
@@ -35,6 +48,8 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     late_frames: int = 0
     path_m: _Bytes = b""
     quality: _Bytes = b""
+    part: _Bytes = b""
+    parts: Annotated[list[LivePart], msgspec.Meta(max_length=NO_PART)] = []
     landmarks_m: _Bytes = b""
     loops_m: _Bytes = b""
     loops: int = 0
@@ -45,11 +60,19 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     def path(self) -> Array:
         """(N, 3) x, y and quality from 0 to 1; raises LinkError where they do not fit each other."""
         places, quality = _rows(self.path_m, 2, "path_m"), np.frombuffer(self.quality, np.uint8)
-        if len(places) != len(quality):
-            raise LinkError(
-                f"a survey of {len(places)} places has {len(quality)} qualities; does the sender run the same fleetmap?"
-            )
+        _check_length(len(places), len(quality), "qualities")
         return np.column_stack([places, quality / 255.0])
+
+    def part_numbers(self) -> NDArray[np.uint8]:
+        """(N,) of the path's places, NO_PART where none were sent; raises LinkError where they do not fit the path or name no part."""
+        if not self.part:
+            return np.full(len(self.path_m) // 8, NO_PART, np.uint8)
+        numbers = np.frombuffer(self.part, np.uint8)
+        _check_length(len(self.path_m) // 8, len(numbers), "part numbers")
+        wrong = numbers[(numbers != NO_PART) & (numbers >= len(self.parts))]
+        if len(wrong):
+            raise LinkError(f"part {wrong[0]} of {len(self.parts)} is none; does the sender run the same fleetmap?")
+        return numbers
 
     def landmarks(self) -> Array:
         """(M, 2); raises LinkError for bytes that are no places."""
@@ -58,6 +81,11 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     def loop_lines(self) -> Array:
         """(L, 4) x and y from and to; raises LinkError for bytes that are no lines."""
         return _rows(self.loops_m, 4, "loops_m")
+
+
+def _check_length(places: int, count: int, what: str) -> None:
+    if places != count:
+        raise LinkError(f"a survey of {places} places has {count} {what}; does the sender run the same fleetmap?")
 
 
 def _rows(data: bytes, columns: int, name: str) -> Array:

@@ -54,6 +54,7 @@ class LiveFigures(NamedTuple):
     lag_s: float
     dropped: int
     loops: int
+    parts: int
     mapping_failed: str
 
     def words(self) -> str:
@@ -62,9 +63,10 @@ class LiveFigures(NamedTuple):
         kept = "played as fast as it went"
         if self.latency_ms is not None:
             kept = f"answered within {self.latency_ms[1]:.0f} ms (99 %), {self.late_frames} late"
+        apart = f" in {self.parts} parts that nothing has joined" if self.parts > 1 else ""
         return (
             f"live: {self.frames} frames of {self.seconds:.1f} s, {kept}, {self.dropped} dropped; {self.keyframes} keyframes, mapping at "
-            f"most {self.most_behind} behind ({self.lag_s:.1f} s), {self.loops} loops{'; ' if failed else ''}{failed}"
+            f"most {self.most_behind} behind ({self.lag_s:.1f} s), {self.loops} loops{apart}{'; ' if failed else ''}{failed}"
         )
 
 
@@ -176,6 +178,7 @@ class _Survey:
             lag_s=round(self._lag_s, 3),
             dropped=self._drive.dropped,
             loops=self._sketch.loops,
+            parts=len(self._sketch.parts),
             mapping_failed=self._failed,
         )
 
@@ -207,6 +210,8 @@ class _Survey:
                 late_frames=figures.late_frames,
                 path_m=sketch.path_m.astype("<f4").tobytes(),
                 quality=np.round(255 * np.clip(qualities, 0, 1)).astype(np.uint8).tobytes(),
+                part=sketch.part.tobytes(),
+                parts=sketch.parts,
                 landmarks_m=sketch.landmarks_m.astype("<f4").tobytes(),
                 loops_m=sketch.loops_m.astype("<f4").tobytes(),
                 loops=sketch.loops,

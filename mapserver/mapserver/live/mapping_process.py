@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array
-from fleetmap.live_survey import MAX_ARRAY_BYTES
+from fleetmap.live_survey import MAX_ARRAY_BYTES, NO_PART, LivePart
 from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.survey.live.live_map import LiveMap, LiveRig, NewKeyframe
 from mapserver.survey.survey_inputs import SurveyConfig
@@ -26,19 +26,21 @@ _MAX_WAITING = 256  # pictures of keyframes, 0.6 MB each
 
 
 class MapSketch(NamedTuple):
-    """The map after so many keyframes: their places (K, 2), landmarks (N, 2) thinned evenly, believed loops (L, 4), and how many
-    candidates were refused, by verdict.
+    """The map after so many keyframes: their places (K, 2) and the number of each one's part, landmarks (N, 2) thinned evenly, believed
+    loops (L, 4), and how many candidates were refused, by verdict. parts: what lies to each other.
     """
 
     keyframes: int
     path_m: Array
+    part: NDArray[np.uint8]
+    parts: list[LivePart]
     landmarks_m: Array
     loops_m: Array
     loops: int
     refused: dict[str, int]
 
 
-NO_SKETCH = MapSketch(0, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 4)), 0, {})
+NO_SKETCH = MapSketch(0, np.zeros((0, 2)), np.zeros(0, np.uint8), [], np.zeros((0, 2)), np.zeros((0, 4)), 0, {})
 
 
 class MappingProcess:
@@ -170,11 +172,14 @@ def _warm(options: SurveyConfig, rig: LiveRig, frames: tuple[RectifiedFrame, ...
 
 def sketch_of(growing: LiveMap) -> MapSketch:
     """What of a map is shown while it grows; no array is larger than a message may hold."""
-    placed, found = growing.map_from_body, growing.loops()
+    placed, found, parts = growing.map_from_body, growing.loops(), growing.parts()
+    numbers = np.where((parts.labels < 0) | (parts.labels >= NO_PART), NO_PART, parts.labels).astype(np.uint8)
     ends = placed[found.believed][:, :, :2, 3].reshape(-1, 4)
     return MapSketch(
         len(growing),
         thinned(placed[:, :2, 3], 2),
+        numbers[thinning(len(numbers), MOST_PLACES)],
+        parts.spans[:NO_PART],
         thinned(growing.points_map()[:, :2], 2),
         thinned(ends, 4),
         len(ends),

@@ -22,6 +22,7 @@ from mapserver.survey.keyframes.connected_components import (
     between_kept,
     covisibility_of,
     find_components,
+    find_parts,
     only_kept,
 )
 from mapserver.survey.keyframes.keyframes import PosedKeyframes
@@ -95,8 +96,7 @@ def survey_from(
     odometry, state, stereo_yaw = _adjust_globally(odometry, state, depths, settings, tools)
     tools.progress("global adjustment", 2, 2)
     frames_of = np.array([k.frame_index for k in odometry.keyframes], np.int64)
-    sigmas_m = SigmaBetween(odometry.covariances[frames_of])
-    components = find_components(covisibility_of(state), sigmas_m, settings.join_sigma_m)
+    components = find_components(covisibility_of(state), _sigmas_m(odometry), settings.join_sigma_m)
     state, odometry, loops = only_kept(state, odometry, loops, components.kept)
     placed = place_frames(odometry, state, settings, stereo_yaw.correction_px, tools.executor)
     survey_map, culled = assemble(state, odometry, placed, settings)
@@ -214,6 +214,11 @@ def _posed(odometry: OdometryPass, state: SurveyState) -> PosedKeyframes:
     return PosedKeyframes(odometry.keyframes, state.map_from_body, state.body_from_cam, state.camera)
 
 
+def _sigmas_m(odometry: OdometryPass) -> SigmaBetween:
+    covariances = odometry.covariances[[k.frame_index for k in odometry.keyframes]]
+    return SigmaBetween(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2))
+
+
 def _close_loops(
     odometry: OdometryPass, state: SurveyState, matched: set[tuple[int, int]], options: SurveyConfig, tools: SurveyTools
 ) -> tuple[SurveyState, Loops]:
@@ -223,7 +228,8 @@ def _close_loops(
     if not odometry.scale_known:
         kind, known = Sim3LoopCloser, gate_covariances(chain, scale_walk)
     marginals = GraphMarginals(state.map_from_body, known)
-    closer = kind(_posed(odometry, state), options, marginals, matched, tools.executor)
+    parts = find_parts(covisibility_of(state), _sigmas_m(odometry), options.settings.join_sigma_m)
+    closer = kind(_posed(odometry, state), options, marginals, matched, tools.executor, parts)
     for i in range(len(odometry.keyframes)):
         closer.close(i)
         tools.progress("loops", i + 1, len(odometry.keyframes))
@@ -236,7 +242,7 @@ def _close_loops(
             scaled.loop_weights
         )
     if loops.edges:
-        solved = optimize_pose_graph(state.map_from_body, [*chain, *loops.edges])
+        solved = optimize_pose_graph(closer.begin, [*chain, *loops.edges])
         return _at(state, solved.map_from_body), loops.without_outliers(solved.loop_weights)
     return state, loops
 

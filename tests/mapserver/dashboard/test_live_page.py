@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import expect, sync_playwright
 
 from fleetmap.bus import ZenohBus
-from fleetmap.live_survey import LiveSurveyState, live_key
+from fleetmap.live_survey import LivePart, LiveSurveyState, live_key
 from fleetmap.messages import encode_message
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import Served, chromium, serving, watch
@@ -51,6 +51,16 @@ def test_a_survey_is_followed_to_its_end(served: Served) -> None:
         assert [page.locator(f"svg .trail.{tone}").count() for tone in ("good", "warn", "bad")] == [1, 1, 1]
         assert page.locator("svg .line.accent").count() == 1
         expect(page.locator("body")).to_contain_text("<script>alert(1)</script>")
+        expect(page.locator("table")).to_have_count(0)
+        parts = [
+            LivePart(start_s=0.0, end_s=5.0, keyframes=25, is_map=True),
+            LivePart(start_s=8.0, end_s=12.0, keyframes=10, is_map=False),
+        ]
+        lost = msgspec.structs.replace(STATE, parts=parts, part=bytes([0] * 25 + [255] * 5 + [1] * 10))
+        bus.publish(live_key("yard"), encode_message(lost))
+        expect(page.locator("table")).to_contain_text("not joined")
+        expect(page.locator(".notice.bad")).to_contain_text("2 parts lie apart")
+        assert page.locator("svg g.part").count() == 2
         finished = msgspec.structs.replace(STATE, phase="stored", version=1, words="")
         bus.publish(live_key("yard"), encode_message(finished))
         expect(page.locator(".notice")).to_contain_text("Version 1")

@@ -45,6 +45,8 @@ def test_the_newest_state_of_a_site_is_kept(world: World) -> None:
     [
         state(site="other"),
         state(quality=b"\x01"),
+        state(part=b"\0"),
+        state(part=b"\0\1"),  # there is no part 1
         state(landmarks_m=b"12345"),
         state(loops_m=np.array([0, 1, np.nan, 2], "<f4").tobytes()),
     ],

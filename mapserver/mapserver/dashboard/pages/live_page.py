@@ -5,11 +5,12 @@ from fastapi import Request
 from markupsafe import Markup
 from nicegui import ui
 
+from fleetmap.geometry import Array
 from mapserver.dashboard import drawing, fleet_parts
 from mapserver.dashboard.drawing import Line, Mark
 from mapserver.dashboard.fleet_parts import Figure
 from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, notice, show
-from mapserver.dashboard.markup import facts, joined, link
+from mapserver.dashboard.markup import badge, facts, joined, link, table
 from mapserver.dashboard.plan import Plan
 from mapserver.serving.live_surveys import LiveSurvey
 
@@ -54,7 +55,7 @@ def _content(context: PageContext, survey: LiveSurvey | None) -> Markup:
             '<p class="quiet">No survey of this site was heard since the server started. '
             "<code>mapserver live RECORDING --site {} --store DIR --server ENDPOINT</code> shows one here.</p>"
         ).format(context.site)
-    return joined([_phase(context, survey), _figures(survey), _picture(survey), _refused(survey)])
+    return joined([_phase(context, survey), _figures(survey), _parts(survey), _picture(survey), _refused(survey)])
 
 
 def _phase(context: PageContext, survey: LiveSurvey) -> Markup:
@@ -84,6 +85,48 @@ def _figures(survey: LiveSurvey) -> Markup:
     )
 
 
+def _parts(survey: LiveSurvey) -> Markup:
+    """What lies to each other, where that is not everything."""
+    parts = survey.state.parts
+    if len(parts) < 2:
+        return Markup("")
+    words = (
+        f"The survey lost itself: {len(parts)} parts lie apart, drawn where odometry guesses. Drive a metre through a place of the "
+        "map, the same way round: three keyframes that agree join the parts. What stays apart is left out of the map."
+    )
+    rows = [
+        (
+            Markup('<span class="part" style="--hue:{}">{}</span>').format(_hue(number), number + 1),
+            f"{part.start_s:.0f} to {part.end_s:.0f} s",
+            part.keyframes,
+            badge("good", "the map") if part.is_map else badge("bad", "not joined"),
+        )
+        for number, part in enumerate(parts)
+    ]
+    head = ("part", "of the recording", "keyframes", "")
+    return joined([notice("bad", words), table(head, rows, empty="", name="Parts of the survey")])
+
+
+def _hue(number: int) -> int:
+    """Degrees, as different as can be from those of the parts before."""
+    return round(250 + number * 137.5) % 360
+
+
+def _part_trails(way: Array, survey: LiveSurvey, width_m: float) -> Markup:
+    """A wide line below each part's path, in its colour, where there are several."""
+    if len(survey.state.parts) < 2:
+        return Markup("")
+    numbers = survey.state.part_numbers()
+    return joined(
+        Markup('<g class="part" style="--hue:{}"><title>part {}</title>{}</g>').format(
+            _hue(n),
+            n + 1,
+            drawing.trail(np.column_stack([way[numbers == n, :2], np.ones(np.sum(numbers == n))]), width_m),
+        )
+        for n in range(len(survey.state.parts))
+    )
+
+
 def _picture(survey: LiveSurvey) -> Markup:
     """Landmarks, revisits and the path, coloured by how well it was tracked."""
     state = survey.state
@@ -101,6 +144,7 @@ def _picture(survey: LiveSurvey) -> Markup:
     layers = [
         drawing.dots(marks, size_m),
         loops,
+        _part_trails(way, survey, 3.5 * size_m),
         drawing.trail(way, size_m),
         drawing.marks(plan, [here]),
         drawing.scale_bar(plan),

@@ -9,16 +9,16 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
-from scipy.sparse.csgraph import connected_components
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
 from mapserver.survey.bundle.bundle_rounds import SurveyState, state_of
 from mapserver.survey.loops.loops import Loops
+from mapserver.survey.loops.parts import Parts
 from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.survey_map import SurveyMap
 
-_MIN_SHARED = 15  # landmarks, as many as a loop needs matches
+MIN_SHARED = 15  # landmarks, as many as a loop needs matches
 MIN_SEEN = 8  # landmarks without which a keyframe counts as blind
 _MIN_KEYFRAMES = 2
 _SURE_SIGMAS = 3.0
@@ -76,31 +76,49 @@ def find_components(survey_map: Observations, odometry_sigmas_m: "SigmaBetween",
     are known to `join_sigma_m` of each other by odometry. Blind ones in between are then connected too; other blind ones
     are with the component before or after as long as three sigmas of the odometry are within that limit.
     """
-    count = len(survey_map.keyframe_stamps_ns)
-    seeing = np.flatnonzero(np.bincount(survey_map.obs_keyframe, minlength=count) >= MIN_SEEN)
-    rows, columns = shared_landmarks(survey_map, _MIN_SHARED)
-    bridges = [(a, b) for a, b in pairwise(seeing) if odometry_sigmas_m(int(a), int(b)) <= join_sigma_m]
-    bridged = {int(a) for a, _ in bridges}
-    for k in np.setdiff1d(np.arange(count), seeing).tolist():
-        at = int(np.searchsorted(seeing, k))
-        limit_m = join_sigma_m if at and int(seeing[at - 1]) in bridged else join_sigma_m / _SURE_SIGMAS
-        for near in (seeing[at - 1] if at else None, seeing[at] if at < len(seeing) else None):
-            if near is not None and odometry_sigmas_m(min(k, int(near)), max(k, int(near))) <= limit_m:
-                bridges.append((near, k))
+    seeing = _seeing(survey_map)
+    groups = np.unique(_parts(survey_map, seeing, odometry_sigmas_m, join_sigma_m).labels(), return_inverse=True)[1]
+    return _named(survey_map, groups.astype(np.int64), np.flatnonzero(seeing))
+
+
+def find_parts(survey_map: Observations, odometry_sigmas_m: "SigmaBetween", join_sigma_m: float) -> Parts:
+    """The same before loops are closed, where parts may be many and none is chosen."""
+    return _parts(survey_map, _seeing(survey_map), odometry_sigmas_m, join_sigma_m)
+
+
+def _seeing(survey_map: Observations) -> NDArray[np.bool_]:
+    return np.bincount(survey_map.obs_keyframe, minlength=len(survey_map.keyframe_stamps_ns)) >= MIN_SEEN
+
+
+def _parts(survey_map: Observations, seeing: NDArray[np.bool_], sigmas_m: "SigmaBetween", join_sigma_m: float) -> Parts:
+    rows, columns = shared_landmarks(survey_map, MIN_SHARED)
+    joins = [*zip(rows.tolist(), columns.tolist(), strict=True), *bridges(seeing, sigmas_m, join_sigma_m)]
+    return Parts(joins, len(seeing))
+
+
+def bridges(
+    seeing: NDArray[np.bool_], sigmas_m: "SigmaBetween", join_sigma_m: float, first: int = 0
+) -> list[tuple[int, int]]:
+    """Keyframes that odometry connects, of those from `first` on; seeing (K,): whether each sees something. See find_components."""
+    seen = first + np.flatnonzero(seeing[first:])
+    joins = [(int(a), int(b)) for a, b in pairwise(seen) if sigmas_m(int(a), int(b)) <= join_sigma_m]
+    bridged = {a for a, _ in joins}
+    for k in (first + np.flatnonzero(~seeing[first:])).tolist():
+        at = int(np.searchsorted(seen, k))
+        limit_m = join_sigma_m if at and int(seen[at - 1]) in bridged else join_sigma_m / _SURE_SIGMAS
+        for near in (seen[at - 1] if at else None, seen[at] if at < len(seen) else None):
+            if near is not None and sigmas_m(min(k, int(near)), max(k, int(near))) <= limit_m:
+                joins.append((int(near), k))
                 break
-    rows = np.concatenate([rows, [a for a, _ in bridges]]).astype(np.int64)
-    columns = np.concatenate([columns, [b for _, b in bridges]]).astype(np.int64)
-    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-    _, groups = connected_components(graph, directed=False)
-    return _named(survey_map, np.asarray(groups, np.int64), seeing)
+    return joins
 
 
 class SigmaBetween:
     """Standard deviation, in metres, of keyframe b relative to keyframe a by odometry."""
 
-    def __init__(self, covariances: Array) -> None:
-        """covariances (K, 6, 6) of the odometry at the keyframes, rotation first."""
-        self._variances = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2)
+    def __init__(self, variances_m2: Array) -> None:
+        """variances_m2 (K,) of the odometry's position at the keyframes, summed over the axes."""
+        self._variances = variances_m2
 
     def __call__(self, a: int, b: int) -> float:
         """The growth of the variance between them, as a standard deviation."""
@@ -141,7 +159,7 @@ def _named(survey_map: Observations, groups: NDArray[np.int64], seeing: NDArray[
     real = [g for g in dict.fromkeys(groups[seeing].tolist()) if sizes[g] >= _MIN_KEYFRAMES]
     if not real:
         raise SurveyError(
-            f"none of {len(groups)} keyframes shares {_MIN_SHARED} landmarks with another; look at the recording with "
+            f"none of {len(groups)} keyframes shares {MIN_SHARED} landmarks with another; look at the recording with "
             "`mapserver doctor`: dark, blurred, or too few frames?"
         )
     largest = max(real, key=lambda g: int(seeing_sizes[g]))

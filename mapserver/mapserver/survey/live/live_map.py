@@ -6,20 +6,24 @@ the loops put keyframes, and adjusts everything together.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, se3_inverse
+from fleetmap.live_survey import LivePart
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.survey.bundle.bundle_adjustment import RelativeTerm, optimize
 from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState, apply_result, bundle_problem
+from mapserver.survey.keyframes.connected_components import MIN_SHARED, SigmaBetween, bridges
 from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, make_keyframe, without_pictures
-from mapserver.survey.loops.loops import LoopCloser, LoopVerdict
+from mapserver.survey.loops.loops import LoopCloser, LoopVerdict, body_edge
+from mapserver.survey.loops.parts import Parts
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
-from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
+from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
 from mapserver.survey.survey_inputs import SurveyConfig
 from mapserver.survey.tracks.matching import PairFinder
 from mapserver.survey.tracks.pairs import PairMatch
@@ -29,6 +33,7 @@ _WINDOW = 10  # keyframes that move while the chain grows: what the newest one s
 _HELD = 2  # of the window's oldest, to which the others are tied
 _MIN_OBSERVATIONS = 30  # below which odometry alone places a keyframe
 _ROTATION_SIGMA_RAD = 0.02
+_LOST = 100.0  # times the variance of what pictures say, from which on odometry has lost a frame that they have not
 _WIDE = 25.0  # factor on odometry's covariance where it only decides what pictures leave open
 
 
@@ -49,7 +54,7 @@ class NewKeyframe:
 
     frame_from_body (4, 4) in odometry's continuous frame; level_from_frame (3, 3) turns that upright as gravity is known now.
     step_cov (6, 6): of the motion since the keyframe before, axes of that one, rotation first; None for the first. velocity_body_mps
-    and biases (3,); imu: samples since the keyframe before.
+    and biases (3,); imu: samples since the keyframe before. variance_m2: of the odometry's position, summed over the axes.
     """
 
     number: int
@@ -61,6 +66,7 @@ class NewKeyframe:
     accel_bias_mps2: Array
     inertial: bool = False
     imu: ImuSamples = field(default_factory=ImuSamples.empty)
+    variance_m2: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +75,16 @@ class LiveLoops:
 
     believed: NDArray[np.int64]
     refused: dict[str, int]
+
+
+class LiveParts(NamedTuple):
+    """Parts of a survey that lost itself: labels (K,) number them in the order of time, -1 for keyframes that saw too little.
+
+    Only one can be the map, that with most keyframes: those that stay apart when the survey is over are left out.
+    """
+
+    labels: NDArray[np.int64]
+    spans: list[LivePart]
 
 
 class LiveMap:
@@ -83,12 +99,16 @@ class LiveMap:
         self._walked_m2: list[float] = [0.0]
         self._pairs: list[PairMatch] = []
         self._points_body: list[Array] = []  # of the landmarks whose reference each keyframe is
+        self._step_covs: list[Array] = []
         self._chain: list[PoseEdge] = []
         self._loops: list[PoseEdge] = []
         self._believed: list[PoseEdge] = []
         self._map_from_body = np.zeros((0, 4, 4))
         self._closer: LoopCloser | None = None
         self._level = np.eye(3)
+        self._seeing = np.zeros(0, bool)
+        self._parts = Parts()  # by what keyframes share with their neighbours, and by odometry
+        self._joined = Parts()  # by loops as well, as the loop closer has it
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -116,6 +136,29 @@ class LiveMap:
         ends = np.array([(edge.i, edge.j) for edge in self._believed], np.int64).reshape(-1, 2)
         return LiveLoops(ends, refused)
 
+    def parts(self) -> LiveParts:
+        """What belongs together: by neighbours, by odometry, and by the loops that are believed."""
+        whole = Parts(enumerate(self._parts.labels().tolist()), len(self))
+        for edge in self._believed:
+            whole.join(edge.i, edge.j)
+        firsts = whole.labels()
+        seen = [p for p in np.unique(firsts[self._seeing]).tolist() if np.sum(firsts == p) > 1]
+        labels = np.full(len(self), -1, np.int64)
+        for number, part in enumerate(seen):
+            labels[firsts == part] = number
+        members = [np.flatnonzero(labels == number) for number in range(len(seen))]
+        largest = int(np.argmax([self._seeing[m].sum() for m in members])) if members else 0
+        spans = [
+            LivePart(
+                start_s=self._seconds(m[0]), end_s=self._seconds(m[-1]), keyframes=len(m), is_map=number == largest
+            )
+            for number, m in enumerate(members)
+        ]
+        return LiveParts(labels, spans)
+
+    def _seconds(self, k: int) -> float:
+        return round((self._keyframes[k].stamp_ns - self._keyframes[0].stamp_ns) * 1e-9, 3)
+
     def add(self, frame: RectifiedFrame, new: NewKeyframe) -> None:
         """One more keyframe: matched with its neighbours, adjusted with them, and compared with all that came before."""
         keyframe = make_keyframe(frame, new.number, self._rig.camera, self._settings)
@@ -125,6 +168,9 @@ class LiveMap:
         self._news.append(new)
         self._level = new.level_from_frame
         self._points_body.append(np.zeros((0, 3)))
+        self._seeing = np.append(self._seeing, False)
+        for parts in (self._parts, self._joined):
+            parts.grow(len(self))
         if len(self._keyframes) == 1:
             self._chain_from_body.append(new.frame_from_body)
             self._map_from_body = new.frame_from_body[None].copy()
@@ -135,9 +181,12 @@ class LiveMap:
         self._walked_m2.append(self._walked_m2[-1] + float(np.trace(new.step_cov[3:, 3:])))
         self._chain_from_body.append(self._chain_from_body[-1] @ motion)
         first = max(0, len(self._keyframes) - _WINDOW)
-        self._pairs = [pair for pair in self._pairs if pair.i >= first] + self._matched(first)
+        found = self._matched(first)
+        self._pairs = [pair for pair in self._pairs if pair.i >= first] + found
+        self._step_covs.append(self._step_cov(new.step_cov, found))
         self._adjust(first)
         self._follow(first)
+        self._connect(first)
         self._close()
 
     def _matched(self, first: int) -> list[PairMatch]:
@@ -158,6 +207,17 @@ class LiveMap:
             wanted, chain_from_body, allowed_m, rotation_sigma_rad=sigma, progress=lambda _number: None
         )
         return [replace(pair, i=pair.i + first, j=pair.j + first) for pair in found]
+
+    def _step_cov(self, by_odometry: Array, found: Sequence[PairMatch]) -> Array:
+        """(6, 6) of the step to the newest keyframe: a frame that odometry lost may be tied to the one before by what both see."""
+        for pair in found:
+            if pair.i == pair.j - 1:
+                edge = body_edge(pair, self._rig.body_from_cam)
+                carry = adjoint(se3_inverse(edge.i_from_j))  # from the axes of the newest to those of the one before
+                tied = carry @ edge.cov_rot_trans @ carry.T
+                if np.trace(by_odometry[:3, :3]) > _LOST * np.trace(tied[:3, :3]):
+                    return np.asarray(tied)
+        return by_odometry
 
     def _adjust(self, first: int) -> None:
         """The window's keyframes by their common points and the motion between them; its oldest ones stay."""
@@ -236,13 +296,26 @@ class LiveMap:
         del self._chain[start:]
         for k in range(start, len(self._keyframes) - 1):
             i_from_j = se3_inverse(self._chain_from_body[k]) @ self._chain_from_body[k + 1]
-            cov = self._news[k + 1].step_cov
-            assert cov is not None
-            self._chain.append(PoseEdge(k, k + 1, i_from_j, cov, is_loop=False))
+            self._chain.append(PoseEdge(k, k + 1, i_from_j, self._step_covs[k], is_loop=False))
         placed = list(self._map_from_body[: start + 1])
         for edge in self._chain[start:]:
             placed.append(placed[-1] @ edge.i_from_j)
         self._map_from_body = np.array(placed)
+
+    def _connect(self, first: int) -> None:
+        """Which part the newest keyframes belong to, by the same rule as a build's."""
+        joins: list[tuple[int, int]] = []
+        for pair in self._pairs:
+            self._seeing[[pair.i, pair.j]] = True
+            if len(pair.features) >= MIN_SHARED:
+                joins.append((pair.i, pair.j))
+        before = np.flatnonzero(self._seeing[:first])
+        sigmas_m = SigmaBetween(np.array([new.variance_m2 for new in self._news]))
+        since = int(before[-1]) if len(before) else 0
+        joins += bridges(self._seeing, sigmas_m, self._settings.join_sigma_m, since)
+        for a, b in joins:
+            self._parts.join(a, b)
+            self._joined.join(a, b)
 
     def _close(self) -> None:
         """Looks for revisits of the newest keyframe; with one more loop the pose graph places all keyframes anew."""
@@ -252,7 +325,7 @@ class LiveMap:
         learned = [] if self._closer is None else self._closer.learned
         marginals = GraphMarginals(self._map_from_body, [*self._chain, *learned])
         if self._closer is None:
-            self._closer = LoopCloser(posed, self._options, marginals, set(matched))
+            self._closer = LoopCloser(posed, self._options, marginals, set(matched), parts=self._joined)
             self._closer.close(0)
         else:
             self._closer.grow(posed, marginals, matched)
@@ -260,7 +333,7 @@ class LiveMap:
         edges = self._closer.loops.edges
         if len(edges) > len(self._loops):
             self._loops = list(edges)
-            solved = optimize_pose_graph(self._map_from_body, [*self._chain, *edges])
+            solved = optimize_pose_graph(self._closer.begin, [*self._chain, *edges])
             self._map_from_body = solved.map_from_body
             self._believed = [e for e, w in zip(edges, solved.loop_weights, strict=True) if w >= 0.5]
 

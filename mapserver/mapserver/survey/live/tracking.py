@@ -87,4 +87,5 @@ class LiveTracking:
             accel_bias_mps2=estimate.accel_bias_mps2,
             inertial=estimate.inertial,
             imu=imu,
+            variance_m2=float(np.trace(covariance[3:, 3:])),
         )

@@ -12,6 +12,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, without_pictures
+from mapserver.survey.loops.parts import Parts, Revisit, WaitingRevisits
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
 from mapserver.survey.survey_inputs import SurveyConfig
@@ -28,6 +29,7 @@ _WORTH_LEARNING = 1.0  # variance against the measurement's: below, a loop chang
 # learned, as they cost memory with their square; what it does not learn leaves it wider, and the next loop can still be learned.
 _WELL_KNOWN_COV = np.diag([0.005**2] * 3 + [0.05**2] * 3)
 _LEARNED_PER_DOUBLING = 64
+_WAITING = "it would join two parts of the survey, and too few keyframes over a metre agree with it yet"
 
 
 class LoopVerdict(StrEnum):
@@ -93,8 +95,13 @@ class LoopCloser:
         marginals: GraphMarginals,
         matched: set[tuple[int, int]],
         executor: Executor = SERIAL,
+        parts: Parts | None = None,
     ) -> None:
-        """matched: pairs of keyframes that were matched as neighbours, and so are no loops."""
+        """matched: pairs of keyframes that were matched as neighbours, and so are no loops. parts: joined here by sure revisits; None
+        where all keyframes belong together.
+        """
+        self.parts = parts
+        self._waiting = WaitingRevisits()
         self._camera, self._vocabulary = posed.camera, options.vocabulary
         self._body_from_cam, self._cam_from_body = posed.body_from_cam, se3_inverse(posed.body_from_cam)
         self._settings, self._zones = options.settings.loops, options.zones
@@ -120,6 +127,11 @@ class LoopCloser:
         bare = [*self._inputs.keyframes, *(without_pictures(k) for k in new)]
         self._inputs = replace(self._inputs, keyframes=bare)
         self._depths_m = np.append(self._depths_m, [median_depth_m(keyframe) for keyframe in new])
+
+    @property
+    def begin(self) -> Array:
+        """(K, 4, 4) from where a pose graph with the loops is to begin: where the keyframes were, unless a loop has turned a part."""
+        return self._marginals.linearised_at
 
     def close(self, i: int) -> None:
         """Looks for revisits of keyframe i among those before it, then adds it to the index. To be called in order."""
@@ -248,11 +260,7 @@ class LoopCloser:
         return j, i, PredictedMotion(self._cam_from_cam(i, j), known)
 
     def _edge(self, match: PairMatch) -> PoseEdge:
-        """Body i from body j; the match has camera i (its j) from camera j (its i)."""
-        body_from_body = self._body_from_cam @ match.j_from_i @ self._cam_from_body
-        carry = adjoint(self._body_from_cam)
-        covariance = _CORRELATION**2 * carry @ match.cov_rot_trans @ carry.T + np.diag([1e-6] * 3 + [1e-5] * 3)
-        return PoseEdge(match.j, match.i, body_from_body, covariance, is_loop=True)
+        return body_edge(match, self._body_from_cam)
 
     def _neighbours_agree(self, match: PairMatch) -> bool | None:
         """Whether a covisible neighbour of the old keyframe, placed by this match, matches too; None where none can be seen."""
@@ -284,6 +292,20 @@ class LoopCloser:
                 self.loops.records.append(replace(record, verdict=LoopVerdict.AMBIGUOUS, reason=reason))
                 continue
             self.loops.records.append(record)
+            if self.parts is None or self.parts.of(edge.i) == self.parts.of(edge.j):
+                self._accept([edge])
+                continue
+            number = len(self.loops.records) - 1
+            self.loops.records[number] = replace(record, verdict=LoopVerdict.AMBIGUOUS, reason=_WAITING)
+            sure = self._waiting.add(Revisit(edge, number), self.parts, self._marginals)
+            for revisit in sure:
+                waited = self.loops.records[revisit.record]
+                self.loops.records[revisit.record] = replace(waited, verdict=LoopVerdict.ACCEPTED, reason="verified")
+                self.parts.join(revisit.edge.i, revisit.edge.j)
+            self._accept([revisit.edge for revisit in sure])
+
+    def _accept(self, edges: list[PoseEdge]) -> None:
+        for edge in edges:
             self.loops.edges.append(edge)
             if self._marginals.gain(edge, self._well_known()) > _WORTH_LEARNING:
                 self._marginals.add(edge)
@@ -292,6 +314,14 @@ class LoopCloser:
 
     def _well_known(self) -> Array:
         return np.asarray(_WELL_KNOWN_COV * 2.0 ** (self._marginals.learned / _LEARNED_PER_DOUBLING))
+
+
+def body_edge(match: PairMatch, body_from_cam: Array) -> PoseEdge:
+    """Body i from body j as a loop; the match has camera i (its j) from camera j (its i)."""
+    body_from_body = body_from_cam @ match.j_from_i @ se3_inverse(body_from_cam)
+    carry = adjoint(body_from_cam)
+    covariance = _CORRELATION**2 * carry @ match.cov_rot_trans @ carry.T + np.diag([1e-6] * 3 + [1e-5] * 3)
+    return PoseEdge(match.j, match.i, body_from_body, covariance, is_loop=True)
 
 
 def _verify(inputs: MatchInputs, pair: tuple[int, int, PredictedMotion]) -> PairMatch | None:

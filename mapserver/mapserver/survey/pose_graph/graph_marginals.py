@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 from fleetmap.features.matching_kernels import Indices
 from fleetmap.geometry import Array, se3_inverse, se3_log, so3_left_jacobian
 from mapserver.survey.pose_graph.chain_covariance import ChainCovariance
-from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, check_edges
+from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, check_edges, optimize_pose_graph
 
 CHI2_3_0999 = 16.266  # 0.999 of chi-square with 3 degrees of freedom: a place
 CHI2_6_0999 = 22.458  # with 6: a place and a direction
+_FIRST_ORDER_RAD = 0.5  # a loop that turns the graph further is not to be added to first order
 
 
 class GraphMarginals:
@@ -32,6 +33,10 @@ class GraphMarginals:
     def __init__(self, map_from_body: Array, edges: Sequence[PoseEdge]) -> None:
         """Raises SurveyError as `check_edges`."""
         check_edges(len(map_from_body), edges)
+        self._linearise(map_from_body, edges)
+
+    def _linearise(self, map_from_body: Array, edges: Sequence[PoseEdge]) -> None:
+        self.linearised_at, self._edges = map_from_body, list(edges)
         # Seen from the middle of the site: far from the origin, turns would drown everything else in rounding.
         self._middle_m = map_from_body[:, :3, 3].mean(axis=0)
         self._map_from_body = map_from_body.copy()
@@ -61,6 +66,11 @@ class GraphMarginals:
         Narrowing alone would refuse the next true loop of a place whose drift this one has shown.
         """
         check_edges(len(self._map_from_body), [edge], connected=False)
+        self._edges.append(edge)
+        if np.linalg.norm(self._innovation(edge)[:3]) > _FIRST_ORDER_RAD:
+            solved = optimize_pose_graph(self.map_from_body, self._edges, robust=False)
+            self._linearise(solved.map_from_body, self._edges)
+            return
         said_map = adjoint(self._map_from_body[edge.i]) @ self._innovation(edge)
         self._map_from_body = _moved(self._map_from_body, self._measure(edge) @ said_map)
 
