@@ -12,14 +12,12 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from fleetsim.commands import record_order
-    from fleetsim.estimator.simulated_run import EstimatorSession
     from fleetsim.recorder import Order, Session, prepare
     from fleetsim.scenarios import SCENARIOS
 
-__all__ = ["SCENARIOS", "EstimatorSession", "Order", "Session", "__version__", "prepare", "record_order"]
+__all__ = ["SCENARIOS", "Order", "Session", "__version__", "prepare", "record_order"]
 _MODULES = {
     "SCENARIOS": "fleetsim.scenarios",
-    "EstimatorSession": "fleetsim.estimator.simulated_run",
     "Order": "fleetsim.recorder",
     "Session": "fleetsim.recorder",
     "prepare": "fleetsim.recorder",

@@ -7,14 +7,14 @@ import pytest
 
 from benchmarks.common import estimator_loop
 from fleetmap.geometry import se3_inverse, transform_points
-from fleetsim.estimator.landmarks import LandmarkField
-from fleetsim.estimator.simulated_run import EstimatorSession
-from fleetsim.estimator.statistics import FeatureStatistics, FlowStatistics
 from fleetsim.recorder import Order, prepare
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.world import World
 from fleetsim.sensors.faults import Fault
 from fleetsim.sensors.robots import HiddenErrors
+from support.estimator.landmarks import LandmarkField
+from support.estimator.simulated_run import EstimatorSession
+from support.estimator.statistics import FeatureStatistics, FlowStatistics
 
 
 @lru_cache(maxsize=4)

@@ -12,11 +12,11 @@ import pytest
 from benchmarks.common import estimator_loop
 from fleetmap.messages import Cause, Status
 from fleetmap.relocalization.map_view import MapView
-from fleetsim.estimator.landmarks import LandmarkField
-from fleetsim.estimator.simulated_run import EstimatorSession
 from fleetsim.recorder import Order, Session, prepare
 from fleetsim.sensors.faults import Fault, FaultPlan
 from locclient.localization.estimate import Estimate
+from support.estimator.landmarks import LandmarkField
+from support.estimator.simulated_run import EstimatorSession
 
 BEGIN_S = 2.5  # on the way, three seconds before the end
 WRONG_M = 0.3

@@ -9,8 +9,6 @@ from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.odometry import OdometryEstimate, OdometrySettings
 from fleetmap.odometry.checks.imu_faults import joined
 from fleetmap.sensors.calibration import RigCalibration
-from fleetsim.estimator.landmarks import LandmarkField
-from fleetsim.estimator.simulated_run import EstimatorSession
 from fleetsim.motion.body_motion import RouteMotion
 from fleetsim.motion.routes import Route
 from fleetsim.recorder import Order, Session, prepare
@@ -18,6 +16,8 @@ from fleetsim.scenarios import find_scenario
 from fleetsim.sensors.faults import Fault, FaultPlan
 from fleetsim.sensors.measurements import START_NS, measure_imu, measure_wheels, sample_times
 from fleetsim.sensors.robots import nominal_calibration, true_calibration
+from support.estimator.landmarks import LandmarkField
+from support.estimator.simulated_run import EstimatorSession
 
 _SCENARIO = "small-loop"
 _SIDEWAYS_M = 0.15  # by which a run's way points are shifted at random

@@ -1,4 +1,4 @@
-"""Odometry and localization fed by `fleetsim.estimator.simulated_run` instead of pictures.
+"""Odometry and localization fed by `support.estimator.simulated_run` instead of pictures.
 
 The loop is closed here because the simulator and the estimators may not know each other.
 """
@@ -23,10 +23,10 @@ from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import PositionPrior, wheel_between
-from fleetsim.estimator.simulated_run import EstimatorSession, Found
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
+from support.estimator.simulated_run import EstimatorSession, Found
 
 SETTINGS = LocalizerSettings()
 _TILE_M = 1024.0

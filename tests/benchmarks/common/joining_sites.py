@@ -15,8 +15,6 @@ from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.samples import SensorSet
 from fleetsim import recorder
-from fleetsim.estimator.landmarks import LandmarkField, Landmarks
-from fleetsim.estimator.simulated_run import EstimatorSession
 from fleetsim.motion.routes import Route
 from fleetsim.scenarios import SCENARIOS, Run, Scenario, find_scenario
 from fleetsim.scene.world import World
@@ -26,6 +24,8 @@ from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import session_relocalization
 from mapserver.survey.merge.join_test import JoinTest, Visit
 from mapserver.survey.odometry_pass import FrameChain, continued_covariances
+from support.estimator.landmarks import LandmarkField, Landmarks
+from support.estimator.simulated_run import EstimatorSession
 
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 RATE_HZ = 7.5

@@ -26,7 +26,6 @@ from benchmarks.common import estimator_loop
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.mapformat import Tile
 from fleetmap.messages import RobotHealth, WantedVersion, decode_message, robot_key
-from fleetsim.estimator.simulated_run import EstimatorSession
 from fleetsim.recorder import Order, prepare
 from locclient.localization.estimate import Estimate
 from locclient.robot.health_report import FixFigures
@@ -36,6 +35,7 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.canary_test import CanarySettings, number_of
 from mapserver.serving.bus_service import BusService
 from mapserver.store import DraftContent, MapStore
+from support.estimator.simulated_run import EstimatorSession
 from support.storage.map_samples import draft_details
 
 SITE, SHIFT_M, AISLE_Y_M = "hall", np.array([0.5, 0.0, 0.0]), 3.8

@@ -14,8 +14,6 @@ from fleetmap.messages import Status
 from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import PositionPrior, Trajectory
-from fleetsim.estimator.landmarks import LandmarkField
-from fleetsim.estimator.simulated_run import EstimatorSession, Found, Ids, Sighting
 from fleetsim.recorder import Order, prepare
 from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings, TrackSettings
@@ -26,6 +24,8 @@ from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.landmark_budget import choose_landmarks
 from mapserver.tiles.tiling import TILE_SIZE_M
+from support.estimator.landmarks import LandmarkField
+from support.estimator.simulated_run import EstimatorSession, Found, Ids, Sighting
 
 RIGHT_M, WRONG_M = 0.5, 0.3
 WHOLE_SITE = LocalizerSettings(track=TrackSettings(is_whole_site_mapped=True))

@@ -18,9 +18,9 @@ from benchmarks.common import estimator_loop, rendered_map
 from fleetmap.geometry import Array
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
-from fleetsim.estimator.simulated_run import EstimatorSession
 from fleetsim.recorder import Order, Session, prepare
 from locclient.localization.estimate import Estimate
+from support.estimator.simulated_run import EstimatorSession
 
 Figures = dict[str, float]
 

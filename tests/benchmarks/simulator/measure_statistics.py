@@ -1,4 +1,4 @@
-"""Measures on rendered pictures what `fleetsim.estimator.statistics` states; run it when the painter or the features change.
+"""Measures on rendered pictures what `support.estimator.statistics` states; run it when the painter or the features change.
 
 `python tests/benchmarks/simulator/measure_statistics.py` prints the table, about two minutes on one core.
 """

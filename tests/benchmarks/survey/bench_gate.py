@@ -24,8 +24,6 @@ from benchmarks.common.estimator_loop import blank
 from fleetmap.bow import Vocabulary, train_vocabulary
 from fleetmap.features import orb
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse
-from fleetsim.estimator.landmarks import LandmarkField
-from fleetsim.estimator.simulated_run import EstimatorSession
 from fleetsim.motion.routes import Route
 from fleetsim.recorder import Order, Session, prepare
 from fleetsim.scenarios import SCENARIOS, Run, Scenario, find_scenario
@@ -36,6 +34,8 @@ from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMargin
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import LoopSettings, SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig
+from support.estimator.landmarks import LandmarkField
+from support.estimator.simulated_run import EstimatorSession
 
 NAME = "site-identical"
 END_M = 2.7

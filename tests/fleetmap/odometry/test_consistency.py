@@ -6,8 +6,8 @@ import pytest
 from benchmarks.common import consistency, estimator_loop
 from fleetmap.odometry import OdometryEstimate, OdometrySettings
 from fleetmap.odometry.settings import FilterSettings
-from fleetsim.estimator.simulated_run import EstimatorSession
 from fleetsim.sensors.faults import Fault
+from support.estimator.simulated_run import EstimatorSession
 
 WITHOUT_WHEELS = OdometrySettings(filter=FilterSettings(use_wheels=False))
 

@@ -8,10 +8,10 @@ from fleetmap.geometry import Array, so3_log
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import ImuSamples
-from fleetsim.estimator.simulated_run import EstimatorSession
 from fleetsim.recorder import Order, Session, prepare
 from mapserver.calibration.parameters import COLUMNS, RigAxes, corrected_rig
 from mapserver.calibration.problem import CalibrationData, MotionState
+from support.estimator.simulated_run import EstimatorSession
 
 SIGMAS_PX = np.array([0.25, 0.12, 0.15])  # of the left pixel, the disparity, the row difference
 

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.numerics.kernel import inner_kernel, kernel
-from fleetsim.estimator.landmark_kernels import mixed, uniform
-from fleetsim.estimator.statistics import FeatureStatistics, FlowStatistics
+from support.estimator.landmark_kernels import mixed, uniform
+from support.estimator.statistics import FeatureStatistics, FlowStatistics
 
 Float = NDArray[np.float64]
 Words = NDArray[np.uint64]

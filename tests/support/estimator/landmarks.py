@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse
-from fleetsim.estimator import landmark_kernels
-from fleetsim.estimator.statistics import PITCH_PX
 from fleetsim.render.ray_kernels import BoxGrid, box_grid
 from fleetsim.scene.world import NEAR_COLUMNS, NEAR_ROWS, World
+from support.estimator import landmark_kernels
+from support.estimator.statistics import PITCH_PX
 
 CELLS_M = np.array([0.08, 0.16, 0.32, 0.64, 1.28])  # lattice spacings: with distance coarser ones take over
 _LARGEST = 1.4  # of the size drawn for a cell, see seed_landmarks

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
-from fleetsim.estimator import landmark_kernels, noise_kernels
-from fleetsim.estimator.landmarks import LandmarkField, Landmarks
-from fleetsim.estimator.statistics import PITCH_PX, FeatureStatistics, FlowStatistics
 from fleetsim.recorder import Session
+from support.estimator import landmark_kernels, noise_kernels
+from support.estimator.landmarks import LandmarkField, Landmarks
+from support.estimator.statistics import PITCH_PX, FeatureStatistics, FlowStatistics
 
 _STATION_M, _STATION_RAD = 0.5, 0.15
 _CONE_MARGIN = 0.3  # of the tangent: what turning and moving within a station may bring into the picture

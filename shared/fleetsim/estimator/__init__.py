@@ -1,1 +1,0 @@
-"""Runs without pictures: what an estimator would measure, landmark by landmark."""
