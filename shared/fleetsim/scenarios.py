@@ -26,7 +26,6 @@ class Run:
 
     @property
     def kind(self) -> RobotKind:
-        """The robot's model."""
         return ROBOTS[self.robot]
 
 

@@ -28,7 +28,6 @@ class FixFigures:
         self._speed_mps: float | None = None
 
     def handle(self, estimate: Estimate, dock_error_m: float | None, speed_mps: float | None = None) -> None:
-        """Counts a frame."""
         self._speed_mps = speed_mps
         was_tracking = self._last is not None and self._last.status is Status.TRACKING
         self._last = estimate
@@ -76,7 +75,6 @@ class HealthFigures:
         return self._last
 
     def handle(self, outcome: Outcome) -> None:
-        """Counts a frame."""
         estimate = outcome.estimate
         self._last = outcome
         self._frame_ms.append(1e3 * outcome.cpu_s)
@@ -90,7 +88,6 @@ class HealthFigures:
         self._fixes.handle(estimate, outcome.dock_error_m, outcome.speed_mps)
 
     def count_failure(self) -> None:
-        """Counts a detected failure."""
         self._failures += 1
 
     def report(self, site: str, robot: str, wall_ns: int, more: Mapping[str, Figure], silent: bool) -> RobotHealth:

@@ -97,7 +97,6 @@ class BuildOptions:
 
     @property
     def reading(self) -> RecordingOptions:
-        """How the recordings are read."""
         source = self.trajectory_source, self.initial_trajectory
         return RecordingOptions(self.frames, self.calibration, self.use, *source)
 

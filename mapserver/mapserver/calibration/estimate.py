@@ -66,7 +66,6 @@ class CalibrationEstimate:
     observations: int
 
     def get(self, name: CalibrationParameter) -> ParameterEstimate:
-        """The estimate of one parameter."""
         return next(p for p in self.parameters if p.name is name)
 
     def corrections(self) -> Array:

@@ -38,7 +38,6 @@ class Vocabulary:
 
     @property
     def word_count(self) -> int:
-        """Number of words."""
         return len(self.idf)
 
     def words(self, descriptors: Descriptors) -> WordIds:

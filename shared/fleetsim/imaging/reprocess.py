@@ -28,7 +28,6 @@ class _ProcessedFrames:
         return replace(stored, left=png_image(frame.left), right=right)
 
     def frame(self, index: int) -> CameraFrame:
-        """Frame `index`, decoded and processed."""
         return process_frame(self.source.frame(index), self.pipeline, self.seed)
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
@@ -37,7 +36,6 @@ class _ProcessedFrames:
         digest.update(repr((self.pipeline, self.seed)).encode())
 
     def close(self) -> None:
-        """Closes the other source."""
         self.source.close()
 
 

@@ -29,7 +29,6 @@ class ZeroVelocityDetector:
         return old[-1][0], self._images[-2][0]
 
     def forget(self) -> None:
-        """Nothing was seen before."""
         self._images.clear()
 
 

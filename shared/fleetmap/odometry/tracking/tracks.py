@@ -46,7 +46,6 @@ class TrackBatch:
 
     @classmethod
     def of(cls, tracks: Sequence[Track]) -> "TrackBatch":
-        """The same tracks as arrays."""
         sizes = [len(track.clone_ids) for track in tracks]
         return cls(
             np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
@@ -70,7 +69,6 @@ class Observations:
         self._pixels = np.concatenate([self._pixels, pixels])
 
     def clear(self) -> None:
-        """Forgets all."""
         self._keep(np.zeros(len(self._ids), bool))
 
     def take(self, alive: Ids, held: Ids, due: NDArray[np.bool_], camera: StereoCamera) -> TrackBatch:

@@ -102,7 +102,6 @@ class McapFrames(SeriesFrames[tuple[_Stream, Location]]):
             hash_file(path, digest)
 
     def close(self) -> None:
-        """Closes the file."""
         self._file.close()
 
     def _image(self, source: tuple[_Stream, Location], stamp_ns: int) -> StoredImage:
