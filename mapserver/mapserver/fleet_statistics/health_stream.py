@@ -24,7 +24,6 @@ class HealthStream:
     """Follows one robot: runs, driving, first fixes, blindness. Reports must come in the order of their stamps."""
 
     def __init__(self) -> None:
-        self.duplicates = 0
         self._stamp_ns: int | None = None
         self._wall_ns: int | None = None
         self._figures: dict[str, float] = {}
@@ -53,7 +52,6 @@ class HealthStream:
     def take_health(self, health: RobotHealth) -> Counters | None:
         """What this report adds; None for one that was taken before."""
         if self._is_known(health):
-            self.duplicates += 1
             return None
         figures = _figures(health)
         if self._is_new_run(health, figures):

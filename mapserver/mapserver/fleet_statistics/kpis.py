@@ -87,11 +87,6 @@ class Counters:
         return self.failures + self.unreported_blindness
 
     @property
-    def overlapping(self) -> int:
-        """Failures that began or were running already when the time of these sums began."""
-        return self.position_failures + self.continued
-
-    @property
     def events(self) -> int:
         """Everything that speaks against a map: failures, blindness not reported, silent ones as estimated."""
         return self.position_failures + self.silent_estimated

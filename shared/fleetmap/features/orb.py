@@ -95,26 +95,6 @@ def describe(image: Image, keypoints: list[cv2.KeyPoint], levels: int) -> Featur
     )
 
 
-def describe_pixels(image: Image, pixels: Array, settings: OrbSettings) -> tuple[Features, NDArray[np.int64]]:
-    """Level-0 features at given pixels (N, 2), and the index of the pixel that each describes."""
-    points = pixels.astype(np.float32)
-    angles = centroid_angles_deg(image, points, _PATCH_RADIUS)
-    keypoints = [
-        cv2.KeyPoint(float(x), float(y), 31.0, float(angle), 1.0, 0, index)
-        for index, ((x, y), angle) in enumerate(zip(points, angles, strict=True))
-    ]
-    engine = cv2.ORB.create(
-        nfeatures=max(len(keypoints), 1), scaleFactor=SCALE_FACTOR, nlevels=settings.levels, edgeThreshold=_BORDER_PX
-    )
-    kept, descriptors = engine.compute(image, keypoints)
-    index = np.array([k.class_id for k in kept], np.int64)
-    if not kept:
-        return Features.empty(), index
-    return Features(
-        pixels[index], np.zeros(len(index), np.int8), angles[index], np.asarray(descriptors, np.uint8)
-    ), index
-
-
 def _quotas(settings: OrbSettings) -> list[int]:
     shares = SCALE_FACTOR ** -np.arange(settings.levels)
     return [int(np.ceil(settings.count * s / shares.sum())) for s in shares]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.geometry import Array
 from fleetmap.inertial.preintegration_kernels import integrate_samples
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples, Stamps
@@ -52,30 +52,6 @@ class Preintegrated:
     gyro_bias_radps: Array
     accel_bias_mps2: Array
     max_gap_s: float
-
-    @property
-    def cov_rot_vel_pos(self) -> Array:
-        """(9, 9) covariance of the motion alone, the biases' walk included."""
-        return np.asarray(self.cov[:9, :9])
-
-    def corrected(self, gyro_bias: Array, accel_bias: Array) -> tuple[Array, Array, Array]:
-        """Increments (3, 3), (3,), (3,) for other biases, to first order. Source: Forster et al. 2017, eq. 44."""
-        gyro, accel = gyro_bias - self.gyro_bias_radps, accel_bias - self.accel_bias_mps2
-        return (
-            self.delta_rotation @ so3_exp(self.d_rotation_d_gyro @ gyro),
-            self.delta_velocity_mps + self.d_velocity_d_gyro @ gyro + self.d_velocity_d_accel @ accel,
-            self.delta_position_m + self.d_position_d_gyro @ gyro + self.d_position_d_accel @ accel,
-        )
-
-    def predict(
-        self, map_from_body: Array, velocity_map_mps: Array, gyro_bias: Array, accel_bias: Array
-    ) -> tuple[Array, Array]:
-        """map_from_body (4, 4) and velocity (3,) at `end_ns` from those at `start_ns`, in a gravity-aligned frame."""
-        rotation, velocity, position = self.corrected(gyro_bias, accel_bias)
-        map_from_start, dt = map_from_body[:3, :3], self.dt_s
-        moved = map_from_body[:3, 3] + velocity_map_mps * dt + 0.5 * GRAVITY_MAP * dt**2 + map_from_start @ position
-        after = velocity_map_mps + GRAVITY_MAP * dt + map_from_start @ velocity
-        return se3(map_from_start @ rotation, moved), np.asarray(after)
 
 
 def preintegrate(

@@ -11,7 +11,7 @@ import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
-from fleetmap.recordings.tum import format_stamp, read_text, stamped_lines, write_text
+from fleetmap.recordings.tum import read_text, stamped_lines
 from fleetmap.sensors.samples import Stamps
 
 _ROWS, _COLUMNS = np.triu_indices(6)
@@ -25,17 +25,8 @@ class StampedCovariances:
     covs_rot_trans: Array
 
 
-def format_covariances(given: StampedCovariances) -> str:
-    """The lines, with a comment line that names the columns first."""
-    names = ", ".join(f"c{row}{column}" for row, column in zip(_ROWS, _COLUMNS, strict=True))
-    lines = [f"# timestamp_s, {names}"]
-    for stamp_ns, covariance in zip(given.stamps_ns.tolist(), given.covs_rot_trans, strict=True):
-        lines.append(", ".join([format_stamp(stamp_ns), *(f"{value:.9g}" for value in covariance[_ROWS, _COLUMNS])]))
-    return "\n".join(lines) + "\n"
-
-
 def parse_covariances(text: str, what: str = "covariances") -> StampedCovariances:
-    """The covariances in text written by `format_covariances`.
+    """The covariances in the text of such a file.
 
     Raises RecordingError, naming `what` and the line, for anything but 22 finite numbers of a positive definite matrix, or
     stamps that do not rise.
@@ -56,8 +47,3 @@ def parse_covariances(text: str, what: str = "covariances") -> StampedCovariance
 def read_covariances(path: Path) -> StampedCovariances:
     """The covariances in the file at `path`; RecordingError as `parse_covariances`, and where it cannot be read."""
     return parse_covariances(read_text(path, "covariances as CSV are expected"), str(path))
-
-
-def write_covariances(path: Path, given: StampedCovariances) -> None:
-    """Writes them; RecordingError where the file cannot be written."""
-    write_text(path, format_covariances(given))

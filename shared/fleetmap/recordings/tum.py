@@ -46,7 +46,10 @@ def parse_tum(text: str, what: str = "trajectory") -> Trajectory:
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Writes `trajectory` as TUM text; RecordingError where the file cannot be written."""
-    write_text(path, format_tum(trajectory))
+    try:
+        path.write_text(format_tum(trajectory), encoding="ascii")
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be written ({error.strerror}); check folder and space") from error
 
 
 def read_tum(path: Path) -> Trajectory:
@@ -89,14 +92,6 @@ def read_text(path: Path, expected: str) -> str:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); check the path") from error
     except UnicodeDecodeError as error:
         raise RecordingError(f"{path} is not a text file ({error.reason}); {expected}") from error
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes ASCII text; RecordingError where the file cannot be written."""
-    try:
-        path.write_text(text, encoding="ascii")
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be written ({error.strerror}); check folder and space") from error
 
 
 def format_stamp(stamp_ns: int) -> str:

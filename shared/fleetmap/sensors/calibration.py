@@ -1,6 +1,6 @@
 """Calibration of a robot's sensors: lenses, mounting, noise. Values only; reading files is the recordings' job."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -51,10 +51,6 @@ class RigCalibration:
     cameras: tuple[CameraCalibration, ...]
     imu: ImuNoise | None = None
     base_from_body: Array = field(default_factory=lambda: np.eye(4))
-
-    def with_base_from_body(self, base_from_body: Array) -> "RigCalibration":
-        """A copy with another mounting of the IMU on the robot."""
-        return replace(self, base_from_body=base_from_body)
 
 
 def check_camera(camera: CameraCalibration, name: str) -> CameraCalibration:

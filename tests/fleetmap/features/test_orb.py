@@ -68,21 +68,8 @@ def test_features_are_found_again_in_a_turned_or_larger_picture(scale: float, an
     assert abs(np.median(turned)) < 4.0
 
 
-def test_given_pixels_are_described_as_detected_ones(image: NDArray[np.uint8]) -> None:
-    """At level 0 the descriptor of a detected feature is that of its pixel."""
-    features = orb.detect(image, orb.OrbSettings(count=300))
-    level0 = features.take(np.flatnonzero(features.octaves == 0))
-    pixels = np.vstack([[[2.0, 2.0]], level0.pixels])  # the first is too near the border to be described
-    described, index = orb.describe_pixels(image, pixels, orb.OrbSettings())
-    assert index.tolist() == list(range(1, len(pixels)))
-    np.testing.assert_array_equal(described.descriptors, level0.descriptors)
-    np.testing.assert_array_equal(described.pixels, level0.pixels)
-
-
 def test_features_are_deterministic_and_none_are_found_on_nothing(image: NDArray[np.uint8]) -> None:
     first, second = (orb.detect(picture, orb.OrbSettings(count=150)) for picture in (image, image.copy()))
     np.testing.assert_array_equal(first.pixels, second.pixels)
     np.testing.assert_array_equal(first.descriptors, second.descriptors)
     assert len(orb.detect(np.full((HEIGHT, WIDTH), 7, np.uint8), orb.OrbSettings())) == 0
-    described, index = orb.describe_pixels(image, np.zeros((0, 2)), orb.OrbSettings())
-    assert len(described) == len(index) == 0

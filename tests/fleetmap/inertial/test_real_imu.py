@@ -7,6 +7,7 @@ from fleetmap.inertial import preintegrate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 from support.recordings.realdata import real_data
+from support.worlds.inertial_motion import predicted
 
 
 def test_two_seconds_of_flight_end_where_the_truth_does() -> None:
@@ -22,9 +23,9 @@ def test_two_seconds_of_flight_end_where_the_truth_does() -> None:
         first, last = truth[i], truth[j]
         summed = preintegrate(imu, int(stamps[i]), int(stamps[j]), first[11:14], first[14:17], ImuNoise())
         map_from_body = se3(rotation_from_quat_wxyz(first[4:8]), first[1:4])
-        predicted, velocity = summed.predict(map_from_body, first[8:11], first[11:14], first[14:17])
-        off_rad.append(np.linalg.norm(so3_log(rotation_from_quat_wxyz(last[4:8]).T @ predicted[:3, :3])))
-        off_m.append(predicted[:3, 3] - last[1:4])
+        there, velocity = predicted(summed, map_from_body, first[8:11], first[11:14], first[14:17])
+        off_rad.append(np.linalg.norm(so3_log(rotation_from_quat_wxyz(last[4:8]).T @ there[:3, :3])))
+        off_m.append(there[:3, 3] - last[1:4])
         off_mps.append(velocity - last[8:11])
         dts_s.append(summed.dt_s)
         gaps_s.append(summed.max_gap_s)

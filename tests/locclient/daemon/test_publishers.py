@@ -9,8 +9,9 @@ from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.messages import Cause, EstimateMessage, Status, decode_message
+from fleetmap.recordings.ros2.cdr import CdrReader
 from fleetmap.recordings.ros2.keys import ros_key
-from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior, decode_text
+from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior
 from locclient.daemon.publishers import OutputSection, open_publisher
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
@@ -59,7 +60,7 @@ def test_ros_topics_hold_the_same() -> None:
     np.testing.assert_allclose(first[0].parent_from_child @ first[1].parent_from_child, expected, atol=1e-12)
     assert [(link.parent, link.child) for link in second] == [("odom", "base_link")]
     states = told[ros_key(3, "/localization/status", "std_msgs/String")]
-    assert [decode_text(state) for state in states] == ["TRACKING", "LOST"]
+    assert [CdrReader(state).text() for state in states] == ["TRACKING", "LOST"]
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from fleetmap.inertial import GRAVITY_MAP, preintegrate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.bundle.bundle_adjustment import BundleProblem, InertialTerms
-from support.worlds.inertial_motion import analytic_motion, sample_motion
+from support.worlds.inertial_motion import analytic_motion, corrected, sample_motion
 
 CAMERA = StereoCamera(focal_px=400.0, cx_px=320.0, cy_px=240.0, baseline_m=0.12, width_px=640, height_px=480)
 BODY_FROM_CAM = se3(
@@ -151,7 +151,7 @@ def _inertial_residuals(inertial: InertialTerms, map_from_body: Array, motion_st
     gyro, accel = inertial.gyro_bias_radps + motion_step[:, 3:6], inertial.accel_bias_mps2 + motion_step[:, 6:]
     parts = []
     for i, j, summed in inertial.edges:
-        delta_rot, delta_vel, delta_pos = summed.corrected(gyro[i], accel[i])
+        delta_rot, delta_vel, delta_pos = corrected(summed, gyro[i], accel[i])
         dt, i_from_map = summed.dt_s, map_from_body[i][:3, :3].T
         residual = np.concatenate(
             [

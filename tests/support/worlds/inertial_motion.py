@@ -6,6 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.inertial import GRAVITY_MAP, Preintegrated
 from fleetmap.sensors.samples import ImuSamples
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -56,3 +57,24 @@ def sample_motion(
         gyro + (0 if gyro_bias is None else gyro_bias),
         accel + (0 if accel_bias is None else accel_bias),
     )
+
+
+def corrected(summed: Preintegrated, gyro_bias: Array, accel_bias: Array) -> tuple[Array, Array, Array]:
+    """Increments (3, 3), (3,), (3,) for other biases, to first order. Source: Forster et al. 2017, eq. 44."""
+    gyro, accel = gyro_bias - summed.gyro_bias_radps, accel_bias - summed.accel_bias_mps2
+    return (
+        summed.delta_rotation @ so3_exp(summed.d_rotation_d_gyro @ gyro),
+        summed.delta_velocity_mps + summed.d_velocity_d_gyro @ gyro + summed.d_velocity_d_accel @ accel,
+        summed.delta_position_m + summed.d_position_d_gyro @ gyro + summed.d_position_d_accel @ accel,
+    )
+
+
+def predicted(
+    summed: Preintegrated, map_from_body: Array, velocity_map_mps: Array, gyro_bias: Array, accel_bias: Array
+) -> tuple[Array, Array]:
+    """map_from_body (4, 4) and velocity (3,) at the end from those at the start, in a gravity-aligned frame."""
+    rotation, velocity, position = corrected(summed, gyro_bias, accel_bias)
+    map_from_start, dt = map_from_body[:3, :3], summed.dt_s
+    moved = map_from_body[:3, 3] + velocity_map_mps * dt + 0.5 * GRAVITY_MAP * dt**2 + map_from_start @ position
+    after = velocity_map_mps + GRAVITY_MAP * dt + map_from_start @ velocity
+    return se3(map_from_start @ rotation, moved), np.asarray(after)

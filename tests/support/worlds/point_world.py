@@ -8,7 +8,7 @@ from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transfo
 from fleetmap.odometry.filter.msckf import InvariantFilter
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.settings import FilterSettings
-from fleetmap.odometry.tracking.tracks import Track
+from fleetmap.odometry.tracking.tracks import TrackBatch
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
@@ -100,17 +100,21 @@ def observe(points_map: Array, time_s: float, rng: np.random.Generator | None) -
     return np.asarray(pixels)
 
 
-def tracks_of(seen: dict[int, Array], chosen: Array) -> list[Track]:
+def tracks_of(seen: dict[int, Array], chosen: Array) -> TrackBatch:
     """Tracks of the chosen points through frames (index -> pixels (N, 3)); those in view of two or more."""
-    tracks = []
+    clones, pixels, guesses = [], [], []
     for point in chosen.tolist():
-        frames = [k for k, pixels in seen.items() if np.isfinite(pixels[point, 0])]
+        frames = [k for k, pixels_there in seen.items() if np.isfinite(pixels_there[point, 0])]
         if len(frames) < 2:
             continue
-        pixels = np.array([seen[k][point] for k in frames])
-        guess = CAMERA.point_from_pixel(pixels[-1:, :2], pixels[-1:, 0] - pixels[-1:, 2])[0]
-        tracks.append(Track(np.array(frames, np.int64), pixels, frames[-1], guess))
-    return tracks
+        clones.append(np.array(frames, np.int64))
+        pixels.append(np.array([seen[k][point] for k in frames]))
+        last = pixels[-1][-1:]
+        guesses.append(CAMERA.point_from_pixel(last[:, :2], last[:, 0] - last[:, 2])[0])
+    starts = np.concatenate([[0], np.cumsum([len(frames) for frames in clones])]).astype(np.int64)
+    anchors = np.array([frames[-1] for frames in clones], np.int64)
+    columns = np.concatenate(clones), np.concatenate(pixels)
+    return TrackBatch(starts, *columns, anchors, np.array(guesses).reshape(-1, 3))
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,6 @@ class ZeroVelocityDetector:
             return None
         return old[-1][0], self._images[-2][0]
 
-    def forget(self) -> None:
-        self._images.clear()
-
 
 def is_image_still(
     old_ids: NDArray[np.int64], old_pixels: Array, ids: NDArray[np.int64], pixels: Array, limit_px: float

@@ -1,6 +1,5 @@
 """The right-invariant multi-state constraint filter: propagation, clones, update."""
 
-from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
@@ -13,7 +12,7 @@ from fleetmap.odometry.filter.measurements import CONSIDERED, LinearMeasurement
 from fleetmap.odometry.filter.msckf_kernels import Clones, NormalEquations, PixelModel, Tracks
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.settings import FilterSettings
-from fleetmap.odometry.tracking.tracks import Track, TrackBatch
+from fleetmap.odometry.tracking.tracks import TrackBatch
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
@@ -161,7 +160,7 @@ class InvariantFilter:
 
     def update(
         self,
-        tracks: TrackBatch | Sequence[Track],
+        tracks: TrackBatch,
         iterations: int = 1,
         newest_odom_from_body: Array | None = None,
         sigma_scale: float = 1.0,
@@ -172,14 +171,13 @@ class InvariantFilter:
         then where the newest clone is linearised first, when vision knows it better than the prediction. It adds no
         information. sigma_scale widens the measurement noise, for matches that are less exact than flow.
         """
-        batch = tracks if isinstance(tracks, TrackBatch) else TrackBatch.of(tracks)
-        used = np.zeros(len(batch), np.int8)
-        if not len(batch):
+        used = np.zeros(len(tracks), np.int8)
+        if not len(tracks):
             return used
         order = np.argsort(self.clone_ids)
         ids = np.array(self.clone_ids)[order]
-        clones, anchors = (order[np.searchsorted(ids, wanted)] for wanted in (batch.clone_ids, batch.anchors))
-        rows = Tracks(batch.starts, clones, batch.pixels, anchors, batch.points_cam)
+        clones, anchors = (order[np.searchsorted(ids, wanted)] for wanted in (tracks.clone_ids, tracks.anchors))
+        rows = Tracks(tracks.starts, clones, tracks.pixels, anchors, tracks.points_cam)
         model = PixelModel(self._camera, self._weights / sigma_scale, self._noise, self._quantile)
         prior = self._kept()
         size = 6 * len(self.clone_ids)

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fleetmap.geometry import Array, rotation_between_vectors, skew, so3_exp, so3_log
+from fleetmap.geometry import Array, rotation_between_vectors, se3, skew, so3_exp, so3_log
 from fleetmap.inertial import GRAVITY_MPS2, Preintegrated, preintegrate
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.init.initial_state import InitialState
@@ -93,9 +93,7 @@ def initial_state(vision: Trajectory, alignment: Alignment) -> InitialState:
     """The filter's first state and covariance at the last view, in the old frame turned so that gravity points down."""
     down = np.array([0.0, 0.0, -1.0])
     turn = rotation_between_vectors(alignment.direction, down)
-    odom_from_old = np.eye(4)
-    odom_from_old[:3, :3] = turn
-    last = odom_from_old @ vision.frame_from_body[-1]
+    last = se3(turn, np.zeros(3)) @ vision.frame_from_body[-1]
     state = NavState(
         last[:3, :3].copy(),
         turn @ alignment.solution[-3:],
@@ -118,7 +116,7 @@ def initial_state(vision: Trajectory, alignment: Alignment) -> InitialState:
     to_error[6:9] = skew(state.position_m) @ to_error[0:3]
     covariance = 4.0 * to_error @ solved @ to_error.T
     floor = np.diag([1e-6] * 3 + [1e-4] * 3 + [1e-6] * 3 + [4e-6] * 3 + [1e-4] * 3)
-    return InitialState(state, covariance + floor, int(vision.stamps_ns[-1]), odom_from_old)
+    return InitialState(state, covariance + floor, int(vision.stamps_ns[-1]))
 
 
 def _gyro_bias_step(motion: VisualMotion, imu: ImuSamples, noise: ImuNoise, gyro_bias: Array) -> Array:

@@ -8,12 +8,8 @@ from fleetmap.odometry.filter.nav_state import NavState
 
 @dataclass(frozen=True, slots=True)
 class InitialState:
-    """A first state with covariance (15, 15) in the filter's error, valid at stamp_ns.
-
-    odom_from_old (4, 4) turns earlier transforms.
-    """
+    """A first state with covariance (15, 15) in the filter's error, valid at stamp_ns."""
 
     state: NavState
     covariance: Array
     stamp_ns: int
-    odom_from_old: Array

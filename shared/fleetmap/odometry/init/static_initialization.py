@@ -78,4 +78,4 @@ def _steady_state(window: ImuSamples, stamp_ns: int, settings: FilterSettings) -
     covariance[0:3, 0:3] = accel * by_bias @ by_bias.T + np.diag([tilt, tilt, 1e-8])
     covariance[0:3, 12:15] = accel * by_bias
     covariance[12:15, 0:3] = covariance[0:3, 12:15].T
-    return InitialState(state, covariance, stamp_ns, np.eye(4))
+    return InitialState(state, covariance, stamp_ns)

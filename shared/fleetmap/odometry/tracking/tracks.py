@@ -1,6 +1,5 @@
 """Observations of points from frame to frame, kept as one table until the filter uses them."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,24 +14,11 @@ Ids = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
-    """Observations of one point: which clones (n,), pixels (n, 3) u_left v u_right.
-
-    A first guess of the point as clone `anchor` sees it is in camera axes (3,), so that it follows the clone when an
-    iterated update moves it.
-    """
-
-    clone_ids: Ids
-    pixels: Array
-    anchor: int
-    point_cam: Array
-
-
-@dataclass(frozen=True, slots=True)
 class TrackBatch:
-    """T tracks: starts (T + 1,) delimits each one's rows of clone_ids (n,) and pixels (n, 3).
+    """T tracks: starts (T + 1,) delimits each one's rows of clone_ids (n,), which clones saw it, and pixels (n, 3) u_left v u_right.
 
-    anchors (T,) and points_cam (T, 3) are as in Track.
+    A first guess of each point as clone `anchors` (T,) sees it is points_cam (T, 3) in camera axes, so that it follows the clone when an
+    iterated update moves it.
     """
 
     starts: Ids
@@ -43,17 +29,6 @@ class TrackBatch:
 
     def __len__(self) -> int:
         return len(self.anchors)
-
-    @classmethod
-    def of(cls, tracks: Sequence[Track]) -> "TrackBatch":
-        sizes = [len(track.clone_ids) for track in tracks]
-        return cls(
-            np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
-            np.concatenate([np.zeros(0, np.int64), *(track.clone_ids for track in tracks)]),
-            np.concatenate([np.zeros((0, 3)), *(track.pixels for track in tracks)]),
-            np.array([track.anchor for track in tracks], np.int64),
-            np.array([track.point_cam for track in tracks]).reshape(-1, 3),
-        )
 
 
 class Observations:

@@ -32,7 +32,7 @@ def take(
 
     ids (M,), frames (M,), pixels (M, 3) u_left v u_right; order (M,): rows by id, earlier ones first; alive (A,) ascending,
     due (A,). camera: focal, cx, cy, focal * baseline. Filled: stays (M,), all False before, of what is used later; rows (M,)
-    in the order of the tracks, starts (T + 1,) delimiting each one's, anchors (T,) and points_cam (T, 3) as in `tracks.Track`:
+    in the order of the tracks, starts (T + 1,) delimiting each one's, anchors (T,) and points_cam (T, 3) as in `tracks.TrackBatch`:
     the stereo point of the nearest view; as far as a disparity of far_px along the last ray where no view has a disparity.
     """
     tracks, taken, lives = 0, 0, 0

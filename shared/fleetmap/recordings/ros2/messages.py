@@ -222,11 +222,6 @@ def encode_text(text: str) -> bytes:
     return CdrWriter().text(text).message()
 
 
-def decode_text(data: bytes) -> str:
-    """std_msgs/String."""
-    return CdrReader(data).text()
-
-
 def _target_from_source(position_quat_xyzw: Array) -> Array:
     norm = float(np.linalg.norm(position_quat_xyzw[3:]))
     if not np.isfinite(position_quat_xyzw).all() or abs(norm - 1) > 0.01:

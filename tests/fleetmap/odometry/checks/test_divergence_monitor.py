@@ -45,5 +45,3 @@ def test_pictures_stand_still_only_after_a_whole_window_of_it() -> None:
     assert found[5] == (200_000_000, 400_000_000)
     assert pictures.since(600_000_000, ids, pixels + 4.0) is None
     assert pictures.since(700_000_000, ids[:9], pixels[:9]) is None, "nine points are too few to tell"
-    pictures.forget()
-    assert pictures.since(800_000_000, ids, pixels) is None
