@@ -1,8 +1,7 @@
 """Odometry of stereo and single cameras, with and without IMU: run live by the robot and as initial trajectory by the survey."""
 
-from fleetmap.odometry.continuous_frame import ContinuousFrame
-from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
-from fleetmap.odometry.mono.monocular import MonocularOdometry, make_odometry
+from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate, OdometryStatus
+from fleetmap.odometry.mono.mono_modes import MonocularOdometry, make_odometry
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.settings import OdometrySettings
 

@@ -1,4 +1,4 @@
-"""The state that odometry estimates."""
+"""The state that odometry estimates, and what it begins with."""
 
 from dataclasses import dataclass, field
 
@@ -30,3 +30,12 @@ class NavState:
         self.position_m = turn @ self.position_m + error[6:9]
         self.gyro_bias_radps = self.gyro_bias_radps + error[9:12]
         self.accel_bias_mps2 = self.accel_bias_mps2 + error[12:15]
+
+
+@dataclass(frozen=True, slots=True)
+class InitialState:
+    """A first state with covariance (15, 15) in the filter's error, valid at stamp_ns."""
+
+    state: NavState
+    covariance: Array
+    stamp_ns: int

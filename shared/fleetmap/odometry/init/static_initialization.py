@@ -6,9 +6,8 @@ import numpy as np
 
 from fleetmap.geometry import Array, rotation_between_vectors
 from fleetmap.inertial import GRAVITY_MPS2
-from fleetmap.odometry.filter.nav_state import NavState
+from fleetmap.odometry.filter.nav_state import InitialState, NavState
 from fleetmap.odometry.init import static_initialization_kernels
-from fleetmap.odometry.init.initial_state import InitialState
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings, StartSettings
 from fleetmap.sensors.samples import ImuSamples
 

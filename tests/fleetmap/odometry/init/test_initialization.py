@@ -6,8 +6,8 @@ import pytest
 from fleetmap.geometry import Array, se3_exp, se3_inverse, so3_exp
 from fleetmap.odometry.filter.measurements import LinearMeasurement
 from fleetmap.odometry.filter.msckf import InvariantFilter
-from fleetmap.odometry.init.dynamic_initialization import dynamic_initialization
-from fleetmap.odometry.init.initial_state import InitialState
+from fleetmap.odometry.filter.nav_state import InitialState
+from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.init.static_initialization import static_initialization
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.sensors.samples import ImuSamples, Trajectory

@@ -16,8 +16,8 @@ from fleetmap.odometry import (
     make_odometry,
 )
 from fleetmap.odometry.checks.divergence_monitor import DivergenceMonitor
-from fleetmap.odometry.init.initial_state import InitialState
-from fleetmap.odometry.init.mono_inertial_init import mono_inertial_initialization
+from fleetmap.odometry.filter.nav_state import InitialState
+from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization
 from fleetmap.odometry.mono import mono_modes
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
