@@ -129,7 +129,7 @@ def reprocess(
     if out.exists() or out.suffix != ".mcap":
         raise UsageError(f"{out} {'exists already' if out.exists() else 'should end in .mcap'}; choose another name")
     from fleetmap.recordings import open_recording
-    from fleetsim.imaging.reprocess import reprocess
+    from fleetsim.imaging.pipelines import reprocess
 
     with open_recording(recording) as opened:
         reprocess(opened, out, camera_pipeline, seed)

@@ -9,7 +9,7 @@ import pytest
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import RECORDING_FORMATS, Recording, open_recording
-from fleetmap.recordings.export_mcap import copy_to_mcap
+from fleetmap.recordings.mcap.writer import copy_to_mcap
 from support.recordings.recording_samples import (
     make_sample,
     world_from_cam0,

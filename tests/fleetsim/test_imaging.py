@@ -10,9 +10,8 @@ from fleetmap.errors import UsageError
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.samples import CameraFrame
 from fleetsim.cli import app
-from fleetsim.imaging import stages
-from fleetsim.imaging.pipelines import IMAGE_PIPELINES, ImagePipeline, process_frame
-from fleetsim.imaging.reprocess import processed
+from fleetsim.imaging import pipelines as stages
+from fleetsim.imaging.pipelines import IMAGE_PIPELINES, ImagePipeline, process_frame, processed
 
 RNG = np.random.default_rng(0)
 REAL_PIPELINES = [name for name in IMAGE_PIPELINES if name != "clean"]

@@ -9,9 +9,8 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from fleetmap.errors import UsageError
-from fleetsim.motion.body_motion import CarriedMotion, RouteMotion, Shake
+from fleetsim.motion.body_motion import CarriedMotion, RouteMotion, Shake, UniformSpline
 from fleetsim.motion.routes import Limits, Route, check_clear, time_path
-from fleetsim.motion.splines import UniformSpline
 from fleetsim.recorder import drive
 from fleetsim.scenarios import SCENARIOS
 from fleetsim.scene.layout import Layout

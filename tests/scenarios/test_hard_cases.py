@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, open_recording
-from fleetmap.recordings.export_mcap import copy_to_mcap
+from fleetmap.recordings.mcap.writer import copy_to_mcap
 from mapserver.cli import app
 from support.recordings.calibration_faults import IMAGE_FAULTS, pair_turn
 from support.recordings.recording_samples import write_euroc

@@ -1,18 +1,140 @@
 """Pose hypotheses from the first fix until one is confirmed. Pure."""
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, se3_inverse
 from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.relocalization.relocalizer import Fix
-from locclient.localization import hypothesis_scoring as scoring
-from locclient.localization.alias_disambiguation import ViewpointGate
+from locclient.localization.alias_disambiguation import ViewpointGate, log_odds, mark_shared
 from locclient.localization.pose_covariance import boxminus
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
+
+_PAIRS_AT_ONCE = 4  # comparisons in a time slice of a query
+
+
+def begin_query(hypotheses: Sequence[PoseHypothesis], settings: TrackSettings, *, is_new_viewpoint: bool) -> None:
+    """Begins a map query: so far no fix supports any of them."""
+    for hypothesis in hypotheses:
+        hypothesis.misses += 1
+        hypothesis.decay(settings.evidence_kept_share)
+        if is_new_viewpoint:
+            hypothesis.history.begin_view()
+
+
+def vote(
+    hypotheses: list[PoseHypothesis],
+    fix: Fix,
+    fresh: PoseHypothesis,
+    odom_from_body: Array | None,
+    settings: TrackSettings,
+) -> None:
+    """A fix votes for the hypothesis at its pose, which takes that over, or founds one. fresh: the fix's pose at present.
+
+    odom_from_body: at present, None where the viewpoint is not new and its landmarks are not counted.
+    """
+    for hypothesis in hypotheses:
+        if _is_same_pose(fresh, hypothesis, settings):
+            if hypothesis.misses:  # at most one vote a query
+                hypothesis.support, hypothesis.misses = hypothesis.support + 1, 0
+                _count(hypothesis, fix, fresh, odom_from_body, settings)
+            hypothesis.take_pose(fresh)
+            return
+    fresh.decay(0.0)
+    _count(fresh, fix, fresh, odom_from_body, settings)
+    hypotheses.append(fresh)
+
+
+def recent(hypotheses: Sequence[PoseHypothesis], settings: TrackSettings) -> list[PoseHypothesis]:
+    """Those that some recent query supported."""
+    return [h for h in hypotheses if h.misses < settings.max_misses]
+
+
+def ranked(hypotheses: Sequence[PoseHypothesis]) -> list[PoseHypothesis]:
+    """The one with most inliers first."""
+    return sorted(hypotheses, key=lambda h: -h.inlier_sum)
+
+
+def competitors(
+    hypotheses: Sequence[PoseHypothesis], settings: TrackSettings, best: PoseHypothesis | None = None
+) -> list[PoseHypothesis]:
+    """Hypotheses besides the best with nearly its support per query since they were founded: by inliers, or by landmark recall, since
+    a place where the map is thin is no less likely than its alias."""
+    if not hypotheses:
+        return []
+    best = best or ranked(hypotheses)[0]
+    inliers, recall = best.mean_inliers, best.mean_recall
+
+    def competes(other: PoseHypothesis) -> bool:
+        if other.mean_inliers >= settings.rival_share * inliers:
+            return True
+        has_recall = other.mean_recall >= settings.rival_hit_share * recall
+        return has_recall and other.mean_inliers >= settings.rival_least_share * inliers
+
+    return [h for h in hypotheses if h is not best and competes(h)]
+
+
+def disambiguated(hypotheses: Sequence[PoseHypothesis], settings: TrackSettings) -> TimeSliced[PoseHypothesis | None]:
+    """The hypothesis whose log odds against every competitor reach the threshold; None while there is none. In time slices.
+
+    It need not rank first: a sign is little beside all that aliases share. Only where the whole site is mapped: of the aliases of a
+    place that the map does not hold, one is always the least unlike it. The test is repeated with every query, as in a sequential
+    test (Wald 1945); it never rejects.
+    """
+    if not settings.is_whole_site_mapped or not competitors(hypotheses, settings):
+        return None
+    order = ranked(hypotheses)
+    shared = [np.zeros(len(h.history.ids), bool) for h in order]
+    for number, (i, j) in enumerate(combinations(range(len(order)), 2)):
+        if number and number % _PAIRS_AT_ONCE == 0:
+            yield
+        mark_shared(order[i].history, order[j].history, shared[i], shared[j])
+    known = {id(h): (h.history, flags) for h, flags in zip(order, shared, strict=True)}
+
+    def lead(one: PoseHypothesis, other: PoseHypothesis) -> float:
+        (history, flags), (other_history, other_flags) = known[id(one)], known[id(other)]
+        return log_odds(history, other_history, flags, other_flags)
+
+    yield
+    best = max(order[1:], key=lambda other: lead(other, order[0]))
+    if lead(best, order[0]) < settings.telling_evidence:
+        best = order[0]
+    for number, other in enumerate(competitors(hypotheses, settings, best)):
+        if number and number % _PAIRS_AT_ONCE == 0:
+            yield
+        if lead(best, other) < settings.telling_evidence:
+            return None
+    return best
+
+
+def is_supported(hypothesis: PoseHypothesis, settings: TrackSettings) -> bool:
+    """Whether enough fixes agreed over enough distance."""
+    return hypothesis.support >= settings.confirming_fixes and hypothesis.travelled_m >= settings.confirming_distance_m
+
+
+def is_unambiguous(fix: Fix, settings: TrackSettings) -> bool:
+    """Whether a fix, the only one of its query, agrees so well that no other place of this map can be meant."""
+    return fix.inlier_share >= settings.strong_share and fix.alias_ratio < settings.strong_twin_share
+
+
+def _count(
+    hypothesis: PoseHypothesis, fix: Fix, fresh: PoseHypothesis, odom_from_body: Array | None, settings: TrackSettings
+) -> None:
+    hypothesis.add_fix(fix.inliers, fix.landmark_recall)
+    if settings.is_whole_site_mapped and fix.covisible is not None and odom_from_body is not None:
+        hypothesis.history.add(odom_from_body @ se3_inverse(fresh.now_map_from_body), fix.covisible)
+
+
+def _is_same_pose(fresh: PoseHypothesis, hypothesis: PoseHypothesis, settings: TrackSettings) -> bool:
+    error, covariance = boxminus(fresh.now_map_from_body, hypothesis.now_map_from_body), hypothesis.now_cov
+    far_m = settings.hypothesis_distance_m + 3 * np.sqrt(np.trace(covariance[3:, 3:]))
+    far_rad = np.radians(settings.hypothesis_angle_deg) + 3 * np.sqrt(np.trace(covariance[:3, :3]))
+    return bool(np.linalg.norm(error[3:]) < far_m and np.linalg.norm(error[:3]) < far_rad)
+
 
 # The fixes of one query, and each one's pose, propagated to the present.
 Observations = Sequence[tuple[Fix, PoseHypothesis]]
@@ -47,21 +169,21 @@ class HypothesisSet:
     def observe(self, observations: Observations, hypotheses: list[PoseHypothesis], odom_from_body: Array) -> None:
         """One query: every fix votes for one of `hypotheses`, or founds one."""
         is_new = self._viewpoint_gate.is_new(odom_from_body)
-        scoring.begin_query(hypotheses, self._settings, is_new_viewpoint=is_new)
+        begin_query(hypotheses, self._settings, is_new_viewpoint=is_new)
         for fix, fresh in observations:
-            scoring.vote(hypotheses, fix, fresh, odom_from_body if is_new else None, self._settings)
+            vote(hypotheses, fix, fresh, odom_from_body if is_new else None, self._settings)
 
     def update(self, observations: Observations, odom_from_body: Array) -> TimeSliced[None]:
         """Votes, pruning and disambiguation by one query; in time slices."""
         self.observe(observations, self.hypotheses, odom_from_body)
-        self.hypotheses = scoring.recent(self.hypotheses, self._settings)
-        self._disambiguated = yield from scoring.disambiguated(self.hypotheses, self._settings)
+        self.hypotheses = recent(self.hypotheses, self._settings)
+        self._disambiguated = yield from disambiguated(self.hypotheses, self._settings)
 
     def ranking(self) -> tuple[list[PoseHypothesis], list[PoseHypothesis]]:
         """The hypotheses, the most likely first, and the competitors of that one."""
-        order, best = scoring.ranked(self.hypotheses), self._disambiguated
+        order, best = ranked(self.hypotheses), self._disambiguated
         if not any(h is best for h in order):  # it may have been pruned in a query that goes on
-            return order, scoring.competitors(self.hypotheses, self._settings)
+            return order, competitors(self.hypotheses, self._settings)
         return sorted(order, key=lambda h: h is not best), []
 
     def may_be_lookalike(self, hypothesis: PoseHypothesis) -> bool:
@@ -71,12 +193,12 @@ class HypothesisSet:
     def is_confirmed(self, hypothesis: PoseHypothesis, fixes: Sequence[Fix]) -> bool:
         """By enough fixes over enough distance, or as the only hypothesis by an unambiguous fix: a strong one, or one of enough that
         agree where the map's look-alikes were measured well enough, so that no distance needs to exclude them."""
-        if len(self.hypotheses) == len(fixes) == 1 and scoring.is_unambiguous(fixes[0], self._settings):
+        if len(self.hypotheses) == len(fixes) == 1 and is_unambiguous(fixes[0], self._settings):
             has_enough = hypothesis.support >= self._settings.confirming_fixes
             is_measured = self.lookalikes is not None and self.lookalikes.max_wrong_share <= _MAX_WRONG_SHARE
             if fixes[0].inliers >= self._settings.strong_inliers or (has_enough and is_measured):
                 return True
-        return scoring.is_supported(hypothesis, self._settings)
+        return is_supported(hypothesis, self._settings)
 
     def moved_m(self, hypothesis: PoseHypothesis) -> float | None:
         """The distance of a hypothesis from the abandoned pose; None where their covariances admit it (Mahalanobis test)."""

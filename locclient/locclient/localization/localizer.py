@@ -24,8 +24,7 @@ from locclient.localization.calibration.pair_order import REVERSED_TEXT
 from locclient.localization.calibration.watch import Mounting
 from locclient.localization.estimate import Estimate
 from locclient.localization.estimate_assembly import LocalizationState, assemble
-from locclient.localization.hypothesis_scoring import recent
-from locclient.localization.hypothesis_set import HypothesisSet, Observations
+from locclient.localization.hypothesis_set import HypothesisSet, Observations, recent
 from locclient.localization.image_quality import ImageQualityMonitor
 from locclient.localization.initial_pose_prior import InitialPosePrior
 from locclient.localization.pose_covariance import boxminus, boxplus, transport_cov

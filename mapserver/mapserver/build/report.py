@@ -13,7 +13,7 @@ from fleetmap.sensors.samples import Trajectory
 from mapserver.evaluation.trajectory_error import AteResult, absolute_trajectory_error, paired
 from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence, Starts, TileDirections
-from mapserver.quality.starts import lookalike_words
+from mapserver.quality.probes import lookalike_words
 from mapserver.survey.loops.loops import LoopRecord, LoopVerdict
 from mapserver.survey.merge.multi_session import Joined
 from mapserver.survey.survey_map import SurveyMap

@@ -27,7 +27,7 @@ def convert(
     from rich.progress import Progress
 
     from fleetmap.recordings import OpenOptions, open_recording
-    from fleetmap.recordings.export_mcap import copy_to_mcap
+    from fleetmap.recordings.mcap.writer import copy_to_mcap
 
     console = Console(stderr=True)
     with open_recording(recording, OpenOptions(calibration_file=calibration)) as source:

@@ -7,8 +7,7 @@ from typing import Annotated
 import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options
-from mapserver.commands.options import Json
-from mapserver.commands.print_json import print_json
+from mapserver.commands.options import Json, print_json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +37,7 @@ def evaluate(
     from rich.console import Console
     from rich.table import Table
 
-    from fleetmap.recordings.covariances import read_covariances
-    from fleetmap.recordings.tum import read_tum
+    from fleetmap.recordings.tum import read_covariances, read_tum
     from mapserver.evaluation.summary_table import summary
 
     covariances = None if options.covariances is None else read_covariances(options.covariances)

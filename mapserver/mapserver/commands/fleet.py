@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetmap.cli_options import ConfigFile, Group, settings_of
-from mapserver.commands.options import Json, SiteName, StoreFolder
-from mapserver.commands.print_json import print_json
+from mapserver.commands.options import Json, SiteName, StoreFolder, print_json
 
 if TYPE_CHECKING:
     from mapserver.fleet.resurvey_list import ResurveyList

@@ -11,6 +11,7 @@ from fleetmap.errors import UsageError
 if TYPE_CHECKING:
     from mapserver.store import Actor
 
+
 SiteName = Annotated[str, typer.Option(help="Name of the site.")]
 StoreFolder = Annotated[Path, typer.Option(help="Folder of the map store.")]
 NewStoreFolder = Annotated[Path, typer.Option(help="Folder of the map store; created if it does not exist.")]
@@ -77,3 +78,10 @@ def check_output(option: str, path: Path | None) -> None:
     """Raises UsageError unless `path` can be a file."""
     if path is not None and (path.is_dir() or not path.parent.is_dir()):
         raise UsageError(f"{option} {path}: name a file in a folder that exists")
+
+
+def print_json(value: object) -> None:
+    """Writes a value to stdout, indented; dataclasses become objects."""
+    import msgspec
+
+    typer.echo(msgspec.json.format(msgspec.json.encode(value), indent=2).decode())

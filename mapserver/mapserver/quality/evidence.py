@@ -12,8 +12,7 @@ from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import Stamps
 from mapserver.quality.figures import Aliasing, Compared, Evidence, ProbeFigures, TrajectoryBreaks
-from mapserver.quality.probes import ELSEWHERE_M, Probe, most_similar_beyond, relocalized
-from mapserver.quality.starts import starts_without_prior
+from mapserver.quality.probes import ELSEWHERE_M, Probe, most_similar_beyond, relocalized, starts_without_prior
 
 _STRETCH_M, _APART_M = 3.0, 1.0
 _BREAK_M, _BREAK_SHARE = 0.15, 0.05

@@ -13,8 +13,7 @@ from fleetmap.recordings.calibration_files import format_calibration, read_calib
 from fleetmap.recordings.folders import euroc, kitti, seven_scenes, tumvi
 from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap import reader
-from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording, Topics
-from fleetmap.recordings.selection import FrameSelection
+from fleetmap.recordings.recording import FrameSelection, FrameSource, OpenOptions, Recording, Topics
 
 __all__ = [
     "RECORDING_FORMATS",

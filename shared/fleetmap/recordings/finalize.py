@@ -6,12 +6,84 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.geometry import Array
 from fleetmap.recordings.calibration_files import CalibrationFile, load_calibration
-from fleetmap.recordings.imu_units import check_imu_units
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, SensorSet, Stamps, Trajectory, WheelSample
+
+_MIN_SAMPLES = 50
+_ACCEL_IN_G = (0.8, 1.25)
+_FASTEST_GYRO_RADPS = 35.0  # 2000 deg/s, the full scale of the usual sensors
+_WINDOW_S, _SMOOTH_S = 0.5, 0.1
+
+
+def check_imu_units(imu: ImuSamples, where: str) -> None:
+    """Raises RecordingError for an accelerometer in g and for a gyro in degrees per second.
+
+    The accelerometer at rest or in any gentle motion measures about 9.81. The gyro is judged by what the accelerometer
+    sees of its rotation: over half a second the direction of the specific force, turned by the integrated rate, must
+    come out where it is found (in slow motion to a few degrees). It is in degrees where that fails badly and a rate 57
+    times smaller explains it.
+    """
+    if len(imu) < _MIN_SAMPLES:
+        return
+    accel = float(np.median(np.linalg.norm(imu.accel_mps2, axis=1)))
+    if _ACCEL_IN_G[0] <= accel <= _ACCEL_IN_G[1]:
+        raise RecordingError(
+            f"{where}: the accelerometer seems to be in g (median {accel:.2f}, gravity is 9.81 m/s^2); "
+            "multiply it by 9.80665"
+        )
+    rate = float(np.percentile(np.linalg.norm(imu.gyro_radps, axis=1), 99))
+    if rate > _FASTEST_GYRO_RADPS or _accelerometer_prefers_degrees(imu):
+        raise RecordingError(
+            f"{where}: the gyro seems to be in degrees per second (99 % of the rates are below {rate:.1f} where rad/s "
+            "are expected, and the accelerometer does not see such turns); multiply it by pi/180"
+        )
+
+
+def gravity_direction_errors_rad(imu: ImuSamples, gyro_scale: float) -> Array:
+    """(K,) angle between the specific force that the gyro times `gyro_scale` predicts and the measured one.
+
+    Over windows of half a second, and only where both ends measure within 1 m/s^2 of gravity: elsewhere the direction
+    is that of an acceleration.
+    """
+    period_s = float(np.median(np.diff(imu.stamps_ns))) * 1e-9
+    smooth = max(1, round(_SMOOTH_S / period_s))
+    window = max(2, round(_WINDOW_S / period_s))
+    kernel = np.ones(smooth) / smooth
+    accel = np.stack([np.convolve(column, kernel, "same") for column in imu.accel_mps2.T], axis=1)
+    usable = np.abs(np.linalg.norm(accel, axis=1) - 9.81) < 1.0
+    starts = np.arange(smooth, len(imu) - window - smooth, window)
+    starts = starts[usable[starts] & usable[starts + window]]
+    starts = starts[imu.stamps_ns[starts + window] - imu.stamps_ns[starts] < 1.5e9 * _WINDOW_S]
+    predicted = accel[starts]
+    for step in range(window):
+        steps_s = (imu.stamps_ns[starts + step + 1] - imu.stamps_ns[starts + step]) * 1e-9
+        predicted = _turned(predicted, -gyro_scale * steps_s[:, None] * imu.gyro_radps[starts + step])
+    return _angles_rad(predicted, accel[starts + window])
+
+
+def _accelerometer_prefers_degrees(imu: ImuSamples) -> bool:
+    as_radians = gravity_direction_errors_rad(imu, 1.0)
+    if len(as_radians) < 4 or np.median(as_radians) < np.radians(10):
+        return False
+    as_degrees = gravity_direction_errors_rad(imu, np.pi / 180)
+    return bool(np.median(as_radians) > 4 * np.median(as_degrees))
+
+
+def _turned(vectors: Array, rotvecs_rad: Array) -> Array:
+    """Vectors (K, 3), each turned by its rotation vector (K, 3). Source: Rodrigues' formula."""
+    angles = np.linalg.norm(rotvecs_rad, axis=1, keepdims=True)
+    axes = rotvecs_rad / np.maximum(angles, 1e-300)
+    along = axes * (axes * vectors).sum(axis=1, keepdims=True)
+    return np.asarray(along + np.cos(angles) * (vectors - along) + np.sin(angles) * np.cross(axes, vectors))
+
+
+def _angles_rad(first: Array, second: Array) -> Array:
+    norms = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+    return np.asarray(np.arccos(np.clip((first * second).sum(axis=1) / norms, -1, 1)))
 
 
 @dataclass(frozen=True)

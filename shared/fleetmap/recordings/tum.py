@@ -4,6 +4,7 @@ Stamps are written with nine decimals and read as decimals, never through a floa
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +13,7 @@ import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
-from fleetmap.sensors.samples import Trajectory
+from fleetmap.sensors.samples import Stamps, Trajectory
 
 _NS = 1_000_000_000
 _MOST_S = 9_223_372_036  # what 64 bits of nanoseconds hold
@@ -109,3 +110,38 @@ def parse_stamp_ns(field: str) -> int:
     if not seconds.is_finite() or abs(seconds) > _MOST_S:
         raise ValueError(f"stamp {field!r} is not within {_MOST_S} seconds")
     return int(seconds * _NS)
+
+
+_ROWS, _COLUMNS = np.triu_indices(6)
+
+
+@dataclass(frozen=True, slots=True)
+class StampedCovariances:
+    """stamps_ns (N,) rising, covs_rot_trans (N, 6, 6)."""
+
+    stamps_ns: Stamps
+    covs_rot_trans: Array
+
+
+def parse_covariances(text: str, what: str = "covariances") -> StampedCovariances:
+    """The covariances in the text of such a file.
+
+    Raises RecordingError, naming `what` and the line, for anything but 22 finite numbers of a positive definite matrix, or
+    stamps that do not rise.
+    """
+    stamps, covariances = [], []
+    for line in stamped_lines(text, what):
+        if len(line.values) != len(_ROWS) or not np.isfinite(line.values).all():
+            raise RecordingError(f"{line.where}: {len(line.values)} numbers after the stamp, 21 finite ones are needed")
+        covariance = np.zeros((6, 6))
+        covariance[_ROWS, _COLUMNS] = covariance[_COLUMNS, _ROWS] = line.values
+        if np.linalg.eigvalsh(covariance)[0] <= 0:
+            raise RecordingError(f"{line.where}: the covariance is not positive definite; is its order rotation first?")
+        stamps.append(line.stamp_ns)
+        covariances.append(covariance)
+    return StampedCovariances(np.array(stamps, np.int64), np.array(covariances).reshape(-1, 6, 6))
+
+
+def read_covariances(path: Path) -> StampedCovariances:
+    """The covariances in the file at `path`; RecordingError as `parse_covariances`, and where it cannot be read."""
+    return parse_covariances(read_text(path, "covariances as CSV are expected"), str(path))

@@ -1,12 +1,108 @@
 """Registry of image pipelines: named combinations of the stages, in the order in which light passes them."""
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.errors import UsageError
+from fleetmap.recordings import FrameSource, Recording, StoredFrame
+from fleetmap.recordings.images import png_image
+from fleetmap.recordings.mcap.writer import copy_to_mcap
 from fleetmap.sensors.samples import CameraFrame, Image
-from fleetsim.imaging import stages
+
+Grey = NDArray[np.float32]
+_WHITE = 255.0
+# Electrons behind a grey value at gain 1, and read noise before and after the amplifier, as of the renderer's own sensor.
+_ELECTRONS_PER_GREY, _READ_ELECTRONS, _AFTER_GAIN_GREY = 39.0, 5.0, 0.5
+# Exponents of the tone curves that tint the grey scene: warm lights, cold shadows, so that edges are coloured as well.
+_TINT_EXPONENTS = {"red": 0.9, "green": 1.0, "blue": 1.15}
+# What a sensor's dyes pass of white light; the white balance divides by it, and noise grows with the division.
+_DYE_SHARE = {"red": 0.6, "green": 1.0, "blue": 0.5}
+_LUMA = {"red": 0.299, "green": 0.587, "blue": 0.114}
+
+
+def lens_blur(picture: Grey, sigma_px: float) -> Grey:
+    """A Gaussian point spread of standard deviation sigma_px."""
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT_101), np.float32)
+
+
+def vignette(picture: Grey, corner_loss: float) -> Grey:
+    """Light falls with the square of the distance from the middle; the corners lose the share corner_loss."""
+    height, width = picture.shape
+    y, x = np.mgrid[0:height, 0:width].astype(np.float32)
+    squared = ((x - 0.5 * (width - 1)) ** 2 + (y - 0.5 * (height - 1)) ** 2) / (0.25 * (width**2 + height**2))
+    return np.asarray(picture * (np.float32(1.0) - np.float32(corner_loss) * squared), np.float32)
+
+
+def rolling_exposure(picture: Grey, amplitude: float, periods: float, phase_rad: float) -> Grey:
+    """Rows are exposed one after the other under lamps that flicker: `periods` of them from the first row to the last."""
+    rows = np.linspace(0.0, 2 * np.pi * periods, picture.shape[0], dtype=np.float32)[:, None]
+    factor = np.float32(1.0) + np.float32(amplitude) * np.sin(rows + np.float32(phase_rad))
+    return np.asarray(picture * factor, np.float32)
+
+
+def sensor_noise(picture: Grey, gain: float, rng: np.random.Generator) -> Grey:
+    """Shot and read noise, Gaussian and independent from pixel to pixel.
+
+    Source: European Machine Vision Association, EMVA Standard 1288, the linear camera model.
+    """
+    shot = gain / _ELECTRONS_PER_GREY
+    read = np.hypot(_AFTER_GAIN_GREY, gain * _READ_ELECTRONS / _ELECTRONS_PER_GREY)
+    sigma = np.sqrt(np.maximum(picture, 0.0) * np.float32(shot) + np.float32(read * read))
+    return np.asarray(picture + sigma * rng.standard_normal(picture.shape, np.float32), np.float32)
+
+
+def bayer(picture: Grey, gain: float, rng: np.random.Generator) -> Grey:
+    """One colour per photosite (RGGB), noise, white balance, bilinear demosaicing, and grey of the three colours.
+
+    The scene is grey; each colour sees it through a tone curve of its own, so that edges differ between colours.
+    """
+    share = np.clip(picture / np.float32(_WHITE), 0.0, 1.0)
+    mosaic = np.empty_like(picture)
+    for (row, column), colour in {(0, 0): "red", (0, 1): "green", (1, 0): "green", (1, 1): "blue"}.items():
+        site = share[row::2, column::2] ** np.float32(_TINT_EXPONENTS[colour]) * np.float32(_WHITE)
+        dye = np.float32(_DYE_SHARE[colour])
+        mosaic[row::2, column::2] = sensor_noise(site * dye, gain, rng) / dye
+    # 16 bits with an offset hold noise below black, and what white balance lifts above white.
+    raw = np.rint(np.clip(mosaic * np.float32(64.0) + np.float32(8192.0), 0.0, 65535.0)).astype(np.uint16)
+    colours = cv2.demosaicing(raw, cv2.COLOR_BayerRGGB2RGB).astype(np.float32)
+    luma = sum(np.float32(weight) * colours[..., k] for k, weight in enumerate(_LUMA.values()))
+    return np.asarray((luma - np.float32(8192.0)) / np.float32(64.0), np.float32)
+
+
+def gamma(picture: Grey, exponent: float) -> Grey:
+    """The tone curve x^(1 / exponent)."""
+    share = np.clip(picture / np.float32(_WHITE), 0.0, 1.0)
+    return np.asarray(share ** np.float32(1.0 / exponent) * np.float32(_WHITE), np.float32)
+
+
+def sharpen(picture: Grey, amount: float, sigma_px: float) -> Grey:
+    """Unsharp mask: edges overshoot by `amount` of what a blur of sigma_px takes away."""
+    return picture + np.float32(amount) * (picture - lens_blur(picture, sigma_px))
+
+
+def rescale(picture: Grey, factor: float) -> Grey:
+    """The picture as if it had been made `factor` times as large and brought to its size by bicubic interpolation."""
+    height, width = picture.shape
+    other = max(8, round(width * factor)), max(8, round(height * factor))
+    there = cv2.resize(picture, other, interpolation=cv2.INTER_CUBIC)
+    return np.asarray(cv2.resize(there, (width, height), interpolation=cv2.INTER_CUBIC), np.float32)
+
+
+def jpeg(picture: Image, quality: int) -> Image:
+    """Compressed and decoded."""
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+
+def quantise(picture: Grey) -> Image:
+    """Whole grey values."""
+    return np.clip(np.rint(picture), 0.0, _WHITE).astype(np.uint8)
+
 
 _FLICKER_HZ = 100.0  # lamps on 50 Hz mains
 _READOUT_S = 0.015  # from the first row to the last
@@ -69,21 +165,62 @@ def process_frame(frame: CameraFrame, pipeline: ImagePipeline, seed: int) -> Cam
 def _process(picture: Image, pipeline: ImagePipeline, stamp_ns: int, rng: np.random.Generator) -> Image:
     grey = picture.astype(np.float32)
     if pipeline.blur_px is not None:
-        grey = stages.lens_blur(grey, pipeline.blur_px)
+        grey = lens_blur(grey, pipeline.blur_px)
     if pipeline.corner_loss is not None:
-        grey = stages.vignette(grey, pipeline.corner_loss)
+        grey = vignette(grey, pipeline.corner_loss)
     if pipeline.flicker is not None:
         phase = 2 * np.pi * ((stamp_ns * 1e-9 * _FLICKER_HZ) % 1.0)
-        grey = stages.rolling_exposure(grey, pipeline.flicker, _READOUT_S * _FLICKER_HZ, phase)
+        grey = rolling_exposure(grey, pipeline.flicker, _READOUT_S * _FLICKER_HZ, phase)
     if pipeline.has_bayer:
-        grey = stages.bayer(grey, pipeline.gain or 0.0, rng)
+        grey = bayer(grey, pipeline.gain or 0.0, rng)
     elif pipeline.gain is not None:
-        grey = stages.sensor_noise(grey, pipeline.gain, rng)
+        grey = sensor_noise(grey, pipeline.gain, rng)
     if pipeline.gamma is not None:
-        grey = stages.gamma(grey, pipeline.gamma)
+        grey = gamma(grey, pipeline.gamma)
     if pipeline.sharpening is not None:
-        grey = stages.sharpen(grey, *pipeline.sharpening)
+        grey = sharpen(grey, *pipeline.sharpening)
     if pipeline.rescaling is not None:
-        grey = stages.rescale(grey, pipeline.rescaling)
-    image = stages.quantise(grey)
-    return image if pipeline.jpeg_quality is None else stages.jpeg(image, pipeline.jpeg_quality)
+        grey = rescale(grey, pipeline.rescaling)
+    image = quantise(grey)
+    return image if pipeline.jpeg_quality is None else jpeg(image, pipeline.jpeg_quality)
+
+
+@dataclass(frozen=True, slots=True)
+class _ProcessedFrames:
+    """The frames of another source, each through a pipeline."""
+
+    source: FrameSource
+    pipeline: ImagePipeline
+    seed: int
+
+    def stored(self, index: int) -> StoredFrame:
+        """Frame `index`, its pictures as PNG; untouched where the pipeline has no stage."""
+        if self.pipeline == ImagePipeline():
+            return self.source.stored(index)
+        frame, stored = self.frame(index), self.source.stored(index)
+        right = None if frame.right is None else png_image(frame.right)
+        return replace(stored, left=png_image(frame.left), right=right)
+
+    def frame(self, index: int) -> CameraFrame:
+        return process_frame(self.source.frame(index), self.pipeline, self.seed)
+
+    def hash_into(self, digest: "hashlib._Hash") -> None:
+        """The other source's content, then pipeline and seed."""
+        self.source.hash_into(digest)
+        digest.update(repr((self.pipeline, self.seed)).encode())
+
+    def close(self) -> None:
+        self.source.close()
+
+
+def processed(recording: Recording, pipeline: str, seed: int = 0) -> Recording:
+    """The recording as cameras with that pipeline would have made it; UsageError for a pipeline that is not known.
+
+    With the seed of its run it equals what `fleetsim record --camera-pipeline` writes.
+    """
+    return replace(recording, frames=_ProcessedFrames(recording.frames, find_pipeline(pipeline), seed))
+
+
+def reprocess(recording: Recording, out: Path, pipeline: str, seed: int = 0) -> None:
+    """Writes the processed recording as MCAP with lossless pictures."""
+    copy_to_mcap(processed(recording, pipeline, seed), out)

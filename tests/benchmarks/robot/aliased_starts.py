@@ -18,8 +18,7 @@ from fleetsim.recorder import Order, prepare
 from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings, TrackSettings
 from mapserver.build.draft_evidence import PROBES
-from mapserver.quality.probes import Probe
-from mapserver.quality.starts import starts_without_prior
+from mapserver.quality.probes import Probe, starts_without_prior
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.landmark_budget import choose_landmarks

@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks.common.laps import repeated
 from benchmarks.survey import bench_survey
 from fleetmap.recordings import open_recording
-from fleetmap.recordings.export_mcap import copy_to_mcap
+from fleetmap.recordings.mcap.writer import copy_to_mcap
 
 SPEED_LIMIT, MEMORY_LIMIT_MB = 3.0, 2000.0
 _RATE_HZ = 20.0

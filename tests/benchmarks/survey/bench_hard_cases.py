@@ -20,7 +20,7 @@ import numpy as np
 
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings import Recording, open_recording
-from fleetmap.recordings.export_mcap import copy_to_mcap
+from fleetmap.recordings.mcap.writer import copy_to_mcap
 from mapserver.build.build import BuildOptions, BuildRequest, build_draft
 from mapserver.config import MapserverConfig
 from support.recordings.calibration_faults import IMAGE_FAULTS, camera_imu_turn, pair_turn

@@ -15,8 +15,7 @@ from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetsim.commands import record_order
-from fleetsim.imaging.pipelines import IMAGE_PIPELINES
-from fleetsim.imaging.reprocess import processed
+from fleetsim.imaging.pipelines import IMAGE_PIPELINES, processed
 from fleetsim.recorder import Order
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey.pipeline import survey

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleetmap.geometry import rotation_angle_rad, rotation_from_quat_wxyz, so3_exp
-from fleetmap.mapformat import quantise
+from fleetmap.mapformat import tile_codec as quantise
 
 
 @pytest.mark.parametrize("steps", [127, 42])

@@ -21,8 +21,7 @@ from fleetmap.config import load_toml
 from fleetmap.errors import CalibrationError, RecordingError, UsageError
 from fleetmap.recordings import OpenOptions, open_recording
 from fleetmap.recordings.calibration_files import MAX_CALIBRATION_BYTES, parse_calibration, read_yaml
-from fleetmap.recordings.image_header import image_size
-from fleetmap.recordings.images import MAX_PIXELS, StoredImage, decode_grey
+from fleetmap.recordings.images import MAX_PIXELS, StoredImage, decode_grey, image_size
 from fleetmap.recordings.mcap.scan import MAGIC, MAX_ATTACHMENT_BYTES, MAX_CHUNK_BYTES, McapScan, decompress
 from mapserver.config import MapserverConfig
 from support.recordings.mcap_samples import foreign_messages, write_foreign

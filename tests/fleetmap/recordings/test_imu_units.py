@@ -5,7 +5,7 @@ import pytest
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import open_recording
-from fleetmap.recordings.imu_units import check_imu_units
+from fleetmap.recordings.finalize import check_imu_units
 from fleetmap.sensors.samples import ImuSamples
 from support.recordings.realdata import real_data
 from support.recordings.recording_samples import make_sample

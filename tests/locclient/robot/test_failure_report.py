@@ -12,8 +12,8 @@ from fleetmap.messages import MAX_MESSAGE_BYTES, MAX_THUMBNAIL_BYTES, encode_mes
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame
 from locclient.delivery.failure_files import write_failure
+from locclient.robot.failure_report import expected_matches, match_view, small_jpeg
 from locclient.robot.jit_warmup import warm_up_kernels
-from locclient.robot.match_view import expected_matches, match_view, small_jpeg
 from mapserver.store import MapStore
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world

@@ -9,15 +9,16 @@ from typer.testing import CliRunner
 
 from fleetmap.errors import RecordingError, SurveyError
 from fleetmap.geometry import se3, so3_exp
-from fleetmap.recordings.covariances import (
+from fleetmap.recordings.tum import (
     StampedCovariances,
+    format_stamp,
     parse_covariances,
     read_covariances,
+    write_tum,
 )
-from fleetmap.recordings.tum import format_stamp, write_tum
 from fleetmap.sensors.samples import Trajectory
 from mapserver.cli import app
-from mapserver.evaluation.nees import at_first_stamp, consistency
+from mapserver.evaluation.summary_table import at_first_stamp, consistency
 
 COUNT = 3000
 

@@ -23,8 +23,7 @@ from mapserver.build.draft_evidence import Before, HeldOut, JudgedSession, exami
 from mapserver.quality.evidence import trajectory_breaks
 from mapserver.quality.figures import Evidence, RigEvidence, merged
 from mapserver.quality.gate import GateSettings, GateVerdict, judge
-from mapserver.quality.probes import held_out_frames, probe_features
-from mapserver.quality.starts import lookalike_words
+from mapserver.quality.probes import held_out_frames, lookalike_words, probe_features
 from mapserver.survey.pipeline import Survey, survey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs

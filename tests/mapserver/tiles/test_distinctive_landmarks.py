@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array
-from mapserver.tiles import distinctive_landmarks as module
-from mapserver.tiles.distinctive_landmarks import distinctive_landmarks
+from mapserver.tiles import landmark_budget as module
+from mapserver.tiles.landmark_budget import distinctive_landmarks
 
 
 def racks(rng: np.random.Generator, aisles: int, count: int, noise: float) -> tuple[Array, np.ndarray]:

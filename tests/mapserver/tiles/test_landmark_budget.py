@@ -11,8 +11,7 @@ from fleetmap.mapformat import encode_tile
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles import landmark_budget_kernels as kernels
-from mapserver.tiles.distinctive_landmarks import distinctive_landmarks
-from mapserver.tiles.landmark_budget import choose_landmarks, covered_path_m
+from mapserver.tiles.landmark_budget import choose_landmarks, covered_path_m, distinctive_landmarks
 from mapserver.tiles.tiling import tiles_from_survey
 from support.storage.map_samples import random_survey
 

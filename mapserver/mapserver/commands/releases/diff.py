@@ -4,8 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mapserver.commands.options import Json, SiteName, StoreFolder
-from mapserver.commands.print_json import print_json
+from mapserver.commands.options import Json, SiteName, StoreFolder, print_json
 
 if TYPE_CHECKING:
     from mapserver.releases import Difference

@@ -23,7 +23,7 @@ def publish(
     """Take a draft through the gate and make it the current version; status 4 if the gate refuses it."""
     from mapserver import releases
     from mapserver.quality.directions import one_way_words
-    from mapserver.quality.starts import lookalike_words
+    from mapserver.quality.probes import lookalike_words
     from mapserver.store import MapStore
 
     gate = settings_of(context).gate

@@ -1,7 +1,6 @@
 """`mapserver versions`: the versions of a site."""
 
-from mapserver.commands.options import Json, SiteName, StoreFolder
-from mapserver.commands.print_json import print_json
+from mapserver.commands.options import Json, SiteName, StoreFolder, print_json
 
 
 def versions(site: SiteName, store: StoreFolder, json: Json = False) -> None:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetmap.errors import UsageError
-from mapserver.commands.options import Json, StoreFolder
-from mapserver.commands.print_json import print_json
+from mapserver.commands.options import Json, StoreFolder, print_json
 from mapserver.commands.store.verify import EXIT_STATUS_FAULTS
 
 if TYPE_CHECKING:

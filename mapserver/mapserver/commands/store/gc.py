@@ -7,8 +7,7 @@ import typer
 
 from fleetmap.cli_options import expand_options
 from fleetmap.errors import StoreError
-from mapserver.commands.options import ActorOptions, Json, StoreFolder
-from mapserver.commands.print_json import print_json
+from mapserver.commands.options import ActorOptions, Json, StoreFolder, print_json
 
 if TYPE_CHECKING:
     from mapserver.store.garbage_collection import Garbage

@@ -6,8 +6,7 @@ import typer
 
 from fleetmap.cli_options import Group, expand_options
 from fleetmap.errors import UsageError
-from mapserver.commands.options import ActorOptions, Json, StoreFolder
-from mapserver.commands.print_json import print_json
+from mapserver.commands.options import ActorOptions, Json, StoreFolder, print_json
 from mapserver.operators.roles import Role, Scope
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ import typer
 
 from fleetmap.cli_options import Group, expand_options
 from fleetmap.errors import UsageError
-from mapserver.commands.options import Json, StoreFolder
-from mapserver.commands.print_json import print_json
+from mapserver.commands.options import Json, StoreFolder, print_json
 
 if TYPE_CHECKING:
     from mapserver.store import MapStore

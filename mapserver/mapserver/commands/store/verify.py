@@ -2,8 +2,7 @@
 
 import typer
 
-from mapserver.commands.options import Json, StoreFolder
-from mapserver.commands.print_json import print_json
+from mapserver.commands.options import Json, StoreFolder, print_json
 
 EXIT_STATUS_FAULTS = 3
 
