@@ -23,11 +23,10 @@ _ZEROS = ",0,0,0,0,0,0,0,0,0"  # velocity and biases, which readers of this layo
 
 
 class EurocRecordingWriter:
-    """Same calls as McapRecordingWriter; wheels and priors are counted in `left_out` instead of written."""
+    """Same calls as McapRecordingWriter; the layout has no place for wheels and priors."""
 
     def __init__(self, path: Path, calibration: RigCalibration) -> None:
         self._root = path / "mav0"
-        self.left_out = 0
         if self._root.exists():
             raise RecordingError(f"{self._root} exists already; choose another folder with --out")
         for number, camera in enumerate(calibration.cameras):
@@ -54,12 +53,10 @@ class EurocRecordingWriter:
             self._tables["imu0"].write(f"{stamp_ns}," + ",".join(map(repr, row)) + "\n")
 
     def write_wheel(self, samples: tuple[WheelSample, ...]) -> None:
-        """The layout has no place for them."""
-        self.left_out += len(samples)
+        """Leaves them out."""
 
     def write_prior(self, priors: tuple[PositionPrior, ...]) -> None:
-        """The layout has no place for them."""
-        self.left_out += len(priors)
+        """Leaves them out."""
 
     def write_ground_truth(self, trajectory: Trajectory) -> None:
         table = self._tables["state_groundtruth_estimate0"]

@@ -4,13 +4,14 @@ import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 
 from fleetmap.errors import UsageError
+from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
+from fleetsim.euroc_writer import EurocRecordingWriter
 from fleetsim.imaging.pipelines import find_pipeline, process_frame
 from fleetsim.motion.body_motion import CarriedMotion, Motion, RouteMotion
 from fleetsim.motion.routes import check_clear
@@ -25,6 +26,7 @@ from fleetsim.sensors.measurements import measure_imu, measure_priors, measure_w
 from fleetsim.sensors.robots import HiddenErrors, RobotKind, nominal_calibration, true_calibration
 
 _TRUTH_STEP_S = 0.02
+Writer = McapRecordingWriter | EurocRecordingWriter
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,25 +48,6 @@ class Order:
     size_px: tuple[int, int] | None = None
     hidden: HiddenErrors = field(default_factory=HiddenErrors)
     camera_pipeline: str = "clean"
-
-
-class Writer(Protocol):
-    """Receiver of samples; fleetmap's McapRecordingWriter is one."""
-
-    def write_frame(self, frame: CameraFrame) -> None:
-        """One pair, as pixels."""
-
-    def write_imu(self, samples: ImuSamples) -> None:
-        """Inertial samples."""
-
-    def write_wheel(self, samples: tuple[WheelSample, ...]) -> None:
-        """Wheel odometry."""
-
-    def write_prior(self, priors: tuple[PositionPrior, ...]) -> None:
-        """Position priors."""
-
-    def write_ground_truth(self, trajectory: Trajectory) -> None:
-        """True transforms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +140,11 @@ def _truth(motion: Motion, frame_times_s: list[float], end_s: float) -> Trajecto
     return Trajectory(stamps_from_s(times), motion.map_from_body(times))
 
 
-def write_session(session: Session, writer: Writer, on_frame: Callable[[int], None] = lambda done: None) -> None:
+def write_session(
+    session: Session,
+    writer: Writer,
+    on_frame: Callable[[int], None] = lambda done: None,
+) -> None:
     """Writes everything in the order of time, a frame's worth at a time."""
     start_ns = 0
     for done, frame in enumerate(session.frames(), start=1):

@@ -1,6 +1,7 @@
 """`mapserver calibrate`: a rig's calibration measured from its recordings."""
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from mapserver.calibration import CalibrationEstimate
+    from mapserver.survey.survey_inputs import SurveyTools
 
 
 def calibrate(
@@ -45,26 +47,18 @@ def calibrate(
         _from_guess(recordings, out, guess, config_path(context))
         return
     from rich.console import Console
-    from rich.progress import Progress
 
-    from fleetmap.errors import UsageError, disk_errors
     from fleetmap.recordings import OpenOptions, open_recording
     from mapserver.calibration import estimate_calibration
     from mapserver.calibration.calibration_file import corrected_file
     from mapserver.config import survey_settings
-    from mapserver.survey.survey_inputs import SurveyTools
 
     with ExitStack() as opened:
         sources = [
             opened.enter_context(open_recording(path, OpenOptions(calibration_file=calibration))) for path in recordings
         ]
         settings = survey_settings(config_path(context), sources[0].sensor_set)
-        progress = opened.enter_context(Progress(console=Console(stderr=True), transient=True))
-        task = progress.add_task("", total=None)
-        tools = SurveyTools(
-            progress=lambda stage, done, of: progress.update(task, description=stage, completed=done, total=of)
-        )
-        estimate = estimate_calibration(sources, settings, tools)
+        estimate = estimate_calibration(sources, settings, opened.enter_context(_shown()))
         rig = sources[0].calibration
     _print(Console(), estimate)
     if out is None:
@@ -73,24 +67,40 @@ def calibrate(
         raise RecordingError(
             f"--out {out}: nothing could be judged, so nothing is written; the table says what motion is missing"
         )
+    text = corrected_file(estimate, rig, [source.name for source in sources])
+    _write(out, text, f"check it with `mapserver doctor RECORDING --calibration {out}`")
+
+
+@contextmanager
+def _shown() -> "Iterator[SurveyTools]":
+    """Tools of a survey whose progress is shown."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from mapserver.survey.survey_inputs import SurveyTools
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("", total=None)
+        yield SurveyTools(lambda stage, done, of: progress.update(task, description=stage, completed=done, total=of))
+
+
+def _write(out: Path, text: str, advice: str) -> None:
+    from fleetmap.errors import UsageError, disk_errors
+
     with disk_errors(f"--out {out} cannot be written", "check folder and space", UsageError):
-        out.write_text(corrected_file(estimate, rig, [source.name for source in sources]), encoding="utf-8")
-    typer.echo(f"{out}: written; check it with `mapserver doctor RECORDING --calibration {out}`")
+        out.write_text(text, encoding="utf-8")
+    typer.echo(f"{out}: written; {advice}")
 
 
 def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Path | None) -> None:
     import re
     from tempfile import TemporaryDirectory
 
-    from rich.console import Console
-    from rich.progress import Progress
-
-    from fleetmap.errors import UsageError, disk_errors
+    from fleetmap.errors import UsageError
     from fleetmap.recordings import OpenOptions, format_calibration, open_recording
     from mapserver.calibration.calibration_file import guessed_file, guessed_in_words
     from mapserver.calibration.from_guess import calibration_from_guess, first_rig
     from mapserver.config import survey_settings
-    from mapserver.survey.survey_inputs import SurveyTools
 
     known = re.fullmatch(r"([1-9]\d{1,4})x([1-9]\d{1,4}):(\d*\.?\d+)", guess)
     baseline_m = float(known[3]) if known else 0.0
@@ -99,22 +109,17 @@ def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Pa
             f"--guess {guess} for {len(recordings)} recordings: give the size of the raw images and the metres between the cameras, such "
             "as --guess 752x480:0.11, and one recording"
         )
-    with TemporaryDirectory() as folder, Progress(console=Console(stderr=True), transient=True) as progress:
+    with TemporaryDirectory() as folder, _shown() as tools:
         first = Path(folder) / "guess.yaml"
         rig = first_rig(int(known[1]), int(known[2]), baseline_m)
         first.write_text(format_calibration(rig), encoding="utf-8")
-        task = progress.add_task("", total=None)
-        tools = SurveyTools(
-            progress=lambda stage, done, of: progress.update(task, description=stage, completed=done, total=of)
-        )
         with open_recording(recordings[0], OpenOptions(calibration_file=first)) as recording:
             found = calibration_from_guess(recording, survey_settings(config, recording.sensor_set), tools)
             name = recording.name
     typer.echo("\n".join(guessed_in_words(found)))
     if out is not None:
-        with disk_errors(f"--out {out} cannot be written", "check folder and space", UsageError):
-            out.write_text(guessed_file(found, name), encoding="utf-8")
-        typer.echo(f"{out}: written; add how the IMU is mounted, then calibrate again with --calibration {out}")
+        advice = f"add how the IMU is mounted, then calibrate again with --calibration {out}"
+        _write(out, guessed_file(found, name), advice)
 
 
 def _print(console: "Console", estimate: "CalibrationEstimate") -> None:

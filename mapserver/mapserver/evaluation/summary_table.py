@@ -9,7 +9,6 @@ from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.recordings.tum import StampedCovariances
 from fleetmap.sensors.samples import Trajectory
 from mapserver.evaluation.trajectory_error import (
-    MAX_GAP_NS,
     absolute_trajectory_error,
     best_clock_shift,
     drift,
@@ -46,16 +45,14 @@ def at_first_stamp(estimate: Trajectory, truth: Trajectory) -> Trajectory:
     return Trajectory(estimate.stamps_ns, frame_from_estimate @ estimate.frame_from_body)
 
 
-def consistency(
-    estimate: Trajectory, covariances: StampedCovariances, truth: Trajectory, max_gap_ns: int = MAX_GAP_NS
-) -> Consistency:
+def consistency(estimate: Trajectory, covariances: StampedCovariances, truth: Trajectory) -> Consistency:
     """The normalised errors of an estimate that is in the truth's frame; covariances are in that frame's axes.
 
     Errors of rotation (on the left) and position are taken apart from each other. SurveyError where no stamp has estimate,
     covariance and truth. Source: Bar-Shalom, Li and Kirubarajan 2001 (NEES).
     """
     known = np.isin(estimate.stamps_ns, covariances.stamps_ns)
-    mine, true = paired(Trajectory(estimate.stamps_ns[known], estimate.frame_from_body[known]), truth, max_gap_ns)
+    mine, true = paired(Trajectory(estimate.stamps_ns[known], estimate.frame_from_body[known]), truth)
     if len(mine) == 0:
         raise SurveyError(
             f"none of {len(estimate)} stamps has a covariance ({len(covariances.stamps_ns)} there) and a truth; "

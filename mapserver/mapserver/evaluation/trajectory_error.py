@@ -9,7 +9,7 @@ from fleetmap.geometry import Array, align_points, rotation_angle_rad, se3_inver
 from fleetmap.sensors.samples import Stamps, Trajectory
 
 MAX_GAP_NS = 200_000_000
-MAX_CLOCK_SHIFT_S = 0.05
+_MAX_SHIFT_S = 0.05
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 SHORT_LENGTHS_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # for runs too short for KITTI's
 
@@ -44,12 +44,10 @@ class ClockShift:
 
 @dataclass(frozen=True, slots=True)
 class RelativeResult:
-    """Errors of relative transforms: translations_m and rotations_rad (pairs,), with their root mean squares."""
+    """Root mean squares of the errors of relative transforms."""
 
     rmse_m: float
     rmse_rad: float
-    translations_m: Array
-    rotations_rad: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +77,6 @@ def absolute_trajectory_error(
     truth: Trajectory,
     *,
     with_scale: bool = False,
-    max_gap_ns: int = MAX_GAP_NS,
     frames: int | None = None,
 ) -> AteResult:
     """Position errors after the least-squares rigid (or similarity) alignment of all matched positions.
@@ -87,10 +84,10 @@ def absolute_trajectory_error(
     frames: how many frames should have had an estimate (default: as many as have one), the base of evaluated_share.
     Raises SurveyError where fewer than three stamps have a truth. Source: Sturm et al. 2012 (ATE), Umeyama 1991.
     """
-    mine, true = paired(estimate, truth, max_gap_ns)
+    mine, true = paired(estimate, truth)
     if len(mine) < 3:
         raise SurveyError(
-            f"{len(mine)} of {len(estimate)} estimated stamps have ground truth within {max_gap_ns / 1e6:.0f} ms gaps; "
+            f"{len(mine)} of {len(estimate)} estimated stamps have ground truth within {MAX_GAP_NS / 1e6:.0f} ms gaps; "
             "at least 3 are needed: check that both are on the same clock"
         )
     frame_from_estimate, scale = align_points(true.positions_m, mine.positions_m, with_scale=with_scale)
@@ -109,18 +106,16 @@ def absolute_trajectory_error(
     )
 
 
-def best_clock_shift(
-    estimate: Trajectory, truth: Trajectory, max_shift_s: float = MAX_CLOCK_SHIFT_S, max_gap_ns: int = MAX_GAP_NS
-) -> ClockShift | None:
-    """The shift of the truth's stamps, within +- `max_shift_s`, at which the rigid ATE is smallest.
+def best_clock_shift(estimate: Trajectory, truth: Trajectory) -> ClockShift | None:
+    """The shift of the truth's stamps, within +- _MAX_SHIFT_S, at which the rigid ATE is smallest.
 
     A diagnosis beside the ATE, never in its place: a truth that was recorded by another clock costs speed times shift. Positions
     of the truth are interpolated linearly. None where fewer than three stamps have a truth at every shift.
     """
-    mine, _ = paired(estimate, truth, max_gap_ns)
+    mine, _ = paired(estimate, truth)
     origin_ns = int(truth.stamps_ns[0]) if len(truth) else 0
     at_s, own_s = (truth.stamps_ns - origin_ns) * 1e-9, (mine.stamps_ns - origin_ns) * 1e-9
-    inside = (own_s >= at_s[0] + max_shift_s) & (own_s <= at_s[-1] - max_shift_s) if len(mine) else np.zeros(0, bool)
+    inside = (own_s >= at_s[0] + _MAX_SHIFT_S) & (own_s <= at_s[-1] - _MAX_SHIFT_S) if len(mine) else np.zeros(0, bool)
     if inside.sum() < 3:
         return None
     own_s, positions = own_s[inside], mine.positions_m[inside]
@@ -133,34 +128,30 @@ def best_clock_shift(
     from scipy.optimize import minimize_scalar  # a build does not need it
 
     # The error has one minimum for a smooth motion, but noise makes others: the best of a grid says around which to look.
-    grid = np.linspace(-max_shift_s, max_shift_s, 21)
+    grid = np.linspace(-_MAX_SHIFT_S, _MAX_SHIFT_S, 21)
     middle, step = float(grid[np.argmin([rmse_m(shift) for shift in grid])]), float(grid[1] - grid[0])
-    bounds = max(middle - step, -max_shift_s), min(middle + step, max_shift_s)
+    bounds = max(middle - step, -_MAX_SHIFT_S), min(middle + step, _MAX_SHIFT_S)
     found = minimize_scalar(rmse_m, bounds=bounds, method="bounded", options={"xatol": 1e-5})
     return ClockShift(float(found.x), float(found.fun))
 
 
-def unaligned_errors(
-    estimate: Trajectory, truth: Trajectory, max_gap_ns: int = MAX_GAP_NS
-) -> tuple[Stamps, Array, Array]:
+def unaligned_errors(estimate: Trajectory, truth: Trajectory) -> tuple[Stamps, Array, Array]:
     """Stamps (P,), metres and radians (P,) between estimate and truth as they are, both already in one frame."""
-    mine, true = paired(estimate, truth, max_gap_ns)
+    mine, true = paired(estimate, truth)
     errors_m, errors_rad = _split_errors(se3_inverse(true.frame_from_body) @ mine.frame_from_body)
     return mine.stamps_ns, errors_m, errors_rad
 
 
-def relative_trajectory_error(
-    estimate: Trajectory, truth: Trajectory, *, step: int = 1, max_gap_ns: int = MAX_GAP_NS
-) -> RelativeResult:
+def relative_trajectory_error(estimate: Trajectory, truth: Trajectory, *, step: int = 1) -> RelativeResult:
     """Errors of the motion over `step` matched stamps, for every start.
 
     Needs no alignment. Raises SurveyError where no pair of stamps has a truth. Source: Sturm et al. 2012 (RPE).
     """
-    mine, true = paired(estimate, truth, max_gap_ns)
+    mine, true = paired(estimate, truth)
     if len(mine) <= step:
         raise SurveyError(f"{len(mine)} matched stamps are too few for relative errors over {step}; check the clocks")
     errors_m, errors_rad = _split_errors(_motion_errors(mine, true, np.arange(len(mine) - step), step))
-    return RelativeResult(_rms(errors_m), _rms(errors_rad), errors_m, errors_rad)
+    return RelativeResult(_rms(errors_m), _rms(errors_rad))
 
 
 def kitti_drift(
@@ -169,13 +160,12 @@ def kitti_drift(
     *,
     lengths_m: tuple[float, ...] = KITTI_LENGTHS_M,
     every: int = 10,
-    max_gap_ns: int = MAX_GAP_NS,
 ) -> DriftResult | None:
     """Mean drift over all segments of the given lengths along the truth, beginning at every `every`-th matched stamp.
 
     None where the path is shorter than the shortest length. Source: Geiger et al. 2012 (KITTI odometry benchmark).
     """
-    mine, true = paired(estimate, truth, max_gap_ns)
+    mine, true = paired(estimate, truth)
     if len(mine) < 2:
         return None
     steps = np.linalg.norm(np.diff(true.positions_m, axis=0), axis=1)

@@ -7,6 +7,7 @@ import numpy as np
 
 from fleetmap.geometry import Array
 from fleetmap.numerics.kernel import kernel
+from fleetmap.numerics.linear_kernels import skew_series
 
 SMALL_ANGLE_RAD = 1e-4  # below it the series' next term is under 1e-17
 
@@ -52,29 +53,14 @@ def matmul3_skew(matrix: Array, vector: Array, out: Array) -> None:
 
 
 @kernel
-def _series(vector: Array, linear: float, square: float, out: Array) -> None:
-    """out = I + linear skew(vector) + square skew(vector)^2."""
-    x, y, z = vector[0], vector[1], vector[2]
-    out[0, 0] = 1.0 - square * (y * y + z * z)
-    out[1, 1] = 1.0 - square * (x * x + z * z)
-    out[2, 2] = 1.0 - square * (x * x + y * y)
-    out[0, 1] = square * x * y - linear * z
-    out[1, 0] = square * x * y + linear * z
-    out[0, 2] = square * x * z + linear * y
-    out[2, 0] = square * x * z - linear * y
-    out[1, 2] = square * y * z - linear * x
-    out[2, 1] = square * y * z + linear * x
-
-
-@kernel
 def exp_into(rotvec_rad: Array, out: Array) -> None:
     """out = the rotation of a rotation vector. Source: Rodrigues' formula."""
     squared = rotvec_rad[0] ** 2 + rotvec_rad[1] ** 2 + rotvec_rad[2] ** 2
     angle = np.sqrt(squared)
     if angle < SMALL_ANGLE_RAD:
-        _series(rotvec_rad, 1.0 - squared / 6.0, 0.5 - squared / 24.0, out)
+        skew_series(rotvec_rad, 1.0 - squared / 6.0, 0.5 - squared / 24.0, out)
     else:
-        _series(rotvec_rad, np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared, out)
+        skew_series(rotvec_rad, np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared, out)
 
 
 @kernel
@@ -83,14 +69,14 @@ def right_jacobian_into(rotvec_rad: Array, out: Array) -> None:
     squared = rotvec_rad[0] ** 2 + rotvec_rad[1] ** 2 + rotvec_rad[2] ** 2
     angle = np.sqrt(squared)
     if angle < 1e-2:
-        _series(
+        skew_series(
             rotvec_rad,
             -0.5 + squared / 24.0 - squared**2 / 720.0,
             1.0 / 6.0 - squared / 120.0 + squared**2 / 5040.0,
             out,
         )
     else:
-        _series(rotvec_rad, -(1.0 - np.cos(angle)) / squared, (angle - np.sin(angle)) / (squared * angle), out)
+        skew_series(rotvec_rad, -(1.0 - np.cos(angle)) / squared, (angle - np.sin(angle)) / (squared * angle), out)
 
 
 @kernel
@@ -102,7 +88,7 @@ def inverse_left_jacobian_into(rotvec_rad: Array, out: Array) -> None:
         square = 1.0 / 12.0 + squared / 720.0 + squared**2 / 30240.0
     else:
         square = 1.0 / squared - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
-    _series(rotvec_rad, -0.5, square, out)
+    skew_series(rotvec_rad, -0.5, square, out)
 
 
 @kernel

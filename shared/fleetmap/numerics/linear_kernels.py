@@ -76,6 +76,21 @@ def solve_spd(a: Array, b: Array) -> bool:
 
 
 @kernel
+def skew_series(vector: Array, linear: float, square: float, out: Array) -> None:
+    """out = I + linear skew(vector) + square skew(vector)^2."""
+    x, y, z = vector[0], vector[1], vector[2]
+    out[0, 0] = 1.0 - square * (y * y + z * z)
+    out[1, 1] = 1.0 - square * (x * x + z * z)
+    out[2, 2] = 1.0 - square * (x * x + y * y)
+    out[0, 1] = square * x * y - linear * z
+    out[1, 0] = square * x * y + linear * z
+    out[0, 2] = square * x * z + linear * y
+    out[2, 0] = square * x * z - linear * y
+    out[1, 2] = square * y * z - linear * x
+    out[2, 1] = square * y * z + linear * x
+
+
+@kernel
 def exp_so3(rotvec: Array) -> Array:
     """(3, 3) rotation of a rotation vector."""
     x, y, z = rotvec[0], rotvec[1], rotvec[2]
@@ -86,15 +101,7 @@ def exp_so3(rotvec: Array) -> Array:
     else:
         a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared
     out = np.empty((3, 3))
-    out[0, 0] = 1.0 - b * (y * y + z * z)
-    out[1, 1] = 1.0 - b * (x * x + z * z)
-    out[2, 2] = 1.0 - b * (x * x + y * y)
-    out[0, 1] = b * x * y - a * z
-    out[1, 0] = b * x * y + a * z
-    out[0, 2] = b * x * z + a * y
-    out[2, 0] = b * x * z - a * y
-    out[1, 2] = b * y * z - a * x
-    out[2, 1] = b * y * z + a * x
+    skew_series(rotvec, a, b, out)
     return out
 
 

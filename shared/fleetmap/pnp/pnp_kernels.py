@@ -33,24 +33,10 @@ def linearize(
     j = np.empty((3, 6))
     r = np.empty(3)
     for n in range(len(points)):
-        x = (
-            rotation[0, 0] * points[n, 0]
-            + rotation[0, 1] * points[n, 1]
-            + rotation[0, 2] * points[n, 2]
-            + translation[0]
-        )
-        y = (
-            rotation[1, 0] * points[n, 0]
-            + rotation[1, 1] * points[n, 1]
-            + rotation[1, 2] * points[n, 2]
-            + translation[1]
-        )
-        z = (
-            rotation[2, 0] * points[n, 0]
-            + rotation[2, 1] * points[n, 1]
-            + rotation[2, 2] * points[n, 2]
-            + translation[2]
-        )
+        px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+        x = rotation[0, 0] * px + rotation[0, 1] * py + rotation[0, 2] * pz + translation[0]
+        y = rotation[1, 0] * px + rotation[1, 1] * py + rotation[1, 2] * pz + translation[1]
+        z = rotation[2, 0] * px + rotation[2, 1] * py + rotation[2, 2] * pz + translation[2]
         squared[n] = 1e12
         if z < 0.05:
             cost += 0.5 * width * width
@@ -207,11 +193,8 @@ def search_translation(
     for k in range(count):
         if np.isnan(seen_points[k, 2]):
             continue
-        tx, ty, tz = (
-            seen_points[k, 0] - turned[k, 0],
-            seen_points[k, 1] - turned[k, 1],
-            seen_points[k, 2] - turned[k, 2],
-        )
+        own, seen = turned[k], seen_points[k]
+        tx, ty, tz = seen[0] - own[0], seen[1] - own[1], seen[2] - own[2]
         score = 0
         for n in range(count):
             z = turned[n, 2] + tz

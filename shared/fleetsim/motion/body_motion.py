@@ -3,7 +3,7 @@
 Euler angles are safe here: a floor robot never pitches anywhere near 90 degrees.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -165,7 +165,7 @@ class CarriedMotion:
     def velocity_body(self, times_s: Array) -> Array:
         return self._pick(times_s, lambda motion, local_s: motion.velocity_body(local_s))
 
-    def _pick(self, times_s: Array, ask: "_Ask") -> Array:
+    def _pick(self, times_s: Array, ask: Callable[[RouteMotion, Array], Array]) -> Array:
         piece = np.minimum(np.searchsorted(self._ends_s, times_s, side="right"), len(self._motions) - 1)
         starts = np.concatenate([[0.0], self._ends_s[:-1]])
         answers = [
@@ -175,10 +175,6 @@ class CarriedMotion:
         for number, answer in enumerate(answers):
             merged[piece == number] = answer
         return merged
-
-
-class _Ask(Protocol):
-    def __call__(self, motion: RouteMotion, local_s: Array) -> Array: ...
 
 
 def _control_points(path: TimedPath, height_m: float, shake: Shake, rng: np.random.Generator) -> Array:
