@@ -16,12 +16,8 @@ from mapserver.commands.fleet import FLEET
 from mapserver.commands.live import live
 from mapserver.commands.nightly import nightly
 from mapserver.commands.prepare import prepare
-from mapserver.commands.releases.diff import diff
-from mapserver.commands.releases.inspect import inspect
-from mapserver.commands.releases.promote import promote
-from mapserver.commands.releases.publish import publish
-from mapserver.commands.releases.rollback import rollback
-from mapserver.commands.releases.versions import versions
+from mapserver.commands.releases.inspect import diff, inspect, versions
+from mapserver.commands.releases.promote import promote, publish, rollback
 from mapserver.commands.serve import serve
 from mapserver.commands.store.audit import audit
 from mapserver.commands.store.export import export

@@ -17,8 +17,8 @@ from fleetmap.sources.source import Source
 from locclient.daemon.publishers import Publisher
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.systemd_notify import ServiceManager
-from locclient.delivery.failure_files import write_failure
 from locclient.delivery.outbox import Outbox, QueuedReport
+from locclient.delivery.report_delivery import write_failure
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader

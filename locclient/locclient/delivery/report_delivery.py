@@ -1,8 +1,12 @@
-"""Delivery of failure reports from the outbox to the server, until each is acknowledged. May block."""
+"""Delivery of reports of failures: to the server from the outbox, and into a folder of the robot."""
 
+import json
 import logging
+from pathlib import Path
 
-from fleetmap.errors import LinkError, UnreachableError
+import msgspec
+
+from fleetmap.errors import LinkError, UnreachableError, disk_errors
 from fleetmap.messages import FailureReport, decode_message
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.maps.map_client import MapClient
@@ -49,3 +53,19 @@ def _is_whole(report: QueuedReport) -> bool:
     if decoded_id != report.id:
         _log.warning("the report of failure %s is damaged and dropped: it tells of %s", report.id, decoded_id)
     return decoded_id == report.id
+
+
+def write_failure(folder: Path, report: FailureReport) -> Path:
+    """The path of `STAMP-KIND-CAUSE.json`, written with its pictures beside it; raises StoreError where the disk refuses."""
+    name = f"{report.stamp_ns}-{report.kind}-{report.cause}"
+    fields = msgspec.to_builtins(msgspec.structs.replace(report, thumbnails=()))
+    fields["thumbnails"] = []
+    with disk_errors(f"{folder} cannot be written", "choose another folder with [run] failures"):
+        folder.mkdir(parents=True, exist_ok=True)
+        for number, picture in enumerate(report.thumbnails):
+            path = folder / f"{name}-{number}-{picture.kind}.jpg"
+            path.write_bytes(picture.jpeg)
+            fields["thumbnails"].append(path.name)
+        target = folder / f"{name}.json"
+        target.write_text(json.dumps(fields, indent=2) + "\n")
+    return target

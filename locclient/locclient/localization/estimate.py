@@ -1,13 +1,20 @@
-"""A robot's estimate of its pose, frame by frame."""
+"""A robot's estimate of its pose, frame by frame, and its assembly: status, pose with covariance, cause. Pure."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
+import numpy as np
+
+from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.messages import Cause, Status
-from fleetmap.odometry import OdometryEstimate
+from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.relocalizer import Fix
 from locclient.localization.calibration.parameters import NOT_JUDGED, CalibrationState
+from locclient.localization.hypothesis_set import HypothesisSet
 from locclient.localization.image_quality import GOOD_IMAGE, ImageQuality
+from locclient.localization.pose_hypothesis import PoseHypothesis
+from locclient.localization.settings import TrackSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,3 +55,62 @@ class Estimate:
     innovation_m: float | None = None
     moved_m: float | None = None
     calibration: CalibrationState = NOT_JUDGED
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizationState:
+    """confirmed: the pose that is tracked; candidates: competing ones while there is none. prior: the pose by the prior and the motion
+    since. has_failed: the last map query found no fix."""
+
+    confirmed: PoseHypothesis | None
+    candidates: HypothesisSet
+    prior: PoseHypothesis | None
+    has_failed: bool
+    was_tracking: bool
+
+
+def assemble(estimate: Estimate, state: LocalizationState, settings: TrackSettings) -> Estimate:
+    """`estimate`, whose cause is that of its images, with status, pose and cause by the state."""
+    if state.confirmed is not None:
+        return _of_confirmed(estimate, state.confirmed, state.has_failed, settings)
+    ranking, competitors = state.candidates.ranking()
+    is_open = bool(competitors) or (bool(ranking) and state.candidates.may_be_lookalike(ranking[0]))
+    status = Status.AMBIGUOUS if is_open else Status.LOST if state.was_tracking else Status.INITIALISING
+    estimate = replace(estimate, status=status, hypotheses=_published(ranking))
+    if ranking:
+        return estimate if is_open else _with_pose(estimate, ranking[0], settings)
+    if state.prior is None or estimate.map_version is None:
+        return estimate
+    # Nothing in the map agrees: the prior and the odometry since, as far as that goes.
+    if radius_95_m(state.prior.now_cov) <= settings.lost_radius_m:
+        status = Status.DEGRADED
+    estimate = replace(estimate, status=status, cause=estimate.cause or Cause.UNMATCHED)
+    return _with_pose(estimate, state.prior, settings)
+
+
+def _of_confirmed(estimate: Estimate, confirmed: PoseHypothesis, has_failed: bool, settings: TrackSettings) -> Estimate:
+    radius_m = radius_95_m(confirmed.now_cov)
+    age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9
+    is_lost = estimate.odometry.status is OdometryStatus.DEGRADED
+    cause = estimate.cause or (Cause.ODOMETRY if is_lost else Cause.UNMATCHED if has_failed else Cause.NONE)
+    if radius_m > settings.lost_radius_m:
+        status = Status.LOST
+    elif radius_m > settings.degraded_radius_m or age_s > settings.degraded_after_s or cause is Cause.FROZEN:
+        status = Status.DEGRADED
+    else:
+        status, cause = Status.TRACKING, Cause.NONE
+    estimate = replace(estimate, status=status, cause=cause)
+    if status is not Status.TRACKING and confirmed.kidnap_hypotheses:  # it may be at either
+        places = _published([confirmed, *confirmed.kidnap_hypotheses])
+        return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)
+    return _with_pose(estimate, confirmed, settings)
+
+
+def _with_pose(estimate: Estimate, hypothesis: PoseHypothesis, settings: TrackSettings) -> Estimate:
+    """With the map's own uncertainty, which is common to all fixes: no number of them averages it away."""
+    of_map = np.diag([settings.map_sigma_rad**2] * 3 + [settings.map_sigma_m**2] * 3)
+    return replace(estimate, map_from_body=hypothesis.now_map_from_body, cov_rot_trans=hypothesis.now_cov + of_map)
+
+
+def _published(hypotheses: Sequence[PoseHypothesis]) -> tuple[Hypothesis, ...]:
+    return tuple(Hypothesis(h.now_map_from_body, h.support) for h in hypotheses)

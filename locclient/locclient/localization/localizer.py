@@ -22,8 +22,7 @@ from locclient.localization.alias_disambiguation import ViewpointGate
 from locclient.localization.calibration.monitor import CalibrationMonitor, FinishedQuery
 from locclient.localization.calibration.pair_order import REVERSED_TEXT
 from locclient.localization.calibration.watch import Mounting
-from locclient.localization.estimate import Estimate
-from locclient.localization.estimate_assembly import LocalizationState, assemble
+from locclient.localization.estimate import Estimate, LocalizationState, assemble
 from locclient.localization.hypothesis_set import HypothesisSet, Observations, recent
 from locclient.localization.image_quality import ImageQualityMonitor
 from locclient.localization.initial_pose_prior import InitialPosePrior

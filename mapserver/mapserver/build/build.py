@@ -23,7 +23,7 @@ from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver.build.draft_evidence import Before, JudgedSession, examine_draft, replayed_probes
 from mapserver.build.image_spill import ImageSpill
-from mapserver.build.job_record import Job, recorded_job
+from mapserver.build.job_lock import Job, recorded_job
 from mapserver.build.progress import ProgressView, StageTimes
 from mapserver.build.report import (
     Accuracy,

@@ -1,11 +1,14 @@
-"""Locks of running jobs and nights. The operating system releases the lock when the process dies: a running job without one was killed."""
+"""Running jobs and nights: their locks, which the operating system releases when a process dies, and their records in the store."""
 
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from fleetmap.errors import BusyError, disk_errors
 from mapserver.store import JobInfo, MapStore
@@ -88,3 +91,28 @@ def _opened(path: Path) -> Iterator[int]:
         yield descriptor
     finally:
         os.close(descriptor)
+
+
+@dataclass(slots=True)
+class Job:
+    """What a job says at its end."""
+
+    message: str = ""
+    report: dict[str, Any] = field(default_factory=dict)
+
+
+@contextmanager
+def recorded_job(maps: MapStore, site: str, kind: str) -> Iterator[Job]:
+    """Notes a job as running, then as done, or as failed with the error that ended it.
+
+    One that is killed stands as running until the server, or the next job, finds that nobody holds its lock.
+    """
+    end_interrupted(maps, time.time_ns())
+    job, number = Job(), maps.begin_job(site, kind)
+    try:
+        with held(maps.folder, number):
+            yield job
+    except BaseException as error:
+        maps.update_job(number, "failed", str(error) or type(error).__name__, job.report)
+        raise
+    maps.update_job(number, "done", job.message, job.report)

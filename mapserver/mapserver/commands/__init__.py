@@ -1,1 +1,1 @@
-"""One file for each command of `mapserver`."""
+"""The commands of `mapserver`, a file for each or for those that belong together."""

@@ -1,8 +1,7 @@
 """Bag of binary words: a vocabulary of descriptors and an index that ranks places by appearance."""
 
 from fleetmap.bow.place_index import PlaceIndex
-from fleetmap.bow.training import train_vocabulary
-from fleetmap.bow.vocabulary import BowVector, Vocabulary
+from fleetmap.bow.vocabulary import BowVector, Vocabulary, train_vocabulary
 from fleetmap.bow.vocabulary_codec import (
     MAX_NODES,
     VOCABULARY_FORMAT,

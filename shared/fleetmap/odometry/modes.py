@@ -8,15 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, interpolate_se3, se3_inverse, skew
-from fleetmap.odometry.checks.divergence_monitor import DivergenceMonitor
-from fleetmap.odometry.checks.imu_faults import longest_gap_ns
-from fleetmap.odometry.checks.zero_velocity import ZeroVelocityDetector
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter.measurements import wheel_odometry, zero_velocity
 from fleetmap.odometry.filter.nav_state import InitialState, NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.init.static_initialization import is_steady, polynomial_rate, static_initialization
+from fleetmap.odometry.odometry_checks import DivergenceMonitor, ZeroVelocityDetector, longest_gap_ns
 from fleetmap.odometry.sensor_buffer import SensorBuffer
 from fleetmap.odometry.tracking.tracker import Tracked
 from fleetmap.sensors.calibration import ImuNoise

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fleetmap.geometry import Array
-from fleetmap.odometry.checks.imu_faults import joined, without_spikes
+from fleetmap.odometry.odometry_checks import joined, without_spikes
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 
 _WHEEL_REACH_NS = 30_000_000  # a sample serves a frame within half the period of slow wheel odometry

@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.common import estimator_loop
 from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.odometry import OdometryEstimate, OdometrySettings
-from fleetmap.odometry.checks.imu_faults import joined
+from fleetmap.odometry.odometry_checks import joined
 from fleetmap.sensors.calibration import RigCalibration
 from fleetsim.motion.body_motion import RouteMotion
 from fleetsim.motion.routes import Route

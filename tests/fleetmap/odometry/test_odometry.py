@@ -10,11 +10,11 @@ import pytest
 
 from fleetmap.geometry import Array, se3_inverse, se3_log, so3_exp
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings, OdometryStatus, modes
-from fleetmap.odometry.checks.divergence_monitor import DivergenceMonitor
 from fleetmap.odometry.filter.nav_state import InitialState
 from fleetmap.odometry.filter.sliding_window import SlidingWindow
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.modes import InertialMode
+from fleetmap.odometry.odometry_checks import DivergenceMonitor
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracking.tracker import Tracked, Tracker
 from fleetmap.sensors.calibration import ImuNoise

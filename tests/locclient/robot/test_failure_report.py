@@ -11,7 +11,7 @@ from fleetmap.geometry import se3
 from fleetmap.messages import MAX_MESSAGE_BYTES, MAX_THUMBNAIL_BYTES, encode_message
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame
-from locclient.delivery.failure_files import write_failure
+from locclient.delivery.report_delivery import write_failure
 from locclient.robot.failure_report import expected_matches, match_view, small_jpeg
 from locclient.robot.jit_warmup import warm_up_kernels
 from mapserver.store import MapStore

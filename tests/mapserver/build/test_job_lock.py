@@ -5,8 +5,7 @@ import signal
 import time
 from pathlib import Path
 
-from mapserver.build.job_lock import INTERRUPTED, end_interrupted
-from mapserver.build.job_record import recorded_job
+from mapserver.build.job_lock import INTERRUPTED, end_interrupted, recorded_job
 from mapserver.store import MapStore
 from support.storage.map_samples import save_sample_draft
 

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from fleetmap.errors import StateError, UsageError
 from fleetmap.mapformat import Manifest
-from mapserver.build.job_record import recorded_job
+from mapserver.build.job_lock import recorded_job
 from mapserver.dashboard import drawing
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData, trend_words

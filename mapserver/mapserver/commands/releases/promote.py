@@ -1,11 +1,48 @@
-"""`mapserver promote`: a version becomes current, for all robots at once or for some of them first."""
+"""`mapserver publish`, `promote` and `rollback`: which version of a site is current."""
 
 from typing import Annotated
 
 import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
-from mapserver.commands.options import ActorOptions, SiteOptions
+from mapserver.commands.options import ActorOptions, SiteName, SiteOptions, StoreFolder
+
+
+@expand_options
+def publish(
+    context: typer.Context,
+    where: SiteOptions,
+    by: ActorOptions,
+    version: Annotated[int | None, typer.Option(min=1, help="The draft to publish; default: the newest.")] = None,
+    force: Annotated[
+        bool,
+        typer.Option("--force", help="Publish although the gate refuses, except beyond hard limits; needs --reason."),
+    ] = False,
+    config: ConfigFile = None,
+) -> None:
+    """Take a draft through the gate and make it the current version; status 4 if the gate refuses it."""
+    from mapserver import releases
+    from mapserver.quality.directions import one_way_words
+    from mapserver.quality.probes import lookalike_words
+    from mapserver.store import MapStore
+
+    gate = settings_of(context).gate
+    with MapStore.open(where.store) as maps:
+        published = releases.publish(maps, where.site, version, actor=by.named(), force=force, gate=gate)
+        info = maps.version(where.site, published)
+        verdict = maps.verdicts(where.site, published)[-1]
+        evidence = maps.evidence(where.site, published)
+    directions = () if evidence is None else evidence.directions or ()
+    sizes = f"{info.tiles} tiles, {info.landmarks} landmarks, {info.map_bytes} bytes"
+    typer.echo(f"site {where.site}: version {published} is current ({sizes})")
+    for refused in verdict.reasons:
+        typer.echo(f"published by force although {refused}")
+    if verdict.report.get("not_judged"):
+        typer.echo(f"not judged, evidence missing: {', '.join(verdict.report['not_judged'])}")
+    if one_way := one_way_words(directions):
+        typer.echo(one_way)
+    if alike := lookalike_words(None if evidence is None else evidence.starts):
+        typer.echo(alike)
 
 
 @expand_options
@@ -50,3 +87,14 @@ def _share(text: str) -> float:
     if not 0 < share < 1:
         raise UsageError(f"--canary {text!r}: write a share of the robots between 0 and 1, such as 5% or 0.05")
     return share
+
+
+@expand_options
+def rollback(site: SiteName, store: StoreFolder, by: ActorOptions) -> None:
+    """Make the previous version current again; the current one retires."""
+    from mapserver import releases
+    from mapserver.store import MapStore
+
+    with MapStore.open(store) as maps:
+        version = releases.roll_back(maps, site, actor=by.named())
+    typer.echo(f"site {site}: version {version} is current again")

@@ -3,8 +3,7 @@
 import numpy as np
 
 from fleetmap.geometry import se3, so3_exp
-from fleetmap.odometry.checks.divergence_monitor import DivergenceMonitor
-from fleetmap.odometry.checks.zero_velocity import ZeroVelocityDetector
+from fleetmap.odometry.odometry_checks import DivergenceMonitor, ZeroVelocityDetector
 
 STILL = np.eye(4)
 

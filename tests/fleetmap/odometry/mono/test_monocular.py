@@ -15,10 +15,10 @@ from fleetmap.odometry import (
     OdometryStatus,
     make_odometry,
 )
-from fleetmap.odometry.checks.divergence_monitor import DivergenceMonitor
 from fleetmap.odometry.filter.nav_state import InitialState
 from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization
 from fleetmap.odometry.mono import mono_modes
+from fleetmap.odometry.odometry_checks import DivergenceMonitor
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, Trajectory

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleetmap.odometry.checks.imu_faults import longest_gap_ns, without_spikes
+from fleetmap.odometry.odometry_checks import longest_gap_ns, without_spikes
 from fleetmap.odometry.tracking.tracks import Observations
 from fleetmap.sensors.samples import ImuSamples
 from support.worlds.point_world import CAMERA
