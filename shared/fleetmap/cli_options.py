@@ -100,12 +100,9 @@ def options_of(command: Command) -> dict[str, inspect.Parameter]:
     return {
         name.rstrip("_"): parameter
         for name, parameter in inspect.signature(command, eval_str=True).parameters.items()
-        if name != "config" and any(_is_option(mark) for mark in getattr(parameter.annotation, "__metadata__", ()))
+        if name != "config"
+        and any(isinstance(m, typer.models.OptionInfo) for m in getattr(parameter.annotation, "__metadata__", ()))
     }
-
-
-def _is_option(mark: object) -> bool:
-    return isinstance(mark, typer.models.OptionInfo)
 
 
 def file_type(settings: "type[Section]", commands: Commands) -> "type[Section]":
@@ -151,13 +148,10 @@ def command_defaults(given: Mapping[str, Any], commands: Commands) -> Options:
             found[name] = command_defaults({**common, **section}, command.commands)
         else:
             options = options_of(command)
-            needed = {key: value for key, value in common.items() if key in options and _is_required(options[key])}
+            required = {key for key, option in options.items() if option.default is inspect.Parameter.empty}
+            needed = {key: value for key, value in common.items() if key in required}
             found[name] = {options[key].name: value for key, value in (needed | section).items()}
     return found
-
-
-def _is_required(parameter: inspect.Parameter) -> bool:
-    return parameter.default is inspect.Parameter.empty
 
 
 def take_defaults(context: typer.Context, path: Path | None) -> Path | None:

@@ -67,16 +67,11 @@ class HealthFigures:
         self._first_fix_s: float | None = None
         self._first_frame_ms: float | None = None
         self._fixes = FixFigures()
-        self._last: Outcome | None = None
-
-    @property
-    def last(self) -> Outcome | None:
-        """The last frame, None before the first."""
-        return self._last
+        self.last: Outcome | None = None  # the last frame
 
     def handle(self, outcome: Outcome) -> None:
         estimate = outcome.estimate
-        self._last = outcome
+        self.last = outcome
         self._frame_ms.append(1e3 * outcome.cpu_s)
         if self._first_ns is None:
             self._first_ns, self._first_frame_ms = estimate.stamp_ns, 1e3 * outcome.cpu_s
@@ -92,7 +87,7 @@ class HealthFigures:
 
     def report(self, site: str, robot: str, wall_ns: int, more: Mapping[str, Figure], silent: bool) -> RobotHealth:
         """The message; more: figures of other parts. silent: whether the source has stopped sending frames."""
-        last = None if self._last is None else self._last.estimate
+        last = None if self.last is None else self.last.estimate
         flags: list[str] = [Cause.NO_FRAMES] if silent else []
         figures: dict[str, Figure] = {
             "localised_share_of_all": self._localised / self._all_frames if self._all_frames else None,
@@ -110,7 +105,7 @@ class HealthFigures:
             flags += [Cause.CALIBRATION] if last.calibration.is_wrong else []
             flags += ["blind"] if is_blind(last.status, radius_95_m(last.cov_rot_trans)) else []
             flags += [last.image.cause] if last.image.cause else []
-            flags += [] if self._last is None or self._last.may_be_mapped else [OFF_MAP]
+            flags += [] if self.last is None or self.last.may_be_mapped else [OFF_MAP]
         return RobotHealth(
             site=site,
             robot=robot,

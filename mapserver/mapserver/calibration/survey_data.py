@@ -1,6 +1,7 @@
 """Data of a calibration from a survey's first stages: its keyframes, tracks and odometry as they are."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
@@ -41,7 +42,7 @@ def stretch_of_survey(
         motions = np.column_stack([motion.velocities_mps, motion.gyro_bias_radps, motion.accel_bias_mps2])
     calibration, rectifier = rig
     return CalibrationData(
-        calibration=calibration if motion.inertial else _without_imu(calibration),
+        calibration=calibration if motion.inertial else replace(calibration, imu=None),
         rectifier=rectifier,
         stamps_ns=part.stamps_ns,
         start=MotionState(part.map_from_body, motions, marks.points_map),
@@ -53,10 +54,6 @@ def stretch_of_survey(
         wheel=wheel,
         bias_px=_BIAS_PX,
     )
-
-
-def _without_imu(rig: RigCalibration) -> RigCalibration:
-    return RigCalibration(rig.cameras, None, rig.base_from_body)
 
 
 def _busiest(state: SurveyState) -> NDArray[np.bool_]:

@@ -59,15 +59,13 @@ def consistency(estimate: Trajectory, covariances: StampedCovariances, truth: Tr
             "stamps must be equal to the nanosecond"
         )
     covs = covariances.covs_rot_trans[np.searchsorted(covariances.stamps_ns, mine.stamps_ns)]
-    errors = np.array([_error(t, m) for t, m in zip(true.frame_from_body, mine.frame_from_body, strict=True)])
+    both_rotations = zip(true.frame_from_body[:, :3, :3], mine.frame_from_body[:, :3, :3], strict=True)
+    turned = np.array([so3_log(t @ m.T) for t, m in both_rotations])
+    errors = np.hstack([turned, true.positions_m - mine.positions_m])
     both = _squared(errors, covs)
     rotation, position = _squared(errors[:, :3], covs[:, :3, :3]), _squared(errors[:, 3:], covs[:, 3:, 3:])
     means = float(position.mean() / 3), float(rotation.mean() / 3), float(both.mean() / 6)
     return Consistency(*means, float((both < _BOUND).mean()), float((position < _POSITION_BOUND).mean()), len(mine))
-
-
-def _error(true: Array, mine: Array) -> Array:
-    return np.concatenate([so3_log(true[:3, :3] @ mine[:3, :3].T), true[:3, 3] - mine[:3, 3]])
 
 
 def _squared(errors: Array, covs: Array) -> Array:

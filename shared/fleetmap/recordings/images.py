@@ -150,7 +150,8 @@ def decode_grey(stored: StoredImage) -> Image:
     """(H, W) uint8. 16-bit images keep their upper byte, colour becomes grey by the usual luma weights."""
     pixels = _decode(stored)
     if pixels.ndim == 3:
-        pixels = cv2.cvtColor(pixels, _GREY_FROM.get(stored.encoding, _grey_code(pixels)))
+        usual = cv2.COLOR_BGRA2GRAY if pixels.shape[2] == 4 else cv2.COLOR_BGR2GRAY
+        pixels = cv2.cvtColor(pixels, _GREY_FROM.get(stored.encoding, usual))
     if pixels.dtype == np.uint16:
         return np.asarray(pixels >> 8, np.uint8)
     if pixels.dtype != np.uint8:
@@ -206,10 +207,6 @@ def store_frame(frame: CameraFrame) -> StoredFrame:
     right = None if frame.right is None else grey_image(frame.right)
     depth = None if frame.depth_m is None else depth_image(frame.depth_m)
     return StoredFrame(frame.stamp_ns, grey_image(frame.left), right, depth)
-
-
-def _grey_code(pixels: AnyArray) -> int:
-    return cv2.COLOR_BGRA2GRAY if pixels.shape[2] == 4 else cv2.COLOR_BGR2GRAY
 
 
 def _decode(stored: StoredImage) -> AnyArray:

@@ -42,7 +42,7 @@ class HallMaker:
         return column * layout.chunk_length_m, y_min, x_max, y_max
 
     def add_chunk(self, builder: FaceBuilder, column: int, row: int) -> None:
-        self._add_floor(builder, column, row)
+        self._add_floor_quad(builder, self.rectangle(column, row), 0.0, self._textures.concrete, row)
         self._add_markings(builder, column, row)
         self._add_walls(builder, column, row)
         self._add_roof(builder, column, row)
@@ -77,9 +77,6 @@ class HallMaker:
         offset_texels = self._offset_texels(x_min, y_max, row)
         surface = Surface(texture, material=MATERIAL_FLOOR, offset_texels=offset_texels)
         builder.add_quad((x_min, y_max, z_m), (x_max - x_min, 0, 0), (0, y_min - y_max, 0), surface)
-
-    def _add_floor(self, builder: FaceBuilder, column: int, row: int) -> None:
-        self._add_floor_quad(builder, self.rectangle(column, row), 0.0, self._textures.concrete, row)
 
     def _add_markings(self, builder: FaceBuilder, column: int, row: int) -> None:
         """Lane lines along the racks, a stop line across each aisle mouth; 2 mm above the floor."""

@@ -43,7 +43,12 @@ class FoxgloveCodec:
             accel = np.array([_xyz(message.linear_acceleration) for message in parsed])
         except AttributeError as error:
             raise ValueError(f"{channel.schema.name} has no {error.name}") from error
-        return np.array([_stamp_ns(message) for message in parsed], np.int64), gyro, accel, _frame_id(parsed[0])
+        return (
+            np.array([_stamp_ns(message) for message in parsed], np.int64),
+            gyro,
+            accel,
+            str(getattr(parsed[0], "frame_id", "")),
+        )
 
     def pose(self, channel: Channel, data: bytes) -> tuple[int, Array]:
         message = self._parse(channel, data)
@@ -120,10 +125,6 @@ def _stamp_ns(message: Message) -> int:
 
 def _xyz(vector: Message) -> tuple[float, float, float]:
     return vector.x, vector.y, vector.z
-
-
-def _frame_id(message: Message) -> str:
-    return str(getattr(message, "frame_id", ""))
 
 
 def _link(message: Message) -> FrameLink:

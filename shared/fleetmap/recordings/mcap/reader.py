@@ -249,7 +249,7 @@ def _collect(scan: McapScan, topics: Topics) -> dict[int, _Stream]:
             stream = streams[channel.id] = _Stream(channel, codec)
         if type_name(channel) not in IMAGE_TYPES:
             # Lenses repeat with every image, one is enough
-            if not (stream.messages and _is_lens(channel)):
+            if not (stream.messages and type_name(channel) in ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")):
                 scan.keep(len(data))
                 stream.messages.append(bytes(data))
             continue
@@ -268,10 +268,6 @@ def _may_be_needed(channel: Channel, topics: Topics) -> bool:
     if channel.message_encoding not in CODECS or type_name(channel) not in KNOWN_TYPES:
         return False
     return channel.topic == topics.tf_static or "Transform" not in type_name(channel).replace("TFMessage", "Transform")
-
-
-def _is_lens(channel: Channel) -> bool:
-    return type_name(channel) in ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
 
 
 def _with_hints(topics: Topics, given: CalibrationFile | None, present: set[str]) -> Topics:
