@@ -4,6 +4,7 @@ Every request but those of `_OPEN` needs a scope, where sign-in is on; what is n
 """
 
 import base64
+import gzip
 import hashlib
 import re
 import secrets
@@ -26,8 +27,9 @@ from mapserver.operators.operators import LIFE_S
 from mapserver.store import Actor
 
 SIGN_IN, SIGN_OUT = "/sign-in", "/sign-out"
-_OPEN = {"/healthz", "/readyz", SIGN_IN}
+_OPEN = {"/healthz", "/readyz", SIGN_IN, SIGN_OUT}
 _SOCKET = "/_nicegui_ws/"
+_LEVEL = 5
 _SCRIPT = re.compile(rb"<script\b(?![^>]*\bnonce=)")
 _FIXED = [
     (b"x-content-type-options", b"nosniff"),
@@ -113,7 +115,7 @@ def set_session(response: Response, scope: Scope, session: str) -> None:
 def address_of(scope: Scope) -> str:
     """The address that a request comes from."""
     client = scope.get("client")
-    return str(client[0]) if client else ""
+    return str(client[0])[:64] if client else ""
 
 
 class Guard:
@@ -198,8 +200,9 @@ class _Answer:
         self._start: Message | None = None
         self._body = b""
         # The pages' own compression comes first, and scripts could not be found in what it makes.
-        self.scope = scope
+        self.scope, self._may_compress = scope, False
         if _wants_page(scope):
+            self._may_compress = "gzip" in _headers(scope).get("accept-encoding", "")
             kept = [(name, value) for name, value in scope["headers"] if name != b"accept-encoding"]
             self.scope = {**scope, "headers": kept}
 
@@ -215,6 +218,9 @@ class _Answer:
             if message.get("more_body"):
                 return
             body = _SCRIPT.sub(b'<script nonce="%s"' % self._nonce.encode(), self._body)
+            if body and self._may_compress:
+                body = gzip.compress(body, _LEVEL)
+                self._start["headers"] += [(b"content-encoding", b"gzip"), (b"vary", b"Accept-Encoding")]
             headers = [(name, value) for name, value in self._start["headers"] if name != b"content-length"]
             # An answer to HEAD has the length of a body that is not there.
             headers = [*headers, (b"content-length", b"%d" % len(body))] if body else self._start["headers"]
@@ -250,7 +256,7 @@ def _needed(scope: Scope) -> Right | None:
         return Right.METRICS
     # Acts of the pages come by the socket and are asked for one by one.
     is_reading = scope["type"] == "websocket" or scope["method"] in {"GET", "HEAD", "OPTIONS"}
-    return Right.READ if is_reading or _SOCKET in path or path == SIGN_OUT else Right.CHANGE
+    return Right.READ if is_reading or _SOCKET in path else Right.CHANGE
 
 
 def _refuse(scope: Scope, status: int, words: str, headers: dict[str, str] | None = None) -> Response:

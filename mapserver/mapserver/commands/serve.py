@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _STOP_WITHIN_S = 5
 _SWITCH_INTERVAL_S = 0.001
-_RENEW_EVERY_S = 30.0
+_RENEW_EVERY_S = 10.0
 _INSECURE = (
     "This server was started with --insecure. Whoever reaches it may read everything and change the maps of the robots."
 )

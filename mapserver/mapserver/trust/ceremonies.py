@@ -81,7 +81,8 @@ def admit(
 
     Raises StateError unless enough people signed, UsageError for a threshold that the keys cannot meet.
     """
-    with _ceremony(store, people) as repository:
+    words = f"site {site}: {max(1, len(keys))} keys may sign its lists, {threshold} must"
+    with _ceremony(store, people, words) as repository:
         if not 1 <= threshold <= max(1, len(keys)):
             raise UsageError(f"--threshold {threshold}: {max(1, len(keys))} keys cannot meet it")
         own = list(keys) or [_keys(store).replace(site_role(site)).public_key]
@@ -90,7 +91,7 @@ def admit(
 
 def rotate_online(store: MapStore, people: Sequence["CryptoSigner"]) -> None:
     """Another online key, after a theft of the server or of the key; robots forget what the old one signed."""
-    with _ceremony(store, people) as repository:
+    with _ceremony(store, people, "another online key") as repository:
         repository.replace_online(_keys(store).replace("online").public_key, people)
 
 
@@ -100,7 +101,9 @@ def revoke_site(store: MapStore, site: str, keys: Sequence["Key"], people: Seque
     The site's key alone would not do: robots refuse numbers below those that the thief signed until the online key is another one.
     Whoever holds the new keys signs again; errors as of `admit`.
     """
-    with _ceremony(store, people) as repository:
+    with _ceremony(
+        store, people, f"site {site}: other keys for it and the server, the old ones are revoked"
+    ) as repository:
         before = repository.lists.site_roles().get(site_role(site))
         if before is None:
             raise UsageError(f"no key may sign maps of site {site}; `mapserver trust status` shows the sites")
@@ -131,7 +134,8 @@ def rotate_root(
             for signer in added:
                 root.add_key(signer.public_key, role)
 
-    with _ceremony(store, people) as repository:
+    words = f"root and targets signed anew, {int(add is not None)} people added, {len(removed)} removed"
+    with _ceremony(store, people, words) as repository:
         known = set(repository.root().roles["root"].keyids)
         if not {key.keyid for key in removed} <= known:
             raise UsageError("the person whose key is to be removed holds no root key; `trust status` counts them")
@@ -149,7 +153,8 @@ def sign_site(store: MapStore, site: str, signer: "CryptoSigner") -> int:
 
     Raises StateError where nothing is to be signed, or this key may not.
     """
-    with _ceremony(store, None) as repository:
+    words = f"site {site}: its list was signed with key {signer.public_key.keyid[:8]}"
+    with _ceremony(store, None, words) as repository:
         repository.check_signer(site, signer)
         previous = repository.lists.site_roles()[site_role(site)].previous
         wanted = admitted_versions(store.releases(site), previous)
@@ -166,8 +171,8 @@ def sign_site(store: MapStore, site: str, signer: "CryptoSigner") -> int:
 
 
 @contextmanager
-def _ceremony(store: MapStore, people: Sequence["CryptoSigner"] | None) -> Iterator[ListRepository]:
-    """The lists for one change, checked before it; afterwards the server signs what follows from it."""
+def _ceremony(store: MapStore, people: Sequence["CryptoSigner"] | None, words: str) -> Iterator[ListRepository]:
+    """The lists for one change, checked before it; afterwards `words` stand in the log, and the server signs what follows from it."""
     repository = _repository(store)
     if not repository.lists.are_there:
         raise StateError(f"{store.folder} has no signed lists; `mapserver trust init` makes them")
@@ -177,6 +182,7 @@ def _ceremony(store: MapStore, people: Sequence["CryptoSigner"] | None) -> Itera
             if people is not None:
                 repository.check_people(people)
             yield repository
+    store.audit("trust changed", words)
     update_lists(store, all_anew=True)
 
 

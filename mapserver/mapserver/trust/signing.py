@@ -52,8 +52,12 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
         repository = ListRepository(lists, now)
         faults = []
         for info in store.sites():
+            role = site_role(info.site)
+            before = lists.newest(role)
             try:
                 _update_site(repository, keys, store.releases(info.site), now)
+                if lists.newest(role) != before:
+                    store.audit("list signed", f"site {info.site}, list {lists.newest(role)}")
             except FleetmapError as error:  # of one site: the others' robots, and the timestamp, must not wait for it
                 faults.append(error)
         online = keys.signer("online")

@@ -143,6 +143,7 @@ def test_without_a_name_nothing_answers(server: Server) -> None:
         paths = paths_of(client)
         assert len(paths) > 20
     with client_of(server) as client:
+        assert client.post("/sign-out", headers={"Origin": EVIL}).status_code == 403
         for method, path in [
             *paths,
             ("GET", "/openapi.json"),

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from fleetmap.trust import TrustedMap
 from mapserver import cli, releases
 from mapserver.store import Actor, MapStore
 from mapserver.store.access.chain import COLUMNS, line_sha256
@@ -55,16 +56,26 @@ def folder(tmp_path: Path) -> Path:
         init_here(store)
         store.audit("enrolled", "tug-7", actor=Actor("ada", "", "ada", "10.0.0.1"))
         update_lists(store, all_anew=True)
-    shutil.copy(tmp_path / "store" / "trust" / "timestamp.json", tmp_path / "witness.json")
+    robot_asks(tmp_path / "store")
     return tmp_path / "store"
 
 
+def robot_asks(store: Path) -> None:
+    """What a robot does that asks for its map."""
+
+    def ask(name: str) -> bytes | None:
+        path = store / "trust" / name
+        return path.read_bytes() if path.is_file() else None
+
+    TrustedMap(store.parent / "robot", "lab", None, ask).refresh()
+
+
 def test_an_honest_log_is_clean(folder: Path) -> None:
-    witness = str(folder.parent / "witness.json")
-    assert run("--store", str(folder), "--verify", "--witness", witness) == (0, "5 lines, 2 witnesses, clean\n")
+    witness = str(folder.parent / "robot" / "timestamp.json")
+    assert run("--store", str(folder), "--verify", "--witness", witness) == (0, "6 lines, 2 witnesses, clean\n")
     status, printed = run("--store", str(folder))
-    assert (status, len(printed.splitlines())) == (0, 5)
-    assert "enrolled, 'tug-7', by 'ada' (signed in), from 10.0.0.1" in printed
+    assert (status, len(printed.splitlines())) == (0, 6)
+    assert "enrolled, 'tug-7', by 'ada' (signed in), from '10.0.0.1'" in printed
     assert len(json.loads(run("--store", str(folder), "--last", "2", "--json")[1])) == 2
 
 
@@ -72,11 +83,11 @@ def test_an_honest_log_is_clean(folder: Path) -> None:
     ("statement", "words"),
     [
         ("UPDATE events SET actor = 'bob' WHERE id = 2", "line 2 was changed"),
-        ("UPDATE events SET address = '10.0.0.2' WHERE id = 5", "line 5 was changed"),
+        ("UPDATE events SET address = '10.0.0.2' WHERE id = 6", "line 6 was changed"),
         ("UPDATE events SET sha256 = '' WHERE id = 3", "line 3 was changed"),
         ("DELETE FROM events WHERE id = 3", "lines 3 to 3 are missing"),
-        ("DELETE FROM events WHERE id = 5", "the log ends at line 4"),
-        ("INSERT INTO events (id, stamp_ns, site, kind, detail) VALUES (6, 1, 'lab', 'x', 'y')", "line 6 was changed"),
+        ("DELETE FROM events WHERE id = 6", "the log ends at line 5"),
+        ("INSERT INTO events (id, stamp_ns, site, kind, detail) VALUES (7, 1, 'lab', 'x', 'y')", "line 7 was changed"),
     ],
 )
 def test_a_changed_line_is_found(folder: Path, statement: str, words: str) -> None:
@@ -91,9 +102,11 @@ def test_a_log_written_anew_is_found_by_what_a_robot_kept(folder: Path) -> None:
     with MapStore.open(folder) as store:
         update_lists(store, all_anew=True)  # the administrator has the online key too
     assert run("--store", str(folder), "--verify")[0] == 0, "the control: alone the store cannot know"
-    status, printed = run("--store", str(folder), "--verify", "--witness", str(folder.parent / "witness.json"))
+    status, printed = run(
+        "--store", str(folder), "--verify", "--witness", str(folder.parent / "robot" / "timestamp.json")
+    )
     assert status == 3
-    assert "witness.json knows another line 5: the log was written anew" in printed
+    assert "timestamp.json knows another line 6: the log was written anew" in printed
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,6 @@ def _words(line: "AuditLine") -> str:
     when = datetime.fromtimestamp(line.stamp_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S")
     proved = " (signed in)" if line.operator else ""
     parts = [f"{line.id} {when} {line.kind}", line.site and f"site {line.site}", repr(line.detail)]
-    parts += [line.actor and f"by {line.actor!r}{proved}", line.address and f"from {line.address}"]
+    parts += [line.actor and f"by {line.actor!r}{proved}", line.address and f"from {line.address!r}"]
     parts += [line.reason and f"because {line.reason!r}"]
     return ", ".join(part for part in parts if part)
