@@ -4,6 +4,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 import numpy as np
 
@@ -67,11 +68,20 @@ class Session:
     truth: Trajectory
 
     def frames(self) -> Iterator[CameraFrame]:
-        """The pictures, one pair at a time; stamps on the cameras' clock."""
+        """The pictures, one pair at a time; stamps on the cameras' clock. The next pair is made while one is used."""
         pipeline = find_pipeline(self.order.camera_pipeline)
-        for time_s, stamp_ns in zip(self.frame_times_s, self.frame_stamps_ns(), strict=True):
+
+        def made(time_s: float, stamp_ns: int) -> CameraFrame:
             shot = self.renderer.shoot(time_s)
-            yield process_frame(CameraFrame(stamp_ns, shot.left, shot.right), pipeline, self.order.seed)
+            return process_frame(CameraFrame(stamp_ns, shot.left, shot.right), pipeline, self.order.seed)
+
+        moments = iter(zip(self.frame_times_s, self.frame_stamps_ns(), strict=True))
+        with ThreadPoolExecutor(1, thread_name_prefix="shutter") as shutter:
+            coming = [shutter.submit(made, *moment) for moment in islice(moments, 1)]
+            while coming:
+                frame = coming.pop().result()
+                coming += [shutter.submit(made, *moment) for moment in islice(moments, 1)]
+                yield frame
 
     def frame_stamps_ns(self) -> list[int]:
         """Stamps of the frames: late ones late, all shifted by the rig's hidden delay."""

@@ -28,6 +28,19 @@ def inner_kernel(function: F) -> F:
     return _cached(function, forceinline=True)
 
 
+def uncounted_kernel(function: F) -> F:
+    """As `kernel`, for one that allocates nothing: references to arrays are not counted on the way through its helpers.
+
+    numba counts each array of a tuple each time that it is handed on, by an atomic operation that no optimisation removes.
+    """
+    return _cached(function, _nrt=False)
+
+
+def uncounted_inner_kernel(function: F) -> F:
+    """As `inner_kernel`, for helpers of an `uncounted_kernel`."""
+    return _cached(function, forceinline=True, _nrt=False)
+
+
 def _cached(function: F, **options: Any) -> F:
     try:
         compiled = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)

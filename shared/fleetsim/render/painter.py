@@ -69,8 +69,7 @@ class Painter:
         """The picture whose exposure is centred at t; `groups` are the strengths of the lamp groups."""
         self._prepare(scene, groups, t_s)
         height, width = self._optics.height_px, self._optics.width_px
-        depth, faces = np.zeros((height, width), np.float32), np.full((height, width), -1, np.int32)
-        canvas = Canvas(np.zeros((height, width)), depth, faces)
+        canvas = Canvas.empty(height, width)
         count = self.subframes(path, t_s, exposure) if self._look.has_blur else 1
         samples, look = self._look.samples if count == 1 else 1, self._look
         for number in range(count):
@@ -80,7 +79,7 @@ class Painter:
             is_middle = number == count // 2
             instant = Instant(samples, shift, 1.0 / count, look.most_taps, look.reflectance, is_middle)
             self._add(canvas, instant, path(moment), moment)
-        return Shot(self._develop(canvas.radiance, exposure, noise_key), depth, faces, count)
+        return Shot(self._develop(canvas.radiance, exposure, noise_key), canvas.depth_m, canvas.faces, count)
 
     def subframes(self, path: Path, t_s: float, exposure: Exposure) -> int:
         """Number of pictures to average so that a thing 1.5 m away moves at most 1.2 px from one to the next."""

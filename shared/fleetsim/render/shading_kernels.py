@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.numerics.kernel import inline_kernel, inner_kernel, kernel
+from fleetmap.numerics.kernel import inline_kernel, uncounted_inner_kernel, uncounted_kernel
 
 Float = NDArray[np.float64]
 Int32 = NDArray[np.int32]
@@ -19,6 +19,7 @@ Bytes = NDArray[np.uint8]
 _WRAP = 1048575.5
 _GLOSS = 9.0  # footprint area of a reflection: the polish is not perfect
 _JOINT_M = 4.4
+_MOST_SAMPLES = 16  # of a pixel
 
 
 class Surfaces(NamedTuple):
@@ -62,11 +63,26 @@ class Instant(NamedTuple):
 
 
 class Canvas(NamedTuple):
-    """A picture in the making (H, W): radiance, depth along the optical axis, face of each pixel (-1 for nothing)."""
+    """A picture in the making (H, W): radiance, depth along the optical axis, face of each pixel (-1 for nothing).
+
+    seen, hits, sum_x, sum_y (16,): room for the polygons of one pixel.
+    """
 
     radiance: Float
     depth_m: NDArray[np.float32]
     faces: Int32
+    seen: Int32
+    hits: Int32
+    sum_x: Float
+    sum_y: Float
+
+    @classmethod
+    def empty(cls, height: int, width: int) -> "Canvas":
+        """One that shows nothing yet."""
+        seen, hits = np.empty(_MOST_SAMPLES, np.int32), np.empty(_MOST_SAMPLES, np.int32)
+        sum_x, sum_y = np.empty(_MOST_SAMPLES), np.empty(_MOST_SAMPLES)
+        depth_m, faces = np.zeros((height, width), np.float32), np.full((height, width), -1, np.int32)
+        return cls(np.zeros((height, width)), depth_m, faces, seen, hits, sum_x, sum_y)
 
 
 @inline_kernel
@@ -88,7 +104,7 @@ def bilinear(
     return upper + (lower - upper) * share_y
 
 
-@inner_kernel
+@uncounted_inner_kernel
 def sample(
     surfaces: Surfaces,
     texture: int,
@@ -168,7 +184,7 @@ def sample(
     return value
 
 
-@inner_kernel
+@uncounted_inner_kernel
 def joint_factor(distance_m: float, width_texels: float) -> float:
     """Darkening by a saw-cut joint 12 mm wide at distance_m from its centre, filtered over the footprint."""
     blur_m = max(width_texels, 1.0) * 0.0025
@@ -176,7 +192,7 @@ def joint_factor(distance_m: float, width_texels: float) -> float:
     return 1.0 - 0.6 * cover * min(1.0, 0.012 / blur_m)
 
 
-@inner_kernel
+@uncounted_inner_kernel
 def floor_pattern(
     surfaces: Surfaces, x: float, y: float, ax: float, ay: float, bx: float, by: float, most_taps: int, area: float
 ) -> float:
@@ -208,7 +224,7 @@ def floor_pattern(
     return factor
 
 
-@inner_kernel
+@uncounted_inner_kernel
 def shade(
     surfaces: Surfaces,
     visible: Visible,
@@ -265,7 +281,7 @@ def shade(
     return grey * (1.0 / 255.0) * values[f, 2] * received, u, v, w
 
 
-@kernel
+@uncounted_kernel
 def shade_image(
     surfaces: Surfaces,
     visible: Visible,
@@ -284,7 +300,7 @@ def shade_image(
     shadows (M, 3): x, y, 1 / radius^2 of soft contact shadows on the floor.
     """
     samples, shift, weight, most_taps, reflectance, wants_truth = instant
-    radiance, depth_m, faces = canvas
+    radiance, depth_m, faces, seen, hits, sum_x, sum_y = canvas
     owner, face_of, mirror_owner = visible.owner, visible.face_of, mirror.owner
     quads, numbers, floor = surfaces.quads, surfaces.numbers, surfaces.floor
     texels, table = surfaces.texels, surfaces.table
@@ -293,8 +309,6 @@ def shade_image(
     has_lens = rays.shape[0] > 0
     per_px_x, per_px_y = 1.0 / pinhole[0], 1.0 / pinhole[1]
     wide_x, wide_y = per_px_x, per_px_y
-    seen, hits = np.empty(16, np.int32), np.empty(16, np.int32)
-    sum_x, sum_y = np.empty(16), np.empty(16)
     step = 1.0 / samples
     for y in range(height):
         for x in range(width):
