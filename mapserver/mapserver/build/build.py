@@ -5,7 +5,6 @@ import time
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError,
 from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
-from fleetmap.sensors.samples import SensorSet, Trajectory
+from fleetmap.sensors.samples import SensorSet
 from mapserver.build.draft_evidence import Before, JudgedSession, examine_draft, replayed_probes
 from mapserver.build.image_spill import ImageSpill
 from mapserver.build.job_lock import Job, recorded_job
@@ -30,6 +29,7 @@ from mapserver.build.report import (
     BuildCost,
     BuildReport,
     accuracy,
+    library_versions,
     loop_places,
     make_report,
     report_details,
@@ -39,9 +39,12 @@ from mapserver.build.survey_recordings import (
     Admission,
     OpenRecordings,
     RecordingOptions,
+    SurveyBeginnings,
     Surveyed,
     admit_recordings,
+    begins_site,
     joined_truth,
+    map_trajectories,
     survey_all,
     survey_recording,
 )
@@ -50,6 +53,7 @@ from mapserver.build.worker import open_executor
 from mapserver.quality.figures import Evidence, merged
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
+from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.loops.zones import Zones, zones_of
@@ -63,7 +67,6 @@ from mapserver.tiles.tiling import TILE_SIZE_M, tiles_from_survey
 from mapserver.trust.signing import check_base
 
 _NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled", "directions", "starts")
-_LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fleetmap")
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +126,16 @@ class _Run:
     console: Console
     times: StageTimes
     started_s: float
+    images: ImageSpill
+
+    def tools(self, executor: Executor, view: ProgressView) -> SurveyTools:
+        """With progress that is shown and timed."""
+
+        def progress(stage: str, done: int, total: int) -> None:
+            self.times(stage, done, total)
+            view(stage, done, total)
+
+        return SurveyTools(progress, self.images, executor)
 
 
 @dataclass(frozen=True)
@@ -162,14 +175,9 @@ def build_draft(
     options, started_s = request.options, time.perf_counter()
     zones = Zones() if options.zones is None else read_zones(options.zones)
     times, console = StageTimes(time.perf_counter), Console(stderr=True)
-    with OpenRecordings(options.reading, request.store) as reading:
-        run = _Run(request, reading, settings, zones, unusable, console, times, started_s)
-        times.begin("examination")
-        truth = options.frame_from_ground_truth
-        with open_executor(options.threads, None) as executor:
-            admitted = admit_recordings(
-                request.recordings, reading, console, needs_truth=truth, unusable=unusable, executor=executor
-            )
+    with OpenRecordings(options.reading, request.store) as reading, ImageSpill(reading.folder) as images:
+        run = _Run(request, reading, settings, zones, unusable, console, times, started_s, images)
+        admitted = _admitted(run)
         with (
             MapStore.open(request.store, create=True) as maps,
             recorded_job(maps, request.site, "build") if recorded else nullcontext(Job()) as job,
@@ -181,6 +189,22 @@ def build_draft(
             draft = replace(draft, report=draft.report | {"loop_places": loop_places(built.taken, built.joined)})
             job.message, job.report = draft.sentence, draft.report | {"version": draft.version}
             return draft, built
+
+
+def _admitted(run: _Run) -> dict[Path, Admission]:
+    request, options = run.request, run.request.options
+    run.times.begin("examination")
+    with ProgressView(run.console) as view, open_executor(options.threads, None) as executor:
+        begun = len(request.recordings) == 1 and begins_site(request.store, request.site)
+        beginnings = SurveyBeginnings(run.settings, run.tools(executor, view), may_begin=begun)
+        return admit_recordings(
+            request.recordings,
+            run.reading,
+            run.console,
+            needs_truth=options.frame_from_ground_truth,
+            unusable=run.unusable,
+            beginnings=beginnings,
+        )
 
 
 def read_zones(path: Path) -> Zones:
@@ -216,23 +240,17 @@ def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, 
     options, settings = run.request.options, run.settings
     with (
         ProgressView(run.console) as view,
-        ImageSpill(run.request.store) as images,
         open_executor(options.threads, options.scheduler) as executor,
     ):
-
-        def progress(stage: str, done: int, total: int) -> None:
-            run.times(stage, done, total)
-            view(stage, done, total)
-
         survey_options = SurveyConfig(settings, chosen.vocabulary, run.zones)
-        tools = SurveyTools(progress, images, executor)
+        tools = run.tools(executor, view)
 
         def survey_one(path: Path, pinhole: StereoCamera | None) -> Surveyed:
             return survey_recording(path, admitted[path], run.reading, pinhole, survey_options, tools)
 
         pinhole = None if base is None else base.camera
         surveyed = survey_all(list(admitted), survey_one, pinhole, run.unusable)
-        progress("joining", 0, 1)
+        tools.progress("joining", 0, 1)
         joined = join_sessions(base, [Session(s.survey, s.map_from_survey) for s in surveyed], settings)
     run.times.begin("vocabulary")
     chosen = judged(chosen, surveyed[0].survey, settings)
@@ -285,7 +303,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         camera=CameraEntry(**{name: getattr(camera, name) for name in CameraEntry.__struct_fields__}),
         recordings=tuple(s.entry for s in built.taken),
         configuration=_configuration(run, parent),
-        libraries=_library_versions(),
+        libraries=library_versions(),
         # A robot downloads the manifest: what it says about the build is short.
         report={key: value for key, value in msgspec.to_builtins(report).items() if key not in _NOT_FOR_ROBOTS},
     )
@@ -316,18 +334,11 @@ def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None)
     if before is not None:
         reading = options.frames, options.calibration, options.use
         replayed = replayed_probes(options.replay, before, *reading, (camera, run.settings.orb))
-    trajectories = _map_trajectories(built.joined)
+    trajectories = map_trajectories(built.joined)
     sessions = [JudgedSession(t, s.held_out, s.survey) for t, s in zip(trajectories, built.taken, strict=True)]
     evidence = examine_draft(tiles, camera, built.vocabulary.vocabulary, before, sessions, replayed)
     known = [] if before is None else before.calibrations
     return msgspec.structs.replace(evidence, calibrations=merged([*known, *(s.evidence() for s in built.taken)]))
-
-
-def _map_trajectories(joined: Joined) -> list[Trajectory]:
-    """The joined recordings' trajectories in the map's final frame, which the finished map has one after the other."""
-    ends = np.cumsum([len(trajectory) for trajectory in joined.trajectories])
-    parts = np.split(joined.map.trajectory.frame_from_body, ends[:-1])
-    return [Trajectory(t.stamps_ns, part) for t, part in zip(joined.trajectories, parts, strict=True)]
 
 
 def _wanted_ids(parent: Before | None, survey_map: SurveyMap) -> NDArray[np.uint32] | None:
@@ -355,16 +366,6 @@ def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
         "zones": {name: polygon.tolist() for name, polygon in run.zones.polygons.items()},
         "survey": to_dict(run.settings),
     }
-
-
-def _library_versions() -> dict[str, str]:
-    versions = {}
-    for name in _LIBRARIES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:  # a source tree that is not installed, or a library by another name
-            versions[name] = "not installed as a package"
-    return versions
 
 
 def picture_png(site: str, draft: Draft, built: Built) -> bytes:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 MAX_REFUSED = 300  # loops of a build, the most alike first: they are what could have made a wrong map
 MIN_MATCHED = 3  # stamps with a truth, below which no alignment is defined
+
+_LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fleetmap")
 
 
 class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -253,3 +256,14 @@ def _place(name: str, record: LoopRecord, places_map: Array, frames: list[int]) 
         "reason": record.reason,
         "score": round(record.score, 4),
     }
+
+
+def library_versions() -> dict[str, str]:
+    """Of what a map depends on besides settings."""
+    versions = {}
+    for name in _LIBRARIES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:  # a source tree that is not installed, or a library by another name
+            versions[name] = "not installed as a package"
+    return versions

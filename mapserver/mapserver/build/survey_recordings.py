@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from fleetmap.errors import FleetmapError, RecordingError, SurveyError
+from fleetmap.errors import FleetmapError, RecordingError, StoreError, SurveyError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
@@ -26,14 +26,20 @@ from mapserver.build.sensor_subset import reduced
 from mapserver.build.trajectory_sources import trajectory_source
 from mapserver.build.worker import read_ahead
 from mapserver.calibration import CalibrationParameter
+from mapserver.calibration.problem import CalibrationData
+from mapserver.calibration.recordings import LONGEST_S, Follow, stretch_of_chain
 from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
 from mapserver.quality.figures import RigEvidence
-from mapserver.survey.executor import SERIAL, Executor
+from mapserver.store import MapStore
+from mapserver.survey.executor import SERIAL
 from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey_by_priors
 from mapserver.survey.finish.map_transform import scaled, scaled_state
 from mapserver.survey.merge.multi_session import Joined, chained
-from mapserver.survey.pipeline import Survey, survey
+from mapserver.survey.pipeline import AdjustedChain, Survey, begin_survey, finish_survey, survey
+from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
+
+_SHARED_STRETCHES = 3  # of which a calibration takes one
 
 
 @dataclass(frozen=True)
@@ -76,13 +82,56 @@ class Surveyed:
 
 
 @dataclass(frozen=True, slots=True)
+class BegunSurvey:
+    """A survey up to its loops, with the calibration and the rectifier that it was made with."""
+
+    rig: RigCalibration
+    rectifier: Rectifier
+    chain: AdjustedChain
+
+
+@dataclass(frozen=True, slots=True)
 class Admission:
-    """A recording fit to be surveyed: every statement of the doctor, the calibration to use, what was found of the given one."""
+    """A recording fit to be surveyed: every statement of the doctor, the calibration to use, what was found of the given one.
+
+    begun: its survey, where the calibration was measured from that.
+    """
 
     statements: tuple[str, ...]
     rig: RigCalibration
     calibration: RigEvidence
     corrections: dict[str, float]
+    begun: BegunSurvey | None = None
+
+
+class SurveyBeginnings:
+    """Begins surveys of recordings as a build's examination needs them; the last one goes on where its calibration is taken.
+
+    A recording that is much longer than the stretch from which its calibration is measured is not worth a survey that may be refused.
+    """
+
+    def __init__(self, settings: SurveySettings, tools: SurveyTools, *, may_begin: bool = True) -> None:
+        """may_begin: else no survey is begun, and calibrations are measured by passes of their own."""
+        self._settings, self._tools, self._may_begin = settings, tools, may_begin
+        self.executor = tools.executor
+        self.last: BegunSurvey | None = None
+
+    def follow(self, recording: Recording, indices: NDArray[np.int64], given: Trajectory | None) -> Follow | None:
+        """How the calibration of these frames is to be followed; None where that takes a pass of its own."""
+        self.last = None
+        seconds = np.ptp(recording.frame_stamps_ns[indices]) * 1e-9 if len(indices) else 0.0
+        if not self._may_begin or given is not None or seconds > _SHARED_STRETCHES * LONGEST_S:
+            return None
+
+        def followed(rig: RigCalibration) -> CalibrationData:
+            self.last = None
+            rigged = replace(recording, calibration=rig)
+            inputs = _inputs(rigged, indices, Rectifier(rig), None)
+            self.last = BegunSurvey(rig, inputs.rectifier, begin_survey(inputs, self._settings, self._tools))
+            self._tools.progress("examination", 0, 1)
+            return stretch_of_chain(self.last.chain, recording, (rig, inputs.rectifier))
+
+        return followed
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +187,7 @@ class OpenRecordings:
 
     def __init__(self, options: RecordingOptions, folder: Path) -> None:
         self._options = options
-        self._folder = next(each for each in (folder, *folder.absolute().parents) if each.is_dir())
+        self.folder = next(each for each in (folder, *folder.absolute().parents) if each.is_dir())
         self._path: Path | None = None
         self._opened: tuple[Recording, NDArray[np.int64]]
 
@@ -158,7 +207,7 @@ class OpenRecordings:
         if path != self._path:
             self.__exit__()
             recording, indices = self._options.opened(path)
-            self._opened = replace(recording, frames=KeptFrames(recording.frames, self._folder)), indices
+            self._opened = replace(recording, frames=KeptFrames(recording.frames, self.folder)), indices
             self._path = path
         yield self._opened
         frames = self._opened[0].frames
@@ -173,16 +222,16 @@ def admit_recordings(
     *,
     needs_truth: bool,
     unusable: dict[Path, str] | None = None,
-    executor: Executor = SERIAL,
+    beginnings: SurveyBeginnings | None = None,
 ) -> dict[Path, Admission]:
-    """Checks all recordings, so that a hopeless one is refused before the work begins.
+    """Checks all recordings, so that a hopeless one is refused before the work begins; `beginnings` begin the survey of a single one.
 
     unusable: takes those that are refused, with the reason; without it, or where all are, that is an error.
     """
     admitted: dict[Path, Admission] = {}
     for path in paths:
         try:
-            admitted[path] = _admission(path, options, console, needs_truth, executor)
+            admitted[path] = _admission(path, options, console, needs_truth, beginnings)
         except RecordingError as error:
             if unusable is None:
                 raise
@@ -192,17 +241,27 @@ def admit_recordings(
     return admitted
 
 
-def _admission(path: Path, options: Reading, console: Console, needs_truth: bool, executor: Executor) -> Admission:
+def _admission(
+    path: Path,
+    options: Reading,
+    console: Console,
+    needs_truth: bool,
+    beginnings: SurveyBeginnings | None,
+) -> Admission:
     with options.open(path) as (recording, indices):
         for issue in recording.issues:
             console.print(f"issue: {issue.what}: {issue.detail}", markup=False)
         if needs_truth:
             check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
-        options.given_trajectory(recording, indices)
-        result = checked(recording, executor=executor)
+        given = options.given_trajectory(recording, indices)
+        follow = None if beginnings is None else beginnings.follow(recording, indices, given)
+        executor = SERIAL if beginnings is None else beginnings.executor
+        result = checked(recording, executor=executor, follow=follow)
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
-        return Admission(tuple(result.statements()), result.rig, result.calibration, result.corrections)
+        begun = None if beginnings is None else beginnings.last
+        begun = begun if begun is not None and begun.rig is result.rig else None
+        return Admission(tuple(result.statements()), result.rig, result.calibration, result.corrections, begun)
 
 
 def survey_recording(
@@ -216,13 +275,14 @@ def survey_recording(
     """Surveys one recording as if `pinhole` (or the camera that suits it) had seen it."""
     with reading.open(path) as (opened, indices):
         recording = replace(opened, calibration=admission.rig)
-        rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
-        frames = read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices)
-        given = reading.given_trajectory(recording, indices)
-        inputs = SurveyInputs(
-            frames, len(indices), recording.imu, recording.calibration, rectifier, recording.wheel, given
-        )
-        done, map_from_survey = _aligned(survey(inputs, options, tools), recording)
+        if (begun := admission.begun) is not None:
+            rectifier, done = begun.rectifier, finish_survey(begun.chain, options, tools)
+        else:
+            has_depth = recording.sensor_set is SensorSet.RGBD
+            rectifier = Rectifier(recording.calibration, has_depth=has_depth, pinhole=pinhole)
+            given = reading.given_trajectory(recording, indices)
+            done = survey(_inputs(recording, indices, rectifier, given), options, tools)
+        done, map_from_survey = _aligned(done, recording)
         return Surveyed(
             entry=RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices)),
             format=recording.format,
@@ -236,6 +296,13 @@ def survey_recording(
             corrections=admission.corrections,
             held_out=held_out_of(recording, indices.tolist(), rectifier, done, options.settings.orb),
         )
+
+
+def _inputs(
+    recording: Recording, indices: NDArray[np.int64], rectifier: Rectifier, given: Trajectory | None
+) -> SurveyInputs:
+    frames = read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices)
+    return SurveyInputs(frames, len(indices), recording.imu, recording.calibration, rectifier, recording.wheel, given)
 
 
 def _aligned(done: Survey, recording: Recording) -> tuple[Survey, Array | None]:
@@ -280,3 +347,19 @@ def joined_truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
     truths = [s.truth for s, outcome in zip(surveyed, joined.outcomes, strict=True) if outcome.joined]
     known = [truth for truth in truths if truth is not None]
     return chained(known, joined.trajectories) if len(known) == len(truths) else None
+
+
+def map_trajectories(joined: Joined) -> list[Trajectory]:
+    """The joined recordings' trajectories in the map's final frame, which the finished map has one after the other."""
+    ends = np.cumsum([len(trajectory) for trajectory in joined.trajectories])
+    parts = np.split(joined.map.trajectory.frame_from_body, ends[:-1])
+    return [Trajectory(t.stamps_ns, part) for t, part in zip(joined.trajectories, parts, strict=True)]
+
+
+def begins_site(store: Path, site: str) -> bool:
+    """Whether a site has no version yet, whose camera would be the map's instead of the recording's own."""
+    try:
+        with MapStore.open(store) as maps:
+            return site not in {info.site for info in maps.sites()} or maps.current(site) is None
+    except StoreError:  # there is none; what else is wrong with it is said where it is made
+        return True

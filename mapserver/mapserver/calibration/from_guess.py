@@ -99,7 +99,7 @@ def _judged(rig: RigCalibration, found: Adjusted, keyframes: int, passes: int) -
 
 def raw_matches(recording: Recording, on_progress: Callable[[str, int, int], None]) -> RawMatches:
     """Matches of unrectified images at moments spread over the busiest stretch."""
-    frames = busiest_frames(recording)
+    frames = busiest_frames(recording.frame_stamps_ns, recording.imu)
     settings, rng = OrbSettings(count=1500), np.random.default_rng(0)
     pairs, motions = [], []
     for n, at in enumerate(np.linspace(0, len(frames) - 1 - max(_STEPS), _MOMENTS).astype(int).tolist()):

@@ -1,6 +1,6 @@
 """Calibration of recordings: their busiest stretches are followed as a survey would, and adjusted together with the calibration."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from msgspec import structs
@@ -10,19 +10,21 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sensors.samples import SensorSet
+from fleetmap.sensors.samples import ImuSamples, SensorSet, Stamps
 from mapserver.calibration.estimate import CalibrationEstimate, continued_from, estimate_from
 from mapserver.calibration.parameters import COLUMNS, INDEX, CalibrationParameter, RigAxes, corrected_rig
 from mapserver.calibration.problem import CalibrationData
-from mapserver.calibration.survey_data import stretch_of_survey
-from mapserver.survey.odometry_pass import run_odometry
-from mapserver.survey.pipeline import adjusted_chain
+from mapserver.calibration.survey_data import stretch_of_survey, thinned
+from mapserver.survey.bundle.bundle_rounds import state_of
+from mapserver.survey.pipeline import AdjustedChain, begin_survey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 P = CalibrationParameter
+Follow = Callable[[RigCalibration], CalibrationData]
 LONGEST_S = 30.0  # of a recording: its busiest stretch
 _FEATURES = 700  # of a keyframe: a calibration needs fewer than a map
+_OBSERVATIONS = 300  # of a keyframe in the mean: what so many features leave over
 _PASSES = 3
 # A correction above this changes what is matched and how: the images are rectified again and followed anew.
 _ANEW = {
@@ -38,10 +40,14 @@ _ANEW |= dict.fromkeys((P.CAMERA_IMU_X, P.CAMERA_IMU_Y, P.CAMERA_IMU_Z), 0.02)
 
 
 def estimate_calibration(
-    recordings: Sequence[Recording], settings: SurveySettings, tools: SurveyTools | None = None
+    recordings: Sequence[Recording],
+    settings: SurveySettings,
+    tools: SurveyTools | None = None,
+    follow: Follow | None = None,
 ) -> CalibrationEstimate:
     """The calibration that recordings of one rig show together.
 
+    follow: the stretch of the only recording under a calibration, instead of the first pass here.
     RecordingError where there is none or where their calibrations differ; SurveyError where one of them holds too little to be followed.
     """
     if not recordings:
@@ -58,7 +64,10 @@ def estimate_calibration(
     for _ in range(_PASSES):
         axes = RigAxes.of(rig, Rectifier(rig))
         current = corrected_rig(rig, axes, before) if before.any() else rig
-        stretches = [followed(r, current, settings, tools or SurveyTools()) for r in recordings]
+        if follow is not None and current is rig:
+            stretches = [follow(rig)]
+        else:
+            stretches = [followed(r, current, settings, tools or SurveyTools()) for r in recordings]
         estimate = continued_from(before, estimate_from(stretches))
         after = estimate.corrections()
         if not any(abs(after[INDEX[p]] - before[INDEX[p]]) > limit for p, limit in _ANEW.items()):
@@ -84,17 +93,27 @@ def followed(
     recording: Recording, rig: RigCalibration, settings: SurveySettings, tools: SurveyTools
 ) -> CalibrationData:
     """The busiest stretch of a recording, followed under the calibration `rig`."""
-    chosen = busiest_frames(recording)
+    chosen = busiest_frames(recording.frame_stamps_ns, recording.imu)
     rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD)
     frames = (recording.read_frame(int(index)) for index in chosen)
     inputs = SurveyInputs(frames, len(chosen), recording.imu, rig, rectifier, recording.wheel)
-    chain = adjusted_chain(run_odometry(inputs, settings, tools), inputs, settings, tools)
+    chain = begin_survey(inputs, settings, tools)
     return stretch_of_survey(chain.state, chain.odometry.keyframes, (rig, rectifier), recording.wheel)
 
 
-def busiest_frames(recording: Recording) -> NDArray[np.int64]:
+def stretch_of_chain(
+    chain: AdjustedChain, recording: Recording, rig: tuple[RigCalibration, Rectifier]
+) -> CalibrationData:
+    """The same from a survey of a whole recording that has begun: of its busiest stretch, thinned to what a calibration needs."""
+    stamps_ns, seen_ns = np.array([e.stamp_ns for e in chain.odometry.estimates], np.int64), chain.state.stamps_ns
+    ends_ns = stamps_ns[busiest_frames(stamps_ns, recording.imu)[[0, -1]]]
+    state = state_of(chain.state, (seen_ns >= ends_ns[0]) & (seen_ns <= ends_ns[1]))
+    keyframes = [k for k in chain.odometry.keyframes if ends_ns[0] <= k.stamp_ns <= ends_ns[1]]
+    return stretch_of_survey(thinned(state, _OBSERVATIONS), keyframes, rig, recording.wheel)
+
+
+def busiest_frames(stamps: Stamps, imu: ImuSamples) -> NDArray[np.int64]:
     """Numbers of the frames of the LONGEST_S seconds in which gyro and accelerometer feel most, the first where there is no IMU."""
-    stamps, imu = recording.frame_stamps_ns, recording.imu
     last = np.searchsorted(stamps, stamps + int(LONGEST_S * 1e9))
     starts = np.flatnonzero(last < len(stamps))
     if not len(starts):

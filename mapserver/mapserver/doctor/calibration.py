@@ -17,7 +17,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate, estimate_calibration
 from mapserver.calibration.parameters import RANGES
-from mapserver.calibration.recordings import busiest_frames
+from mapserver.calibration.recordings import Follow, busiest_frames
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 from mapserver.doctor.timing import SPARSE_S, median_period_s
 from mapserver.survey.executor import Executor
@@ -92,17 +92,22 @@ class MeasuredCalibration:
 def followed_frames(recording: Recording) -> int:
     """How many frames `measure_calibration` reads; 0 where it judges nothing."""
     is_judged = len(recording.calibration.cameras) > 1 and median_period_s(recording.frame_stamps_ns) <= SPARSE_S
-    return len(busiest_frames(recording)) if is_judged else 0
+    return len(busiest_frames(recording.frame_stamps_ns, recording.imu)) if is_judged else 0
 
 
-def measure_calibration(recording: Recording, on_frame: Callable[[], None], executor: Executor) -> MeasuredCalibration:
-    """What the busiest stretch of a recording with a pair of cameras says about every parameter of its calibration."""
+def measure_calibration(
+    recording: Recording, on_frame: Callable[[], None], executor: Executor, follow: Follow | None = None
+) -> MeasuredCalibration:
+    """What the busiest stretch of a recording with a pair of cameras says about every parameter of its calibration.
+
+    follow: see `estimate_calibration`.
+    """
     period_s = median_period_s(recording.frame_stamps_ns)
     if period_s > SPARSE_S:
         return _unknown(f"frames are {period_s:.2f} s apart", "record every frame of the camera")
     tools = SurveyTools(progress=lambda *_: on_frame(), executor=executor)
     try:
-        estimate = estimate_calibration([recording], SurveySettings(), tools)
+        estimate = estimate_calibration([recording], SurveySettings(), tools, follow)
     except (FleetmapError, np.linalg.LinAlgError) as error:
         return _unknown(f"the frames could not be followed: {error}", "record a drive in the light, with every frame")
     focal_px = Rectifier(recording.calibration).camera.focal_px

@@ -10,6 +10,7 @@ from fleetmap.geometry import Array, so3_log
 from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, Image, SensorSet
+from mapserver.calibration.recordings import Follow
 from mapserver.doctor import inertial, timing
 from mapserver.doctor.calibration import MeasuredCalibration, measure_calibration
 from mapserver.doctor.camera_rotation import rotation_between
@@ -60,11 +61,12 @@ def run_checks(
     sampled: int = SAMPLED_FRAMES,
     turn_frames: int = TURN_FRAMES,
     executor: Executor = SERIAL,
+    follow: Follow | None = None,
 ) -> CheckResults:
     """Everything the checks say about a recording.
 
     Reads at most `sampled` frames, spread over the recording, a run of `turn_frames`, and with a pair the busiest 30 s; `on_frame` is
-    called after each.
+    called after each. follow: see `measure_calibration`.
     """
     stamps_ns, imu = recording.frame_stamps_ns, recording.imu
     frames = _Frames(recording, on_frame)
@@ -83,7 +85,7 @@ def run_checks(
     seen = _sampled(recording, frames, rectifier, sampled, executor)
     if recording.sensor_set in (SensorSet.STEREO, SensorSet.STEREO_INERTIAL):
         findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
-        calibration = measure_calibration(recording, on_frame, executor)
+        calibration = measure_calibration(recording, on_frame, executor, follow)
     turns = _camera_turns(recording, frames, rectifier, turn_frames, executor)
     checked, measured_offset_s = gyro_check(turns, imu, shift_s)
     findings += [*checked, *calibration.findings, sharpness(seen.variances), _readable(frames)]

@@ -78,19 +78,29 @@ class AdjustedChain:
 def survey(inputs: SurveyInputs, options: SurveyConfig, tools: SurveyTools | None = None) -> Survey:
     """Maps one recording. Raises SurveyError where it holds too little to map."""
     tools = tools or SurveyTools()
+    return finish_survey(begin_survey(inputs, options.settings, tools), options, tools)
+
+
+def begin_survey(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> AdjustedChain:
+    """The stages before loops are looked for: `finish_survey` goes on. Raises SurveyError where there is too little."""
     if inputs.initial_trajectory is None:
-        odometry = run_odometry(inputs, options.settings, tools)
+        odometry = run_odometry(inputs, settings, tools)
     else:
-        odometry = poses_as_odometry(inputs.initial_trajectory, inputs, options.settings, tools)
-    return survey_from(odometry, inputs, options, tools)
+        odometry = poses_as_odometry(inputs.initial_trajectory, inputs, settings, tools)
+    return adjusted_chain(odometry, inputs, settings, tools)
 
 
 def survey_from(
     odometry: OdometryPass, inputs: SurveyInputs, options: SurveyConfig, tools: SurveyTools | None = None
 ) -> Survey:
     """All stages after the initial trajectory."""
-    settings, tools = options.settings, tools or SurveyTools()
-    chain = adjusted_chain(odometry, inputs, settings, tools)
+    tools = tools or SurveyTools()
+    return finish_survey(adjusted_chain(odometry, inputs, options.settings, tools), options, tools)
+
+
+def finish_survey(chain: AdjustedChain, options: SurveyConfig, tools: SurveyTools) -> Survey:
+    """The stages from the loops on."""
+    settings = options.settings
     odometry, state, depths = chain.odometry, chain.state, chain.depths
     state, loops = _close_loops(odometry, state, chain.matched, options, tools)
     odometry, state, stereo_yaw = _adjust_globally(odometry, state, depths, settings, tools)

@@ -1,17 +1,33 @@
 """Recordings of a build: opened once, and frames of the examination decoded once."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from fleetmap.bow import decode_vocabulary
+from fleetmap.bow.shipped_vocabulary import default_vocabulary_bytes
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings import image_series as series
 from fleetmap.recordings.images import StoredFrame
 from fleetmap.sensors.samples import CameraFrame, SensorSet
-from mapserver.build import image_spill
-from mapserver.build.survey_recordings import OpenRecordings, RecordingOptions
+from mapserver.build import image_spill, survey_recordings
+from mapserver.build.admission import CheckedRecording, rig_evidence
+from mapserver.build.survey_recordings import (
+    Admission,
+    OpenRecordings,
+    RecordingOptions,
+    SurveyBeginnings,
+    admit_recordings,
+    survey_recording,
+)
+from mapserver.calibration.recordings import Follow
+from mapserver.store.archive import encode_archive
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 from support.recordings.recording_samples import make_sample, write_euroc
 
 
@@ -94,3 +110,48 @@ def test_without_room_frames_are_decoded_again(
         decoded.clear()
         assert same(recording.read_frame(1), recording.read_frame(1))
         assert len(decoded) == 2
+
+
+def admitted(path: Path, reading: OpenRecordings | RecordingOptions) -> Admission:
+    """As a build of this recording alone admits it."""
+    beginnings = SurveyBeginnings(SurveySettings(), SurveyTools())
+    return admit_recordings([path], reading, Console(quiet=True), needs_truth=False, beginnings=beginnings)[path]
+
+
+def test_a_survey_goes_on_from_its_examination_to_the_same_map(tmp_path: Path) -> None:
+    path = write_euroc(tmp_path / "turn", make_sample(24))
+    options = SurveyConfig(SurveySettings(), decode_vocabulary(default_vocabulary_bytes()))
+    with OpenRecordings(RecordingOptions(), tmp_path) as reading:
+        admission = admitted(path, reading)
+        assert admission.begun is not None
+        assert admission.begun.rig is admission.rig
+        maps = [
+            encode_archive(survey_recording(path, each, reading, None, options, SurveyTools()).survey.map)
+            for each in (admission, replace(admission, begun=None))
+        ]
+    assert maps[0] == maps[1]
+
+
+def test_a_survey_under_another_calibration_does_not_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_euroc(tmp_path / "turn", make_sample(24))
+    followed: list[int] = []
+
+    def corrected(recording: Recording, *, follow: Follow, **_: object) -> CheckedRecording:
+        followed.append(len(follow(recording.calibration).stamps_ns))
+        other = replace(recording.calibration, base_from_body=np.eye(4))
+        return CheckedRecording(other, [], rig_evidence("", []), {})
+
+    monkeypatch.setattr(survey_recordings, "checked", corrected)
+    assert admitted(path, RecordingOptions()).begun is None
+    assert followed[0] >= 2
+
+
+def test_nothing_is_begun_that_may_be_in_vain(euroc: Path) -> None:
+    beginnings, indices = SurveyBeginnings(SurveySettings(), SurveyTools()), np.arange(8)
+    with open_recording(euroc) as recording:
+        assert beginnings.follow(recording, indices, None) is not None
+        stamps_ns = recording.frame_stamps_ns
+        assert recording.ground_truth is not None
+        assert beginnings.follow(recording, indices, recording.ground_truth) is None
+        slow = replace(recording, frame_stamps_ns=stamps_ns[0] + 1000 * (stamps_ns - stamps_ns[0]))
+        assert beginnings.follow(slow, indices, None) is None
