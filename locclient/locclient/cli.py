@@ -8,6 +8,7 @@ from fleetmap.cli_exit import run_cli
 from fleetmap.cli_options import Commands, Options, make_app
 from locclient.commands.check import check
 from locclient.commands.config import CONFIG
+from locclient.commands.enrol import enrol
 from locclient.commands.prepare import prepare
 from locclient.commands.replay import replay
 from locclient.commands.run import run
@@ -15,7 +16,14 @@ from locclient.commands.run import run
 if TYPE_CHECKING:
     from locclient.config import LocclientConfig
 
-COMMANDS: Commands = {"check": check, "replay": replay, "run": run, "prepare": prepare, "config": CONFIG}
+COMMANDS: Commands = {
+    "enrol": enrol,
+    "check": check,
+    "replay": replay,
+    "run": run,
+    "prepare": prepare,
+    "config": CONFIG,
+}
 
 
 def locclient() -> None:

@@ -18,7 +18,7 @@ from locclient.robot.version_trial import TrialSettings
 TIERS = {
     "user": {
         "": "site store server",
-        "run": "server store site robot prior cache cache_bytes root spool failures",
+        "run": "server store site robot prior cache cache_bytes root identity insecure spool failures",
         "source": "kind calibration endpoint recording device",
         "output": "format endpoint",
         "topics": "*",
@@ -52,6 +52,8 @@ class RunSection(Section, frozen=True):
     cache: str | None = None
     cache_bytes: int = DEFAULT_MAX_BYTES
     root: str | None = None
+    identity: str | None = None
+    insecure: bool = False
     spool: str | None = None
     spool_bytes: int = 50_000_000
     failures: str | None = None

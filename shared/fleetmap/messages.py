@@ -7,6 +7,7 @@ fleetmap/{site}/robots/{robot}/pose      published by the robot: PoseMessage
 fleetmap/{site}/robots/{robot}/estimate  published by the robot for every frame: EstimateMessage
 fleetmap/{site}/robots/{robot}/failures  asked by the robot, FailureReport: FailureAck, once the server has it on its disk
 fleetmap/{site}/robots/{robot}/alive     liveliness token of the robot
+fleetmap/{site}/robots/{robot}/renew     asked by the robot with its next key: fleetmap.trust.enrolment
 fleetmap/{site}/live/survey              published by a survey under way: fleetmap.live_survey
 fleetmap/{site}/manifests/{version}      asked by the robot, ChunkRequest: Part of a manifest
 fleetmap/{site}/blobs/{sha256}           asked by the robot, ChunkRequest: Part of a tile, vocabulary or manifest
@@ -345,7 +346,7 @@ def report_dict(message: Message) -> dict[str, Any]:
 
 
 def robot_key(site: str, robot: str, what: str) -> str:
-    """Key of a robot's wanted, ack, health, pose, estimate, failures or alive; '*' for any site or robot."""
+    """Key of a robot's wanted, ack, health, pose, estimate, failures, alive or renew; '*' for any site or robot."""
     return f"{_ROOT}/{site}/robots/{robot}/{what}"
 
 

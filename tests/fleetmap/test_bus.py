@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from fleetmap.bus import MAX_MESSAGE_BYTES, Bus, MemoryBus, MemoryHub, ZenohBus, check_endpoint, key_matches
+from fleetmap.access import key_includes
+from fleetmap.bus import MAX_MESSAGE_BYTES, Bus, MemoryBus, MemoryHub, ZenohBus, check_endpoint
 from fleetmap.errors import LinkError, StoreError, UnreachableError, UsageError
 
 
@@ -214,8 +215,13 @@ def test_key_expressions() -> None:
         ("**", "a/b", True),
         ("a", "b", False),
         ("a/*", "a", False),
+        ("a/*/c", "a/*/c", True),
+        ("a/b/c", "a/*/c", False),
+        ("a/*", "a/**", False),
+        ("a/**", "a/*/**", True),
+        ("a/*/c", "**", False),
     ):
-        assert key_matches(key_expr, key) is expected, (key_expr, key)
+        assert key_includes(key_expr, key) is expected, (key_expr, key)
 
 
 def test_presence_of_more_than_a_channel_usually_holds() -> None:

@@ -8,33 +8,44 @@ import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
 from fleetmap.errors import UsageError
+from locclient.commands.options import IdentityFolder, Insecure
 
 if TYPE_CHECKING:
     from locclient.config import LocclientConfig
+    from locclient.identity import MapAddress
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapOptions:
     """The map and the robot that asks for it."""
 
-    server: Annotated[str | None, typer.Option(help="zenoh endpoint of the map server, tcp/HOST:PORT.")] = None
+    server: Annotated[
+        str | None, typer.Option(help="zenoh endpoint of the map server; default: the robot's identity.")
+    ] = None
     store: Annotated[Path | None, typer.Option(help="Folder of a map store, instead of a server.")] = None
     site: Annotated[str | None, typer.Option(help="Name of the site.")] = None
-    robot: Annotated[str, typer.Option(help="Name under which the robot reports.")] = "replay"
+    robot: Annotated[
+        str | None, typer.Option(help="Name under which the robot reports; default: its identity's, or replay.")
+    ] = None
     cache: Annotated[Path | None, typer.Option(help="Folder of the tile cache; default: the user's cache.")] = None
     root: Annotated[
         Path | None,
         typer.Option(help="trust/1.root.json of the server's store; needed for a server on another machine."),
     ] = None
+    identity: IdentityFolder = None
+    insecure: Insecure = False
     # As tile_cache.DEFAULT_MAX_BYTES, which is not imported, so that --help stays fast.
     cache_bytes: Annotated[int, typer.Option(min=0, help="Largest size of the tile cache.")] = 2_000_000_000
 
-    def check(self) -> None:
-        """Raises UsageError unless the options name one map."""
-        if self.site is None:
-            raise UsageError("--site NAME is missing")
-        if (self.server is None) == (self.store is None):
-            raise UsageError("give either --server tcp/HOST:PORT or --store DIR")
+    def address(self) -> "MapAddress":
+        """Where the map comes from; UsageError unless the options name one map."""
+        from locclient.identity import GivenAddress
+
+        words = {name: None if value is None else str(value) for name, value in vars(self).items()}
+        named = ("site", "robot", "server", "store", "root", "identity")
+        return GivenAddress(**{name: words[name] for name in named}, insecure=self.insecure, sign="--").resolve(
+            "replay"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,13 +91,17 @@ def replay(
 ) -> None:
     """Fetch the site's map, localize every frame of a recording in it, and report the result."""
     settings = settings_of(context)
-    map_options.check()
+    address = map_options.address()
     files.check()
-    _print_table(_run(recording, map_options, playback, files, settings))
+    _print_table(_run(recording, (address, map_options), playback, files, settings))
 
 
 def _run(
-    path: Path, map_options: MapOptions, playback: PlaybackOptions, files: ResultFiles, settings: "LocclientConfig"
+    path: Path,
+    map_from: "tuple[MapAddress, MapOptions]",
+    playback: PlaybackOptions,
+    files: ResultFiles,
+    settings: "LocclientConfig",
 ) -> dict[str, Any]:
     import json
 
@@ -102,13 +117,14 @@ def _run(
     from locclient.replay.replay import ReplayOptions
     from locclient.replay.replay import replay as play
 
+    address, map_options = map_from
     prior = parse_prior(playback.prior, "--prior")
     selection = FrameSelection.parse(playback.frames)
     opening = OpenOptions(calibration_file=playback.calibration, topics=settings.topics)
     console = Console(stderr=True)
     with (
         open_recording(path, opening) as recording,
-        connected(vars(map_options)) as connection,
+        connected(address, map_options.cache, map_options.cache_bytes) as connection,
         Progress(console=console, disable=not console.is_terminal) as bar,
     ):
         for issue in recording.issues:

@@ -2,15 +2,15 @@
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
 
 from fleetmap.bus import Bus, ZenohBus
 from fleetmap.errors import LinkError, UsageError
-from fleetmap.mapformat import check_name
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.intake import Intake
@@ -20,7 +20,8 @@ from locclient.daemon.publishers import Publisher, open_publisher
 from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.outbox import Outbox
-from locclient.maps.connection import cache_folder, outbox_path, trusted_map
+from locclient.identity import GivenAddress, MapAddress, check_reach
+from locclient.maps.connection import cache_folder, open_bus, outbox_path, trusted_map
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
@@ -34,13 +35,27 @@ _PATIENCE_S = 120.0  # in the middle of fetching a version; from the next part o
 _log = logging.getLogger(__name__)
 
 
-def check_run(config: LocclientConfig) -> tuple[str, str]:
-    """Names of site and robot; UsageError naming what [run] lacks or contradicts."""
+def check_run(config: LocclientConfig) -> MapAddress:
+    """Who the robot is, and where its map comes from; UsageError naming what [run] lacks or contradicts."""
     run = config.run
-    if run.site is None or run.robot is None:
-        raise UsageError(f"[run] {'site' if run.site is None else 'robot'} is missing: which site's map, and who asks?")
-    if (run.server is None) == (run.store is None):
-        raise UsageError("[run]: give either server, tcp/HOST:PORT, or store, a folder")
+    try:
+        address = GivenAddress(
+            site=run.site,
+            robot=run.robot,
+            server=run.server,
+            store=run.store,
+            root=run.root,
+            identity=run.identity,
+            insecure=run.insecure,
+        ).resolve()
+    except UsageError as error:
+        raise UsageError(f"[run] {error}") from error
+    topics = None if config.source.kind == "recording" else config.source.endpoint
+    for section, endpoint in (("source", topics), ("output", config.output.endpoint)):
+        try:
+            check_reach(endpoint, insecure=run.insecure)
+        except UsageError as error:
+            raise UsageError(f"[{section}] endpoint = {error}") from error
     if run.frame_queue < 1:
         raise UsageError(f"[run] frame_queue = {run.frame_queue}: at least one frame must be able to wait")
     if not run.trial.contradicting_looks < config.localizer.track.kidnap_fixes:
@@ -48,7 +63,7 @@ def check_run(config: LocclientConfig) -> tuple[str, str]:
             f"[run.trial] contradicting_looks = {run.trial.contradicting_looks} must be below [localizer.track] kidnap_fixes = "
             f"{config.localizer.track.kidnap_fixes}: a version must be given up before the robot believes that it was carried away"
         )
-    return check_name(run.site, "site"), check_name(run.robot, "robot")
+    return address
 
 
 @contextmanager
@@ -59,14 +74,15 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
     """
     cv2.setNumThreads(1)  # the rest of the board belongs to the robot's other programs
     run = config.run
-    site, name = check_run(config)
+    address = check_run(config)
+    site, name = address.site, address.robot
     with ExitStack() as stack:
         prior = parse_prior(run.prior)
         source = open_source(config.source, config.topics)
         stack.callback(source.close)
         calibration = source.calibration
         rectifier = Rectifier(calibration, has_depth=source.has_depth)
-        bus = None if run.server is None else ZenohBus.connect(run.server)
+        bus = None if address.store is not None else open_bus(address)
         if bus is not None:
             stack.callback(bus.close)
         publisher = _publisher(config, bus, site, name, stack)
@@ -87,9 +103,9 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             # Two views of the same folder, because a cache is not for two threads; the second only reads.
             caches = tuple(TileCache(cache_folder(run.cache), max_bytes=run.cache_bytes) for _ in range(2))
             client = MapClient(bus, caches[0], site, name, patience_s=_PATIENCE_S)
-            client.require(trusted_map(bus, site, run.server or "", cache_folder(run.cache), run.root))
+            client.require(trusted_map(bus, address, cache_folder(run.cache)))
             maps, first = CachedMap(caches[1], site), client.active()
-            server = ServerSync(client, outbox, retry_s=run.trial.retry_s)
+            server = ServerSync(client, outbox, retry_s=run.trial.retry_s, upkeep=_upkeep(address, bus))
         robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time)
         if prior is not None:
             robot.localizer.handle_prior(prior)
@@ -110,6 +126,18 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             failures_folder=None if run.failures is None else Path(run.failures),
             caches=caches,
         )
+
+
+def _upkeep(address: MapAddress, bus: Bus) -> Callable[[], None]:
+    """Renews the certificate of a robot that has one, once it is a month old."""
+    identity = address.identity
+
+    def renew() -> None:
+        if identity is not None and identity.is_renewal_due(datetime.now(UTC)):
+            identity.renew(bus)
+            _log.info("the certificate is renewed until %s", identity.certificate().ends)
+
+    return renew
 
 
 def configured_outbox(run: RunSection, site: str, robot: str) -> Path:

@@ -4,9 +4,10 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import handshake_fault
 from fleetmap.errors import FleetmapError, LinkError, UnreachableError
 from fleetmap.features.orb import OrbSettings
 from fleetmap.recordings import StoredFrame
@@ -19,8 +20,9 @@ from fleetmap.sources.source import Source, open_source
 from locclient.config import LocclientConfig
 from locclient.daemon.daemon import check_run, configured_outbox
 from locclient.delivery.outbox import Outbox
+from locclient.identity import MapAddress
 from locclient.localization.calibration.pair_order import REVERSED_TEXT, PairOrder, pair_order
-from locclient.maps.connection import cache_folder, trusted_map
+from locclient.maps.connection import cache_folder, open_bus, trusted_map
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import LocalMapSource
 from locclient.maps.tile_cache import TileCache
@@ -31,6 +33,7 @@ _BASELINE_M = (0.03, 0.6)
 _MIN_FREE_BYTES = 200_000_000
 _OLD_NS = 1_700_000_000_000_000_000  # a clock before this program was written is wrong
 _SKEW_S = 0.5
+_CERTIFICATE_DAYS = 60  # robots renew after a month, with eleven left
 _MIN_FRAME_HZ, _MIN_IMU_HZ = 5.0, 90.0
 _SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
 
@@ -47,18 +50,20 @@ class Finding:
 def run_preflight(config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
     """One finding after another; never raises for a fault of the robot. listen_s: how long to listen to its sensors."""
     try:
-        check_run(config)
+        address = check_run(config)
     except FleetmapError as error:
         yield Finding(FAIL, "configuration", str(error))
         return
-    yield Finding(OK, "configuration", f"{config.run.robot} at {config.run.site}, source {config.source.kind}")
+    yield Finding(OK, "configuration", f"{address.robot} at {address.site}, source {config.source.kind}")
     yield from _guarded("calibration", lambda: _sensors(config, listen_s))
     yield _clock(time.time_ns(), _SYNCHRONISED.exists())
-    yield from _guarded("spool", lambda: _outbox(config))
-    if config.run.store is not None:
-        yield from _guarded("store", lambda: _store(config))
-    else:
-        yield from _guarded("cache", lambda: _cache_and_server(config))
+    yield from _guarded("spool", lambda: _outbox(config, address))
+    if address.store is not None:
+        yield from _guarded("store", lambda: _store(address))
+        return
+    if address.identity is not None:
+        yield from _guarded("identity", lambda: _identity(address, datetime.now(UTC)))
+    yield from _guarded("cache", lambda: _cache_and_server(config, address))
 
 
 def _guarded(what: str, check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
@@ -172,8 +177,8 @@ def _clock(now_ns: int, synchronised: bool) -> Finding:
     return Finding(OK, "clock", "synchronised")
 
 
-def _outbox(config: LocclientConfig) -> Iterator[Finding]:
-    path = configured_outbox(config.run, str(config.run.site), str(config.run.robot))
+def _outbox(config: LocclientConfig, address: MapAddress) -> Iterator[Finding]:
+    path = configured_outbox(config.run, address.site, address.robot)
     outbox = Outbox(path, max_bytes=config.run.spool_bytes)
     counts = outbox.counts()
     text = f"{path}: {counts['waiting']} reports wait, {counts['delivered']} delivered, {counts['dropped']} dropped"
@@ -185,21 +190,35 @@ def _outbox(config: LocclientConfig) -> Iterator[Finding]:
         yield Finding(OK, "spool", text)
 
 
-def _store(config: LocclientConfig) -> Iterator[Finding]:
-    source = LocalMapSource(Path(str(config.run.store)), str(config.run.site))
+def _store(address: MapAddress) -> Iterator[Finding]:
+    source = LocalMapSource(Path(str(address.store)), address.site)
     wanted = source.wanted()
     fetched = source.tiles(source.manifest(wanted))
     yield _pieces("store", wanted.version, len(fetched.tiles), list(fetched.refused.values()))
 
 
-def _cache_and_server(config: LocclientConfig) -> Iterator[Finding]:
-    run = config.run
+def _identity(address: MapAddress, now: datetime) -> Iterator[Finding]:
+    identity = address.identity
+    assert identity is not None
+    about = identity.certificate()
+    days = (about.ends - now).total_seconds() / 86_400
+    text = f"{about.name}, certificate for {days:.0f} days"
+    if fault := handshake_fault(str(address.server), identity.tls):
+        yield Finding(FAIL, "identity", f"{text}; {address.server}: {fault}")
+    elif days < _CERTIFICATE_DAYS:
+        yield Finding(WARN, "identity", f"{text}; the running robot renews it, let it reach its server")
+    else:
+        yield Finding(OK, "identity", f"{text}, accepted by {address.server}")
+
+
+def _cache_and_server(config: LocclientConfig, address: MapAddress) -> Iterator[Finding]:
+    run, site = config.run, address.site
     folder = cache_folder(run.cache)
     cache = TileCache(folder, max_bytes=run.cache_bytes)
     free_bytes = shutil.disk_usage(folder).free
     if free_bytes < _MIN_FREE_BYTES:
         yield Finding(WARN, "disk", f"{free_bytes / 1e6:.0f} MB free beside {folder}; make room for new versions")
-    active = cache.active(str(run.site))
+    active = cache.active(site)
     if active is None:
         hint = "the robot needs its server for the first one"
         yield Finding(WARN, "cache", f"{folder} holds no whole version yet; {hint}")
@@ -207,10 +226,10 @@ def _cache_and_server(config: LocclientConfig) -> Iterator[Finding]:
         damaged = sum(cache.get(sha256) is None for sha256 in active.blobs)
         reasons = ["missing or damaged, fetched again at the next start"] * damaged
         yield _pieces("cache", active.version, len(active.blobs) - damaged, reasons)
-    bus = ZenohBus.connect(str(run.server))
+    bus = open_bus(address)
     try:
-        client = MapClient(bus, cache, str(run.site), str(run.robot), timeout_s=_ANSWER_S)
-        trust = trusted_map(bus, str(run.site), str(run.server), folder, run.root)
+        client = MapClient(bus, cache, site, address.robot, timeout_s=_ANSWER_S)
+        trust = trusted_map(bus, address, folder)
         client.require(trust)
         wanted = client.wanted()
     except UnreachableError as error:
@@ -221,11 +240,11 @@ def _cache_and_server(config: LocclientConfig) -> Iterator[Finding]:
         bus.close()
     if wanted.version is None:
         hint = "publish one with `mapserver publish`"
-        yield Finding(FAIL, "connection", f"site {run.site} has no published version; {hint}")
+        yield Finding(FAIL, "connection", f"site {site} has no published version; {hint}")
         return
-    is_here = active is not None and wanted == active.wanted(str(run.site))
+    is_here = active is not None and wanted == active.wanted(site)
     hint = ", which is here" if is_here else "; it is fetched when the robot runs"
-    yield Finding(OK, "connection", f"{run.server} wants version {wanted.version}{hint}")
+    yield Finding(OK, "connection", f"{address.server} wants version {wanted.version}{hint}")
     try:
         trust.admitted(wanted)
     except LinkError as error:

@@ -13,6 +13,7 @@ from locclient.maps.map_client import MapClient
 from locclient.robot.robot import Change, VersionChange
 
 _ASK_EVERY_S = 60.0
+_UPKEEP_EVERY_S = 3600.0
 _BACKOFF_S, _MAX_BACKOFF_S = 1.0, 30.0
 _log = logging.getLogger(__name__)
 
@@ -32,8 +33,10 @@ class ServerSync:
         retry_s: float,
         clock_s: Callable[[], float] = time.monotonic,
         wall_ns: Callable[[], int] = time.time_ns,
+        upkeep: Callable[[], None] = lambda: None,
     ) -> None:
-        """retry_s: when a postponed version is offered again."""
+        """retry_s: when a postponed version is offered again. upkeep: called once an hour; what it refuses goes into the log."""
+        self._upkeep, self._upkeep_at_s = upkeep, 0.0
         self.client, self._outbox, self._retry_s = client, outbox, retry_s
         self._clock_s, self._wall_ns = clock_s, wall_ns
         self.health: deque[RobotHealth] = deque(maxlen=1)  # only the last one is worth sending
@@ -63,6 +66,9 @@ class ServerSync:
             self._fetch_again()
             if self._announced or now_s >= self._ask_at_s:
                 self._ask(now_s)
+            if now_s >= self._upkeep_at_s:
+                self._upkeep_at_s = now_s + _UPKEEP_EVERY_S
+                self._upkeep()
         except UnreachableError as error:
             _log.info("the map server is away: %s", error)
             self._silent_until_s = self._clock_s() + self._backoff_s

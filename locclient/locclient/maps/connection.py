@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from fleetmap.bus import Bus, ZenohBus, is_loopback
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.trust import TrustedMap, ask_over
+from locclient.identity import MapAddress
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import LocalMapSource, MapSource
-from locclient.maps.tile_cache import TileCache
+from locclient.maps.tile_cache import DEFAULT_MAX_BYTES, TileCache
 
 _log = logging.getLogger(__name__)
 _PATIENCE_S = 120.0  # with a server that goes away in the middle of a fetch; one that is restarted is back by then
@@ -33,11 +33,14 @@ class MapConnection:
     outbox: Path | None = None
 
 
-def trusted_map(bus: Bus, site: str, server: str, cache: Path, root: str | Path | None) -> TrustedMap:
-    """The signed lists of a site. server: its endpoint; root: file of the root to trust, for servers on other machines.
+def open_bus(address: MapAddress) -> ZenohBus:
+    """A connection to the server, with the robot's identity where it has one."""
+    return ZenohBus.connect(str(address.server), tls=address.tls)
 
-    Raises UsageError where a root is needed and not given, or cannot be read.
-    """
+
+def trusted_map(bus: Bus, address: MapAddress, cache: Path) -> TrustedMap:
+    """The signed lists of a site; UsageError where a root is needed and not given, or cannot be read."""
+    site, server, root = address.site, str(address.server), address.root
     folder, data = cache / "trust" / site, None
     if root is not None:
         with disk_errors(f"the root {root} cannot be read", "copy 1.root.json of the server's store", UsageError):
@@ -50,20 +53,22 @@ def trusted_map(bus: Bus, site: str, server: str, cache: Path, root: str | Path 
 
 
 @contextmanager
-def connected(options: dict[str, Any]) -> Iterator[MapConnection]:
-    """A connection for the options `server` or `store`, `site`, `robot`, `cache`, `cache_bytes`, `root`; closed afterwards."""
-    site, robot = options["site"], options["robot"]
-    if options["store"] is not None:
-        yield MapConnection(LocalMapSource(Path(options["store"]), site), None, site, robot)
+def connected(
+    address: MapAddress, cache_setting: Path | None = None, cache_bytes: int = DEFAULT_MAX_BYTES
+) -> Iterator[MapConnection]:
+    """A connection to a map's address, by a cache of at most so many bytes; closed afterwards."""
+    site, robot = address.site, address.robot
+    if address.store is not None:
+        yield MapConnection(LocalMapSource(Path(address.store), site), None, site, robot)
         return
-    folder = cache_folder(options["cache"])
-    cache = TileCache(folder, max_bytes=options["cache_bytes"])
-    bus = ZenohBus.connect(options["server"])
+    folder = cache_folder(cache_setting)
+    cache = TileCache(folder, max_bytes=cache_bytes)
+    bus = open_bus(address)
     try:
         client = MapClient(bus, cache, site, robot, patience_s=_PATIENCE_S)
-        client.require(trusted_map(bus, site, options["server"], folder, options.get("root")))
+        client.require(trusted_map(bus, address, folder))
         client.announce_presence()
-        yield MapConnection(client, client, site, robot, outbox_path(site, robot, options["cache"]))
+        yield MapConnection(client, client, site, robot, outbox_path(site, robot, cache_setting))
         for fault in cache.take_faults():
             _log.warning("tile cache: %s", fault)
     finally:

@@ -10,6 +10,7 @@ import cv2
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
 from fleetmap.sensors.samples import PositionPrior
 from fleetmap.sources.replay_source import ReplaySource
+from locclient.identity import GivenAddress, MapAddress
 from locclient.maps.connection import connected
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
@@ -24,14 +25,18 @@ class LocalizeOptions(ReplayOptions):
     """Options of `localize` beside those of every replay.
 
     frames: which of the recording's, as a Python slice. reverse: backwards, with new stamps and without IMU. calibration, topics: for
-    opening a recording by its path. robot: the name that the server sees. cache, cache_bytes: folder and size of the tile cache.
+    opening a recording by its path. robot: the name that the server sees, `replay` unless it has an identity. root, identity,
+    insecure: as of the command. cache, cache_bytes: folder and size of the tile cache.
     """
 
     frames: str = ":"
     reverse: bool = False
     calibration: Path | None = None
     topics: Topics = field(default_factory=Topics)
-    robot: str = "replay"
+    robot: str | None = None
+    root: Path | None = None
+    identity: Path | None = None
+    insecure: bool = False
     cache: Path | None = None
     cache_bytes: int = DEFAULT_MAX_BYTES
 
@@ -57,7 +62,8 @@ def localize(
             how = OpenOptions(calibration_file=options.calibration, topics=options.topics)
             recording = stack.enter_context(open_recording(Path(recording), how))
         selection = FrameSelection.parse(options.frames)
-        connection = stack.enter_context(connected(_connection_options(maps, site, options)))
+        address = _address(maps, site, options)
+        connection = stack.enter_context(connected(address, options.cache, options.cache_bytes))
         source = ReplaySource.of(recording, selection, reverse=options.reverse)
         stack.callback(cv2.setNumThreads, cv2.getNumThreads())
         return replay(source, connection, options, prior)
@@ -65,12 +71,18 @@ def localize(
 
 def fetch_map(maps: str | Path, site: str, options: LocalizeOptions = _DEFAULTS) -> LoadedMap:
     """The current map of a site with all of its tiles, for a `MapView`; arguments and errors as of `localize`."""
-    with connected(_connection_options(maps, site, options)) as connection:
+    with connected(_address(maps, site, options), options.cache, options.cache_bytes) as connection:
         return load_map(connection.source)[0]
 
 
-def _connection_options(maps: str | Path, site: str, options: LocalizeOptions) -> dict[str, object]:
+def _address(maps: str | Path, site: str, options: LocalizeOptions) -> MapAddress:
     is_server = isinstance(maps, str) and _ENDPOINT.match(maps) is not None
-    source = {"server": maps, "store": None} if is_server else {"server": None, "store": Path(maps)}
-    own = {"robot": options.robot, "cache": options.cache, "cache_bytes": options.cache_bytes}
-    return {**source, "site": site, **own}
+    return GivenAddress(
+        site=site,
+        robot=options.robot,
+        server=str(maps) if is_server else None,
+        store=None if is_server else str(maps),
+        root=None if options.root is None else str(options.root),
+        identity=None if options.identity is None else str(options.identity),
+        insecure=options.insecure,
+    ).resolve("replay")

@@ -60,7 +60,7 @@ def live(
         asked.pop(name) for name in ("site", "store", "speed", "server", "sensors", "record")
     )
     build, is_stopped = BuildOptions(**asked), _stopping()
-    with _drive(recording, sensors, record, build, speed) as (drive, settings), _bus(server) as bus:
+    with _drive(recording, sensors, record, build, speed) as (drive, settings), _bus(server, store) as bus:
         request = LiveRequest(site, store, settings, build)
         result = run_live(request, drive, _teller(bus), is_stopped, Console(stderr=True))
     typer.echo(result.figures.words())
@@ -105,10 +105,19 @@ def _stopping() -> Callable[[], bool]:
     return lambda: stopped
 
 
-def _bus(server: str | None) -> "AbstractContextManager[Bus | None]":
-    from fleetmap.bus import ZenohBus
+def _bus(server: str | None, store: Path) -> "AbstractContextManager[Bus | None]":
+    from fleetmap.bus import ZenohBus, check_endpoint, has_tls
 
-    return nullcontext(None) if server is None else ZenohBus.connect(server)
+    if server is None:
+        return nullcontext(None)
+    if not has_tls(check_endpoint(server)):
+        return ZenohBus.connect(server)
+    from mapserver.store import MapStore
+    from mapserver.trust.enrolment import RobotRegister
+
+    with MapStore.open(store) as maps:
+        tls = RobotRegister(maps).survey_tls()
+    return ZenohBus.connect(server, tls=tls)
 
 
 def _teller(bus: "Bus | None") -> "Callable[[LiveSurveyState], None]":

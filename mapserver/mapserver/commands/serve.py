@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from fleetmap.bus import ZenohBus
     from mapserver.api.guard import GuardSettings
     from mapserver.config import MapserverConfig
+    from mapserver.serving.bus_access import BusGuard
     from mapserver.store import MapStore
     from mapserver.trust.http_certificate import HttpCertificate
 
@@ -29,6 +30,7 @@ _RENEW_EVERY_S = 10.0
 _INSECURE = (
     "This server was started with --insecure. Whoever reaches it may read everything and change the maps of the robots."
 )
+_OPEN_BUS = "This server was started with --insecure. Whoever reaches its bus may speak as any robot."
 _NO_TLS = "This server was started with --insecure. Passwords and sessions can be read on their way to it."
 
 
@@ -69,8 +71,10 @@ class HttpOptions:
             return None
         return HttpCertificate(self.http_cert, self.http_key)
 
-    def guard(self, store: "MapStore", certificate: "HttpCertificate | None") -> "GuardSettings":
-        """Who is let in; UsageError where the server must not be reached like this."""
+    def guard(self, store: "MapStore", certificate: "HttpCertificate | None", warning: str) -> "GuardSettings":
+        """Who is let in. warning: about something else, for every page.
+
+         UsageError where the server must not be reached like this."""
         from fleetmap.errors import UsageError
         from mapserver.api.guard import GuardSettings
         from mapserver.dashboard.layout import HANDLERS
@@ -95,7 +99,7 @@ class HttpOptions:
             operators=Operators(store),
             must_sign_in=not fault and not is_loopback_name(host),
             handlers=HANDLERS,
-            warning=(_NO_TLS if store.operators.may_sign_in() else _INSECURE) if fault else "",
+            warning=(_NO_TLS if store.operators.may_sign_in() else _INSECURE) if fault else warning,
         )
 
 
@@ -105,26 +109,28 @@ def serve(
     store: StoreFolder,
     at: HttpOptions,
     zenoh: Annotated[
-        str, typer.Option(help="zenoh endpoint to listen on; port 0 picks a free port.")
+        str,
+        typer.Option(help="zenoh endpoint to listen on; port 0 picks a free port. tls/ and quic/ need `trust init`."),
     ] = "tcp/127.0.0.1:7447",
     config: ConfigFile = None,
 ) -> None:
     """Serve maps to robots and operators; prints the addresses when ready, ends with status 0 on SIGTERM or SIGINT."""
     host, port = at.host_and_port()
-    from fleetmap.bus import ZenohBus, check_endpoint
+    from fleetmap.bus import check_endpoint
+    from mapserver.serving.bus_access import check_binding, prepare_bus
 
-    check_endpoint(zenoh)
+    is_open = check_binding(check_endpoint(zenoh), insecure=at.insecure)
     from mapserver.store import MapStore
     from mapserver.trust import prepare_lists
 
     certificate, settings = at.load_certificate(), settings_of(context)
     # The sockets come before the store is read, so that a wrong address is reported at once.
     with _listening(host, port) as listener, MapStore.open(store) as maps:
-        guard = at.guard(maps, certificate)
+        guard = at.guard(maps, certificate, _OPEN_BUS if is_open else "")
         prepare_lists(maps, zenoh)
-        # The bus last: whoever answers before this program does could be heard in its place.
-        with ZenohBus.listen(zenoh) as bus:
-            _run(maps, bus, _Http(listener, guard, certificate, bool(at.http_name)), settings)
+        bus, robots = prepare_bus(maps, zenoh, insecure=at.insecure)
+        with bus:
+            _run(maps, (bus, robots), _Http(listener, guard, certificate, bool(at.http_name)), settings)
 
 
 class _Http(NamedTuple):
@@ -134,7 +140,9 @@ class _Http(NamedTuple):
     is_behind_proxy: bool
 
 
-def _run(maps: "MapStore", bus: "ZenohBus", http: _Http, settings: "MapserverConfig") -> None:
+def _run(
+    maps: "MapStore", guarded_bus: "tuple[ZenohBus, BusGuard | None]", http: _Http, settings: "MapserverConfig"
+) -> None:
     import logging
     import signal
     import sys
@@ -149,7 +157,7 @@ def _run(maps: "MapStore", bus: "ZenohBus", http: _Http, settings: "MapserverCon
     from mapserver.api.version_routes import ApiSettings
     from mapserver.dashboard.install import install_dashboard
     from mapserver.fleet.fleet import Fleet
-    from mapserver.serving.background_tasks import BackgroundTask, run_background_tasks, server_tasks
+    from mapserver.serving.background_tasks import BackgroundTask, admission_tasks, run_background_tasks, server_tasks
     from mapserver.serving.bus_service import BusService
 
     # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
@@ -159,21 +167,24 @@ def _run(maps: "MapStore", bus: "ZenohBus", http: _Http, settings: "MapserverCon
         logging.getLogger(__name__).warning("%s", http.guard.warning)
     fleet = Fleet(maps, settings=settings.ingest)
     metrics = Metrics(maps, fleet)
-    bus_service = BusService(maps, fleet, bus, metrics.count_bus)
+    bus, robots = guarded_bus
+    bus_service = BusService(maps, fleet, bus, metrics.count_bus, robots)
     tasks = server_tasks(maps, fleet, bus_service, settings)
 
     @asynccontextmanager
     async def lifespan(_: "FastAPI") -> AsyncIterator[None]:
         import asyncio
 
-        background = asyncio.create_task(run_background_tasks(tasks))
+        both = (tasks, admission_tasks(robots))
+        background = [asyncio.create_task(run_background_tasks(some)) for some in both]
         host, port = http.listener.getsockname()[:2]
         typer.echo(f"http: {'https' if http.certificate else 'http'}://{f'[{host}]' if ':' in host else host}:{port}")
         typer.echo(f"zenoh: {bus.endpoint}")
         typer.echo("ready")
         yield
-        background.cancel()
-        await asyncio.gather(background, return_exceptions=True)
+        for task in background:
+            task.cancel()
+        await asyncio.gather(*background, return_exceptions=True)
 
     api = ApiSettings(http.guard, settings.gate, settings.canary, settings.resurvey)
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
@@ -199,6 +210,8 @@ def _run(maps: "MapStore", bus: "ZenohBus", http: _Http, settings: "MapserverCon
     # the default ones would end the process with a status that says it was killed.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: None)
+    # The bus last: whoever answers before this program does could be heard in its place.
+    bus.open()
     try:
         uvicorn.Server(config).run(sockets=[http.listener])
     finally:

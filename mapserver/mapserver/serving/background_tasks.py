@@ -12,6 +12,7 @@ from mapserver.build.job_lock import end_interrupted
 from mapserver.config import MapserverConfig
 from mapserver.fleet.canary_controller import review
 from mapserver.fleet.fleet import Fleet
+from mapserver.serving.bus_access import BusGuard
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from mapserver.trust import update_lists
@@ -19,6 +20,8 @@ from mapserver.trust import update_lists
 _ANNOUNCE_EVERY_S = 1.0
 _LOOK_EVERY_S = 0.2
 _JOBS_EVERY_S = 20.0
+_ADMIT_EVERY_S = 1.0  # what changes meanwhile goes together
+_CONNECTED_EVERY_S = 5.0
 _log = logging.getLogger(__name__)
 
 
@@ -50,6 +53,16 @@ def server_tasks(
         BackgroundTask(
             "looking at canaries", settings.canary.check_every_s, lambda: review(store, settings.canary, time.time_ns())
         ),
+    ]
+
+
+def admission_tasks(guard: BusGuard | None) -> list[BackgroundTask]:
+    """Those of the bus's door. Apart from the others, because a robot that was stolen must not wait for them."""
+    if guard is None:
+        return []
+    return [
+        BackgroundTask("admitting robots", _ADMIT_EVERY_S, guard.follow),
+        BackgroundTask("looking at who is connected", _CONNECTED_EVERY_S, guard.look),
     ]
 
 

@@ -28,6 +28,7 @@ from fleetmap.messages import (
 )
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.rate_limit import RateLimit
+from mapserver.serving.bus_access import BusGuard
 from mapserver.serving.caches import AuthorizationCache, ByteCache
 from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.store import MapStore
@@ -39,6 +40,7 @@ Count = Callable[[str, str, int], None]
 _log = logging.getLogger(__name__)
 MAX_REPORT_BYTES = 16 << 10  # a health report with everything in it has 3 kB, a pose 0.5 kB
 # What a robot may publish, at once and in a second: robots send health once a second, poses with every frame, an ack with a version.
+RENEWAL_RATE = (5, 1 / 60)  # of a robot: each is a signature, and a line in the log
 REPORT_RATES = {"ack": (20, 1.0), "health": (20, 4.0), "pose": (80, 60.0)}
 _CACHED_BYTES = 64_000_000
 _RECENT_PATCHES_BYTES = 32_000_000
@@ -53,13 +55,16 @@ class BusService:
     Bytes go out in parts; what was sent last is kept in memory, because robots ask for the same things at the same time.
     """
 
-    def __init__(self, store: MapStore, fleet: Fleet, bus: Bus, count: Count) -> None:
+    def __init__(self, store: MapStore, fleet: Fleet, bus: Bus, count: Count, guard: BusGuard | None = None) -> None:
+        """guard: knows the enrolled robots, where only those may speak; None: any may."""
+        self._guard = guard
         self._store = store
         self._fleet = fleet
         self._bus = bus
         self._count = count
         self._refusals = LogLimit(_log)
         self._rates = {what: RateLimit(burst, per_s, store.now_ns) for what, (burst, per_s) in REPORT_RATES.items()}
+        self._rates["renew"] = RateLimit(*RENEWAL_RATE, store.now_ns)
         self._lists = SignedLists(store.folder)
         self._announced: dict[tuple[str, str], str | None] = {}
         self._recent = ByteCache(_CACHED_BYTES)
@@ -77,6 +82,8 @@ class BusService:
             *(bus.subscribe(robot_key("*", "*", what), self._hear) for what in ("ack", "health", "pose")),
             bus.subscribe(live_key("*"), self._hear_survey),
         ]
+        if guard is not None:
+            self._handles.append(bus.queryable(robot_key("*", "*", "renew"), self._counted("renewal", self._renew)))
 
     def announce_changes(self) -> list[str]:
         """Tells every known robot whose wanted version changed since the last call; returns the sites where somebody was told.
@@ -127,13 +134,27 @@ class BusService:
     def _parts(self, whole: Callable[[str], bytes]) -> Callable[[str, bytes], bytes]:
         return lambda key, question: part_of(whole(key), question)
 
+    def _sender(self, key: str) -> tuple[str, str]:
+        """Site and robot of a robot's key; LinkError for one that may not speak, also where the bus let it through."""
+        site, robot, _ = split_key(key)
+        check_name(robot, "robot")
+        if self._guard is not None and not self._guard.access.has_robot(site, robot):
+            raise LinkError(f"robot {robot} of site {site[:64]!r} is not enrolled; `mapserver robots enrol` does that")
+        return site, robot
+
+    def _renew(self, key: str, payload: bytes) -> bytes:
+        site, robot = self._sender(key)
+        assert self._guard is not None
+        if not self._rates["renew"].admits((site, robot)):
+            raise LinkError(f"later: robot {robot} asked for certificates too often")
+        return self._guard.register.renew(site, robot, payload)
+
     def _wanted(self, key: str, _: bytes) -> bytes:
-        site, robot, _what = split_key(key)
-        wanted = self._fleet.take_question(site, check_name(robot, "robot"))
+        wanted = self._fleet.take_question(*self._sender(key))
         return encode_message(self._lists.admitted_or_current(wanted))
 
     def _failure(self, key: str, payload: bytes) -> bytes:
-        site, robot, _what = split_key(key)
+        site, robot = self._sender(key)
         ack = self._fleet.take_failure_bytes(site, robot, payload)
         if ack.refused:
             self._count("failure refused for good", "refused", 0)
@@ -204,8 +225,7 @@ class BusService:
     def _hear(self, key: str, payload: bytes) -> None:
         what = key.rpartition("/")[2]
         try:
-            site, robot, _ = split_key(key)
-            check_name(robot, "robot")
+            site, robot = self._sender(key)
             if not self._rates[what].admits((site, robot)):
                 self._count(what, "dropped", 0)
                 self._refusals.warning(

@@ -77,12 +77,12 @@ class KeyFolder:
 
     def signer(self, name: str) -> "CryptoSigner | None":
         """A key, None where it is not here or not for this account; errors as of `load_key`."""
-        return load_key(self._path(name), _credential(name)) if self.has(name) else None
+        return load_key(self._path(name), credential(name)) if self.has(name) else None
 
     def make(self, name: str) -> "CryptoSigner":
         """A new key of this name; StoreError where there is one already."""
         signer = new_key()
-        save_key(self._path(name), signer, _credential(name))
+        save_key(self._path(name), signer, credential(name))
         return signer
 
     def replace(self, name: str) -> "CryptoSigner":
@@ -97,7 +97,8 @@ class KeyFolder:
         return self.folder / f"{name}.pem"
 
 
-def _credential(name: str) -> str | None:
+def credential(name: str) -> str | None:
+    """Passphrase of a key from the unit's credentials, None where it has none; StoreError where it cannot be read."""
     folder = os.environ.get("CREDENTIALS_DIRECTORY")
     path = None if folder is None else Path(folder) / f"fleetmap-{name}"
     if path is None or not path.is_file():

@@ -9,12 +9,15 @@ import msgspec
 from fleetmap.errors import StateError
 from fleetmap.trust import site_role
 from mapserver.store import MapStore
+from mapserver.trust.authorities import Authorities
+from mapserver.trust.enrolment import RobotRegister
 from mapserver.trust.keys import KeyFolder
 from mapserver.trust.lists import TIMESTAMP, SignedLists
 
 # Days before its end at which a role is to be signed again: by people, who must meet; by the builder, every night; by the server.
 _ENDS_SOON = {"root": 60, "targets": 30, "snapshot": 1, TIMESTAMP: 0.25}
 _SITE_ENDS_SOON = 7
+_CERTIFICATE_ENDS_SOON = 30
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,19 @@ def trust_status(store: MapStore) -> TrustStatus:
         found.risks.append(
             f"{own.folder}/root.pem: who takes this machine can do everything, and nobody can take it back"
         )
+    _look_at_certificates(RobotRegister(store).authorities, found)
     return found
+
+
+def _look_at_certificates(authorities: Authorities, found: TrustStatus) -> None:
+    if not authorities.are_there:
+        return
+    for file, left in authorities.days_left().items():
+        if left < _CERTIFICATE_ENDS_SOON:
+            step = "`mapserver trust rotate server`" if file == "server.pem" else "make it again"
+            found.faults.append(f"{file}: {left:.1f} days are left, then no robot connects; {step}")
+    if (authorities.folder / "servers-ca.pem").is_file():
+        found.risks.append(f"{authorities.folder}/servers-ca.pem: who takes this machine can play the server")
 
 
 def _holders(lists: SignedLists) -> dict[str, tuple[int, int]]:

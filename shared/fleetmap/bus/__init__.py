@@ -1,8 +1,9 @@
 """The bus between server and robots: `Bus` is the contract, `ZenohBus` the network, `MemoryBus` the same in one process."""
 
 from fleetmap.bus.memory import MemoryBus, MemoryHub
-from fleetmap.bus.protocol import MAX_MESSAGE_BYTES, Answer, Bus, Handle, Listen, key_matches
-from fleetmap.bus.zenoh_bus import ZenohBus, check_endpoint, is_loopback
+from fleetmap.bus.protocol import MAX_MESSAGE_BYTES, Answer, Bus, Handle, Listen
+from fleetmap.bus.tls import TlsFiles, handshake_fault
+from fleetmap.bus.zenoh_bus import ZenohBus, check_endpoint, has_tls, is_loopback
 
 __all__ = [
     "MAX_MESSAGE_BYTES",
@@ -12,8 +13,10 @@ __all__ = [
     "Listen",
     "MemoryBus",
     "MemoryHub",
+    "TlsFiles",
     "ZenohBus",
     "check_endpoint",
+    "handshake_fault",
+    "has_tls",
     "is_loopback",
-    "key_matches",
 ]

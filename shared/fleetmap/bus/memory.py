@@ -3,6 +3,7 @@
 import threading
 from typing import Any
 
+from fleetmap.access import Access, Act, Direction, key_includes
 from fleetmap.bus.protocol import (
     Answer,
     Bus,
@@ -11,7 +12,6 @@ from fleetmap.bus.protocol import (
     answer_query,
     check_size,
     deliver,
-    key_matches,
     no_answer,
     query_refused,
 )
@@ -19,36 +19,59 @@ from fleetmap.errors import LinkError
 
 
 class MemoryHub:
-    """What MemoryBus participants share. `reachable` False plays a network that is away."""
+    """What MemoryBus participants share. `reachable` False plays a network that is away.
 
-    def __init__(self) -> None:
+    access: rules for participants with a certificate, as a server's session has them; may be replaced at any time.
+    """
+
+    def __init__(self, access: Access | None = None) -> None:
         self.reachable = True
+        self.access = access
         self.lock = threading.RLock()
-        self.queryables: list[tuple[str, Answer]] = []
-        self.subscribers: list[tuple[str, Listen]] = []
-        self.tokens: list[str] = []
-        self.members = 0
+        self.queryables: list[tuple[str, Answer, str | None]] = []
+        self.subscribers: list[tuple[str, Listen, str | None]] = []
+        self.tokens: list[tuple[str, str | None]] = []
+        self.certificates: list[str | None] = []  # of everybody who is there, None for the server
+
+    def passes(self, certificate: str | None, flow: Direction, act: Act, key_expr: str) -> bool:
+        """Whether a message of or for a participant passes; the server itself (None) is asked nothing."""
+        if self.access is None or certificate is None:
+            return True
+        return self.access.permits(certificate, flow, act, key_expr)
 
 
 class MemoryBus(Bus):
-    """A participant of a MemoryHub; callbacks run on the caller's thread."""
+    """A participant of a MemoryHub; callbacks run on the caller's thread.
 
-    def __init__(self, hub: MemoryHub) -> None:
-        self._hub = hub
+    As on the network, what the rules deny is silence: nothing is raised, and nobody hears it.
+    """
+
+    def __init__(self, hub: MemoryHub, certificate: str | None = None) -> None:
+        """certificate: its common name; None for the server."""
+        self._hub, self._certificate = hub, certificate
         self._handles: list[Handle] | None = []
-        hub.members += 1
+        hub.certificates.append(certificate)
 
     def queryable(self, key_expr: str, answer: Answer) -> Handle:
         """See Bus."""
-        return self._declare(self._hub.queryables, (key_expr, answer))
+        return self._declare(self._hub.queryables, (key_expr, answer, self._certificate))
 
     def get(self, key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
         """See Bus; never waits."""
         check_size(payload, key)
-        with self._hub.lock:
-            answers = [answer for key_expr, answer in self._hub.queryables if key_matches(key_expr, key)]
-        if not self._hub.reachable or not answers:
-            raise no_answer(key, timeout_s)
+        hub, own = self._hub, self._certificate
+        with hub.lock:
+            answers = [
+                answer
+                for key_expr, answer, other in hub.queryables
+                if key_includes(key_expr, key)
+                and hub.passes(other, Direction.IN, Act.ANSWER, key_expr)
+                and hub.passes(other, Direction.OUT, Act.QUERY, key)
+                and hub.passes(other, Direction.IN, Act.REPLY, key)
+            ]
+        may_ask = hub.passes(own, Direction.IN, Act.QUERY, key) and hub.passes(own, Direction.OUT, Act.REPLY, key)
+        if not hub.reachable or not answers or not may_ask:
+            raise no_answer(key, timeout_s, is_silenced=hub.access is not None and own is not None)
         data, reason = answer_query(answers[0], key, payload)
         if data is None:
             raise query_refused(key, reason)
@@ -57,27 +80,47 @@ class MemoryBus(Bus):
     def publish(self, key: str, payload: bytes, *, may_drop: bool = False, attachment: bytes = b"") -> None:
         """See Bus."""
         check_size(payload, key)
-        with self._hub.lock:
-            listeners = [listen for key_expr, listen in self._hub.subscribers if key_matches(key_expr, key)]
-        for listen in listeners if self._hub.reachable else []:
-            deliver(listen, key, payload)
+        hub = self._hub
+        with hub.lock:
+            listeners = [
+                listen
+                for key_expr, listen, other in hub.subscribers
+                if key_includes(key_expr, key)
+                and hub.passes(other, Direction.IN, Act.SUBSCRIBE, key_expr)
+                and hub.passes(other, Direction.OUT, Act.PUT, key)
+            ]
+        if hub.reachable and hub.passes(self._certificate, Direction.IN, Act.PUT, key):
+            for listen in listeners:
+                deliver(listen, key, payload)
 
     def subscribe(self, key_expr: str, listen: Listen) -> Handle:
         """See Bus."""
-        return self._declare(self._hub.subscribers, (key_expr, listen))
+        return self._declare(self._hub.subscribers, (key_expr, listen, self._certificate))
 
     def declare_alive(self, key: str) -> Handle:
         """See Bus."""
-        return self._declare(self._hub.tokens, key)
+        return self._declare(self._hub.tokens, (key, self._certificate))
 
     def alive(self, key_expr: str, *, timeout_s: float = 2.0) -> list[str]:
         """See Bus."""
-        with self._hub.lock:
-            return sorted({key for key in self._hub.tokens if self._hub.reachable and key_matches(key_expr, key)})
+        hub = self._hub
+        if not hub.reachable or not hub.passes(self._certificate, Direction.IN, Act.LOOK_FOR_ALIVE, key_expr):
+            return []
+        with hub.lock:
+            shown = {key for key, other in hub.tokens if hub.passes(other, Direction.IN, Act.SHOW_ALIVE, key)}
+        return sorted(key for key in shown if key_includes(key_expr, key))
+
+    def reopen(self, access: Access) -> None:
+        """Other rules for the hub; as ZenohBus, whose session is opened anew."""
+        self._hub.access = access
+
+    def certificates(self) -> list[str]:
+        """Names in the certificates of who is on the hub, sorted."""
+        return sorted(name for name in self._hub.certificates if name)
 
     def connected(self) -> bool:
         """See Bus."""
-        return self._hub.reachable and self._hub.members > 1 and not self.closed()
+        return self._hub.reachable and len(self._hub.certificates) > 1 and not self.closed()
 
     def closed(self) -> bool:
         """See Bus."""
@@ -87,7 +130,7 @@ class MemoryBus(Bus):
         """See Bus."""
         handles, self._handles = self._handles, None
         if handles is not None:
-            self._hub.members -= 1
+            self._hub.certificates.remove(self._certificate)
             for handle in handles:
                 handle.close()
 

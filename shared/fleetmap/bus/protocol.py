@@ -91,19 +91,6 @@ class Bus(ABC):
         self.close()
 
 
-def key_matches(key_expr: str, key: str) -> bool:
-    """Whether the key expression (chunks may be `*` or `**`) includes the plain key."""
-    return _chunks_match(key_expr.split("/"), key.split("/"))
-
-
-def _chunks_match(pattern: list[str], chunks: list[str]) -> bool:
-    if not pattern:
-        return not chunks
-    if pattern[0] == "**":
-        return any(_chunks_match(pattern[1:], chunks[skip:]) for skip in range(len(chunks) + 1))
-    return bool(chunks) and pattern[0] in {"*", chunks[0]} and _chunks_match(pattern[1:], chunks[1:])
-
-
 def answer_query(answer: Answer, key: str, payload: bytes) -> tuple[bytes | None, str]:
     """The answer, or None and the reason. A fault in the handler reaches the log and the client, which waits for an answer."""
     try:
@@ -132,9 +119,15 @@ def deliver(listen: Listen, key: str, payload: bytes) -> None:
         _log.exception("the subscriber for %r failed", key[:200])
 
 
-def no_answer(key: str, timeout_s: float) -> UnreachableError:
-    """The error of a query without an answer."""
-    return UnreachableError(f"nobody answered for {key} within {timeout_s:g} s; is the server running and reachable?")
+def no_answer(key: str, timeout_s: float, *, is_silenced: bool = False) -> UnreachableError:
+    """The error of a query without an answer. is_silenced: a server is there, and it knows the asker's certificate."""
+    why = "is the server running and reachable?"
+    if is_silenced:
+        why = (
+            "the server is there and lets this certificate say nothing: revoked, enrolled anew, or of another site? "
+            "`mapserver robots list` shows it"
+        )
+    return UnreachableError(f"nobody answered for {key} within {timeout_s:g} s; {why}")
 
 
 def query_refused(key: str, reason: str) -> LinkError:

@@ -1,7 +1,9 @@
 """The bus over zenoh, which is used here alone."""
 
 import json
+import logging
 import socket
+import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -10,6 +12,7 @@ from typing import Any, Self
 
 import zenoh
 
+from fleetmap.access import Access
 from fleetmap.bus.fair_queue import FairQueue, sender_of
 from fleetmap.bus.protocol import (
     MAX_MESSAGE_BYTES,
@@ -23,50 +26,115 @@ from fleetmap.bus.protocol import (
     no_answer,
     query_refused,
 )
+from fleetmap.bus.tls import TlsFiles
 from fleetmap.errors import LinkError, UsageError
 
 _RETRY_S = 0.05
+_REOPEN_WITHIN_S = 10.0
 _MAX_ALIVE = 1 << 17
+_MAX_SESSIONS = 20_000  # zenoh's default is 1000: the next robot would find silence
+_MAX_RECEIVED_BYTES = 2 * MAX_MESSAGE_BYTES
 _BUSY = b"later: too much of this sender is waiting already"
+_log = logging.getLogger(__name__)
+
+
+class _Declared:
+    """Something declared: how to declare it on a session, the object that zenoh gave for it, and what ends with it."""
+
+    def __init__(self, declare: Callable[[Any], Any], stop: Callable[[], None]) -> None:
+        self.declare, self.stop = declare, stop
+        self.current: Any = None
 
 
 class ZenohBus(Bus):
     """A zenoh session with explicit endpoints only: no multicast, no gossip, nothing found by itself.
 
     What a server hears passes a `FairQueue`: one sender who floods is dropped. Whoever connects hears all that he asked for.
+    A server's session can be opened anew with other rules; what was declared is declared again.
     """
 
-    def __init__(self, session: Any, endpoint: str, *, is_server: bool = False) -> None:
-        self._session = session
-        self._is_server = is_server
-        self.endpoint = endpoint
-        # What is declared lives as long as its object: without this list a token would vanish with an ignored handle.
-        self._handles: list[Handle] = []
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        is_server: bool = False,
+        tls: TlsFiles | None = None,
+        access: Access | None = None,
+    ) -> None:
+        """Not open yet: see `open`. tls: mutual TLS; access: who may say what, for a server with mutual TLS.
 
-    @classmethod
-    def listen(cls, endpoint: str) -> Self:
-        """The server's side, a router that robots connect to. Port 0 takes a free one: see `endpoint`.
-
-        Raises UsageError for something that is no endpoint, LinkError where it cannot listen.
+        Raises UsageError for something that is no endpoint, and for TLS without its files.
         """
-        wanted = check_endpoint(endpoint)
-        for attempt in range(5):
-            actual = _with_free_port(wanted)
-            try:
-                return cls(_open("router", listen=actual), actual, is_server=True)
-            except zenoh.ZError as error:
-                # Between finding a free port and listening on it another process may take it.
-                if actual == wanted or attempt == 4:
-                    raise LinkError(f"cannot listen on {wanted} ({error}); is another server running there?") from error
-        raise AssertionError("unreachable")
+        self.endpoint = check_endpoint(endpoint)
+        if has_tls(endpoint) and tls is None and is_server:
+            raise UsageError(f"endpoint {endpoint}: without a certificate nobody can listen with TLS")
+        self._is_server, self._tls, self.access = is_server, tls, access
+        self._lock = threading.RLock()
+        self._session: Any = None
+        self._is_closed = False
+        # What is declared lives as long as its object: without this list a token would vanish with an ignored handle.
+        self._declared: list[_Declared] = []
 
     @classmethod
-    def connect(cls, endpoint: str) -> Self:
+    def listen(cls, endpoint: str, *, tls: TlsFiles | None = None, access: Access | None = None) -> Self:
+        """The server's side, open: a router that robots connect to. Port 0 takes a free one: see `endpoint`.
+
+        Errors as of `open`.
+        """
+        bus = cls(endpoint, is_server=True, tls=tls, access=access)
+        bus.open()
+        return bus
+
+    @classmethod
+    def connect(cls, endpoint: str, *, tls: TlsFiles | None = None) -> Self:
         """A robot's side. Returns at once; connects, and after every loss connects again, in the background."""
-        try:
-            return cls(_open("peer", connect=check_endpoint(endpoint)), endpoint)
-        except zenoh.ZError as error:
-            raise LinkError(f"cannot connect to {endpoint} ({error}); check the endpoint") from error
+        bus = cls(endpoint, tls=tls)
+        bus.open()
+        return bus
+
+    def open(self) -> None:
+        """Opens the session with all that was declared so far; raises LinkError where it cannot listen or connect."""
+        wanted = self.endpoint
+        with self._lock:
+            for attempt in range(5):
+                self.endpoint = _with_free_port(wanted)
+                try:
+                    self._open()
+                    return
+                except zenoh.ZError as error:
+                    if not self._is_server:
+                        raise LinkError(f"cannot connect to {wanted} ({error}); check the endpoint") from error
+                    # Between finding a free port and listening on it another process may take it.
+                    if self.endpoint == wanted or attempt == 4:
+                        raise LinkError(
+                            f"cannot listen on {wanted} ({error}); is another server running there?"
+                        ) from error
+
+    def reopen(self, access: Access) -> None:
+        """Opens a server's session anew with these rules and the present certificate: zenoh reads both when it opens.
+
+        Robots connect again by themselves; calls on other threads wait. Raises LinkError where that is not possible: the session
+        stays as it is where a certificate cannot be used, and else is closed until another attempt succeeds.
+        """
+        fault = "" if self._tls is None else self._tls.fault()
+        if fault:
+            raise LinkError(f"{fault}; the bus stays as it is")
+        with self._lock:
+            if self._is_closed:
+                return
+            if self._session is not None and not self._session.is_closed():
+                self._session.close()
+            self.access = access
+            give_up_s = time.monotonic() + _REOPEN_WITHIN_S
+            while True:
+                try:
+                    self._open()
+                    return
+                except zenoh.ZError as error:
+                    # The port of QUIC is not free in the moment in which its session is closed.
+                    if time.monotonic() > give_up_s:
+                        raise LinkError(f"cannot listen on {self.endpoint} again ({error}); trying on") from error
+                    time.sleep(_RETRY_S)
 
     def queryable(self, key_expr: str, answer: Answer) -> Handle:
         """See Bus."""
@@ -76,10 +144,13 @@ class ZenohBus(Bus):
             with query:
                 payload = b"" if query.payload is None else query.payload.to_bytes()
                 data, reason = answer_query(answer, key, payload)
-                if data is None:
-                    query.reply_err(reason.encode("utf-8", "replace"))
-                else:
-                    query.reply(key, data)
+                try:
+                    if data is None:
+                        query.reply_err(reason.encode("utf-8", "replace"))
+                    else:
+                        query.reply(key, data)
+                except zenoh.ZError as error:
+                    _log.debug("the session that asked for %r is gone: %s", key[:200], error)  # the asker asks again
 
         def take(query: Any) -> None:
             key = str(query.key_expr)
@@ -90,19 +161,18 @@ class ZenohBus(Bus):
 
         if not self._is_server:
             plain = lambda query: reply(query, str(query.key_expr))  # noqa: E731
-            return self._handle(lambda: self._session.declare_queryable(key_expr, plain, complete=True))
+            return self._declare(lambda session: session.declare_queryable(key_expr, plain, complete=True))
         queue = FairQueue(f"answers {key_expr}")
-        direct = zenoh.handlers.Callback(take, queue.close, indirect=False)
-        return self._handle(lambda: self._session.declare_queryable(key_expr, direct, complete=True))
+        direct = zenoh.handlers.Callback(take, lambda: None, indirect=False)
+        return self._declare(lambda session: session.declare_queryable(key_expr, direct, complete=True), queue.close)
 
     def get(self, key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
         """See Bus. Asks again until the time is over, because before a connection stands zenoh answers with silence."""
         check_size(payload, key)
         deadline = time.monotonic() + timeout_s
         while (left_s := deadline - time.monotonic()) > 0:
-            # The answer travels with the question's congestion control; what may be dropped would lose large answers.
-            ask = partial(self._session.get, key, timeout=left_s, payload=payload)
-            replies = self._guarded(partial(ask, congestion_control=zenoh.CongestionControl.BLOCK))
+            ask = partial(_ask, key=key, payload=payload, timeout_s=left_s)
+            replies = self._guarded(ask)
             reasons = []
             for reply in replies:
                 if reply.ok is not None:
@@ -112,13 +182,14 @@ class ZenohBus(Bus):
             if refusals:
                 raise query_refused(key, refusals[0])
             time.sleep(min(_RETRY_S, max(0.0, deadline - time.monotonic())))
-        raise no_answer(key, timeout_s)
+        raise no_answer(key, timeout_s, is_silenced=self._tls is not None and self.connected())
 
     def publish(self, key: str, payload: bytes, *, may_drop: bool = False, attachment: bytes = b"") -> None:
         """See Bus."""
         control = zenoh.CongestionControl.DROP if may_drop else zenoh.CongestionControl.BLOCK
-        put = partial(self._session.put, key, check_size(payload, key), congestion_control=control)
-        self._guarded(partial(put, attachment=attachment) if attachment else put)
+        beside = {"attachment": attachment} if attachment else {}
+        check_size(payload, key)
+        self._guarded(lambda session: session.put(key, payload, congestion_control=control, **beside))
 
     def subscribe(self, key_expr: str, listen: Listen) -> Handle:
         """See Bus."""
@@ -131,53 +202,90 @@ class ZenohBus(Bus):
 
         if not self._is_server:
             plain = lambda sample: deliver(listen, str(sample.key_expr), sample.payload.to_bytes())  # noqa: E731
-            return self._handle(lambda: self._session.declare_subscriber(key_expr, plain))
+            return self._declare(lambda session: session.declare_subscriber(key_expr, plain))
         queue = FairQueue(f"hears {key_expr}")
-        direct = zenoh.handlers.Callback(take, queue.close, indirect=False)
-        return self._handle(lambda: self._session.declare_subscriber(key_expr, direct))
+        direct = zenoh.handlers.Callback(take, lambda: None, indirect=False)
+        return self._declare(lambda session: session.declare_subscriber(key_expr, direct), queue.close)
 
     def declare_alive(self, key: str) -> Handle:
         """See Bus."""
-        return self._handle(lambda: self._session.liveliness().declare_token(key))
+        return self._declare(lambda session: session.liveliness().declare_token(key))
 
     def alive(self, key_expr: str, *, timeout_s: float = 2.0) -> list[str]:
         """See Bus."""
         # A router answers from its own table before `get` returns: what the channel does not hold would stop it for ever.
         channel: Any = zenoh.handlers.FifoChannel(_MAX_ALIVE)
-        replies = self._guarded(lambda: self._session.liveliness().get(key_expr, channel, timeout=timeout_s))
+        replies = self._guarded(lambda session: session.liveliness().get(key_expr, channel, timeout=timeout_s))
         return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+
+    def certificates(self) -> list[str]:
+        """Names in the certificates of who is connected to a server with mutual TLS, sorted, one for each connection."""
+        links = self._guarded(lambda session: session.info.links())
+        return sorted(link.auth_identifier for link in links if link.auth_identifier)
 
     def connected(self) -> bool:
         """See Bus."""
-        if self.closed():
+        session = self._session
+        if session is None or session.is_closed():
             return False
-        return bool(self._session.info.routers_zid() or self._session.info.peers_zid())
+        return bool(session.info.routers_zid() or session.info.peers_zid())
 
     def closed(self) -> bool:
         """See Bus."""
-        return bool(self._session.is_closed())
+        return self._is_closed
 
     def close(self) -> None:
         """See Bus. Without it the process would hang at its end."""
-        if not self.closed():
-            self._session.close()
+        with self._lock:
+            declared, self._declared, self._is_closed = self._declared, [], True
+            if self._session is not None and not self._session.is_closed():
+                self._session.close()
+        for entry in declared:
+            entry.stop()
 
-    def _handle(self, declare: Callable[[], Any]) -> Handle:
-        declared = self._guarded(declare)
+    def _open(self) -> None:
+        """A new session with everything that was declared. The caller holds the lock."""
+        way = "listen" if self._is_server else "connect"
+        entries: dict[str, Any] = {f"{way}/endpoints": [self.endpoint]}
+        if self._tls is not None:
+            entries["transport/link/tls"] = self._tls.listening() if self._is_server else self._tls.connecting()
+        if self._is_server:
+            entries |= _SERVER
+            if self.access is not None:
+                entries |= {"transport/link/rx/max_message_size": _MAX_RECEIVED_BYTES, **self.access.zenoh_config()}
+        self._session = zenoh.open(_config(entries))
+        for entry in self._declared:
+            entry.current = entry.declare(self._session)
+
+    def _declare(self, declare: Callable[[Any], Any], stop: Callable[[], None] = lambda: None) -> Handle:
+        declared = _Declared(declare, stop)
+        with self._lock:
+            if self._session is not None:
+                declared.current = self._guarded(declare)
+            self._declared.append(declared)
 
         def undo() -> None:
-            if not self.closed():
-                declared.undeclare()
+            with self._lock:
+                if declared in self._declared:
+                    self._declared.remove(declared)
+                    if declared.current is not None and not self._session.is_closed():
+                        declared.current.undeclare()
+            stop()
 
-        handle = Handle(undo)
-        self._handles = [*(other for other in self._handles if not other.closed()), handle]
-        return handle
+        return Handle(undo)
 
-    def _guarded(self, call: Callable[[], Any]) -> Any:
-        try:
-            return call()
-        except zenoh.ZError as error:
-            raise LinkError(f"the bus at {self.endpoint} refused ({error}); is it closed?") from error
+    def _guarded(self, call: Callable[[Any], Any]) -> Any:
+        while True:
+            with self._lock:
+                session = self._session
+            if session is None:
+                raise LinkError(f"the bus at {self.endpoint} is not open yet")
+            try:
+                return call(session)
+            except zenoh.ZError as error:
+                with self._lock:
+                    if session is self._session or self._is_closed:
+                        raise LinkError(f"the bus at {self.endpoint} refused ({error}); is it closed?") from error
 
 
 def check_endpoint(endpoint: str) -> str:
@@ -189,6 +297,17 @@ def check_endpoint(endpoint: str) -> str:
     if int(port) > 65535:
         raise UsageError(f"endpoint {endpoint!r}: port {port} is above 65535")
     return endpoint
+
+
+def _ask(session: Any, *, key: str, payload: bytes, timeout_s: float) -> Any:
+    # The answer travels with the question's congestion control; what may be dropped would lose large answers.
+    control = zenoh.CongestionControl.BLOCK
+    return session.get(key, timeout=timeout_s, payload=payload, congestion_control=control)
+
+
+def has_tls(endpoint: str) -> bool:
+    """Whether an endpoint's protocol has TLS in it."""
+    return endpoint.startswith(("tls/", "quic/"))
 
 
 def is_loopback(endpoint: str) -> bool:
@@ -217,21 +336,26 @@ def _with_free_port(endpoint: str) -> str:
         return f"{protocol}/{host}:{probe.getsockname()[1]}"
 
 
-def _open(mode: str, *, listen: str | None = None, connect: str | None = None) -> Any:
+_COMMON: dict[str, Any] = {
+    # In peer mode, without an end and without failure, `open` returns at once and connects in the background for
+    # ever; any other combination gives up, or waits.
+    "mode": "peer",
+    "listen/endpoints": [],
+    "connect/endpoints": [],
+    "connect/timeout_ms": -1,
+    "connect/exit_on_failure": False,
+    "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2},
+    "scouting/delay": 1,
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "transport/shared_memory/enabled": False,
+    "adminspace/enabled": False,
+}
+_SERVER: dict[str, Any] = {"mode": "router", "transport/unicast/max_sessions": _MAX_SESSIONS}
+
+
+def _config(entries: dict[str, Any]) -> zenoh.Config:
     config = zenoh.Config()
-    for key, value in (
-        ("mode", mode),
-        ("listen/endpoints", [] if listen is None else [listen]),
-        ("connect/endpoints", [] if connect is None else [connect]),
-        # In peer mode, without an end and without failure, `open` returns at once and connects in the background for
-        # ever; any other combination gives up, or waits.
-        ("connect/timeout_ms", -1),
-        ("connect/exit_on_failure", False),
-        ("connect/retry", {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2}),
-        ("scouting/delay", 1),
-        ("scouting/multicast/enabled", False),
-        ("scouting/gossip/enabled", False),
-        ("transport/shared_memory/enabled", False),
-    ):
+    for key, value in (_COMMON | entries).items():
         config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
+    return config

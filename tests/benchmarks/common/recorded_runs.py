@@ -15,6 +15,7 @@ from typing import Any
 
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sources.replay_source import ReplaySource
+from locclient.identity import MapAddress
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import connected
 from locclient.replay.replay import ReplayOptions, replay
@@ -126,7 +127,7 @@ def played(
     path: Path, store: Path, settings: LocalizerSettings, frames: str = ":", *, reverse: bool = False
 ) -> ReplayResult:
     """The recording replayed in the store's map, as `locclient replay` does."""
-    options = {"site": SITE, "store": store, "server": None, "robot": "bench"}
-    with open_recording(path) as recording, connected(options) as link:
+    address = MapAddress(site=SITE, robot="bench", store=str(store))
+    with open_recording(path) as recording, connected(address) as link:
         source = ReplaySource.of(recording, FrameSelection.parse(frames), reverse=reverse)
         return replay(source, link, ReplayOptions(settings))

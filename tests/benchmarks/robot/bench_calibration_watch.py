@@ -23,6 +23,7 @@ from fleetmap.messages import Cause, Status
 from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.sensors.samples import PositionPrior, wheel_between
 from fleetmap.sources.replay_source import ReplaySource
+from locclient.identity import MapAddress
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import connected
 from locclient.replay.replay import ReplayOptions, replay
@@ -136,7 +137,7 @@ def played(recording: Recording, store: Path, site: str, indices: NDArray[np.int
     """So many seconds of a recording's frames from the first of `indices` on, as `locclient replay` does."""
     stamps = recording.frame_stamps_ns[indices]
     indices = indices[stamps <= stamps[0] + watched_s * 1e9]
-    with connected({"site": site, "store": store, "server": None, "robot": "bench"}) as link:
+    with connected(MapAddress(site=site, robot="bench", store=str(store))) as link:
         return replay(ReplaySource(recording, indices, reverse=False), link, ReplayOptions(LocalizerSettings()))
 
 

@@ -38,6 +38,7 @@ from fleetmap.sensors.samples import CameraFrame, wheel_between
 from fleetmap.sources.sensor_bundle import SensorBundle
 from fleetsim.imaging.pipelines import find_pipeline, process_frame
 from fleetsim.recorder import Order, Session, prepare
+from locclient.identity import MapAddress
 from locclient.localization import localizer
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import connected
@@ -148,9 +149,8 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)
-    with connected(
-        {"site": SITE, "store": surveyed(arguments.work, arguments.seed), "server": None, "robot": "bench"}
-    ) as link:
+    store = str(surveyed(arguments.work, arguments.seed))
+    with connected(MapAddress(site=SITE, robot="bench", store=store)) as link:
         loaded = load_map(link.source)[0]
     drive = prepare(Order("small-loop", seed=arguments.seed, day=_DAY, light=_LIGHT, robot=_ROBOT))
     found: dict[str, tuple[list[Start], list[Start]]] = {name: ([], []) for name in arguments.pipeline or PROMISES}

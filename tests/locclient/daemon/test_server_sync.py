@@ -186,8 +186,10 @@ def test_a_manifest_of_another_site_is_refused(world: World) -> None:
     told = WantedVersion(site="lab", version=7, manifest_sha256=foreign.manifest_sha256)
     with MemoryBus(world.hub) as server:
         # In front of the real server's answers: a server that lies, or whose store was mixed up.
-        world.hub.queryables.insert(0, (robot_key("lab", "r1", "wanted"), lambda *_: encode_message(told)))
-        world.hub.queryables.insert(0, ("fleetmap/lab/manifests/7", _parts(world.store.blob(foreign.manifest_sha256))))
+        world.hub.queryables.insert(0, (robot_key("lab", "r1", "wanted"), lambda *_: encode_message(told), None))
+        world.hub.queryables.insert(
+            0, ("fleetmap/lab/manifests/7", _parts(world.store.blob(foreign.manifest_sha256)), None)
+        )
         assert not server.closed()
     world.step(61.0)
     assert not world.sync.fetched

@@ -102,7 +102,7 @@ def want(world: World, version: int, sha256: str | None = None) -> None:
     """Whoever answers `wanted` names this version, with the honest manifest's address unless another is given."""
     address = world.store.version(SITE, version).manifest_sha256 if sha256 is None else sha256
     answer = encode_message(WantedVersion(site=SITE, version=version, manifest_sha256=address))
-    world.hub.queryables.insert(0, (robot_key(SITE, ROBOT, "wanted"), lambda *_: answer))
+    world.hub.queryables.insert(0, (robot_key(SITE, ROBOT, "wanted"), lambda *_: answer, None))
 
 
 def running(client: MapClient) -> int | None:
@@ -235,7 +235,7 @@ def test_row_14_a_manifest_larger_than_its_signed_size(world: World) -> None:
     length = world.store.version(SITE, 2).manifest_bytes
     info = world.store.version(SITE, 2)
     data = world.store.blob(info.manifest_sha256) + b" "
-    world.hub.queryables.insert(0, (manifest_key(SITE, 2), lambda _, question: part_of(data, question)))
+    world.hub.queryables.insert(0, (manifest_key(SITE, 2), lambda _, question: part_of(data, question), None))
     with pytest.raises(LinkError, match=f"has {length + 1} bytes where at most {length} are expected"):
         client.fetch(client.wanted())
 

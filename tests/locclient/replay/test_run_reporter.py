@@ -12,6 +12,7 @@ from fleetmap.bus import ZenohBus
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sources.replay_source import ReplaySource
 from locclient.delivery.outbox import Outbox
+from locclient.identity import MapAddress
 from locclient.maps import connection
 from locclient.maps.connection import connected
 from locclient.maps.map_client import MapClient
@@ -62,20 +63,13 @@ def carried(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def played(path: Path, endpoint: str, folder: Path, *, close: Server | None = None) -> dict[str, object]:
     """The report of a replay; close: the server whose service ends before the first failure."""
-    options = {
-        "server": endpoint,
-        "store": None,
-        "site": "room",
-        "robot": "r1",
-        "cache": folder / "cache",
-        "cache_bytes": 10**8,
-    }
+    address = MapAddress(site="room", robot="r1", server=endpoint)
 
     def progress(number: int) -> None:
         if close is not None and number == 70:
             close.service.close()
 
-    with open_recording(path) as recording, connected(options) as link:
+    with open_recording(path) as recording, connected(address, folder / "cache", 10**8) as link:
         source = ReplaySource.of(recording, FrameSelection.parse(":"), reverse=False)
         return replay(source, link, ReplayOptions(robot_world.SETTINGS, progress=progress)).report
 

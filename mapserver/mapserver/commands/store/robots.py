@@ -1,17 +1,22 @@
 """`mapserver robots`: the robots that a store knows."""
 
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from fleetmap.cli_options import Group, expand_options
-from fleetmap.errors import UsageError
-from mapserver.commands.options import ActorOptions, SiteOptions
+from fleetmap.errors import UsageError, disk_errors
+from mapserver.commands.options import ActorOptions, Json, SiteOptions, StoreFolder
+from mapserver.commands.print_json import print_json
+
+Robots = Annotated[list[str], typer.Argument(metavar="ROBOT...", help="Names of robots.")]
 
 
 @expand_options
 def remove(
-    robots: Annotated[list[str], typer.Argument(metavar="ROBOT...", help="Names of robots.")],
+    robots: Robots,
     where: SiteOptions,
     by: ActorOptions,
 ) -> None:
@@ -30,4 +35,80 @@ def remove(
         raise UsageError(f"site {where.site} knows no robot {', '.join(missing)}; its others of these are removed")
 
 
-ROBOTS = Group("The robots that a store knows.", {"remove": remove})
+@expand_options
+def enrol(
+    robots: Robots,
+    where: SiteOptions,
+    by: ActorOptions,
+    endpoint: Annotated[
+        str | None,
+        typer.Option(metavar="ENDPOINT", help="Where they reach the server; default: its certificate's first name."),
+    ] = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the bundles ROBOT.fleetmap.")] = Path(),
+) -> None:
+    """Let robots speak on the bus: writes one bundle a robot, for `locclient enrol`, to be used once within a day.
+
+    A bundle is a secret until it was used: carry it on a stick or over SSH.
+    """
+    from fleetmap.bus import check_endpoint
+    from mapserver.store import MapStore
+    from mapserver.store.files import write_atomically
+    from mapserver.trust.enrolment import LISTENING, RobotRegister, bundle_path
+
+    with MapStore.open(where.store) as maps:
+        register = RobotRegister(maps)
+        reached = check_endpoint(endpoint) if endpoint is not None else register.default_endpoint(LISTENING)
+        with disk_errors(f"{out} cannot be written", "name another folder by --out", UsageError):
+            out.mkdir(parents=True, exist_ok=True)
+            for robot, bundle in register.enrol(where.site, robots, reached, actor=by.named()).items():
+                write_atomically(bundle_path(out, robot), [bundle])
+                typer.echo(
+                    f"{bundle_path(out, robot)}: for robot {robot} of site {where.site} at {reached}, within 24 h"
+                )
+        if where.site not in {info.site for info in maps.sites()}:
+            typer.echo(f"note: the store has no map of site {where.site} yet", err=True)
+
+
+@expand_options
+def revoke(robots: Robots, where: SiteOptions, by: ActorOptions) -> None:
+    """Take robots off the bus at once, such as stolen ones; a server that runs follows within two seconds."""
+    from mapserver.store import MapStore
+    from mapserver.trust.enrolment import RobotRegister
+
+    with MapStore.open(where.store) as maps:
+        gone = RobotRegister(maps).revoke(where.site, robots, actor=by.named())
+    for robot in gone:
+        typer.echo(f"site {where.site}: robot {robot} is revoked")
+    missing = [robot for robot in robots if robot not in gone]
+    if missing:
+        raise UsageError(f"site {where.site} has not enrolled {', '.join(missing)}; its others of these are revoked")
+
+
+def list_(
+    store: StoreFolder,
+    site: Annotated[str | None, typer.Option(help="Name of the site; default: all sites.")] = None,
+    json: Json = False,
+) -> None:
+    """Show the enrolled robots, the names in their certificates, and how long those last."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from mapserver.store import MapStore
+    from mapserver.trust.enrolment import RobotRegister
+
+    with MapStore.open(store, read_only=True) as maps:
+        rows = [entry.row(maps.now_ns()) for entry in RobotRegister(maps).robots(site)]
+    if json:
+        print_json(rows)
+        return
+    table = Table("site", "robot", "certificate", "enrolled", "state")
+    for row in rows:
+        enrolled = datetime.fromtimestamp(row.enrolled_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M")
+        table.add_row(row.site, row.robot, row.certificate, enrolled, row.state)
+    Console().print(table)
+
+
+ROBOTS = Group(
+    "The robots that a store knows, and those that may speak to its server.",
+    {"enrol": enrol, "revoke": revoke, "list": list_, "remove": remove},
+)

@@ -1,5 +1,6 @@
 """`mapserver trust`: who may sign maps, and what is signed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -22,6 +23,10 @@ PublicKeys = Annotated[
     list[str] | None,
     typer.Option(metavar="FILE.pub", help="Public key that signs the site's lists; default: a new one in keys/."),
 ]
+Hosts = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="Name or address by which robots reach this machine; repeat it."),
+]
 SiteArgument = Annotated[str, typer.Argument(metavar="SITE", help="Name of the site.")]
 
 
@@ -30,6 +35,8 @@ class Rotated(StrEnum):
 
     ONLINE = "online"
     ROOT = "root"
+    SERVER = "server"
+    ROBOTS_CA = "robots-ca"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,23 +59,36 @@ def init(
     here: Annotated[bool, typer.Option("--here", help="Keep all keys on this machine, without passphrases.")] = False,
     stick: Annotated[list[str] | None, typer.Option(metavar="DIR", help="Folder for one root key; repeat it.")] = None,
     threshold: Annotated[int, typer.Option(min=1, help="How many root keys are needed for a change.")] = 2,
+    host: Hosts = None,
 ) -> None:
-    """Sign the maps of a store from now on; robots then run only what the signed lists admit."""
+    """Make the keys of a store: its maps are signed from now on, and its server can tell robots apart by certificates."""
+    import socket
+
     from mapserver.store import MapStore
-    from mapserver.trust import init_here
+    from mapserver.trust import SignedLists, init_here
     from mapserver.trust.ceremonies import init_with_people
+    from mapserver.trust.enrolment import RobotRegister
+    from mapserver.trust.keys import make_passphrase
 
     if here == bool(stick):
         raise UsageError(
             "say where the keys are: --here for this machine, or --stick DIR for every person who holds a root key"
         )
+    sticks, hosts = [Path(folder) for folder in stick or ()], host or [socket.gethostname()]
     with MapStore.open(store) as maps:
-        passphrases = {} if here else init_with_people(maps, [Path(folder) for folder in stick or ()], threshold)
-        if here:
-            init_here(maps)
-    for path, passphrase in passphrases.items():
-        typer.echo(f"{path}: {passphrase}   (shown once: write it down, apart from the stick)")
-    typer.echo(f"signed; robots on other machines need {store / 'trust' / '1.root.json'}")
+        authorities, passphrases = RobotRegister(maps).authorities, {}
+        # A store that was served on loopback has lists already, and no certificates.
+        if authorities.are_there or not SignedLists(maps.folder).are_there:
+            passphrases = {} if here else init_with_people(maps, sticks, threshold)
+            if here:
+                init_here(maps)
+        path, words = (None, None) if here else (sticks[0] / "servers-ca.pem", make_passphrase())
+        authorities.init(hosts, path, words)
+        passphrases |= {path: words} if path is not None and words is not None else {}
+    for file, passphrase in passphrases.items():
+        typer.echo(f"{file}: {passphrase}   (shown once: write it down, apart from the stick)")
+    typer.echo(f"robots reach the server by the name {', '.join(hosts)}; --host names others")
+    typer.echo(f"serve with --zenoh tls/0.0.0.0:7447; `mapserver robots enrol ROBOT --site SITE --store {store}`")
 
 
 def key(
@@ -132,15 +152,32 @@ def sign(site: SiteArgument, people: PeopleOptions) -> None:
 @expand_options
 def rotate(
     what: Annotated[
-        Rotated, typer.Argument(help="online: the server's key; root: root and targets, for two and one more years.")
+        Rotated,
+        typer.Argument(
+            help="online: the key of the lists; root: root and targets, for two and one more years; server: its certificate; "
+            "robots-ca: who signs robots."
+        ),
     ],
     people: PeopleOptions,
     add: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for the root key of a person who comes.")
     ] = None,
     remove: Annotated[Path | None, typer.Option(metavar="FILE.pub", help="Public key of a person who leaves.")] = None,
+    host: Hosts = None,
+    stolen: Annotated[
+        bool, typer.Option("--stolen", help="Of robots-ca: nothing that it signed counts; all robots enrol again.")
+    ] = False,
 ) -> None:
     """Replace keys, or sign root and targets anew before they expire."""
+    if what in {Rotated.SERVER, Rotated.ROBOTS_CA}:
+        if add or remove or (host and what is Rotated.ROBOTS_CA) or (stolen and what is Rotated.SERVER):
+            raise UsageError(
+                "--host is for `trust rotate server`, --stolen for `trust rotate robots-ca`, --add for root"
+            )
+        _rotate_certificates(what, people, host or (), is_stolen=stolen)
+        return
+    if host or stolen:
+        raise UsageError("--host is for `trust rotate server`, --stolen for `trust rotate robots-ca`")
     from mapserver.store import MapStore
     from mapserver.trust import ceremonies
 
@@ -155,6 +192,28 @@ def rotate(
             for path, passphrase in ceremonies.rotate_root(maps, signers, removed=removed, add=add).items():
                 typer.echo(f"{path}: {passphrase}   (shown once: write it down, apart from the stick)")
     typer.echo("done; robots follow with their next question")
+
+
+def _rotate_certificates(what: Rotated, people: PeopleOptions, hosts: Sequence[str], *, is_stolen: bool) -> None:
+    import getpass
+
+    from mapserver.store import MapStore
+    from mapserver.trust.enrolment import RobotRegister
+
+    with MapStore.open(people.store) as maps:
+        register = RobotRegister(maps)
+        _ = register.tls  # raises where there is nothing to rotate
+        if what is Rotated.SERVER:
+            path = Path(people.key[0]) if people.key else None
+            words = None if path is None else getpass.getpass(f"passphrase of {path}: ").strip()
+            register.authorities.rotate_server(path, words, hosts)
+            typer.echo("done; a server that runs takes it within two seconds")
+            return
+        register.authorities.rotate_robots_ca(is_stolen=is_stolen)
+        if is_stolen:
+            typer.echo(f"done; {register.revoke_all()} robots must be enrolled again")
+        else:
+            typer.echo("done; robots follow when they renew their certificates, within a month")
 
 
 @expand_options

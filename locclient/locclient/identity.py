@@ -1,0 +1,258 @@
+"""A robot's identity: the folder that enrolment fills, and what follows from it for every connection to the server.
+
+robot.pem      key and certificate in one file, so that both change in one moment; its presence says that the robot is enrolled
+next.pem       the key that waits for its certificate; on the disk before anybody is asked, because answers get lost
+servers.ca     who may sign servers' certificates          root.json    whose lists of maps are believed
+identity.json  site, robot and endpoint
+"""
+
+import os
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import msgspec
+
+from fleetmap.bus import TlsFiles, ZenohBus, check_endpoint, handshake_fault, has_tls, is_loopback
+from fleetmap.errors import LinkError, StateError, UsageError, disk_errors
+from fleetmap.mapformat import check_name
+from fleetmap.messages import decode_message, robot_key
+
+if TYPE_CHECKING:
+    from fleetmap.bus import Bus
+    from fleetmap.trust.enrolment import CertificateInfo
+
+_RENEW_AFTER = timedelta(days=30)  # of 365: a robot that was parked for eleven months comes back
+_ANSWER_S = 20.0
+_ENROL = "enrol it: `mapserver robots enrol ROBOT --site SITE` on the server, `locclient enrol ROBOT.fleetmap` here"
+
+
+class Identity(msgspec.Struct, frozen=True, kw_only=True):
+    """Who the robot is, and where its server is."""
+
+    site: str
+    robot: str
+    endpoint: str
+
+
+class RobotIdentity:
+    """One folder, for this account alone."""
+
+    def __init__(self, folder: Path, who: Identity) -> None:
+        self.folder, self.who = folder, who
+
+    @classmethod
+    def load(cls, folder: Path) -> Self | None:
+        """The identity in a folder, None where the robot is not enrolled; UsageError where it cannot be read."""
+        if not (folder / "robot.pem").is_file():
+            return None
+        with disk_errors(f"the identity in {folder} cannot be read", "check whose account this is", UsageError):
+            data = (folder / "identity.json").read_bytes()
+        try:
+            return cls(folder, msgspec.json.decode(data, type=Identity))
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+            raise UsageError(
+                f"the identity in {folder} is damaged ({error}); remove the folder and {_ENROL}"
+            ) from error
+
+    @property
+    def tls(self) -> TlsFiles:
+        """Files of the connection."""
+        return TlsFiles(self.folder / "servers.ca", self.folder / "robot.pem")
+
+    def certificate(self) -> "CertificateInfo":
+        """About the robot's certificate; UsageError for a damaged file."""
+        from fleetmap.trust.enrolment import certificate_info
+
+        return certificate_info(self._read("robot.pem"))
+
+    def is_renewal_due(self, now: datetime) -> bool:
+        """Whether the certificate is a month old."""
+        return now - self.certificate().begins > _RENEW_AFTER
+
+    def renew(self, bus: "Bus") -> None:
+        """Another key and certificate in the place of the present ones; connections that stand are not touched.
+
+        Raises LinkError where the server is away or refuses, StoreError where the disk does. The present ones stay then.
+        """
+        self._ask(bus, self._read("robot.pem"), _ANSWER_S)
+
+    @classmethod
+    def enrol(cls, folder: Path, bundle: bytes) -> Self:
+        """The identity that a bundle brings. May be repeated where the answer was lost.
+
+        Raises UsageError for something that is no bundle, StateError where the robot has an identity, LinkError where the server
+        cannot be reached or refuses.
+        """
+        from fleetmap.trust.enrolment import decode_bundle
+
+        given = decode_bundle(bundle)
+        who = Identity(
+            site=check_name(given.site, "site"),
+            robot=check_name(given.robot, "robot"),
+            endpoint=check_endpoint(given.endpoint),
+        )
+        before = cls.load(folder)
+        if before is not None:
+            raise StateError(
+                f"{folder} holds the identity of {before.who.robot} at {before.who.site}; remove it if the robot is to be "
+                "another one"
+            )
+        made = cls(folder, who)
+        with disk_errors(f"{folder} cannot be written", "choose another folder by --identity"):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            folder.chmod(0o700)
+        for name, data in (
+            ("servers.ca", given.servers.encode()),
+            ("root.json", given.root.encode()),
+            ("bundle.pem", given.own.encode()),
+            ("identity.json", msgspec.json.encode(who)),
+        ):
+            made._write(name, data)
+        first = TlsFiles(folder / "servers.ca", folder / "bundle.pem")
+        if fault := handshake_fault(who.endpoint, first):
+            raise LinkError(f"{who.endpoint}: {fault}")
+        with ZenohBus.connect(who.endpoint, tls=first) as bus:
+            made._ask(bus, given.own.encode(), _ANSWER_S)
+        (folder / "bundle.pem").unlink(missing_ok=True)
+        return made
+
+    def _ask(self, bus: "Bus", old: bytes, timeout_s: float) -> None:
+        from fleetmap.trust import enrolment
+
+        key = self._next_key(old)
+        question = enrolment.renewal_request(old, key)
+        answer = decode_message(
+            bus.get(robot_key(self.who.site, self.who.robot, "renew"), question, timeout_s=timeout_s),
+            enrolment.RenewalAnswer,
+        )
+        if enrolment.certificate_info(answer.certificate.encode()).fingerprint != enrolment.key_fingerprint(key):
+            raise LinkError("the server answered with a certificate of another key; who answers there?")
+        # Before the certificate: with it the robot may meet a server that another authority signed.
+        self._write("servers.ca", answer.servers.encode())
+        self._write("robot.pem", key + answer.certificate.encode())
+        (self.folder / "next.pem").unlink(missing_ok=True)
+
+    def _next_key(self, old: bytes) -> bytes:
+        from fleetmap.trust import enrolment
+
+        path = self.folder / "next.pem"
+        if path.is_file():
+            key = self._read("next.pem")
+            if enrolment.key_fingerprint(key) != enrolment.key_fingerprint(old):
+                return key
+        self._write("next.pem", enrolment.new_key())
+        return self._read("next.pem")
+
+    def _read(self, name: str) -> bytes:
+        with disk_errors(f"{self.folder / name} cannot be read", "check whose account this is", UsageError):
+            return (self.folder / name).read_bytes()
+
+    def _write(self, name: str, data: bytes) -> None:
+        """Whole or not at all, for this account alone, also after a power cut."""
+        temporary = self.folder / f".{name}.tmp"
+        with disk_errors(f"{self.folder / name} cannot be written", "make space, or choose another folder"):
+            temporary.unlink(missing_ok=True)
+            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(descriptor)
+            temporary.replace(self.folder / name)
+            folder = os.open(self.folder, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapAddress:
+    """Where a robot's map comes from: `server` an endpoint, or `store` a folder. identity: where the server knows robots."""
+
+    site: str
+    robot: str
+    server: str | None = None
+    store: str | None = None
+    root: str | None = None
+    identity: RobotIdentity | None = None
+
+    @property
+    def tls(self) -> TlsFiles | None:
+        """Files of the connection, None without TLS."""
+        return None if self.identity is None else self.identity.tls
+
+
+@dataclass(frozen=True, kw_only=True)
+class GivenAddress:
+    """What the configuration says of the map's address; what it leaves out comes from the identity."""
+
+    site: str | None
+    robot: str | None
+    server: str | None
+    store: str | None
+    root: str | None
+    identity: str | None
+    insecure: bool
+    sign: str = ""  # before the names in messages
+
+    def resolve(self, usual_robot: str | None = None) -> MapAddress:
+        """The address. usual_robot: the name of a robot that has none.
+
+        UsageError for contradictions, and for a server on another machine that cannot know the robot."""
+        if self.server is not None and self.store is not None:
+            raise UsageError(f"give either {self.sign}server, such as tls/HOST:7447, or {self.sign}store, a folder")
+        folder = identity_folder(self.identity)
+        identity = None if self.store is not None else RobotIdentity.load(folder)
+        if identity is None:
+            self._named("site", None, None)  # the first thing that is asked of who has given nothing
+        server = self.server or (None if identity is None else identity.who.endpoint)
+        if server is None and self.store is None:
+            raise UsageError(
+                f"give either {self.sign}server, such as tcp/127.0.0.1:7447, or {self.sign}store, a folder; or {_ENROL}"
+            )
+        if server is None or not has_tls(server):
+            identity = None
+            check_reach(server, insecure=self.insecure)
+        elif identity is None:
+            raise UsageError(f"this robot has no identity in {folder}, which {server} asks for; {_ENROL}")
+        return MapAddress(
+            site=check_name(self._named("site", identity, None), "site"),
+            robot=check_name(self._named("robot", identity, usual_robot), "robot"),
+            server=server,
+            store=self.store,
+            root=self.root or (None if identity is None else str(folder / "root.json")),
+            identity=identity,
+        )
+
+    def _named(self, what: str, identity: RobotIdentity | None, usual: str | None) -> str:
+        given: str | None = getattr(self, what)
+        if identity is None:
+            given = given or usual
+            if given is None:
+                raise UsageError(f"{self.sign}{what} is missing: which site's map, and who asks?")
+            return given
+        enrolled: str = getattr(identity.who, what)
+        if given not in {None, enrolled}:
+            raise UsageError(f"{what} {given} is asked for, but {identity.folder} is enrolled as {what} {enrolled}")
+        return enrolled
+
+
+def check_reach(endpoint: str | None, *, insecure: bool) -> None:
+    """Raises UsageError for an endpoint without TLS on another machine, unless that is wanted."""
+    if endpoint is None or has_tls(check_endpoint(endpoint)) or is_loopback(endpoint) or insecure:
+        return
+    raise UsageError(
+        f"{endpoint} is on another machine and without TLS: anybody on the way can read and answer. Use tls/HOST:PORT, or "
+        "--insecure where nobody else is on that network"
+    )
+
+
+def identity_folder(setting: str | Path | None = None) -> Path:
+    """The folder of the setting, else `identity` in the unit's or the user's folder of state (STATE_DIRECTORY, XDG_STATE_HOME)."""
+    if setting is not None:
+        return Path(setting)
+    if unit := os.environ.get("STATE_DIRECTORY"):
+        return Path(unit.split(":")[0]) / "identity"
+    return Path(os.environ.get("XDG_STATE_HOME", str(Path.home() / ".local" / "state"))) / "fleetmap" / "identity"

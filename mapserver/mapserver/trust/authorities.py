@@ -1,0 +1,229 @@
+"""The two authorities of the bus and the server's certificate.
+
+KEYS/servers-ca.crt                 who signs servers: robots trust it. Its key, servers-ca.pem, may lie on a stick
+KEYS/robots-ca.pem robots-ca.crt    who signs robots: the server's own; the .crt holds the one before, too, after a rotation
+KEYS/server.pem                     the server's key and certificate in one file
+
+A robot's certificate cannot play the server: another authority signed it, for another use.
+"""
+
+import ipaddress
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives import serialization as s
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from fleetmap.bus import TlsFiles
+from fleetmap.errors import StateError, UsageError, disk_errors
+from fleetmap.trust.enrolment import certificate_info
+from mapserver.store.files import make_folder, write_atomically
+from mapserver.trust.keys import credential
+
+SERVERS_CA, ROBOTS_CA, SERVER = "servers-ca", "robots-ca", "server"
+DAYS = {SERVERS_CA: 3650, ROBOTS_CA: 1825, SERVER: 397, "robot": 365, "enrol": 1, "survey": 7}
+_BEGINS_EARLIER = timedelta(minutes=10)  # clocks of robots differ
+_PEM = s.Encoding.PEM
+
+
+@dataclass(frozen=True)
+class Authority:
+    """Who signs certificates."""
+
+    key: ec.EllipticCurvePrivateKey
+    certificate: x509.Certificate
+
+    def sign(self, key: ec.EllipticCurvePublicKey, name: str, days: float, *, hosts: Sequence[str] = ()) -> bytes:
+        """PEM of a certificate: of a server with these hosts, of a robot without any."""
+        use = ExtendedKeyUsageOID.SERVER_AUTH if hosts else ExtendedKeyUsageOID.CLIENT_AUTH
+        names: list[x509.GeneralName] = [_host(host) for host in hosts]
+        built = (
+            _builder(name, self.certificate.subject, key, days)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(x509.ExtendedKeyUsage([use]), critical=False)
+            .add_extension(
+                x509.SubjectAlternativeName(names or [x509.UniformResourceIdentifier(f"urn:fleetmap:{name}")]),
+                critical=False,
+            )
+            .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key()), critical=False)
+        )
+        return built.sign(self.key, hashes.SHA256()).public_bytes(_PEM)
+
+
+class Authorities:
+    """The files of one folder of keys. now: the moment that certificates begin at."""
+
+    def __init__(self, folder: Path, now: datetime) -> None:
+        self.folder, self._now = folder, now.astimezone(UTC)
+
+    @property
+    def are_there(self) -> bool:
+        """Whether a server can speak mutual TLS from here."""
+        return all(path.is_file() for path in (self.tls.authority, self.tls.own))
+
+    @property
+    def tls(self) -> TlsFiles:
+        """Files of the server."""
+        return TlsFiles(self._path(f"{ROBOTS_CA}.crt"), self._path(f"{SERVER}.pem"))
+
+    @property
+    def servers(self) -> str:
+        """PEM of who signs servers."""
+        return self._read(f"{SERVERS_CA}.crt").decode()
+
+    @property
+    def hosts(self) -> tuple[str, ...]:
+        """The names that robots may reach the server by."""
+        certificate = x509.load_pem_x509_certificate(self._read(f"{SERVER}.pem"))
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        return tuple(str(name.value) for name in names)
+
+    def init(self, hosts: Sequence[str], servers_key: Path | None, passphrase: str | None) -> None:
+        """Both authorities and the server's certificate. servers_key: where the servers' key goes; None: among the others.
+
+        Raises StateError where there are some, UsageError for hosts that are none, StoreError where the disk refuses.
+        """
+        if self.are_there:
+            raise StateError(f"{self.folder} has a server's certificate already; `mapserver trust status` shows it")
+        checked, path = _checked(hosts), servers_key or self._path(f"{SERVERS_CA}.pem")
+        if path.exists():
+            raise StateError(f"{path} is a key already, and none is overwritten; name another folder")
+        servers = self._make(SERVERS_CA)
+        self._write_key(path, servers.key, passphrase)
+        self._write(f"{SERVERS_CA}.crt", servers.certificate.public_bytes(_PEM))
+        self._renew_robots_ca(before=b"")
+        self._sign_server(servers, checked)
+
+    def rotate_server(self, servers_key: Path | None, passphrase: str | None, hosts: Sequence[str] = ()) -> None:
+        """Another key and certificate of the server, for the same hosts unless others are named. Errors as of `init`."""
+        path = servers_key or self._path(f"{SERVERS_CA}.pem")
+        if not path.is_file():
+            raise UsageError(f"{path} is not there: name the servers' key by --key, where `trust init` put it")
+        key = _load(path, passphrase)
+        certificates = x509.load_pem_x509_certificates(self._read(f"{SERVERS_CA}.crt"))
+        own = [c for c in certificates if c.public_key() == key.public_key()]
+        if not own:
+            raise UsageError(f"{path} is not the key of {SERVERS_CA}.crt, which robots trust; bring the right one")
+        self._sign_server(Authority(key, own[0]), _checked(hosts or self.hosts))
+
+    def rotate_robots_ca(self, *, is_stolen: bool) -> None:
+        """Another authority of robots. is_stolen: nothing that the last one signed counts any more, else it does till the next time."""
+        before = b"" if is_stolen else self._robots_ca().certificate.public_bytes(_PEM)
+        self._renew_robots_ca(before)
+
+    def sign_robot(self, key: bytes, name: str, purpose: str = "robot") -> bytes:
+        """PEM of a certificate for a public key (DER). purpose: robot, enrol or survey."""
+        public = s.load_der_public_key(key)
+        assert isinstance(public, ec.EllipticCurvePublicKey)
+        return self._robots_ca().sign(public, name, DAYS[purpose])
+
+    def make_own(self, name: str, purpose: str) -> bytes:
+        """PEM of a new key and its certificate, for a bundle or a program of this account."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        return _pem(key, None) + self._robots_ca().sign(key.public_key(), name, DAYS[purpose])
+
+    def days_left(self) -> dict[str, float]:
+        """By file, how long each certificate lasts."""
+        files = [f"{SERVERS_CA}.crt", f"{ROBOTS_CA}.crt", f"{SERVER}.pem"]
+        ends = {file: certificate_info(self._read(file)).ends for file in files}
+        return {file: (end - self._now).total_seconds() / 86_400 for file, end in ends.items()}
+
+    def _robots_ca(self) -> Authority:
+        key = _load(self._path(f"{ROBOTS_CA}.pem"), credential(ROBOTS_CA))
+        return Authority(key, x509.load_pem_x509_certificate(self._read(f"{ROBOTS_CA}.crt")))
+
+    def _renew_robots_ca(self, before: bytes) -> None:
+        made = self._make(ROBOTS_CA)
+        # The key first: a certificate without its key would make nobody's.
+        self._write_key(self._path(f"{ROBOTS_CA}.pem"), made.key, credential(ROBOTS_CA))
+        self._write(f"{ROBOTS_CA}.crt", made.certificate.public_bytes(_PEM) + before)
+
+    def _sign_server(self, servers: Authority, hosts: Sequence[str]) -> None:
+        key = ec.generate_private_key(ec.SECP256R1())
+        certificate = servers.sign(key.public_key(), "fleetmap server", DAYS[SERVER], hosts=hosts)
+        self._write(f"{SERVER}.pem", _pem(key, None) + certificate)
+
+    def _make(self, name: str) -> Authority:
+        key, subject = ec.generate_private_key(ec.SECP256R1()), _name(f"fleetmap {name}")
+        built = (
+            _builder(f"fleetmap {name}", subject, key.public_key(), DAYS[name])
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(x509.KeyUsage(False, False, False, False, False, True, True, False, False), critical=True)
+            .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+        )
+        return Authority(key, built.sign(key, hashes.SHA256()))
+
+    def _write_key(self, path: Path, key: ec.EllipticCurvePrivateKey, passphrase: str | None) -> None:
+        with disk_errors(f"the key {path} cannot be written", "check the folder"):
+            make_folder(path.parent)
+            write_atomically(path, [_pem(key, passphrase)])
+
+    def _write(self, file: str, data: bytes) -> None:
+        with disk_errors(f"{self._path(file)} cannot be written", "check the folder"):
+            make_folder(self.folder)
+            write_atomically(self._path(file), [data])
+
+    def _read(self, file: str) -> bytes:
+        with disk_errors(f"{self._path(file)} cannot be read", "`mapserver trust init` makes it"):
+            return self._path(file).read_bytes()
+
+    def _path(self, file: str) -> Path:
+        return self.folder / file
+
+
+def _pem(key: ec.EllipticCurvePrivateKey, passphrase: str | None) -> bytes:
+    how = s.NoEncryption() if passphrase is None else s.BestAvailableEncryption(passphrase.encode())
+    return key.private_bytes(_PEM, s.PrivateFormat.PKCS8, how)
+
+
+def _load(path: Path, passphrase: str | None) -> ec.EllipticCurvePrivateKey:
+    with disk_errors(f"the key {path} cannot be read", "check the folder and whose account this is"):
+        data = path.read_bytes()
+    try:
+        key = s.load_pem_private_key(data, None if passphrase is None else passphrase.encode())
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        raise UsageError(f"{path} is no key, or of another passphrase ({error})") from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise UsageError(f"{path} is a key of another kind than authorities have; bring the right one")
+    return key
+
+
+def _builder(name: str, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: float) -> x509.CertificateBuilder:
+    now = datetime.now(UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(_name(name))
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _BEGINS_EARLIER)
+        .not_valid_after(now + timedelta(days=days))
+    )
+
+
+def _name(name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+
+
+def _checked(hosts: Sequence[str]) -> tuple[str, ...]:
+    for host in hosts:
+        try:
+            _host(host)
+        except ValueError as error:
+            raise UsageError(f"--host {host!r} is no name or address that robots can reach ({error})") from error
+    return tuple(dict.fromkeys(hosts))
+
+
+def _host(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        if not host.replace("-", "a").replace(".", "a").isalnum() or not host.isascii():
+            raise
+        return x509.DNSName(host)

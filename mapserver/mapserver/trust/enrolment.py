@@ -1,0 +1,271 @@
+"""The robots that may speak on the bus: enrolled by a bundle, renewed by themselves, revoked by a command.
+
+STORE/keys/robots.json names them. Whoever stands there is in the rules of the bus, and nobody else.
+"""
+
+import secrets
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+
+from fleetmap.access import Access, Holder, Purpose
+from fleetmap.bus import TlsFiles
+from fleetmap.errors import LinkError, StateError, StoreError, UsageError, disk_errors
+from fleetmap.mapformat import check_name
+from fleetmap.messages import encode_message
+from fleetmap.trust.enrolment import Bundle, RenewalAnswer, certificate_info, check_request, key_fingerprint
+from mapserver.store import NOBODY, Actor, MapStore
+from mapserver.store.files import locked, make_folder, write_atomically
+from mapserver.trust.authorities import DAYS, Authorities
+from mapserver.trust.lists import SignedLists
+
+LISTENING = "tls/0.0.0.0:7447"
+"""The endpoint that robots are enrolled for unless another is named; its host is the server's name."""
+
+SURVEY = Holder("live.survey", purpose=Purpose.SURVEY)
+_DAY_NS = 86_400_000_000_000
+_MAX_ROBOTS = 20_000
+_NAME_LENGTH = 40  # a certificate's name has 64 signs at most; the mark behind it makes it unique
+
+
+class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
+    """One robot. key: fingerprint of the key that may renew; before: of the one whose place it took, for an answer that was lost.
+
+    renewed_ns: when it got its last certificate, None while its bundle waits.
+    """
+
+    site: str
+    robot: str
+    mark: str
+    key: str
+    before: str = ""
+    enrolled_ns: int
+    renewed_ns: int | None = None
+
+    @property
+    def certificate(self) -> str:
+        """Name in its certificates."""
+        return f"{self.robot[:_NAME_LENGTH]}.{self.mark}"
+
+    @property
+    def bundle(self) -> str:
+        """Name in the certificate of its bundle."""
+        return f"{self.certificate}.enrol"
+
+    def row(self, now_ns: int) -> "EnrolledRow":
+        """What people want to know of it."""
+        since_ns = self.enrolled_ns if self.renewed_ns is None else self.renewed_ns
+        left = DAYS["enrol" if self.renewed_ns is None else "robot"] - (now_ns - since_ns) / _DAY_NS
+        if self.renewed_ns is None:
+            state = f"bundle waits, {24 * left:.0f} h left" if left > 0 else "bundle expired: enrol again"
+        else:
+            state = f"certificate for {left:.0f} days" if left > 0 else "certificate expired: revoke and enrol again"
+        return EnrolledRow(self.site, self.robot, self.certificate, self.enrolled_ns, round(left, 2), state)
+
+
+@dataclass(frozen=True)
+class EnrolledRow:
+    """One enrolled robot. certificate: the name in it; days_left: of it, or of the bundle that waits."""
+
+    site: str
+    robot: str
+    certificate: str
+    enrolled_ns: int
+    days_left: float
+    state: str
+
+
+class RobotRegister:
+    """The enrolled robots of a store. For any thread; sees at once what other processes write."""
+
+    def __init__(self, store: MapStore) -> None:
+        self._store = store
+        self._keys = store.folder / "keys"
+        self._path = self._keys / "robots.json"
+
+    @property
+    def authorities(self) -> Authorities:
+        """Who signs the robots' certificates and the server's."""
+        return Authorities(self._keys, datetime.fromtimestamp(self._store.now_ns() / 1e9, UTC))
+
+    @property
+    def tls(self) -> TlsFiles:
+        """The server's files; StateError where it has none."""
+        authorities = self.authorities
+        if not authorities.are_there:
+            folder = self._store.folder
+            raise StateError(
+                f"{folder} has no certificate for its server; `mapserver trust init --here --host NAME --store {folder}` "
+                "makes one, with the NAME or address by which robots reach this machine"
+            )
+        return authorities.tls
+
+    def robots(self, site: str | None = None) -> list[Enrolled]:
+        """All (of a site), by site and name; StoreError where the file cannot be read."""
+        if not self._path.is_file():
+            return []
+        with disk_errors(f"{self._path} cannot be read", "check whose account this is"):
+            data = self._path.read_bytes()
+        try:
+            found = msgspec.json.decode(data, type=list[Enrolled])
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+            raise StoreError(f"{self._path} cannot be read ({error}); restore it") from error
+        return [entry for entry in found if site in {None, entry.site}]
+
+    def access(self) -> Access:
+        """The rules for the bus as of now."""
+        now_ns, holders = self._store.now_ns(), [SURVEY]
+        for entry in self.robots():
+            holders.append(Holder(entry.certificate, entry.site, entry.robot))
+            # Used ones too, for as long as their certificate lasts: a copy then hears why it is refused, and stands in the log.
+            if now_ns - entry.enrolled_ns < DAYS["enrol"] * _DAY_NS:
+                holders.append(Holder(entry.bundle, entry.site, entry.robot, Purpose.ENROL))
+        return Access(holders)
+
+    def state(self) -> object:
+        """Something that is another after robots, an authority or the server's certificate changed."""
+        return (_stamp(self._path), self.tls_state())
+
+    def tls_state(self) -> object:
+        """The same of the certificates alone."""
+        tls = self.authorities.tls
+        return (_stamp(tls.authority), _stamp(tls.own))
+
+    def enrol(self, site: str, robots: Sequence[str], endpoint: str, *, actor: Actor = NOBODY) -> dict[str, bytes]:
+        """The bundle of each robot. One whose bundle was not used gets another, and the old one is worth nothing.
+
+        Raises StateError for robots that are enrolled, UsageError for names that are none and an endpoint that is not in the
+        server's certificate.
+        """
+        check_name(site, "site")
+        self._check_endpoint(endpoint)
+        authorities, root = self.authorities, self._root()
+        bundles = {}
+        with self._changing() as entries:
+            for robot in dict.fromkeys(robots):
+                known = entries.get((site, check_name(robot, "robot")))
+                if known is not None and known.renewed_ns is not None:
+                    raise StateError(
+                        f"robot {robot} of site {site} is enrolled; if it lost its key: `mapserver robots revoke {robot}` first"
+                    )
+                if known is None and len(entries) >= _MAX_ROBOTS:
+                    raise StateError(f"{len(entries)} robots are enrolled, more than that no server has; revoke some")
+                mark = secrets.token_hex(4)
+                entry = Enrolled(site=site, robot=robot, mark=mark, key="", enrolled_ns=self._store.now_ns())
+                own = authorities.make_own(entry.bundle, "enrol")
+                entries[site, robot] = msgspec.structs.replace(entry, key=key_fingerprint(own))
+                bundle = Bundle(
+                    format=1,
+                    site=site,
+                    robot=robot,
+                    endpoint=endpoint,
+                    servers=authorities.servers,
+                    root=root,
+                    own=own.decode(),
+                )
+                bundles[robot] = msgspec.json.format(msgspec.json.encode(bundle)) + b"\n"
+        for robot in bundles:
+            self._store.audit("robot enrolled", robot, actor=actor, site=site)
+        return bundles
+
+    def revoke(self, site: str, robots: Sequence[str], *, actor: Actor = NOBODY) -> list[str]:
+        """Takes robots out of the rules and returns those that were in them; a server that runs follows within two seconds."""
+        with self._changing() as entries:
+            gone = [robot for robot in dict.fromkeys(robots) if entries.pop((site, robot), None) is not None]
+        for robot in gone:
+            self._store.audit("robot revoked", robot, actor=actor, site=site)
+        return gone
+
+    def revoke_all(self, *, actor: Actor = NOBODY) -> int:
+        """Takes all robots of all sites out of the rules, and returns how many those were."""
+        entries = self.robots()
+        for site in sorted({entry.site for entry in entries}):
+            self.revoke(site, [entry.robot for entry in entries if entry.site == site], actor=actor)
+        return len(entries)
+
+    def renew(self, site: str, robot: str, payload: bytes) -> bytes:
+        """The encoded answer to a robot that asks for a certificate of its new key; its name is ours to say, not the request's.
+
+        The same question with the same keys is answered again, because answers get lost. Raises LinkError for anybody else; refusals
+        go into the log.
+        """
+        try:
+            asked = check_request(payload)
+            with self._changing() as entries:
+                entry = entries.get((site, robot))
+                if entry is None:
+                    raise LinkError(f"robot {robot} of site {site} is not enrolled")
+                is_repeated = (asked.old_fingerprint, asked.new_fingerprint) == (entry.before, entry.key)
+                if asked.old_fingerprint != entry.key and not is_repeated:
+                    raise LinkError("this key may not renew; was the bundle used before, or a key restored?")
+                certificate = self.authorities.sign_robot(asked.new_key, entry.certificate)
+                entries[site, robot] = msgspec.structs.replace(
+                    entry, key=asked.new_fingerprint, before=asked.old_fingerprint, renewed_ns=self._store.now_ns()
+                )
+        except LinkError as error:
+            self._store.audit("renewal refused", f"{robot[:64]}: {error}"[:2000], site=site[:64])
+            raise
+        self._store.audit("robot renewed", f"{robot}, key {asked.new_fingerprint[:12]}", site=site)
+        return encode_message(RenewalAnswer(certificate=certificate.decode(), servers=self.authorities.servers))
+
+    def survey_tls(self) -> TlsFiles:
+        """Files for a survey of this account that shows itself on the bus; StateError where the store has no authorities."""
+        own = self._keys / "survey.pem"
+        authorities = self.authorities
+        if not authorities.are_there:
+            raise StateError(f"{self._store.folder} has no certificates; run the survey where the server's store is")
+        if not own.is_file() or (certificate_info(own.read_bytes()).ends - datetime.now(UTC)).days < 1:
+            with disk_errors(f"{own} cannot be written", "check whose account this is"):
+                write_atomically(own, [authorities.make_own(SURVEY.certificate, "survey")])
+        return TlsFiles(self._keys / "servers-ca.crt", own)
+
+    def default_endpoint(self, listening: str) -> str:
+        """Where robots reach a server that listens at an endpoint: by the first name in its certificate."""
+        host = self.authorities.hosts[0]
+        return f"{listening.partition('/')[0]}/{f'[{host}]' if ':' in host else host}:{listening.rpartition(':')[2]}"
+
+    def _check_endpoint(self, endpoint: str) -> None:
+        _ = self.tls
+        host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+        hosts = self.authorities.hosts
+        if host not in hosts:
+            raise UsageError(
+                f"robots would refuse the server at {endpoint}: its certificate names {', '.join(hosts)}; name one of them, or "
+                "make another certificate: `mapserver trust rotate server --host ...`"
+            )
+
+    def _root(self) -> str:
+        lists = SignedLists(self._store.folder)
+        if not lists.are_there:
+            raise StateError(f"the maps of {self._store.folder} are not signed; `mapserver trust init` comes first")
+        return lists.path("root", lists.newest("root")).read_text("utf-8")
+
+    @contextmanager
+    def _changing(self) -> Iterator[dict[tuple[str, str], Enrolled]]:
+        """The robots, to be changed by one process at a time; written at the end unless something was raised."""
+        with disk_errors(f"{self._path} cannot be written", "make space, and check whose account this is"):
+            make_folder(self._keys)
+            with locked(self._keys / "lock", shared=False):
+                before = {(entry.site, entry.robot): entry for entry in self.robots()}
+                entries = dict(before)
+                yield entries
+                if entries != before:
+                    ordered = [entries[key] for key in sorted(entries)]
+                    write_atomically(self._path, [msgspec.json.encode(ordered)])
+
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    try:
+        stat = path.stat()
+    except FileNotFoundError:
+        return None
+    return stat.st_mtime_ns, stat.st_ino, stat.st_size
+
+
+def bundle_path(folder: Path, robot: str) -> Path:
+    """The file that a robot's bundle is written to."""
+    return folder / f"{robot}.fleetmap"

@@ -1,0 +1,172 @@
+"""Who may say what on the bus: from the names in certificates to the rules that zenoh obeys, and MemoryBus too.
+
+Nothing is allowed that no rule names. The list of certificates is therefore the list of who is not revoked.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from fleetmap.messages import robot_key
+
+SITE_ANSWERS = ("manifests", "blobs", "patches", "trust")
+ROBOT_KEYS = ("ack", "health", "pose", "estimate", "wanted", "failures", "alive", "renew")
+# Far above what robots send: one message is dropped where two come closer together, without a burst.
+_MOST_HZ = {"ack": 10.0, "health": 10.0, "pose": 60.0, "estimate": 60.0}
+_REPORT_BYTES, _QUESTION_BYTES = 1 << 16, 1 << 20
+_NOBODY = "-"
+
+
+class Direction(StrEnum):
+    """Direction of a message, as the server sees it."""
+
+    IN = "ingress"
+    OUT = "egress"
+
+
+class Act(StrEnum):
+    """Kind of a message."""
+
+    PUT = "put"
+    QUERY = "query"
+    REPLY = "reply"
+    SUBSCRIBE = "declare_subscriber"
+    ANSWER = "declare_queryable"
+    SHOW_ALIVE = "liveliness_token"
+    LOOK_FOR_ALIVE = "liveliness_query"
+
+
+class Purpose(StrEnum):
+    """What a certificate is for: a robot's work, its first certificate of its own, or showing a survey under way."""
+
+    ROBOT = "robot"
+    ENROL = "enrol"
+    SURVEY = "survey"
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """Who holds a certificate. certificate: its common name; site and robot: empty for a survey."""
+
+    certificate: str
+    site: str = ""
+    robot: str = ""
+    purpose: Purpose = Purpose.ROBOT
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """Messages that may pass under keys that any of `keys` includes."""
+
+    id: str
+    flow: Direction
+    acts: tuple[Act, ...]
+    keys: tuple[str, ...]
+
+    def allows(self, flow: Direction, act: Act, key_expr: str) -> bool:
+        """Whether such a message passes; `key_expr` may hold wildcards itself."""
+        return flow is self.flow and act in self.acts and any(key_includes(key, key_expr) for key in self.keys)
+
+
+class Access:
+    """The rules for some holders of certificates; nobody else may say anything."""
+
+    def __init__(self, holders: Iterable[Holder]) -> None:
+        self._holders = {holder.certificate: holder for holder in holders}
+        self._robots = {(holder.site, holder.robot) for holder in self._holders.values() if holder.robot}
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Access) and self._holders == other._holders
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def robot_count(self) -> int:
+        """How many robots are enrolled."""
+        return len(self._robots)
+
+    def holder(self, certificate: str) -> Holder | None:
+        """Who holds a certificate of this name; None where nobody may."""
+        return self._holders.get(certificate)
+
+    def has_robot(self, site: str, robot: str) -> bool:
+        """Whether such a robot is enrolled."""
+        return (site, robot) in self._robots
+
+    def permits(self, certificate: str, flow: Direction, act: Act, key_expr: str) -> bool:
+        """Whether a message from (IN) or to (OUT) the holder of a certificate passes."""
+        holder = self._holders.get(certificate)
+        return holder is not None and any(rule.allows(flow, act, key_expr) for rule in _rules(holder))
+
+    def zenoh_config(self) -> dict[str, Any]:
+        """Sections of zenoh's configuration that enforce the rules, and bound how often and how much a participant sends."""
+        rules = {rule.id: rule for holder in self._holders.values() for rule in _rules(holder)}
+        policies = [{"rules": [r.id for r in _rules(h)], "subjects": [h.certificate]} for h in self._holders.values()]
+        if not rules:  # zenoh refuses empty lists, and lists that are missing
+            rules = {_NOBODY: Rule(_NOBODY, Direction.IN, (Act.PUT,), (_NOBODY,))}
+            policies = [{"rules": [_NOBODY], "subjects": [_NOBODY]}]
+        subjects = [{"id": name, "cert_common_names": [name]} for name in self._holders or (_NOBODY,)]
+        return {
+            "access_control": {
+                "enabled": True,
+                "default_permission": "deny",
+                "rules": [_zenoh_rule(rule) for rule in rules.values()],
+                "subjects": subjects,
+                "policies": policies,
+            },
+            "downsampling": [
+                {
+                    "id": "reports",
+                    "flows": [Direction.IN],
+                    "messages": [Act.PUT],
+                    "rules": [{"key_expr": robot_key("*", "*", what), "freq": hz} for what, hz in _MOST_HZ.items()],
+                }
+            ],
+            "low_pass_filter": [
+                _size_limit("reports", Act.PUT, robot_key("*", "*", "*"), _REPORT_BYTES),
+                _size_limit("questions", Act.QUERY, "fleetmap/**", _QUESTION_BYTES),
+            ],
+        }
+
+
+def key_includes(key_expr: str, other: str) -> bool:
+    """Whether a key expression covers every key that `other`, a key or key expression, stands for."""
+    return _includes(key_expr.split("/"), other.split("/"))
+
+
+def _includes(chunks: Sequence[str], others: Sequence[str]) -> bool:
+    if not chunks:
+        return not others
+    if chunks[0] == "**":
+        return any(_includes(chunks[1:], others[skip:]) for skip in range(len(others) + 1))
+    if not others or others[0] == "**" or chunks[0] not in {"*", others[0]}:
+        return False
+    return _includes(chunks[1:], others[1:])
+
+
+def _rules(holder: Holder) -> tuple[Rule, ...]:
+    name = holder.certificate
+    if holder.purpose is Purpose.SURVEY:
+        return (Rule(f"{name}-says", Direction.IN, (Act.PUT,), ("fleetmap/*/live/survey",)),)
+    whats = ("renew",) if holder.purpose is Purpose.ENROL else ROBOT_KEYS
+    own = tuple(robot_key(holder.site, holder.robot, what) for what in whats)
+    if holder.purpose is Purpose.ENROL:
+        says = (Act.QUERY,)
+        return Rule(f"{name}-says", Direction.IN, says, own), Rule(f"{name}-told", Direction.OUT, (Act.REPLY,), own)
+    maps = tuple(f"fleetmap/{holder.site}/{what}/*" for what in SITE_ANSWERS)
+    return (
+        # A question and its answer are two messages in two directions; an answer that is an error is one too.
+        Rule(f"{holder.site}-asks", Direction.IN, (Act.QUERY,), maps),
+        Rule(f"{holder.site}-told", Direction.OUT, (Act.REPLY,), maps),
+        Rule(f"{name}-says", Direction.IN, (Act.PUT, Act.QUERY, Act.SHOW_ALIVE, Act.SUBSCRIBE), own),
+        Rule(f"{name}-told", Direction.OUT, (Act.PUT, Act.REPLY), own),
+    )
+
+
+def _zenoh_rule(rule: Rule) -> dict[str, Any]:
+    return {"id": rule.id, "permission": "allow", "flows": [rule.flow], "messages": rule.acts, "key_exprs": rule.keys}
+
+
+def _size_limit(name: str, act: Act, key: str, most_bytes: int) -> dict[str, Any]:
+    return {"id": name, "flows": [Direction.IN], "messages": [act], "key_exprs": [key], "size_limit": most_bytes}

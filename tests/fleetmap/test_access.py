@@ -1,0 +1,334 @@
+"""Who may say what: the same attacks on both buses, as a peer and as a client, each also where the rules are off.
+
+Rows 1, 3, 6, 7 and 30 of the list of attacks in docs/security.md.
+"""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleetmap.access import Access, Act, Direction, Holder, Purpose
+from fleetmap.bus import Bus, MemoryBus, MemoryHub, TlsFiles, ZenohBus, handshake_fault
+from fleetmap.bus.zenoh_bus import _config
+from fleetmap.errors import LinkError, UnreachableError
+from mapserver.trust.authorities import Authorities
+
+OWN, OTHERS = "fleetmap/hall/robots/a/", "fleetmap/hall/robots/b/"
+ACCESS = Access(
+    [
+        Holder("a.1", "hall", "a"),
+        Holder("b.1", "hall", "b"),
+        Holder("c.1.enrol", "hall", "c", Purpose.ENROL),
+        Holder("live.survey", purpose=Purpose.SURVEY),
+    ]
+)
+
+
+def eventually(condition: Callable[[], bool], within_s: float = 15.0) -> bool:
+    deadline = time.monotonic() + within_s
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+class Keys:
+    """Authorities of a server, of its robots and of strangers, and files of theirs."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.ours, self.strangers = (Authorities(folder / name, datetime.now(UTC)) for name in ("ours", "strangers"))
+        for authorities in (self.ours, self.strangers):
+            authorities.init(["127.0.0.1"], None, None)
+
+    def robot(self, certificate: str, authorities: Authorities | None = None) -> TlsFiles:
+        signed_by = authorities or self.ours
+        path = self.folder / f"{certificate}-{signed_by.folder.name}.pem"
+        path.write_bytes(signed_by.make_own(certificate, "robot"))
+        return TlsFiles(self.folder / "ours" / "servers-ca.crt", path)
+
+
+class World:
+    """A server that answers, and others who join by the names in their certificates."""
+
+    def __init__(self, kind: str, is_guarded: bool, keys: Keys, stack: ExitStack) -> None:
+        self.kind, self.keys, self.stack = kind, keys, stack
+        if kind == "memory":
+            self.hub = MemoryHub(ACCESS if is_guarded else None)
+            self.server: Bus = MemoryBus(self.hub)
+        else:
+            self.server = ZenohBus.listen("tls/127.0.0.1:0", tls=keys.ours.tls, access=ACCESS if is_guarded else None)
+        stack.enter_context(self.server)
+        self.heard: list[str] = []
+        self.server.subscribe("fleetmap/*/robots/*/health", lambda key, _: self.heard.append(key))
+        self.server.subscribe("fleetmap/*/live/*", lambda key, _: self.heard.append(key))
+        for what in ("robots/*/wanted", "blobs/*", "robots/*/renew"):
+            self.server.queryable(f"fleetmap/*/{what}", lambda *_: b"honest")
+
+    def join(self, certificate: str) -> Bus:
+        if self.kind == "memory":
+            return self.stack.enter_context(MemoryBus(self.hub, certificate))
+        bus = ZenohBus(self.server.endpoint, tls=self.keys.robot(certificate))
+        if self.kind == "client":
+            # Whoever attacks chooses the mode; between peers the server's router passes nothing on.
+            tls = bus._tls.connecting()
+            entries = {"mode": "client", "connect/endpoints": [bus.endpoint], "transport/link/tls": tls}
+            bus._session = zenoh.open(_config(entries))
+        else:
+            bus.open()
+        self.stack.callback(bus.close)
+        assert eventually(bus.connected)
+        return bus
+
+    def settle(self) -> None:
+        if self.kind != "memory":
+            time.sleep(0.4)
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Keys:
+    return Keys(tmp_path_factory.mktemp("keys"))
+
+
+@pytest.fixture(params=["memory", "peer", "client"])
+def make(request: pytest.FixtureRequest, keys: Keys) -> Iterator[Callable[[bool], World]]:
+    with ExitStack() as stack:
+        yield lambda is_guarded: World(request.param, is_guarded, keys, stack)
+
+
+def answer(bus: Bus, key: str) -> str:
+    try:
+        return bus.get(key, timeout_s=0.5).decode()
+    except UnreachableError as error:
+        return "silenced" if "lets this certificate say nothing" in str(error) else "silence"
+
+
+ALLOWED, DENIED = "honest", "silenced"
+
+
+@pytest.mark.parametrize(
+    ("key", "guarded"),
+    [
+        (OWN + "wanted", ALLOWED),
+        ("fleetmap/hall/blobs/00ff", ALLOWED),
+        (OWN + "renew", ALLOWED),
+        (OTHERS + "wanted", DENIED),
+        (OTHERS + "renew", DENIED),
+        ("fleetmap/yard/blobs/00ff", DENIED),
+        ("fleetmap/yard/robots/a/wanted", DENIED),
+    ],
+)
+def test_questions(make: Callable[[bool], World], key: str, guarded: str) -> None:
+    assert answer(make(True).join("a.1"), key) == guarded
+    assert answer(make(False).join("a.1"), key) == ALLOWED, "the control"
+
+
+@pytest.mark.parametrize(
+    ("certificate", "key", "arrives"),
+    [
+        ("a.1", OWN + "health", True),
+        ("a.1", OTHERS + "health", False),
+        ("a.1", "fleetmap/yard/robots/a/health", False),
+        ("a.1", "fleetmap/hall/live/survey", False),
+        ("live.survey", "fleetmap/hall/live/survey", True),
+        ("live.survey", OWN + "health", False),
+        ("c.1.enrol", "fleetmap/hall/robots/c/health", False),
+        ("nobody.1", OWN + "health", False),
+    ],
+)
+def test_publications(make: Callable[[bool], World], certificate: str, key: str, arrives: bool) -> None:
+    for is_guarded in (True, False):
+        world = make(is_guarded)
+        robot = world.join(certificate)
+        world.settle()
+        robot.publish(key, b"x")
+        if arrives or not is_guarded:
+            assert eventually(lambda w=world: w.heard == [key], 5)
+        else:
+            world.settle()
+            assert world.heard == []
+
+
+def test_a_pattern_of_keys_is_no_way_round(make: Callable[[bool], World]) -> None:
+    """The bus refuses nothing here: zenoh delivers a put under a wildcard to everybody whom it matches."""
+    world = make(True)
+    robot = world.join("a.1")
+    world.settle()
+    robot.publish("fleetmap/hall/robots/*/health", b"x")
+    world.settle()
+    assert world.heard == []
+    assert answer(robot, "fleetmap/hall/robots/*/wanted") == DENIED
+
+
+@pytest.mark.parametrize("is_guarded", [True, False])
+def test_nobody_answers_in_the_servers_place(make: Callable[[bool], World], is_guarded: bool) -> None:
+    world = make(is_guarded)
+    eve, bob = world.join("a.1"), world.join("b.1")
+    asked: list[str] = []
+
+    def lie(key: str, _: bytes) -> bytes:
+        asked.append(key)
+        return b"EVIL"
+
+    for key in ("fleetmap/hall/manifests/*", "fleetmap/**"):
+        eve.queryable(key, lie)
+    world.settle()
+    said = answer(bob, "fleetmap/hall/manifests/7")
+    if is_guarded:
+        assert (said, asked) == (DENIED, [])
+    elif world.kind != "peer":  # a router passes nothing on between peers, so that there is no attack
+        assert said == "EVIL", "the control"
+
+
+@pytest.mark.parametrize("is_guarded", [True, False])
+def test_nobody_hears_what_is_for_others(make: Callable[[bool], World], is_guarded: bool) -> None:
+    world = make(is_guarded)
+    eve, bob = world.join("a.1"), world.join("b.1")
+    heard: list[str] = []
+    for key_expr in (OWN + "wanted", OTHERS + "wanted", "**", "fleetmap/hall/robots/*/health"):
+        eve.subscribe(key_expr, lambda key, _: heard.append(key))
+    world.settle()
+    world.server.publish(OTHERS + "wanted", b"3")
+    bob.publish(OTHERS + "health", b"x")
+    world.server.publish(OWN + "wanted", b"3")
+    assert eventually(lambda: OWN + "wanted" in heard, 5)
+    world.settle()
+    if is_guarded:
+        assert set(heard) == {OWN + "wanted"}
+    else:
+        assert OTHERS + "wanted" in heard, "the control"
+
+
+def test_presence_is_shown_for_oneself_alone(make: Callable[[bool], World]) -> None:
+    for is_guarded in (True, False):
+        world = make(is_guarded)
+        eve, bob = world.join("a.1"), world.join("b.1")
+        eve.declare_alive(OWN + "alive")
+        eve.declare_alive(OTHERS + "alive")
+        expected = [OWN + "alive"] if is_guarded else [OWN + "alive", OTHERS + "alive"]
+        assert eventually(lambda w=world, e=expected: w.server.alive("fleetmap/**") == e, 5)
+        if is_guarded:
+            assert bob.alive("fleetmap/**") == []
+
+
+def test_the_admin_space_is_closed(keys: Keys) -> None:
+    """Row 30: nothing of the server is read there, and rules that are written there change nothing."""
+    with ExitStack() as stack:
+        world = World("client", True, keys, stack)
+        robot = world.join("a.1")
+        server = str(world.server._session.zid())
+        found = [str(r.ok.key_expr) for r in robot._session.get("@/**", timeout=1) if r.ok is not None]
+        assert not [key for key in found if key.startswith(f"@/{server}/")]
+        rules = {"enabled": False, "default_permission": "allow"}
+        robot._session.put(f"@/{server}/router/config/access_control", json.dumps(rules))
+        world.settle()
+        assert answer(robot, OTHERS + "wanted") == DENIED
+        control = _config({"mode": "router", "listen/endpoints": ["tcp/127.0.0.1:17448"], "adminspace/enabled": True})
+        with zenoh.open(control) as bare, ZenohBus.connect("tcp/127.0.0.1:17448") as reader:
+            assert eventually(reader.connected)
+            where = f"@/{bare.zid()}/**"
+            assert [reply for reply in reader._session.get(where, timeout=1) if reply.ok is not None], "the control"
+
+
+def test_certificates_of_others(keys: Keys, tmp_path: Path) -> None:
+    """Row 3, and why TLS refuses: zenoh tries on and says nothing, the handshake says it."""
+    with ExitStack() as stack:
+        world = World("peer", True, keys, stack)
+        endpoint = world.server.endpoint
+        assert handshake_fault(endpoint, keys.robot("a.1")) == ""
+        stranger = keys.robot("a.1", keys.strangers)
+        assert "does not know who signed" in handshake_fault(endpoint, stranger)
+        wrong_server = TlsFiles(tmp_path / "other.ca", keys.robot("a.1").own)
+        wrong_server.authority.write_text(keys.strangers.servers)
+        assert "server's certificate is refused" in handshake_fault(endpoint, wrong_server)
+        for files in (stranger, wrong_server):
+            bus = stack.enter_context(ZenohBus.connect(endpoint, tls=files))
+            with pytest.raises(UnreachableError):
+                bus.get(OWN + "wanted", timeout_s=1.0)
+            assert not bus.connected()
+        # A robot's certificate cannot play the server, and neither can the server under another name.
+        fake = stack.enter_context(
+            ZenohBus.listen(
+                "tls/127.0.0.1:0", tls=TlsFiles(keys.ours.tls.authority, keys.robot("a.1").own), access=ACCESS
+            )
+        )
+        fake.queryable("fleetmap/**", lambda *_: b"EVIL")
+        elsewhere = world.server.endpoint.replace("127.0.0.1", "localhost")
+        for wrong in (fake.endpoint, elsewhere):
+            victim = stack.enter_context(ZenohBus.connect(wrong, tls=keys.robot("b.1")))
+            with pytest.raises(UnreachableError):
+                victim.get("fleetmap/hall/blobs/00ff", timeout_s=1.0)
+            assert not victim.connected()
+            assert "server's certificate is refused" in handshake_fault(wrong, keys.robot("b.1"))
+        good = stack.enter_context(ZenohBus.connect(endpoint, tls=keys.robot("b.1")))
+        assert good.get("fleetmap/hall/blobs/00ff") == b"honest", "the control"
+    assert "cannot be reached" in handshake_fault(endpoint, keys.robot("a.1"))
+
+
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_a_revoked_robot_is_out_while_it_is_connected(keys: Keys, protocol: str) -> None:
+    """Row 6: what robots and the server had declared comes back by itself, but not the revoked one's."""
+    heard: list[str] = []
+    with ZenohBus.listen(f"{protocol}/127.0.0.1:0", tls=keys.ours.tls, access=ACCESS) as server:
+        server.queryable("fleetmap/*/robots/*/wanted", lambda key, _: key.encode())
+        server.subscribe("fleetmap/*/robots/*/health", lambda key, _: heard.append(key))
+        closed = server.queryable("fleetmap/*/blobs/*", lambda *_: b"")
+        closed.close()
+        with (
+            ZenohBus.connect(server.endpoint, tls=keys.robot("a.1")) as a,
+            ZenohBus.connect(server.endpoint, tls=keys.robot("b.1")) as b,
+        ):
+            for bus, own in ((a, OWN), (b, OTHERS)):
+                assert bus.get(own + "wanted", timeout_s=10)
+                bus.declare_alive(own + "alive")
+            assert eventually(lambda: len(server.alive("fleetmap/**")) == 2)
+            assert server.certificates() == ["a.1", "b.1"]
+            told: list[bytes] = []
+            b.subscribe(OTHERS + "wanted", lambda _, payload: told.append(payload))
+            server.reopen(Access([Holder("b.1", "hall", "b")]))
+            assert b.get(OTHERS + "wanted", timeout_s=5)
+            assert eventually(lambda: server.alive("fleetmap/**") == [OTHERS + "alive"], 5)
+            assert eventually(lambda: server.publish(OTHERS + "wanted", b"4") or bool(told), 5)
+            assert eventually(a.connected)
+            with pytest.raises(UnreachableError, match="lets this certificate say nothing"):
+                a.get(OWN + "wanted", timeout_s=0.5)
+            heard.clear()
+            for bus, own in ((a, OWN), (b, OTHERS)):
+                bus.publish(own + "health", b"x")
+            assert eventually(lambda: heard == [OTHERS + "health"], 3)
+            with pytest.raises(UnreachableError):
+                b.get("fleetmap/hall/blobs/00", timeout_s=0.3)  # a closed handle stays closed
+            server.reopen(ACCESS)
+            assert a.get(OWN + "wanted", timeout_s=5), "the control"
+
+
+def test_a_damaged_certificate_does_not_close_the_bus(keys: Keys, tmp_path: Path) -> None:
+    own = tmp_path / "server.pem"
+    own.write_bytes(keys.ours.tls.own.read_bytes())
+    with ZenohBus.listen("tls/127.0.0.1:0", tls=TlsFiles(keys.ours.tls.authority, own), access=ACCESS) as server:
+        server.queryable("fleetmap/*/blobs/*", lambda *_: b"honest")
+        with ZenohBus.connect(server.endpoint, tls=keys.robot("a.1")) as robot:
+            own.write_text("damaged")
+            with pytest.raises(LinkError, match="the bus stays as it is"):
+                server.reopen(ACCESS)
+            assert robot.get("fleetmap/hall/blobs/00", timeout_s=10) == b"honest"
+
+
+def test_rules_of_nobody_and_of_many() -> None:
+    """zenoh refuses empty lists; a site's rules are shared."""
+    config = Access([]).zenoh_config()["access_control"]
+    assert config["default_permission"] == "deny"
+    assert all(config[name] for name in ("rules", "subjects", "policies"))
+    many = Access(Holder(f"r{n}.1", f"s{n % 3}", f"r{n}") for n in range(300)).zenoh_config()["access_control"]
+    assert len(many["rules"]) == 3 * 2 + 300 * 2
+    assert len({rule["id"] for rule in many["rules"]}) == len(many["rules"])
+    assert not ACCESS.permits("a.1", Direction.IN, Act.ANSWER, "fleetmap/hall/blobs/*")
+    assert not ACCESS.permits("a.1", Direction.IN, Act.SUBSCRIBE, "fleetmap/hall/robots/*/wanted")
+    assert not any("@" in key for rule in many["rules"] for key in rule["key_exprs"])
