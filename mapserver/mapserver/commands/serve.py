@@ -74,7 +74,7 @@ class HttpOptions:
     def guard(self, store: "MapStore", certificate: "HttpCertificate | None", warning: str) -> "GuardSettings":
         """Who is let in. warning: about something else, for every page.
 
-         UsageError where the server must not be reached like this."""
+        UsageError where the server must not be reached like this."""
         from fleetmap.errors import UsageError
         from mapserver.api.guard import GuardSettings
         from mapserver.dashboard.layout import HANDLERS

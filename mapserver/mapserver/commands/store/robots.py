@@ -8,8 +8,7 @@ import typer
 
 from fleetmap.cli_options import Group, expand_options
 from fleetmap.errors import UsageError, disk_errors
-from mapserver.commands.options import ActorOptions, Json, SiteOptions, StoreFolder
-from mapserver.commands.print_json import print_json
+from mapserver.commands.options import ActorOptions, Json, SiteOptions, StoreFolder, print_json
 
 Robots = Annotated[list[str], typer.Argument(metavar="ROBOT...", help="Names of robots.")]
 

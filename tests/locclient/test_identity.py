@@ -1,0 +1,202 @@
+"""Where a robot's map comes from, and its identity: enrolment over real TLS, lost answers, renewal; row 37."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from fleetmap.bus import TlsFiles, ZenohBus
+from fleetmap.errors import LinkError, StateError, UnreachableError, UsageError
+from fleetmap.messages import robot_key
+from locclient.config import LocclientConfig, RunSection, SourceSection
+from locclient.daemon.daemon import check_run
+from locclient.daemon.publishers import OutputSection
+from locclient.identity import GivenAddress, RobotIdentity, check_reach, identity_folder
+from mapserver.store import MapStore
+from mapserver.trust import init_here
+from mapserver.trust.enrolment import RobotRegister
+from support.storage.map_samples import save_sample_draft
+
+
+@dataclass
+class Server:
+    """Authorities and a bus that renews; `answers` False loses them."""
+
+    register: RobotRegister
+    bus: ZenohBus
+    answers: bool = True
+
+    def bundle(self, robot: str) -> bytes:
+        made = self.register.enrol("lab", [robot], self.bus.endpoint)[robot]
+        self.bus.reopen(self.register.access())
+        return made
+
+    def renew(self, key: str, payload: bytes) -> bytes:
+        answer = self.register.renew("lab", key.split("/")[3], payload)
+        if not self.answers:
+            raise LinkError("lost on its way")
+        return answer
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        save_sample_draft(store)
+        init_here(store)
+        register = RobotRegister(store)
+        register.authorities.init(["127.0.0.1"], None, None)
+        with ZenohBus.listen("tls/127.0.0.1:0", tls=register.tls, access=register.access()) as bus:
+            made = Server(register, bus)
+            bus.queryable(robot_key("*", "*", "renew"), made.renew)
+            bus.queryable(robot_key("*", "*", "wanted"), lambda key, _: key.encode())
+            yield made
+
+
+def asks(identity: RobotIdentity, robot: str) -> bytes:
+    with ZenohBus.connect(identity.who.endpoint, tls=identity.tls) as bus:
+        return bus.get(robot_key("lab", robot, "wanted"), timeout_s=5)
+
+
+def test_enrolment_and_renewal(tmp_path: Path, server: Server) -> None:
+    folder = tmp_path / "identity"
+    bundle = server.bundle("r1")
+    identity = RobotIdentity.enrol(folder, bundle)
+    assert asks(identity, "r1")
+    with pytest.raises(UnreachableError, match="lets this certificate say nothing"):
+        asks(identity, "r2")
+    assert folder.stat().st_mode & 0o077 == 0
+    assert all(path.stat().st_mode & 0o077 == 0 for path in folder.iterdir())
+    assert {path.name for path in folder.iterdir()} == {"identity.json", "robot.pem", "root.json", "servers.ca"}
+    with pytest.raises(StateError, match="holds the identity of r1 at lab"):
+        RobotIdentity.enrol(folder, bundle)
+    with pytest.raises(LinkError, match="was the bundle used before"):
+        RobotIdentity.enrol(tmp_path / "thief", bundle)
+    assert RobotIdentity.load(tmp_path / "thief") is None
+    before = identity.certificate()
+    now = datetime.now(UTC)
+    assert not identity.is_renewal_due(now)
+    assert identity.is_renewal_due(now + timedelta(days=31))
+    with ZenohBus.connect(identity.who.endpoint, tls=identity.tls) as bus:
+        identity.renew(bus)
+        assert bus.get(robot_key("lab", "r1", "wanted"), timeout_s=5), "the connection that stands goes on"
+    after = RobotIdentity.load(folder).certificate()
+    assert (after.name, after.fingerprint != before.fingerprint) == (before.name, True)
+    assert asks(identity, "r1")
+
+
+def test_lost_answers_do_no_harm(tmp_path: Path, server: Server) -> None:
+    folder, bundle = tmp_path / "identity", server.bundle("r1")
+    server.answers = False
+    with pytest.raises(LinkError, match="lost on its way"):
+        RobotIdentity.enrol(folder, bundle)
+    assert RobotIdentity.load(folder) is None
+    server.answers = True
+    identity = RobotIdentity.enrol(folder, bundle)
+    server.answers = False
+    with ZenohBus.connect(identity.who.endpoint, tls=identity.tls) as bus:
+        before = identity.certificate()
+        with pytest.raises(LinkError, match="lost on its way"):
+            identity.renew(bus)
+        assert identity.certificate() == before
+        assert asks(identity, "r1"), "the old certificate goes on"
+        server.answers = True
+        identity.renew(bus)
+    assert identity.certificate().fingerprint != before.fingerprint
+    assert asks(identity, "r1")
+
+
+def test_a_server_that_is_not_the_bundles(tmp_path: Path, server: Server) -> None:
+    bundle = msgspec.json.decode(server.bundle("r1"))
+    with pytest.raises(UsageError, match="no enrolment bundle"):
+        RobotIdentity.enrol(tmp_path / "a", b"PK\x03\x04")
+    with pytest.raises(UsageError, match="robot name"):
+        RobotIdentity.enrol(tmp_path / "b", msgspec.json.encode({**bundle, "robot": "../r1"}))
+    with pytest.raises(LinkError, match="cannot be reached"):
+        RobotIdentity.enrol(tmp_path / "c", msgspec.json.encode({**bundle, "endpoint": "tls/127.0.0.1:1"}))
+    server.register.revoke("lab", ["r1"])
+    server.bus.reopen(server.register.access())
+    begun_s = time.monotonic()
+    with pytest.raises(UnreachableError, match="lets this certificate say nothing"):
+        RobotIdentity.enrol(tmp_path / "d", msgspec.json.encode(bundle))
+    assert time.monotonic() - begun_s < 40
+
+
+GIVEN = GivenAddress(
+    site="lab", robot="r1", server=None, store=None, root=None, identity="nowhere", insecure=False, sign="--"
+)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (replace(GIVEN, server="tcp/127.0.0.1:7447", store="maps"), "either --server"),
+        (GIVEN, "locclient enrol"),
+        (replace(GIVEN, site=None), "--site is missing"),
+        (replace(GIVEN, server="tcp/127.0.0.1:7447", robot=None), "--robot is missing"),
+        (replace(GIVEN, server="tcp/10.0.0.1:7447"), "another machine and without TLS"),
+        (replace(GIVEN, server="tls/10.0.0.1:7447"), "no identity in nowhere"),
+        (replace(GIVEN, server="tls/127.0.0.1:7447", insecure=True), "no identity in nowhere"),
+        (replace(GIVEN, server="nonsense"), "endpoint"),
+    ],
+)
+def test_addresses_that_cannot_be_right(given: GivenAddress, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        given.resolve()
+
+
+def test_addresses(tmp_path: Path, server: Server) -> None:
+    folder = tmp_path / "identity"
+    identity = RobotIdentity.enrol(folder, server.bundle("r1"))
+    bare = replace(GIVEN, site=None, robot=None, identity=str(folder))
+    found = bare.resolve()
+    assert (found.site, found.robot, found.server) == ("lab", "r1", identity.who.endpoint)
+    assert found.root == str(folder / "root.json")
+    assert found.tls == TlsFiles(folder / "servers.ca", folder / "robot.pem")
+    with pytest.raises(UsageError, match="robot r2 is asked for"):
+        replace(bare, robot="r2").resolve()
+    # On loopback and in a store's folder the identity is out of play.
+    for other in (replace(GIVEN, server="tcp/127.0.0.1:7447"), replace(GIVEN, store="maps")):
+        found = replace(other, site="yard", identity=str(folder)).resolve()
+        assert (found.site, found.tls, found.root) == ("yard", None, None)
+    assert replace(GIVEN, server="tcp/10.0.0.1:7447", insecure=True).resolve().tls is None
+
+
+def test_the_usual_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/fleetmap:/elsewhere")
+    assert identity_folder() == Path("/var/lib/fleetmap/identity")
+    monkeypatch.delenv("STATE_DIRECTORY")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert identity_folder() == tmp_path / "fleetmap" / "identity"
+    assert identity_folder("x") == Path("x")
+
+
+@pytest.mark.parametrize("section", ["source", "output"])
+def test_row_37_ros_on_another_machine(section: str) -> None:
+    parts = {"source": SourceSection(), "output": OutputSection()}
+
+    def config(endpoint: str, *, insecure: bool = False) -> LocclientConfig:
+        run = RunSection(store="maps", site="lab", robot="r1", insecure=insecure)
+        changed = msgspec.structs.replace(parts[section], endpoint=endpoint)
+        return LocclientConfig(run=run, **{**parts, section: changed})
+
+    with pytest.raises(UsageError, match=rf"\[{section}\] endpoint = tcp/10.0.0.1:7448 is on another machine"):
+        check_run(config("tcp/10.0.0.1:7448"))
+    for good in (config("tcp/10.0.0.1:7448", insecure=True), config("tls/10.0.0.1:7448"), config("tcp/[::1]:7448")):
+        assert check_run(good).robot == "r1", "the control"
+    check_reach(None, insecure=False)
+
+
+def test_a_damaged_identity_is_told(tmp_path: Path) -> None:
+    (tmp_path / "robot.pem").write_text("x")
+    with pytest.raises(UsageError, match="cannot be read"):
+        RobotIdentity.load(tmp_path)
+    (tmp_path / "identity.json").write_text("{")
+    with pytest.raises(UsageError, match="is damaged"):
+        RobotIdentity.load(tmp_path)
+    (tmp_path / "identity.json").write_text('{"site": "lab", "robot": "r1", "endpoint": "tls/h:1"}')
+    with pytest.raises(UsageError, match="no certificate"):
+        RobotIdentity.load(tmp_path).certificate()

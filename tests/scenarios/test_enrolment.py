@@ -1,0 +1,158 @@
+"""From a store to enrolled robots with the programs, on loopback with TLS: enrolment, a thief among the robots, revocation."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleetmap.bus import ZenohBus
+from fleetmap.bus.zenoh_bus import _config
+from fleetmap.errors import UnreachableError
+from fleetmap.messages import WantedVersion, decode_message, encode_message, robot_key
+from locclient.identity import GivenAddress, RobotIdentity
+from locclient.maps.connection import connected
+from mapserver import releases
+from mapserver.store import MapStore
+from support.storage.map_samples import save_sample_draft
+
+SITE = "lab"
+FORGED = encode_message(WantedVersion(site=SITE, version=99, manifest_sha256="f" * 64))
+
+
+class Site:
+    """A store with one version, and the programs over it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.store, self.endpoint = folder, folder / "store", ""
+        self.environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "XDG_STATE_HOME": str(folder)}
+
+    def run(self, program: str, *words: object) -> str:
+        """Both outputs of a program; its status is 0 unless they begin with an error."""
+        command = [sys.executable, "-m", f"{program}.cli", *map(str, words)]
+        done = subprocess.run(command, env=self.environment, capture_output=True, text=True, timeout=120, check=False)
+        assert (done.returncode == 0) == (not done.stderr.startswith("error: ")), done.stderr
+        return done.stdout + done.stderr
+
+    @contextmanager
+    def serving(self, endpoint: str) -> Iterator[subprocess.Popen[str]]:
+        words = ["serve", "--store", self.store, "--http", "127.0.0.1:0", "--zenoh", endpoint]
+        command = [sys.executable, "-m", "mapserver.cli", *map(str, words)]
+        process = subprocess.Popen(command, env=self.environment, stdout=subprocess.PIPE, text=True)
+        try:
+            process.stdout.readline()
+            self.endpoint = process.stdout.readline().split()[1]
+            assert process.stdout.readline() == "ready\n"
+            yield process
+        finally:
+            process.terminate()
+            process.wait(timeout=30)
+            process.stdout.close()
+
+    def enrol(self, robot: str) -> RobotIdentity:
+        where = ("--site", SITE, "--store", self.store, "--endpoint", self.endpoint, "--out", self.folder)
+        self.run("mapserver", "robots", "enrol", robot, *where)
+        told = self.run("locclient", "enrol", self.folder / f"{robot}.fleetmap", "--identity", self.folder / robot)
+        assert f"enrolled as {robot} of site {SITE}" in told
+        return RobotIdentity.load(self.folder / robot)
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Site:
+    made = Site(tmp_path)
+    with MapStore.open(made.store, create=True) as store:
+        save_sample_draft(store)
+        releases.publish(store, SITE)
+    return made
+
+
+def eventually(condition: Callable[[], bool], within_s: float) -> float:
+    """Seconds until it holds."""
+    begun_s = time.monotonic()
+    while not condition():
+        assert time.monotonic() - begun_s < within_s
+        time.sleep(0.02)
+    return time.monotonic() - begun_s
+
+
+def wanted(bus: ZenohBus, robot: str, timeout_s: float = 10.0) -> int | None:
+    try:
+        return decode_message(bus.get(robot_key(SITE, robot, "wanted"), timeout_s=timeout_s), WantedVersion).version
+    except UnreachableError:
+        return None
+
+
+def attacker(endpoint: str, identity: RobotIdentity | None) -> zenoh.Session:
+    """Somebody in client mode who answers every robot's question for its version."""
+    entries = {"mode": "client", "connect/endpoints": [endpoint]}
+    session = zenoh.open(
+        _config(entries | ({} if identity is None else {"transport/link/tls": identity.tls.connecting()}))
+    )
+
+    def lie(query: zenoh.Query) -> None:
+        with query:
+            query.reply(query.key_expr, FORGED)
+
+    session.declare_queryable(robot_key("*", "*", "wanted"), lie, complete=True)
+    return session
+
+
+def test_two_robots_from_an_empty_folder(site: Site) -> None:
+    assert "mapserver trust init --here" in site.run(
+        "mapserver", "serve", "--store", site.store, "--zenoh", "tcp/0.0.0.0:0"
+    )
+    assert "--host 127.0.0.1" not in site.run(
+        "mapserver", "trust", "init", "--here", "--host", "127.0.0.1", "--store", site.store
+    )
+    with ExitStack() as stack:
+        with site.serving("tls/127.0.0.1:0"):
+            one, two = site.enrol("r1"), site.enrol("r2")
+            bundle, elsewhere = site.folder / "r1.fleetmap", site.folder / "thief"
+            assert "was the bundle used before" in site.run("locclient", "enrol", bundle, "--identity", elsewhere)
+            listed = site.run("mapserver", "robots", "list", "--store", site.store)
+            assert listed.count("certificate for 365 days") == 2
+            # Row 1: a robot that answers in the server's place.
+            thief = stack.enter_context(attacker(site.endpoint, one))
+            honest = stack.enter_context(ZenohBus.connect(two.who.endpoint, tls=two.tls))
+            assert [wanted(honest, "r2") for _ in range(10)] == [1] * 10
+            given = GivenAddress(
+                site=None, robot=None, server=None, store=None, root=None, identity=str(two.folder), insecure=False
+            )
+            with connected(given.resolve(), site.folder / "cache", 10**8) as connection:
+                assert (connection.source.ready().wanted.version, connection.robot) == (1, "r2")
+        # Row 2: the same while the server starts; who was connected before is there first.
+        with site.serving(site.endpoint):
+            assert [wanted(honest, "r2") for _ in range(10)] == [1] * 10
+            # Row 6: revoked while it is connected.
+            with ZenohBus.connect(one.who.endpoint, tls=one.tls) as stolen:
+                assert wanted(stolen, "r1") == 1
+                site.run("mapserver", "robots", "revoke", "r1", "--site", SITE, "--store", site.store)
+                eventually(lambda: wanted(stolen, "r1", 0.3) is None, 5)
+                eventually(lambda: wanted(honest, "r2", 1.0) == 1, 10)
+                assert wanted(stolen, "r1", 2.0) is None
+            thief.close()
+
+
+def test_the_same_thief_without_tls_is_heard(site: Site) -> None:
+    """The control: on an open bus he answers first, most of the time."""
+    with (
+        site.serving("tcp/127.0.0.1:0"),
+        ZenohBus.connect(site.endpoint) as honest,
+        attacker(site.endpoint, None) as thief,
+    ):
+        assert eventually(lambda: wanted(honest, "r2") == 99, 20) < 20
+        thief.close()
+
+
+def test_the_demo_needs_no_keys(site: Site) -> None:
+    with site.serving("tcp/127.0.0.1:0"), ZenohBus.connect(site.endpoint) as robot:
+        assert wanted(robot, "anybody") == 1
+    assert re.search(
+        "has no certificate", site.run("mapserver", "serve", "--store", site.store, "--zenoh", "tls/127.0.0.1:0")
+    )
