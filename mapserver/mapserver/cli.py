@@ -20,9 +20,8 @@ from mapserver.commands.releases.inspect import diff, inspect, versions
 from mapserver.commands.releases.promote import promote, publish, rollback
 from mapserver.commands.serve import serve
 from mapserver.commands.store.audit import audit
-from mapserver.commands.store.export import export
+from mapserver.commands.store.export import export, import_
 from mapserver.commands.store.gc import gc
-from mapserver.commands.store.import_ import import_
 from mapserver.commands.store.operators import OPERATORS
 from mapserver.commands.store.robots import ROBOTS
 from mapserver.commands.store.trust import TRUST

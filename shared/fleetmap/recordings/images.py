@@ -13,11 +13,8 @@ from fleetmap.geometry import AnyArray
 from fleetmap.sensors.samples import CameraFrame, Image
 
 _PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]{0,1000}\n){1,20}(\d{1,10})(?:\s+|#[^\n]{0,1000}\n){1,20}(\d{1,10})[\s#]")
-_JPEG_SIZES = set(range(0xC0, 0xD0)) - {
-    0xC4,
-    0xC8,
-    0xCC,
-}  # start of frame; not tables, extensions, arithmetic conditioning
+# start of frame; not tables, extensions, arithmetic conditioning
+_JPEG_SIZES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
 _TIFF_KINDS = {1: "B", 3: "H", 4: "I"}  # byte, short, long
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
@@ -231,9 +228,8 @@ def _decode(stored: StoredImage) -> AnyArray:
         step = row_bytes  # nothing says how long the only row is
     padded = stored.data[: step * stored.height_px].ljust(step * stored.height_px, b"\0")
     rows = np.frombuffer(padded, np.uint8).reshape(stored.height_px, step)[:, :row_bytes]
-    pixels: AnyArray = (
-        rows.copy().view(wire_type).astype(dtype, copy=False)
-    )  # writable, as all images: one kind for kernels
+    # writable, as all images: one kind for kernels
+    pixels: AnyArray = rows.copy().view(wire_type).astype(dtype, copy=False)
     return pixels if channels == 1 else pixels.reshape(stored.height_px, stored.width_px, channels)
 
 

@@ -1,19 +1,18 @@
 """Calibration faults for recordings of any format: a rig described wrongly, images exchanged or mirrored, foreign sensors.
 
 A `RigFault` changes what is believed of the rig and nothing that was recorded, so it can be given to every program as `--calibration
-FILE` (`write_calibration`). An `ImageFault` changes the stored images and needs a new recording (`copy_to_mcap`). All are
+FILE`. An `ImageFault` changes the stored images and needs a new recording (`copy_to_mcap`). All are
 deterministic. Rotations are about the axes of the left camera (x right, y down, z forward) unless said otherwise.
 """
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
-from fleetmap.recordings import Recording, format_calibration
+from fleetmap.recordings import Recording
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_grey, png_image
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from support.recordings.spoiled_recording import with_frames
@@ -46,11 +45,6 @@ class RigFault:
     def recording(self, good: Recording) -> Recording:
         """The good recording as it opens with the wrong calibration."""
         return replace(good, calibration=self.change(good.calibration))
-
-    def write_calibration(self, good: RigCalibration, path: Path) -> Path:
-        """A camchain for `--calibration` that has this fault."""
-        path.write_text(format_calibration(self.change(good)))
-        return path
 
 
 def baseline(percent: float) -> RigFault:

@@ -14,10 +14,8 @@ from fleetmap.sensors.samples import WheelSample
 _ACCEL_BIAS_RAD = 0.003  # gravity in the IMU's axes, from moment to moment
 _FLOOR_RADIUS_M, _FLOOR_SIGMA_M = 4.0, 0.02
 _SLAB_M = 0.06  # landmarks of a floor lie within this height
-_MIN_IN_SLAB, _MIN_DENSITY = (
-    12,
-    3.0,
-)  # landmarks of a floor, and how much more of them than in the slabs above, in the mean
+# landmarks of a floor, and how much more of them than in the slabs above, in the mean
+_MIN_IN_SLAB, _MIN_DENSITY = 12, 3.0
 _BELOW_SHARE = 0.05  # of the landmarks, below the floor: reflections, and errors of depth
 _MIN_STEP_M, _MAX_TURN_RAD = 0.4, 0.15  # of a step that shows the driving direction
 _KEPT_SAMPLES = 2000  # of wheel odometry: 20 s at 100 Hz, a hundred times what a fix takes

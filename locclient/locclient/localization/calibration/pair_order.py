@@ -13,11 +13,8 @@ REVERSED_TEXT = (
     "or switch the mirroring off in the camera's driver"
 )
 _MIN_MATCHES = 40
-_DECIDED_PX, _ROW_SHARE, _WIDTH_SHARE = (
-    1.0,
-    0.03,
-    0.3,
-)  # a disparity with a sign; rows and columns as shares of the image
+# a disparity with a sign; rows and columns as shares of the image
+_DECIDED_PX, _ROW_SHARE, _WIDTH_SHARE = 1.0, 0.03, 0.3
 _MAX_BITS, _RATIO = 48, 0.9
 _ODDS = 3.0  # chance spreads matches over both signs alike
 
