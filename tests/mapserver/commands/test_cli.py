@@ -114,7 +114,7 @@ def test_every_option_has_its_key_in_the_file() -> None:
     assert set(_keys(file)) == settings | {name.replace("-", "_") for name in cli.COMMANDS}
     shown = typer.main.get_command(cli.app).commands
     commands = {name: (command, _keys(file)[name.replace("-", "_")]) for name, command in shown.items()}
-    for group in ("fleet", "robots", "trust", "config"):
+    for group in ("fleet", "robots", "operators", "trust", "config"):
         _, sections = commands.pop(group)
         assert set(_keys(sections)) == set(shown[group].commands)
         commands |= {f"{group} {name}": (one, _keys(sections)[name]) for name, one in shown[group].commands.items()}
