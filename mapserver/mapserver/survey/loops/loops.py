@@ -17,7 +17,7 @@ from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
 from mapserver.survey.survey_inputs import SurveyConfig
 from mapserver.survey.tracks.matching import median_depth_m
-from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotion, match_pair
+from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PairTask, PredictedMotion, match_pair, match_task
 
 # Matched points share calibration and depth errors: a pair's own covariance is too narrow by about this factor.
 _CORRELATION = 3.0
@@ -108,7 +108,9 @@ class LoopCloser:
         self._vectors: list[BowVector] = []
         self._neighbours: dict[int, list[int]] = {}
         self._executor = executor
-        self._inputs = MatchInputs([], posed.camera, options.settings.pairs)
+        self._shared = MatchInputs({}, posed.camera, options.settings.pairs)
+        self._bare: dict[int, Keyframe] = {}
+        self._inputs = replace(self._shared, keyframes=self._bare)
         self._depths_m = np.zeros(0)
         self._index = PlaceIndex(options.vocabulary.word_count)
         self.loops = Loops()
@@ -124,8 +126,7 @@ class LoopCloser:
         for i, j in sorted(matched):
             self._neighbours.setdefault(i, []).append(j)
             self._neighbours.setdefault(j, []).append(i)
-        bare = [*self._inputs.keyframes, *(without_pictures(k) for k in new)]
-        self._inputs = replace(self._inputs, keyframes=bare)
+        self._bare.update(enumerate(map(without_pictures, new), len(self._bare)))
         self._depths_m = np.append(self._depths_m, [median_depth_m(keyframe) for keyframe in new])
 
     @property
@@ -138,8 +139,9 @@ class LoopCloser:
         ids, scores = self._alike(i)
         verified: list[tuple[PoseEdge, LoopRecord]] = []
         inside = self._gate(i, ids, scores)
-        matches = self._executor.map(_verify, self._inputs, [self._predict(i, int(ids[n])) for n in inside])
-        for n, match in zip(inside, matches, strict=True):
+        tasks = [PairTask.of([self._predict(i, int(ids[n]))], self._inputs) for n in inside]
+        matches = self._executor.map(match_task, self._shared, tasks)
+        for n, (match,) in zip(inside, matches, strict=True):
             j, score = int(ids[n]), float(scores[n])
             others = np.array([edge.j for edge, _ in verified], np.int64)
             same = others[~self._are_apart(j, others)].tolist() if len(others) else []
@@ -322,11 +324,6 @@ def body_edge(match: PairMatch, body_from_cam: Array) -> PoseEdge:
     carry = adjoint(body_from_cam)
     covariance = _CORRELATION**2 * carry @ match.cov_rot_trans @ carry.T + np.diag([1e-6] * 3 + [1e-5] * 3)
     return PoseEdge(match.j, match.i, body_from_body, covariance, is_loop=True)
-
-
-def _verify(inputs: MatchInputs, pair: tuple[int, int, PredictedMotion]) -> PairMatch | None:
-    j, i, predicted = pair
-    return match_pair(j, i, inputs, predicted)
 
 
 def _around(distance_m: float) -> Array:

@@ -1,6 +1,7 @@
 """Selection of keyframe pairs to match, and checks of the measured motion against the predicted one."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +11,10 @@ from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.keyframes.keyframes import Keyframe, without_pictures
 from mapserver.survey.settings import PairSettings
-from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotion, match_pair, view_overlap
+from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PairTask, PredictedMotion, match_task, view_overlap
 
 _NEAR_CANDIDATES = 40
-_BATCH = 16  # pairs: a tenth of a second of work, so that handing it out costs nothing
+_BATCH = 32  # pairs: a tenth of a second of work; the twenty keyframes that travel with it cost a few milliseconds
 _MAX_VIEW_ANGLE_DEG = 75.0
 _WIDE = 2  # cells to each side that are looked at for what is near
 
@@ -32,6 +33,7 @@ class PairFinder:
         self._keyframes, self._camera, self._body_from_cam, self._settings = keyframes, camera, body_from_cam, settings
         self._executor = executor
         self._inputs = MatchInputs([without_pictures(k) for k in keyframes], camera, settings)
+        self._shared = replace(self._inputs, keyframes={})
         self._depths_m = np.array([median_depth_m(k) for k in keyframes])
 
     def candidates(self, map_from_body: Array, *, previous: int, only_near: int | None = None) -> list[tuple[int, int]]:
@@ -82,7 +84,8 @@ class PairFinder:
             predictions.append((i, j, PredictedMotion(j_from_i, rotation_sigma_rad, is_known)))
         matches, number = [], 0
         batches: list[list[_Prediction]] = in_batches(predictions, _BATCH)
-        for batch, found in zip(batches, self._executor.map(_match_batch, self._inputs, batches), strict=True):
+        tasks = (PairTask.of(batch, self._inputs) for batch in batches)
+        for batch, found in zip(batches, self._executor.map(match_task, self._shared, tasks), strict=True):
             for (i, j, predicted), match in zip(batch, found, strict=True):
                 if match is not None and _agrees(match.j_from_i, predicted.j_from_i, allowed_m(i, j)):
                     matches.append(match)
@@ -124,10 +127,6 @@ class NearPlaces:
 
 
 _Prediction = tuple[int, int, PredictedMotion]
-
-
-def _match_batch(inputs: MatchInputs, batch: list[_Prediction]) -> list[PairMatch | None]:
-    return [match_pair(i, j, inputs, predicted) for i, j, predicted in batch]
 
 
 def _agrees(measured: Array, predicted: Array, allowed_m: float) -> bool:

@@ -1,6 +1,6 @@
 """Feature matching of two keyframes: by descriptor, verified by one rigid motion, completed by projection."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,11 +32,24 @@ class PairMatch:
 
 @dataclass(frozen=True, slots=True)
 class MatchInputs:
-    """The keyframes of a survey, without their pictures, as matching reads them."""
+    """Keyframes by their numbers, without their pictures, as matching reads them: of a survey, or of a few pairs."""
 
-    keyframes: list[Keyframe]
+    keyframes: list[Keyframe] | dict[int, Keyframe]
     camera: StereoCamera
     settings: PairSettings
+
+
+class PairTask(NamedTuple):
+    """Work for a process: pairs (i, j, predicted motion), and their keyframes. No process needs those of the whole survey."""
+
+    pairs: "list[tuple[int, int, PredictedMotion]]"
+    keyframes: dict[int, Keyframe]
+
+    @classmethod
+    def of(cls, pairs: "list[tuple[int, int, PredictedMotion]]", inputs: MatchInputs) -> "PairTask":
+        """The task of some of a survey's pairs."""
+        numbers = sorted({k for i, j, _ in pairs for k in (i, j)})
+        return cls(pairs, {k: inputs.keyframes[k] for k in numbers})
 
 
 class PredictedMotion(NamedTuple):
@@ -49,6 +62,12 @@ class PredictedMotion(NamedTuple):
     j_from_i: Array
     rotation_sigma_rad: float | None = None
     is_known: bool = False
+
+
+def match_task(shared: MatchInputs, task: PairTask) -> list[PairMatch | None]:
+    """The verified match of each pair of a task; `shared` needs no keyframes."""
+    inputs = replace(shared, keyframes=task.keyframes)
+    return [match_pair(i, j, inputs, predicted) for i, j, predicted in task.pairs]
 
 
 def match_pair(i: int, j: int, inputs: MatchInputs, predicted: PredictedMotion | None = None) -> PairMatch | None:

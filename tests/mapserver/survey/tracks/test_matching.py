@@ -1,12 +1,15 @@
 """Which keyframes are matched with which, and how far a match may be from what odometry says."""
 
+import pickle
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, se3_exp, so3_exp
 from fleetmap.sensors.rectification import Rectifier
+from mapserver.survey.executor import SERIAL, SerialExecutor
 from mapserver.survey.keyframes.keyframes import Keyframe, make_keyframe
 from mapserver.survey.settings import PairSettings, SurveySettings
 from mapserver.survey.tracks.matching import (
@@ -16,7 +19,7 @@ from mapserver.survey.tracks.matching import (
     fixed_allowance_m,
     median_depth_m,
 )
-from mapserver.survey.tracks.pairs import view_overlap
+from mapserver.survey.tracks.pairs import PairTask, view_overlap
 from support.recordings.recording_samples import calibration
 from support.worlds.box_room import out_and_back, stereo_pair
 
@@ -140,3 +143,36 @@ def test_near_places_hold_all_that_reach_each_other() -> None:
         assert (np.diff(found) > 0).all() and (found < until).all()
         looked += len(found)
     assert looked < 0.6 * 400 * 399 / 2
+
+
+class _Watched(SerialExecutor):
+    """Keeps what would travel to a process."""
+
+    def __init__(self) -> None:
+        self.shared: list[Any] = []
+        self.tasks: list[PairTask] = []
+
+    def map(self, function: Any, shared: Any, batches: Any) -> Any:
+        self.shared.append(shared)
+        for batch in batches:
+            self.tasks.append(batch)
+            yield function(pickle.loads(pickle.dumps(shared)), pickle.loads(pickle.dumps(batch)))
+
+
+def test_a_process_gets_the_keyframes_of_its_pairs_alone() -> None:
+    keyframes, places, rectifier = seen()
+    rig = rectifier.camera, rectifier.body_from_cam, SETTINGS.pairs
+    watched, pairs = _Watched(), [(0, 1), (1, 2), (7, 8)]
+    allowed_m = fixed_allowance_m(places)
+    found = [
+        PairFinder(keyframes, *rig, executor).match(
+            pairs, places, allowed_m, rotation_sigma_rad=0.02, progress=lambda _: None
+        )
+        for executor in (SERIAL, watched)
+    ]
+    assert len(found[0]) == len(found[1]) > 0
+    for own, other in zip(*found, strict=True):
+        assert np.array_equal(own.features, other.features)
+        assert np.array_equal(own.j_from_i, other.j_from_i)
+    assert [len(shared.keyframes) for shared in watched.shared] == [0]
+    assert [sorted(task.keyframes) for task in watched.tasks] == [[0, 1, 2, 7, 8]]
