@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.back_end import bench_consistency, bench_loops, bench_solvers
+from benchmarks.back_end import bench_consistency, bench_loops, bench_site, bench_solvers
 from benchmarks.common import consistency
 from benchmarks.common.yardstick import at_reference, slowness
 from benchmarks.survey import bench_gate, bench_hard_cases
@@ -61,6 +61,23 @@ def test_no_loop_joins_two_aisles_of_a_whole_site() -> None:
     assert found.aliased >= bench_gate.MIN_ALIASED
     assert found.wrong == 0
     assert found.closed_share >= bench_gate.MIN_CLOSED_SHARE
+
+
+@pytest.mark.timeout(4 * 3600)
+def test_cost_grows_with_the_site_and_not_faster(tmp_path: Path) -> None:
+    """A drive through the fulfilment centre without pictures: CPU and memory by keyframes, the error, no wrong loop."""
+    drive = tmp_path / "drive.pkl"
+    bench_site.simulate("survey-south", 12_600, drive)
+    rows = []
+    for row in bench_site.measured((250, 1000, 4000), drive):
+        print(json.dumps(row))
+        assert row["wrong_loops"] == 0
+        assert row["kept"] == row["keyframes"]
+        assert row["ate_m"] <= bench_site.ATE_LIMIT_M
+        assert row["peak_mb"] <= bench_site.PEAK_LIMIT_MB
+        rows.append(row)
+    assert bench_site.slope(rows, "cpu_s") <= bench_site.SLOPE_LIMIT
+    assert bench_site.slope(rows, "peak_mb") <= bench_site.SLOPE_LIMIT
 
 
 def test_rendered_identical_aisles(tmp_path: Path) -> None:

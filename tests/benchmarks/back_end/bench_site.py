@@ -1,0 +1,157 @@
+"""What the back end of a survey costs as its site grows: the fulfilment centre without pictures, its first so many keyframes.
+
+CPU seconds and peak memory by stage and keyframes, the slopes of their growth (log-log fits), the error against the truth, and loops
+that are wrong. Everything after the odometry is the survey's own; sub-pixel alignment is drawn (see `common/simulated_survey.py`), so
+that its cost, which goes with the observations, is not in the figures. Each size runs in a process of its own.
+
+    python tests/benchmarks/back_end/bench_site.py [--keyframes 250,1000] [--robot survey-south] [--frames N] [--drive FILE.pkl]
+"""
+
+import argparse
+import hashlib
+import json
+import pickle
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.common.simulated_survey import SimulatedSurvey, drawn_alignment, session_of, simulated_survey
+from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.sensors.samples import SensorSet, Trajectory
+from fleetsim.scene.layout import Layout
+from mapserver.build.worker import open_executor
+from mapserver.config import survey_settings
+from mapserver.evaluation.trajectory_error import absolute_trajectory_error
+from mapserver.survey.pipeline import Survey, survey_from
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
+
+SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
+SLOPE_LIMIT, PEAK_LIMIT_MB, ATE_LIMIT_M = 1.1, 4096.0, 0.05
+_WRONG_M = 0.5 * Layout.bay_m  # half of the smallest step by which the site repeats
+
+
+def simulate(robot: str, frames: int | None, out: Path) -> None:
+    """Writes what a drive's odometry saw: minutes for an hour's drive."""
+    survey = simulated_survey(session_of("fulfilment-centre", robot, frames=frames), SETTINGS)
+    out.write_bytes(pickle.dumps(survey, protocol=5))
+
+
+def measure(survey: SimulatedSurvey, threads: int) -> dict[str, Any]:
+    """One survey's figures."""
+    stages: dict[str, float] = {}
+    last = ["start", time.process_time()]
+
+    def progress(stage: str, done: int, total: int) -> None:
+        now = time.process_time()
+        stages[last[0]] = stages.get(last[0], 0.0) + now - last[1]
+        last[:] = stage, now
+
+    before_mb = _peak_mb()
+    begun = time.process_time(), time.perf_counter()
+    options = SurveyConfig(SETTINGS, default_vocabulary())
+    with drawn_alignment(survey), open_executor(threads, None) as executor:
+        made = survey_from(survey.odometry, survey.inputs, options, SurveyTools(progress=progress, executor=executor))
+    progress("end", 0, 0)
+    count = len(survey.odometry.keyframes)
+    truth = survey.map_from_body[[k.frame_index for k in made.odometry.keyframes]]
+    cpu_s = time.process_time() - begun[0]
+    return {
+        "keyframes": count,
+        "frames": len(survey.odometry.estimates),
+        "path_m": float(np.linalg.norm(np.diff(survey.map_from_body[:, :3, 3], axis=0), axis=1).sum()),
+        "cpu_s": cpu_s,
+        "wall_s": time.perf_counter() - begun[1],
+        "cpu_ms_per_keyframe": 1e3 * cpu_s / count,
+        "stages_s": {name: round(seconds, 2) for name, seconds in stages.items()},
+        "peak_mb": _peak_mb(),
+        "input_mb": before_mb,
+        "observations": len(made.state.landmarks.obs_keyframe),
+        "loops": len(made.loops.edges),
+        "wrong_loops": wrong_loops(made.loops.edges, survey),
+        "kept": len(made.odometry.keyframes),
+        "ate_m": ate_m(made.state.map_from_body, truth),
+        "digest": digest(made),
+        "odometry_ate_m": ate_m(survey.odometry.odom_from_body, survey.map_from_body),
+    }
+
+
+def digest(made: Survey) -> str:
+    """Of all that the survey found: equal for equal results."""
+    state, marks, found = made.state, made.state.landmarks, hashlib.sha256()
+    for array in (state.map_from_body, marks.points_map, marks.obs_keyframe, marks.obs_feature, made.map.point_sigma_m):
+        found.update(np.ascontiguousarray(array))
+    found.update(np.ascontiguousarray(made.map.trajectory.frame_from_body))
+    return found.hexdigest()[:16]
+
+
+def ate_m(map_from_body: Array, truth: Array) -> float:
+    """Root mean square of position errors after rigid alignment."""
+    stamps = np.arange(len(truth), dtype=np.int64)
+    return absolute_trajectory_error(Trajectory(stamps, map_from_body), Trajectory(stamps, truth)).rmse_m
+
+
+def wrong_loops(edges: Any, survey: SimulatedSurvey) -> int:
+    """How many accepted loops join what the truth says is elsewhere."""
+    frames, wrong = [k.frame_index for k in survey.odometry.keyframes], 0
+    for edge in edges:
+        true = se3_inverse(survey.map_from_body[frames[edge.i]]) @ survey.map_from_body[frames[edge.j]]
+        off = se3_inverse(true) @ edge.i_from_j
+        wrong += int(np.linalg.norm(off[:3, 3]) > _WRONG_M)
+    return wrong
+
+
+def measured(sizes: Sequence[int], drive: Path, threads: int = 1) -> Iterator[dict[str, Any]]:
+    """The figures of each size, in a process of its own that reads no more than its part of the drive."""
+    part = drive.with_suffix(".part")
+    for size in sizes:
+        survey: SimulatedSurvey = pickle.loads(drive.read_bytes())
+        part.write_bytes(pickle.dumps(survey.first(size), protocol=5))
+        del survey
+        command = [sys.executable, __file__, "--one", "--drive", str(part), "--threads", str(threads)]
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+        part.unlink()
+        yield json.loads(done.stdout.splitlines()[-1])
+
+
+def slope(rows: list[dict[str, Any]], key: str) -> float:
+    """Of the log-log fit against the keyframes."""
+    return float(np.polyfit(np.log([r["keyframes"] for r in rows]), np.log([r[key] for r in rows]), 1)[0])
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def main() -> None:
+    """Prints one line of JSON for each size, then the slopes."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--keyframes", default="250,1000", help="sizes, comma separated")
+    parser.add_argument("--robot", default="survey-south", help="a drive of the scenario")
+    parser.add_argument("--frames", type=int, default=None, help="at most so many frames of it, at 7.5 Hz")
+    parser.add_argument("--drive", type=Path, default=Path("out/site.pkl"), help="as simulated; made where missing")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.one:
+        print(json.dumps(measure(pickle.loads(given.drive.read_bytes()), given.threads)), flush=True)
+        return
+    if not given.drive.exists():
+        given.drive.parent.mkdir(parents=True, exist_ok=True)
+        simulate(given.robot, given.frames, given.drive)
+    rows = []
+    for row in measured(sorted(int(size) for size in given.keyframes.split(",")), given.drive, given.threads):
+        rows.append(row)
+        print(json.dumps(row), flush=True)
+    if len(rows) > 1:
+        print(json.dumps({"cpu_slope": slope(rows, "cpu_s"), "memory_slope": slope(rows, "peak_mb")}))
+
+
+if __name__ == "__main__":
+    main()

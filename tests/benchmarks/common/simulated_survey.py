@@ -1,0 +1,178 @@
+"""Surveys without pictures: what `support.estimator` measures goes through the odometry and the back end that surveys have.
+
+Features, their disparities and the points that flow follows come from a session. Sub-pixel alignment needs pictures, so that the
+coordinates which it finds are drawn instead: exact ones with noise where feature and reference show one landmark, those of the
+detector where they do not. All else is the survey's own code.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.common.estimator_loop import EstimatorTracker, blank
+from fleetmap.features import orb, patch_align
+from fleetmap.geometry import Array
+from fleetmap.odometry import OdometryStatus
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetsim import recorder
+from fleetsim.scenarios import SCENARIOS, Scenario, find_scenario
+from mapserver.survey.executor import Executor
+from mapserver.survey.frame_tracks import FrameTracks
+from mapserver.survey.keyframes.keyframes import Keyframe, Pictures, PosedKeyframes
+from mapserver.survey.odometry_pass import OdometryPass, OdometryRun, SampleFeed, continued_covariances
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyInputs
+from mapserver.survey.tracks import tracks
+from support.estimator.simulated_run import EstimatorSession
+
+_ALIGNED_PX, _DISPARITY_PX = (
+    0.2,
+    0.13,
+)  # errors of aligned coordinates and of disparities, as rendered pictures show them
+_SIZE_PX = (480, 640)
+
+
+class GreyPictures:
+    """An ImageStore in which every keyframe has the same picture: patches are cut of it, nothing is measured in it."""
+
+    def __init__(self) -> None:
+        left = np.random.default_rng(1).integers(0, 255, _SIZE_PX, np.uint8)
+        self._pictures = Pictures(RectifiedFrame(0, left, left, None), patch_align.half_pyramid(left))
+
+    def put(self, pictures: Pictures) -> int:
+        """Keeps nothing."""
+        return 0
+
+    def get(self, number: int) -> Pictures:
+        """The one there is."""
+        return self._pictures
+
+
+@dataclass(frozen=True)
+class SimulatedSurvey:
+    """The odometry of a session, and for each of its K keyframes which landmark a feature shows and where that is, exactly.
+
+    landmarks: K arrays (N,), 0 for clutter; exact_px: K arrays (N, 3) u_left v u_right; map_from_body (F, 4, 4) the truth of all frames.
+    """
+
+    odometry: OdometryPass
+    inputs: SurveyInputs
+    landmarks: list[NDArray[np.uint64]]
+    exact_px: list[NDArray[np.float32]]
+    map_from_body: Array
+
+    def first(self, keyframes: int) -> "SimulatedSurvey":
+        """The survey up to its keyframe number `keyframes`."""
+        own = self.odometry
+        if keyframes >= len(own.keyframes):
+            return self
+        frames = own.keyframes[keyframes].frame_index
+        assert own.tracks is not None
+        ends = own.tracks.starts[: frames + 1]
+        seen = FrameTracks(ends, own.tracks.ids[: ends[-1]], own.tracks.pixels[: ends[-1]])
+        odometry = replace(
+            own, estimates=own.estimates[:frames], odom_from_body=own.odom_from_body[:frames],
+            covariances=own.covariances[:frames], tracked=own.tracked[:frames], keyframes=own.keyframes[:keyframes],
+            tracks=seen,
+        )  # fmt: skip
+        until_ns = own.estimates[frames - 1].stamp_ns + 1_000_000_000
+        inputs = replace(self.inputs, frame_count=frames, imu=self.inputs.imu.between(-(2**62), until_ns))
+        return SimulatedSurvey(
+            odometry, inputs, self.landmarks[:keyframes], self.exact_px[:keyframes], self.map_from_body[:frames]
+        )
+
+
+def session_of(
+    scenario: str, robot: str, seed: int = 0, rate_hz: float = 7.5, frames: int | None = None
+) -> EstimatorSession:
+    """A scenario's run at another frame rate."""
+    base = find_scenario(scenario)
+
+    def slower() -> Scenario:
+        return replace(base, runs={robot: replace(base.runs[robot], rate_hz=rate_hz)})
+
+    with patch.dict(SCENARIOS, {scenario: slower}):
+        return EstimatorSession(recorder.prepare(recorder.Order(scenario, seed=seed, robot=robot, frames=frames)))
+
+
+def simulated_survey(session: EstimatorSession, settings: SurveySettings) -> SimulatedSurvey:
+    """The odometry over a session, with the keyframes that its policy chooses."""
+    nominal = session.session.nominal
+    rectifier = Rectifier(nominal)
+    run = OdometryRun(nominal, rectifier, settings)
+    run._odometry._tracker = EstimatorTracker(session, session.camera, settings.odometry.tracker)  # type: ignore[attr-defined]
+    feed = SampleFeed(session.session.imu, session.session.wheel, rectifier.imu_minus_cam_s)
+    images, seen = GreyPictures(), list[FrameTracks]()
+    keyframes, landmarks, exact_px = list[Keyframe](), list[NDArray[np.uint64]](), list[NDArray[np.float32]]()
+    for number in range(len(session)):
+        frame = blank(session, number)
+        tracked = run.handle(frame, *feed.until(frame.stamp_ns))
+        seen.append(FrameTracks.of_frame(tracked.estimate))
+        if tracked.is_keyframe:
+            keyframe, ids, exact = _keyframe(session, number, images)
+            keyframes.append(keyframe)
+            landmarks.append(ids)
+            exact_px.append(exact)
+    estimates = run.chain.estimates
+    odometry = OdometryPass(
+        estimates, run.chain.odom_from_body(), continued_covariances(estimates),
+        np.array([e.status is not OdometryStatus.DEGRADED for e in estimates]), keyframes, estimates[-1].inertial,
+        estimates[-1].scale_known, estimates[-1].inertial and settings.odometry.filter.use_wheels, FrameTracks.joined(seen),
+    )  # fmt: skip
+    inputs = SurveyInputs([], len(session), session.session.imu, nominal, rectifier, session.session.wheel)
+    return SimulatedSurvey(odometry, inputs, landmarks, exact_px, session.map_from_body)
+
+
+def _keyframe(
+    session: EstimatorSession, number: int, images: GreyPictures
+) -> tuple[Keyframe, NDArray[np.uint64], NDArray[np.float32]]:
+    """A keyframe, the landmarks (N,) that its features show, and where these are exactly (N, 3)."""
+    found, sighting = session.features(number), session.sighting(number)
+    real = found.rows >= 0
+    ids, exact = np.zeros(len(real), np.uint64), np.zeros((len(real), 3), np.float32)
+    ids[real], exact[real] = sighting.ids[found.rows[real]], sighting.pixels[found.rows[real]]
+    measured = found.pixels[:, 0] - found.pixels[:, 2]
+    disparities = np.column_stack([measured, np.where(np.isfinite(measured), _DISPARITY_PX, np.nan)])
+    points = session.camera.point_from_pixel(found.pixels[:, :2], measured)
+    angles = np.zeros(len(real), np.float32)
+    features = orb.Features(found.pixels[:, :2].copy(), found.octaves.copy(), angles, found.descriptors.copy())
+    return Keyframe(number, session.stamps_ns[number], features, disparities, points, images, 0), ids, exact
+
+
+@contextmanager
+def drawn_alignment(survey: SimulatedSurvey) -> Iterator[None]:
+    """Alignment's results are drawn while this holds; equal arguments give equal results."""
+    number = {id(keyframe.features): k for k, keyframe in enumerate(survey.odometry.keyframes)}
+
+    def observe(
+        posed: PosedKeyframes, table: NDArray[np.int64], points_map: Array, settings: SurveySettings, executor: Executor
+    ) -> tuple[Array, Array]:
+        """As `tracks._observe`."""
+        noise = settings.noise
+        is_reference = np.diff(table[:, 1], prepend=-1) != 0
+        reference_row = np.maximum.accumulate(np.where(is_reference, np.arange(len(table)), 0))
+        shown, octaves = np.zeros(len(table), np.uint64), np.zeros(len(table), np.int8)
+        pixels, own = np.empty((len(table), 3)), np.empty((len(table), 3))
+        order = np.argsort(table[:, 0], kind="stable")
+        ends = np.cumsum(np.bincount(table[:, 0], minlength=len(posed.keyframes)))
+        for keyframe, rows in zip(posed.keyframes, np.split(order, ends[:-1]), strict=True):
+            k, features = number[id(keyframe.features)], table[rows, 2]
+            shown[rows], octaves[rows] = survey.landmarks[k][features], keyframe.features.octaves[features]
+            drawn = np.random.default_rng([7, k]).standard_normal((len(keyframe.features), 3), np.float32)[features]
+            pixels[rows] = survey.exact_px[k][features] + drawn * np.float32(_ALIGNED_PX)
+            disparity = survey.exact_px[k][features, 0] - survey.exact_px[k][features, 2] + drawn[:, 2] * _DISPARITY_PX
+            pixels[rows, 2] = pixels[rows, 0] - disparity
+            own[rows, :2] = keyframe.features.pixels[features]
+            own[rows, 2] = own[rows, 0] - keyframe.disparities[features, 0]
+        sure = (shown == shown[reference_row]) & (shown > 0)
+        sigmas = np.where(sure, noise.aligned_sigma_px, noise.descriptor_sigma_px * 1.2 ** octaves.astype(np.float64))
+        measured = np.where(np.isfinite(own[:, 2]), noise.disparity_sigma_px, np.hypot(noise.disparity_sigma_px, 1.0))
+        pixels[np.isnan(own[:, 2]), 2] = np.nan
+        return np.where(sure[:, None], pixels, own), np.column_stack([sigmas, measured])
+
+    with patch.object(tracks, "_observe", observe):
+        yield
