@@ -19,7 +19,7 @@ TIERS = {
     "user": {
         "": "site store server",
         "run": "server store site robot prior cache cache_bytes root identity insecure spool failures",
-        "source": "kind calibration endpoint recording device",
+        "source": "kind sensors calibration endpoint recording device",
         "output": "format endpoint",
         "topics": "*",
     },

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import LinkError
 from fleetmap.geometry import Array
-from fleetmap.messages import Name, Text, Version
+from fleetmap.messages import EstimateMessage, Name, Text, Version
 
 MAX_ARRAY_BYTES = 64 << 10
 NO_PART = 255
+COVERAGE_CELL_M = 5.0
 _Bytes = Annotated[bytes, msgspec.Meta(max_length=MAX_ARRAY_BYTES)]
 
 
@@ -24,6 +25,34 @@ class LivePart(msgspec.Struct, frozen=True, kw_only=True):
     is_map: bool
 
 
+class LiveRevisit(msgspec.Struct, frozen=True, kw_only=True):
+    """A candidate for a revisit: keyframe at at_s seconds against that at seen_s; its verdict, why in words, matches that agreed."""
+
+    at_s: float
+    seen_s: float
+    verdict: Name
+    words: Text
+    matches: int
+
+
+class LiveFinding(msgspec.Struct, frozen=True, kw_only=True):
+    """What the doctor found in ten seconds before at_s: verdict ok, warn or fail."""
+
+    name: Text
+    verdict: Name
+    words: Text
+    at_s: float
+
+
+class LiveMissing(msgspec.Struct, frozen=True, kw_only=True):
+    """A heading (E along x, N along y of the survey's frame) that nothing looks at around a place that was passed the other way."""
+
+    x_m: float
+    y_m: float
+    heading: Name
+    places: int
+
+
 class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     """A survey under way, as of the frame at stamp_ns; coordinates are metres in its own upright frame.
 
@@ -33,7 +62,9 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     path_m (N, 2) and landmarks_m (M, 2), loops_m (L, 4) from and to: little-endian float32, thinned evenly. quality (N,): bytes, 0 where
     tracking was lost, 255 where all points agreed. part (N,): bytes, the number in `parts`, NO_PART where too little was seen to belong
     to any. More than one part: the survey lost itself, and no sure revisit has joined them yet. loops, refused: how many, and of which
-    verdict.
+    verdict; revisits: the newest ones. cells (T, 3): x and y of squares of COVERAGE_CELL_M that are covered, and their landmarks.
+    estimate: where the newest keyframe is in this map, or in the `frozen` version, odometry's frame in the place of `odom`.
+    scale_known: False while, of one camera, nothing has shown how long a metre is.
     """
 
     site: Name
@@ -54,6 +85,13 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     loops_m: _Bytes = b""
     loops: int = 0
     refused: Annotated[dict[Name, int], msgspec.Meta(max_length=16)] = {}
+    revisits: Annotated[list[LiveRevisit], msgspec.Meta(max_length=32)] = []
+    cells: _Bytes = b""
+    missing: Annotated[list[LiveMissing], msgspec.Meta(max_length=64)] = []
+    findings: Annotated[list[LiveFinding], msgspec.Meta(max_length=32)] = []
+    estimate: EstimateMessage | None = None
+    frozen: Version | None = None
+    scale_known: bool = True
     version: Version | None = None
     words: Text = ""
 
@@ -81,6 +119,10 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     def loop_lines(self) -> Array:
         """(L, 4) x and y from and to; raises LinkError for bytes that are no lines."""
         return _rows(self.loops_m, 4, "loops_m")
+
+    def covered(self) -> Array:
+        """(T, 3); raises LinkError for bytes that are no squares."""
+        return _rows(self.cells, 3, "cells")
 
 
 def _check_length(places: int, count: int, what: str) -> None:

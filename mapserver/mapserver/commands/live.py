@@ -24,6 +24,14 @@ if TYPE_CHECKING:
 class LiveCommandOptions(SurveyOptions):
     """Options of `live` beside those of `nightly`."""
 
+    use: Annotated[str | None, typer.Option(metavar="SENSORS", help="Use only these sensors of the recording.")] = None
+    map: Annotated[
+        int | None, typer.Option(metavar="VERSION", help="Localize in this version of the site; with --frozen.")
+    ] = None
+    frozen: Annotated[bool, typer.Option("--frozen", help="Map nothing: the version of --map stays what it is.")] = (
+        False
+    )
+
     speed: Annotated[float, typer.Option(help="Speed of the recording; 1 is its own, 0 as fast as it goes.")] = 1.0
     sensors: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Drive with the [source] and [topics] of this file instead.")
@@ -32,6 +40,10 @@ class LiveCommandOptions(SurveyOptions):
     server: Annotated[
         str | None,
         typer.Option(metavar="ENDPOINT", help="zenoh endpoint of the server whose dashboard shows the survey."),
+    ] = None
+    ros2: Annotated[
+        str | None,
+        typer.Option(metavar="ENDPOINT", help="zenoh endpoint to show the survey at as ROS 2 topics, for Foxglove."),
     ] = None
 
 
@@ -50,21 +62,30 @@ def live(
         raise UsageError(
             "name a RECORDING to play, or --sensors FILE to drive with and --record FILE.mcap to keep it in"
         )
+    if options.frozen != (options.map is not None):
+        raise UsageError("--map VERSION --frozen localizes in a version; without both of them a map is made")
     from rich.console import Console
 
     from mapserver import BuildOptions
+    from mapserver.build.sensor_subset import named_sensor_set
     from mapserver.live import LiveRequest, run_live
 
-    asked = vars(options) | {"config": config_path(context)}
-    site, store, speed, server, sensors, record = (
-        asked.pop(name) for name in ("site", "store", "speed", "server", "sensors", "record")
+    use = None if options.use is None else named_sensor_set(options.use)
+    asked = vars(options) | {"config": config_path(context), "use": use}
+    site, store, speed, server, sensors, record, version, ros2, _ = (
+        asked.pop(name) for name in ("site", "store", "speed", "server", "sensors", "record", "map", "ros2", "frozen")
     )
     build, is_stopped = BuildOptions(**asked), _stopping()
-    with _drive(recording, sensors, record, build, speed) as (drive, settings), _bus(server, store) as bus:
-        request = LiveRequest(site, store, settings, build)
-        result = run_live(request, drive, _teller(bus), is_stopped, Console(stderr=True))
+    with (
+        _drive(recording, sensors, record, build, speed) as (drive, settings),
+        _bus(server, store) as bus,
+        _bus(ros2, store) as viewers,
+    ):
+        request = LiveRequest(site, store, settings, build, version)
+        result = run_live(request, drive, _teller(bus, viewers), is_stopped, Console(stderr=True))
     typer.echo(result.figures.words())
-    typer.echo(result.built.sentence)
+    if result.built is not None:
+        typer.echo(result.built.sentence)
 
 
 @contextmanager
@@ -84,7 +105,13 @@ def _drive(
     assert sensors is not None
     assert record is not None
     drive = SensorDrive.open(sensors, record)
-    kind = SensorSet.STEREO if drive.calibration.imu is None else SensorSet.STEREO_INERTIAL
+    kinds = {
+        (2, True): SensorSet.STEREO_INERTIAL,
+        (2, False): SensorSet.STEREO,
+        (1, True): SensorSet.MONO_INERTIAL,
+        (1, False): SensorSet.MONO,
+    }
+    kind = kinds[len(drive.calibration.cameras), drive.calibration.imu is not None]
     yield drive, survey_settings(build.config, SensorSet.RGBD if drive.has_depth else kind)
 
 
@@ -120,14 +147,20 @@ def _bus(server: str | None, store: Path) -> "AbstractContextManager[Bus | None]
     return ZenohBus.connect(server, tls=tls)
 
 
-def _teller(bus: "Bus | None") -> "Callable[[LiveSurveyState], None]":
+def _teller(bus: "Bus | None", viewers: "Bus | None") -> "Callable[[LiveSurveyState], None]":
     from fleetmap.errors import LinkError
     from fleetmap.live_survey import live_key
     from fleetmap.messages import encode_message
+    from mapserver.live.ros2_view import Ros2View
+
+    view = None if viewers is None else Ros2View(viewers)
 
     def tell(state: "LiveSurveyState") -> None:
         if bus is not None:
             with suppress(LinkError):  # a survey goes on without those who look at it
                 bus.publish(live_key(state.site), encode_message(state), may_drop=True)
+        if view is not None:
+            with suppress(LinkError):
+                view.show(state)
 
     return tell

@@ -4,21 +4,28 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
 
+from fleetmap.bow import decode_vocabulary
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
-from fleetmap.errors import FleetmapError, UsageError
+from fleetmap.errors import FleetmapError
+from fleetmap.geometry import se3_inverse, skew
 from fleetmap.live_survey import LiveSurveyState
+from fleetmap.messages import EstimateMessage, Placement
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.build.build import BuildOptions, read_zones
-from mapserver.library import BuiltMap, build_map
+from mapserver.library import BuiltMap, build_map, open_map
 from mapserver.live.drives import Drive, DueFrame
-from mapserver.live.mapping_process import MOST_PLACES, NO_SKETCH, MappingProcess, thinning
-from mapserver.survey.live.live_map import LiveRig
+from mapserver.live.mapping_process import MOST_PLACES, NO_SKETCH, MakeMap, MappingProcess, thinning
+from mapserver.store import MapStore
+from mapserver.survey.live.frozen_map import FrozenMap, FrozenVersion
+from mapserver.survey.live.live_map import LiveMap
+from mapserver.survey.live.live_values import LiveEstimate, LiveRig
 from mapserver.survey.live.tracking import LiveTracking
 from mapserver.survey.loops.zones import Zones
 from mapserver.survey.settings import SurveySettings
@@ -31,12 +38,13 @@ _TELL_EVERY_S = 0.5
 
 @dataclass(frozen=True)
 class LiveRequest:
-    """A survey to follow. options: of the build at its end."""
+    """A survey to follow. options: of the build at its end. frozen: a version of the site to localize in; nothing is mapped then."""
 
     site: str
     store: Path
     settings: SurveySettings
     options: BuildOptions = field(default_factory=BuildOptions)
+    frozen: int | None = None
 
 
 class LiveFigures(NamedTuple):
@@ -71,10 +79,10 @@ class LiveFigures(NamedTuple):
 
 
 class LiveResult(NamedTuple):
-    """What the survey saw while it drove, and the draft that was made of it."""
+    """What the survey saw while it drove, and the draft that was made of it; None where it was localized in a frozen version."""
 
     figures: LiveFigures
-    built: BuiltMap
+    built: BuiltMap | None
 
 
 def run_live(
@@ -87,6 +95,10 @@ def run_live(
     survey = _Survey(request, drive, tell)
     survey.follow(is_stopped)
     console.print(survey.figures().words(), markup=False)
+    if request.frozen is not None:
+        drive.finish(survey.figures().frames)
+        survey.say("localized", words=survey.figures().words())
+        return LiveResult(survey.figures(), None)
     survey.say("adjusting")
     try:
         path, frames = drive.finish(survey.figures().frames)
@@ -104,11 +116,6 @@ class _Survey:
     """One survey while it drives, and what can be said of it."""
 
     def __init__(self, request: LiveRequest, drive: Drive, tell: Tell) -> None:
-        """Raises UsageError for a camera without depth."""
-        if drive.rectifier.camera.baseline_m == 0 and not drive.has_depth:
-            raise UsageError(
-                f"{drive.name}: one camera alone gives no depths before its survey is over, so that no map can grow; build it"
-            )
         self._request, self._drive, self._tell = request, drive, tell
         self._stamps_ns: list[int] = []
         self._most_behind = 0
@@ -117,22 +124,38 @@ class _Survey:
         self._worst = 1.0
         self._sketch = NO_SKETCH
         self._behind, self._failed, self._lag_s = 0, "", 0.0
+        self._scale_known = True
+        self._stamps_since: list[int] = []
+        self._localized = 0  # keyframes
 
     def follow(self, is_stopped: Callable[[], bool]) -> None:
         """Tracks all frames, each when it is due."""
         request, drive = self._request, self._drive
         rectifier, imu = drive.rectifier, drive.calibration.imu
-        rig = LiveRig(rectifier.camera, rectifier.body_from_cam, imu, rectifier.imu_minus_cam_s, drive.has_depth)
-        zones = Zones() if request.options.zones is None else read_zones(request.options.zones)
-        options = SurveyConfig(request.settings, default_vocabulary(), zones)
+        rig = LiveRig(
+            rectifier.camera,
+            rectifier.body_from_cam,
+            imu,
+            rectifier.imu_minus_cam_s,
+            drive.has_depth,
+            scale_known=rectifier.camera.baseline_m > 0 or imu is not None,
+        )
         warm_up = drive.warm_up()
         scratch = LiveTracking(drive.calibration, rectifier, request.settings)
         for frame in warm_up:
             scratch.handle(frame, ImuSamples.empty(), ())
-        with MappingProcess(options, rig, warm_up) as mapping:
+        with MappingProcess(self._maker(rig), rig, warm_up) as mapping:
             self._track(LiveTracking(drive.calibration, rectifier, request.settings), mapping, is_stopped)
             mapping.finish()
             self._look(mapping)
+
+    def _maker(self, rig: LiveRig) -> MakeMap:
+        """What makes the map that takes the keyframes."""
+        request = self._request
+        if request.frozen is not None:
+            return partial(FrozenMap, frozen_version(request.store, request.site, request.frozen), rig)
+        zones = Zones() if request.options.zones is None else read_zones(request.options.zones)
+        return partial(LiveMap, SurveyConfig(request.settings, default_vocabulary(), zones), rig)
 
     def _track(self, tracking: LiveTracking, mapping: MappingProcess, is_stopped: Callable[[], bool]) -> None:
         told_s = 0.0
@@ -152,9 +175,12 @@ class _Survey:
         if due.due_s is not None:
             self._latencies_s.append(time.monotonic() - due.due_s)
         self._stamps_ns.append(due.frame.stamp_ns)
+        self._stamps_since.append(due.frame.stamp_ns)
+        self._scale_known = tracking.scale_known
         self._worst = min(self._worst, tracked.quality)
         if tracked.keyframe is not None:
-            mapping.put(due.frame, tracked.keyframe)
+            mapping.put(due.frame, tracked.keyframe, self._stamps_since)
+            self._stamps_since = []
             self._qualities.append(self._worst)
             self._worst = 1.0
 
@@ -216,7 +242,43 @@ class _Survey:
                 loops_m=sketch.loops_m.astype("<f4").tobytes(),
                 loops=sketch.loops,
                 refused=sketch.refused,
+                revisits=list(sketch.revisits),
+                cells=sketch.quality.cells.astype("<f4").tobytes(),
+                missing=sketch.quality.missing,
+                findings=sketch.quality.findings,
+                estimate=self._estimate(sketch.estimate),
+                frozen=self._request.frozen,
+                scale_known=self._scale_known,
                 version=version,
                 words=(words or self._failed)[:2000],
             )
         )
+
+    def _estimate(self, found: LiveEstimate | None) -> EstimateMessage | None:
+        """As robots say it: of the base, with the odometry's continuous frame in the place of `odom`."""
+        if found is None:
+            return None
+        base_from_body = self._drive.calibration.base_from_body
+        body_from_base = se3_inverse(base_from_body)
+        odom_from_body, placed, cov = found.keyframe.frame_from_body, found.map_from_body, found.cov_rot_trans
+        if placed is not None and cov is not None:
+            lever = np.eye(6)
+            lever[3:, :3] = -skew(placed[:3, :3] @ body_from_base[:3, 3])
+            cov = lever @ cov @ lever.T
+        return EstimateMessage(
+            stamp_ns=self._stamps_ns[found.keyframe.number],
+            status=found.status.value,
+            cause=found.cause.value,
+            map_version=self._request.frozen,
+            odom_from_base=Placement.of(odom_from_body @ body_from_base),
+            map_from_odom=None if placed is None else Placement.of(placed @ se3_inverse(odom_from_body)),
+            cov_rot_trans=None if cov is None else tuple(cov.ravel().tolist()),
+        )
+
+
+def frozen_version(store: Path, site: str, version: int) -> FrozenVersion:
+    """A version of a store to localize in; StoreErrors where it is not there."""
+    found = open_map(store, site, version)
+    with MapStore.open(store) as maps:
+        vocabulary = decode_vocabulary(maps.blob(found.manifest.vocabulary.sha256))
+    return FrozenVersion(version, found.tiles, vocabulary, found.manifest.camera.focal_px)

@@ -6,28 +6,64 @@ import signal
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import NamedTuple, Self
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array
-from fleetmap.live_survey import MAX_ARRAY_BYTES, NO_PART, LivePart
+from fleetmap.live_survey import MAX_ARRAY_BYTES, NO_PART, LiveFinding, LiveMissing, LivePart, LiveRevisit
 from fleetmap.sensors.rectification import RectifiedFrame
-from mapserver.survey.live.live_map import LiveMap, LiveRig, NewKeyframe
-from mapserver.survey.survey_inputs import SurveyConfig
+from mapserver.live.drive_quality import DriveDoctor, covered_cells, missing_directions
+from mapserver.survey.live.live_values import LiveEstimate, LiveLoops, LiveParts, LiveRig, NewKeyframe
 
 _READY_WITHIN_S = 120.0  # a first start compiles kernels
 _STOP_WITHIN_S = 120.0  # for the keyframes that wait
 MOST_PLACES = MAX_ARRAY_BYTES // 8  # x and y as float32
+_LOOK_EVERY_S = 2.0  # at what the drive lacks
 _MAX_WAITING = 256  # pictures of keyframes, 0.6 MB each
+
+
+class GrowingMap(Protocol):
+    """What takes keyframes: a map that grows, or one that is frozen."""
+
+    @property
+    def map_from_body(self) -> Array:
+        """(K, 4, 4) of the keyframes so far."""
+
+    def __len__(self) -> int: ...
+
+    def add(self, frame: RectifiedFrame, new: NewKeyframe) -> None:
+        """One more keyframe."""
+
+    def points_map(self) -> Array:
+        """(N, 3) landmarks."""
+
+    def loops(self) -> LiveLoops:
+        """What became of revisits."""
+
+    def parts(self) -> LiveParts:
+        """What belongs together."""
+
+    def estimate(self) -> LiveEstimate | None:
+        """Where the newest keyframe is."""
+
+
+class Quality(NamedTuple):
+    """What the drive lacks, looked at now and then: see LiveSurveyState."""
+
+    cells: Array
+    missing: list[LiveMissing]
+    findings: list[LiveFinding]
 
 
 class MapSketch(NamedTuple):
     """The map after so many keyframes: their places (K, 2) and the number of each one's part, landmarks (N, 2) thinned evenly, believed
-    loops (L, 4), and how many candidates were refused, by verdict. parts: what lies to each other.
+    loops (L, 4), how many candidates were refused, by verdict, and the newest ones. parts: what lies to each other. estimate: of the
+    newest keyframe.
     """
 
     keyframes: int
@@ -38,21 +74,31 @@ class MapSketch(NamedTuple):
     loops_m: Array
     loops: int
     refused: dict[str, int]
+    revisits: tuple[LiveRevisit, ...]
+    estimate: LiveEstimate | None
+    quality: Quality
 
 
-NO_SKETCH = MapSketch(0, np.zeros((0, 2)), np.zeros(0, np.uint8), [], np.zeros((0, 2)), np.zeros((0, 4)), 0, {})
+_NO_QUALITY = Quality(np.zeros((0, 3)), [], [])
+NO_SKETCH = MapSketch(
+    0, np.zeros((0, 2)), np.zeros(0, np.uint8), [], np.zeros((0, 2)), np.zeros((0, 4)), 0, {}, (), None, _NO_QUALITY
+)
+
+
+MakeMap = Callable[[], GrowingMap]
+_Item = tuple[RectifiedFrame, NewKeyframe, list[int]]
 
 
 class MappingProcess:
     """The process and the threads that speak with it, from `with` until its end."""
 
-    def __init__(self, options: SurveyConfig, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...] = ()) -> None:
-        """warm_up: frames on which its kernels are loaded before the survey begins."""
+    def __init__(self, make: MakeMap, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...] = ()) -> None:
+        """make: the empty map, there. warm_up: frames on which its kernels are loaded before the survey begins."""
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
-        self._process = context.Process(target=_map, args=(theirs, options, rig, warm_up), daemon=True, name="mapping")
+        self._process = context.Process(target=_map, args=(theirs, make, rig, warm_up), daemon=True, name="mapping")
         self._theirs = theirs
-        self._waiting: queue.Queue[tuple[RectifiedFrame, NewKeyframe] | None] = queue.Queue()
+        self._waiting: queue.Queue[_Item | None] = queue.Queue()
         self._sent = 0
         self._latest, self._failed = NO_SKETCH, ""
         self._put_s: deque[float] = deque()
@@ -87,8 +133,11 @@ class MappingProcess:
         """Why no more keyframes are taken; empty while all is well."""
         return self._failed
 
-    def put(self, frame: RectifiedFrame, keyframe: NewKeyframe) -> None:
-        """One more keyframe; returns at once. A map that is too far behind is given up: the build at the end needs it not."""
+    def put(self, frame: RectifiedFrame, keyframe: NewKeyframe, stamps_ns: list[int]) -> None:
+        """One more keyframe, and the stamps of the frames since the one before; returns at once.
+
+        A map that is too far behind is given up: the build at the end does not need it.
+        """
         if self._failed:
             return
         if self.behind >= _MAX_WAITING:
@@ -99,7 +148,7 @@ class MappingProcess:
             return
         self._sent += 1
         self._put_s.append(time.monotonic())
-        self._waiting.put((frame, keyframe))
+        self._waiting.put((frame, keyframe, stamps_ns))
 
     def finish(self) -> None:
         """Waits for the keyframes that were put, at most some time, and ends the process."""
@@ -134,22 +183,28 @@ class MappingProcess:
                     self._failed = answer
                     return
                 self._latest = answer
-                self.longest_lag_s = max(self.longest_lag_s, time.monotonic() - self._put_s.popleft())
+                if self._put_s:  # the last sketch of all answers no keyframe
+                    self.longest_lag_s = max(self.longest_lag_s, time.monotonic() - self._put_s.popleft())
         except (EOFError, OSError):
             self._failed = self._failed or "the mapping process ended; the finished map is built all the same"
 
 
-def _map(pipe: Connection, options: SurveyConfig, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...]) -> None:
+def _map(pipe: Connection, make: MakeMap, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...]) -> None:
     """The process: answers every keyframe with the map that it makes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the survey's own process says when it is over
-    _warm(options, rig, warm_up)
-    growing = LiveMap(options, rig)
+    _warm(make(), warm_up)
+    growing, doctor, quality, looked_s = make(), DriveDoctor(rig), _NO_QUALITY, 0.0
     try:
         pipe.send("ready")
         while (item := pipe.recv()) is not None:
-            frame, keyframe = item
+            frame, keyframe, stamps_ns = item
             growing.add(frame, keyframe)
-            pipe.send(sketch_of(growing))
+            if time.monotonic() - looked_s >= _LOOK_EVERY_S:
+                looked_s = time.monotonic()
+                quality = _quality(growing, rig, doctor)
+            pipe.send(sketch_of(growing, quality))
+            doctor.take(frame, keyframe, stamps_ns)  # after the answer, which nobody waits for it with
+        pipe.send(sketch_of(growing, _quality(growing, rig, doctor)))
         pipe.send(None)
     except (EOFError, OSError):  # the survey was killed
         pass
@@ -157,9 +212,18 @@ def _map(pipe: Connection, options: SurveyConfig, rig: LiveRig, warm_up: tuple[R
         pipe.send(f"mapping failed ({type(error).__name__}: {error}); the finished map is built all the same")
 
 
-def _warm(options: SurveyConfig, rig: LiveRig, frames: tuple[RectifiedFrame, ...]) -> None:
+def _quality(growing: GrowingMap, rig: LiveRig, doctor: DriveDoctor) -> Quality:
+    """Directions and coverage of the part that is the map."""
+    labels = growing.parts().labels
+    largest = np.bincount(labels[labels >= 0]).argmax() if (labels >= 0).any() else 0
+    cells = covered_cells(growing.points_map(), MAX_ARRAY_BYTES // 12)
+    return Quality(
+        cells, missing_directions(growing.map_from_body[labels == largest] @ rig.body_from_cam), doctor.findings
+    )
+
+
+def _warm(scratch: GrowingMap, frames: tuple[RectifiedFrame, ...]) -> None:
     """Loads every kernel on some frames."""
-    scratch = LiveMap(options, rig)
     step = np.diag([1e-4] * 6)
     for number, frame in enumerate(frames):
         still = np.zeros(3)
@@ -170,7 +234,7 @@ def _warm(options: SurveyConfig, rig: LiveRig, frames: tuple[RectifiedFrame, ...
         )
 
 
-def sketch_of(growing: LiveMap) -> MapSketch:
+def sketch_of(growing: GrowingMap, quality: Quality = _NO_QUALITY) -> MapSketch:
     """What of a map is shown while it grows; no array is larger than a message may hold."""
     placed, found, parts = growing.map_from_body, growing.loops(), growing.parts()
     numbers = np.where((parts.labels < 0) | (parts.labels >= NO_PART), NO_PART, parts.labels).astype(np.uint8)
@@ -184,6 +248,9 @@ def sketch_of(growing: LiveMap) -> MapSketch:
         thinned(ends, 4),
         len(ends),
         found.refused,
+        found.newest,
+        growing.estimate(),
+        quality,
     )
 
 

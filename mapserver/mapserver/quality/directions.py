@@ -2,13 +2,13 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fleetmap.geometry import Array
-from fleetmap.mapformat import Tile
 from mapserver.quality.figures import TileDirections
 
 HEADINGS = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")  # E along x of `map`, N along y
@@ -19,7 +19,23 @@ _LEAST_M = 3.0  # places that look one way only and lie closer together than thi
 _NAMED = 2
 
 
-def tile_directions(tiles: Sequence[Tile]) -> list[TileDirections]:
+class Places(Protocol):
+    """A square with the places in it; a Tile is one."""
+
+    @property
+    def tile_x(self) -> int:
+        """Number along x."""
+
+    @property
+    def tile_y(self) -> int:
+        """Number along y."""
+
+    @property
+    def map_from_cam(self) -> Array:
+        """(K, 4, 4)."""
+
+
+def tile_directions(tiles: Sequence[Places]) -> list[TileDirections]:
     """What each tile with places was seen of, in the order of the tiles; places that look up or down are left out.
 
     One way only is judged for every place by those around it, over the borders of tiles: in a tile with two aisles, each driven

@@ -33,7 +33,7 @@ class LiveSurveys:
 
     def take(self, state: LiveSurveyState) -> None:
         """Keeps a state; LinkError for arrays that are none, of which nothing is kept."""
-        state.path(), state.part_numbers(), state.landmarks(), state.loop_lines()
+        state.path(), state.part_numbers(), state.landmarks(), state.loop_lines(), state.covered()
         with self._lock:
             self._states.pop(state.site, None)
             self._states[state.site] = state, self._clock_s()

@@ -21,17 +21,28 @@ class Ros2Source:
     """Subscribes to the topics, to image topics also with `/compressed` appended; the key names the type of a message."""
 
     def __init__(
-        self, bus: Bus, domain: int, topics: Topics, calibration: RigCalibration, *, images: bool = True
+        self,
+        bus: Bus,
+        domain: int,
+        topics: Topics,
+        calibration: RigCalibration,
+        *,
+        images: bool = True,
+        has_depth: bool = False,
     ) -> None:
-        """images: False takes everything but images, which come from another source."""
+        """images: False takes everything but images, which come from another source. has_depth: depth images in place of the right ones.
+
+        A calibration of one camera takes left images alone.
+        """
         self._bus, self._domain = bus, domain
-        self.calibration, self.has_depth = calibration, False
+        self.calibration, self.has_depth = calibration, has_depth
         self._pairs = StereoPairs()
         self._topics: list[tuple[str, Take]] = [(topics.wheel, _take_wheel), (topics.prior, _take_prior)]
         if calibration.imu is not None:
             self._topics.append((topics.imu, _take_imu))
         if images:
-            for side, topic in (("left", topics.left), ("right", topics.right)):
+            sides = [("left", topics.left), ("right", topics.depth if has_depth else topics.right)]
+            for side, topic in sides if has_depth or len(calibration.cameras) > 1 else sides[:1]:
                 self._topics += [(name, partial(self._take_image, side)) for name in (topic, f"{topic}/compressed")]
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
@@ -67,9 +78,13 @@ class Ros2Source:
         stamp_ns, _ = messages.header_of(payload)
         compressed = type_name == "sensor_msgs/CompressedImage"
         decode = messages.decode_compressed_image if compressed else messages.decode_image
-        frame: StoredFrame | None = self._pairs.add(side, stamp_ns, decode(payload, f"{side} at {stamp_ns}"))
+        image = decode(payload, f"{side} at {stamp_ns}")
+        if not self.has_depth and len(self.calibration.cameras) == 1:
+            intake.put_frame(StoredFrame(stamp_ns, image))
+            return
+        frame: StoredFrame | None = self._pairs.add(side, stamp_ns, image)
         if frame is not None:
-            intake.put_frame(frame)
+            intake.put_frame(StoredFrame(frame.stamp_ns, frame.left, None, frame.right) if self.has_depth else frame)
 
 
 def _take_imu(intake: Intake, _: str, payload: bytes) -> None:

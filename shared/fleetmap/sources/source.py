@@ -1,8 +1,9 @@
 """Sensor sources of a running robot. To add one: a file and a line in SOURCES."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import cv2
 
@@ -18,9 +19,10 @@ from fleetmap.sources.uvc import UvcSource, VideoMode
 
 
 class SourceSection(Section, frozen=True):
-    """Kind of the sensor source, and its options; a kind ignores those of others."""
+    """Kind of the sensor source, and its options; a kind ignores those of others. sensors: of topics, with the IMU if the rig has one."""
 
     kind: str = "ros2"
+    sensors: Literal["stereo", "rgbd", "mono"] = "stereo"
     calibration: str | None = None
     endpoint: str = "tcp/127.0.0.1:7447"
     domain: int = 0
@@ -56,10 +58,15 @@ def _recording(section: SourceSection, topics: Topics) -> Source:
 
 def _ros2(section: SourceSection, topics: Topics) -> Source:
     calibration = _calibration(section)
-    return Ros2Source(ZenohBus.connect(section.endpoint), section.domain, topics, calibration)
+    bus = ZenohBus.connect(section.endpoint)
+    return Ros2Source(bus, section.domain, topics, calibration, has_depth=section.sensors == "rgbd")
 
 
 def _uvc(section: SourceSection, topics: Topics) -> Source:
+    if section.sensors != "stereo":
+        raise UsageError(
+            f'[source] sensors = "{section.sensors}": a uvc camera sends pairs; take topics, kind = "ros2"'
+        )
     calibration = _calibration(section)
     device: int | str = int(section.device) if section.device.isdecimal() else section.device
     topic_source = Ros2Source(ZenohBus.connect(section.endpoint), section.domain, topics, calibration, images=False)
@@ -71,8 +78,11 @@ def _calibration(section: SourceSection) -> RigCalibration:
     if section.calibration is None:
         raise UsageError("[source] calibration is missing: a live camera needs the path of its Kalibr camchain")
     calibration = read_calibration(Path(section.calibration))
+    if section.sensors != "stereo":
+        return replace(calibration, cameras=calibration.cameras[:1])
     if len(calibration.cameras) < 2:
-        reason = f"{section.calibration} describes {len(calibration.cameras)} camera; a live source needs a stereo pair"
+        count = len(calibration.cameras)
+        reason = f"{section.calibration} describes {count} camera; a stereo source needs a pair: or set [source] sensors to rgbd or mono"
         raise UsageError(reason)
     return calibration
 

@@ -7,8 +7,11 @@ The draft at the end is that of `build`, to the byte, so that its accuracy is no
 
 import argparse
 import json
+import os
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,20 +25,53 @@ from mapserver.live import LiveRequest, RecordedDrive, run_live
 
 LATENCY_LIMIT_MS = 33.0  # of 0.99 of the frames
 LAG_LIMIT_S = 2.0  # from a keyframe to the map that shows it
+LOOP_LIMIT_S = 3.0  # from a revisit to the map that it has corrected
 
 
 def bench(recordings: Sequence[Path], frames: str = "::") -> Iterator[dict[str, Any]]:
     """A row for each recording, played at its own speed."""
     for path in recordings:
-        told: list[LiveSurveyState] = []
+        told: list[tuple[float, LiveSurveyState]] = []
         with tempfile.TemporaryDirectory() as folder, RecordingOptions(frames).open(path) as (opened, indices):
             settings = survey_settings(None, opened.sensor_set)
             drive = RecordedDrive(path, opened, indices, frames, 1.0)
             request = LiveRequest("live", Path(folder) / "store", settings, BuildOptions(frames=frames))
-            result = run_live(request, drive, told.append, lambda: False, Console(quiet=True))
-        report = result.built.report
-        row = {"recording": path.name, "states": len(told), "ate_rmse_m": report.get("ate_rmse_m")}
-        yield row | result.figures._asdict()
+            hear = partial(_hear, told)
+            result = run_live(request, drive, hear, lambda: False, Console(quiet=True))
+        assert result.built is not None
+        row = {"recording": path.name, "states": len(told), "ate_rmse_m": result.built.report.get("ate_rmse_m")}
+        row |= {"load": os.getloadavg()[0], "loop_visible_s": loop_visible_s(told)} | result.figures._asdict()
+        yield row | {"missed": missed(row)}
+
+
+def _hear(told: list[tuple[float, LiveSurveyState]], state: LiveSurveyState) -> None:
+    told.append((time.monotonic(), state))
+
+
+def loop_visible_s(told: Sequence[tuple[float, LiveSurveyState]]) -> float | None:
+    """Longest time from a revisit's frame to the first state that shows it as believed; None without a revisit."""
+    driving = [(heard_s, state) for heard_s, state in told if state.phase == "tracking" and state.frames]
+    if not driving:
+        return None
+    begin_s = min(heard_s - state.seconds for heard_s, state in driving)
+    first: dict[float, float] = {}
+    for heard_s, state in driving:
+        for revisit in state.revisits:
+            if revisit.verdict == "accepted":
+                first.setdefault(revisit.at_s, heard_s)
+    return max((heard_s - begin_s - at_s for at_s, heard_s in first.items()), default=None)
+
+
+def missed(row: dict[str, Any]) -> list[str]:
+    """Names of the targets that a row misses."""
+    found = []
+    if row["latency_ms"][1] > LATENCY_LIMIT_MS:
+        found.append("latency_ms")
+    if row["lag_s"] > LAG_LIMIT_S:
+        found.append("lag_s")
+    if row["loop_visible_s"] is not None and row["loop_visible_s"] > LOOP_LIMIT_S:
+        found.append("loop_visible_s")
+    return found + (["dropped"] if row["dropped"] else [])
 
 
 def main() -> None:

@@ -2,13 +2,15 @@
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fleetmap.bus import MemoryBus, MemoryHub, ZenohBus
+from fleetmap.errors import UsageError
 from fleetmap.recordings import StoredFrame, Topics
-from fleetmap.recordings.images import decode_frame, grey_image, png_image
+from fleetmap.recordings.images import decode_frame, depth_image, grey_image, png_image
 from fleetmap.recordings.ros2.keys import attachment, ros_key
 from fleetmap.recordings.ros2.messages import (
     encode_compressed_image,
@@ -17,9 +19,10 @@ from fleetmap.recordings.ros2.messages import (
     encode_odometry,
     encode_prior,
 )
-from fleetmap.sensors.samples import PositionPrior, WheelSample
+from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.ros2 import Ros2Source
+from fleetmap.sources.source import SourceSection, open_source
 from fleetmap.sources.stereo_pairs import StereoPairs
 from support.recordings.recording_samples import calibration
 
@@ -120,3 +123,32 @@ def test_pairs_are_by_stamp_and_the_lonely_are_counted() -> None:
     for number in range(20):
         assert pairs.add("right", (100 + 50 * number) * 1_000_000, image) is None
     assert pairs.unpaired == 13
+
+
+@pytest.mark.parametrize("has_depth", [False, True])
+def test_one_camera_needs_no_right_image(has_depth: bool) -> None:
+    hub, queue = MemoryHub(), intake()
+    depth_m = np.full((6, 8), 1.5, np.float32)
+    with MemoryBus(hub) as driver:
+        rig = replace(calibration(), cameras=calibration().cameras[:1])
+        source = Ros2Source(MemoryBus(hub), 7, TOPICS, rig, has_depth=has_depth)
+        source.subscribe(queue)
+        for topic, image in (("left", grey_image(LEFT)), ("right", grey_image(RIGHT)), ("depth", depth_image(depth_m))):
+            name = {"left": TOPICS.left, "right": TOPICS.right, "depth": TOPICS.depth}[topic]
+            driver.publish(ros_key(7, name, "sensor_msgs/Image"), encode_image(50, "cam0", image))
+        queue.put_imu(ImuSamples(np.array([10**9]), np.zeros((1, 3)), np.zeros((1, 3))))
+        found = queue.take(1.0).frame
+    assert isinstance(found, StoredFrame)
+    frame = decode_frame(found)
+    np.testing.assert_array_equal(frame.left, LEFT)
+    assert frame.right is None
+    if has_depth:
+        assert frame.depth_m is not None
+        np.testing.assert_array_equal(frame.depth_m, depth_m)
+    else:
+        assert frame.depth_m is None
+
+
+def test_a_uvc_camera_has_a_pair() -> None:
+    with pytest.raises(UsageError, match="uvc camera sends pairs"):
+        open_source(SourceSection(kind="uvc", sensors="mono"), TOPICS)

@@ -10,8 +10,8 @@ import pytest
 from playwright.sync_api import expect, sync_playwright
 
 from fleetmap.bus import ZenohBus
-from fleetmap.live_survey import LivePart, LiveSurveyState, live_key
-from fleetmap.messages import encode_message
+from fleetmap.live_survey import LiveFinding, LiveMissing, LivePart, LiveRevisit, LiveSurveyState, live_key
+from fleetmap.messages import EstimateMessage, Placement, encode_message
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import Served, chromium, serving, watch
 
@@ -52,6 +52,35 @@ def test_a_survey_is_followed_to_its_end(served: Served) -> None:
         assert page.locator("svg .line.accent").count() == 1
         expect(page.locator("body")).to_contain_text("<script>alert(1)</script>")
         expect(page.locator("table")).to_have_count(0)
+        found = msgspec.structs.replace(
+            STATE,
+            revisits=[
+                LiveRevisit(at_s=11.0, seen_s=1.0, verdict="accepted", words="verified", matches=88),
+                LiveRevisit(at_s=11.5, seen_s=2.0, verdict="rejected", words="too few or too crowded", matches=16),
+            ],
+            cells=np.array([[0, 0, 300], [1, 0, 40]], "<f4").tobytes(),
+            missing=[LiveMissing(x_m=7.0, y_m=0.0, heading="W", places=9)],
+            findings=[LiveFinding(name="sharpness", verdict="warn", words="blurred", at_s=10.0)],
+            estimate=EstimateMessage(
+                stamp_ns=5, status="DEGRADED", cause="odometry lost", map_version=None,
+                odom_from_base=Placement.of(np.eye(4)), map_from_odom=Placement.of(np.eye(4)),
+                cov_rot_trans=tuple((0.04 * np.eye(6)).ravel().tolist()),
+            ),
+            scale_known=False,
+        )  # fmt: skip
+        bus.publish(live_key("yard"), encode_message(found))
+        for words in (
+            "DEGRADED",
+            "σ 0.20 units",
+            "11.5°",
+            "50 m²",
+            "too few or too crowded",
+            "blurred",
+            "scale is not known",
+        ):
+            expect(page.locator("body")).to_contain_text(words)
+        assert page.locator("svg .cell.tile").count() == 2
+        assert page.locator("svg .mark.warn").count() == 1
         parts = [
             LivePart(start_s=0.0, end_s=5.0, keyframes=25, is_map=True),
             LivePart(start_s=8.0, end_s=12.0, keyframes=10, is_map=False),

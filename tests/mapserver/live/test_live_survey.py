@@ -26,6 +26,7 @@ from mapserver.live import LiveRequest, LiveResult, RecordedDrive, SensorDrive, 
 from mapserver.live.mapping_process import MappingProcess, thinned, thinning
 from mapserver.store import MapStore
 from support.recordings.recording_samples import make_sample, write_euroc
+from support.worlds import robot_world
 
 FRAMES = 24
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
@@ -68,6 +69,10 @@ def test_every_frame_is_tracked_and_every_keyframe_mapped(
     last = told[-1]
     assert len(last.path()) == last.keyframes == figures.keyframes > 2
     assert last.behind == 0
+    assert last.estimate is not None
+    assert last.estimate.status == "TRACKING"
+    assert last.covered()[:, 2].sum() > 100
+    assert {finding.verdict for finding in last.findings} <= {"ok", "warn", "fail"}
     assert (last.path()[:, 2] > 0.5).all()
     assert len(last.landmarks()) > 100
 
@@ -105,15 +110,56 @@ def test_a_drive_that_is_ended_early_is_built_as_far_as_it_went(recording: Path,
 
 
 def test_what_cannot_be_mapped_live_is_refused_before_it_begins(recording: Path, tmp_path: Path) -> None:
-    request = LiveRequest("lab", tmp_path / "maps", SETTINGS)
-    with pytest.raises(UsageError, match="one camera alone"), played(recording, use=SensorSet.MONO) as drive:
-        run_live(request, drive, print, lambda: False, QUIET)
     with pytest.raises(UsageError, match="100:200"), played(recording, "100:200"):
         pass
     for speed in (-1.0, float("nan")):
         with pytest.raises(UsageError, match="--speed"), played(recording, speed=speed):
             pass
     assert not (tmp_path / "maps").exists()
+
+
+def test_a_frozen_version_is_localized_in_and_stays_what_it_is(tmp_path: Path) -> None:
+    """The robot's own map of a painted room, driven through once more."""
+    path = write_euroc(tmp_path / "ride", robot_world.cycle())
+    with MapStore.open(tmp_path / "maps", create=True) as store:
+        version = robot_world.save(store, site="lab")
+    told: list[LiveSurveyState] = []
+    with played(path, ":50", speed=0) as drive:
+        request = LiveRequest("lab", tmp_path / "maps", SETTINGS, frozen=version)
+        result = run_live(request, drive, told.append, lambda: False, QUIET)
+    last = told[-1]
+    assert (result.built, last.phase, last.frozen, result.figures.mapping_failed) == (None, "localized", version, "")
+    assert last.estimate is not None
+    assert (last.estimate.status, last.estimate.map_version) == ("TRACKING", version)
+    assert last.estimate.map_from_odom is not None
+    placed = last.estimate.map_from_odom.target_from_source @ last.estimate.odom_from_base.target_from_source
+    stamps = [int(stamp) for stamp in robot_world.cycle().stamps_ns]
+    truth = robot_world.truth(stamps.index(last.estimate.stamp_ns))
+    assert np.linalg.norm(placed[:3, 3] - truth[:3, 3]) < 0.05
+    assert len(last.landmarks()) > 100
+    with MapStore.open(tmp_path / "maps") as store:
+        assert [info.version for info in store.versions("lab")] == [version]
+
+
+def test_a_version_that_is_not_there_is_refused_before_the_drive(recording: Path, tmp_path: Path) -> None:
+    MapStore.open(tmp_path / "maps", create=True).close()
+    with pytest.raises(FleetmapError, match="no site lab"), played(recording) as drive:
+        run_live(LiveRequest("lab", tmp_path / "maps", SETTINGS, frozen=7), drive, print, lambda: False, QUIET)
+    said = CliRunner().invoke(app, ["live", str(recording), "--site", "lab", "--store", str(tmp_path), "--frozen"])
+    assert isinstance(said.exception, UsageError)
+    assert "--map VERSION --frozen" in str(said.exception)
+
+
+@pytest.mark.parametrize("use", [SensorSet.MONO_INERTIAL, SensorSet.MONO])
+def test_one_camera_says_that_its_scale_is_not_known_yet(recording: Path, tmp_path: Path, use: SensorSet) -> None:
+    """The camera of this recording only turns: it sees no depth, so that nothing can be mapped, and says why."""
+    told: list[LiveSurveyState] = []
+    with pytest.raises(FleetmapError), played(recording, speed=0, use=use) as drive:
+        settings = survey_settings(None, use)
+        options = BuildOptions(use=use)
+        run_live(LiveRequest("lab", tmp_path / "maps", settings, options), drive, told.append, lambda: False, QUIET)
+    assert {state.scale_known for state in told[1:]} == {False}
+    assert told[-1].phase == "failed"
 
 
 def test_sensors_are_recorded_while_they_are_mapped(recording: Path, tmp_path: Path) -> None:

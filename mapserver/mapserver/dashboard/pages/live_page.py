@@ -1,11 +1,14 @@
 """The live page: a survey while it drives, its path, landmarks and revisits, and whether tracking and mapping keep up."""
 
+from typing import NamedTuple
+
 import numpy as np
 from fastapi import Request
 from markupsafe import Markup
 from nicegui import ui
 
 from fleetmap.geometry import Array
+from fleetmap.live_survey import COVERAGE_CELL_M
 from mapserver.dashboard import drawing, fleet_parts
 from mapserver.dashboard.drawing import Line, Mark
 from mapserver.dashboard.fleet_parts import Figure
@@ -22,6 +25,7 @@ _PHASES = {
     "tracking": ("warn", "The survey drives."),
     "adjusting": ("warn", "The drive is over; the finished map is made."),
     "stored": ("good", "The finished map is stored as a draft."),
+    "localized": ("good", "The drive is over; nothing was mapped."),
     "failed": ("bad", "No map could be made of it."),
 }
 
@@ -55,7 +59,8 @@ def _content(context: PageContext, survey: LiveSurvey | None) -> Markup:
             '<p class="quiet">No survey of this site was heard since the server started. '
             "<code>mapserver live RECORDING --site {} --store DIR --server ENDPOINT</code> shows one here.</p>"
         ).format(context.site)
-    return joined([_phase(context, survey), _figures(survey), _parts(survey), _picture(survey), _refused(survey)])
+    found = [_phase(context, survey), _scale(survey), _figures(survey), _parts(survey), _picture(survey)]
+    return joined([*found, _estimate(survey), _missing(survey), _revisits(survey), _refused(survey), _findings(survey)])
 
 
 def _phase(context: PageContext, survey: LiveSurvey) -> Markup:
@@ -75,13 +80,108 @@ def _figures(survey: LiveSurvey) -> Markup:
     way_m = float(np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1).sum()) if len(way) > 1 else 0.0
     answered = "as fast as it goes" if state.latency_ms is None else f"{state.latency_ms:.0f} ms"
     late = f"{state.late_frames} of {state.frames} frames later than the next one"
+    covered = state.covered()
     return fleet_parts.figures(
         [
             Figure("Recorded", f"{state.seconds:.0f} s", f"{state.frames} frames, {way_m:.0f} m"),
             Figure("Frames answered within", answered, late),
             Figure("Keyframes", str(state.keyframes), f"{state.behind} wait to be mapped"),
+            _where(survey),
+            Figure(
+                "Covered",
+                f"{len(covered) * COVERAGE_CELL_M**2:.0f} m²",
+                f"squares of {COVERAGE_CELL_M:g} m with landmarks",
+            ),
             Figure("Revisits", str(state.loops), f"{sum(state.refused.values())} candidates refused"),
         ]
+    )
+
+
+def _where(survey: LiveSurvey) -> Figure:
+    """Status and accuracy of the newest keyframe."""
+    estimate = survey.state.estimate
+    inside = "this map" if survey.state.frozen is None else f"version {survey.state.frozen}"
+    if estimate is None:
+        return Figure("Localization", "–", f"in {inside}")
+    return Figure("Localization", estimate.status, f"in {inside}, {_sigma(survey) or 'place unknown'}")
+
+
+def _sigma(survey: LiveSurvey) -> str:
+    """Standard deviations of position and heading in words; empty where none is known."""
+    estimate = survey.state.estimate
+    if estimate is None or estimate.cov_rot_trans is None:
+        return ""
+    variances = np.diag(np.reshape(estimate.cov_rot_trans, (6, 6)))
+    sigma = _units(survey)
+    return f"σ {np.sqrt(variances[3:5].max()):.2f} {sigma}, {np.degrees(np.sqrt(variances[2])):.1f}°"
+
+
+def _units(survey: LiveSurvey) -> str:
+    return "m" if survey.state.scale_known else "units"
+
+
+def _scale(survey: LiveSurvey) -> Markup:
+    if survey.state.scale_known:
+        return Markup("")
+    words = (
+        "The scale is not known: one camera alone does not show how long a metre is. With an IMU it is found once the robot has "
+        "speeded up, slowed down and turned; without one, lengths below are in a unit of the survey's own."
+    )
+    return notice("warn", words)
+
+
+def _estimate(survey: LiveSurvey) -> Markup:
+    estimate = survey.state.estimate
+    if estimate is None or estimate.map_from_odom is None:
+        return Markup("")
+    placed = estimate.map_from_odom.target_from_source @ estimate.odom_from_base.target_from_source
+    heading_deg = np.degrees(np.arctan2(placed[1, 0], placed[0, 0]))
+    where = f"{placed[0, 3]:.2f}, {placed[1, 3]:.2f}, {placed[2, 3]:.2f} {_units(survey)}"
+    rows = [("status", estimate.status), ("cause", estimate.cause or "–"), ("position", where)]
+    rows += [("heading", f"{heading_deg:.1f}°"), ("standard deviations", _sigma(survey) or "–")]
+    return joined([Markup("<h2>Where the robot is</h2>"), facts(rows)])
+
+
+def _missing(survey: LiveSurvey) -> Markup:
+    missing = survey.state.missing
+    if not missing:
+        return Markup("")
+    rows = [(f"{m.x_m:.0f}, {m.y_m:.0f}", m.heading, m.places) for m in missing]
+    head = ("around x, y (m)", "nothing looks", "places that were passed the other way")
+    words = "A robot that comes the other way finds nothing there. Drive these again, looking that way (E along x, N along y)."
+    title = Markup("<h2>Directions that are missing</h2><p>{}</p>").format(words)
+    return joined([title, table(head, rows, empty="", name="Missing directions")])
+
+
+def _revisits(survey: LiveSurvey) -> Markup:
+    tones = {"accepted": "good", "ambiguous": "warn"}
+    rows = [
+        (
+            f"{r.at_s:.0f} s",
+            f"{r.seen_s:.0f} s",
+            badge(tones.get(r.verdict, "bad"), r.verdict.replace("_", " ")),
+            r.matches,
+            r.words,
+        )
+        for r in reversed(survey.state.revisits)
+    ]
+    if not rows:
+        return Markup("")
+    head = ("at", "looks like", "", "matches", "why")
+    return joined([Markup("<h2>Newest revisits</h2>"), table(head, rows, empty="", name="Newest revisits")])
+
+
+def _findings(survey: LiveSurvey) -> Markup:
+    tones = {"ok": "good", "warn": "warn"}
+    rows = [
+        (f.name, badge(tones.get(f.verdict, "bad"), f.verdict), f.words, f"{f.at_s:.0f} s")
+        for f in survey.state.findings
+    ]
+    if not rows:
+        return Markup("")
+    head = ("check", "", "found", "at")
+    return joined(
+        [Markup("<h2>The doctor, while it drives</h2>"), table(head, rows, empty="", name="Findings of the doctor")]
     )
 
 
@@ -127,6 +227,14 @@ def _part_trails(way: Array, survey: LiveSurvey, width_m: float) -> Markup:
     )
 
 
+class _Square(NamedTuple):
+    """A covered square, as `drawing.coverage` takes a tile."""
+
+    x: int
+    y: int
+    landmarks: int
+
+
 def _picture(survey: LiveSurvey) -> Markup:
     """Landmarks, revisits and the path, coloured by how well it was tracked."""
     state = survey.state
@@ -137,22 +245,32 @@ def _picture(survey: LiveSurvey) -> Markup:
     marks = marks[((marks > low) & (marks < high)).all(axis=1)][:: max(1, len(marks) // _SHOWN_LANDMARKS)]
     seen = np.concatenate([way[:, :2], marks])
     low, high = seen.min(axis=0) - _MARGIN_M, seen.max(axis=0) + _MARGIN_M
-    plan = Plan((float(low[0]), float(low[1])), (float(high[0]), float(high[1])), 1.0, (), len(way), b"", ())
+    tiles = tuple(_Square(int(x), int(y), int(n)) for x, y, n in state.covered().tolist())
+    corners = (float(low[0]), float(low[1])), (float(high[0]), float(high[1]))
+    plan = Plan(*corners, COVERAGE_CELL_M, tiles, len(way), b"", ())
     size_m = max(plan.size_m) * 0.004
     loops = drawing.lines(Line((a, b), (c, d), "accent", "revisit") for a, b, c, d in lines.tolist())
     here = Mark(float(way[-1, 0]), float(way[-1, 1]), "good" if way[-1, 2] > 0 else "bad", "circle", "newest keyframe")
+    lacking = [
+        Mark(
+            m.x_m, m.y_m, "warn", "triangle", f"nothing looks {m.heading}: {m.places} places were passed the other way"
+        )
+        for m in state.missing
+    ]
     layers = [
+        drawing.coverage(plan),
         drawing.dots(marks, size_m),
         loops,
         _part_trails(way, survey, 3.5 * size_m),
         drawing.trail(way, size_m),
-        drawing.marks(plan, [here]),
+        drawing.marks(plan, [*lacking, here]),
         drawing.scale_bar(plan),
     ]
     picture = drawing.svg(plan, f"Survey of {state.site} so far", layers)
     return Markup(
         '<div class="planbox">{}</div><p class="quiet">The way is green where tracking is good, yellow where half of the points disagree, '
-        "red where it was lost. Thin lines are revisits. The finished map is adjusted anew.</p>"
+        "red where it was lost. Thin lines are revisits. Squares are covered, the fuller the more landmarks they hold; triangles lack a "
+        "direction. The finished map is adjusted anew.</p>"
     ).format(picture)
 
 

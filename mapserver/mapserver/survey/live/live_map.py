@@ -5,27 +5,28 @@ the loops put keyframes, and adjusts everything together.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, se3_inverse
-from fleetmap.live_survey import LivePart
-from fleetmap.sensors.calibration import ImuNoise
-from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
-from fleetmap.sensors.samples import ImuSamples
+from fleetmap.live_survey import LivePart, LiveRevisit
+from fleetmap.messages import Cause, Status
+from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.survey.bundle.bundle_adjustment import RelativeTerm, optimize
 from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState, apply_result, bundle_problem
 from mapserver.survey.keyframes.connected_components import MIN_SHARED, SigmaBetween, bridges
 from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, make_keyframe, without_pictures
-from mapserver.survey.loops.loops import LoopCloser, LoopVerdict, body_edge
+from mapserver.survey.live.live_values import LiveEstimate, LiveLoops, LiveParts, LiveRig, NewKeyframe, joined_imu
+from mapserver.survey.loops.loops import CONTRADICTED, LoopCloser, LoopRecord, LoopVerdict, body_edge
 from mapserver.survey.loops.parts import Parts
+from mapserver.survey.loops.sim3_loops import Sim3LoopCloser, gate_covariances, rigid, solve_scaled
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
 from mapserver.survey.survey_inputs import SurveyConfig
 from mapserver.survey.tracks.matching import PairFinder
+from mapserver.survey.tracks.mono_depths import MonoDepths, survey_camera
 from mapserver.survey.tracks.pairs import PairMatch
 from mapserver.survey.tracks.tracks import build_landmarks, tracks_of
 
@@ -34,65 +35,19 @@ _HELD = 2  # of the window's oldest, to which the others are tied
 _MIN_OBSERVATIONS = 30  # below which odometry alone places a keyframe
 _ROTATION_SIGMA_RAD = 0.02
 _LOST = 100.0  # times the variance of what pictures say, from which on odometry has lost a frame that they have not
+_NEWEST = 12
+_BELONGING = 2  # keyframes of which a map can be made
 _WIDE = 25.0  # factor on odometry's covariance where it only decides what pictures leave open
-
-
-@dataclass(frozen=True, slots=True)
-class LiveRig:
-    """What saw the survey: the rectified camera, its place on the body, the IMU's noise (None without one) and its clock."""
-
-    camera: StereoCamera
-    body_from_cam: Array
-    imu_noise: ImuNoise | None = None
-    imu_minus_cam_s: float = 0.0
-    is_depth_camera: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class NewKeyframe:
-    """A frame that the odometry chose.
-
-    frame_from_body (4, 4) in odometry's continuous frame; level_from_frame (3, 3) turns that upright as gravity is known now.
-    step_cov (6, 6): of the motion since the keyframe before, axes of that one, rotation first; None for the first. velocity_body_mps
-    and biases (3,); imu: samples since the keyframe before. variance_m2: of the odometry's position, summed over the axes.
-    """
-
-    number: int
-    frame_from_body: Array
-    level_from_frame: Array
-    step_cov: Array | None
-    velocity_body_mps: Array
-    gyro_bias_radps: Array
-    accel_bias_mps2: Array
-    inertial: bool = False
-    imu: ImuSamples = field(default_factory=ImuSamples.empty)
-    variance_m2: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class LiveLoops:
-    """Loops so far: ends (L, 2) of those that are believed, keyframe numbers; how many candidates were refused and for which reason."""
-
-    believed: NDArray[np.int64]
-    refused: dict[str, int]
-
-
-class LiveParts(NamedTuple):
-    """Parts of a survey that lost itself: labels (K,) number them in the order of time, -1 for keyframes that saw too little.
-
-    Only one can be the map, that with most keyframes: those that stay apart when the survey is over are left out.
-    """
-
-    labels: NDArray[np.int64]
-    spans: list[LivePart]
 
 
 class LiveMap:
     """Takes every keyframe in turn; what it makes of them depends on nothing else."""
 
     def __init__(self, options: SurveyConfig, rig: LiveRig) -> None:
-        """rig: a stereo or depth camera; one camera alone knows no depths before its survey is over."""
+        """rig: of one camera, features get their depths from the keyframes of the window."""
         self._options, self._settings, self._rig = options, options.settings, rig
+        self._camera = survey_camera(rig.camera)
+        self._depths = MonoDepths([], self._camera, options.settings) if rig.camera.baseline_m == 0 else None
         self._keyframes: list[Keyframe] = []
         self._news: list[NewKeyframe] = []
         self._chain_from_body: list[Array] = []  # adjusted in windows, moved by no loop
@@ -105,6 +60,7 @@ class LiveMap:
         self._believed: list[PoseEdge] = []
         self._map_from_body = np.zeros((0, 4, 4))
         self._closer: LoopCloser | None = None
+        self._marginals: GraphMarginals | None = None
         self._level = np.eye(3)
         self._seeing = np.zeros(0, bool)
         self._parts = Parts()  # by what keyframes share with their neighbours, and by odometry
@@ -134,7 +90,28 @@ class LiveMap:
         if contradicted:
             refused[LoopVerdict.REJECTED.value] = refused.get(LoopVerdict.REJECTED.value, 0) + contradicted
         ends = np.array([(edge.i, edge.j) for edge in self._believed], np.int64).reshape(-1, 2)
-        return LiveLoops(ends, refused)
+        return LiveLoops(ends, refused, self._newest())
+
+    def _newest(self) -> tuple[LiveRevisit, ...]:
+        best: dict[int, LoopRecord] = {}
+        for record in [] if self._closer is None else self._closer.loops.records:
+            if record.inliers > (best[record.i].inliers if record.i in best else 0):
+                best[record.i] = record
+        believed = {(edge.i, edge.j) for edge in self._believed}
+        return tuple(
+            LiveRevisit(
+                at_s=self._seconds(r.i),
+                seen_s=self._seconds(r.j),
+                verdict=r.verdict.value
+                if (r.i, r.j) in believed or r.verdict is not LoopVerdict.ACCEPTED
+                else "rejected",
+                words=r.reason[:200]
+                if (r.i, r.j) in believed or r.verdict is not LoopVerdict.ACCEPTED
+                else CONTRADICTED,
+                matches=r.inliers,
+            )
+            for _, r in sorted(best.items())[-_NEWEST:]
+        )
 
     def parts(self) -> LiveParts:
         """What belongs together: by neighbours, by odometry, and by the loops that are believed."""
@@ -156,6 +133,27 @@ class LiveMap:
         ]
         return LiveParts(labels, spans)
 
+    def estimate(self) -> LiveEstimate | None:
+        """Where the newest keyframe is in the map that grows, relative to its first one; LOST while its part is not that map."""
+        if len(self) < _BELONGING:
+            return None
+        parts, newest = self.parts(), len(self) - 1
+        label = int(parts.labels[newest])
+        span = parts.spans[label] if label >= 0 else None
+        if span is not None and not span.is_map:
+            return LiveEstimate(self._news[-1], Status.LOST, Cause.NO_MATCH, None, None)
+        if not parts.spans:
+            return LiveEstimate(self._news[-1], Status.INITIALISING, Cause.NONE, None, None)
+        is_sure = span is not None and bool(self._seeing[newest])
+        kept = next(n for n, each in enumerate(parts.spans) if each.is_map)
+        first, placed = int(np.flatnonzero(parts.labels == kept)[0]), self.map_from_body[newest]
+        cov = np.zeros((6, 6))
+        if self._marginals is not None and first != newest:
+            turn = np.kron(np.eye(2), placed[:3, :3])
+            cov = turn @ self._marginals.relative_cov(newest, first) @ turn.T
+        status = (Status.TRACKING, Cause.NONE) if is_sure else (Status.DEGRADED, Cause.ODOMETRY)
+        return LiveEstimate(self._news[-1], *status, placed, np.asarray(cov))
+
     def _seconds(self, k: int) -> float:
         return round((self._keyframes[k].stamp_ns - self._keyframes[0].stamp_ns) * 1e-9, 3)
 
@@ -165,6 +163,8 @@ class LiveMap:
         self._keyframes.append(keyframe)
         if len(self._keyframes) > _WINDOW:
             self._keyframes[-_WINDOW - 1] = without_pictures(self._keyframes[-_WINDOW - 1])
+            if self._depths is not None:
+                self._depths.release(len(self._keyframes) - _WINDOW - 1)
         self._news.append(new)
         self._level = new.level_from_frame
         self._points_body.append(np.zeros((0, 3)))
@@ -181,10 +181,12 @@ class LiveMap:
         self._walked_m2.append(self._walked_m2[-1] + float(np.trace(new.step_cov[3:, 3:])))
         self._chain_from_body.append(self._chain_from_body[-1] @ motion)
         first = max(0, len(self._keyframes) - _WINDOW)
+        self._place_features(first)
         found = self._matched(first)
         self._pairs = [pair for pair in self._pairs if pair.i >= first] + found
         self._step_covs.append(self._step_cov(new.step_cov, found))
         self._adjust(first)
+        self._place_features(first)
         self._follow(first)
         self._connect(first)
         self._close()
@@ -193,7 +195,7 @@ class LiveMap:
         """The newest keyframe with those of the window that see the same."""
         window, newest = self._keyframes[first:], len(self._keyframes) - 1
         settings, rig = self._settings.pairs, self._rig
-        finder = PairFinder(window, rig.camera, rig.body_from_cam, settings)
+        finder = PairFinder(window, self._camera, rig.body_from_cam, settings)
         chain_from_body = np.array(self._chain_from_body[first:])
         wanted = [p for p in finder.candidates(chain_from_body, previous=settings.previous) if p[1] == newest - first]
 
@@ -207,6 +209,13 @@ class LiveMap:
             wanted, chain_from_body, allowed_m, rotation_sigma_rad=sigma, progress=lambda _number: None
         )
         return [replace(pair, i=pair.i + first, j=pair.j + first) for pair in found]
+
+    def _place_features(self, first: int) -> None:
+        """Depths of one camera's features, from where the window's keyframes are now."""
+        if self._depths is not None:
+            self._depths.grow(self._keyframes)
+            placed = np.array(self._chain_from_body)
+            self._keyframes[first:] = self._depths.keyframes_at(placed, self._rig.body_from_cam, first)
 
     def _step_cov(self, by_odometry: Array, found: Sequence[PairMatch]) -> Array:
         """(6, 6) of the step to the newest keyframe: a frame that odometry lost may be tied to the one before by what both see."""
@@ -269,13 +278,13 @@ class LiveMap:
             accel_bias_mps2=np.array([new.accel_bias_mps2 for new in news]),
             relative=[] if inertial else self._relative(first),
         )
-        posed = PosedKeyframes(self._keyframes[first:], level_from_body, rig.body_from_cam, rig.camera)
+        posed = PosedKeyframes(self._keyframes[first:], level_from_body, rig.body_from_cam, self._camera)
         pairs = [replace(pair, i=pair.i - first, j=pair.j - first) for pair in self._pairs]
         return SurveyState(
             stamps_ns=np.array([keyframe.stamp_ns for keyframe in posed.keyframes], np.int64),
             map_from_body=level_from_body,
             body_from_cam=rig.body_from_cam,
-            camera=rig.camera,
+            camera=self._camera,
             motion=motion,
             landmarks=build_landmarks(posed, tracks_of(pairs), self._settings),
             is_depth_camera=rig.is_depth_camera,
@@ -320,12 +329,14 @@ class LiveMap:
     def _close(self) -> None:
         """Looks for revisits of the newest keyframe; with one more loop the pose graph places all keyframes anew."""
         newest, rig = len(self._keyframes) - 1, self._rig
-        posed = PosedKeyframes(self._keyframes, self._map_from_body, rig.body_from_cam, rig.camera)
+        posed = PosedKeyframes(self._keyframes, self._map_from_body, rig.body_from_cam, self._camera)
         matched = [(pair.i, pair.j) for pair in self._pairs if pair.j == newest]
         learned = [] if self._closer is None else self._closer.learned
-        marginals = GraphMarginals(self._map_from_body, [*self._chain, *learned])
+        marginals = GraphMarginals(self._map_from_body, [*self._known(), *learned])
+        self._marginals = marginals
         if self._closer is None:
-            self._closer = LoopCloser(posed, self._options, marginals, set(matched), parts=self._joined)
+            kind = LoopCloser if self._rig.scale_known else Sim3LoopCloser
+            self._closer = kind(posed, self._options, marginals, set(matched), parts=self._joined)
             self._closer.close(0)
         else:
             self._closer.grow(posed, marginals, matched)
@@ -333,15 +344,20 @@ class LiveMap:
         edges = self._closer.loops.edges
         if len(edges) > len(self._loops):
             self._loops = list(edges)
-            solved = optimize_pose_graph(self._closer.begin, [*self._chain, *edges])
-            self._map_from_body = solved.map_from_body
-            self._believed = [e for e, w in zip(edges, solved.loop_weights, strict=True) if w >= 0.5]
+            self._map_from_body, weights = self._solved(self._closer, edges)
+            self._believed = [e for e, w in zip(edges, weights, strict=True) if w >= 0.5]
 
+    def _known(self) -> list[PoseEdge]:
+        """The chain as the position gate must see it."""
+        if self._rig.scale_known:
+            return self._chain
+        return gate_covariances(self._chain, self._settings.monocular.scale_walk)
 
-def joined_imu(parts: Sequence[ImuSamples]) -> ImuSamples:
-    """Samples of parts that follow each other."""
-    return ImuSamples(
-        np.concatenate([part.stamps_ns for part in parts]),
-        np.concatenate([part.gyro_radps for part in parts]),
-        np.concatenate([part.accel_mps2 for part in parts]),
-    )
+    def _solved(self, closer: LoopCloser, edges: list[PoseEdge]) -> tuple[Array, Array]:
+        """(K, 4, 4) of the keyframes by chain and loops, and the loops' weights."""
+        if isinstance(closer, Sim3LoopCloser):
+            walk = self._settings.monocular.scale_walk
+            scaled = solve_scaled(closer.begin, self._chain, edges, closer.scales, walk)
+            return rigid(scaled), scaled.loop_weights
+        solved = optimize_pose_graph(closer.begin, [*self._chain, *edges])
+        return solved.map_from_body, solved.loop_weights

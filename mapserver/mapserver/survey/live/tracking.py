@@ -11,9 +11,11 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 from mapserver.survey.bundle.odometry_factors import gained_covariance
-from mapserver.survey.live.live_map import NewKeyframe, joined_imu
+from mapserver.survey.live.live_values import NewKeyframe, joined_imu
 from mapserver.survey.odometry_pass import ContinuedCovariance, OdometryRun
 from mapserver.survey.settings import SurveySettings
+
+_TORN_M2 = 100.0
 
 
 class Tracked(NamedTuple):
@@ -30,11 +32,12 @@ class Tracked(NamedTuple):
 
 
 class _Before(NamedTuple):
-    """The last keyframe: its covariance and rotation in odom axes, and its place."""
+    """The last keyframe: its covariance and rotation in odom axes, its place, and what was torn until then."""
 
     covariance: Array
     odom_from_body: Array
     position_m: Array
+    torn_m2: float
 
 
 class LiveTracking:
@@ -42,6 +45,9 @@ class LiveTracking:
 
     def __init__(self, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings) -> None:
         self._run = OdometryRun(calibration, rectifier, settings)
+        self._is_single, self._has_imu = rectifier.camera.baseline_m == 0, calibration.imu is not None
+        self._torn_m2 = 0.0  # variance of what lies between runs of one camera
+        self.scale_known = not self._is_single
         self._continued = ContinuedCovariance()
         self._before: _Before | None = None
         self._imu: list[ImuSamples] = []
@@ -52,11 +58,22 @@ class LiveTracking:
         self._imu.append(imu)
         estimate, covariance = tracked.estimate, self._continued.handle(tracked.estimate)
         self._turn(estimate)
+        self.scale_known = estimate.scale_known and (self._has_imu or not self._is_single)
         keyframe = None
-        if tracked.is_keyframe:
+        if tracked.is_keyframe and self._has_place(estimate):
             keyframe = self._keyframe(tracked.number, estimate, covariance, tracked.frame_from_body)
         quality = 0.0 if estimate.status is OdometryStatus.DEGRADED else float(estimate.inlier_share)
         return Tracked(tracked.frame, tracked.frame_from_body, quality, keyframe)
+
+    def _has_place(self, estimate: OdometryEstimate) -> bool:
+        """Whether a frame lies to those before: of one camera not until it has started, with an IMU not until the scale is known."""
+        if not self._is_single or (
+            estimate.status is not OdometryStatus.INITIALISING and estimate.scale_known == self._has_imu
+        ):
+            return True
+        if self._before is not None and not self._has_imu:
+            self._torn_m2 += _TORN_M2  # a new start has a scale of its own
+        return False
 
     def _turn(self, estimate: OdometryEstimate) -> None:
         """The last keyframe's values in the axes that odom has now."""
@@ -74,8 +91,10 @@ class LiveTracking:
         if before is not None:
             way_m = float(np.linalg.norm(frame_from_body[:3, 3] - before.position_m))
             step_cov = gained_covariance(covariance - before.covariance, before.odom_from_body, way_m)
+            if self._torn_m2 > before.torn_m2:
+                step_cov = step_cov + _TORN_M2 * np.eye(6)
         rotation = estimate.odom_from_body[:3, :3]
-        self._before = _Before(covariance, rotation, frame_from_body[:3, 3])
+        self._before = _Before(covariance, rotation, frame_from_body[:3, 3], self._torn_m2)
         self._imu = []
         return NewKeyframe(
             number=number,
@@ -87,5 +106,5 @@ class LiveTracking:
             accel_bias_mps2=estimate.accel_bias_mps2,
             inertial=estimate.inertial,
             imu=imu,
-            variance_m2=float(np.trace(covariance[3:, 3:])),
+            variance_m2=float(np.trace(covariance[3:, 3:])) + self._torn_m2,
         )

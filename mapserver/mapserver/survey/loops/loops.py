@@ -29,6 +29,7 @@ _WORTH_LEARNING = 1.0  # variance against the measurement's: below, a loop chang
 # learned, as they cost memory with their square; what it does not learn leaves it wider, and the next loop can still be learned.
 _WELL_KNOWN_COV = np.diag([0.005**2] * 3 + [0.05**2] * 3)
 _LEARNED_PER_DOUBLING = 64
+CONTRADICTED = "contradicts the other loops in the pose graph"
 _WAITING = "it would join two parts of the survey, and too few keyframes over a metre agree with it yet"
 
 
@@ -77,11 +78,10 @@ class Loops:
     def without_outliers(self, weights: Array) -> "Loops":
         """The same with every loop rejected whose pose-graph weight is below one half; one weight for each edge."""
         outliers = {(e.i, e.j) for e, weight in zip(self.edges, weights, strict=True) if weight < 0.5}
-        reason = "contradicts the other loops in the pose graph"
         records = list(self.records)
         for n, r in enumerate(records):
             if (r.i, r.j) in outliers and r.verdict is LoopVerdict.ACCEPTED:
-                records[n] = replace(r, verdict=LoopVerdict.REJECTED, reason=reason)
+                records[n] = replace(r, verdict=LoopVerdict.REJECTED, reason=CONTRADICTED)
         return Loops(records, [e for e in self.edges if (e.i, e.j) not in outliers])
 
 

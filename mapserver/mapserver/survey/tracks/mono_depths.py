@@ -10,7 +10,7 @@ from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.odometry.mono.two_view import triangulate_pair
 from fleetmap.sensors.rectification import RGBD_BASELINE_M, StereoCamera
-from mapserver.survey.keyframes.keyframes import Keyframe
+from mapserver.survey.keyframes.keyframes import Keyframe, without_pictures
 from mapserver.survey.settings import SurveySettings
 
 
@@ -23,24 +23,37 @@ class MonoDepths:
     """Places features of single-camera keyframes by triangulation with neighbours in time; matches are looked for once."""
 
     def __init__(self, keyframes: Sequence[Keyframe], camera: StereoCamera, settings: SurveySettings) -> None:
-        self._keyframes, self._camera, self._settings = keyframes, camera, settings
-        reach, descriptors = settings.monocular.depth_views, [k.features.descriptors for k in keyframes]
-        pairs = [(i, j) for j in range(len(keyframes)) for i in range(max(0, j - reach), j)]
-        self._matches = {
-            (i, j): match_mutual(descriptors[i], descriptors[j], settings.pairs.max_distance, settings.pairs.ratio)
-            for i, j in pairs
-        }
+        self._camera, self._settings = camera, settings
+        self._keyframes: list[Keyframe] = []
+        self._matches: dict[tuple[int, int], NDArray[np.int64]] = {}
+        self.grow(keyframes)
 
-    def keyframes_at(self, map_from_body: Array, body_from_cam: Array) -> list[Keyframe]:
-        """The keyframes with disparities and points of those features that several views agree on, the others without."""
+    def grow(self, keyframes: Sequence[Keyframe]) -> None:
+        """Takes a longer chain, of which those that are known come first."""
+        known, pairs = len(self._keyframes), self._settings.pairs
+        self._keyframes += keyframes[known:]
+        for j in range(known, len(self._keyframes)):
+            for i in range(max(0, j - self._settings.monocular.depth_views), j):
+                a, b = (self._keyframes[k].features.descriptors for k in (i, j))
+                self._matches[i, j] = match_mutual(a, b, pairs.max_distance, pairs.ratio)
+
+    def release(self, k: int) -> None:
+        """Lets go of a keyframe's pictures."""
+        self._keyframes[k] = without_pictures(self._keyframes[k])
+
+    def keyframes_at(self, map_from_body: Array, body_from_cam: Array, first: int = 0) -> list[Keyframe]:
+        """The keyframes from `first` on with disparities and points of those features that several of them agree on, the others without."""
         map_from_cam = map_from_body @ body_from_cam
         found: list[list[Array]] = [[] for _ in self._keyframes]  # rows of feature, inverse depth, its sigma
-        for (i, j), match in self._matches.items():
-            rows_i, rows_j = self._measure(i, j, match, se3_inverse(map_from_cam[j]) @ map_from_cam[i])
-            found[i].append(rows_i)
-            found[j].append(rows_j)
+        for j in range(first, len(self._keyframes)):
+            for i in range(max(first, j - self._settings.monocular.depth_views), j):
+                j_from_i = se3_inverse(map_from_cam[j]) @ map_from_cam[i]
+                rows_i, rows_j = self._measure(i, j, self._matches[i, j], j_from_i)
+                found[i].append(rows_i)
+                found[j].append(rows_j)
         return [
-            self._with_depths(k, np.concatenate(rows) if rows else np.zeros((0, 3))) for k, rows in enumerate(found)
+            self._with_depths(k, np.concatenate(found[k]) if found[k] else np.zeros((0, 3)))
+            for k in range(first, len(self._keyframes))
         ]
 
     def _measure(self, i: int, j: int, match: NDArray[np.int64], j_from_i: Array) -> tuple[Array, Array]:

@@ -14,7 +14,8 @@ from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, SensorSet
 from mapserver.config import survey_settings
-from mapserver.survey.live.live_map import LiveMap, LiveRig
+from mapserver.survey.live.live_map import LiveMap
+from mapserver.survey.live.live_values import LiveRig
 from mapserver.survey.live.tracking import LiveTracking
 from mapserver.survey.odometry_pass import SampleFeed
 from mapserver.survey.survey_inputs import SurveyConfig

@@ -11,7 +11,8 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import SensorSet
 from mapserver.build.survey_recordings import RecordingOptions
 from mapserver.config import survey_settings
-from mapserver.survey.live.live_map import LiveMap, LiveParts, LiveRig
+from mapserver.survey.live.live_map import LiveMap
+from mapserver.survey.live.live_values import LiveParts, LiveRig
 from mapserver.survey.live.tracking import LiveTracking
 from mapserver.survey.odometry_pass import SampleFeed
 from mapserver.survey.pipeline import Survey, survey
