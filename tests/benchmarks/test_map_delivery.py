@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.fleet import bench_service, bench_trust
+from benchmarks.fleet import bench_bus_access, bench_service, bench_trust
 from benchmarks.maps import bench_map_budget, bench_map_fuzz
 from benchmarks.survey import bench_nights
 from support.recordings.realdata import real_data
@@ -36,6 +36,20 @@ def test_signed_lists_cost_little(tmp_path: Path) -> None:
     assert memory["mib"] <= 20
     assert robot["first contact"]["bytes"] <= 4000
     assert max(costs["cpu_ms"] for costs in robot.values()) <= 10
+
+
+def test_enrolled_robots_cost_little(tmp_path: Path) -> None:
+    found = bench_bus_access.opening_and_revoking(tmp_path / "many", 1000, 12)
+    ways = {
+        has_tls: bench_bus_access.delivery_s(tmp_path / str(has_tls), 50, 8 << 20, has_tls=has_tls)
+        for has_tls in (False, True)
+    }
+    print(json.dumps({"1000 robots": found, "50 robots x 8 MiB, s": ways}))
+    assert found["open_s"] <= 1
+    assert found["mib"] <= 100
+    assert found["revoked_is_out_s"] <= 2
+    assert found["others_again_s"] <= 2
+    assert found["revoked_stays_out"]
 
 
 def test_a_hundred_thousand_hostile_inputs() -> None:

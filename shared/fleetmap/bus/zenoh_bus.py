@@ -344,7 +344,7 @@ _COMMON: dict[str, Any] = {
     "connect/endpoints": [],
     "connect/timeout_ms": -1,
     "connect/exit_on_failure": False,
-    "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2},
+    "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
     "scouting/delay": 1,
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
