@@ -51,7 +51,7 @@ def test_a_survey_is_followed_to_its_end(served: Served) -> None:
         assert [page.locator(f"svg .trail.{tone}").count() for tone in ("good", "warn", "bad")] == [1, 1, 1]
         assert page.locator("svg .line.accent").count() == 1
         expect(page.locator("body")).to_contain_text("<script>alert(1)</script>")
-        expect(page.locator("table")).to_have_count(0)
+        expect(page.get_by_role("table")).to_have_count(0)
         found = msgspec.structs.replace(
             STATE,
             revisits=[
@@ -87,7 +87,7 @@ def test_a_survey_is_followed_to_its_end(served: Served) -> None:
         ]
         lost = msgspec.structs.replace(STATE, parts=parts, part=bytes([0] * 25 + [255] * 5 + [1] * 10))
         bus.publish(live_key("yard"), encode_message(lost))
-        expect(page.locator("table")).to_contain_text("not joined")
+        expect(page.get_by_role("table", name="Parts of the survey")).to_contain_text("not joined")
         expect(page.locator(".notice.bad")).to_contain_text("2 parts lie apart")
         assert page.locator("svg g.part").count() == 2
         finished = msgspec.structs.replace(STATE, phase="stored", version=1, words="")
