@@ -189,7 +189,7 @@ class Fleet:
 
     def __init__(self, endpoint: str, clients: int, processes: int) -> None:
         shares = [len(part) for part in np.array_split(np.arange(clients), processes)]
-        program = "from benchmarks.service_clients import main; main()"
+        program = "from benchmarks.fleet.service_clients import main; main()"
         self._processes = [
             subprocess.Popen(
                 [sys.executable, "-c", program, endpoint, str(1000 * number), str(share)],
