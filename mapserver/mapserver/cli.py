@@ -18,6 +18,7 @@ from mapserver.commands.nightly import nightly
 from mapserver.commands.prepare import prepare
 from mapserver.commands.releases.inspect import diff, inspect, versions
 from mapserver.commands.releases.promote import promote, publish, rollback
+from mapserver.commands.releases.signer import signer
 from mapserver.commands.serve import serve
 from mapserver.commands.store.audit import audit
 from mapserver.commands.store.export import export, import_
@@ -57,6 +58,7 @@ COMMANDS: Commands = {
     "audit": audit,
     "prepare": prepare,
     "trust": TRUST,
+    "signer": signer,
     "config": CONFIG,
 }
 

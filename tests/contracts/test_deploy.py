@@ -1,7 +1,10 @@
 """What is deployed: a file and no name of an index, rights for one user, memory that ends; pickles in one module alone. Rows 28, 31, 32."""
 
 import ast
+import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -64,3 +67,33 @@ def test_pickles_are_opened_in_one_module_alone() -> None:
     found = [path.name for folder in PACKAGES for path in folder.rglob("*.py") if opens_pickles(path)]
     assert found == ["worker.py"]
     assert opens_pickles(Path(__file__).parents[1] / "support/storage/store_faults.py"), "the control"
+
+
+def lock_of(tmp_path: Path, *entries: dict[str, object]) -> subprocess.CompletedProcess[str]:
+    report = tmp_path / "report.json"
+    report.write_text(json.dumps({"install": list(entries)}))
+    words = [sys.executable, str(REPOSITORY / "deploy" / "lock_report.py"), str(report)]
+    return subprocess.run(words, capture_output=True, text=True, check=False)
+
+
+def entry(name: str, sha256: str | None) -> dict[str, object]:
+    hashes = {} if sha256 is None else {"hashes": {"sha256": sha256}}
+    return {"metadata": {"name": name, "version": "1.0"}, "download_info": {"archive_info": hashes}}
+
+
+def test_a_lock_names_a_hash_for_every_library(tmp_path: Path) -> None:
+    done = lock_of(tmp_path, entry("numpy", "a" * 64), entry("fleetmap", None), entry("cffi", "b" * 64))
+    assert done.stdout == f"cffi==1.0 --hash=sha256:{'b' * 64}\nnumpy==1.0 --hash=sha256:{'a' * 64}\n"
+    without = lock_of(tmp_path, entry("numpy", None))
+    assert (without.returncode, without.stdout) == (1, "")
+    assert "came without a SHA-256" in without.stderr
+    assert lock_of(tmp_path, entry("fleetmap", None)).returncode == 1
+
+
+def test_what_is_deployed_is_installed_by_hash() -> None:
+    """From a lock that the deployer made: no file of the project names an index or the files of one."""
+    for unit in ("mapserver.service", "locclient.service"):
+        assert "--require-hashes" in (REPOSITORY / "deploy" / unit).read_text("utf-8"), unit
+    places = [*(REPOSITORY / "deploy").iterdir(), REPOSITORY / "constraints.txt", REPOSITORY / "pyproject.toml"]
+    for path in places:
+        assert "index-url" not in path.read_text("utf-8", "replace"), path

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from fleetmap.bus import Bus
 from fleetmap.errors import LinkError, UnreachableError
-from fleetmap.messages import ChunkRequest, Part, decode_message, encode_message
+from fleetmap.messages import PART_BYTES, ChunkRequest, Part, decode_message, encode_message
 
 _RETRY_S = 0.2
 _MAX_INCOMPLETE = 8
@@ -28,7 +28,8 @@ class ChunkReader:
     def read(self, key: str, *, max_bytes: int) -> bytes:
         """All bytes under `key`, not yet verified.
 
-        Raises UnreachableError where nobody answers, LinkError for a refusal, for more than max_bytes and for nonsense.
+        Raises UnreachableError where nobody answers, LinkError for a refusal, for more than max_bytes, for parts that are not full
+        and for nonsense.
         """
         data = self._incomplete.pop(key, bytearray())
         try:
@@ -48,8 +49,12 @@ class ChunkReader:
             raise LinkError(f"{key} has {chunk.total_bytes} bytes where at most {max_bytes} are expected")
         if chunk.offset != offset or offset + len(chunk.data) > chunk.total_bytes:
             raise LinkError(f"{key}: asked from byte {offset} on, got {len(chunk.data)} from {chunk.offset} on")
-        if not chunk.data and chunk.total_bytes > offset:
-            raise LinkError(f"{key}: nothing from byte {offset} on, though there are {chunk.total_bytes}")
+        # Fewer bytes at a time would let whoever answers keep a robot busy for ever: so a part must come within each patience.
+        if len(chunk.data) < min(PART_BYTES, chunk.total_bytes - offset):
+            raise LinkError(
+                f"{key}: {len(chunk.data)} bytes from byte {offset} on of {chunk.total_bytes}, where a part has {PART_BYTES}; "
+                "do both sides run the same fleetmap, and is it the server that answers?"
+            )
         return chunk
 
     def _request(self, key: str, request: bytes) -> Part:

@@ -12,11 +12,13 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessColl
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from fleetmap.errors import StateError, StoreError
 from fleetmap.messages import Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.kpis import Counters
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS, calibration_figures
 from mapserver.store import MapStore
+from mapserver.trust.status import trust_status
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _SEEN_WITHIN_S = 60.0
@@ -54,6 +56,11 @@ _SITE_ROBOTS: tuple[tuple[str, str, Callable[[list[RobotStatus]], float]], ...] 
         "clock_skew_max_seconds",
         "The most that a robot's clock is wrong.",
         lambda robots: max(map(_skew_s, robots), default=0.0),
+    ),
+    (
+        "map_word_hours_max",
+        "The oldest proof of what may be run, of robots heard in the last minute.",
+        lambda robots: max(map(_word_hours, _seen(robots)), default=0.0),
     ),
 )
 
@@ -107,6 +114,7 @@ class _FleetCollector(Collector):
         trials = [((info.site,), tried.get(info.site, 0)) for info in sites]
         yield _filled(_gauge("site_canary_version", "Version that some robots try, 0 for none."), trials)
         yield from self._robots([info.site for info in sites])
+        yield from _trust(self._store)
         totals = [((site,), counts) for (site, _), counts in counters(None, "site").items()]
         yield from _sums("site", _SITE_SUMS, ["site"], totals)
         kept = {(info.site, str(version.version)) for info in sites for version in self._store.versions(info.site)}
@@ -135,6 +143,30 @@ class _FleetCollector(Collector):
             )
             _filled(drifting, (((site, name), drifts[name]) for name in PARAMETERS))
         yield drifting
+
+
+def _trust(store: MapStore) -> Iterator[Metric]:
+    """Days that the signed lists last; no figures for a store that is not signed."""
+    faults = GaugeMetricFamily("fleetmap_trust_faults", "What keeps robots from new maps, now or soon.")
+    days = GaugeMetricFamily("fleetmap_trust_days_left", "Days until a role expires.", labels=["role"])
+    try:
+        found = trust_status(store)
+    except StateError:  # a store that is not signed
+        pass
+    except StoreError:  # lists that cannot be read
+        faults.add_metric([], 1)
+    else:
+        faults.add_metric([], len(found.faults))
+        for role in found.roles:
+            if role.days_left is not None:
+                days.add_metric([role.role], role.days_left)
+    yield faults
+    yield days
+
+
+def _word_hours(robot: RobotStatus) -> float:
+    hours = (robot.last_health or {}).get("metrics", {}).get("map_word_hours")
+    return float(hours) if isinstance(hours, int | float) else 0.0
 
 
 def _gauge(name: str, words: str, *labels: str) -> GaugeMetricFamily:

@@ -64,7 +64,7 @@ from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.landmark_budget import choose_landmarks
 from mapserver.tiles.tiling import TILE_SIZE_M, tiles_from_survey
-from mapserver.trust.signing import check_base
+from mapserver.trust.signing import check_base, record_built
 
 _NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled", "directions", "starts")
 
@@ -76,7 +76,7 @@ class BuildOptions:
     frames: an A:B:C slice of each recording. use: only the sensors of a poorer set. trajectory_source, initial_trajectory: an entry of
     TRAJECTORY_SOURCES and its file. replay: earlier recordings of the current version, of which frames are looked for in the draft.
     threads, scheduler: see worker.py. settings: those of the survey; for None the preset of the first recording's sensors with the [survey]
-    section of the file `config` over it. job: the number of the job that builds, for its draft.
+    section of the file `config` over it. job: its number, for the draft. keys: the builder's folder, if not the server's.
     """
 
     frames: str = "::"
@@ -97,6 +97,7 @@ class BuildOptions:
     job: int | None = None
     config: Path | None = None
     settings: SurveySettings | None = None
+    keys: Path | None = None
 
     @property
     def reading(self) -> RecordingOptions:
@@ -226,7 +227,7 @@ def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
             f"site {site} has version {current.version}, whose frame stays; build without --frame-from-ground-truth, "
             "or name another --site"
         )
-    check_base(maps, current)
+    check_base(maps, current, request.options.keys)
     archive = maps.archive(site, current.version)
     if archive is None:
         raise StoreError(
@@ -315,7 +316,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         evidence=evidence,
         job=run.request.options.job,
     )
-    version = maps.save_draft(site, content, actor=run.request.options.actor)
+    version = record_built(maps.save(site, content, actor=run.request.options.actor), run.request.options.keys)
     report = msgspec.structs.replace(report, map_bytes=maps.version(site, version).map_bytes)
     run.times.begin("writing")
     draft = Draft(

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, config_path, expand_options
+from fleetmap.cli_options import ConfigFile, config_path, expand_options, settings_of
 from fleetmap.errors import UsageError
 from mapserver.commands.options import SurveyOptions, check_output
 
@@ -59,4 +59,14 @@ def build(
     use = None if options.use is None else named_sensor_set(options.use)
     asked = vars(options) | {"use": use, "replay": tuple(options.replay or ()), "config": config_path(context)}
     site, store = asked.pop("site"), asked.pop("store")
-    typer.echo(build_map(recordings, store, site, BuildOptions(**asked)).sentence)
+    built = build_map(recordings, store, site, BuildOptions(**asked))
+    if options.keys is not None:
+        from mapserver.releases.signer import note_verdict
+        from mapserver.store import MapStore
+        from mapserver.trust.builder_folder import BuilderFolder
+
+        with MapStore.open(store) as maps:
+            note_verdict(
+                maps, BuilderFolder(options.keys), maps.version(site, built.version), settings_of(context).gate
+            )
+    typer.echo(built.sentence)

@@ -16,6 +16,10 @@ SiteName = Annotated[str, typer.Option(help="Name of the site.")]
 StoreFolder = Annotated[Path, typer.Option(help="Folder of the map store.")]
 NewStoreFolder = Annotated[Path, typer.Option(help="Folder of the map store; created if it does not exist.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+BuilderKeys = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="Folder of the account that builds and signs, if that is not the server's."),
+]
 Calibration = Annotated[Path | None, typer.Option(metavar="FILE", help="Kalibr camchain to use.")]
 
 
@@ -65,6 +69,8 @@ class SurveyOptions(SiteOptions):
         str | None,
         typer.Option(metavar="ADDRESS", help="Run on this dask cluster (tls://...); `local` starts processes here."),
     ] = None
+
+    keys: BuilderKeys = None
 
     def check(self) -> None:
         """Raises UsageError for a report that cannot be written and for an impossible name of the site."""

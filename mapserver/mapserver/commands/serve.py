@@ -112,6 +112,9 @@ def serve(
         str,
         typer.Option(help="zenoh endpoint to listen on; port 0 picks a free port. tls/ and quic/ need `trust init`."),
     ] = "tcp/127.0.0.1:7447",
+    signer: Annotated[
+        bool, typer.Option("--signer", help="Ask `mapserver signer` for releases that its lists do not admit yet.")
+    ] = False,
     config: ConfigFile = None,
 ) -> None:
     """Serve maps to robots and operators; prints the addresses when ready, ends with status 0 on SIGTERM or SIGINT."""
@@ -130,7 +133,7 @@ def serve(
         prepare_lists(maps, zenoh)
         bus, robots = prepare_bus(maps, zenoh, insecure=at.insecure)
         with bus:
-            _run(maps, (bus, robots), _Http(listener, guard, certificate, bool(at.http_name)), settings)
+            _run(maps, (bus, robots), _Http(listener, guard, certificate, bool(at.http_name), signer), settings)
 
 
 class _Http(NamedTuple):
@@ -138,6 +141,7 @@ class _Http(NamedTuple):
     guard: "GuardSettings"
     certificate: "HttpCertificate | None"
     is_behind_proxy: bool
+    signer: bool
 
 
 def _run(
@@ -186,7 +190,7 @@ def _run(
             task.cancel()
         await asyncio.gather(*background, return_exceptions=True)
 
-    api = ApiSettings(http.guard, settings.gate, settings.canary, settings.resurvey)
+    api = ApiSettings(http.guard, settings.gate, settings.canary, settings.resurvey, http.signer)
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
     install_dashboard(app, maps, fleet, api, bus_service.surveys)
     config = uvicorn.Config(

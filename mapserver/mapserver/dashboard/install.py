@@ -26,7 +26,7 @@ PATH = "/dashboard"
 def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings, surveys: LiveSurveys) -> None:
     """Adds the pages to `app`. Once in a process: NiceGUI keeps its pages in the module."""
     services = Services(
-        MapData(store, settings.gate, settings.canary.share),
+        MapData(store, settings.gate, settings.canary.share, signer=settings.signer),
         HealthData(store, settings.canary, settings.resurvey, time.time_ns),
         LiveRobots(fleet, time.monotonic),
         settings.guard,

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from fleetmap.errors import UsageError
 from fleetmap.mapformat import decode_tile
 from mapserver.fleet_statistics.canary_test import threshold_for
-from mapserver.quality.gate import GateSettings, judge
+from mapserver.quality.gate import GateSettings, GateVerdict, judge
 from mapserver.releases import rules
 from mapserver.releases.version_diff import Difference, manifest_difference
 from mapserver.store import NOBODY, Actor, CanaryRow, MapStore, NewCanary, VerdictRow, VersionInfo
@@ -38,6 +38,18 @@ def publish(
     judged_against = _pass_gate(store, draft, actor, gate, force=force)
     _change(store, site, lambda rows: rules.publication(rows, draft.version, judged_against, actor))
     return draft.version
+
+
+def judge_draft(store: MapStore, draft: VersionInfo, gate: GateSettings) -> GateVerdict:
+    """What the gate says of a draft, beside the site's current version."""
+    current = store.current(draft.site)
+    return judge(
+        store.manifest(draft.site, draft.version),
+        None if current is None else store.manifest(draft.site, current.version),
+        next(info.vocabulary_sha256 for info in store.sites() if info.site == draft.site),
+        gate,
+        store.evidence(draft.site, draft.version),
+    )
 
 
 def promote(store: MapStore, site: str, version: int, *, actor: Actor = NOBODY) -> None:
@@ -120,13 +132,7 @@ def _pass_gate(store: MapStore, draft: VersionInfo, actor: Actor, gate: GateSett
     site = draft.site
     store.check_bytes(draft)
     current = store.current(site)
-    verdict = judge(
-        store.manifest(site, draft.version),
-        None if current is None else store.manifest(site, current.version),
-        next(info.vocabulary_sha256 for info in store.sites() if info.site == site),
-        gate,
-        store.evidence(site, draft.version),
-    )
+    verdict = judge_draft(store, draft, gate)
     forced = rules.is_forced(verdict, force=force)
     reasons = (*verdict.hard_reasons, *verdict.reasons)
     row = VerdictRow(store.now_ns(), verdict.accepted, forced, reasons, verdict.report)

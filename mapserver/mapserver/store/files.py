@@ -14,6 +14,7 @@ from fleetmap.errors import StoreError
 _CHUNK_BYTES = 1 << 20
 _LOCK_WITHIN_S = 60.0
 _OWN_FILE, _OWN_FOLDER = 0o600, 0o700  # maps, positions and pictures are nobody else's business on a shared machine
+_GROUP_FILE, _GROUP_FOLDER = 0o660, 0o2770  # in a folder that its owner gave to a group, by hand
 _RESERVE_BYTES = 4 << 20  # what a transaction that removes some hundred versions writes
 TEMPORARY_SUFFIX = ".tmp"
 
@@ -26,7 +27,7 @@ def write_atomically(path: Path, chunks: Iterable[bytes]) -> None:
     Raises OSError where the disk refuses.
     """
     temporary = path.with_name(f".{path.name[:16]}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
-    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, _OWN_FILE)
+    descriptor = _open_own(temporary, os.O_WRONLY | os.O_EXCL)
     try:
         try:
             for chunk in chunks:
@@ -76,6 +77,8 @@ def make_folder(folder: Path) -> None:
     for parent in reversed(missing):
         with suppress(FileExistsError):
             os.mkdir(parent, _OWN_FOLDER)  # noqa: PTH102
+            if is_of_group(parent.parent):
+                os.chmod(parent, _GROUP_FOLDER)  # noqa: PTH101
         sync_folder(parent.parent)
     if not missing:
         sync_folder(folder.parent)
@@ -102,13 +105,13 @@ def is_plain_file(path: Path) -> bool:
 
 def make_own_file(path: Path) -> None:
     """An empty file for its owner alone, unless there is one."""
-    os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, _OWN_FILE))
+    os.close(_open_own(path, os.O_RDWR))
 
 
 def keep_reserve(root: Path) -> None:
     """Space that `release_reserve` gives back on a full disk, so that garbage can be collected there. A full disk has none to keep."""
     with suppress(OSError):
-        descriptor = os.open(root / "reserve", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, _OWN_FILE)
+        descriptor = _open_own(root / "reserve", os.O_RDWR | os.O_NOFOLLOW)
         try:
             os.posix_fallocate(descriptor, 0, _RESERVE_BYTES)
         finally:
@@ -130,12 +133,26 @@ def locked(path: Path, *, shared: bool) -> Iterator[None]:
 
     Raises StoreError when the lock is not free within a minute, OSError where the file cannot be made.
     """
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, _OWN_FILE)
+    descriptor = _open_own(path, os.O_RDWR | os.O_NOFOLLOW)
     try:
         _take_lock(descriptor, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, path)
         yield
     finally:
         os.close(descriptor)
+
+
+def is_of_group(folder: Path) -> bool:
+    """Whether a folder was given to a group (mode 2770): two accounts of one machine, which serve and build, share such a store."""
+    return os.stat(folder).st_mode & (stat.S_ISGID | stat.S_IWGRP) == stat.S_ISGID | stat.S_IWGRP  # noqa: PTH116
+
+
+def _open_own(path: Path, flags: int) -> int:
+    """A file that is made if it is not there, for its owner alone or for the group of its folder."""
+    descriptor = os.open(path, flags | os.O_CREAT | os.O_CLOEXEC, _OWN_FILE)
+    if is_of_group(path.parent):
+        with suppress(PermissionError):  # made by the other account
+            os.fchmod(descriptor, _GROUP_FILE)
+    return descriptor
 
 
 def _take_lock(descriptor: int, kind: int, path: Path) -> None:

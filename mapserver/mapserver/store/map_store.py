@@ -118,7 +118,11 @@ class MapStore(StoreQueries):
         self.close()
 
     def save_draft(self, site: str, content: DraftContent, *, actor: Actor = NOBODY) -> int:
-        """The number of a new draft version of `site`, whole on the disk.
+        """The number of a new draft; as `save`."""
+        return self.save(site, content, actor=actor).version
+
+    def save(self, site: str, content: DraftContent, *, actor: Actor = NOBODY) -> VersionInfo:
+        """A new draft version of `site`, whole on the disk, as it was made and not as the database tells it afterwards.
 
         Raises MapFormatError for tiles that cannot be encoded, StoreError where the disk refuses.
         """
@@ -148,7 +152,7 @@ class MapStore(StoreQueries):
                         "INSERT INTO evidence (site, version, figures) VALUES (?, ?, ?)",
                         (site, manifest.version, msgspec.json.encode(content.evidence).decode()),
                     )
-        return manifest.version
+        return draft
 
     def change_releases(self, site: str, decide: Callable[[SiteReleases], ReleaseChanges]) -> ReleaseChanges:
         """Writes what `decide` makes of a site's rows, in the one transaction that reads them; on the disk when this returns.

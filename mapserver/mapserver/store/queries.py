@@ -234,12 +234,12 @@ class StoreQueries:
         with self._transactions.write(durable=False) as connection:
             keep_last_reports(connection, {(site, robot): (version, self._clock_ns(), report)})
 
-    def begin_job(self, site: str, kind: str) -> int:
+    def begin_job(self, site: str, kind: str, message: str = "", report: dict[str, Any] | None = None) -> int:
         """The number of a new running job."""
         with self._transactions.write() as connection:
             done = connection.execute(
-                "INSERT INTO jobs (site, kind, state, started, message, report) VALUES (?, ?, 'running', ?, '', '{}')",
-                (check_name(site, "site"), kind, self._now()),
+                "INSERT INTO jobs (site, kind, state, started, message, report) VALUES (?, ?, 'running', ?, ?, ?)",
+                (check_name(site, "site"), kind, self._now(), message, json.dumps(report or {})),
             )
             return int(done.lastrowid or 0)
 

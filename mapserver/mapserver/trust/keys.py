@@ -37,7 +37,9 @@ def save_key(path: Path, signer: "CryptoSigner", passphrase: str | None) -> None
     how = s.NoEncryption() if passphrase is None else s.BestAvailableEncryption(passphrase.encode())
     data = key.private_bytes(s.Encoding.PEM, s.PrivateFormat.PKCS8, how)
     with disk_errors(f"the key {path} cannot be written", "check the folder; a key is never overwritten"):
-        make_folder(path.parent)
+        if not path.parent.is_dir():
+            make_folder(path.parent)
+            path.parent.chmod(0o700)  # also in a store that a group shares
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)

@@ -116,10 +116,11 @@ class SignedLists:
         roles = (self.read("targets").delegations or {}).get("roles", [])
         return {role.name: role for role in msgspec.convert(roles, list[SiteRole])}
 
-    def is_signed(self, role: SiteRole) -> bool:
-        """Whether the newest list of a site bears the names of enough keys that may sign it now; no signature is verified."""
+    def is_signed(self, role: SiteRole, path: Path | None = None) -> bool:
+        """Whether a list (the newest, if not named) bears the names of enough keys that may sign it now; no signature is verified."""
+        path = self.path(role.name, self.newest(role.name)) if path is None else path
         try:
-            file = msgspec.json.decode(self.path(role.name, self.newest(role.name)).read_bytes(), type=_File)
+            file = msgspec.json.decode(path.read_bytes(), type=_File)
         except (OSError, msgspec.MsgspecError):
             return False
         return len({signature.keyid for signature in file.signatures} & set(role.keyids)) >= role.threshold

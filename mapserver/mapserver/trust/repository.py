@@ -163,10 +163,15 @@ class ListRepository:
             self.accept_site(site, metadata)
             path.unlink(missing_ok=True)
             return 0
+        self.lay_down(site, metadata)
+        return missing
+
+    def lay_down(self, site: str, metadata: Metadata[Any]) -> None:
+        """Puts a list aside, where the server and further people find it."""
+        path = self.lists.staged_path(site)
         with disk_errors(f"{path} cannot be written", "make space, and run the command again"):
             make_folder(path.parent)
             write_atomically(path, [metadata.to_bytes(_COMPACT)])
-        return missing
 
     def check_signer(self, site: str, signer: CryptoSigner) -> None:
         """Raises StateError where a key may not sign the lists of a site."""

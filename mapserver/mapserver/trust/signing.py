@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fleetmap.errors import FleetmapError, StateError, UsageError
@@ -11,6 +12,7 @@ from fleetmap.trust.site_list import VersionState
 from mapserver.store import MapStore, VersionInfo
 from mapserver.store.files import locked
 from mapserver.store.rows import SiteReleases
+from mapserver.trust.builder_folder import BuilderFolder
 from mapserver.trust.keys import KeyFolder
 from mapserver.trust.lists import TIMESTAMP, SignedLists, is_fresh
 
@@ -55,6 +57,7 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
             role = site_role(info.site)
             before = lists.newest(role)
             try:
+                _take_staged(store, repository, info.site)
                 _update_site(repository, keys, store.releases(info.site), now)
                 if lists.newest(role) != before:
                     store.audit("list signed", f"site {info.site}, list {lists.newest(role)}")
@@ -106,11 +109,45 @@ def init_here(store: MapStore) -> None:
     update_lists(store)
 
 
-def check_base(store: MapStore, info: VersionInfo) -> None:
-    """Raises StateError where the database names other bytes for a version, its archive too, than the last signed list.
+def sign_as_builder(store: MapStore, builder: BuilderFolder, site: str) -> bool:
+    """Signs what the site's releases admit, with the builder's key, and lays it down for the server; False where nothing is due.
 
-    The next map is built on it: otherwise whoever writes into the database decides what is built.
+    Of the database only the numbers of versions are believed. Raises StateError for a version that was not built here or did not
+    pass, or where this account's key may not sign.
     """
+    lists, rows = SignedLists(store.folder), store.releases(site)
+    now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
+    role = site_role(site)
+    if not builder.keys.has(role) or role not in lists.site_roles() or not _site_is_due(lists, rows, now):
+        return False
+    from mapserver.trust.repository import ListRepository
+
+    with locked(lists.folder / "lock", shared=False):
+        repository, signer = ListRepository(lists, now), builder.keys.signer(role)
+        assert signer is not None
+        repository.check_signer(site, signer)
+        admitted = admitted_versions(rows, lists.site_roles()[role].previous)
+        builder.check_entries(site, admitted)
+        repository.lay_down(site, repository.sign_site(site, admitted, [signer]))
+    return True
+
+
+def record_built(built: VersionInfo, keys: Path | None) -> int:
+    """Keeps what was built in the builder's folder, if that is not the server's; returns its number. StoreError where the disk refuses."""
+    if keys is not None:
+        BuilderFolder(keys).record(built)
+    return built.version
+
+
+def check_base(store: MapStore, info: VersionInfo, keys: Path | None = None) -> None:
+    """Raises StateError where the database names other bytes for a version, its archive too, than the builder knows.
+
+    The next map is built on it: otherwise whoever writes into the database decides what is built. keys: the builder's folder;
+    without one what was signed last is compared.
+    """
+    if keys is not None:
+        BuilderFolder(keys).check(info)
+        return
     lists = SignedLists(store.folder)
     number = lists.newest(site_role(info.site)) if lists.are_there else 0
     if number:
@@ -146,9 +183,36 @@ def _due(store: MapStore, lists: SignedLists, keys: KeyFolder, now: datetime) ->
     if keys.has("online") and _online_is_due(lists, now):
         return True
     return any(
-        _site_is_due(lists, store.releases(info.site), now) and (keys.has(site_role(info.site)) or keys.has("root"))
+        (_site_is_due(lists, store.releases(info.site), now) and (keys.has(site_role(info.site)) or keys.has("root")))
+        or _is_laid_down(lists, info.site)
         for info in store.sites()
     )
+
+
+def _is_laid_down(lists: SignedLists, site: str) -> bool:
+    """Whether a list waits that bears the names of enough keys."""
+    role = lists.site_roles().get(site_role(site))
+    return role is not None and lists.is_signed(role, lists.staged_path(site))
+
+
+def _take_staged(store: MapStore, repository: "ListRepository", site: str) -> None:
+    """Gives robots a list that the builder, or the last of several people, laid down, after the same judgement that robots make.
+
+    Raises StateError where the store does not have what it names.
+    """
+    if not _is_laid_down(repository.lists, site):
+        return
+    metadata, found = repository.staged(site), repository.lists.staged_list(site)
+    assert metadata is not None
+    assert found is not None
+    for entry in found.admitted:
+        info = store.version(site, entry.about.version)
+        if info.manifest_sha256 != entry.sha256:
+            raise StateError(
+                f"a list names version {info.version} of site {site} with bytes that the store does not have"
+            )
+        store.check_bytes(info)
+    repository.stage_site(site, metadata)
 
 
 def _online_is_due(lists: SignedLists, now: datetime) -> bool:

@@ -66,7 +66,7 @@ def trust_status(store: MapStore) -> TrustStatus:
             found.faults.append(f"{role}: a list waits for another signature; `mapserver trust sign {info.site}`")
         if role not in holders and info.current_version is not None:
             found.faults.append(f"site {info.site}: no key may sign its maps; `mapserver trust admit {info.site}`")
-        elif own.has(role):
+        elif own.has(role) and holders.get(role, (1, 1))[1] == 1:
             found.risks.append(f"{own.folder}/{role}.pem: who takes this machine can publish maps of {info.site}")
     if own.has("root"):
         found.risks.append(

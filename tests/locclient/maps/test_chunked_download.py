@@ -5,9 +5,11 @@ import pytest
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import LinkError, UnreachableError
 from fleetmap.messages import PART_BYTES, ChunkRequest, Part, decode_message, encode_message, part_of
+from locclient.maps import chunked_download
 from locclient.maps.chunked_download import ChunkReader
 
 DATA = bytes(range(256)) * 3000  # three parts
+WHOLE = PART_BYTES + 5
 
 
 def answered(*parts: Part) -> ChunkReader:
@@ -42,16 +44,34 @@ def test_an_empty_question_asks_for_the_first_part() -> None:
 @pytest.mark.parametrize(
     ("second", "words"),
     [
-        (Part(total_bytes=10, offset=0, data=b"01234"), "from 0 on"),
-        (Part(total_bytes=10, offset=5, data=b""), "nothing from byte 5"),
-        (Part(total_bytes=10, offset=5, data=b"0123456"), "got 7 from 5"),
-        (Part(total_bytes=99, offset=5, data=b"0"), "has 99 bytes"),
+        (Part(total_bytes=WHOLE, offset=0, data=b"01234"), "from 0 on"),
+        (Part(total_bytes=WHOLE, offset=PART_BYTES, data=b""), "0 bytes from byte 262144"),
+        (Part(total_bytes=WHOLE, offset=PART_BYTES, data=b"0123"), "4 bytes from byte 262144"),
+        (Part(total_bytes=WHOLE, offset=PART_BYTES, data=b"0123456"), "got 7 from 262144"),
+        (Part(total_bytes=10**6, offset=PART_BYTES, data=b"0"), "has 1000000 bytes"),
     ],
 )
 def test_nonsense_is_refused(second: Part, words: str) -> None:
-    reader = answered(Part(total_bytes=10, offset=0, data=b"01234"), second)
+    reader = answered(Part(total_bytes=WHOLE, offset=0, data=bytes(PART_BYTES)), second)
     with pytest.raises(LinkError, match=words):
-        reader.read("x", max_bytes=10)
+        reader.read("x", max_bytes=WHOLE)
+
+
+def test_row_15_a_server_that_gives_bytes_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    hub, asked = MemoryHub(), []
+
+    def slow(_: str, question: bytes) -> bytes:
+        offset = decode_message(question, ChunkRequest).offset
+        asked.append(offset)
+        return encode_message(Part(total_bytes=500, offset=offset, data=b"x"))
+
+    MemoryBus(hub).queryable("x", slow)
+    with pytest.raises(LinkError, match="1 bytes from byte 0 on of 500"):
+        ChunkReader(MemoryBus(hub), timeout_s=0.01, patience_s=0).read("x", max_bytes=500)
+    assert asked == [0]
+    monkeypatch.setattr(chunked_download, "PART_BYTES", 1)  # the control: without the rule it goes on
+    ChunkReader(MemoryBus(hub), timeout_s=0.01, patience_s=0).read("x", max_bytes=500)
+    assert len(asked) == 501
 
 
 def test_patience_ends() -> None:

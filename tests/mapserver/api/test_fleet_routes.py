@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import quote
 
 import msgspec
 import pytest
@@ -124,3 +125,34 @@ def test_metrics_are_what_prometheus_reads(server: Server) -> None:
     assert found["fleetmap_site_cause_failures_total", "lab", 'x\n"y\\'] == 1
     assert found["fleetmap_site_robots_status", "TRACKING", "lab"] == 1
     assert found["fleetmap_site_clock_skew_max_seconds", "lab"] == pytest.approx(8.0, abs=0.5)
+
+
+QUOTES = ("' OR 1=1 --", '" OR "" = "', "lab'; DROP TABLE failures; --", "%", "_", "lab\x00", "1 UNION SELECT 1")
+
+
+@pytest.mark.parametrize("words", QUOTES)
+def test_row_29_quotes_in_every_filter(server: Server, words: str) -> None:
+    """A filter with SQL in it finds nothing, and nothing is lost."""
+    assert server.fleet.take_failure("lab", "r1", failure(1)).refused == ""
+    names = ("site", "robot", "version", "tile", "cause", "kind", "cursor", "limit", "by", "key", "hours")
+    for path in (
+        "/v1/failures",
+        "/v1/jobs",
+        "/v1/robots",
+        "/v1/fleet/measures",
+        "/v1/sites/lab/hours",
+        "/v1/sites/lab/events",
+    ):
+        for name in names:
+            answer = server.client.get(path, params={name: words})
+            assert answer.status_code < 500, (path, name)
+            if path == "/v1/failures" and name in ("site", "robot", "cause", "kind") and answer.status_code == 200:
+                assert answer.json()["failures"] == [], name
+    for path in (f"/v1/sites/{quote(words)}/versions", f"/v1/failures/{quote(words)}", f"/v1/tiles/{quote(words)}"):
+        assert server.client.get(path).status_code in (404, 422)
+    found = server.client.get("/v1/failures").json()["failures"]
+    assert [row["robot"] for row in found] == ["r1"]
+    # The control: where the words become part of the statement, they find it.
+    if "OR 1=1" in words:
+        rows = server.store._transactions.query(f"SELECT robot FROM failures WHERE cause = '{words}'")
+        assert rows == [{"robot": "r1"}]

@@ -10,7 +10,7 @@ import pytest
 
 from fleetmap.bus import MemoryBus
 from fleetmap.errors import LinkError, MapFormatError, UnreachableError, UsageError
-from fleetmap.mapformat import blob_path
+from fleetmap.mapformat import blob_path, sha256_hex
 from fleetmap.messages import (
     FailureAck,
     FailureReport,
@@ -34,6 +34,7 @@ from mapserver.store import FailureFilter, MapStore
 from support.fleet.served_world import World, served_world
 from support.storage.map_samples import random_tile, save_sample_draft
 
+FOREIGN_VOCABULARY = b"other" * 50
 TILE_COLUMNS = (
     "landmark_ids", "points_map", "descriptors", "view_directions_map", "view_half_angle_rad", "max_distance_m", "sigma_m",
 )  # fmt: skip
@@ -109,6 +110,20 @@ def test_a_lying_server_is_refused_by_hash(world: World) -> None:
         with pytest.raises(MapFormatError, match="damaged"):
             world.link.manifest(wanted)
     assert all(tile.sha256 not in world.cache for tile in manifest.tiles)
+
+
+def test_row_11_a_vocabulary_of_another_site(world: World) -> None:
+    """A sound one, under the address of the right one: words of one vocabulary mean nothing in a map of another."""
+    manifest = world.link.manifest(world.link.wanted())
+    world.service.close()
+    with MemoryBus(world.hub) as liar:
+        liar.queryable(blob_key("*", "*"), lambda _, asked: part_of(FOREIGN_VOCABULARY, asked))
+        with pytest.raises((MapFormatError, LinkError), match=r"damaged|at most"):
+            world.link.vocabulary(manifest)
+        # The control: under its own address it is taken.
+        address = sha256_hex(FOREIGN_VOCABULARY)
+        assert world.link.blob(address, len(FOREIGN_VOCABULARY)) == FOREIGN_VOCABULARY
+    assert manifest.vocabulary.sha256 not in world.cache
 
 
 def test_a_known_version_is_read_with_the_server_away(world: World) -> None:

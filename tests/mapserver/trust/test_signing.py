@@ -10,8 +10,10 @@ import pytest
 from securesystemslib.signer import CryptoSigner
 
 from fleetmap.errors import StateError, StoreError, UsageError
-from fleetmap.messages import WantedVersion
+from fleetmap.messages import RobotHealth, WantedVersion
 from mapserver import releases
+from mapserver.api.metrics import Metrics
+from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
 from mapserver.trust import KeyFolder, SignedLists, ceremonies, init_here, prepare_lists, update_lists
 from mapserver.trust.keys import load_key, make_passphrase, new_key, save_key
@@ -353,3 +355,39 @@ def test_a_key_does_not_close_a_folder_that_was_there(tmp_path: Path) -> None:
     assert stat.S_IMODE(tmp_path.stat().st_mode) == 0o755
     save_key(tmp_path / "made" / "ada.pem", new_key(), None)
     assert stat.S_IMODE((tmp_path / "made").stat().st_mode) == 0o700
+
+
+def test_metrics_say_how_long_the_lists_last(store: MapStore, clock: Clock) -> None:
+    fleet = Fleet(store, clock_ns=clock)
+    for robot, hours in (("r1", 0.5), ("r2", 31.0), ("r3", None)):
+        health = RobotHealth(
+            site="lab", robot=robot, stamp_ns=1, version=1, status="TRACKING", metrics={"map_word_hours": hours}
+        )
+        fleet.take_health("lab", robot, health)
+
+    def figures() -> dict[str, float]:
+        lines = Metrics(store, fleet).text().decode().splitlines()
+        return {line.rpartition(" ")[0]: float(line.rpartition(" ")[2]) for line in lines if line[0] != "#"}
+
+    found = figures()
+    assert found['fleetmap_site_map_word_hours_max{site="lab"}'] == 31.0
+    days = {
+        role: found[f'fleetmap_trust_days_left{{role="{role}"}}']
+        for role in ("root", "targets", "timestamp", "site-lab")
+    }
+    assert days == {"root": 730.0, "targets": 365.0, "timestamp": 1.0, "site-lab": 14.0}
+    assert found["fleetmap_trust_faults"] == 0
+    clock.now_ns += 8 * 24 * HOUR_NS
+    found = figures()
+    assert found['fleetmap_trust_days_left{role="timestamp"}'] == -7.0
+    assert found["fleetmap_trust_faults"] == 3  # timestamp, snapshot, and the site's list
+    (store.folder / "trust" / "timestamp.json").write_text("{")
+    assert figures()["fleetmap_trust_faults"] == 1
+
+
+def test_a_stolen_server_can_publish_only_where_its_key_is_enough(store: MapStore) -> None:
+    assert "who takes this machine can publish maps of lab" in " ".join(trust_status(store).risks)
+    people, own = [KeyFolder(store.folder / "keys").signer("root")], KeyFolder(store.folder / "keys").signer("site-lab")
+    both = [own.public_key, new_key().public_key]
+    ceremonies.admit(store, "lab", both, people, threshold=2, previous=1)
+    assert "can publish maps" not in " ".join(trust_status(store).risks)

@@ -1,19 +1,27 @@
 """`mapserver publish`, `promote` and `rollback`: which version of a site is current."""
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
-from mapserver.commands.options import ActorOptions, SiteName, SiteOptions, StoreFolder
+from mapserver.commands.options import ActorOptions, BuilderKeys, SiteName, SiteOptions, StoreFolder
+
+
+@dataclass(frozen=True, kw_only=True)
+class DraftOptions(SiteOptions):
+    """A draft, and who built it."""
+
+    version: Annotated[int | None, typer.Option(min=1, help="The draft to publish; default: the newest.")] = None
+    keys: BuilderKeys = None
 
 
 @expand_options
 def publish(
     context: typer.Context,
-    where: SiteOptions,
+    where: DraftOptions,
     by: ActorOptions,
-    version: Annotated[int | None, typer.Option(min=1, help="The draft to publish; default: the newest.")] = None,
     force: Annotated[
         bool,
         typer.Option("--force", help="Publish although the gate refuses, except beyond hard limits; needs --reason."),
@@ -24,11 +32,20 @@ def publish(
     from mapserver import releases
     from mapserver.quality.directions import one_way_words
     from mapserver.quality.probes import lookalike_words
+    from mapserver.releases import rules
     from mapserver.store import MapStore
+    from mapserver.trust.builder_folder import BuilderFolder
+    from mapserver.trust.signing import sign_as_builder
 
     gate = settings_of(context).gate
     with MapStore.open(where.store) as maps:
-        published = releases.publish(maps, where.site, version, actor=by.named(), force=force, gate=gate)
+        builder = None if where.keys is None else BuilderFolder(where.keys)
+        if builder is not None:
+            builder.check(rules.chosen_draft(maps.releases(where.site), where.version))
+        published = releases.publish(maps, where.site, where.version, actor=by.named(), force=force, gate=gate)
+        if builder is not None:
+            builder.note_passed(where.site, published)
+            sign_as_builder(maps, builder, where.site)
         info = maps.version(where.site, published)
         verdict = maps.verdicts(where.site, published)[-1]
         evidence = maps.evidence(where.site, published)

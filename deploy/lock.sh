@@ -1,0 +1,17 @@
+#!/bin/sh
+# Writes requirements.lock: every library of an installation with the hashes of the files that this machine's package index gave out now.
+# An index that later gives other bytes under the same version is then refused. Made by the deployer, because platforms and indexes
+# differ; keep the file, and install every machine of that platform from it:
+#   deploy/lock.sh dist/fleetmap-0.1.0-py3-none-any.whl server requirements.lock
+#   pip install --require-hashes --only-binary :all: -r requirements.lock
+#   pip install --no-deps dist/fleetmap-0.1.0-py3-none-any.whl
+set -eu
+[ $# -eq 3 ] && [ -f "$1" ] || { echo "usage: deploy/lock.sh WHEEL server|client LOCK; make the wheel with: python3 -m pip wheel --no-deps --wheel-dir dist ." >&2; exit 2; }
+here=$(dirname "$0")
+python=${PYTHON:-python3}
+report=$(mktemp)
+trap 'rm -f "$report"' EXIT
+"$python" -m pip install --dry-run --ignore-installed --quiet --only-binary :all: -c "$here/../constraints.txt" --report "$report" "$1[$2]"
+"$python" "$here/lock_report.py" "$report" > "$3.new"
+mv "$3.new" "$3"
+echo "$3: $(grep -c '==' "$3") libraries; keep it beside the wheel"
