@@ -92,6 +92,6 @@ def test_a_survey_is_followed_to_its_end(served: Served) -> None:
         assert page.locator("svg g.part").count() == 2
         finished = msgspec.structs.replace(STATE, phase="stored", version=1, words="")
         bus.publish(live_key("yard"), encode_message(finished))
-        expect(page.locator(".notice")).to_contain_text("Version 1")
+        expect(page.locator(".notice.good")).to_contain_text("Version 1")
         assert seen.faults == []
         browser.close()
