@@ -14,39 +14,39 @@ _LINE = "INSERT INTO events (stamp_ns, site, kind, detail) VALUES (1, 'hall', 'n
 
 
 @pytest.fixture
-def builder(tmp_path: Path) -> Iterator[Transactions]:
+def ledger(tmp_path: Path) -> Iterator[Transactions]:
     opened = Transactions(tmp_path / "store.sqlite3", lambda: 1)
     yield opened
     opened.close()
 
 
-def _read_elsewhere(builder: Transactions) -> int:
+def _read_elsewhere(ledger: Transactions) -> int:
     found: list[int] = []
-    thread = threading.Thread(target=lambda: found.append(builder.query(COUNT)[0]["n"]), daemon=True)
+    thread = threading.Thread(target=lambda: found.append(ledger.query(COUNT)[0]["n"]), daemon=True)
     thread.start()
     thread.join(timeout=20)
     assert found, "reading waits for the transaction"
     return found[0]
 
 
-def test_others_read_on_while_a_transaction_is_open(builder: Transactions) -> None:
-    with builder.write() as connection:
+def test_others_read_on_while_a_transaction_is_open(ledger: Transactions) -> None:
+    with ledger.write() as connection:
         connection.execute(_LINE)
-        assert builder.query(COUNT)[0]["n"] == 1, "its own thread sees what it wrote"
-        assert _read_elsewhere(builder) == 0
-    assert _read_elsewhere(builder) == builder.query(COUNT)[0]["n"] == 1
+        assert ledger.query(COUNT)[0]["n"] == 1, "its own thread sees what it wrote"
+        assert _read_elsewhere(ledger) == 0
+    assert _read_elsewhere(ledger) == ledger.query(COUNT)[0]["n"] == 1
 
 
-def test_what_is_taken_back_was_never_there(builder: Transactions) -> None:
-    with pytest.raises(RuntimeError), builder.write() as connection:
+def test_what_is_taken_back_was_never_there(ledger: Transactions) -> None:
+    with pytest.raises(RuntimeError), ledger.write() as connection:
         connection.execute(_LINE)
         raise RuntimeError
-    assert builder.query(COUNT)[0]["n"] == 0
+    assert ledger.query(COUNT)[0]["n"] == 0
 
 
-def test_reading_cannot_write(builder: Transactions) -> None:
+def test_reading_cannot_write(ledger: Transactions) -> None:
     with pytest.raises(StoreError, match="cannot be read"):
-        builder.query(_LINE)
+        ledger.query(_LINE)
 
 
 def test_closing_leaves_one_file(tmp_path: Path) -> None:
