@@ -10,7 +10,7 @@ from fleetmap.live_survey import LiveSurveyState
 from fleetmap.messages import EstimateMessage, Placement
 from fleetmap.recordings.ros2.cdr import CdrReader
 from fleetmap.recordings.ros2.keys import type_of_key
-from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior, decode_text
+from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior
 from mapserver.live.ros2_view import TOPICS, Ros2View
 
 WAY = np.array([[0.0, 0.0], [1.0, 0.5], [2.0, 0.5]])
@@ -48,7 +48,7 @@ def test_everything_that_the_state_knows_is_shown() -> None:
     np.testing.assert_allclose(np.diag(prior.cov_rot_trans), [1, 2, 3, 4, 5, 6])
     links = decode_frame_links(found["tf2_msgs/TFMessage"])
     assert [(link.parent, link.child) for link in links] == [("map", "odom"), ("odom", "base_link")]
-    assert decode_text(found["std_msgs/String"]) == "TRACKING"
+    assert CdrReader(found["std_msgs/String"]).text() == "TRACKING"
 
 
 def test_a_cloud_has_its_points_as_float32() -> None:
@@ -68,4 +68,4 @@ def test_a_robot_without_a_place_has_no_pose() -> None:
     )
     found = shown(lost)
     assert "geometry_msgs/PoseWithCovarianceStamped" not in found
-    assert decode_text(found["std_msgs/String"]) == "tracking"
+    assert CdrReader(found["std_msgs/String"]).text() == "tracking"
