@@ -34,7 +34,7 @@ from mapserver.api.views import (
     VersionView,
 )
 from mapserver.fleet.fleet import Fleet
-from mapserver.operators import Operators
+from mapserver.operators.operators import Operators
 from mapserver.store import JobInfo, MapStore, VersionInfo
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]

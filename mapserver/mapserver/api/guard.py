@@ -21,9 +21,9 @@ from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapserver.api.problems import problem
-from mapserver.operators import Identity, Operators
-from mapserver.operators import Scope as Right
-from mapserver.operators.operators import LIFE_S
+from mapserver.operators.operators import LIFE_S, Operators
+from mapserver.operators.roles import Identity
+from mapserver.operators.roles import Scope as Right
 from mapserver.store import Actor
 
 SIGN_IN, SIGN_OUT = "/sign-in", "/sign-out"

@@ -78,8 +78,8 @@ class HttpOptions:
         from fleetmap.errors import UsageError
         from mapserver.api.guard import GuardSettings
         from mapserver.dashboard.layout import HANDLERS
-        from mapserver.operators import HttpBinding, Operators, binding_fault
-        from mapserver.operators.binding import is_loopback_name
+        from mapserver.operators.binding import HttpBinding, binding_fault, is_loopback_name
+        from mapserver.operators.operators import Operators
 
         given, host = tuple(name.lower() for name in self.http_name or ()), self.host_and_port()[0]
         fault = binding_fault(

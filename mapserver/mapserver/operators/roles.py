@@ -3,9 +3,12 @@
 import re
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 from fleetmap.errors import UsageError
-from mapserver.store import Actor
+
+if TYPE_CHECKING:
+    from mapserver.store import Actor
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9._@+-]{0,63}")
 
@@ -47,8 +50,10 @@ class Identity:
     address: str
     proof: str = ""
 
-    def actor(self, reason: str = "") -> Actor:
+    def actor(self, reason: str = "") -> "Actor":
         """As the store keeps who acts."""
+        from mapserver.store import Actor
+
         return Actor(self.name, reason, self.name if self.proof else f"token of {self.name}", self.address)
 
 

@@ -60,7 +60,7 @@ class Robots:
 
     def __init__(self, endpoint: str, robots: int, seconds: int, processes: int) -> None:
         shares = [len(part) for part in np.array_split(np.arange(robots), processes)]
-        program = "from benchmarks.fleet_clients import main; main()"
+        program = "from benchmarks.fleet.fleet_clients import main; main()"
         self._processes = [
             subprocess.Popen(
                 [sys.executable, "-c", program, endpoint, str(1000 * number), str(share), str(seconds)],

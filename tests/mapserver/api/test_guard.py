@@ -17,7 +17,7 @@ from mapserver.api.app import create_app
 from mapserver.api.guard import Guard, GuardSettings, set_session
 from mapserver.api.metrics import Metrics
 from mapserver.api.version_routes import ApiSettings
-from mapserver.operators import Operators
+from mapserver.operators.operators import Operators
 from mapserver.store import Actor
 from support.fleet.served_api import Server, check_problem, served_api
 

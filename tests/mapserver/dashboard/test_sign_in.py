@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
-from mapserver.operators import Operators
+from mapserver.operators.operators import Operators
 from mapserver.store import Actor, MapStore
 from support.fleet.dashboard_scene import SITE, Served, chromium, failure, fill_store, serving, watch
 

@@ -10,9 +10,9 @@ import pytest
 from argon2 import PasswordHasher
 
 from fleetmap.errors import UsageError
-from mapserver.operators import HttpBinding, Operators, binding_fault
 from mapserver.operators import operators as module
-from mapserver.operators.operators import IDLE_S, LIFE_S, TRIES, TRY_EVERY_S
+from mapserver.operators.binding import HttpBinding, binding_fault
+from mapserver.operators.operators import IDLE_S, LIFE_S, TRIES, TRY_EVERY_S, Operators
 from mapserver.store import Actor, MapStore
 
 PASSWORD = "ada has a long password"

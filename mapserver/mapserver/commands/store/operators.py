@@ -20,7 +20,7 @@ Asked = Annotated[bool, typer.Option("--ask", help="Ask for a password instead o
 @expand_options
 def add(name: Name, store: StoreFolder, by: ActorOptions, role: NewRole = Role.VIEWER, ask: Asked = False) -> None:
     """Name an operator; prints the password once. From the first one on, a server answers only who signs in."""
-    from mapserver.operators import Operators
+    from mapserver.operators.operators import Operators
     from mapserver.store import MapStore
 
     with MapStore.open(store) as maps:
@@ -32,7 +32,7 @@ def add(name: Name, store: StoreFolder, by: ActorOptions, role: NewRole = Role.V
 @expand_options
 def password(name: Name, store: StoreFolder, by: ActorOptions, ask: Asked = False) -> None:
     """Give an operator another password, a disabled one too; ends the sessions that there are."""
-    from mapserver.operators import Operators
+    from mapserver.operators.operators import Operators
     from mapserver.store import MapStore
 
     with MapStore.open(store) as maps:
@@ -77,7 +77,7 @@ def token(
     days: Annotated[float, typer.Option(min=0.01, max=400, help="Days after which it ends.")] = 90,
 ) -> None:
     """Make a token for a program, which shows it as `Authorization: Bearer TOKEN`; prints it once."""
-    from mapserver.operators import Operators
+    from mapserver.operators.operators import Operators
     from mapserver.store import MapStore
 
     wrong = [word for word in scope or () if word not in set(Scope)]

@@ -8,7 +8,7 @@ from starlette.exceptions import HTTPException
 
 from fleetmap.errors import FleetmapError
 from mapserver.dashboard.layout import Services, html, load, notice
-from mapserver.operators import Identity, Scope
+from mapserver.operators.roles import Identity, Scope
 from mapserver.store import Actor
 
 _MAX_NAME, _MAX_REASON = 200, 2000
