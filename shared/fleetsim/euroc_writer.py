@@ -43,11 +43,13 @@ class EurocRecordingWriter:
             self._tables[name].write(head + "\n")
 
     def write_frame(self, frame: CameraFrame) -> None:
+        """Both pictures as PNG, named by the stamp."""
         self._write_picture("cam0", frame.stamp_ns, frame.left)
         if frame.right is not None:
             self._write_picture("cam1", frame.stamp_ns, frame.right)
 
     def write_imu(self, samples: ImuSamples) -> None:
+        """One row per sample, at full precision."""
         rows = np.concatenate([samples.gyro_radps, samples.accel_mps2], axis=1)
         for stamp_ns, row in zip(samples.stamps_ns.tolist(), rows.tolist(), strict=True):
             self._tables["imu0"].write(f"{stamp_ns}," + ",".join(map(repr, row)) + "\n")
@@ -59,12 +61,14 @@ class EurocRecordingWriter:
         """Leaves them out."""
 
     def write_ground_truth(self, trajectory: Trajectory) -> None:
+        """One row per transform."""
         table = self._tables["state_groundtruth_estimate0"]
         for stamp_ns, map_from_body in zip(trajectory.stamps_ns.tolist(), trajectory.frame_from_body, strict=True):
             values = [*map_from_body[:3, 3].tolist(), *quat_wxyz_from_rotation(map_from_body[:3, :3]).tolist()]
             table.write(f"{stamp_ns}," + ",".join(map(repr, values)) + _ZEROS + "\n")
 
     def close(self) -> None:
+        """Ends the tables."""
         for table in self._tables.values():
             table.close()
 

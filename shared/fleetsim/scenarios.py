@@ -26,6 +26,7 @@ class Run:
 
     @property
     def kind(self) -> RobotKind:
+        """The robot's model."""
         return ROBOTS[self.robot]
 
 

@@ -157,6 +157,7 @@ class _StampRecorder(Intake):
         self.last_frame: CameraFrame | StoredFrame | None = None
 
     def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
+        """See Intake."""
         before = self.counts.frames
         super().put_frame(frame)
         if self.counts.frames > before:
@@ -164,6 +165,7 @@ class _StampRecorder(Intake):
             self.last_frame = frame
 
     def wait_for_room(self, timeout_s: float) -> bool:
+        """See Intake; there is always room."""
         return True
 
 

@@ -49,6 +49,7 @@ class MessagePackPublisher:
         self._bus, self._key = bus, robot_key(site, robot, "estimate")
 
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
+        """See Publisher."""
         covariance = estimate.cov_rot_trans if published.map_from_odom is not None else None
         body_from_base = se3_inverse(base_from_body)
         hypotheses = estimate.hypotheses[:_MAX_HYPOTHESES]

@@ -13,6 +13,7 @@ class ServiceManager:
         self._address = "\0" + given[1:] if given.startswith("@") else given
 
     def ready(self) -> None:
+        """The service is ready."""
         self._tell("READY=1")
 
     def alive(self, status: str) -> None:
@@ -20,6 +21,7 @@ class ServiceManager:
         self._tell(f"WATCHDOG=1\nSTATUS={status}")
 
     def stopping(self) -> None:
+        """The service is stopping."""
         self._tell("STOPPING=1")
 
     def _tell(self, text: str) -> None:

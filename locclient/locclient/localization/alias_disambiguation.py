@@ -63,6 +63,7 @@ class ViewpointGate:
         return True
 
     def redefine_odom(self, new_odom_from_old_odom: Array) -> None:
+        """The odometry has redefined its frame."""
         if self.odom_from_body is not None:
             self.odom_from_body = new_odom_from_old_odom @ self.odom_from_body
 
@@ -113,6 +114,7 @@ class ObservationHistory:
         return np.bitwise_count(self.expected & mask), np.bitwise_count(self.found & mask)
 
     def redefine_odom(self, new_odom_from_old_odom: Array) -> None:
+        """The odometry has redefined its frame."""
         self.points_odom = transform_points(new_odom_from_old_odom, self.points_odom)
 
     def _keep(self, rows: NDArray[np.int64]) -> None:

@@ -47,6 +47,7 @@ class PoseHypothesis:
 
     @classmethod
     def at(cls, odometry: OdometryEstimate, map_from_body: Array, cov_rot_trans: Array) -> "PoseHypothesis":
+        """At the present frame."""
         return cls(odometry.frame_index, odometry.stamp_ns, map_from_body, cov_rot_trans, map_from_body, cov_rot_trans)
 
     @classmethod
@@ -78,6 +79,7 @@ class PoseHypothesis:
         self.looks += 1
 
     def add_fix(self, inliers: int, landmark_recall: float) -> None:
+        """Counts a fix of this query at this pose."""
         self.inlier_sum += inliers
         self.recall_sum += landmark_recall
         self.recall_total += landmark_recall

@@ -57,4 +57,5 @@ class LocalizerSettings(Section, frozen=True):
 
     @property
     def relocalizer(self) -> RelocalizerSettings:
+        """Those of relocalization."""
         return RelocalizerSettings(self.seed, self.stereo, self.orb, self.fix)

@@ -21,6 +21,7 @@ class LoadedMap:
 
     @property
     def version(self) -> int:
+        """Its number."""
         return self.manifest.version
 
     @property

@@ -24,6 +24,7 @@ class ActiveVersion(msgspec.Struct, frozen=True):
     blobs: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
 
     def wanted(self, site: str) -> WantedVersion:
+        """The same as a server names a version."""
         return WantedVersion(site=site, version=self.version, manifest_sha256=self.blobs[0])
 
 
@@ -52,6 +53,7 @@ class TileCache:
 
     @property
     def total_bytes(self) -> int:
+        """Bytes of all cached files."""
         return sum(self._sizes.values())
 
     def get(self, sha256: str) -> bytes | None:

@@ -41,6 +41,7 @@ class RunReporter:
         self._send(lambda to: to.ack(result.manifest.version, stamp_ns=time.time_ns(), refused=refused))
 
     def handle(self, outcome: Outcome) -> None:
+        """Sends what is due after a frame, which stands in the result already."""
         self._fixes.handle(outcome.estimate, outcome.dock_error_m, outcome.speed_mps)
         if outcome.failure is not None:
             self._report_failure(outcome.failure)

@@ -53,6 +53,7 @@ class ReplayResult:
 
     @property
     def statuses(self) -> list[Status]:
+        """Status of each frame."""
         return [estimate.status for estimate in self.estimates]
 
     @property
@@ -70,6 +71,7 @@ class ReplayResult:
 
     @property
     def trajectory(self) -> Trajectory:
+        """map_from_body of the localised frames."""
         kept = np.array(localised(self.frames), bool) & ~np.isnan(self.map_from_body[:, 0, 0])
         return Trajectory(self.stamps_ns[kept], self.map_from_body[kept])
 

@@ -29,6 +29,7 @@ class ContinuousOdom:
         self._is_localized = False
 
     def handle(self, estimate: Estimate) -> PublishedPose:
+        """The pose to publish for this frame."""
         if not self._is_localized:
             self._frame = ContinuousFrame()
         odom_from_body = self._frame.handle(estimate.odometry)

@@ -28,6 +28,7 @@ class FixFigures:
         self._speed_mps: float | None = None
 
     def handle(self, estimate: Estimate, dock_error_m: float | None, speed_mps: float | None = None) -> None:
+        """Counts a frame."""
         self._speed_mps = speed_mps
         was_tracking = self._last is not None and self._last.status is Status.TRACKING
         self._last = estimate
@@ -70,6 +71,7 @@ class HealthFigures:
         self.last: Outcome | None = None  # the last frame
 
     def handle(self, outcome: Outcome) -> None:
+        """Counts a frame."""
         estimate = outcome.estimate
         self.last = outcome
         self._frame_ms.append(1e3 * outcome.cpu_s)
@@ -83,6 +85,7 @@ class HealthFigures:
         self._fixes.handle(estimate, outcome.dock_error_m, outcome.speed_mps)
 
     def count_failure(self) -> None:
+        """Counts a detected failure."""
         self._failures += 1
 
     def report(self, site: str, robot: str, wall_ns: int, more: Mapping[str, Figure], silent: bool) -> RobotHealth:

@@ -76,6 +76,7 @@ class Outcome:
     may_be_mapped: bool = True
 
     def pose_message(self) -> PoseMessage | None:
+        """The pose for the server; None while there is no single one with a covariance."""
         estimate, map_from_odom = self.estimate, self.published.map_from_odom
         if map_from_odom is None or estimate.cov_rot_trans is None:
             return None
@@ -131,6 +132,7 @@ class Robot:
 
     @property
     def running(self) -> LoadedMap | None:
+        """The version that the localizer uses."""
         versions = self._versions
         return versions.good if versions.candidate is None or versions.is_recheck else versions.candidate
 
@@ -187,6 +189,7 @@ class Robot:
         return Outcome(estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered)
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
+        """The failure of a source that has sent no frame for so long."""
         failure = self.monitor.handle_silence(for_s)
         return None if failure is None else self._context(failure, None)
 
@@ -221,6 +224,7 @@ class Robot:
         return None if self._last is None else VersionTrial(self._trial_settings, self._last[1])
 
     def _try(self, estimate: Estimate, frame: RectifiedFrame) -> None:
+        """Counts the frame for the running trial, if any."""
         self._last = (frame, estimate)
         versions = self._versions
         if versions.candidate is None:

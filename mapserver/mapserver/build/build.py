@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from fleetmap.bow import encode_vocabulary
-from fleetmap.config import Section, load_toml, to_dict
+from fleetmap.config import to_dict
 from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError, disk_errors
 from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.recordings.tum import write_tum
@@ -50,13 +50,14 @@ from mapserver.build.survey_recordings import (
 )
 from mapserver.build.vocabulary_selection import ChosenVocabulary, choose_vocabulary, judged
 from mapserver.build.worker import open_executor
+from mapserver.build.zones_file import read_zones
 from mapserver.quality.figures import Evidence, merged
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
 from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
-from mapserver.survey.loops.zones import Zones, zones_of
+from mapserver.survey.loops.zones import Zones
 from mapserver.survey.merge.initial_history import history_of
 from mapserver.survey.merge.multi_session import Joined, Session, join_sessions
 from mapserver.survey.settings import SurveySettings
@@ -101,8 +102,10 @@ class BuildOptions:
 
     @property
     def reading(self) -> RecordingOptions:
-        source = self.trajectory_source, self.initial_trajectory
-        return RecordingOptions(self.frames, self.calibration, self.use, *source)
+        """How the recordings are read."""
+        return RecordingOptions(
+            self.frames, self.calibration, self.use, self.trajectory_source, self.initial_trajectory
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +177,7 @@ def build_draft(
     a job of the store.
     """
     options, started_s = request.options, time.perf_counter()
-    zones = Zones() if options.zones is None else read_zones(options.zones)
+    zones = read_zones(options.zones)
     times, console = StageTimes(time.perf_counter), Console(stderr=True)
     with OpenRecordings(options.reading, request.store) as reading, ImageSpill(reading.folder) as images:
         run = _Run(request, reading, settings, zones, unusable, console, times, started_s, images)
@@ -206,15 +209,6 @@ def _admitted(run: _Run) -> dict[Path, Admission]:
             unusable=run.unusable,
             beginnings=beginnings,
         )
-
-
-def read_zones(path: Path) -> Zones:
-    """The zones of a site from a TOML file: a table [zones] with name = [[x, y], ...] in metres; UsageError for anything else."""
-    return zones_of(load_toml(path, _ZonesFile).zones, str(path))
-
-
-class _ZonesFile(Section, frozen=True):
-    zones: dict[str, object]
 
 
 def _parent(request: BuildRequest, maps: MapStore) -> Before | None:

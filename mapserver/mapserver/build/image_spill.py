@@ -82,6 +82,7 @@ class ImageSpill:
         self._file.close()
 
     def put(self, pictures: Pictures) -> int:
+        """See ImageStore."""
         frame, number = pictures.frame, len(self._places)
         parts = (frame.left, frame.right, frame.disparity_px)
         with disk_errors(f"picture {number} of the survey cannot be set aside", "make space beside the store"):
@@ -90,6 +91,7 @@ class ImageSpill:
         return number
 
     def get(self, number: int) -> Pictures:
+        """See ImageStore."""
         if number not in self._held:
             place = self._places[number]
             left, right, disparity = self._file.get(place)
@@ -113,9 +115,11 @@ class KeptFrames:
         self.keeps = True
 
     def stored(self, index: int) -> "StoredFrame":
+        """See FrameSource."""
         return self._source.stored(index)
 
     def frame(self, index: int) -> CameraFrame:
+        """See FrameSource."""
         if self._file is not None and index in self._places:
             place = self._places[index]
             return CameraFrame(place.stamp_ns, *self._file.get(place))
@@ -133,9 +137,11 @@ class KeptFrames:
             self.keeps = False
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
+        """See FrameSource."""
         self._source.hash_into(digest)
 
     def close(self) -> None:
+        """See FrameSource."""
         self._source.close()
         if self._file is not None:
             self._file.close()

@@ -20,6 +20,7 @@ class StageTimes:
         self._stage, self._finished = "", True
 
     def __call__(self, stage: str, done: int, total: int) -> None:
+        """Notes that `done` of `total` parts of a stage are done."""
         self._spend(stage if self._finished and done > 0 else self._stage or stage)
         self._stage, self._finished = stage, done >= total
 
@@ -54,6 +55,7 @@ class ProgressView:
             self._bars.stop()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
+        """Shows that `done` of `total` parts of a stage are done."""
         if self._bars is not None:
             self._show_bar(self._bars, stage, done, total)
         elif stage != self._shown:

@@ -200,10 +200,12 @@ class OpenRecordings:
             self._path = None
 
     def given_trajectory(self, recording: Recording, indices: NDArray[np.int64]) -> Trajectory | None:
+        """See RecordingOptions."""
         return self._options.given_trajectory(recording, indices)
 
     @contextmanager
     def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
+        """See RecordingOptions."""
         if path != self._path:
             self.__exit__()
             recording, indices = self._options.opened(path)

@@ -37,6 +37,7 @@ class Threads:
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
     ) -> Iterator[Result]:
+        """See Executor."""
         return _in_order(lambda batch: self._pool.submit(function, shared, batch), Future.result, batches, self._ahead)
 
 
@@ -53,6 +54,7 @@ class Processes:
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
     ) -> Iterator[Result]:
+        """See Executor."""
         if self._shared is not shared or not self._files:
             for old in self._files[:-1]:
                 old.unlink()
@@ -81,6 +83,7 @@ class Cluster:
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
     ) -> Iterator[Result]:
+        """See Executor."""
         if self._shared[0] is not shared:
             packed = (secrets.token_hex(8), pickle.dumps(shared, protocol=5))
             self._shared = (shared, self._client.scatter([packed], broadcast=True, hash=False)[0])

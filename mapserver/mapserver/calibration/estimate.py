@@ -66,6 +66,7 @@ class CalibrationEstimate:
     observations: int
 
     def get(self, name: CalibrationParameter) -> ParameterEstimate:
+        """The estimate of one parameter."""
         return next(p for p in self.parameters if p.name is name)
 
     def corrections(self) -> Array:

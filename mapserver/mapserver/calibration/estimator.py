@@ -130,6 +130,7 @@ class _Problem:
         self.keyframes = data.obs_keyframe.astype(np.int64)
 
     def prepare(self, state: MotionState, theta: Array, scales: ErrorScales) -> None:
+        """Integrates the samples and takes over the scales."""
         offset_s = float(theta[INDEX[CalibrationParameter.TIME_OFFSET]])
         self.scales, self.base_offset_s = scales, offset_s
         given, self.origin = self.data.calibration.imu, state
@@ -158,11 +159,13 @@ class _Problem:
         return rows + [_divided(each, self.scales.wheel) for each in rolled]
 
     def cost(self, theta: Array, state: MotionState) -> float:
+        """Half the robust sum of squares, priors included."""
         rows, _ = image_residuals(self.seen, self.data, self._at_exposure(theta, state), theta, self.scales.images)
         edges = sum(float(each.residual @ each.residual) for each in self._edges(theta, state))
         return robust_cost(rows) + 0.5 * (edges + float(self.prior @ theta**2) + self._held(state)[2])
 
     def system(self, theta: Array, state: MotionState, damping: float = 0.0) -> _System:
+        """The normal equations at theta and `state`."""
         exposed = self._at_exposure(theta, state)
         fixed = self.rates_map, self.slopes
         images = image_rows(self.seen, self.data, (exposed, theta), self.scales.images, fixed)

@@ -39,6 +39,7 @@ class ActorOptions:
     reason: Annotated[str, typer.Option(metavar="TEXT", help="Why; kept in the log.")] = ""
 
     def named(self) -> "Actor":
+        """The actor for the store's log."""
         import getpass
         import os
 

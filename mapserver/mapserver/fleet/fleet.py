@@ -138,6 +138,7 @@ class Fleet:
             self._ingest.take_health(health, entry.last_estimate, now_ns, dict(entry.report), entry.version)
 
     def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
+        """Keeps an estimate in memory."""
         now_ns = self._clock_ns()
         with self._lock:
             self._entry(site, robot, now_ns, message.map_version).last_estimate = message
@@ -212,6 +213,7 @@ class Fleet:
             return sorted(robot for key_site, robot in self._robots if key_site == site)
 
     def robots(self, site: str | None = None) -> list[RobotStatus]:
+        """All robots (of a site), by site and name."""
         now_ns = self._clock_ns()
         with self._lock:
             chosen = [(key, robot) for key, robot in sorted(self._robots.items()) if site in {None, key[0]}]

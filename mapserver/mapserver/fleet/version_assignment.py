@@ -21,6 +21,7 @@ class VersionAssignment:
         return canary is not None and number_of(canary.site, canary.version, robot) < canary.threshold
 
     def wanted(self, robot: str) -> WantedVersion:
+        """The version that this robot should run."""
         return self.tried if self.tried is not None and self.is_canary(robot) else self.current
 
 

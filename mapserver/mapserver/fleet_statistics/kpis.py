@@ -57,10 +57,12 @@ class Counters:
     continued: int = 0
 
     def add(self, other: Self) -> None:
+        """Adds what another one holds."""
         for name in COUNTER_COLUMNS:
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
     def values(self) -> tuple[float, ...]:
+        """All sums in the order of COUNTER_COLUMNS."""
         return astuple(self)
 
     @property

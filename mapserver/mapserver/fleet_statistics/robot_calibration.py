@@ -36,6 +36,7 @@ class CalibrationFigure:
 
     @property
     def words(self) -> str:
+        """Value and sigma with their unit."""
         if self.name.endswith("_scale"):
             return f"{100 * self.value:+.2f} ± {100 * self.sigma:.2f} %"
         scale, unit = (1e3, "ms") if self.name.endswith("_s") else (1.0, self.name.rpartition("_")[2])

@@ -18,7 +18,8 @@ from fleetmap.geometry import se3_inverse, skew
 from fleetmap.live_survey import LiveSurveyState
 from fleetmap.messages import EstimateMessage, Placement
 from fleetmap.sensors.samples import ImuSamples
-from mapserver.build.build import BuildOptions, read_zones
+from mapserver.build.build import BuildOptions
+from mapserver.build.zones_file import read_zones
 from mapserver.library import BuiltMap, build_map, open_map
 from mapserver.live.drives import Drive, DueFrame
 from mapserver.live.mapping_process import MOST_PLACES, NO_SKETCH, MakeMap, MappingProcess, thinning
@@ -27,7 +28,6 @@ from mapserver.survey.live.frozen_map import FrozenMap, FrozenVersion
 from mapserver.survey.live.live_map import LiveMap
 from mapserver.survey.live.live_values import LiveEstimate, LiveRig
 from mapserver.survey.live.tracking import LiveTracking
-from mapserver.survey.loops.zones import Zones
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig
 
@@ -154,7 +154,7 @@ class _Survey:
         request = self._request
         if request.frozen is not None:
             return partial(FrozenMap, frozen_version(request.store, request.site, request.frozen), rig)
-        zones = Zones() if request.options.zones is None else read_zones(request.options.zones)
+        zones = read_zones(request.options.zones)
         return partial(LiveMap, SurveyConfig(request.settings, default_vocabulary(), zones), rig)
 
     def _track(self, tracking: LiveTracking, mapping: MappingProcess, is_stopped: Callable[[], bool]) -> None:

@@ -47,6 +47,7 @@ class GateVerdict:
 
     @property
     def accepted(self) -> bool:
+        """Whether there is no reason against the draft."""
         return not self.reasons and not self.hard_reasons
 
 

@@ -39,6 +39,7 @@ class PlaceIndex:
         return self._place_ids[: self._count]
 
     def add(self, place_id: int, vector: BowVector) -> None:
+        """Adds a place; its id must be new."""
         assert place_id not in self._known, place_id
         assert len(vector) == 0 or vector.word_ids[-1] < self._word_count
         self._known.add(place_id)

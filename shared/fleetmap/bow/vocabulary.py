@@ -38,6 +38,7 @@ class Vocabulary:
 
     @property
     def word_count(self) -> int:
+        """Number of words."""
         return len(self.idf)
 
     def words(self, descriptors: Descriptors) -> WordIds:

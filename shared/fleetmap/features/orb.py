@@ -46,12 +46,14 @@ class Features:
         return len(self.pixels)
 
     def take(self, indices: NDArray[np.int64]) -> "Features":
+        """The features at `indices`."""
         return Features(
             self.pixels[indices], self.octaves[indices], self.angles_deg[indices], self.descriptors[indices]
         )
 
     @classmethod
     def empty(cls) -> "Features":
+        """No features."""
         return cls(np.zeros((0, 2)), np.zeros(0, np.int8), np.zeros(0, np.float32), np.zeros((0, 32), np.uint8))
 
 

@@ -26,6 +26,7 @@ class Columns:
         self._what = what
 
     def bytes(self, count: int) -> NDArray[np.uint8]:
+        """The next `count` bytes."""
         self._offset += count
         return self._data[self._offset - count : self._offset]
 

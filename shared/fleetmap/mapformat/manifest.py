@@ -70,6 +70,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def landmarks(self) -> int:
+        """Landmarks in all tiles."""
         return sum(tile.landmarks for tile in self.tiles)
 
     @property

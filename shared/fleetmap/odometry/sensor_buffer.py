@@ -24,6 +24,7 @@ class SensorBuffer:
         self._pending.append(samples)
 
     def add_wheel(self, samples: Sequence[WheelSample]) -> None:
+        """Takes samples newer than any before."""
         self._wheel.extend(samples)
 
     def absorb(self, needed_from_ns: int, memory_s: float) -> None:

@@ -32,6 +32,7 @@ class Correspondences:
         return len(self.points_source)
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Correspondences":
+        """Some of them."""
         return Correspondences(self.camera, self.points_source[rows], self.pixels[rows], self.sigmas_px[rows])
 
 

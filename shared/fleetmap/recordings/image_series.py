@@ -25,9 +25,11 @@ class ImageSeries(Generic[T]):
         return len(self.sources)
 
     def take(self, indices: NDArray[np.int64]) -> "ImageSeries[T]":
+        """Those at `indices` (K,)."""
         return ImageSeries(self.stamps_ns[indices], tuple(self.sources[int(i)] for i in indices))
 
     def forward(self, what: str, log: ReadLog) -> "ImageSeries[T]":
+        """Those whose stamps increase, as `forward_only`."""
         return self.take(np.flatnonzero(forward_only(self.stamps_ns, what, log)))
 
 
@@ -57,6 +59,7 @@ class SeriesFrames(Generic[T]):
         self.left, self.right, self.depth = left, right, depth
 
     def stored(self, index: int) -> StoredFrame:
+        """Frame `index` with its images as they are stored."""
         left, right, depth = (
             None if series is None else self._load(series.sources[index], int(series.stamps_ns[index]))
             for series in (self.left, self.right, self.depth)
@@ -65,4 +68,5 @@ class SeriesFrames(Generic[T]):
         return StoredFrame(int(self.left.stamps_ns[index]), left, right, depth)
 
     def frame(self, index: int) -> CameraFrame:
+        """Frame `index`, decoded."""
         return decode_frame(self.stored(index))

@@ -26,6 +26,7 @@ class ReadLog:
     files: list[Path] = field(default_factory=list)
 
     def note(self, what: str, detail: str) -> None:
+        """Adds an issue."""
         self.issues.append(DataIssue(what, detail))
 
 

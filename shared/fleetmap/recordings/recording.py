@@ -124,6 +124,7 @@ class Recording:
         return digest.hexdigest()
 
     def close(self) -> None:
+        """Closes open files; the recording's arrays stay usable."""
         self.frames.close()
 
     def __enter__(self) -> "Recording":

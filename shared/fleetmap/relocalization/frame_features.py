@@ -38,6 +38,7 @@ class FrameFeatures:
         return self.pixels[rows]
 
     def without_depth(self) -> "FrameFeatures":
+        """A copy as of a single camera."""
         return FrameFeatures(self.features, np.column_stack([self.pixels[:, :2], np.full(len(self.pixels), np.nan)]))
 
 

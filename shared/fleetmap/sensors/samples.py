@@ -40,6 +40,7 @@ class ImuSamples:
 
     @classmethod
     def empty(cls) -> "ImuSamples":
+        """No samples."""
         return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
 
     def between(self, start_ns: int, end_ns: int) -> "ImuSamples":

@@ -152,6 +152,7 @@ class CarriedMotion:
 
     @property
     def duration_s(self) -> float:
+        """Of all pieces."""
         return float(self._ends_s[-1])
 
     def map_from_body(self, times_s: Array) -> Array:
@@ -159,10 +160,12 @@ class CarriedMotion:
         return self._pick(times_s, lambda motion, local_s: motion.map_from_body(local_s))
 
     def rates(self, times_s: Array) -> tuple[Array, Array]:
+        """As RouteMotion.rates of the piece in force."""
         gyro = self._pick(times_s, lambda motion, local_s: motion.rates(local_s)[0])
         return gyro, self._pick(times_s, lambda motion, local_s: motion.rates(local_s)[1])
 
     def velocity_body(self, times_s: Array) -> Array:
+        """As RouteMotion.velocity_body of the piece in force."""
         return self._pick(times_s, lambda motion, local_s: motion.velocity_body(local_s))
 
     def _pick(self, times_s: Array, ask: Callable[[RouteMotion, Array], Array]) -> Array:

@@ -31,6 +31,7 @@ class Optics:
 
     @property
     def has_lens(self) -> bool:
+        """Whether samples go through a look-up."""
         return len(self.rays) > 0
 
     def plane_indices(self, samples: int) -> NDArray[np.int32]:

@@ -62,6 +62,7 @@ class StereoRenderer:
         self._last_right: Image | None = None
 
     def close(self) -> None:
+        """Ends the threads."""
         self._workers.shutdown()
 
     def path(self, camera: int) -> Callable[[float], Array]:
@@ -84,6 +85,7 @@ class StereoRenderer:
         return chosen
 
     def shoot(self, t_s: float) -> StereoShot:
+        """The pair whose exposure is centred at t."""
         place = self._motion.map_from_body(np.array([t_s]))[0][:3, 3]
         scene = self._world.scene_around(float(place[0]), float(place[1]))
         exposure = self.exposure(t_s)

@@ -42,6 +42,7 @@ class HallMaker:
         return column * layout.chunk_length_m, y_min, x_max, y_max
 
     def add_chunk(self, builder: FaceBuilder, column: int, row: int) -> None:
+        """Everything of the hall that lies in the chunk."""
         self._add_floor_quad(builder, self.rectangle(column, row), 0.0, self._textures.concrete, row)
         self._add_markings(builder, column, row)
         self._add_walls(builder, column, row)
@@ -55,6 +56,7 @@ class HallMaker:
         self._add_signs(builder, column, row)
 
     def lamps(self, column: int, row: int) -> list[Lamp]:
+        """The light sources in the chunk."""
         layout, (x_min, _, x_max, _) = self._layout, self.rectangle(column, row)
         y = layout.aisle_y_m(row)
         lamps = [Lamp(x, y, layout.ceiling_m - 0.8, LAMP_POWER, group) for x, group in self._lamp_places(column, row)]

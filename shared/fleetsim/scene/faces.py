@@ -107,6 +107,7 @@ class FaceBuilder:
         self._box_numbers.append((*textures, mask, material, group, scramble, int(is_solid)))
 
     def add_quad(self, origin_map: Vector, edge_u: Vector, edge_v: Vector, surface: Surface) -> None:
+        """A single face."""
         texture, tint, scramble, material, emission, group, offset_texels = surface
         assert isinstance(texture, int)
         self._quads.append((*origin_map, *edge_u, *edge_v))

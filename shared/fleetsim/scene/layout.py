@@ -55,6 +55,7 @@ class Layout(Section, frozen=True):
 
     @property
     def rack_top_m(self) -> float:
+        """Height of the uprights."""
         return self.shelf_heights_m[self.levels - 1] + 1.3
 
     @property
@@ -63,9 +64,11 @@ class Layout(Section, frozen=True):
         return 2 * self.aisles
 
     def aisle_y_m(self, aisle: int) -> float:
+        """Centre line of an aisle."""
         return self.margin_m + self.pitch_m * (aisle + 0.5)
 
     def row_y_m(self, row: int) -> float:
+        """Centre line of a rack row."""
         side = -1.0 if row % 2 else 1.0
         return self.aisle_y_m(row // 2) + side * (self.aisle_width_m + self.rack_depth_m) / 2
 

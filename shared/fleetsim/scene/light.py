@@ -24,6 +24,7 @@ class Exposure:
 
     @property
     def grey_per_radiance(self) -> float:
+        """Factor from radiance to grey levels."""
         return GREY_PER_MS * 1e3 * self.time_s * self.gain
 
 

@@ -91,6 +91,7 @@ class World:
         return self._scenes[centre]
 
     def builder(self) -> FaceBuilder:
+        """An empty builder that knows the site's textures."""
         return FaceBuilder(self.textures.atlas.table[:, :2], self.textures.stretched)
 
     def detailed_faces(self, column: int, row: int) -> Faces:

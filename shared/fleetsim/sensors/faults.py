@@ -31,6 +31,7 @@ class Fault:
     end_s: float
 
     def covers(self, time_s: float) -> bool:
+        """Whether it is in force."""
         return self.start_s <= time_s < self.end_s
 
 
@@ -57,6 +58,7 @@ class FaultPlan:
     faults: tuple[Fault, ...] = ()
 
     def has(self, name: str, time_s: float) -> bool:
+        """Whether a fault of that name is in force."""
         return any(fault.name == name and fault.covers(time_s) for fault in self.faults)
 
     def spoil_imu(self, samples: ImuSamples) -> ImuSamples:
@@ -72,6 +74,7 @@ class FaultPlan:
         return ImuSamples(samples.stamps_ns[kept], gyro[kept], accel[kept])
 
     def spoil_wheels(self, samples: tuple[WheelSample, ...]) -> tuple[WheelSample, ...]:
+        """The samples with slip."""
         return tuple(self._slipped(sample) for sample in samples)
 
     def _slipped(self, sample: WheelSample) -> WheelSample:

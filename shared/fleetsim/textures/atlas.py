@@ -53,4 +53,5 @@ class AtlasBuilder:
         return len(self._rows) - 1
 
     def finish(self) -> Atlas:
+        """The atlas of everything added."""
         return Atlas(np.concatenate(self._parts), np.array(self._rows, np.int32))

@@ -71,6 +71,7 @@ class CalibrationMonitor:
                 self._job = self._search(query)
 
     def work(self) -> None:
+        """One slice of what is to be done."""
         if self._job is not None and next(self._job, self) is self:
             self._job = None
 

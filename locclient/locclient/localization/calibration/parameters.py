@@ -94,6 +94,7 @@ class CalibrationState(NamedTuple):
 
     @property
     def is_wrong(self) -> bool:
+        """Whether the calibration is wrong by more than may pass."""
         return bool(self.text)
 
     def cov_bias(self, map_from_cam: Array, map_from_body: Array) -> Array:

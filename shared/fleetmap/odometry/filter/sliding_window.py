@@ -62,6 +62,7 @@ class SlidingWindow:
     # --- what it knows ---
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
+        """As `Odometry.motion_since`."""
         kept, frame_from_kept = self._kept(frame_index)
         if kept not in self.filter.clone_ids:
             return None
@@ -70,6 +71,7 @@ class SlidingWindow:
         return frame_from_kept @ kept_from_now, carry @ covariance @ carry.T
 
     def body_since(self, frame_index: int) -> Array | None:
+        """The transform of `motion_since` alone."""
         kept, frame_from_kept = self._kept(frame_index)
         return frame_from_kept @ self.filter.body_since(kept) if kept in self.filter.clone_ids else None
 

@@ -70,6 +70,7 @@ class VisualOdometry:
 
     @property
     def started(self) -> bool:
+        """Whether there are points to be located by."""
         return bool(self._local_map.views)
 
     def points_in_camera(self, ids: Ids) -> Array:
@@ -245,6 +246,7 @@ class VisualOdometry:
         return bool(np.median(np.linalg.norm(last.pixels[a] - view.pixels[b], axis=1)) > wanted_px)
 
     def _grow(self) -> None:
+        """The window adjusted, and what left it forgotten."""
         self._adjust(held=2)
         self._local_map.views = self._local_map.views[-self._settings.window_views :]
         seen = {i for v in self._local_map.views for i in v.ids.tolist()}

@@ -44,6 +44,7 @@ class Observations:
         self._pixels = np.concatenate([self._pixels, pixels])
 
     def clear(self) -> None:
+        """Forgets all."""
         self._keep(np.zeros(len(self._ids), bool))
 
     def take(self, alive: Ids, held: Ids, due: NDArray[np.bool_], camera: StereoCamera) -> TrackBatch:

@@ -129,9 +129,11 @@ class RegisteredFrames:
         return replace(frame, depth_m=depth_mm.astype(np.float32) / np.float32(1000.0))
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
+        """The files as they are."""
         self._files.hash_into(digest)
 
     def close(self) -> None:
+        """Closes the files."""
         self._files.close()
 
     def _registered_mm(self, depth_m: Depth, stored: StoredFrame) -> Depth:

@@ -30,6 +30,7 @@ class InfoCamera(NamedTuple):
 
     @property
     def frame(self) -> str:
+        """The name of its frame in the transforms."""
         return self.info.frame_id.lstrip("/")
 
 

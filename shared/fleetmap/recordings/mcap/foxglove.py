@@ -28,15 +28,18 @@ class FoxgloveCodec:
         self._classes: dict[int, Any] = {}
 
     def stamp_ns(self, channel: Channel, data: memoryview) -> int:
+        """The field `timestamp`."""
         return _stamp_ns(self._parse(channel, bytes(data)))
 
     def image(self, channel: Channel, data: bytes, where: str) -> StoredImage:
+        """RawImage or CompressedImage."""
         message = self._parse(channel, data)
         if channel.schema.name.endswith("CompressedImage"):
             return StoredImage("file", message.data, where)
         return StoredImage(message.encoding, message.data, where, message.width, message.height, message.step)
 
     def imu(self, channel: Channel, messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
+        """Messages of the convention in this module's head."""
         parsed = [self._parse(channel, data) for data in messages]
         try:
             gyro = np.array([_xyz(message.angular_velocity) for message in parsed])
@@ -51,15 +54,18 @@ class FoxgloveCodec:
         )
 
     def pose(self, channel: Channel, data: bytes) -> tuple[int, Array]:
+        """PoseInFrame."""
         message = self._parse(channel, data)
         turn = message.pose.orientation
         return _stamp_ns(message), np.array([*_xyz(message.pose.position), turn.w, turn.x, turn.y, turn.z])
 
     def links(self, channel: Channel, data: bytes) -> list[FrameLink]:
+        """FrameTransform or FrameTransforms."""
         message = self._parse(channel, data)
         return [_link(item) for item in (message.transforms if hasattr(message, "transforms") else [message])]
 
     def camera_info(self, channel: Channel, data: bytes) -> CameraInfo:
+        """CameraCalibration."""
         message = self._parse(channel, data)
         matrix, projection = np.array(message.K), np.array(message.P)
         if len(matrix) != 9:

@@ -63,29 +63,37 @@ class RosCodec:
     """ROS 2 messages in CDR."""
 
     def stamp_ns(self, channel: Channel, data: memoryview) -> int:
+        """From the message's header, its first field."""
         return CdrReader(bytes(data[:16])).stamp_ns()
 
     def image(self, channel: Channel, data: bytes, where: str) -> StoredImage:
+        """Image or CompressedImage."""
         if type_name(channel).endswith("CompressedImage"):
             return ros_messages.decode_compressed_image(data, where)
         return ros_messages.decode_image(data, where)
 
     def imu(self, channel: Channel, messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
+        """Imu messages."""
         return ros_messages.decode_imu(messages)
 
     def pose(self, channel: Channel, data: bytes) -> tuple[int, Array]:
+        """PoseStamped."""
         return ros_messages.decode_pose(data)
 
     def links(self, channel: Channel, data: bytes) -> list[FrameLink]:
+        """TFMessage."""
         return ros_messages.decode_frame_links(data)
 
     def camera_info(self, channel: Channel, data: bytes) -> CameraInfo:
+        """CameraInfo."""
         return ros_messages.decode_camera_info(data)
 
     def wheel(self, channel: Channel, data: bytes) -> WheelSample:
+        """Odometry."""
         return ros_messages.decode_odometry(data)
 
     def prior(self, channel: Channel, data: bytes) -> PositionPrior:
+        """PoseWithCovarianceStamped."""
         return ros_messages.decode_prior(data)
 
 
@@ -168,6 +176,7 @@ class McapFrames(SeriesFrames[tuple[_Stream, Location]]):
             hash_file(path, digest)
 
     def close(self) -> None:
+        """Closes the file."""
         self._file.close()
 
     def _image(self, source: tuple[_Stream, Location], stamp_ns: int) -> StoredImage:

@@ -82,6 +82,7 @@ class Damage:
         self.bad_chunk_bytes += size
 
     def all(self) -> list[DataIssue]:
+        """Everything in words."""
         found = list(self.issues)
         if self.too_large:
             limits = f"{MAX_CHUNK_BYTES >> 20} MiB in a chunk, {MAX_ATTACHMENT_BYTES >> 20} MiB in an attachment"

@@ -77,6 +77,7 @@ class McapRecordingWriter:
             self._write_image(topics.depth, stamp_ns, "cam0", stored.depth, is_depth=True)
 
     def write_imu(self, samples: ImuSamples) -> None:
+        """Inertial samples, in body axes."""
         for stamp_ns, gyro, accel in zip(
             samples.stamps_ns.tolist(), samples.gyro_radps, samples.accel_mps2, strict=True
         ):
@@ -84,11 +85,13 @@ class McapRecordingWriter:
             self._write(self._topics.imu, "sensor_msgs/Imu", stamp_ns, data)
 
     def write_wheel(self, samples: WheelSample | Iterable[WheelSample]) -> None:
+        """Wheel odometry, one sample or several."""
         for sample in [samples] if isinstance(samples, WheelSample) else samples:
             data = messages.encode_odometry(sample, ODOM_FRAME, BASE_FRAME)
             self._write(self._topics.wheel, "nav_msgs/Odometry", sample.stamp_ns, data)
 
     def write_prior(self, priors: PositionPrior | Iterable[PositionPrior]) -> None:
+        """Position priors, one or several."""
         for prior in [priors] if isinstance(priors, PositionPrior) else priors:
             data = messages.encode_prior(prior, MAP_FRAME)
             self._write(self._topics.prior, "geometry_msgs/PoseWithCovarianceStamped", prior.stamp_ns, data)
@@ -108,6 +111,7 @@ class McapRecordingWriter:
         self._part.replace(self._path)
 
     def discard(self) -> None:
+        """Throws away what was written."""
         self._file.close()
         self._part.unlink(missing_ok=True)
 

@@ -23,9 +23,11 @@ class CdrReader:
         self.endian = "<" if data[1] else ">"
 
     def unsigned(self) -> int:
+        """A uint32."""
         return int(self._unpack("I", 4))
 
     def byte(self) -> int:
+        """A uint8 or bool."""
         return int(self._unpack("B", 1))
 
     def stamp_ns(self) -> int:
@@ -34,10 +36,12 @@ class CdrReader:
         return seconds * 1_000_000_000 + self.unsigned()
 
     def text(self) -> str:
+        """A string; what is no UTF-8 in it is replaced."""
         length = self.unsigned()
         return self._take(length).rstrip(b"\0").decode("utf-8", "replace")
 
     def blob(self) -> bytes:
+        """A sequence of uint8."""
         return self._take(self.unsigned())
 
     def doubles(self, count: int) -> Array:
@@ -70,22 +74,27 @@ class CdrWriter:
         self._out = bytearray(_HEAD)
 
     def unsigned(self, value: int) -> "CdrWriter":
+        """A uint32."""
         return self._pack("<I", 4, value)
 
     def byte(self, value: int) -> "CdrWriter":
+        """A uint8 or bool."""
         return self._pack("<B", 1, value)
 
     def header(self, stamp_ns: int, frame_id: str) -> "CdrWriter":
+        """std_msgs/Header."""
         seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
         return self._pack("<i", 4, seconds).unsigned(nanoseconds).text(frame_id)
 
     def text(self, value: str) -> "CdrWriter":
+        """A string."""
         encoded = value.encode() + b"\0"
         self.unsigned(len(encoded))
         self._out += encoded
         return self
 
     def blob(self, value: bytes) -> "CdrWriter":
+        """A sequence of uint8."""
         self.unsigned(len(value))
         self._out += value
         return self
@@ -99,6 +108,7 @@ class CdrWriter:
         return self
 
     def message(self) -> bytes:
+        """All that was put in."""
         return bytes(self._out)
 
     def _pack(self, code: str, size: int, value: int) -> "CdrWriter":
