@@ -64,7 +64,7 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     to any. More than one part: the survey lost itself, and no sure revisit has joined them yet. loops, refused: how many, and of which
     verdict; revisits: the newest ones. cells (T, 3): x and y of squares of COVERAGE_CELL_M that are covered, and their landmarks.
     estimate: where the newest keyframe is in this map, or in the `frozen` version, odometry's frame in the place of `odom`.
-    scale_known: False while, of one camera, nothing has shown how long a metre is.
+    scale_known: False for one camera: the map that grows is in a unit of its own, with an IMU too.
     """
 
     site: Name

@@ -124,7 +124,8 @@ class _Survey:
         self._worst = 1.0
         self._sketch = NO_SKETCH
         self._behind, self._failed, self._lag_s = 0, "", 0.0
-        self._scale_known = True
+        # Also with an IMU: odometry finds the scale, and the map's adjustment, at half of it on one recording, does not keep to that.
+        self._scale_known = drive.rectifier.camera.baseline_m > 0
         self._stamps_since: list[int] = []
         self._localized = 0  # keyframes
 
@@ -176,7 +177,6 @@ class _Survey:
             self._latencies_s.append(time.monotonic() - due.due_s)
         self._stamps_ns.append(due.frame.stamp_ns)
         self._stamps_since.append(due.frame.stamp_ns)
-        self._scale_known = tracking.scale_known
         self._worst = min(self._worst, tracked.quality)
         if tracked.keyframe is not None:
             mapping.put(due.frame, tracked.keyframe, self._stamps_since)

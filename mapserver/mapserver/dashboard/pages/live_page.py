@@ -124,8 +124,8 @@ def _scale(survey: LiveSurvey) -> Markup:
     if survey.state.scale_known:
         return Markup("")
     words = (
-        "The scale is not known: one camera alone does not show how long a metre is. With an IMU it is found once the robot has "
-        "speeded up, slowed down and turned; without one, lengths below are in a unit of the survey's own."
+        "The scale is not known: lengths of a map from one camera that is still being made are in a unit of its own. With an IMU "
+        "the draft at the end has metres, if the robot speeded up, slowed down and turned enough."
     )
     return notice("warn", words)
 

@@ -47,7 +47,6 @@ class LiveTracking:
         self._run = OdometryRun(calibration, rectifier, settings)
         self._is_single, self._has_imu = rectifier.camera.baseline_m == 0, calibration.imu is not None
         self._torn_m2 = 0.0  # variance of what lies between runs of one camera
-        self.scale_known = not self._is_single
         self._continued = ContinuedCovariance()
         self._before: _Before | None = None
         self._imu: list[ImuSamples] = []
@@ -58,7 +57,6 @@ class LiveTracking:
         self._imu.append(imu)
         estimate, covariance = tracked.estimate, self._continued.handle(tracked.estimate)
         self._turn(estimate)
-        self.scale_known = estimate.scale_known and (self._has_imu or not self._is_single)
         keyframe = None
         if tracked.is_keyframe and self._has_place(estimate):
             keyframe = self._keyframe(tracked.number, estimate, covariance, tracked.frame_from_body)
