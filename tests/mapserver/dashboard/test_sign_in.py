@@ -195,6 +195,7 @@ def injected(context: BrowserContext, served: Served) -> bool:
 @pytest.mark.parametrize("is_policy_off", [False, True])
 def test_a_script_in_a_failures_words_does_not_run(browser: Browser, served: Served, is_policy_off: bool) -> None:
     context = browser.new_context(ignore_https_errors=True, bypass_csp=is_policy_off)
+    context.set_default_timeout(90_000)
     try:
         assert injected(context, served) is is_policy_off
     finally:

@@ -269,7 +269,7 @@ def serving(folder: Path, *options: str, http: str = "127.0.0.1:0") -> Iterator[
             served = Served(addresses["http"], addresses["zenoh"], folder, process.pid)
             yield served
             process.terminate()
-            assert process.wait(timeout=20) == 0
+            assert process.wait(timeout=20) == 0, (folder / "server.log").read_text(encoding="utf-8")
             log.seek(0)
             served.log = log.read().splitlines()
         finally:
