@@ -136,7 +136,7 @@ def test_a_long_key_is_kept_nowhere(store: MapStore, fleet: Fleet, caplog: pytes
         service._hear(f"fleetmap/{'x' * 60_000}/robots/r1/health", b"nonsense")
         with pytest.raises(LinkError):
             service._failure(f"fleetmap/lab/robots/{'x' * 60_000}/failures", b"nonsense")
-        assert [rate._buckets for rate in (*service._rates.values(), fleet._failures)] == [{}] * 4
+        assert not any(rate._buckets for rate in (*service._rates.values(), fleet._failures))
         assert "refused" in caplog.text
         assert len(caplog.text) < 2000
         service.close()
@@ -257,10 +257,9 @@ def test_the_database_shrinks_again(tmp_path: Path, clock: Clock) -> None:
 def test_an_older_database_shrinks_after_gc(tmp_path: Path) -> None:
     """It was made without the setting, as all before this version: gc writes it anew, once."""
     golden = REPOSITORY / "tests" / "golden"
-    newest = sorted(golden.glob("store-*.sqlite3"))[-1]
     root = tmp_path / "store"
     root.mkdir()
-    shutil.copy(newest, root / "store.sqlite3")
+    shutil.copy(golden / "store-6.sqlite3", root / "store.sqlite3")
     shutil.copytree(golden / "store-blobs", root / "blobs")
     with MapStore.open(root) as store:
         before = store.versions("lab")
