@@ -1,8 +1,13 @@
-"""Pictures in temporary files: of keyframes, which keeps a long survey small, and of frames, which are decoded once."""
+"""Pictures in temporary files: of keyframes, which keeps a long survey small, and of frames, which are decoded once.
 
+What is found in keyframes lies in a file too, a tenth of a megabyte for each: it is read where it lies, and leaves memory between stages.
+"""
+
+import mmap
 import os
 import tempfile
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -23,6 +28,8 @@ if TYPE_CHECKING:
     from fleetmap.recordings import FrameSource, StoredFrame
 
 _HELD = 48  # more than the keyframes that one is compared with
+_SEGMENT_BYTES = 1 << 24  # of the file that features lie in; a keyframe has more than a hundred in it
+_ALIGNED_BYTES = 64
 _KEPT_BYTES = 1_000_000_000  # all that an examination decodes of a pair of 1280 x 720
 
 
@@ -67,11 +74,45 @@ class _ArrayFile:
         return array
 
 
-class ImageSpill:
-    """An ImageStore over a temporary file in `folder`."""
+class _MappedFile:
+    """Arrays in an unnamed file in `folder` that are read where they lie; the system removes it with the last of them."""
 
     def __init__(self, folder: Path) -> None:
-        self._file = _ArrayFile(folder)
+        with disk_errors(f"{folder} takes no temporary file", "check its rights and space"):
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed with its owner
+        self._segments: list[mmap.mmap] = []
+        self._size, self._used = 0, 0  # of the file, and of its last segment
+
+    def close(self) -> None:
+        self._file.close()
+
+    def put(self, array: AnyArray) -> AnyArray:
+        """The same array in the file; OSError where that has no room."""
+        data = np.ascontiguousarray(array)
+        if not data.size:
+            return data
+        if not self._segments or self._used + data.nbytes > len(self._segments[-1]):
+            length = -(-max(data.nbytes, _SEGMENT_BYTES) // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
+            # Room is taken before it is written to: a full disk would end the process then.
+            os.posix_fallocate(self._file.fileno(), self._size, length)
+            self._segments.append(mmap.mmap(self._file.fileno(), length, offset=self._size))
+            self._size, self._used = self._size + length, 0
+        kept = np.frombuffer(self._segments[-1], data.dtype, data.size, self._used).reshape(data.shape)
+        kept[...] = data
+        self._used += -(-data.nbytes // _ALIGNED_BYTES) * _ALIGNED_BYTES
+        return kept
+
+    def release(self) -> None:
+        """Takes the file out of this process's memory; what is read again comes back from the system's own, or from the disk."""
+        for segment in self._segments:
+            segment.madvise(mmap.MADV_DONTNEED)
+
+
+class ImageSpill:
+    """An ImageStore over temporary files in `folder`."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file, self._features = _ArrayFile(folder), _MappedFile(folder)
         self._places: list[_Place] = []
         self._held: OrderedDict[int, Pictures] = OrderedDict()
 
@@ -80,6 +121,7 @@ class ImageSpill:
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
         self._file.close()
+        self._features.close()
 
     def put(self, pictures: Pictures) -> int:
         """See ImageStore."""
@@ -98,6 +140,15 @@ class ImageSpill:
             self._hold(number, Pictures(RectifiedFrame(place.stamp_ns, left, right, disparity), half_pyramid(left)))
         self._held.move_to_end(number)
         return self._held[number]
+
+    def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
+        """See ImageStore."""
+        with disk_errors("what a keyframe shows cannot be set aside", "make space beside the store"):
+            return [self._features.put(array) for array in arrays]
+
+    def release(self) -> None:
+        """See ImageStore."""
+        self._features.release()
 
     def _hold(self, number: int, pictures: Pictures) -> None:
         self._held[number] = pictures

@@ -100,7 +100,7 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
             frame = raw if isinstance(raw, RectifiedFrame) else rectifier.rectify(raw)
             tracked = run.handle(frame, *feed.until(frame.stamp_ns))
             seen.append(FrameTracks.of_frame(tracked.estimate))
-            tools.progress("odometry", tracked.number + 1, inputs.frame_count)
+            tools.at("odometry", tracked.number + 1, inputs.frame_count)
             if tracked.is_keyframe:
                 yield tracked.number, tracked.frame
 

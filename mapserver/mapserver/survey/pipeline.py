@@ -101,10 +101,13 @@ def survey_from(
 def finish_survey(chain: AdjustedChain, options: SurveyConfig, tools: SurveyTools) -> Survey:
     """The stages from the loops on."""
     settings = options.settings
-    odometry, state, depths = chain.odometry, chain.state, chain.depths
-    state, loops = _close_loops(odometry, state, chain.matched, options, tools)
+    odometry, depths = chain.odometry, chain.depths
+    state, loops = _close_loops(odometry, chain.state, chain.matched, options, tools)
+    # The landmarks so far are those of neighbours; all are made anew, and nobody may hold the old ones meanwhile.
+    del chain
+    state = replace(state, landmarks=no_landmarks())
     odometry, state, stereo_yaw = _adjust_globally(odometry, state, depths, settings, tools)
-    tools.progress("global adjustment", 2, 2)
+    tools.at("global adjustment", 2, 2)
     frames_of = np.array([k.frame_index for k in odometry.keyframes], np.int64)
     components = find_components(covisibility_of(state), _sigmas_m(odometry), settings.join_sigma_m)
     state, odometry, loops = only_kept(state, odometry, loops, components.kept)
@@ -134,7 +137,7 @@ def adjusted_chain(
     state = _first_landmarks(odometry, state, pairs, settings, tools)
     matched = {(p.i, p.j) for p in pairs}
     del pairs  # as large as all else in a long survey
-    tools.progress("local adjustment", 0, 1)
+    tools.at("local adjustment", 0, 1)
     state = local_windows(state, settings)
     if state.motion.inertial:
         state = bundle_rounds(state, settings, rounds=2)
@@ -201,7 +204,7 @@ def _match_all(state: SurveyState, finder: PairFinder, settings: SurveySettings,
 
 
 def _progress(tools: SurveyTools, stage: str, total: int) -> Callable[[int], None]:
-    return lambda number: tools.progress(stage, number + 1, total)
+    return lambda number: tools.at(stage, number + 1, total)
 
 
 def _first_landmarks(
@@ -242,7 +245,7 @@ def _close_loops(
     closer = kind(_posed(odometry, state), options, marginals, matched, tools.executor, parts)
     for i in range(len(odometry.keyframes)):
         closer.close(i)
-        tools.progress("loops", i + 1, len(odometry.keyframes))
+        tools.at("loops", i + 1, len(odometry.keyframes))
     loops = closer.loops
     if loops.edges and isinstance(closer, Sim3LoopCloser):
         scaled = solve_scaled(state.map_from_body, chain, loops.edges, closer.scales, scale_walk)
@@ -271,7 +274,7 @@ def _adjust_globally(
     yaw, redundant = NO_YAW, np.zeros(len(odometry.keyframes), bool)
     finder = _finder(odometry, state, settings, tools)
     for round_number in range(2):
-        tools.progress("global adjustment", round_number, 2)
+        tools.at("global adjustment", round_number, 2)
         search = round_number == 0 or depths is not None
         if depths is not None:
             odometry = _with_depths(odometry, state, depths)
@@ -285,6 +288,8 @@ def _adjust_globally(
         else:  # a second search finds hardly a match more; its coordinates are finer
             landmarks = refine_observations(posed, state.landmarks, settings, tools.executor)
         state = replace(state, landmarks=without_stereo_yaw(landmarks, state.camera, yaw.correction_px))
+        del landmarks
+        tools.release()
         state = adjust_visits(state, settings, redundant, rounds=3 if search else 2)
         if round_number == 0:
             yaw = estimate_stereo_yaw(without_redundant(state, redundant), settings)

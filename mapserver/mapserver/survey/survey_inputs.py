@@ -12,6 +12,7 @@ from mapserver.survey.keyframes.keyframes import ImageStore
 from mapserver.survey.loops.zones import Zones
 from mapserver.survey.settings import SurveySettings
 
+_RELEASED_EVERY = 4096  # steps of a stage: the features that these have read are far fewer than a site's
 Progress = Callable[[str, int, int], None]  # stage, done, total
 
 
@@ -51,3 +52,14 @@ class SurveyTools:
     progress: Progress = no_progress
     images: ImageStore | None = None
     executor: Executor = SERIAL
+
+    def at(self, stage: str, done: int, total: int) -> None:
+        """Reports progress; what is found in keyframes leaves memory now and then, and when the stage is over."""
+        self.progress(stage, done, total)
+        if done == total or done % _RELEASED_EVERY == 0:
+            self.release()
+
+    def release(self) -> None:
+        """What was found in keyframes may leave memory until it is read again."""
+        if self.images is not None:
+            self.images.release()

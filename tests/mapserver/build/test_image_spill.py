@@ -1,5 +1,6 @@
 """Pictures that were set aside come back as they were, however many there are."""
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from fleetmap.errors import StoreError
 from fleetmap.features.patch_align import half_pyramid
 from fleetmap.sensors.rectification import RectifiedFrame
+from mapserver.build import image_spill
 from mapserver.build.image_spill import ImageSpill
 from mapserver.survey.keyframes.keyframes import Pictures
 
@@ -36,6 +38,32 @@ def test_pictures_come_back_to_the_bit(tmp_path: Path) -> None:
                     np.testing.assert_array_equal(own, theirs)
                     assert own.flags.writeable
     assert list(tmp_path.iterdir()) == []
+
+
+def test_features_stay_what_they_are_out_of_memory_and_after_the_store(tmp_path: Path) -> None:
+    """Arrays of several segments, one larger than a segment, an empty one."""
+    rng, segment = np.random.default_rng(1), image_spill._SEGMENT_BYTES
+    given = [rng.integers(0, 256, (n, 32), np.uint8) for n in (7, segment // 32 - 100, 200, 0, segment // 16, 3)]
+    given += [rng.uniform(-1, 1, (5, 3)), rng.uniform(-1, 1, (6, 2)).astype(np.float32)]
+    with ImageSpill(tmp_path) as shelf:
+        kept = shelf.keep(given)
+        shelf.release()
+        assert list(tmp_path.iterdir()) == []
+    for own, theirs in zip(kept, given, strict=True):
+        np.testing.assert_array_equal(own, theirs)
+        assert own.dtype == theirs.dtype
+        assert own.flags.c_contiguous
+        assert own.flags.writeable
+        assert own.flags.aligned
+
+
+def test_a_full_disk_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(image_spill.os, "posix_fallocate", full)
+    with ImageSpill(tmp_path) as shelf, pytest.raises(StoreError, match="make space"):
+        shelf.keep([np.zeros((3, 2))])
 
 
 def test_a_folder_that_takes_no_file_is_named(tmp_path: Path) -> None:

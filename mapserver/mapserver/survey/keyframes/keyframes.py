@@ -1,7 +1,7 @@
 """Keyframe selection, and the data that is kept of each keyframe."""
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Protocol
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.features import extract, orb, patch_align, stereo
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.geometry import AnyArray, Array, rotation_angle_rad, se3_inverse
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.settings import KeyframeSettings, SurveySettings
@@ -28,13 +28,19 @@ class Pictures:
 
 
 class ImageStore(Protocol):
-    """Storage for the pictures of keyframes: those of a long survey do not fit in memory."""
+    """Storage for the pictures of keyframes, and for what is found in them: those of a long survey do not fit in memory."""
 
     def put(self, pictures: Pictures) -> int:
         """The number under which `get` gives them back."""
 
     def get(self, number: int) -> Pictures:
         """The pictures as they were put."""
+
+    def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
+        """The same arrays, where memory need not hold them all the time."""
+
+    def release(self) -> None:
+        """A stage is over: what `keep` returned may leave memory until it is read again."""
 
 
 class MemoryImageStore:
@@ -51,6 +57,13 @@ class MemoryImageStore:
     def get(self, number: int) -> Pictures:
         """See ImageStore."""
         return self._pictures[number]
+
+    def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
+        """See ImageStore."""
+        return list(arrays)
+
+    def release(self) -> None:
+        """See ImageStore."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +143,7 @@ def make_keyframes(
             number, frame = waiting.popleft()
             points = camera.point_from_pixel(features.pixels, disparities[:, 0])
             place = kept.put(Pictures(frame, patch_align.half_pyramid(frame.left)))
-            yield Keyframe(number, frame.stamp_ns, features, disparities, points, kept, place)
+            yield set_aside(Keyframe(number, frame.stamp_ns, features, disparities, points, kept, place), kept)
 
 
 def _extract(
@@ -143,6 +156,14 @@ def _extract(
         features = extract(frame.left, settings.orb)
         found.append((features, stereo.disparities(frame, camera, features.pixels, settings.stereo)))
     return found
+
+
+def set_aside(keyframe: Keyframe, store: ImageStore) -> Keyframe:
+    """The same keyframe with its features where `store` keeps them."""
+    own = keyframe.features
+    found = own.pixels, own.octaves, own.angles_deg, own.descriptors, keyframe.disparities, keyframe.points_cam
+    *features, disparities, points_cam = store.keep(found)
+    return replace(keyframe, features=orb.Features(*features), disparities=disparities, points_cam=points_cam)
 
 
 def with_pictures(keyframe: Keyframe, *, whole: bool) -> Keyframe:
