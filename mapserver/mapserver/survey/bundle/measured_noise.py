@@ -11,6 +11,7 @@ from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.bundle.problem import BundleProblem
 
 _CLASSES = 8
+_CHUNK = 50_000  # observations, whose poses and points take a third of a kilobyte each
 _LEAST_OBSERVATIONS = 100  # of a class: its median is then good to 15 %
 # Medians of |x| and of the length of a pair for normal noise of sigma 1
 _MEDIAN_OF_ONE, _MEDIAN_OF_TWO = 0.6745, 1.1774
@@ -33,11 +34,15 @@ def measured_sigmas(problem: BundleProblem, huber_sigmas: float) -> Array:
 
 def _residuals(problem: BundleProblem) -> tuple[Array, Array]:
     """Lengths (M,) of the residuals of pixel and disparity, NaN where there is none."""
-    cam_from_map = se3_inverse(problem.map_from_body @ problem.body_from_cam)[problem.obs_keyframe]
-    points = problem.points_map[problem.obs_landmark]
-    seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points) + cam_from_map[:, :3, 3]
-    off = problem.camera.pixel_from_point(seen) - problem.obs_pixels
-    return np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 0] - off[:, 2])
+    cam_from_map = se3_inverse(problem.map_from_body @ problem.body_from_cam)
+    pixel, disparity = np.empty((2, len(problem.obs_keyframe)))
+    for first in range(0, len(pixel), _CHUNK):
+        rows = slice(first, first + _CHUNK)
+        own, points = cam_from_map[problem.obs_keyframe[rows]], problem.points_map[problem.obs_landmark[rows]]
+        seen = np.einsum("mij,mj->mi", own[:, :3, :3], points) + own[:, :3, 3]
+        off = problem.camera.pixel_from_point(seen) - problem.obs_pixels[rows]
+        pixel[rows], disparity[rows] = np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 0] - off[:, 2])
+    return pixel, disparity
 
 
 def _by_class(noise: Array, claimed: Array) -> Array:

@@ -12,10 +12,13 @@ from fleetmap.geometry import AnyArray, Array
 from mapserver.survey.bundle.problem import BundleSettings
 from mapserver.survey.bundle.reduced_system_kernels import (
     ChainFactors,
+    Numbers,
     SystemArrays,
+    add_numbers,
     conjugate_gradients,
     factor_chains,
     fill_lower,
+    lay_out,
 )
 from mapserver.survey.bundle.sparsity import Structure
 
@@ -151,67 +154,32 @@ def _factor(matrix: scipy.sparse.csc_array, order: Literal["NATURAL", "MMD_AT_PL
 class SparseLayout:
     """Where a problem's numbers lie in the sparse matrix of each of its systems, unknowns in an order that fills in little.
 
-    order (U,): the unknowns by their place in the matrix. entries: of all numbers of a system those that count, in the matrix's
-    order; starts: the first of each group that is summed; indices, indptr as in a CSC matrix.
+    order (U,): the unknowns by their place in the matrix. below: image blocks beside the diagonal. target: to which of the matrix's
+    values each number of a system is added; indices, indptr as in a CSC matrix.
     """
 
     order: AnyArray
-    entries: AnyArray
-    starts: AnyArray
+    below: AnyArray
+    target: AnyArray
     indices: AnyArray
     indptr: AnyArray
 
     @classmethod
     def of(cls, system: ReducedSystem, order: AnyArray) -> "SparseLayout":
         """The layout of all systems with the structure of this one."""
-        count, held = system.rhs.size, ~system.structure.free.ravel()
-        place = np.empty(count, np.int64)
-        place[order] = np.arange(count)
-        rows, cols = _unknowns(system)
-        # numbers of held unknowns are dropped, but for the last ones, which are the diagonal's
-        used = (rows >= 0) & (cols >= 0) & ~(held[rows] | held[cols])
-        used[len(rows) - count :] = True
-        entries = np.flatnonzero(used).astype(np.int32)
-        codes = place[cols[entries]] * count + place[rows[entries]]
-        del rows, cols, used  # there are millions
-        sequence = np.argsort(codes, kind="stable")
-        entries, codes = entries[sequence], codes[sequence]
-        starts = np.flatnonzero(np.diff(codes, prepend=-1))
-        indptr = np.searchsorted(codes[starts] // count, np.arange(count + 1))
-        return cls(order, entries, starts, (codes[starts] % count).astype(np.int32), indptr.astype(np.int32))
+        s = system.structure
+        place = np.empty(system.rhs.size, np.int32)
+        place[order] = np.arange(len(place))
+        block_rows = np.repeat(np.arange(len(s.row_ptr) - 1, dtype=np.int32), np.diff(s.row_ptr))
+        below = np.flatnonzero(block_rows != s.cols)
+        edges = np.ascontiguousarray(system.chains.edge_slots, np.int64).reshape(-1, 2)
+        numbers = Numbers(block_rows, s.cols, below, edges, s.free.ravel(), place, system.rhs.shape[1])
+        indptr, indices, target = lay_out(numbers)
+        return cls(order, below, target, indices, indptr)
 
     def matrix(self, system: ReducedSystem) -> scipy.sparse.csc_array:
         """S with rows and columns in `order`; unknowns that are held have a one on the diagonal."""
         damp = np.where(system.structure.free, system.damp, 1.0)
-        values = np.concatenate(
-            [system.blocks.ravel(), system.blocks[_below(system)].ravel(), system.edge_blocks.ravel(), damp.ravel()]
-        )
-        data = np.add.reduceat(values[self.entries], self.starts)
-        return scipy.sparse.csc_array((data, self.indices, self.indptr), shape=(len(self.order),) * 2)
-
-
-def _block_rows(system: ReducedSystem) -> AnyArray:
-    s = system.structure
-    return np.repeat(np.arange(len(s.row_ptr) - 1), np.diff(s.row_ptr))
-
-
-def _below(system: ReducedSystem) -> AnyArray:
-    """(B,) which image blocks lie beside the diagonal, and so count a second time above it."""
-    return np.asarray(_block_rows(system) != system.structure.cols)
-
-
-def _unknowns(system: ReducedSystem) -> tuple[AnyArray, AnyArray]:
-    """Row and column of every number of a system: image blocks, those mirrored, edge blocks, diagonal; -1 for held keyframes."""
-    size, s = system.rhs.shape[1], system.structure
-    shape = (len(s.cols), 6, 6)
-    six = np.arange(6, dtype=np.int32)
-    row = np.broadcast_to(size * _block_rows(system).astype(np.int32)[:, None, None] + six[:, None], shape)
-    col = np.broadcast_to(size * s.cols.astype(np.int32)[:, None, None] + six, shape)
-    below = _below(system)
-    slots = np.repeat(system.chains.edge_slots.reshape(-1, 2), 15, axis=1)
-    ends = np.where(slots >= 0, size * slots + np.tile(np.arange(15), 2), -1).astype(np.int32)
-    along = np.repeat(ends[:, :, None], 30, axis=2)
-    diagonal = np.arange(system.rhs.size, dtype=np.int32)
-    rows = [row.ravel(), col[below].ravel(), along.ravel(), diagonal]
-    cols = [col.ravel(), row[below].ravel(), along.transpose(0, 2, 1).ravel(), diagonal]
-    return np.concatenate(rows), np.concatenate(cols)
+        values = np.zeros(len(self.indices))
+        add_numbers(system.blocks, self.below, system.edge_blocks, damp, self.target, values)
+        return scipy.sparse.csc_array((values, self.indices, self.indptr), shape=(len(self.order),) * 2)
