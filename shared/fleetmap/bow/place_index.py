@@ -27,8 +27,7 @@ class PlaceIndex:
         self._slots = np.zeros(0, np.int32)
         self._weights = np.zeros(0, np.float32)
         self._sorted_places = 0
-        self._tail: list[BowVector] = []
-        self._flat_tail: _Flat | None = None
+        self._tail = _Tail()
 
     def __len__(self) -> int:
         return self._count
@@ -48,7 +47,6 @@ class PlaceIndex:
         self._place_ids[self._count] = place_id
         self._count += 1
         self._tail.append(vector)
-        self._flat_tail = None
         if len(self._tail) > max(_SMALLEST_TAIL, self._sorted_places // _TAIL_SHARE):
             self._sort_tail_in()
 
@@ -78,26 +76,50 @@ class PlaceIndex:
         place_index_kernels.add_sorted_scores(
             vector.word_ids, vector.weights, self._starts, self._slots, self._weights, scores
         )
-        if self._tail:
-            if self._flat_tail is None:
-                self._flat_tail = _flatten(self._tail)
+        if len(self._tail):
             spread = np.zeros(self._word_count, np.float32)
             spread[vector.word_ids] = vector.weights
-            place_index_kernels.add_tail_scores(spread, *self._flat_tail, scores[self._sorted_places :])
+            place_index_kernels.add_tail_scores(spread, *self._tail.flat, scores[self._sorted_places :])
         return scores
 
     def _sort_tail_in(self) -> None:
         self._starts, self._slots, self._weights = place_index_kernels.merged_postings(
-            self._starts, self._slots, self._weights, self._sorted_places, *_flatten(self._tail)
+            self._starts, self._slots, self._weights, self._sorted_places, *self._tail.flat
         )
         self._sorted_places = len(self)
-        self._tail, self._flat_tail = [], None
+        self._tail.clear()
 
 
-_Flat = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
+class _Tail:
+    """Vectors one after the other, in arrays with room for more: a new one copies none of those before."""
 
+    def __init__(self) -> None:
+        self._count = 0
+        self._bounds = np.zeros(_FIRST_CAPACITY, np.int64)
+        self._word_ids, self._weights = np.zeros(0, np.int32), np.zeros(0, np.float32)
 
-def _flatten(vectors: list[BowVector]) -> _Flat:
-    """Bounds (len + 1,), word ids and weights of the vectors, one after the other."""
-    bounds = np.concatenate([[0], np.cumsum([len(vector) for vector in vectors])]).astype(np.int64)
-    return bounds, np.concatenate([v.word_ids for v in vectors]), np.concatenate([v.weights for v in vectors])
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def flat(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+        """Bounds (len + 1,), word ids and weights of the vectors."""
+        end = self._bounds[self._count]
+        return self._bounds[: self._count + 1], self._word_ids[:end], self._weights[:end]
+
+    def append(self, vector: BowVector) -> None:
+        """Takes one more."""
+        first = int(self._bounds[self._count])
+        end = first + len(vector)
+        if end > len(self._word_ids):
+            more = end + len(self._word_ids)
+            self._word_ids, self._weights = np.resize(self._word_ids, more), np.resize(self._weights, more)
+        if self._count + 1 == len(self._bounds):
+            self._bounds = np.resize(self._bounds, 2 * len(self._bounds))
+        self._word_ids[first:end], self._weights[first:end] = vector.word_ids, vector.weights
+        self._count += 1
+        self._bounds[self._count] = end
+
+    def clear(self) -> None:
+        """Forgets all of them, and keeps the room."""
+        self._count = 0
