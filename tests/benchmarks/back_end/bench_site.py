@@ -10,8 +10,6 @@ that its cost, which goes with the observations, is not in the figures. Each siz
 import argparse
 import hashlib
 import json
-import pickle
-import resource
 import subprocess
 import sys
 import time
@@ -26,9 +24,11 @@ from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from fleetsim.scene.layout import Layout
+from mapserver.build.image_spill import ImageSpill
 from mapserver.build.worker import open_executor
 from mapserver.config import survey_settings
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
+from mapserver.survey.keyframes.keyframes import ImageStore
 from mapserver.survey.pipeline import Survey, survey_from
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 
@@ -40,25 +40,42 @@ _WRONG_M = 0.5 * Layout.bay_m  # half of the smallest step by which the site rep
 def simulate(robot: str, frames: int | None, out: Path) -> None:
     """Writes what a drive's odometry saw: minutes for an hour's drive."""
     survey = simulated_survey(session_of("fulfilment-centre", robot, frames=frames), SETTINGS)
-    out.write_bytes(pickle.dumps(survey, protocol=5))
+    survey.write(out)
 
 
-def measure(survey: SimulatedSurvey, threads: int) -> dict[str, Any]:
+class Stages:
+    """CPU and peak memory by stage, said on standard error as each ends."""
+
+    def __init__(self) -> None:
+        self.cpu_s: dict[str, float] = {}
+        self.peak_mb: dict[str, float] = {}
+        self._last, self._since_s = "start", time.process_time()
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        if stage == self._last:
+            return
+        last, now_s = self._last, time.process_time()
+        self.cpu_s[last] = round(self.cpu_s.get(last, 0.0) + now_s - self._since_s, 2)
+        self.peak_mb[last] = round(max(self.peak_mb.get(last, 0.0), _peak_mb()))
+        print(f"{last}: {self.cpu_s[last]} s of CPU, peak {self.peak_mb[last]} MB", file=sys.stderr, flush=True)
+        self._last, self._since_s = stage, now_s
+        Path("/proc/self/clear_refs").write_text("5")  # the peak from now on
+
+
+def measure(drive: Path, keyframes: int, threads: int) -> dict[str, Any]:
     """One survey's figures."""
-    stages: dict[str, float] = {}
-    last = ["start", time.process_time()]
+    with ImageSpill(drive.parent) as store:
+        survey = SimulatedSurvey.read(drive, keyframes, store)
+        return _measure(survey, store, threads)
 
-    def progress(stage: str, done: int, total: int) -> None:
-        now = time.process_time()
-        stages[last[0]] = stages.get(last[0], 0.0) + now - last[1]
-        last[:] = stage, now
 
-    before_mb = _peak_mb()
+def _measure(survey: SimulatedSurvey, store: ImageStore, threads: int) -> dict[str, Any]:
+    stages, before_mb = Stages(), _peak_mb()
     begun = time.process_time(), time.perf_counter()
     options = SurveyConfig(SETTINGS, default_vocabulary())
     with drawn_alignment(survey), open_executor(threads, None) as executor:
-        made = survey_from(survey.odometry, survey.inputs, options, SurveyTools(progress=progress, executor=executor))
-    progress("end", 0, 0)
+        made = survey_from(survey.odometry, survey.inputs, options, SurveyTools(stages, store, executor))
+    stages("end", 0, 0)
     count = len(survey.odometry.keyframes)
     truth = survey.map_from_body[[k.frame_index for k in made.odometry.keyframes]]
     cpu_s = time.process_time() - begun[0]
@@ -69,8 +86,9 @@ def measure(survey: SimulatedSurvey, threads: int) -> dict[str, Any]:
         "cpu_s": cpu_s,
         "wall_s": time.perf_counter() - begun[1],
         "cpu_ms_per_keyframe": 1e3 * cpu_s / count,
-        "stages_s": {name: round(seconds, 2) for name, seconds in stages.items()},
-        "peak_mb": _peak_mb(),
+        "stages_s": stages.cpu_s,
+        "stages_mb": stages.peak_mb,
+        "peak_mb": max(stages.peak_mb.values()),
         "input_mb": before_mb,
         "observations": len(made.state.landmarks.obs_keyframe),
         "loops": len(made.loops.edges),
@@ -109,14 +127,9 @@ def wrong_loops(edges: Any, survey: SimulatedSurvey) -> int:
 
 def measured(sizes: Sequence[int], drive: Path, threads: int = 1) -> Iterator[dict[str, Any]]:
     """The figures of each size, in a process of its own that reads no more than its part of the drive."""
-    part = drive.with_suffix(".part")
     for size in sizes:
-        survey: SimulatedSurvey = pickle.loads(drive.read_bytes())
-        part.write_bytes(pickle.dumps(survey.first(size), protocol=5))
-        del survey
-        command = [sys.executable, __file__, "--one", "--drive", str(part), "--threads", str(threads)]
+        command = [sys.executable, __file__, "--one", str(size), "--drive", str(drive), "--threads", str(threads)]
         done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-        part.unlink()
         yield json.loads(done.stdout.splitlines()[-1])
 
 
@@ -126,7 +139,8 @@ def slope(rows: list[dict[str, Any]], key: str) -> float:
 
 
 def _peak_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    status = Path("/proc/self/status").read_text()
+    return float(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
 def main() -> None:
@@ -137,10 +151,10 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=None, help="at most so many frames of it, at 7.5 Hz")
     parser.add_argument("--drive", type=Path, default=Path("out/site.pkl"), help="as simulated; made where missing")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--one", type=int, default=None, help=argparse.SUPPRESS)
     given = parser.parse_args()
-    if given.one:
-        print(json.dumps(measure(pickle.loads(given.drive.read_bytes()), given.threads)), flush=True)
+    if given.one is not None:
+        print(json.dumps(measure(given.drive, given.one, given.threads)), flush=True)
         return
     if not given.drive.exists():
         given.drive.parent.mkdir(parents=True, exist_ok=True)

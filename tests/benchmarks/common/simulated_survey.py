@@ -5,9 +5,11 @@ coordinates which it finds are drawn instead: exact ones with noise where featur
 detector where they do not. All else is the survey's own code.
 """
 
-from collections.abc import Iterator
+import pickle
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
@@ -15,14 +17,14 @@ from numpy.typing import NDArray
 
 from benchmarks.common.estimator_loop import EstimatorTracker, blank
 from fleetmap.features import orb, patch_align
-from fleetmap.geometry import Array
+from fleetmap.geometry import AnyArray, Array
 from fleetmap.odometry import OdometryStatus
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetsim import recorder
 from fleetsim.scenarios import SCENARIOS, Scenario, find_scenario
 from mapserver.survey.executor import Executor
 from mapserver.survey.frame_tracks import FrameTracks
-from mapserver.survey.keyframes.keyframes import Keyframe, Pictures, PosedKeyframes
+from mapserver.survey.keyframes.keyframes import ImageStore, Keyframe, Pictures, PosedKeyframes, set_aside
 from mapserver.survey.odometry_pass import OdometryPass, OdometryRun, SampleFeed, continued_covariances
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyInputs
@@ -51,6 +53,13 @@ class GreyPictures:
         """The one there is."""
         return self._pictures
 
+    def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
+        """As they are."""
+        return list(arrays)
+
+    def release(self) -> None:
+        """Nothing to do."""
+
 
 @dataclass(frozen=True)
 class SimulatedSurvey:
@@ -65,25 +74,44 @@ class SimulatedSurvey:
     exact_px: list[NDArray[np.float32]]
     map_from_body: Array
 
-    def first(self, keyframes: int) -> "SimulatedSurvey":
-        """The survey up to its keyframe number `keyframes`."""
-        own = self.odometry
-        if keyframes >= len(own.keyframes):
-            return self
-        frames = own.keyframes[keyframes].frame_index
-        assert own.tracks is not None
+    def write(self, path: Path) -> None:
+        """Writes it so that `read` need not hold more of it in memory than is asked for."""
+        odometry = replace(self.odometry, keyframes=[])
+        with path.open("wb") as file:
+            pickle.dump((odometry, self.inputs, self.map_from_body, len(self.landmarks)), file, protocol=5)
+            for keyframe, landmarks, exact_px in zip(
+                self.odometry.keyframes, self.landmarks, self.exact_px, strict=True
+            ):
+                bare = replace(keyframe, images=None)  # type: ignore[arg-type]  the one picture is made anew
+                pickle.dump((bare, landmarks, exact_px), file, protocol=5)
+
+    @classmethod
+    def read(cls, path: Path, keyframes: int, store: ImageStore) -> "SimulatedSurvey":
+        """The survey up to its keyframe number `keyframes`; `store` keeps what the keyframes show."""
+        images, kept = GreyPictures(), list[Keyframe]()
+        landmarks, exact_px = list[NDArray[np.uint64]](), list[NDArray[np.float32]]()
+        with path.open("rb") as file:
+            own, inputs, map_from_body, count = pickle.load(file)
+            frames = len(own.estimates)
+            for number in range(min(keyframes + 1, count)):
+                bare, ids, exact = pickle.load(file)
+                if number == keyframes:
+                    frames = bare.frame_index
+                    break
+                kept.append(set_aside(replace(bare, images=images), store))
+                ids, exact = store.keep((ids, exact))
+                landmarks.append(ids)
+                exact_px.append(exact)
+        store.release()
         ends = own.tracks.starts[: frames + 1]
-        seen = FrameTracks(ends, own.tracks.ids[: ends[-1]], own.tracks.pixels[: ends[-1]])
         odometry = replace(
             own, estimates=own.estimates[:frames], odom_from_body=own.odom_from_body[:frames],
-            covariances=own.covariances[:frames], tracked=own.tracked[:frames], keyframes=own.keyframes[:keyframes],
-            tracks=seen,
+            covariances=own.covariances[:frames], tracked=own.tracked[:frames], keyframes=kept,
+            tracks=FrameTracks(ends, own.tracks.ids[: ends[-1]].copy(), own.tracks.pixels[: ends[-1]].copy()),
         )  # fmt: skip
         until_ns = own.estimates[frames - 1].stamp_ns + 1_000_000_000
-        inputs = replace(self.inputs, frame_count=frames, imu=self.inputs.imu.between(-(2**62), until_ns))
-        return SimulatedSurvey(
-            odometry, inputs, self.landmarks[:keyframes], self.exact_px[:keyframes], self.map_from_body[:frames]
-        )
+        inputs = replace(inputs, frame_count=frames, imu=inputs.imu.between(-(2**62), until_ns))
+        return cls(odometry, inputs, landmarks, exact_px, map_from_body[:frames])
 
 
 def session_of(
