@@ -1,6 +1,7 @@
 """Releases of an open store: each is decided by `rules` within the one transaction that writes it, and is on the disk at its end."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from fleetmap.errors import UsageError
 from fleetmap.mapformat import decode_tile
@@ -107,7 +108,7 @@ def end_canary(store: MapStore, canary: CanaryRow, *, promote: bool, outcome: st
     """
     if promote:
         store.check_bytes(store.version(canary.site, canary.version))
-        who = Actor(actor.name, outcome)
+        who = replace(actor, reason=outcome)
         _change(store, canary.site, lambda rows: rules.canary_promotion(rows, canary, who))
     else:
         _change(store, canary.site, lambda rows: rules.canary_withdrawal(rows, canary, outcome, actor))

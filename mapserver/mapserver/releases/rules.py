@@ -4,6 +4,8 @@ draft -> current when published; current -> published when another becomes curre
 published -> retired by `gc`, once newer ones are enough; published or retired -> current when promoted.
 """
 
+from dataclasses import replace
+
 from fleetmap.errors import GateRefusedError, StateError, UsageError
 from mapserver.quality.gate import GateVerdict
 from mapserver.store.rows import (
@@ -126,7 +128,7 @@ def canary_withdrawal(rows: SiteReleases, canary: CanaryRow, outcome: str, actor
     """Ends a canary and retires its version; raises StateError where it does not run any more."""
     _check_running(rows, canary)
     detail = f"version {canary.version}; version {canary.base_version} stays current"
-    entry = LogEntry("canary_rolled_back", detail, canary.version, Actor(actor.name, outcome))
+    entry = LogEntry("canary_rolled_back", detail, canary.version, replace(actor, reason=outcome))
     is_published = canary.version in rows.versions and rows.versions[canary.version].state == "published"
     return ReleaseChanges(
         states=((canary.version, "retired"),) if is_published else (),
@@ -145,7 +147,7 @@ def _becomes_current(rows: SiteReleases, version: int, entry: LogEntry) -> Relea
     is_promoted = tried == version
     outcome = actor.reason if is_promoted and actor.reason else f"version {version} became current"
     kind = "canary_promoted" if is_promoted else "canary_stopped"
-    end = LogEntry(kind, f"version {tried}", tried, Actor(actor.name, outcome))
+    end = LogEntry(kind, f"version {tried}", tried, replace(actor, reason=outcome))
     return ReleaseChanges(
         states=states,
         new_current=version,

@@ -133,20 +133,28 @@ def test_every_page_and_every_act_runs_under_the_policy(page: Page, served: Serv
     is_live(page)
     page.get_by_role("button", name="Light or dark").click()
     assert page.evaluate("document.body.classList.contains('body--dark')")
-    for words, version in (("Roll back to version 1", 1), ("Promote version 2", 2), ("Publish draft 3", 3)):
+    for words, told in (
+        ("Roll back to version 1", "Robots should use version 1."),
+        ("Promote version 2", "Robots should use version 2."),
+        ("Publish draft 3", "Robots should use version 3."),
+        ("Roll back to version 2", "Robots should use version 2."),
+        ("Try version 3 on 5% of the robots", "Robots should use version 2. Version 3 is tried by 5.0 % of them."),
+        ("Stop trying version 3", "taken back by hand: robots lose themselves in aisle 3"),
+    ):
         page.get_by_role("button", name=words, exact=True).click()
         dialog = page.locator(".q-dialog")
         expect(dialog.get_by_label("Your name")).to_have_count(0)
         dialog.get_by_label("Reason").fill("robots lose themselves in aisle 3")
         dialog.get_by_role("button", name=f"Yes: {words}").click()
-        expect(page.locator(".nicegui-content")).to_contain_text(
-            f"Robots should use version {version}.", timeout=60_000
-        )
+        expect(page.locator(".nicegui-content")).to_contain_text(told, timeout=60_000)
     assert seen.faults == []
     with MapStore.open(served.folder) as store:
         last = [line for line in store.audit_lines() if line.site == SITE][-1]
         assert (last.actor, last.operator, last.address) == ("olga", "olga", "127.0.0.1")
-        assert last.reason == "robots lose themselves in aisle 3"
+        assert (last.kind, last.reason) == (
+            "canary_rolled_back",
+            "taken back by hand: robots lose themselves in aisle 3",
+        )
 
 
 def test_a_viewer_has_no_buttons_and_a_session_that_is_gone_changes_nothing(page: Page, served: Served) -> None:
