@@ -179,7 +179,7 @@ class Fleet:
         except LinkError as error:
             ack = rejection(payload, str(error))
         if ack.refused:
-            self._rejected.keep(site, robot, payload, ack.refused, self._clock_ns())
+            self._rejected.keep(site, robot, payload[:MAX_FAILURE_BYTES], ack.refused, self._clock_ns())
         return ack
 
     def take_presence(self, present: Iterable[tuple[str, str]]) -> None:

@@ -29,7 +29,7 @@ def rejection(payload: bytes, reason: str) -> FailureAck:
 
 
 class RejectedReports:
-    """A folder of the last rejected reports, each beside its reason. A full disk loses only these."""
+    """A folder of the last rejected reports, each as far as the limit goes, beside its reason. A full disk loses only these."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

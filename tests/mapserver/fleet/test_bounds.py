@@ -142,9 +142,11 @@ def test_a_long_key_is_kept_nowhere(store: MapStore, fleet: Fleet, caplog: pytes
         service.close()
 
 
-def test_a_failure_has_a_size(fleet: Fleet, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_has_a_size(store: MapStore, fleet: Fleet, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     large = msgspec.msgpack.encode({**msgspec.to_builtins(failure(clock, 1)), "more": "x" * MAX_FAILURE_BYTES})
     assert "the limit is" in fleet.take_failure_bytes("lab", "r1", large).refused
+    (kept,) = (store.folder / "refused").glob("*.msgpack")
+    assert len(large) > kept.stat().st_size == MAX_FAILURE_BYTES, "of what is too large its beginning is set aside"
     monkeypatch.setattr(fleet_module, "MAX_FAILURE_BYTES", 1 << 30)
     assert fleet.take_failure_bytes("lab", "r1", large).refused == "", "the control"
 
