@@ -1,10 +1,11 @@
 """A fleet that reports to one server, counted at both ends; run by `make bench`."""
 
 import json
+from pathlib import Path
 
 import pytest
 
-from benchmarks.fleet import bench_canary, bench_fleet
+from benchmarks.fleet import bench_canary, bench_fleet, bench_flood
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
@@ -20,6 +21,15 @@ def test_three_hundred_robots_report_and_nothing_is_lost() -> None:
     assert load["rss_end_mb"] < 1.1 * load["rss_begin_mb"]
     assert max(load["slowest_page_ms"].values()) < 1000
     assert month["size_mb"] < 500
+
+
+def test_a_robot_that_floods_is_in_nobodys_way(tmp_path: Path) -> None:
+    found = bench_flood.bench(tmp_path)
+    print(json.dumps(found))
+    for kind in bench_flood.KINDS:
+        assert found[kind]["longest_wait_s"] <= 1.0, kind
+        assert found[kind]["memory_mb"] <= 50, kind
+        assert found[kind]["disk_mb"] <= 50, kind
 
 
 def test_a_map_with_a_shifted_aisle_is_taken_back() -> None:

@@ -1,19 +1,20 @@
-"""Cost of enrolled robots: a server's bus with 1000 of them, a revocation, and maps over mutual TLS beside plain TCP."""
+"""Cost of enrolled robots: a server's bus with 1000 of them, and a revocation.
+
+PYTHONPATH=tests python -m benchmarks.fleet.bench_bus_access
+"""
 
 import json
-import multiprocessing
 import os
 import tempfile
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from fleetmap.access import Holder
 from fleetmap.bus import TlsFiles, ZenohBus
 from fleetmap.errors import UnreachableError
-from fleetmap.messages import PART_BYTES, robot_key
+from fleetmap.messages import robot_key
 from mapserver.serving.bus_access import BusGuard
 from mapserver.store import MapStore
 from mapserver.trust import init_here
@@ -27,7 +28,8 @@ def _resident_mib() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def _register(folder: Path) -> tuple[MapStore, RobotRegister]:
+def open_register(folder: Path) -> tuple[MapStore, RobotRegister]:
+    """A store with one draft, keys and authorities."""
     store = MapStore.open(folder / "store", create=True)
     save_sample_draft(store)
     init_here(store)
@@ -36,7 +38,8 @@ def _register(folder: Path) -> tuple[MapStore, RobotRegister]:
     return store, register
 
 
-def _robot_files(register: RobotRegister, holder: Holder, folder: Path) -> TlsFiles:
+def robot_files(register: RobotRegister, holder: Holder, folder: Path) -> TlsFiles:
+    """An enrolled robot's key and certificate."""
     own = folder / f"{holder.certificate}.pem"
     own.write_bytes(register.authorities.make_own(holder.certificate, "robot"))
     return TlsFiles(folder / "store" / "keys" / "servers-ca.crt", own)
@@ -53,7 +56,7 @@ def _until(condition: Callable[[], bool], within_s: float = 20.0) -> float:
 
 def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, float]:
     """With `count` enrolled robots: seconds to open, memory (MiB); seconds until a revoked one is out and all others are answered."""
-    store, register = _register(folder)
+    store, register = open_register(folder)
     names = [f"r{number}" for number in range(count)]
     register.enrol(SITE, names, ENDPOINT)
     holders = [Holder(entry.certificate, SITE, entry.robot) for entry in register.robots()[:connected]]
@@ -71,7 +74,7 @@ def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, 
             guard.follow()
 
     threading.Thread(target=follow, daemon=True).start()
-    robots = [ZenohBus.connect(bus.endpoint, tls=_robot_files(register, holder, folder)) for holder in holders]
+    robots = [ZenohBus.connect(bus.endpoint, tls=robot_files(register, holder, folder)) for holder in holders]
 
     def answered(number: int) -> bool:
         try:
@@ -92,51 +95,6 @@ def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, 
     return found
 
 
-def _fetch(
-    endpoint: str, files: list[TlsFiles] | None, robots: int, size: int, done: "multiprocessing.Queue[float]"
-) -> None:
-    buses = [ZenohBus.connect(endpoint, tls=None if files is None else files[number]) for number in range(robots)]
-    _until(lambda: all(bus.connected() for bus in buses), 60.0)
-
-    def fetch(bus: ZenohBus) -> int:
-        return sum(len(bus.get(f"fleetmap/{SITE}/blobs/{part}", timeout_s=60.0)) for part in range(size // PART_BYTES))
-
-    fetch(buses[0])
-    begun_s = time.perf_counter()
-    with ThreadPoolExecutor(16) as pool:
-        total = sum(pool.map(fetch, buses))
-    done.put(time.perf_counter() - begun_s)
-    assert total == robots * (size // PART_BYTES) * PART_BYTES
-    for bus in buses:
-        bus.close()
-
-
-def delivery_s(folder: Path, robots: int, size: int, *, has_tls: bool) -> float:
-    """Seconds until so many robots of another process have `size` bytes each, in parts as maps are sent."""
-    store, register = _register(folder)
-    register.enrol(SITE, [f"r{number}" for number in range(robots)], ENDPOINT)
-    holders = [Holder(entry.certificate, SITE, entry.robot) for entry in register.robots()]
-    files = [_robot_files(register, holder, folder) for holder in holders] if has_tls else None
-    part, context = os.urandom(PART_BYTES), multiprocessing.get_context("spawn")
-    done: multiprocessing.Queue[float] = context.Queue()
-    how = {"tls": register.tls, "access": register.access()} if has_tls else {}
-    with ZenohBus.listen(f"{'tls' if has_tls else 'tcp'}/127.0.0.1:0", **how) as bus:  # type: ignore[arg-type]
-        bus.queryable("fleetmap/*/blobs/*", lambda *_: part)
-        process = context.Process(target=_fetch, args=(bus.endpoint, files, robots, size, done))
-        process.start()
-        took_s = done.get(timeout=300)
-        process.join()
-    store.close()
-    return took_s
-
-
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as name:
-        found = {"1000 robots": opening_and_revoking(Path(name) / "many", 1000, 12)}
-        ways = {has_tls: [Path(name) / f"{number}-{has_tls}" for number in range(3)] for has_tls in (False, True)}
-        pairs = [
-            [delivery_s(ways[has_tls][number], 50, 8 << 20, has_tls=has_tls) for has_tls in ways] for number in range(3)
-        ]
-        plain, tls = (min(pair[way] for pair in pairs) for way in (0, 1))
-        found["50 robots x 8 MiB"] = {"tcp_s": plain, "tls_s": tls, "ratio": tls / plain}
-        print(json.dumps(found, indent=1))
+        print(json.dumps(opening_and_revoking(Path(name) / "many", 1000, 12), indent=1))

@@ -28,7 +28,7 @@ import msgspec
 import numpy as np
 from prometheus_client.parser import text_string_to_metric_families
 
-from benchmarks.fleet.bench_service import _SOURCES, _cpu_s, _rss_mb, serving
+from benchmarks.fleet.bench_service import _SOURCES, cpu_s, resident_mb, serving
 from benchmarks.fleet.fleet_clients import SITE, TILES
 from mapserver import releases
 from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters
@@ -112,16 +112,16 @@ def measure_load(folder: Path, robots: int, seconds: int, processes: int) -> dic
             with httpx.Client(base_url=http, timeout=30) as client:
                 number = 0
                 while not over.wait(1.0):
-                    rss_mb.append(_rss_mb(process.pid))
+                    rss_mb.append(resident_mb(process.pid))
                     page = _PAGES[number % len(_PAGES)]
                     page_ms[page].append(_timed_ms(lambda page=page: client.get(page).raise_for_status()))
                     number += 1
 
         watcher = threading.Thread(target=watch)
         watcher.start()
-        begun_s, begun_cpu_s = time.monotonic(), _cpu_s(process.pid)
+        begun_s, begun_cpu_s = time.monotonic(), cpu_s(process.pid)
         said = fleet.drive()
-        cores = (_cpu_s(process.pid) - begun_cpu_s) / (time.monotonic() - begun_s)
+        cores = (cpu_s(process.pid) - begun_cpu_s) / (time.monotonic() - begun_s)
         over.set()
         watcher.join()
         time.sleep(6.0)  # the last flush and the last look for robots

@@ -146,7 +146,7 @@ def measured(pid: int, http: str) -> Iterator[Load]:
 
     def watch() -> None:
         while not over.wait(0.5):
-            load.rss_mb.append(_rss_mb(pid))
+            load.rss_mb.append(resident_mb(pid))
 
     def ask() -> None:
         with httpx.Client(base_url=http, timeout=30) as client:
@@ -158,8 +158,8 @@ def measured(pid: int, http: str) -> Iterator[Load]:
                 number += 1
 
     threads = [threading.Thread(target=work) for work in (watch, ask)]
-    load.rss_mb.append(_rss_mb(pid))
-    begun_s, begun_cpu_s = time.monotonic(), _cpu_s(pid)
+    load.rss_mb.append(resident_mb(pid))
+    begun_s, begun_cpu_s = time.monotonic(), cpu_s(pid)
     for thread in threads:
         thread.start()
     try:
@@ -168,18 +168,18 @@ def measured(pid: int, http: str) -> Iterator[Load]:
         over.set()
         for thread in threads:
             thread.join()
-        load.wall_s, load.cpu_s = time.monotonic() - begun_s, _cpu_s(pid) - begun_cpu_s
-        load.rss_mb.append(_rss_mb(pid))
+        load.wall_s, load.cpu_s = time.monotonic() - begun_s, cpu_s(pid) - begun_cpu_s
+        load.rss_mb.append(resident_mb(pid))
 
 
-def _rss_mb(pid: int) -> float:
+def resident_mb(pid: int) -> float:
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1]) * 1024 / 1e6
     return float("nan")
 
 
-def _cpu_s(pid: int) -> float:
+def cpu_s(pid: int) -> float:
     words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -187,12 +187,13 @@ def _cpu_s(pid: int) -> float:
 class Fleet:
     """Processes full of robots."""
 
-    def __init__(self, endpoint: str, clients: int, processes: int) -> None:
+    def __init__(self, endpoint: str, clients: int, processes: int, identities: Path | None = None) -> None:
+        """identities: folder with the certificates of all robots, where the bus asks for them."""
         shares = [len(part) for part in np.array_split(np.arange(clients), processes)]
         program = "from benchmarks.fleet.service_clients import main; main()"
         self._processes = [
             subprocess.Popen(
-                [sys.executable, "-c", program, endpoint, str(1000 * number), str(share)],
+                [sys.executable, "-c", program, endpoint, str(number), str(share), *([str(identities)] if identities else [])],
                 env=os.environ | {"PYTHONPATH": _SOURCES}, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
             )
             for number, share in enumerate(shares)
@@ -216,6 +217,10 @@ class Fleet:
             "robots": len(phases), "bytes_per_robot": phases[0]["bytes"], "bytes": sum(phase["bytes"] for phase in phases),
             "robot_median_s": float(np.median(seconds)), "robot_max_s": float(seconds.max()),
         }  # fmt: skip
+
+    def cpu_s(self) -> float:
+        """Of all robots until now."""
+        return sum(cpu_s(process.pid) for process in self._processes)
 
     def close(self) -> None:
         for process in self._processes:

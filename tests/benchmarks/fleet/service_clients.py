@@ -5,14 +5,20 @@ import sys
 import threading
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import TlsFiles, ZenohBus
 from fleetmap.mapformat import Manifest, apply_patch, decode_manifest, sha256_hex, verified
 from fleetmap.messages import WantedVersion, blob_key, decode_message, manifest_key, patch_key, robot_key
 from locclient.maps.chunked_download import ChunkReader
 
 SITE = "bench"
 _TIMEOUT_S, _PATIENCE_S = 20.0, 120.0
+
+
+def robot_name(process: int, number: int) -> str:
+    """Of a robot among those of its process."""
+    return f"robot-{1000 * process + number}"
 
 
 @dataclass
@@ -36,8 +42,8 @@ class Shared:
 class Robot:
     """One client: its connection, its manifest, what it received."""
 
-    def __init__(self, endpoint: str, name: str, shared: Shared) -> None:
-        self._bus = ZenohBus.connect(endpoint)
+    def __init__(self, endpoint: str, name: str, shared: Shared, tls: TlsFiles | None) -> None:
+        self._bus = ZenohBus.connect(endpoint, tls=tls)
         self._name, self._shared = name, shared
         self._parts = ChunkReader(self._bus, timeout_s=_TIMEOUT_S, patience_s=_PATIENCE_S)
         self._manifest: Manifest | None = None
@@ -106,10 +112,12 @@ def together(robots: list[Robot]) -> None:
 
 
 def main() -> None:
-    """ENDPOINT FIRST COUNT: fetches once for every line on stdin, answers each with a line of JSON."""
-    endpoint, first, count = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    """ENDPOINT PROCESS COUNT [FOLDER of certificates]: fetches once for every line on stdin, answers each with a line of JSON."""
+    endpoint, process, count, *folders = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), *map(Path, sys.argv[4:])
     shared = Shared()
-    robots = [Robot(endpoint, f"robot-{first + number}", shared) for number in range(count)]
+    names = [robot_name(process, number) for number in range(count)]
+    identities = {name: TlsFiles(folder / "servers.ca", folder / f"{name}.pem") for folder in folders for name in names}
+    robots = [Robot(endpoint, name, shared, identities.get(name)) for name in names]
     print("ready", flush=True)
     for line in sys.stdin:
         if line.strip() == "anew":
