@@ -1,10 +1,12 @@
 """What is deployed: a file and no name of an index, rights for one user, memory that ends; pickles in one module alone. Rows 28, 31, 32."""
 
 import ast
+import hashlib
 import json
 import re
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -88,6 +90,35 @@ def test_a_lock_names_a_hash_for_every_library(tmp_path: Path) -> None:
     assert (without.returncode, without.stdout) == (1, "")
     assert "came without a SHA-256" in without.stderr
     assert lock_of(tmp_path, entry("fleetmap", None)).returncode == 1
+
+
+def test_a_library_that_changed_on_the_index_is_not_installed(tmp_path: Path) -> None:
+    """Row 31, with pip and an index of one folder."""
+    wheel = tmp_path / "thing-1.0-py3-none-any.whl"
+
+    def give_out(content: str) -> None:
+        about = {"METADATA": "Metadata-Version: 2.1\nName: thing\nVersion: 1.0\n", "RECORD": "", "WHEEL": ""}
+        about["WHEEL"] = "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+        with zipfile.ZipFile(wheel, "w") as file:
+            file.writestr("thing.py", content)
+            for name, text in about.items():
+                file.writestr(f"thing-1.0.dist-info/{name}", text)
+
+    def install(folder: str, *words: object) -> subprocess.CompletedProcess[str]:
+        pip = [sys.executable, "-m", "pip", "--isolated", "--disable-pip-version-check", "install", "--no-cache-dir"]
+        where = ["--no-index", "--find-links", str(tmp_path), "--target", str(tmp_path / folder)]
+        return subprocess.run([*pip, *where, *map(str, words)], capture_output=True, text=True, check=False)
+
+    give_out("honest = True")
+    lock = tmp_path / "requirements.lock"
+    lock.write_text(lock_of(tmp_path, entry("thing", hashlib.sha256(wheel.read_bytes()).hexdigest())).stdout)
+    assert install("first", "--require-hashes", "-r", lock).returncode == 0
+    assert (tmp_path / "first" / "thing.py").read_text() == "honest = True"
+    give_out("honest = False")
+    assert "DO NOT MATCH THE HASHES" in install("second", "--require-hashes", "-r", lock).stderr
+    assert not (tmp_path / "second" / "thing.py").exists()
+    assert install("control", "thing==1.0").returncode == 0, "the control: a version alone is no promise of bytes"
+    assert (tmp_path / "control" / "thing.py").read_text() == "honest = False"
 
 
 def test_what_is_deployed_is_installed_by_hash() -> None:

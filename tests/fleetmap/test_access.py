@@ -268,7 +268,14 @@ def test_certificates_of_others(keys: Keys, tmp_path: Path) -> None:
             assert not victim.connected()
             assert "server's certificate is refused" in handshake_fault(wrong, keys.robot("b.1"))
         good = stack.enter_context(ZenohBus.connect(endpoint, tls=keys.robot("b.1")))
-        assert good.get("fleetmap/hall/blobs/00ff") == b"honest", "the control"
+        assert good.get("fleetmap/hall/blobs/00ff") == b"honest"
+        # The control: without TLS, or where it is not looked at who signed the server's certificate, the robot believes both.
+        for how, robot in ((None, None), (keys.strangers.tls, TlsFiles(wrong_server.authority, stranger.own))):
+            there = ZenohBus.listen("tls/127.0.0.1:0" if how else "tcp/127.0.0.1:0", tls=how)
+            fake = stack.enter_context(there)
+            fake.queryable("fleetmap/**", lambda *_: b"EVIL")
+            victim = stack.enter_context(ZenohBus.connect(fake.endpoint, tls=robot))
+            assert victim.get("fleetmap/hall/blobs/00ff") == b"EVIL"
     assert "cannot be reached" in handshake_fault(endpoint, keys.robot("a.1"))
 
 

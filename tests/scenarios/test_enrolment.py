@@ -150,6 +150,14 @@ def test_the_same_thief_without_tls_is_heard(site: Site) -> None:
         thief.close()
 
 
+def test_a_bus_that_listens_before_the_server_answers_is_the_thiefs() -> None:
+    """The control of row 2: as it was while the server still read its store."""
+    with ZenohBus.listen("tcp/127.0.0.1:0") as bare, ZenohBus.connect(bare.endpoint) as honest:
+        thief = attacker(bare.endpoint, None)
+        assert wanted(honest, "r2") == 99
+        thief.close()
+
+
 def test_the_demo_needs_no_keys(site: Site) -> None:
     with site.serving("tcp/127.0.0.1:0"), ZenohBus.connect(site.endpoint) as robot:
         assert wanted(robot, "anybody") == 1

@@ -13,7 +13,17 @@ from hypothesis import strategies as st
 
 from fleetmap.errors import MapFormatError, NewerFormatError
 from fleetmap.geometry import rotation_angle_rad, se3
-from fleetmap.mapformat import LANDMARK_BYTES, MAX_TILE_PLACES, Tile, decode_tile, encode_tile, pack, sha256_hex, unpack
+from fleetmap.mapformat import (
+    LANDMARK_BYTES,
+    MAX_TILE_PLACES,
+    Tile,
+    apply_patch,
+    decode_tile,
+    encode_tile,
+    pack,
+    sha256_hex,
+    unpack,
+)
 from support.storage.map_samples import random_tile
 
 LIMIT = 64 << 20
@@ -156,15 +166,22 @@ def test_bombs_are_refused_before_they_are_unpacked() -> None:
     honest = struct.pack("<4sHHI", b"FMTL", 1, 0, 300 << 20) + bomb
     lying = struct.pack("<4sHHI", b"FMTL", 1, 0, 1000) + bomb
     counts = pack(b"FMTL", 1, struct.pack("<iidiIII", 0, 0, 16.0, 0, 2**32 - 1, 2**32 - 1, 2**32 - 1))
+    base = encode_tile(golden_tile())
+    patches = [b"FMPT" + data[4:] for data in (honest, lying)]
     started = time.perf_counter()
     tracemalloc.start()
     for data in (honest, lying, counts):
         with pytest.raises(MapFormatError):
             decode_tile(data)
+    for data in patches:
+        with pytest.raises(MapFormatError):
+            apply_patch(base, data)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1 << 20
     assert time.perf_counter() - started < 5
+    assert len(bomb) < 1 << 16
+    assert len(zstandard.ZstdDecompressor().decompress(lying[12:])) == 300 << 20, "the control"
 
 
 def test_tiles_that_break_their_own_rules_are_not_written() -> None:

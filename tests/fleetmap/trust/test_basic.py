@@ -1,6 +1,7 @@
 """What a server may answer, and what a robot makes of it. Named after tuf-conformance where it has the like."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from tuf.api.metadata import Targets
 from fleetmap.bus import Bus
 from fleetmap.errors import LinkError, UnreachableError, UntrustedError
 from fleetmap.messages import Part, encode_message, trust_key
-from fleetmap.trust import TrustedMap, ask_over
+from fleetmap.trust import TrustedMap, ask_over, tuf_client
 from support.fleet.list_publisher import ROLE, SITE, ListPublisher, ListReader, address, reading, wanted
 
 
@@ -170,12 +171,21 @@ class TestLimits:
     """Files that never end or are larger than any honest one."""
 
     @pytest.mark.parametrize("role", ["root", "timestamp", "snapshot", "targets", ROLE])
-    def test_oversized(self, publisher: ListPublisher, robot: ListReader, role: str) -> None:
+    def test_oversized(
+        self, publisher: ListPublisher, robot: ListReader, role: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Well signed, with blanks behind it."""
         limit = {"root": 64_000, "timestamp": 4_000, "snapshot": 64_000}.get(role, 256_000)
         name = {"root": "2.root.json", "timestamp": "timestamp.json"}.get(role, f"1.{role}.json")
-        publisher.files[name] = b"x" * (limit + 1)
+        if role == "root":
+            publisher.publish("root")
+        publisher.files[name] = publisher.files[name].ljust(limit + 1)
         assert robot.refused(1).startswith("size: ")
         assert robot.number(role) in (None, 1)
+        limits = {f"{kind}_max_length": 1 << 20 for kind in ("root", "timestamp", "snapshot", "targets")}
+        monkeypatch.setattr(tuf_client, "CLIENT_LIMITS", replace(tuf_client.CLIENT_LIMITS, **limits))
+        assert robot.refused(1) == "", "the control"
+        assert robot.number(role) == (2 if role == "root" else 1)
 
     def test_endless(self, publisher: ListPublisher, buses: tuple[Bus, Bus], tmp_path: Path) -> None:
         """More bytes behind every answer, or one byte in each."""

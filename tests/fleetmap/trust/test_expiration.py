@@ -1,5 +1,7 @@
 """Expired lists admit nothing new. Named after tuf-conformance; ours keeps the old map all the same."""
 
+import time
+
 import pytest
 
 from support.fleet.list_publisher import ROLE, ListPublisher, ListReader, days
@@ -53,6 +55,10 @@ def test_a_clock_far_ahead_makes_all_expired_until_it_is_right(publisher: ListPu
     robot.ahead_s = 0.0
     robot.start()
     assert robot.refused(1) == ""
+    # The control: if a clock were kept that no fresh word went with, the robot would be out for a month.
+    (robot.folder / "clock").write_text(str(time.time() + 30 * DAY_S))
+    robot.start()
+    assert robot.refused(1).startswith("freeze: ")
 
 
 def test_a_clock_set_back_revives_nothing(publisher: ListPublisher, robot: ListReader) -> None:
@@ -71,6 +77,9 @@ def test_a_clock_set_back_revives_nothing(publisher: ListPublisher, robot: ListR
     (robot.folder / "timestamp.json").unlink()
     publisher.files = replayed
     assert robot.refused(1).startswith("freeze: timestamp expired")
+    (robot.folder / "clock").unlink()  # the control: without what it remembers the replay is believed
+    robot.start()
+    assert robot.refused(1) == ""
 
 
 def test_it_says_how_old_the_last_word_is(publisher: ListPublisher, robot: ListReader) -> None:

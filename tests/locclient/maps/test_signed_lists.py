@@ -11,8 +11,17 @@ import pytest
 from tuf.api.metadata import MetaFile, Snapshot, Timestamp
 
 from fleetmap.bus import MemoryBus, MemoryHub
-from fleetmap.errors import LinkError, UntrustedError
-from fleetmap.messages import RobotAck, WantedVersion, decode_message, encode_message, manifest_key, part_of, robot_key
+from fleetmap.errors import FleetmapError, LinkError, UntrustedError
+from fleetmap.messages import (
+    PART_BYTES,
+    RobotAck,
+    WantedVersion,
+    decode_message,
+    encode_message,
+    manifest_key,
+    part_of,
+    robot_key,
+)
 from fleetmap.trust import TrustedMap, ask_over
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.outbox import Outbox
@@ -168,6 +177,8 @@ def test_row_4_a_thief_of_the_server_with_all_its_keys(world: World, attempt: st
     kind = {"old serial": "rollback", "unlisted": "rollback"}.get(attempt, "signature")
     assert f"version 4 goes on: {kind}: " in note
     assert running(client) == 4
+    if attempt == "unlisted":
+        assert world.client("victim", trusting=False).ready().wanted.version == 1  # the control
 
 
 def test_row_4_among_admitted_versions_the_server_chooses(world: World) -> None:
@@ -179,17 +190,18 @@ def test_row_4_among_admitted_versions_the_server_chooses(world: World) -> None:
 
 
 def test_row_10_mondays_folder_on_tuesday(world: World) -> None:
-    client = world.client()
+    client, victim = world.client(), world.client("victim", trusting=False)
     assert client.ready().wanted.version == 2
     shutil.copytree(world.trust_folder, world.folder / "monday")
     world.publish(seed=2)
-    assert client.ready().wanted.version == 3
+    assert client.ready().wanted.version == victim.ready().wanted.version == 3
     shutil.rmtree(world.trust_folder)
     shutil.copytree(world.folder / "monday", world.trust_folder)
     want(world, 1)
     ready = client.ready()
     assert "version 3 goes on: rollback: " in ready.note
-    late = world.client("late")  # the control: a robot that never saw Tuesday believes Monday
+    assert victim.ready().wanted.version == running(victim) == 1  # the control: without lists Tuesday is forgotten
+    late = world.client("late")  # and lists cannot tell a robot that never saw Tuesday
     assert late.ready().wanted.version == 1
 
 
@@ -212,7 +224,9 @@ def test_row_12_news_are_held_back(world: World) -> None:
     ready = client.ready()
     assert "version 2 goes on: freeze: " in ready.note
     assert client.word_hours == pytest.approx(31.0, abs=0.05)
-    world.ahead_s = 20 * 3600.0  # the control: within its day it is believed
+    ready = world.client("victim", trusting=False).ready()  # the control: without lists no word is ever too old
+    assert (ready.wanted.version, ready.note) == (1, "")
+    world.ahead_s = 20 * 3600.0  # within its day a word is believed
     assert client.ready().wanted.version == 1
 
 
@@ -230,14 +244,18 @@ def test_an_offline_day_changes_nothing(world: World) -> None:
 
 
 def test_row_14_a_manifest_larger_than_its_signed_size(world: World) -> None:
-    """The list says its size: not a part of a larger one is taken."""
-    client = world.client()
-    length = world.store.version(SITE, 2).manifest_bytes
+    """The list says its size: of a larger one the first part ends it."""
+    client, victim = world.client(), world.client("victim", trusting=False)
     info = world.store.version(SITE, 2)
-    data = world.store.blob(info.manifest_sha256) + b" "
+    length = info.manifest_bytes
+    data = world.store.blob(info.manifest_sha256) + bytes(3_000_000)
     world.hub.queryables.insert(0, (manifest_key(SITE, 2), lambda _, question: part_of(data, question), None))
-    with pytest.raises(LinkError, match=f"has {length + 1} bytes where at most {length} are expected"):
+    with pytest.raises(LinkError, match=f"has {len(data)} bytes where at most {length} are expected"):
         client.fetch(client.wanted())
+    assert client.received_bytes <= PART_BYTES
+    with pytest.raises(FleetmapError):  # the control: without a signed size it takes them all before it looks
+        victim.fetch(victim.wanted())
+    assert victim.received_bytes == len(data)
 
 
 def test_a_version_that_begins_to_be_run_is_finished(world: World) -> None:
