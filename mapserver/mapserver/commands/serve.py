@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
+from mapserver.commands.oidc_options import OidcOptions
 from mapserver.commands.options import StoreFolder
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from fleetmap.bus import ZenohBus
     from mapserver.api.guard import GuardSettings
     from mapserver.config import MapserverConfig
+    from mapserver.operators.openid import Provider
     from mapserver.serving.bus_access import BusGuard
     from mapserver.store import MapStore
     from mapserver.trust.http_certificate import HttpCertificate
@@ -35,7 +37,7 @@ _NO_TLS = "This server was started with --insecure. Passwords and sessions can b
 
 
 @dataclass(frozen=True, kw_only=True)
-class HttpOptions:
+class HttpOptions(OidcOptions):
     """Where HTTP is served, and by which names."""
 
     http: Annotated[str, typer.Option(help="HTTP address to listen on; port 0 picks a free port.")] = "127.0.0.1:8080"
@@ -71,7 +73,9 @@ class HttpOptions:
             return None
         return HttpCertificate(self.http_cert, self.http_key)
 
-    def guard(self, store: "MapStore", certificate: "HttpCertificate | None", warning: str) -> "GuardSettings":
+    def guard(
+        self, store: "MapStore", certificate: "HttpCertificate | None", provider: "Provider | None", warning: str
+    ) -> "GuardSettings":
         """Who is let in. warning: about something else, for every page.
 
         UsageError where the server must not be reached like this."""
@@ -82,13 +86,14 @@ class HttpOptions:
         from mapserver.operators.operators import Operators
 
         given, host = tuple(name.lower() for name in self.http_name or ()), self.host_and_port()[0]
+        has_operators = provider is not None or store.operators.may_sign_in()
         fault = binding_fault(
             HttpBinding(
                 address=self.http,
                 host=host,
                 names=given,
                 has_tls=certificate is not None,
-                has_operators=store.operators.may_sign_in(),
+                has_operators=has_operators,
             )
         )
         if fault and not self.insecure:
@@ -97,9 +102,10 @@ class HttpOptions:
         return GuardSettings(
             names=frozenset(names),
             operators=Operators(store),
-            must_sign_in=not fault and not is_loopback_name(host),
+            must_sign_in=provider is not None or (not fault and not is_loopback_name(host)),
             handlers=HANDLERS,
-            warning=(_NO_TLS if store.operators.may_sign_in() else _INSECURE) if fault else warning,
+            warning=(_NO_TLS if has_operators else _INSECURE) if fault else warning,
+            provider=provider,
         )
 
 
@@ -126,10 +132,10 @@ def serve(
     from mapserver.store import MapStore
     from mapserver.trust import prepare_lists
 
-    certificate, settings = at.load_certificate(), settings_of(context)
+    certificate, provider, settings = at.load_certificate(), at.load_provider(), settings_of(context)
     # The sockets come before the store is read, so that a wrong address is reported at once.
     with _listening(host, port) as listener, MapStore.open(store) as maps:
-        guard = at.guard(maps, certificate, _OPEN_BUS if is_open else "")
+        guard = at.guard(maps, certificate, provider, _OPEN_BUS if is_open else "")
         prepare_lists(maps, zenoh)
         bus, robots = prepare_bus(maps, zenoh, insecure=at.insecure)
         with bus:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
     from argon2 import PasswordHasher
 
+    from mapserver.operators.openid import Person
+
 IDLE_S, LIFE_S = 3600, 12 * 3600
 TRIES, TRY_EVERY_S = 5, 12
 MIN_PASSWORD, MAX_PASSWORD = 12, 1000
@@ -95,13 +97,23 @@ class Operators:
         if stored is None or not is_right:
             self.note("sign-in refused", "wrong name or password", who)
             return SignIn(refusal="Wrong name or password.")
+        return self._begin(Actor(name, "", name, address))
+
+    def _begin(self, who: Actor) -> SignIn:
         session = secrets.token_urlsafe(32)
-        self._store.operators.begin_session(_digest(session), name, Actor(name, "", name, address))
+        self._store.operators.begin_session(_digest(session), who.name, who)
         now_ns = self._now_ns()
         self._store.operators.remove_ended(
             begun_before_ns=now_ns - LIFE_S * 10**9, used_before_ns=now_ns - IDLE_S * 10**9
         )
         return SignIn(session)
+
+    def sign_in_by_provider(self, person: "Person", address: str) -> SignIn:
+        """A session for whom the provider has just vouched, with the role of there; a refusal for who is disabled here."""
+        who = Actor(person.name, f"subject {person.subject}", person.name, address)
+        if not self._store.operators.admit(person.name, person.role, who):
+            return SignIn(refusal=f"{person.name} is disabled here; an administrator can change that.")
+        return self._begin(who)
 
     def sign_out(self, who: Identity) -> None:
         """Ends the session that a request came with."""

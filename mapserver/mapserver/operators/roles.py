@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from mapserver.store import Actor
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9._@+-]{0,63}")
+# In front of the names of people who sign in at a provider: no name of ours has a colon.
+PROVIDER_PREFIX = "oidc:"
 
 
 class Scope(StrEnum):
