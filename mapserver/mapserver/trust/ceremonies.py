@@ -16,21 +16,25 @@ from mapserver.trust.repository import ListRepository
 from mapserver.trust.signing import admitted_versions, update_lists
 
 if TYPE_CHECKING:
-    from securesystemslib.signer import CryptoSigner, Key
+    from securesystemslib.signer import CryptoSigner, Key, Signer
     from tuf.api.metadata import Root
 
 
-def init_with_people(store: MapStore, sticks: Sequence[Path], threshold: int) -> dict[Path, str]:
-    """Root keys, one in each of these folders, and the server's online key; the passphrase of every root key by its file.
+def init_with_people(
+    store: MapStore, sticks: Sequence[Path], threshold: int, tokens: Sequence["Signer"] = ()
+) -> dict[Path, str]:
+    """Root keys, one in each of these folders and those on tokens, and the server's online key; the passphrases by their files.
 
     Raises UsageError for a threshold that these keys cannot meet, StateError where the store has lists.
     """
-    if not 1 <= threshold <= len(sticks):
-        raise UsageError(f"--threshold {threshold}: {len(sticks)} root keys cannot meet it")
+    count = len(sticks) + len({signer.public_key.keyid for signer in tokens})
+    if not 1 <= threshold <= count:
+        raise UsageError(f"--threshold {threshold}: {count} root keys cannot meet it")
     lists = SignedLists(store.folder)
     if lists.are_there:
         raise StateError(f"{lists.folder} has signed lists already; `mapserver trust status` shows them")
-    people, passphrases = [], {}
+    people: list[Signer] = list(tokens)
+    passphrases = {}
     for number, folder in enumerate(sticks, 1):
         path = folder / f"root-{number}.pem"
         passphrases[path] = make_passphrase()
@@ -72,7 +76,7 @@ def admit(
     store: MapStore,
     site: str,
     keys: Sequence["Key"],
-    people: Sequence["CryptoSigner"],
+    people: Sequence["Signer"],
     *,
     threshold: int,
     previous: int,
@@ -89,13 +93,13 @@ def admit(
         repository.delegate(site, own, people, threshold=threshold, previous=previous)
 
 
-def rotate_online(store: MapStore, people: Sequence["CryptoSigner"]) -> None:
+def rotate_online(store: MapStore, people: Sequence["Signer"]) -> None:
     """Another online key, after a theft of the server or of the key; robots forget what the old one signed."""
     with _ceremony(store, people, "another online key") as repository:
         repository.replace_online(_keys(store).replace("online").public_key, people)
 
 
-def revoke_site(store: MapStore, site: str, keys: Sequence["Key"], people: Sequence["CryptoSigner"]) -> None:
+def revoke_site(store: MapStore, site: str, keys: Sequence["Key"], people: Sequence["Signer"]) -> None:
     """Other keys for a site and for the server in one ceremony, after a theft of the site's key.
 
     The site's key alone would not do: robots refuse numbers below those that the thief signed until the online key is another one.
@@ -115,17 +119,18 @@ def revoke_site(store: MapStore, site: str, keys: Sequence["Key"], people: Seque
 
 def rotate_root(
     store: MapStore,
-    people: Sequence["CryptoSigner"],
+    people: Sequence["Signer"],
     *,
     removed: Sequence["Key"] = (),
-    add: Path | None = None,
+    add: "Path | Signer | None" = None,
 ) -> dict[Path, str]:
     """The next root and targets, with other people or the same: also before they expire. StateError unless enough signed.
 
-    add: folder for the key of a person who comes; its file and passphrase are returned. UsageError for a `removed` key that is none.
+    add: the key on a token of a person who comes, or the folder for a new one, whose file and passphrase are returned.
+    UsageError for a `removed` key that is none.
     """
     passphrases: dict[Path, str] = {}
-    added: list[CryptoSigner] = []
+    added: list[Signer] = []
 
     def change(root: "Root") -> None:
         for role in ("root", "targets"):
@@ -139,7 +144,9 @@ def rotate_root(
         known = set(repository.root().roles["root"].keyids)
         if not {key.keyid for key in removed} <= known:
             raise UsageError("the person whose key is to be removed holds no root key; `trust status` counts them")
-        if add is not None:
+        if add is not None and not isinstance(add, Path):
+            added.append(add)
+        elif add is not None:
             passphrases[add / "root-new.pem"] = make_passphrase()
             added.append(make_key_file(add / "root-new.pem", passphrases[add / "root-new.pem"]))
         repository.change_root(change, [*people, *added])
@@ -148,7 +155,7 @@ def rotate_root(
     return passphrases
 
 
-def sign_site(store: MapStore, site: str, signer: "CryptoSigner") -> int:
+def sign_site(store: MapStore, site: str, signer: "Signer") -> int:
     """Adds a signature to the list of what a site's releases admit; how many more it needs, 0 where robots get it now.
 
     Raises StateError where nothing is to be signed, or this key may not.
@@ -171,7 +178,7 @@ def sign_site(store: MapStore, site: str, signer: "CryptoSigner") -> int:
 
 
 @contextmanager
-def _ceremony(store: MapStore, people: Sequence["CryptoSigner"] | None, words: str) -> Iterator[ListRepository]:
+def _ceremony(store: MapStore, people: Sequence["Signer"] | None, words: str) -> Iterator[ListRepository]:
     """The lists for one change, checked before it; afterwards `words` stand in the log, and the server signs what follows from it."""
     repository = _repository(store)
     if not repository.lists.are_there:

@@ -9,9 +9,12 @@ from fleetmap.errors import StoreError, UsageError, disk_errors
 from mapserver.store.files import make_folder, sync_folder
 
 if TYPE_CHECKING:
-    from securesystemslib.signer import CryptoSigner
+    from securesystemslib.signer import CryptoSigner, Key
+    from securesystemslib.signer import Signer as AnySigner
 
-Signer: TypeAlias = "CryptoSigner"
+Signer: TypeAlias = "AnySigner"
+PublicKey: TypeAlias = "Key"
+TOKEN_SCHEME = "pkcs11:"  # in the place of a file's path: a key on a token
 
 _LETTERS = "abcdefghijkmnpqrstuvwxyz23456789"  # 32 of them: five bits each, none that looks like another
 _GROUPS, _GROUP = 4, 4

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any, TypeVar
 
-from securesystemslib.signer import CryptoSigner, Key
+from securesystemslib.signer import Key, Signer
 from tuf.api.exceptions import RepositoryError, UnsignedMetadataError
 from tuf.api.metadata import (
     DelegatedRole,
@@ -58,7 +58,7 @@ class ListRepository:
 
     # --- by the people who hold root keys -----------------------------------------------------------------------------
 
-    def init(self, people: Sequence[CryptoSigner], threshold: int, online: Key) -> None:
+    def init(self, people: Sequence[Signer], threshold: int, online: Key) -> None:
         """The first root and targets; StateError where the store has some."""
         if self.lists.are_there:
             raise StateError(f"{self.lists.folder} has signed lists already; `mapserver trust status` shows them")
@@ -74,7 +74,7 @@ class ListRepository:
         self._sign("targets", targets, people)
         self._sign("root", root, people)
 
-    def check_people(self, people: Sequence[CryptoSigner]) -> None:
+    def check_people(self, people: Sequence[Signer]) -> None:
         """Raises StateError where these are not enough for a root and targets, before half of a ceremony is done."""
         root = self.root()
         for name in ("root", "targets"):
@@ -85,14 +85,14 @@ class ListRepository:
                     f"{len(known)} of the {role.threshold} keys that {name} needs are here; bring the others too"
                 )
 
-    def change_root(self, change: Callable[[Root], None], people: Sequence[CryptoSigner]) -> None:
+    def change_root(self, change: Callable[[Root], None], people: Sequence[Signer]) -> None:
         """The next root, with what `change` makes of the last one; StateError unless both roots' people signed it."""
         before, root = self.root(), self.root()
         change(root)
         root.version += 1
         self._sign("root", root, people, (before, root))
 
-    def replace_online(self, online: Key, people: Sequence[CryptoSigner]) -> None:
+    def replace_online(self, online: Key, people: Sequence[Signer]) -> None:
         """Another key for snapshot and timestamp; robots then forget the numbers of the old one."""
 
         def change(root: Root) -> None:
@@ -103,7 +103,7 @@ class ListRepository:
 
         self.change_root(change, people)
 
-    def delegate(self, site: str, keys: Sequence[Key], people: Sequence[CryptoSigner], **rules: int) -> None:
+    def delegate(self, site: str, keys: Sequence[Key], people: Sequence[Signer], **rules: int) -> None:
         """These keys, and no others, sign the list of a site. rules: threshold, and `previous`, how many predecessors stay admitted.
 
         StateError unless enough people signed.
@@ -122,7 +122,7 @@ class ListRepository:
         targets.version += 1
         self._sign("targets", targets, people, (self.root(),))
 
-    def renew_targets(self, people: Sequence[CryptoSigner]) -> None:
+    def renew_targets(self, people: Sequence[Signer]) -> None:
         """The same targets for another year; StateError unless enough people signed."""
         targets = self.targets()
         targets.version += 1
@@ -130,9 +130,7 @@ class ListRepository:
 
     # --- by who builds a site's maps ----------------------------------------------------------------------------------
 
-    def sign_site(
-        self, site: str, admitted: Sequence[AdmittedVersion], signers: Sequence[CryptoSigner]
-    ) -> Metadata[Any]:
+    def sign_site(self, site: str, admitted: Sequence[AdmittedVersion], signers: Sequence[Signer]) -> Metadata[Any]:
         """The next list of a site, not yet among those that robots get."""
         name = site_role(site)
         signed = Targets(version=self.lists.newest(name) + 1, expires=self._expiry("site"))
@@ -173,7 +171,7 @@ class ListRepository:
             make_folder(path.parent)
             write_atomically(path, [metadata.to_bytes(_COMPACT)])
 
-    def check_signer(self, site: str, signer: CryptoSigner) -> None:
+    def check_signer(self, site: str, signer: Signer) -> None:
         """Raises StateError where a key may not sign the lists of a site."""
         if signer.public_key.keyid not in self._delegated(site).keyids:
             raise StateError(
@@ -207,7 +205,7 @@ class ListRepository:
 
     # --- by the server ------------------------------------------------------------------------------------------------
 
-    def sign_online(self, online: CryptoSigner, audit: AuditMark | None = None) -> None:
+    def sign_online(self, online: Signer, audit: AuditMark | None = None) -> None:
         """Snapshot, where something changed, and timestamp. Names only what it has verified with the store's own root.
 
         audit: the end of the store's log, which robots then keep with the timestamp.
@@ -261,7 +259,7 @@ class ListRepository:
     def _expiry(self, role: str) -> datetime:
         return self.now + timedelta(days=DAYS[role])
 
-    def _sign(self, role: str, signed: Signed, signers: Sequence[CryptoSigner], judges: Sequence[Root] = ()) -> None:
+    def _sign(self, role: str, signed: Signed, signers: Sequence[Signer], judges: Sequence[Root] = ()) -> None:
         signed.expires = self._expiry(role)
         metadata = Metadata[Any](signed)
         for signer in signers:

@@ -14,14 +14,15 @@ from mapserver.commands.options import Json, StoreFolder, print_json
 
 if TYPE_CHECKING:
     from mapserver.store import MapStore
-    from mapserver.trust.keys import Signer
+    from mapserver.trust.keys import PublicKey, Signer
 
 KeyFiles = Annotated[
-    list[str] | None, typer.Option(metavar="FILE", help="Key of a person, asked for its passphrase; repeat it.")
+    list[str] | None,
+    typer.Option(metavar="FILE|URI", help="Key of a person, asked for its passphrase or PIN; repeat it."),
 ]
 PublicKeys = Annotated[
     list[str] | None,
-    typer.Option(metavar="FILE.pub", help="Public key that signs the site's lists; default: a new one in keys/."),
+    typer.Option(metavar="FILE.pub|URI", help="Public key that signs the site's lists; default: a new one in keys/."),
 ]
 Hosts = Annotated[
     list[str] | None,
@@ -51,13 +52,16 @@ class PeopleOptions:
         from mapserver.trust import KeyFolder
 
         root = None if self.key else KeyFolder(maps.folder / "keys").signer("root")
-        return [root] if root is not None else [_asked(Path(path)) for path in self.key or ()]
+        return [root] if root is not None else [_asked(path) for path in self.key or ()]
 
 
 def init(
     store: StoreFolder,
     here: Annotated[bool, typer.Option("--here", help="Keep all keys on this machine, without passphrases.")] = False,
-    stick: Annotated[list[str] | None, typer.Option(metavar="DIR", help="Folder for one root key; repeat it.")] = None,
+    stick: Annotated[
+        list[str] | None,
+        typer.Option(metavar="DIR|URI", help="Folder for one root key, or a key on a token; repeat it."),
+    ] = None,
     threshold: Annotated[int, typer.Option(min=1, help="How many root keys are needed for a change.")] = 2,
     host: Hosts = None,
 ) -> None:
@@ -68,18 +72,24 @@ def init(
     from mapserver.trust import SignedLists, init_here
     from mapserver.trust.ceremonies import init_with_people
     from mapserver.trust.enrolment import RobotRegister
-    from mapserver.trust.keys import make_passphrase
+    from mapserver.trust.keys import TOKEN_SCHEME, make_passphrase
 
     if here == bool(stick):
         raise UsageError(
             "say where the keys are: --here for this machine, or --stick DIR for every person who holds a root key"
         )
-    sticks, hosts = [Path(folder) for folder in stick or ()], host or [socket.gethostname()]
+    sticks, hosts = (
+        [Path(name) for name in stick or () if not name.startswith(TOKEN_SCHEME)],
+        host or [socket.gethostname()],
+    )
+    if not here and not sticks:
+        raise UsageError("name a folder too: the servers' authority, servers-ca.pem, is no key for a token")
+    tokens = [_asked(name) for name in stick or () if name.startswith(TOKEN_SCHEME)]
     with MapStore.open(store) as maps:
         authorities, passphrases = RobotRegister(maps).authorities, {}
         # A store that was served on loopback has lists already, and no certificates.
         if authorities.are_there or not SignedLists(maps.folder).are_there:
-            passphrases = {} if here else init_with_people(maps, sticks, threshold)
+            passphrases = {} if here else init_with_people(maps, sticks, threshold, tokens)
             if here:
                 init_here(maps)
         path, words = (None, None) if here else (sticks[0] / "servers-ca.pem", make_passphrase())
@@ -118,7 +128,7 @@ def admit(
     from mapserver.trust import ceremonies
 
     with MapStore.open(people.store) as maps:
-        keys = [ceremonies.public_key(Path(path)) for path in public or ()]
+        keys = [_public(path) for path in public or ()]
         ceremonies.admit(maps, site, keys, people.load(maps), threshold=threshold, previous=previous)
     typer.echo(f"site {site}: {max(1, len(keys))} keys may sign, {threshold} must")
 
@@ -145,7 +155,7 @@ def sign(site: SiteArgument, people: PeopleOptions) -> None:
             for verdict in maps.verdicts(site, rows.current.version)[-1:]:
                 typer.echo(f"the gate: {'; '.join(verdict.reasons) or 'accepted'}")
         for path in people.key:
-            missing = sign_site(maps, site, _asked(Path(path)))
+            missing = sign_site(maps, site, _asked(path))
     typer.echo(f"site {site}: {f'{missing} more signatures are needed' if missing else 'robots get it now'}")
 
 
@@ -160,9 +170,12 @@ def rotate(
     ],
     people: PeopleOptions,
     add: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder for the root key of a person who comes.")
+        str | None,
+        typer.Option(metavar="DIR|URI", help="Folder for the root key of a person who comes, or a key on a token."),
     ] = None,
-    remove: Annotated[Path | None, typer.Option(metavar="FILE.pub", help="Public key of a person who leaves.")] = None,
+    remove: Annotated[
+        str | None, typer.Option(metavar="FILE.pub|URI", help="Public key of a person who leaves.")
+    ] = None,
     host: Hosts = None,
     stolen: Annotated[
         bool, typer.Option("--stolen", help="Of robots-ca: nothing that it signed counts; all robots enrol again.")
@@ -180,6 +193,7 @@ def rotate(
         raise UsageError("--host is for `trust rotate server`, --stolen for `trust rotate robots-ca`")
     from mapserver.store import MapStore
     from mapserver.trust import ceremonies
+    from mapserver.trust.keys import TOKEN_SCHEME
 
     if what is Rotated.ONLINE and (add or remove):
         raise UsageError("--add and --remove are for `trust rotate root`")
@@ -188,8 +202,9 @@ def rotate(
         if what is Rotated.ONLINE:
             ceremonies.rotate_online(maps, signers)
         else:
-            removed = [] if remove is None else [ceremonies.public_key(remove)]
-            for path, passphrase in ceremonies.rotate_root(maps, signers, removed=removed, add=add).items():
+            removed = [] if remove is None else [_public(remove)]
+            comes = None if add is None else _asked(add) if add.startswith(TOKEN_SCHEME) else Path(add)
+            for path, passphrase in ceremonies.rotate_root(maps, signers, removed=removed, add=comes).items():
                 typer.echo(f"{path}: {passphrase}   (shown once: write it down, apart from the stick)")
     typer.echo("done; robots follow with their next question")
 
@@ -223,7 +238,7 @@ def revoke(site: SiteArgument, people: PeopleOptions, public: PublicKeys = None)
     from mapserver.trust import ceremonies
 
     with MapStore.open(people.store) as maps:
-        keys = [ceremonies.public_key(Path(path)) for path in public or ()]
+        keys = [_public(path) for path in public or ()]
         ceremonies.revoke_site(maps, site, keys, people.load(maps))
     typer.echo(f"site {site}: the old keys sign nothing any more; robots follow with their next question")
 
@@ -255,12 +270,31 @@ def status(store: StoreFolder, json: Json = False) -> None:
         raise typer.Exit(1)
 
 
-def _asked(path: Path) -> "Signer":
+def _asked(path: str) -> "Signer":
+    """A key by its file or on a token."""
     import getpass
 
-    from mapserver.trust.keys import load_key
+    from mapserver.trust.keys import TOKEN_SCHEME, load_key
 
-    return load_key(path, getpass.getpass(f"passphrase of {path}: ").strip())
+    if path.startswith(TOKEN_SCHEME):
+        from mapserver.trust.tokens import token_signer
+
+        return token_signer(path, getpass.getpass)
+    return load_key(Path(path), getpass.getpass(f"passphrase of {path}: ").strip())
+
+
+def _public(path: str) -> "PublicKey":
+    """A public key by its file or on a token."""
+    import getpass
+
+    from mapserver.trust.ceremonies import public_key
+    from mapserver.trust.keys import TOKEN_SCHEME
+
+    if path.startswith(TOKEN_SCHEME):
+        from mapserver.trust.tokens import token_public_key
+
+        return token_public_key(path, getpass.getpass)
+    return public_key(Path(path))
 
 
 TRUST = Group(
