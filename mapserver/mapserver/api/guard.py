@@ -6,6 +6,7 @@ Every request but those of `_OPEN` needs a scope, where sign-in is on; what is n
 import base64
 import gzip
 import hashlib
+import logging
 import re
 import secrets
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ from mapserver.operators.operators import LIFE_S, Operators
 from mapserver.operators.roles import PROVIDER_PREFIX, Identity
 from mapserver.operators.roles import Scope as Right
 from mapserver.store import Actor
+
+_log = logging.getLogger(__name__)
 
 SIGN_IN, SIGN_OUT = "/sign-in", "/sign-out"
 PROVIDER, PROVIDER_BACK = "/sign-in/provider", "/sign-in/provider/back"
@@ -154,10 +157,23 @@ class Guard:
                 return await send({"type": "websocket.close", "code": 4403})
             return await self._app(scope, receive, send)
         answer = _Answer(scope, send, self._hashes)
-        if refusal is None:
-            await self._app(answer.scope, receive, answer.send)
-        else:
-            await refusal(scope, receive, answer.send)
+        if refusal is not None:
+            return await refusal(scope, receive, answer.send)
+        is_gone = False
+
+        async def watched() -> Message:
+            nonlocal is_gone
+            message = await receive()
+            is_gone = is_gone or message["type"] == "http.disconnect"
+            return message
+
+        try:
+            await self._app(answer.scope, watched, answer.send)
+        except RuntimeError as error:
+            # Starlette's word for an answer that nobody waits for any more: a page that was closed while it loaded.
+            if not is_gone or str(error) != "No response returned.":
+                raise
+            _log.info("%s %r: whoever asked has left", scope["method"], scope["path"])
         return None
 
     def _refused_place(self, scope: Scope) -> Response | None:

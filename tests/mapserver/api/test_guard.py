@@ -9,8 +9,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import anyio
 import pytest
+from fastapi import Request, Response
 from fastapi.testclient import TestClient
+from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
+from starlette.types import Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from mapserver.api.app import create_app
@@ -251,3 +255,28 @@ def test_the_cookie_is_for_this_host_and_tls_where_there_is_some() -> None:
         response = Response()
         set_session(response, {"type": "http", "scheme": scheme}, "s3cret")
         assert response.headers["set-cookie"] == words
+
+
+@pytest.mark.parametrize("has_left", [True, False])
+def test_whoever_leaves_before_the_answer_is_no_error_of_the_server(has_left: bool) -> None:
+    """As a browser does whose page is closed while it loads; the page library's layers make an error of it."""
+
+    async def silent(scope: Scope, receive: Receive, send: Send) -> None:
+        await receive()
+
+    async def receive() -> Message:
+        return {"type": "http.disconnect"} if has_left else {"type": "http.request", "body": b""}
+
+    async def send(message: Message) -> None:
+        raise AssertionError(message)
+
+    async def passed(request: Request, call_next: RequestResponseEndpoint) -> Response:
+        return await call_next(request)
+
+    guard = Guard(BaseHTTPMiddleware(silent, passed), GuardSettings())
+    scope = {"type": "http", "method": "GET", "path": "/x", "query_string": b"", "headers": [(b"host", b"localhost")]}
+    if has_left:
+        anyio.run(guard, scope, receive, send)
+    else:
+        with pytest.raises(RuntimeError, match="No response returned"):
+            anyio.run(guard, scope, receive, send)

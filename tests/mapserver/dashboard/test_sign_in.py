@@ -60,7 +60,7 @@ def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
         server.http = server.http.replace("0.0.0.0", "127.0.0.1")
         assert server.http.startswith("https://")
         yield server
-    assert [line for line in server.log if "ERROR" in line or "Traceback" in line] == []
+    assert not any("ERROR" in line or "Traceback" in line for line in server.log), "\n".join(server.log)
 
 
 @pytest.fixture
