@@ -48,7 +48,7 @@ def test_recordings_of_other_buildings_are_not_joined_by_build_nor_by_night(tmp_
         assert [info.version for info in maps.versions("hall")] == [1]
 
 
-# Each part is an hour or less of one core, and can be run by itself: -k "no_foreign and true".
+# Each part is an hour or less of one core, and can be run by itself: -k "true-0" for the last one.
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize(("part", "foreign", "true"), [("pictures", 40, 6), ("foreign", 200, 0), ("true", 0, 170)])
 def test_no_foreign_session_is_joined_and_nearly_all_true_ones_are(
