@@ -169,7 +169,9 @@ def _words(identifier: str) -> str:
     return f"_{re.sub(r'(?<=[a-z0-9])(?=[A-Z])', '_', identifier).lower().strip('_')}_"
 
 
-def _identifiers(path: Path) -> set[str]:
+@cache
+def _identifiers(path: Path) -> dict[str, str]:
+    """The words of each."""
     found = {path.stem}
     for node in ast.walk(_tree(path)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
@@ -180,7 +182,7 @@ def _identifiers(path: Path) -> set[str]:
             found.add(node.id)
         elif isinstance(node, ast.Attribute):
             found.add(node.attr)
-    return found
+    return {name: _words(name) for name in found}
 
 
 @pytest.mark.parametrize("word", RETIRED)
@@ -189,8 +191,8 @@ def test_retired_words_stay_retired(word: str) -> None:
         f"{module}: {name}"
         for module, path in _modules().items()
         if module.partition(".")[0] in ONLY_IN.get(word, PACKAGES)
-        for name in _identifiers(path)
-        if f"_{word}_" in _words(name) and name not in KEPT
+        for name, words in _identifiers(path).items()
+        if f"_{word}_" in words and name not in KEPT
     }
     assert found == set(), f"the field says {RETIRED[word]}"
 
