@@ -62,18 +62,25 @@ def ranked(hypotheses: Sequence[PoseHypothesis]) -> list[PoseHypothesis]:
 def competitors(
     hypotheses: Sequence[PoseHypothesis], settings: TrackSettings, best: PoseHypothesis | None = None
 ) -> list[PoseHypothesis]:
-    """Hypotheses besides the best with nearly its support per query since they were founded: by inliers, or by landmark recall, since
-    a place where the map is thin is no less likely than its alias."""
+    """Hypotheses besides the best with nearly its support, per query since they were founded or in this query alone: by inliers, or by
+    landmark recall, since a place where the map is thin is no less likely than its alias. A robot that turns into its aisle sees more of
+    the next one at first: what it saw then must not outweigh that both look alike now.
+    """
     if not hypotheses:
         return []
     best = best or ranked(hypotheses)[0]
-    inliers, recall = best.mean_inliers, best.mean_recall
+
+    def is_near(inliers: float, recall: float, best_inliers: float, best_recall: float) -> bool:
+        if inliers >= settings.rival_share * best_inliers:
+            return True
+        has_recall = recall >= settings.rival_hit_share * best_recall
+        return has_recall and inliers >= settings.rival_least_share * best_inliers
 
     def competes(other: PoseHypothesis) -> bool:
-        if other.mean_inliers >= settings.rival_share * inliers:
+        if is_near(other.mean_inliers, other.mean_recall, best.mean_inliers, best.mean_recall):
             return True
-        has_recall = other.mean_recall >= settings.rival_hit_share * recall
-        return has_recall and other.mean_inliers >= settings.rival_least_share * inliers
+        is_seen = other.query_inliers > 0
+        return is_seen and is_near(other.query_inliers, other.query_recall, best.query_inliers, best.query_recall)
 
     return [h for h in hypotheses if h is not best and competes(h)]
 

@@ -21,9 +21,10 @@ class PoseHypothesis:
 
     map_from_body and cov_rot_trans: at that frame. now_map_from_body, now_cov: propagated to the present. query_map_from_body,
     query_cov: at the frame of the present map query, which may be some frames old. stamp_ns: of the last fix. support: number of
-    fixes that agreed. inlier_sum, recall_sum, queries: sums of inliers, of landmark recall, and of map queries, older ones decayed.
-    recall_total, looks: landmark recall of all queries, 0 for those without a fix, and their number. misses: queries since the last
-    fix. kidnap_hypotheses: places that rejected fixes name instead.
+    fixes that agreed. inlier_sum, recall_sum, queries: sums of inliers, of landmark recall, and of map queries, older ones
+    decayed. query_inliers, query_recall: of this query's fix, 0 without. recall_total, looks: landmark recall of all queries, 0
+    for those without a fix, and their number. misses: queries since the last fix. kidnap_hypotheses: places that rejected fixes
+    name instead.
     """
 
     frame_index: int
@@ -38,6 +39,8 @@ class PoseHypothesis:
     inlier_sum: float = 0.0
     recall_sum: float = 0.0
     queries: float = 0.0
+    query_inliers: int = 0
+    query_recall: float = 0.0
     recall_total: float = 0.0
     looks: int = 0
     misses: int = 0
@@ -76,6 +79,7 @@ class PoseHypothesis:
         """Begins a map query: older ones weigh less."""
         self.inlier_sum, self.recall_sum = kept_share * self.inlier_sum, kept_share * self.recall_sum
         self.queries = kept_share * self.queries + 1.0
+        self.query_inliers, self.query_recall = 0, 0.0
         self.looks += 1
 
     def add_fix(self, inliers: int, landmark_recall: float) -> None:
@@ -83,6 +87,7 @@ class PoseHypothesis:
         self.inlier_sum += inliers
         self.recall_sum += landmark_recall
         self.recall_total += landmark_recall
+        self.query_inliers, self.query_recall = inliers, landmark_recall
 
     def mark_query(self) -> None:
         """Keeps the present pose for the map query that begins now."""
