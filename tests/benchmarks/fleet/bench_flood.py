@@ -36,9 +36,8 @@ from fleetmap.messages import (
 )
 from mapserver import releases
 
-EVIL = "flood"
 KINDS = {"10,000 puts a second": 10_000, "1 MB strings": 100, "1000 failures a second": 1000, "20 MB pictures": 10}
-_EVERY_S = 2.0  # a robot asks this often, and delivers a failure with every second question
+_EVERY_S = 2.0  # a robot asks this often, and delivers a failure with every third question
 _BLOCK = zenoh.CongestionControl.BLOCK
 
 
@@ -52,24 +51,24 @@ def _failure(robot: str, number: int, pictures: int = 0, picture_bytes: int = 60
     return msgspec.msgpack.encode(msgspec.structs.replace(made, **more))
 
 
-def _health(words: str = "") -> bytes:
-    health = RobotHealth(site=SITE, robot=EVIL, stamp_ns=time.time_ns(), version=1, status="TRACKING")
+def _health(robot: str, words: str = "") -> bytes:
+    health = RobotHealth(site=SITE, robot=robot, stamp_ns=time.time_ns(), version=1, status="TRACKING")
     return msgspec.msgpack.encode(msgspec.structs.replace(health, metrics={"words": words}))
 
 
-def _sender(session: Any, kind: str) -> Callable[[int], None]:
+def _sender(session: Any, robot: str, kind: str) -> Callable[[int], None]:
     """Sends one message; the attacker waits for no answer, and is not kept to the sizes of `ZenohBus`."""
 
     def put(what: str, payload: bytes) -> None:
-        session.put(robot_key(SITE, EVIL, what), payload, congestion_control=_BLOCK)
+        session.put(robot_key(SITE, robot, what), payload, congestion_control=_BLOCK)
 
     def ask(what: str, payload: bytes) -> None:
-        key = robot_key(SITE, EVIL, what)
+        key = robot_key(SITE, robot, what)
         session.get(key, lambda _: None, payload=payload, timeout=10.0, congestion_control=_BLOCK)
 
-    whats, small, text = cycle(ROBOT_KEYS), _health(), "x" * 1_000_000
-    large, long = _health(text), _failure(EVIL, 0, cause=text)
-    huge = _failure(EVIL, 0, pictures=1, picture_bytes=20_000_000)
+    whats, small, text = cycle(ROBOT_KEYS), _health(robot), "x" * 1_000_000
+    large, long = _health(robot, text), _failure(robot, 0, cause=text)
+    huge = _failure(robot, 0, pictures=1, picture_bytes=20_000_000)
     strings = cycle([(put, "health", large), (ask, "failures", long), (ask, "wanted", text.encode())])
     pictures = cycle([(ask, "failures", huge), (put, "failures", huge)])
 
@@ -80,15 +79,15 @@ def _sender(session: Any, kind: str) -> Callable[[int], None]:
     return {
         "10,000 puts a second": lambda _: put(next(whats), small),
         "1 MB strings": lambda _: of_cycle(strings),
-        "1000 failures a second": lambda number: ask("failures", _failure(EVIL, number, pictures=4)),
+        "1000 failures a second": lambda number: ask("failures", _failure(robot, number, pictures=4)),
         "20 MB pictures": lambda _: of_cycle(pictures),
     }[kind]
 
 
-def _flood(endpoint: str, files: TlsFiles, kind: str, seconds: float, said: "multiprocessing.Queue[int]") -> None:
+def _flood(endpoint: str, files: TlsFiles, robot: str, kind: str, seconds: float, said: Any) -> None:
     with ZenohBus.connect(endpoint, tls=files) as bus:
-        bus.get(robot_key(SITE, EVIL, "wanted"), timeout_s=60.0)
-        send, sent, begun_s = _sender(bus._session, kind), 0, time.monotonic()
+        bus.get(robot_key(SITE, robot, "wanted"), timeout_s=60.0)
+        send, sent, begun_s = _sender(bus._session, robot, kind), 0, time.monotonic()
         while (elapsed_s := time.monotonic() - begun_s) < seconds:
             if sent > elapsed_s * KINDS[kind]:
                 time.sleep(0.001)
@@ -118,7 +117,7 @@ def _others(endpoint: str, robots: dict[str, TlsFiles], orders: Any, said: Any) 
                 try:
                     decode_message(buses[name].get(robot_key(SITE, name, "wanted"), timeout_s=20.0), WantedVersion)
                     waits.append(time.monotonic() - begun_s)
-                    if number % 2:
+                    if number % 3 == 2:
                         asked_s = time.monotonic()
                         answer = buses[name].get(
                             robot_key(SITE, name, "failures"), _failure(name, number), timeout_s=20.0
@@ -151,21 +150,21 @@ def _disk_mb(folder: Path) -> float:
 
 def bench(folder: Path, seconds: float = 60.0, others: int = 50) -> dict[str, dict[str, float]]:
     """For a quiet time and each kind of flood: messages sent, the others' waits (s), growth of the server's memory and folder (MB)."""
+    evil = {kind: f"flood-{number}" for number, kind in enumerate(KINDS)}  # each with a fresh allowance of failures
     store, register = open_register(folder)
     with store:
         releases.publish(store, SITE)
-        register.enrol(SITE, [EVIL, *(f"r{number}" for number in range(others))], "tls/127.0.0.1:7447")
+        register.enrol(SITE, [*evil.values(), *(f"r{number}" for number in range(others))], "tls/127.0.0.1:7447")
         entries = register.robots()
         files = {e.robot: robot_files(register, Holder(e.certificate, SITE, e.robot), folder) for e in entries}
     context, found = multiprocessing.get_context("spawn"), {}
     orders, said, sent = context.Queue(), context.Queue(), context.Queue()
     with serving(folder / "store", "tls/127.0.0.1:0") as (server, _, endpoint):
-        calm = {name: own for name, own in files.items() if name != EVIL}
+        calm = {name: own for name, own in files.items() if name not in evil.values()}
         process = context.Process(target=_others, args=(endpoint, calm, orders, said))
         process.start()
         assert said.get(timeout=120) == []
         for kind in ("nobody floods", *KINDS):
-            flood = context.Process(target=_flood, args=(endpoint, files[EVIL], kind, seconds, sent))
             before_mb, before_disk_mb = resident_mb(server.pid), _disk_mb(folder / "store")
             memory_mb, over = [before_mb], threading.Event()
 
@@ -177,7 +176,8 @@ def bench(folder: Path, seconds: float = 60.0, others: int = 50) -> dict[str, di
             watcher.start()
             orders.put(seconds if kind in KINDS else min(seconds, 20.0))
             if kind in KINDS:
-                flood.start()
+                robot = evil[kind]
+                context.Process(target=_flood, args=(endpoint, files[robot], robot, kind, seconds, sent)).start()
             waits = said.get(timeout=10 * seconds + 120)
             number = sent.get(timeout=10 * seconds + 120) if kind in KINDS else 0
             over.set()
