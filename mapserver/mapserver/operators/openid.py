@@ -68,7 +68,7 @@ class ProviderSettings:
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """Whom the provider vouches for. subject: its own word for the person, for the log."""
+    """Whom the provider vouches for. subject: its own word for the person, and whose it is, for the log."""
 
     name: str
     role: Role
@@ -172,7 +172,7 @@ class Provider:
                 f"None of your groups at {self.host} has a role here; an administrator can give it one.",
                 name,
             )
-        return Person(name, max(roles, key=list(Role).index), ascii(claims["sub"])[:200])
+        return Person(name, max(roles, key=list(Role).index), f"{ascii(claims['sub'])[:200]} of {given.issuer}")
 
     async def _discover(self) -> dict[str, Any]:
         """The provider's addresses, asked once; ProviderError where there is no proper answer."""

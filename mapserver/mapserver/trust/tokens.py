@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote, unquote_to_bytes
 
-from securesystemslib.exceptions import UnsupportedLibraryError
-from securesystemslib.signer import HSMSigner, Key, SecretsHandler, Signature, Signer, SSlibKey
-from securesystemslib.signer import _hsm_signer as library
+from securesystemslib.exceptions import UnsupportedLibraryError, UnverifiedSignatureError
+from securesystemslib.signer import HSMSigner, Key, SecretsHandler, Signature, Signer
 
 from fleetmap.errors import StateError, UsageError
 from mapserver.trust.keys import TOKEN_SCHEME, credential
@@ -74,30 +73,16 @@ def token_public_key(uri: str, ask: Callable[[str], str]) -> Key:
     return _TokenSigner(key, _pin_of(key, ask)).public_key
 
 
-class _TokenSigner(Signer):
+class _TokenSigner(HSMSigner):
     def __init__(self, key: TokenUri, pin: SecretsHandler) -> None:
-        if library.PKCS11_IMPORT_ERROR:
-            raise UsageError(
-                "keys on tokens need python-pkcs11, which is not installed; pip install '.[server,hsm]' in fleetmap's source folder"
-            )
-        self._key = key
+        self._uri = key
         with _tokens_words(key):
             _, public = HSMSigner.import_(key.number, key.token, pin)
-            self._signer = HSMSigner(key.number, public, pin, key.token)
-
-    @property
-    def public_key(self) -> SSlibKey:
-        return self._signer.public_key
+            super().__init__(key.number, public, pin, key.token)
 
     def sign(self, payload: bytes) -> Signature:
-        with _tokens_words(self._key):
-            return self._signer.sign(payload)
-
-    @classmethod
-    def from_priv_key_uri(
-        cls, priv_key_uri: str, public_key: Key, secrets_handler: SecretsHandler | None = None
-    ) -> "Signer":
-        raise NotImplementedError
+        with _tokens_words(self._uri):
+            return super().sign(payload)
 
 
 @contextmanager
@@ -106,7 +91,11 @@ def _tokens_words(key: TokenUri) -> Iterator[None]:
     os.environ["PYKCS11LIB"] = str(key.module)
     try:
         yield
-    except (ValueError, RuntimeError, AssertionError, UnsupportedLibraryError) as error:
+    except UnsupportedLibraryError as error:
+        raise UsageError(
+            f"keys on tokens need a library more ({error}); pip install '.[server,hsm]' in fleetmap's source folder"
+        ) from error
+    except (ValueError, RuntimeError, AssertionError, UnverifiedSignatureError) as error:
         words = f"{type(error).__name__} {error}".strip()
         if "Pin" in type(error).__name__:
             raise UsageError(

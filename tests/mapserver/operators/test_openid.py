@@ -12,8 +12,10 @@ import pytest
 from fastapi.testclient import TestClient
 from joserfc import jwt
 from joserfc.jwk import ECKey, OctKey
+from typer.testing import CliRunner
 
 from fleetmap.errors import UsageError
+from mapserver import cli
 from mapserver.api.app import create_app
 from mapserver.api.guard import PROVIDER, PROVIDER_BACK, GuardSettings
 from mapserver.api.metrics import Metrics
@@ -107,10 +109,11 @@ def test_who_the_provider_knows_gets_an_ordinary_session(server: Server, provide
         assert all(word in session for word in ("HttpOnly", "SameSite=strict"))
         assert "fleetmap-waiting" not in client.cookies
         assert client.get("/v1/sites").status_code == 200
-        act = {"reason": "monday"}
-        assert client.post("/v1/sites/lab/versions/2/publish", json=act).status_code == 200
+        assert client.post("/v1/sites/lab/versions/2/publish", json={"reason": "monday"}).status_code == 200
         assert server.store.last_events("lab", 1)[0].actor == "oidc:42"
         assert lines(server)[-3][:2] == ("operator added", "oidc:42")
+        signed_in = [line for line in server.store.audit_lines() if line.kind == "signed in"][-1]
+        assert signed_in.reason == f"subject '42' of {provider.issuer}"
         (row,) = server.store.operators.all(0)
         assert (row.name, row.role, row.password, row.sessions) == ("oidc:42", "operator", None, 1)
         assert client.post("/sign-out").status_code == 303
@@ -177,6 +180,9 @@ def test_the_way_back_of_another_browser_is_refused(server: Server, provider: Id
         own = at_provider(attacker)
         is_refused(server, attacker, attacker.get(way_back), 400, "not begun in this browser")
         assert provider.redeemed == 0
+        assert attacker.get(own).status_code == 200, "a link from elsewhere does not end what this browser has begun"
+        attacker.post("/sign-out")
+        own = at_provider(attacker)
         attacker.cookies = {}
         answer = attacker.get(own.replace("state=", "state=%C3%A4"), headers={"Cookie": b"fleetmap-waiting=\xe4"})
         assert answer.status_code == 400
@@ -224,8 +230,7 @@ def test_a_name_that_cannot_stand_in_the_log_is_refused(server: Server, provider
     with browser(server, provider, name_claim="preferred_username") as client:
         for name in NAMES:
             provider.person |= {"preferred_username": name, "bulk": ["y" * 1000] * 50}
-            answer = client.get(at_provider(client))
-            is_refused(server, client, answer, 403, "no name that can stand in the log")
+            is_refused(server, client, client.get(at_provider(client)), 403, "no name that can stand in the log")
         provider.person["bulk"] = "y" * 3_000_000
         is_refused(server, client, client.get(at_provider(client)), 502, "exceeded_size")
         assert max(len(detail) for _, _, detail in lines(server)) < 300
@@ -245,6 +250,14 @@ def test_names_of_the_provider_are_nobodys_here(server: Server, provider: Identi
         client.post("/sign-out")
         answer = client.post("/sign-in", data={"name": "oidc:ada", "password": ""})
         assert answer.status_code == 401, "there is no password"
+        for words in (
+            ("password", "oidc:ada"),
+            ("role", "oidc:ada", "admin"),
+            ("enable", "ada"),
+            ("enable", "oidc:bob"),
+        ):
+            run = CliRunner().invoke(cli.app, ["operators", *words, "--store", str(server.folder)], obj=None)
+            assert isinstance(run.exception, UsageError), (words, run.output)
         for act in (
             lambda: operators.add("oidc:ada", "admin", "a password of the test", root),
             lambda: operators.make_token("oidc:ada", ["read"], 1, root),
@@ -303,8 +316,8 @@ def test_what_the_provider_says_no_to(server: Server, provider: IdentityProvider
             answer = client.get(PROVIDER_BACK, params=asked)
             is_refused(server, client, answer, 403, f"let nobody in: {shown}.")
             assert "<script>" not in answer.text
-        way_back = at_provider(client) + "&iss=https://evil.example"
-        is_refused(server, client, client.get(way_back), 400, "names another provider")
+        answer = client.get(at_provider(client) + "&iss=https://evil.example")
+        is_refused(server, client, answer, 400, "names another provider")
 
 
 def test_it_leads_nowhere_else(server: Server, provider: IdentityProvider) -> None:

@@ -92,9 +92,8 @@ def _install_provider(app: FastAPI, settings: GuardSettings, provider: Provider,
     async def refused(request: Request, fault: ProviderError, then: str = "/") -> Response:
         who = Actor(fault.name or PROVIDER_PREFIX, "", fault.name, address_of(request.scope))
         await to_thread.run_sync(operators.note, "sign-in refused", str(fault), who)
-        page = _page(settings, then, "", str(fault), fault.status)
-        set_waiting(page, request.scope, "")
-        return page
+        # The mark stays: a link from elsewhere to the way back must not end what this browser has begun.
+        return _page(settings, then, "", str(fault), fault.status)
 
     @app.get(PROVIDER, include_in_schema=False)
     async def to_provider(request: Request, next: str = "/") -> Response:
