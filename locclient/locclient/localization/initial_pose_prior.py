@@ -13,6 +13,9 @@ from locclient.localization.settings import TrackSettings
 _SIGMA_M = 0.05  # added to any prior: it is of a moment between two frames
 _DRIFT_SHARE = 0.2  # of the distance travelled since, added likewise
 _CHI2_999, _BOUND_SIGMAS = 13.816, 3.7  # 0.999 of two dimensions
+# What is beyond is never looked at, and the next aisle that looks the same may be within: at 0.999 one start in a thousand would be at the
+# wrong one. A prior's own error counts up to 0.99999 (23.026); the drift that is added to it is a generous bound already.
+_WIDER = 23.026 / _CHI2_999
 _PLACE_REACH_M = 3.0  # between the robot and a place that shows what it sees
 
 
@@ -42,29 +45,29 @@ class InitialPosePrior:
             self.hypothesis = PoseHypothesis.at(odometry, map_from_body, covariance)
 
     def is_compatible(self, hypothesis: PoseHypothesis) -> bool:
-        """Whether the robot's motion leads back from a present pose to within the 0.999 bound of the prior's position."""
+        """Whether the robot's motion leads back from a present pose to within the bound of the prior's position."""
         if self._since is None:
             return True
         since, now = ((h.now_map_from_body, h.now_cov) for h in (self._since, hypothesis))
         map_from_then, covariance = compose_inverse_cov(*now, *since)
         map_from_base = map_from_then @ se3_inverse(self._base_from_body)
         off_m = map_from_base[:2, 3] - self._prior.map_from_base[:2, 3]
-        return bool(off_m @ np.linalg.solve(self._cov_m2() + covariance[3:5, 3:5], off_m) < _CHI2_999)
+        return bool(off_m @ np.linalg.solve(self._cov_m2(_WIDER) + covariance[3:5, 3:5], off_m) < _CHI2_999)
 
     def is_near(self, positions_map: Array) -> NDArray[np.bool_]:
         """(N,) which positions (N, 3) may show what the robot sees now."""
         off_m = np.linalg.norm(positions_map[:, :2] - self._prior.map_from_base[:2, 3], axis=1)
-        return np.asarray(off_m < _BOUND_SIGMAS * self._sigma_m() + self._travelled_m + _PLACE_REACH_M)
+        return np.asarray(off_m < _BOUND_SIGMAS * self._sigma_m(_WIDER) + self._travelled_m + _PLACE_REACH_M)
 
     def is_tight(self, sigma_m: float) -> bool:
         """Whether its horizontal sigma is at most that, now."""
         return self._sigma_m() <= sigma_m
 
-    def _sigma_m(self) -> float:
-        return float(np.sqrt(np.linalg.eigvalsh(self._cov_m2())[-1]))
+    def _sigma_m(self, scale: float = 1.0) -> float:
+        return float(np.sqrt(np.linalg.eigvalsh(self._cov_m2(scale))[-1]))
 
-    def _cov_m2(self) -> Array:
-        """(2, 2) of the prior's horizontal position. It grows with the distance travelled: neither unmodelled drift nor a push nor
-        an operator's error must keep the robot from its pose for ever."""
+    def _cov_m2(self, scale: float = 1.0) -> Array:
+        """(2, 2) of the prior's horizontal position, its own part times `scale`. It grows with the distance travelled: neither unmodelled
+        drift nor a push nor an operator's error must keep the robot from its pose for ever."""
         added = _SIGMA_M**2 + (_DRIFT_SHARE * self._travelled_m) ** 2
-        return np.asarray(self._prior.cov_rot_trans[3:5, 3:5] + added * np.eye(2))
+        return np.asarray(scale * self._prior.cov_rot_trans[3:5, 3:5] + added * np.eye(2))

@@ -66,9 +66,9 @@ def test_a_tight_prior_confirms_the_first_fix(robot: Robot) -> None:
 
 
 def test_a_wide_prior_only_narrows_the_search(robot: Robot) -> None:
-    """Aliased places 9 m apart: the one outside the prior is never believed, the other must still be confirmed."""
+    """Aliased places 12 m apart: the one outside the prior is never believed, the other must still be confirmed."""
     robot.localizer.handle_prior(prior(robot, 2.0))
-    said = [robot.go(0.4, [off(9.0), off(0.0)]) for _ in range(4)]
+    said = [robot.go(0.4, [off(12.0), off(0.0)]) for _ in range(4)]
     assert said[0].status is Status.INITIALISING
     assert said[-1].status is Status.TRACKING
     assert robot.error_m(said[-1]) < 1e-6
