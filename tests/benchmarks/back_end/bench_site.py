@@ -133,9 +133,9 @@ def measured(sizes: Sequence[int], drive: Path, threads: int = 1) -> Iterator[di
         yield json.loads(done.stdout.splitlines()[-1])
 
 
-def slope(rows: list[dict[str, Any]], key: str) -> float:
-    """Of the log-log fit against the keyframes."""
-    return float(np.polyfit(np.log([r["keyframes"] for r in rows]), np.log([r[key] for r in rows]), 1)[0])
+def slope(rows: list[dict[str, Any]], key: str, against: str = "keyframes") -> float:
+    """Of the log-log fit; against the observations parts are alike of which one sees more in a keyframe than another."""
+    return float(np.polyfit(np.log([r[against] for r in rows]), np.log([r[key] for r in rows]), 1)[0])
 
 
 def _peak_mb() -> float:
@@ -164,7 +164,8 @@ def main() -> None:
         rows.append(row)
         print(json.dumps(row), flush=True)
     if len(rows) > 1:
-        print(json.dumps({"cpu_slope": slope(rows, "cpu_s"), "memory_slope": slope(rows, "peak_mb")}))
+        slopes = {"cpu": slope(rows, "cpu_s"), "memory": slope(rows, "peak_mb")}
+        print(json.dumps({"slopes": slopes, "cpu_by_observations": slope(rows, "cpu_s", "observations")}))
 
 
 if __name__ == "__main__":
