@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
 from pathlib import Path
 
 import httpx
@@ -23,6 +24,7 @@ from fleetmap.messages import RobotHealth, WantedVersion
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver import cli, releases
+from mapserver.commands.oidc_options import OidcOptions
 from mapserver.commands.serve import serve
 from mapserver.config import MapserverConfig
 from mapserver.store import DraftContent, MapStore
@@ -122,7 +124,7 @@ def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:
     context = typer.Context(typer.main.get_command(cli.app), obj=Program({}, lambda _: (MapserverConfig(), {})))
 
     def serve_at(http: str, zenoh: str, **more: object) -> None:
-        options = {"http_cert": None, "http_key": None, "http_name": None, "insecure": False}
+        options = {"http_cert": None, "http_key": None, "http_name": None, "insecure": False} | asdict(OidcOptions())
         serve(context=context, store=tmp_path, http=http, zenoh=zenoh, config=None, **options | more)
 
     with pytest.raises(UsageError, match="--http 'nonsense'"):
