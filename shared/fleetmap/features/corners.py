@@ -1,41 +1,31 @@
 """Corners to track: FAST candidates ranked by how well they can be tracked, spread over the image."""
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.features import fast_kernels
 from fleetmap.features.corner_kernels import clear_discs, min_eigenvalue_scores, select_spread
+from fleetmap.features.fast_kernels import LANES, RADIUS_PX
+from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Image
 
 Pixels = NDArray[np.float32]
 _HALF_WINDOW = 3
-_FAST_BORDER_PX = 3  # of the circle that FAST looks at
 
 
 def fast_corners(image: Image, threshold: int, border_px: int = 3, free: NDArray[np.uint8] | None = None) -> Pixels:
     """(N, 2) whole-pixel FAST corners of `image`, non-maximum suppressed, at least border_px from its edges.
 
-    free (H, W): 0 where none is wanted. Every corner is an object of OpenCV first, which costs more than to find it: what is not
-    wanted is left out before.
+    free (H, W): 0 where none is wanted.
     """
     height, width = image.shape
-    off = border_px - _FAST_BORDER_PX - 1  # one more row, for the suppression
-    if off <= 0 or height <= 2 * border_px or width <= 2 * border_px:
-        part, mask, off = image, free, 0
-    else:
-        part = image[off : height - off, off : width - off]
-        mask = None if free is None else free[off : height - off, off : width - off]
-    keypoints = cv2.FastFeatureDetector.create(threshold, True).detect(part, mask)
-    if not keypoints:
+    border_px, short = max(border_px, RADIUS_PX), LANES + 2 * RADIUS_PX - width
+    if min(height, width) <= 2 * border_px:
         return np.zeros((0, 2), np.float32)
-    pixels = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32).reshape(-1, 2) + np.float32(off)
-    inside = (
-        (pixels[:, 0] >= border_px)
-        & (pixels[:, 1] >= border_px)
-        & (pixels[:, 0] < width - border_px)
-        & (pixels[:, 1] < height - border_px)
-    )
-    return np.asarray(pixels[inside])
+    if short > 0:
+        image = np.pad(image, ((0, 0), (0, short)))
+    where = np.zeros((0, 0), np.uint8) if free is None else free
+    return fast_kernels.fast_corners(np.ascontiguousarray(image), width, threshold, border_px, where)
 
 
 def corner_candidates(
@@ -68,6 +58,24 @@ def spread_corners(
         clear_discs(free, held, min_distance_px)
     candidates = corner_candidates(image, 2 * count, threshold, border_px, free)
     scores = min_eigenvalue_scores(image, candidates, _HALF_WINDOW)
-    order = np.argsort(-scores, kind="stable")
-    order = order[scores[order] > 0]
-    return np.asarray(candidates[select_spread(candidates, order, held, min_distance_px, count, width, height)])
+    shown = scores > 0
+    return select_best(candidates[shown], scores[shown], held, min_distance_px, count, (width, height))
+
+
+def select_best(
+    candidates: Pixels, scores: Array, taken: Pixels, min_distance_px: float, count: int, size_px: tuple[int, int]
+) -> Pixels:
+    """Up to `count` candidates (N, 2), the best first, none within min_distance_px of another or of `taken`, in an image of that size.
+
+    Only the better ones are put in order, as long as they are enough.
+    """
+    for most in (4 * count, len(scores)):
+        if most < len(scores):
+            better = np.flatnonzero(scores >= np.partition(scores, -most)[-most])
+        else:
+            better = np.arange(len(scores))
+        order = better[np.argsort(-scores[better], kind="stable")]
+        chosen = select_spread(candidates, order, taken, min_distance_px, count, *size_px)
+        if len(chosen) == count or len(better) == len(scores):
+            break
+    return np.asarray(candidates[chosen])

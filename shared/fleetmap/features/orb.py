@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.config import Section
-from fleetmap.features.corner_kernels import centroid_angles_deg, min_eigenvalue_scores, select_spread
-from fleetmap.features.corners import corner_candidates
+from fleetmap.features.corner_kernels import centroid_angles_deg, min_eigenvalue_scores
+from fleetmap.features.corners import corner_candidates, select_best
 from fleetmap.geometry import Array
 from fleetmap.numerics.time_sliced import TimeSliced, finished
 from fleetmap.sensors.samples import Image
@@ -17,7 +17,6 @@ from fleetmap.sensors.samples import Image
 SCALE_FACTOR = 1.2
 _PATCH_RADIUS = 15
 _BORDER_PX = 19
-_SLICE_LEVEL = 2  # the two finest levels are as much work as all the others
 
 
 class OrbSettings(Section, frozen=True):
@@ -66,35 +65,33 @@ def detect(image: Image, settings: OrbSettings) -> Features:
 
 
 def detect_in_slices(image: Image, settings: OrbSettings) -> TimeSliced[Features]:
-    """As `detect`, in three slices of about equal work."""
-    keypoints: list[cv2.KeyPoint] = []
-    for level, quota in enumerate(_quotas(settings)):
-        if level == _SLICE_LEVEL:
-            yield
-        keypoints += _detect_level(image, level, quota, settings)
+    """As `detect`, in slices of about equal work: corners, descriptors, and what the caller makes of them."""
+    levels = [_detect_level(image, level, quota, settings) for level, quota in enumerate(_quotas(settings))]
     yield
-    return describe(image, keypoints, settings.levels)
+    octaves = np.repeat(np.arange(len(levels), dtype=np.int8), [len(pixels) for pixels, _ in levels])
+    pixels, angles = (np.concatenate(parts) for parts in zip(*levels, strict=True))
+    features = _described(image, pixels, octaves, angles)
+    yield
+    return features
 
 
-def describe(image: Image, keypoints: list[cv2.KeyPoint], levels: int) -> Features:
-    """Features of given oriented keypoints; those too near the border are left out."""
-    if not keypoints:
+def _described(
+    image: Image, pixels: NDArray[np.float32], octaves: NDArray[np.int8], angles_deg: NDArray[np.float32]
+) -> Features:
+    """Features of oriented corners, pixels (N, 2) as OpenCV scales them up from their levels."""
+    if not len(pixels):
         return Features.empty()
     engine = cv2.ORB.create(
-        nfeatures=len(keypoints), scaleFactor=SCALE_FACTOR, nlevels=levels, edgeThreshold=_BORDER_PX
+        nfeatures=len(pixels), scaleFactor=SCALE_FACTOR, nlevels=int(octaves[-1]) + 1, edgeThreshold=_BORDER_PX
     )
+    sizes = 31.0 * SCALE_FACTOR ** octaves.astype(np.float64)
+    columns = *pixels.T.tolist(), sizes.tolist(), angles_deg.tolist()
+    keypoints = list(map(cv2.KeyPoint, *columns, repeat(1.0), octaves.tolist()))
     kept, descriptors = engine.compute(image, keypoints)
-    if not kept:
-        return Features.empty()
-    octaves = np.array([k.octave for k in kept], np.int8)
+    assert len(kept) == len(keypoints), "corners keep to the border that descriptors need"
     # OpenCV scales level pixels up from their corners; where they lie in the image is told from their centres.
     middle = 0.5 * (SCALE_FACTOR ** octaves.astype(np.float64) - 1.0)
-    return Features(
-        np.asarray(cv2.KeyPoint.convert(kept), np.float64).reshape(-1, 2) + middle[:, None],
-        octaves,
-        np.array([k.angle for k in kept], np.float32),
-        np.asarray(descriptors, np.uint8),
-    )
+    return Features(pixels.astype(np.float64) + middle[:, None], octaves, angles_deg, np.asarray(descriptors, np.uint8))
 
 
 def _quotas(settings: OrbSettings) -> list[int]:
@@ -102,7 +99,10 @@ def _quotas(settings: OrbSettings) -> list[int]:
     return [int(np.ceil(settings.count * s / shares.sum())) for s in shares]
 
 
-def _detect_level(image: Image, level: int, quota: int, settings: OrbSettings) -> list[cv2.KeyPoint]:
+def _detect_level(
+    image: Image, level: int, quota: int, settings: OrbSettings
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Pixels (N, 2) of the image and angles (N,) of the corners of a level."""
     scale = SCALE_FACTOR**level
     height, width = (round(s / scale) for s in image.shape)
     scaled = (
@@ -111,11 +111,6 @@ def _detect_level(image: Image, level: int, quota: int, settings: OrbSettings) -
         else np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
     )
     candidates = corner_candidates(scaled, 2 * quota, settings.fast_threshold, _BORDER_PX)
-    scores = min_eigenvalue_scores(scaled, candidates, 3)
-    order = np.argsort(-scores, kind="stable")
-    nothing = np.zeros((0, 2), np.float32)
-    chosen = candidates[select_spread(candidates, order, nothing, settings.min_distance_px, quota, width, height)]
-    angles = centroid_angles_deg(scaled, chosen, _PATCH_RADIUS)
-    columns, rows = (scale * chosen.astype(np.float64).T).tolist()
-    sizes, responses = repeat(31.0 * scale), repeat(1.0)
-    return list(map(cv2.KeyPoint, columns, rows, sizes, angles.tolist(), responses, repeat(level)))
+    scores, nothing = min_eigenvalue_scores(scaled, candidates, 3), np.zeros((0, 2), np.float32)
+    chosen = select_best(candidates, scores, nothing, settings.min_distance_px, quota, (width, height))
+    return (scale * chosen.astype(np.float64)).astype(np.float32), centroid_angles_deg(scaled, chosen, _PATCH_RADIUS)

@@ -89,6 +89,25 @@ def test_corners_keep_their_distance_and_stay_off_the_border(image: NDArray[np.u
     assert (corners < [WIDTH - 12, HEIGHT - 12]).all()
 
 
+@pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (39, 60), (36, 40), (70, 33)])
+@pytest.mark.parametrize(("threshold", "border_px"), [(6, 3), (12, 8), (40, 3)])
+def test_corners_are_those_of_opencv(
+    image: NDArray[np.uint8], size: tuple[int, int], threshold: int, border_px: int
+) -> None:
+    """Also in pictures narrower than what is looked at together, of noise, and where some are not wanted."""
+    rng, (width, height) = np.random.default_rng(5), size
+    engine = cv2.FastFeatureDetector.create(threshold, True)
+    free = rng.integers(0, 2, (height, width), np.uint8)
+    count = 0
+    for part in (np.ascontiguousarray(image[:height, :width]), rng.integers(0, 256, (height, width), np.uint8)):
+        for wanted in (None, free):
+            points = np.array([k.pt for k in engine.detect(part, wanted)], np.float32).reshape(-1, 2)
+            expected = points[((points >= border_px) & (points < np.array(size) - border_px)).all(axis=1)]
+            np.testing.assert_array_equal(fast_corners(part, threshold, border_px, wanted), expected)
+            count += len(expected)
+    assert count > 20
+
+
 def test_a_plain_picture_has_no_corners() -> None:
     assert spread_corners(np.full((HEIGHT, WIDTH), 90, np.uint8), 40, min_distance_px=9.0).shape == (0, 2)
 
