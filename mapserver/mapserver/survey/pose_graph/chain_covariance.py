@@ -6,6 +6,7 @@ from fleetmap.features.matching_kernels import Indices
 from fleetmap.geometry import Array
 
 _FIRST_CAPACITY = 16
+_ROWS = 256  # that a measurement narrows at once
 
 
 class ChainCovariance:
@@ -13,8 +14,8 @@ class ChainCovariance:
 
     Only the ends of measurements are kept in full, as anchors. Between two of them a place is interpolated by the share of
     its steps' covariance in that of the whole way, plus a bridge that no measurement has touched: the chain is
-    Gauss-Markov, so nothing is approximated. Memory and a measurement cost go with the square of the anchors, an answer with their number;
-    how long the chain is does not matter.
+    Gauss-Markov, so nothing is approximated. Memory and a measurement cost go with the square of the anchors, an answer with the places
+    that it is about; how long the chain is does not matter.
     """
 
     def __init__(self, sums: Array) -> None:
@@ -30,8 +31,7 @@ class ChainCovariance:
 
     def of_differences(self, i: int, js: Indices) -> Array:
         """(M, 6, 6) covariances of x_j - x_i for each j of js (M,)."""
-        crossing = self._crossing(i)[:, : len(self._anchors)]
-        before, after = (crossing[:, slots[js]].transpose(1, 0, 2) for slots in (self._before, self._after))
+        before, after = self._crossing(i, self._before[js]), self._crossing(i, self._after[js])
         cross = before + (after - before) @ self._shares[js].transpose(0, 2, 1)
         near = np.flatnonzero(self._starts[js] == self._starts[i])
         cross[near] += self._bridges(i, js[near])
@@ -49,16 +49,17 @@ class ChainCovariance:
         innovation = row[:, b : b + 6] - row[:, a : a + 6] + cov
         root = np.linalg.cholesky(0.5 * (innovation + innovation.T))
         half = np.linalg.solve(root, row)
-        self._joint[:size, :size] -= half.T @ half
+        for start in range(0, size, _ROWS):  # the whole product would take as much memory as the matrix
+            self._joint[start : min(start + _ROWS, size), :size] -= half[:, start : start + _ROWS].T @ half
         gains = np.linalg.solve(root.T, half).T.reshape(-1, 6, 6)
         before, after = gains[self._before], gains[self._after]
         return np.asarray(before + self._shares @ (after - before))
 
-    def _crossing(self, k: int) -> Array:
-        """(6, slots, 6) covariance of place k with every anchor."""
-        rows = self._joint.reshape(-1, 6, self._joint.shape[1])
-        before, after = rows[self._before[k]], rows[self._after[k]]
-        return np.asarray((before + self._shares[k] @ (after - before)).reshape(6, -1, 6))
+    def _crossing(self, k: int, slots: Indices) -> Array:
+        """(M, 6, 6) covariance of place k with the anchors in some slots (M,)."""
+        blocks = self._joint.reshape(len(self._joint) // 6, 6, -1, 6)
+        before, after = blocks[self._before[k], :, slots], blocks[self._after[k], :, slots]
+        return np.asarray(before + self._shares[k] @ (after - before))
 
     def _covariances(self, ks: Indices) -> Array:
         """(M, 6, 6) of each place on its own."""
@@ -87,7 +88,8 @@ class ChainCovariance:
             grown = np.zeros((6 * _grown(slot),) * 2)
             grown[: 6 * slot, : 6 * slot] = self._joint
             self._joint = grown
-        row, own = self._crossing(k).reshape(6, -1)[:, : 6 * slot], self._covariances(np.array([k]))[0]
+        row = self._crossing(k, np.arange(slot)).transpose(1, 0, 2).reshape(6, -1)
+        own = self._covariances(np.array([k]))[0]
         here = slice(6 * slot, 6 * slot + 6)
         self._joint[here, : 6 * slot], self._joint[: 6 * slot, here] = row, row.T
         self._joint[here, here] = 0.5 * (own + own.T)

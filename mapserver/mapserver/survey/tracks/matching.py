@@ -16,7 +16,7 @@ from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PairTask, Pred
 _NEAR_CANDIDATES = 40
 _BATCH = 32  # pairs: a tenth of a second of work; the twenty keyframes that travel with it cost a few milliseconds
 _MAX_VIEW_ANGLE_DEG = 75.0
-_WIDE = 2  # cells to each side that are looked at for what is near
+_NOBODY: list[int] = []
 
 
 class PairFinder:
@@ -95,35 +95,36 @@ class PairFinder:
 
 
 class NearPlaces:
-    """Places (K, 3) that one of two can reach, by reaches (K,): a keyframe costs what stands around it, not the whole site."""
+    """Places (K, 3) that one of two can reach, by reaches (K,): a keyframe costs what stands around it, not the whole site.
+
+    Each lies in a cell as wide as it reaches at most, one of widths that double.
+    """
 
     def __init__(self, positions_m: Array, reach_m: Array) -> None:
         self._positions_m, self._reach_m = positions_m, reach_m
-        self._cells: dict[
-            tuple[int, int], list[int]
-        ] = {}  # of how many keyframes, so that none is asked that comes later
-        self._size_m = max(float(np.median(reach_m)), 1e-3)
-        self._far: list[int] = []  # what reaches over more cells than are looked at
+        least_m = max(float(np.median(reach_m)), 1e-3)
+        self._widths_m = least_m * 2.0 ** np.ceil(np.log2(np.maximum(reach_m / least_m, 1.0)))
+        # Of how many keyframes, so that none is asked that comes later
+        self._cells: dict[float, dict[tuple[int, int], list[int]]] = {}
         self._filled = 0
 
     def before(self, j: int, until: int) -> NDArray[np.int64]:
         """Numbers below `until`, rising, of all that may reach j or be reached from it. `until` must not fall from call to call."""
         for k in range(self._filled, until):
-            if self._reach_m[k] > _WIDE * self._size_m:
-                self._far.append(k)
-            else:
-                self._cells.setdefault(self._cell(k), []).append(k)
+            width_m = float(self._widths_m[k])
+            x, y = np.floor(self._positions_m[k, :2] / width_m).astype(np.int64).tolist()
+            self._cells.setdefault(width_m, {}).setdefault((x, y), []).append(k)
         self._filled = max(self._filled, until)
-        if self._reach_m[j] > _WIDE * self._size_m:
-            return np.arange(until)
-        x, y = self._cell(j)
-        steps = range(-_WIDE, _WIDE + 1)
-        found = [k for dx in steps for dy in steps for k in self._cells.get((x + dx, y + dy), ())]
-        return np.array(sorted([*found, *self._far]), np.int64)
-
-    def _cell(self, k: int) -> tuple[int, int]:
-        x, y = np.floor(self._positions_m[k, :2] / self._size_m).astype(np.int64).tolist()
-        return x, y
+        found: list[int] = []
+        for width_m, cells in self._cells.items():
+            reach_m, place_m = max(float(self._reach_m[j]), width_m), self._positions_m[j, :2]
+            low, high = (np.floor((place_m + side * reach_m) / width_m).astype(np.int64) for side in (-1.0, 1.0))
+            (x, y), (columns, rows) = low.tolist(), (high - low + 1).tolist()
+            around = cells.values()
+            if columns * rows < len(cells):
+                around = [cells.get((x + n % columns, y + n // columns), _NOBODY) for n in range(columns * rows)]
+            found += [k for cell in around for k in cell]
+        return np.array(sorted(found), np.int64)
 
 
 _Prediction = tuple[int, int, PredictedMotion]

@@ -1,5 +1,8 @@
 """A chain with measured differences against the whole joint covariance, conditioned at once; memory does not know the chain."""
 
+import tracemalloc
+from collections.abc import Callable
+
 import numpy as np
 
 from fleetmap.geometry import Array
@@ -53,3 +56,29 @@ def test_memory_goes_with_the_measurements_alone() -> None:
             chain.measure(i, j, 1e-4 * np.eye(6))
         sizes.append(chain._joint.nbytes)
     assert sizes[0] == sizes[1]
+
+
+def test_an_answer_costs_what_it_is_about_and_a_measurement_no_second_matrix() -> None:
+    """In bytes that are allocated meanwhile, after few measurements and after many."""
+    rng, count, asked = np.random.default_rng(2), 2000, np.arange(700, 720)
+    steps = np.tile(1e-4 * np.eye(6), (count - 1, 1, 1))
+    chain, peaks, done = ChainCovariance(np.concatenate([np.zeros((1, 6, 6)), np.cumsum(steps, axis=0)])), [], 0
+    for measurements in (15, 150):
+        for _ in range(done, measurements):
+            i, j = rng.choice(np.arange(1, count), 2, replace=False).tolist()
+            chain.measure(i, j, 1e-4 * np.eye(6))
+        done = measurements
+        peaks.append(_peak_bytes(lambda: chain.of_differences(30, asked)))
+    assert peaks[1] < 1.1 * peaks[0]
+    chain.measure(1000, 10, 1e-4 * np.eye(6))
+    assert _peak_bytes(lambda: chain.measure(1000, 10, 1e-4 * np.eye(6))) < 0.5 * chain._joint.nbytes
+
+
+def _peak_bytes(work: Callable[[], object]) -> int:
+    work()
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()

@@ -145,6 +145,18 @@ def test_near_places_hold_all_that_reach_each_other() -> None:
     assert looked < 0.6 * 400 * 399 / 2
 
 
+def test_what_is_looked_at_does_not_grow_with_the_site() -> None:
+    """A drive of twice the length at the same density, where every fifth keyframe looks far: as many around each."""
+    rng, looked = np.random.default_rng(5), []
+    for count in (1000, 2000):
+        positions = np.column_stack([0.5 * np.arange(count), rng.uniform(0.0, 20.0, count), np.zeros(count)])
+        reach = np.where(np.arange(count) % 5, 4.0, 30.0)
+        around = NearPlaces(positions, reach)
+        looked.append(np.mean([len(around.before(j, j)) for j in range(count)]))
+    assert looked[1] < 1.1 * looked[0]
+    assert looked[1] > 30.0
+
+
 class _Watched(SerialExecutor):
     """Keeps what would travel to a process."""
 
