@@ -20,8 +20,10 @@ from fleetmap.features import orb, patch_align
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.odometry import OdometryStatus
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetmap.sensors.samples import wheel_between
 from fleetsim import recorder
-from fleetsim.scenarios import SCENARIOS, Scenario, find_scenario
+from fleetsim.motion.routes import Route
+from fleetsim.scenarios import SCENARIOS, find_scenario
 from mapserver.survey.executor import Executor
 from mapserver.survey.frame_tracks import FrameTracks
 from mapserver.survey.keyframes.keyframes import ImageStore, Keyframe, Pictures, PosedKeyframes, set_aside
@@ -36,6 +38,8 @@ _ALIGNED_PX, _DISPARITY_PX = (
     0.13,
 )  # errors of aligned coordinates and of disparities, as rendered pictures show them
 _SIZE_PX = (480, 640)
+_TURNING_M = 4.0
+_EVER_NS = -(2**62)
 
 
 class GreyPictures:
@@ -110,21 +114,29 @@ class SimulatedSurvey:
             tracks=FrameTracks(ends, own.tracks.ids[: ends[-1]].copy(), own.tracks.pixels[: ends[-1]].copy()),
         )  # fmt: skip
         until_ns = own.estimates[frames - 1].stamp_ns + 1_000_000_000
-        inputs = replace(inputs, frame_count=frames, imu=inputs.imu.between(-(2**62), until_ns))
+        imu, wheel = inputs.imu.between(_EVER_NS, until_ns), wheel_between(inputs.wheel, _EVER_NS, until_ns)
+        inputs = replace(inputs, frame_count=frames, imu=imu, wheel=wheel)
         return cls(odometry, inputs, landmarks, exact_px, map_from_body[:frames])
 
 
 def session_of(
-    scenario: str, robot: str, seed: int = 0, rate_hz: float = 7.5, frames: int | None = None
+    scenario: str, robots: Sequence[str], seed: int = 0, rate_hz: float = 7.5, frames: int | None = None
 ) -> EstimatorSession:
-    """A scenario's run at another frame rate."""
-    base = find_scenario(scenario)
+    """A scenario's runs, driven one after the other without a break, at another frame rate."""
+    base, name = find_scenario(scenario), "+".join(robots)
+    runs = [base.runs[robot] for robot in robots]
+    joined = replace(runs[0], rate_hz=rate_hz, routes=(_one_after_the_other([run.routes[0] for run in runs]),))
+    with patch.dict(SCENARIOS, {scenario: lambda: replace(base, runs={name: joined})}):
+        return EstimatorSession(recorder.prepare(recorder.Order(scenario, seed=seed, robot=name, frames=frames)))
 
-    def slower() -> Scenario:
-        return replace(base, runs={robot: replace(base.runs[robot], rate_hz=rate_hz)})
 
-    with patch.dict(SCENARIOS, {scenario: slower}):
-        return EstimatorSession(recorder.prepare(recorder.Order(scenario, seed=seed, robot=robot, frames=frames)))
+def _one_after_the_other(routes: Sequence[Route]) -> Route:
+    """One route of several that begin and end at the racks' side towards the docks, where there is room to turn."""
+    points = list(routes[0].way_points_map)
+    for route in routes[1:]:
+        aside_m = min(points[-1][0], route.way_points_map[0][0]) - _TURNING_M
+        points += [(aside_m, points[-1][1]), (aside_m, route.way_points_map[0][1]), *route.way_points_map]
+    return replace(routes[0], way_points_map=tuple(points))
 
 
 def simulated_survey(session: EstimatorSession, settings: SurveySettings) -> SimulatedSurvey:
