@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, se3_adjoint, se3_inverse, skew, so3_log
 from fleetmap.inertial import GRAVITY_MAP, imu_intervals
-from fleetmap.odometry.filter import msckf_kernels, propagation_kernels
+from fleetmap.odometry.filter import covariance_kernels, msckf_kernels, propagation_kernels
 from fleetmap.odometry.filter.measurements import CONSIDERED, LinearMeasurement
 from fleetmap.odometry.filter.msckf_kernels import Clones, NormalEquations, PixelModel, Tracks
 from fleetmap.odometry.filter.nav_state import NavState
@@ -121,15 +121,12 @@ class InvariantFilter:
 
     def add_clone(self, clone_id: int, rate_body_radps: Array) -> None:
         """Keeps the current body transform in the window; the rate ties it to the time offset."""
-        s, size = self.state, len(self.covariance)
+        s = self.state
         turn = s.rotation @ rate_body_radps
-        jacobian = np.zeros((6, size))
-        jacobian[0:3, 0:3] = np.eye(3)
-        jacobian[3:6, 6:9] = np.eye(3)
-        jacobian[0:3, _OFFSET] = turn
-        jacobian[3:6, _OFFSET] = s.velocity_mps + skew(s.position_m) @ turn
-        self.covariance = _grown(self.covariance, jacobian)
-        self.true_error_cov = _grown(self.true_error_cov, np.hstack([np.zeros((6, CONSIDERED)), jacobian]))
+        by_offset = np.concatenate([turn, s.velocity_mps + skew(s.position_m) @ turn])
+        self.covariance = covariance_kernels.with_clone(self.covariance, 0, _OFFSET, by_offset)
+        at = CONSIDERED, CONSIDERED + _OFFSET
+        self.true_error_cov = covariance_kernels.with_clone(self.true_error_cov, *at, by_offset)
         self.clone_ids.append(clone_id)
         self._rotations = np.concatenate([self._rotations, s.rotation[None]])
         self._positions = np.concatenate([self._positions, s.position_m[None]])
@@ -203,17 +200,18 @@ class InvariantFilter:
 
     def _learn(self, gain: Array, information: Array, scatter: Array) -> None:
         """Both covariances after a correction by gain (n, 6 M), arguments as from `accumulate_tracks`."""
-        learned = gain @ (information[:, _PAIR:] @ self.covariance[_CLONES:])
-        self.covariance = _symmetric(self.covariance - learned)
-        left = np.eye(len(self.true_error_cov))
-        left[CONSIDERED:, :_PAIR] -= gain @ information[:, :_PAIR]
-        left[CONSIDERED:, CONSIDERED + _CLONES :] -= gain @ information[:, _PAIR:]
-        self._carry_true_error(left, gain, scatter)
-
-    def _carry_true_error(self, left: Array, gain: Array, noise: Array) -> None:
-        self.true_error_cov = left @ self.true_error_cov @ left.T
-        self.true_error_cov[CONSIDERED:, CONSIDERED:] += gain @ noise @ gain.T
-        self.true_error_cov = _symmetric(self.true_error_cov)
+        by_pair, by_clones = information[:, :_PAIR], information[:, _PAIR:]
+        self.covariance = _symmetric(self.covariance - gain @ (by_clones @ self.covariance[_CLONES:]))
+        # (1 - gain @ information) @ true_error_cov @ (the same).T + gain @ scatter @ gain.T, at the price of its smaller side
+        clones = CONSIDERED + _CLONES
+        seen = by_pair @ self.true_error_cov[:_PAIR] + by_clones @ self.true_error_cov[clones:]
+        spread = seen[:, :_PAIR] @ by_pair.T + seen[:, clones:] @ by_clones.T + scatter
+        seen[:, CONSIDERED:] -= 0.5 * (spread @ gain.T)
+        taken = gain @ seen
+        own = taken[:, CONSIDERED:]
+        self.true_error_cov[CONSIDERED:, CONSIDERED:] -= own + own.T
+        self.true_error_cov[CONSIDERED:, :CONSIDERED] -= taken[:, :CONSIDERED]
+        self.true_error_cov[:CONSIDERED, CONSIDERED:] = self.true_error_cov[CONSIDERED:, :CONSIDERED].T
 
     def correct_with(self, measurement: LinearMeasurement, *, gate: float = np.inf) -> float:
         """Corrects by a linear measurement; returns its squared Mahalanobis distance by true_error_cov.
@@ -222,28 +220,16 @@ class InvariantFilter:
         """
         jacobian, residual, noise = measurement.jacobian, measurement.residual, measurement.noise
         true_noise = noise if measurement.true_noise is None else measurement.true_noise
-        whole = np.zeros((len(residual), len(self.true_error_cov)))
-        whole[:, CONSIDERED : CONSIDERED + jacobian.shape[1]] = jacobian
+        whole = np.zeros((len(residual), CONSIDERED + jacobian.shape[1]))
+        whole[:, CONSIDERED:] = jacobian
         if measurement.by_considered is not None:
             whole[:, :CONSIDERED] = measurement.by_considered
-        normalised = float(residual @ np.linalg.solve(whole @ self.true_error_cov @ whole.T + true_noise, residual))
-        if normalised > gate:
-            return normalised
-        full = whole[:, CONSIDERED:]
-        cross = self.covariance @ full.T
-        innovation = full @ cross + noise
-        gain = np.asarray(np.linalg.solve(innovation, cross.T).T, np.float64)
-        self._correct(gain @ residual)
-        self.covariance = _symmetric(self.covariance - gain @ innovation @ gain.T)
-        # as _carry_true_error with left = 1 - gain @ whole, at the price of the few rows that `whole` has
-        projected = whole @ self.true_error_cov
-        half = -0.5 * (projected @ whole.T + true_noise) @ gain.T
-        half += projected[:, CONSIDERED:]
-        taken = np.zeros_like(self.true_error_cov)
-        taken[CONSIDERED:, CONSIDERED:] = gain @ half
-        taken[CONSIDERED:, :CONSIDERED] = gain @ projected[:, :CONSIDERED]
-        self.true_error_cov = _symmetric(self.true_error_cov - taken - taken.T)
-        return normalised
+        correction = np.empty(len(self.covariance))
+        both, noises = (self.covariance, self.true_error_cov), (noise, true_noise)
+        distance = covariance_kernels.correct(*both, whole, CONSIDERED, residual, *noises, float(gate), correction)
+        if distance <= gate:
+            self._correct(correction)
+        return distance
 
     def inflate(self, clone_id: int, seen_odom_from_body: Array, gap_s: float) -> bool:
         """Inflates position and velocity where vision contradicts the prediction since `clone_id` beyond its covariance.
@@ -305,11 +291,8 @@ class InvariantFilter:
         )
 
     def _transition(self, phi: Array, process: Array, real_process: Array) -> None:
-        for covariance, at, noise in ((self.covariance, 0, process), (self.true_error_cov, CONSIDERED, real_process)):
-            nav = slice(at, at + _NAV)
-            covariance[nav, :] = phi @ covariance[nav, :]
-            covariance[:, nav] = covariance[:, nav] @ phi.T
-            covariance[nav, nav] += noise
+        covariance_kernels.transition(self.covariance, 0, phi, process)
+        covariance_kernels.transition(self.true_error_cov, CONSIDERED, phi, real_process)
 
     def _forget_pair(self, duration_s: float) -> None:
         """The pair's errors change with the view: a first-order Gauss-Markov process, back to the prior."""
@@ -334,18 +317,6 @@ class InvariantFilter:
 def _densities(noise: ImuNoise) -> list[float]:
     walks = noise.gyro_walk_radps2_rthz, noise.accel_walk_mps3_rthz
     return [noise.gyro_noise_radps_rthz, noise.accel_noise_mps2_rthz, *walks]
-
-
-def _grown(covariance: Array, jacobian: Array) -> Array:
-    """The covariance with six more errors, which are jacobian (6, n) times those that it has."""
-    size = len(covariance)
-    cross = jacobian @ covariance
-    grown = np.empty((size + 6, size + 6))
-    grown[:size, :size] = covariance
-    grown[size:, :size] = cross
-    grown[:size, size:] = cross.T
-    grown[size:, size:] = cross @ jacobian.T
-    return grown
 
 
 def _copied(covariance: Array, at: int, nav: int) -> Array:
