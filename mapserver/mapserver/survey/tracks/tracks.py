@@ -47,11 +47,16 @@ class Landmarks:
 
 def of_features(marks: Landmarks, columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """What each observation's feature has: columns are one array for each keyframe, a row for each feature."""
-    out = np.empty((len(marks.obs_keyframe), *columns[0].shape[1:]), columns[0].dtype)
-    order = np.argsort(marks.obs_keyframe, kind="stable")
-    ends = np.cumsum(np.bincount(marks.obs_keyframe, minlength=len(columns)))
+    return _of_features(marks.obs_keyframe, marks.obs_feature, columns)
+
+
+def _of_features(owners: NDArray[Any], features: NDArray[np.int64], columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """The same of features (M,) of keyframes `owners` (M,); a site's columns one after the other would be gigabytes."""
+    out = np.empty((len(owners), *columns[0].shape[1:]), columns[0].dtype)
+    order = np.argsort(owners, kind="stable")
+    ends = np.cumsum(np.bincount(owners, minlength=len(columns)))
     for column, rows in zip(columns, np.split(order, ends[:-1]), strict=True):
-        out[rows] = column[marks.obs_feature[rows]]
+        out[rows] = column[features[rows]]
     return out
 
 
@@ -136,25 +141,24 @@ def _tracks_from_reference(
     """
     if not len(tracks.keyframes):
         return np.zeros((0, 3), np.int64), np.zeros((0, 3))
-    first_of = np.cumsum([0, *(len(k.features) for k in keyframes)])
-    at = first_of[tracks.keyframes] + tracks.features
-    octaves = np.concatenate([k.features.octaves for k in keyframes])[at]
-    disparities = np.concatenate([k.disparities[:, 0] for k in keyframes])[at]
-    members, is_redundant = np.arange(len(at)), redundant[tracks.keyframes]
-    track = np.repeat(np.arange(len(tracks.starts)), np.diff(tracks.starts, append=len(at)))
+    owners, features = tracks.keyframes, tracks.features
+    octaves = _of_features(owners, features, [k.features.octaves for k in keyframes])
+    disparities = _of_features(owners, features, [k.disparities[:, 0] for k in keyframes])
+    members, is_redundant = np.arange(len(owners)), redundant[owners]
+    track = np.repeat(np.arange(len(tracks.starts)), np.diff(tracks.starts, append=len(owners)))
     best = np.lexsort((members, -disparities, octaves, is_redundant, ~np.isfinite(disparities), track))[tracks.starts]
     lasting = (
         np.isfinite(disparities[best])
         & ~is_redundant[best]
         & (np.bincount(track[~is_redundant], minlength=len(best)) > 1)
     )
-    is_reference = np.zeros(len(at), bool)
+    is_reference = np.zeros(len(owners), bool)
     is_reference[best] = True
     order = np.lexsort((members, ~is_reference, track))
     order = order[lasting[track[order]]]
     landmark = (np.cumsum(lasting) - 1)[track]
-    table = np.column_stack([tracks.keyframes, landmark, tracks.features])[order]
-    return table, np.concatenate([k.points_cam for k in keyframes])[at[best[lasting]]]
+    table, best = np.column_stack([owners, landmark, features])[order], best[lasting]
+    return table, _of_features(owners[best], features[best], [k.points_cam for k in keyframes])
 
 
 def _observe(
