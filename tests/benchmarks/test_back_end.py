@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.back_end import bench_consistency, bench_loops, bench_site, bench_solvers
+from benchmarks.back_end import bench_consistency, bench_loops, bench_scaling, bench_site, bench_solvers
 from benchmarks.common import consistency
 from benchmarks.common.yardstick import at_reference, slowness
 from benchmarks.survey import bench_gate, bench_hard_cases
@@ -78,6 +78,18 @@ def test_cost_grows_with_the_site_and_not_faster(tmp_path: Path) -> None:
         rows.append(row)
     assert bench_site.slope(rows, "cpu_s") <= bench_site.SLOPE_LIMIT
     assert bench_site.slope(rows, "peak_mb") <= bench_site.SLOPE_LIMIT
+
+
+def test_processes_of_a_cluster_share_the_work(tmp_path: Path) -> None:
+    """CPU of each process, not the wall of a busy machine; sixteen cores are extrapolated."""
+    drive = tmp_path / "site.drive"
+    bench_site.simulate(bench_site.ROBOTS, 900, drive)
+    rows = [bench_scaling.measure(drive, 250, workers) for workers in bench_scaling.WORKERS]
+    whole = bench_scaling.fit(rows, "seconds")
+    print(json.dumps([*rows, whole]))
+    assert len({row["digest"] for row in rows}) == 1
+    assert bench_scaling.matching_speed_up(rows, 4) >= bench_scaling.SPEED_UP_LIMIT
+    assert whole["site_min"][16] <= bench_scaling.SITE_LIMIT_MIN
 
 
 def test_rendered_identical_aisles(tmp_path: Path) -> None:
