@@ -9,7 +9,7 @@ from fleetmap.cli_options import Commands, Options, command_defaults, file_type
 from fleetmap.config import Section, read_given, refuse_internal
 from fleetmap.recordings import Topics
 from fleetmap.sources.source import SourceSection
-from locclient.daemon.publishers import OutputSection
+from locclient.daemon.output_section import OutputSection
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
 from locclient.maps.tile_selection import TileSelectionSettings
@@ -20,15 +20,16 @@ TIERS = {
         "": "site store server",
         "run": "server store site robot prior cache cache_bytes root identity insecure spool failures",
         "source": "kind sensors calibration endpoint recording device",
-        "output": "format endpoint",
+        "output": "format endpoint map autostart",
         "topics": "*",
     },
     "tuning": {
         "run": "spool_bytes frame_queue imu_wait_s",
         "run.window": "*",
         "run.trial": "*",
-        "source": "domain speed width_px height_px rate_hz delay_s",
-        "output": "domain pose_topic status_topic tf_topic map_frame odom_frame base_frame publish_odom",
+        "source": "domain keys speed width_px height_px rate_hz delay_s",
+        "output": "domain keys namespace node pose_topic initial_pose_topic odom_topic status_topic map_topic tf_topic "
+        "map_frame odom_frame base_frame sensor_frames publish_odom is_map_server transform_tolerance_s",
         "localizer": "seed",
         "localizer.orb": "extractor count",
         "localizer.stereo": "min_depth_m depth_sigma_px",

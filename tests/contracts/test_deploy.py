@@ -125,6 +125,7 @@ def test_what_is_deployed_is_installed_by_hash() -> None:
     """From a lock that the deployer made: no file of the project names an index or the files of one."""
     for unit in ("mapserver.service", "locclient.service"):
         assert "--require-hashes" in (REPOSITORY / "deploy" / unit).read_text("utf-8"), unit
-    places = [*(REPOSITORY / "deploy").iterdir(), REPOSITORY / "constraints.txt", REPOSITORY / "pyproject.toml"]
+    deployed = (path for path in (REPOSITORY / "deploy").rglob("*") if path.is_file())
+    places = [*deployed, REPOSITORY / "constraints.txt", REPOSITORY / "pyproject.toml"]
     for path in places:
         assert "index-url" not in path.read_text("utf-8", "replace"), path

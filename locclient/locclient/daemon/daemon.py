@@ -16,7 +16,7 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
 from locclient.config import LocclientConfig, RunSection
-from locclient.daemon.publishers import Publisher, open_publisher
+from locclient.daemon.publishers import PublisherInputs, open_publisher
 from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.outbox import Outbox
@@ -56,6 +56,12 @@ def check_run(config: LocclientConfig) -> MapAddress:
             check_reach(endpoint, insecure=run.insecure)
         except UsageError as error:
             raise UsageError(f"[{section}] endpoint = {error}") from error
+    output = config.output
+    if output.format == "ros2" and output.odom_topic.lstrip("/") == config.topics.wheel.lstrip("/"):
+        raise UsageError(
+            f"[output] odom_topic = {output.odom_topic!r} is also where [topics] wheel listens: the robot would take its own "
+            'odometry for that of its wheels; set wheel = "" where it has none'
+        )
     if run.frame_queue < 1:
         raise UsageError(f"[run] frame_queue = {run.frame_queue}: at least one frame must be able to wait")
     if not run.trial.contradicting_looks < config.localizer.track.kidnap_fixes:
@@ -85,7 +91,12 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         bus = None if address.store is not None else open_bus(address)
         if bus is not None:
             stack.callback(bus.close)
-        publisher = _publisher(config, bus, site, name, stack)
+        intake = Intake(
+            frames=run.frame_queue,
+            imu_minus_cam_s=rectifier.imu_minus_cam_s,
+            has_imu=calibration.imu is not None,
+            imu_wait_s=run.imu_wait_s,
+        )
         outbox = Outbox(configured_outbox(run, site, name), max_bytes=run.spool_bytes)
         if outbox.set_aside is not None:
             _log.warning("the spool was damaged; it lies in %s now, and a new one was begun", outbox.set_aside)
@@ -109,8 +120,11 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time)
         if prior is not None:
             robot.localizer.handle_prior(prior)
-        has_imu, offset_s = calibration.imu is not None, rectifier.imu_minus_cam_s
-        intake = Intake(frames=run.frame_queue, imu_minus_cam_s=offset_s, has_imu=has_imu, imu_wait_s=run.imu_wait_s)
+        told_bus = _output_bus(config, bus, stack)
+        publisher = None
+        if told_bus is not None:
+            publisher = open_publisher(PublisherInputs(told_bus, site, name, calibration, intake), config.output)
+            stack.callback(publisher.close)
         yield RuntimeParts(
             profile=RobotProfile(
                 site, name, robot.base_from_body, rectifier.body_from_cam, rectifier.camera, config.localizer
@@ -145,11 +159,11 @@ def configured_outbox(run: RunSection, site: str, robot: str) -> Path:
     return outbox_path(site, robot) if run.spool is None else Path(run.spool)
 
 
-def _publisher(config: LocclientConfig, bus: Bus | None, site: str, name: str, stack: ExitStack) -> Publisher | None:
+def _output_bus(config: LocclientConfig, bus: Bus | None, stack: ExitStack) -> Bus | None:
     if config.output.endpoint is not None:
-        bus = ZenohBus.connect(config.output.endpoint)
+        bus = ZenohBus.connect(config.output.endpoint, is_ros=config.output.format == "ros2")
         stack.callback(bus.close)
-    return None if bus is None else open_publisher(bus, site, name, config.output)
+    return bus
 
 
 def _local_map(run: RunSection, site: str) -> tuple[LocalMapSource, WantedVersion]:

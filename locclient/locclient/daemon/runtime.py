@@ -157,6 +157,8 @@ class Runtime:
         is_silent = self._last_frame_s is not None and now_s - self._last_frame_s > _SILENT_S
         if self._parts.server is not None:
             self._parts.server.health.append(self._health(is_silent))
+        if self._parts.publisher is not None:
+            _send(partial(self._parts.publisher.alive, is_silent))
         last = self._figures.last
         status = "no frame yet" if last is None else last.estimate.status.value
         self._manager.alive("no frames come" if is_silent else status)

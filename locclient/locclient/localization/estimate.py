@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,6 +56,17 @@ class Estimate:
     innovation_m: float | None = None
     moved_m: float | None = None
     calibration: CalibrationState = NOT_JUDGED
+
+
+class QueryResult(NamedTuple):
+    """The result of a map query; fields as in Estimate."""
+
+    fix: Fix | None = None
+    refused: str = ""
+    innovation: float | None = None
+    innovation_m: float | None = None
+    moved_m: float | None = None
+    fix_stamp_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,9 +3,19 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.odometry import Odometry, OdometryEstimate
+from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.sensors.samples import PositionPrior
+from locclient.localization.hypothesis_set import (
+    Observations,
+    begin_query,
+    competitors,
+    is_supported,
+    ranked,
+    recent,
+    vote,
+)
 from locclient.localization.pose_covariance import compose_inverse_cov, transport_cov
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
@@ -19,10 +29,23 @@ _WIDER = 23.026 / _CHI2_999
 _PLACE_REACH_M = 3.0  # between the robot and a place that shows what it sees
 
 
+def agrees(prior: PositionPrior, confirmed: PoseHypothesis, base_from_body: Array) -> bool:
+    """Whether a confirmed pose lies within the bound of a prior's position and heading."""
+    map_from_base = confirmed.now_map_from_body @ se3_inverse(base_from_body)
+    off_m = map_from_base[:2, 3] - prior.map_from_base[:2, 3]
+    cov_m2 = _WIDER * prior.cov_rot_trans[3:5, 3:5] + confirmed.now_cov[3:5, 3:5] + _SIGMA_M**2 * np.eye(2)
+    turn_rad = so3_log(prior.map_from_base[:3, :3].T @ map_from_base[:3, :3])[2]
+    variance = _WIDER * prior.cov_rot_trans[2, 2] + confirmed.now_cov[2, 2]
+    return bool(
+        off_m @ np.linalg.solve(cov_m2, off_m) < _CHI2_999 and abs(turn_rad) < _BOUND_SIGMAS * np.sqrt(variance)
+    )
+
+
 class InitialPosePrior:
     """A prior, and the robot's motion since its moment.
 
-    hypothesis: the pose by both, published while the map gives none; None for priors with an unknown direction.
+    hypothesis: the pose by both, published while the map gives none; None for priors with an unknown direction. contradictions: places
+    that fixes name instead of those within a revisable prior.
     """
 
     def __init__(self, prior: PositionPrior, base_from_body: Array) -> None:
@@ -30,6 +53,8 @@ class InitialPosePrior:
         self._travelled_m = 0.0
         self._since: PoseHypothesis | None = None  # the first frame after it, as the identity
         self.hypothesis: PoseHypothesis | None = None
+        self.contradictions: list[PoseHypothesis] = []
+        self.is_revisable = prior.is_revisable
 
     def propagate(self, tracker: Odometry, odometry: OdometryEstimate, step: Array, settings: TrackSettings) -> None:
         """To the present frame, by `step` (4, 4) from the last one. The caller propagates `hypothesis` with the others."""
@@ -44,6 +69,10 @@ class InitialPosePrior:
             covariance = transport_cov(self._prior.cov_rot_trans, lever_m)
             self.hypothesis = PoseHypothesis.at(odometry, map_from_body, covariance)
 
+    def tracked(self) -> list[PoseHypothesis]:
+        """All that must be propagated by the odometry."""
+        return [*([self.hypothesis] if self.hypothesis else []), *self.contradictions]
+
     def is_compatible(self, hypothesis: PoseHypothesis) -> bool:
         """Whether the robot's motion leads back from a present pose to within the bound of the prior's position."""
         if self._since is None:
@@ -53,6 +82,24 @@ class InitialPosePrior:
         map_from_base = map_from_then @ se3_inverse(self._base_from_body)
         off_m = map_from_base[:2, 3] - self._prior.map_from_base[:2, 3]
         return bool(off_m @ np.linalg.solve(self._cov_m2(_WIDER) + covariance[3:5, 3:5], off_m) < _CHI2_999)
+
+    def is_contradicted(
+        self, observations: Observations, settings: TrackSettings, lookalikes: LookAlikes | None
+    ) -> bool:
+        """Whether the fixes of a query without any within the prior, and those before, outweigh it.
+
+        It counts as much as what confirms a pose: more fixes than that must agree, over as much distance, on one place without
+        competitors that no unmapped place resembles. A robot that stands sees the same thing again, which is no more evidence.
+        """
+        begin_query(self.contradictions, settings, is_new_viewpoint=False)
+        for fix, fresh in observations:
+            vote(self.contradictions, fix, fresh, None, settings)
+        self.contradictions = recent(self.contradictions, settings)
+        if not self.contradictions or competitors(self.contradictions, settings):
+            return False
+        best = ranked(self.contradictions)[0]
+        is_lookalike = lookalikes is not None and 0.0 < lookalikes.recall >= best.recall
+        return is_supported(best, settings) and best.support > settings.confirming_fixes and not is_lookalike
 
     def is_near(self, positions_map: Array) -> NDArray[np.bool_]:
         """(N,) which positions (N, 3) may show what the robot sees now."""

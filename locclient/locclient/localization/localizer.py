@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,10 +21,10 @@ from locclient.localization.alias_disambiguation import ViewpointGate
 from locclient.localization.calibration.monitor import CalibrationMonitor, FinishedQuery
 from locclient.localization.calibration.pair_order import REVERSED_TEXT
 from locclient.localization.calibration.watch import Mounting
-from locclient.localization.estimate import Estimate, LocalizationState, assemble
+from locclient.localization.estimate import Estimate, LocalizationState, QueryResult, assemble
 from locclient.localization.hypothesis_set import HypothesisSet, Observations, recent
 from locclient.localization.image_quality import ImageQualityMonitor
-from locclient.localization.initial_pose_prior import InitialPosePrior
+from locclient.localization.initial_pose_prior import InitialPosePrior, agrees
 from locclient.localization.pose_covariance import boxminus, boxplus, transport_cov
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import LocalizerSettings
@@ -33,20 +32,9 @@ from locclient.localization.settings import LocalizerSettings
 _SPREAD_SHARE = 0.45  # of the interval of map queries: at a lower frame rate a query is not spread over frames
 _HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
 _SLICES_AT_REST = (
-    3  # of a search, in a frame: to a robot that stands where its last search began a late estimate costs nothing
+    3  # of a search, in a frame, where the last one began too: a late estimate costs a robot nothing there
 )
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
-
-
-class _QueryResult(NamedTuple):
-    """The result of a map query; fields as in Estimate."""
-
-    fix: Fix | None = None
-    refused: str = ""
-    innovation: float | None = None
-    innovation_m: float | None = None
-    moved_m: float | None = None
-    fix_stamp_ns: int | None = None
 
 
 class Localizer:
@@ -78,7 +66,7 @@ class Localizer:
         self._last_odom_from_body: Array | None = None
         self._last_ns: int | None = None
         self._query_ns: int | None = None  # of the last map query's frame
-        self._work: TimeSliced[_QueryResult] | None = None  # the query that goes on
+        self._work: TimeSliced[QueryResult] | None = None  # the query that goes on
         self._query_frame: PoseHypothesis | None = None  # the frame of that query, as the identity
         self._failed_queries = 0
         self._failed_places: list[Array] = []  # tried in vain from the viewpoint of the gate
@@ -102,8 +90,21 @@ class Localizer:
 
     def handle_prior(self, prior: PositionPrior) -> None:
         """A prior at this moment, used until a pose is confirmed, with a covariance that grows with the distance since. One whose
-        covariance is finite is published as long as the map gives no pose: DEGRADED, by odometry from there."""
+        covariance is finite is published as long as the map gives no pose: DEGRADED, by odometry from there. A person's takes the place of
+        a confirmed pose that it contradicts, and stays until fixes contradict it with more evidence than it has."""
+        if prior.is_revisable and self._confirmed is not None:
+            if agrees(prior, self._confirmed, self._base_from_body):
+                return
+            self.forget_pose()
         self._prior = InitialPosePrior(prior, self._base_from_body)
+
+    def forget_pose(self) -> None:
+        """Searches in the whole map from the next frame on; a map query that goes on is given up."""
+        self._confirmed = self._prior = self._work = self._query_frame = None
+        self._candidates.reset()
+        self._was_tracking, self._failed_queries = False, 0
+        self._failed_places.clear()
+        self._calibration.give_up()
 
     def handle_version(
         self,
@@ -139,7 +140,7 @@ class Localizer:
         self._propagate(odometry)
         self._calibration.work()
         is_reversed = self._calibration.is_reversed(frame, is_localized=self._confirmed is not None)
-        result = _QueryResult(refused=REVERSED_TEXT) if is_reversed else self._query_map(frame, odometry)
+        result = QueryResult(refused=REVERSED_TEXT) if is_reversed else self._query_map(frame, odometry)
         self._last_ns = frame.stamp_ns
         stage_s = {"sight": judged_s - begun_s, "odometry": tracked_s - judged_s, "map": self._clock() - tracked_s}
         estimate = Estimate(
@@ -155,7 +156,7 @@ class Localizer:
             image=image,
             **result._asdict(),
         )
-        prior, has_failed = self._prior_hypothesis(), self._failed_queries > 0
+        prior, has_failed = self._prior.hypothesis if self._prior else None, self._failed_queries > 0
         state = LocalizationState(self._confirmed, self._candidates, prior, has_failed, self._was_tracking)
         last_fix_ns = None if self._confirmed is None else self._confirmed.stamp_ns
         return self._calibration.judged(
@@ -185,15 +186,11 @@ class Localizer:
 
     def _hypotheses(self) -> list[PoseHypothesis]:
         confirmed = [self._confirmed, *self._confirmed.kidnap_hypotheses] if self._confirmed else []
-        prior = self._prior_hypothesis()
-        return [*confirmed, *self._candidates.tracked(), *([prior] if prior else [])]
-
-    def _prior_hypothesis(self) -> PoseHypothesis | None:
-        return self._prior.hypothesis if self._prior is not None else None
+        return [*confirmed, *self._candidates.tracked(), *(self._prior.tracked() if self._prior else [])]
 
     # --- map queries --------------------------------------------------------------------------------------------------
 
-    def _query_map(self, frame: RectifiedFrame, odometry: OdometryEstimate) -> _QueryResult:
+    def _query_map(self, frame: RectifiedFrame, odometry: OdometryEstimate) -> QueryResult:
         """The result of a map query that is finished with this frame, an empty one otherwise.
 
         Its stamp is that of the frame that it is for. Queries are spread over frames, but for the first one, those after a gap, and
@@ -202,7 +199,7 @@ class Localizer:
         is_at_once = False
         if self._work is None:
             if self._relocalizer is None or not self._is_query_due(frame.stamp_ns, odometry):
-                return _QueryResult()
+                return QueryResult()
             is_at_once = self._is_sparse(frame.stamp_ns) or odometry.after_gap
             self._query_ns = frame.stamp_ns
             self._query_frame = PoseHypothesis.at(odometry, np.eye(4), np.zeros((6, 6)))
@@ -220,7 +217,7 @@ class Localizer:
             while is_at_once:
                 next(self._work)
         except StopIteration as done:
-            result: _QueryResult = done.value._replace(fix_stamp_ns=self._query_frame.stamp_ns)
+            result: QueryResult = done.value._replace(fix_stamp_ns=self._query_frame.stamp_ns)
             self._work = self._query_frame = None
             if self._relocalizer is not None and self._query_input is not None and self._query_features is not None:
                 is_confirmed = self._confirmed is not None
@@ -230,7 +227,7 @@ class Localizer:
                 self._calibration.add(looked)
             self._failed_queries = 0 if result.fix is not None else self._failed_queries + 1
             return result
-        return _QueryResult()
+        return QueryResult()
 
     def _is_query_due(self, stamp_ns: int, odometry: OdometryEstimate) -> bool:
         interval_s = self._track.fix_interval_s
@@ -246,7 +243,7 @@ class Localizer:
             return True
         return (stamp_ns - self._last_ns) * 1e-9 > _SPREAD_SHARE * self._track.fix_interval_s
 
-    def _query(self, frame: RectifiedFrame, relocalizer: Relocalizer) -> TimeSliced[_QueryResult]:
+    def _query(self, frame: RectifiedFrame, relocalizer: Relocalizer) -> TimeSliced[QueryResult]:
         features = self._query_features = yield from relocalizer.extract(frame)
         if self._confirmed is None:
             fixes = yield from self._search(features, relocalizer)
@@ -260,7 +257,7 @@ class Localizer:
             fixes = yield from relocalizer.anywhere(features, None, (map_from_body @ self._body_from_cam)[:3, :3])
             fixes = [fix for fix in fixes if fix.inliers >= self._settings.fix.min_inliers]
         if not fixes:
-            return _QueryResult(None, "nothing in the map agrees with this frame")
+            return QueryResult(None, "nothing in the map agrees with this frame")
         return self._update_confirmed(fixes, map_from_body, covariance, is_near=near is not None)
 
     def _near(self, features: FrameFeatures, relocalizer: Relocalizer, hypothesis: PoseHypothesis) -> Fix | None:
@@ -288,7 +285,18 @@ class Localizer:
         fixes = [fix for fix in fixes if self._is_reliable(fix)]
         if self._prior is None:
             return fixes
-        return [fix for fix, hypothesis in self._observations(fixes) if self._prior.is_compatible(hypothesis)]
+        prior = self._prior
+        within = [fix for fix, hypothesis in self._observations(fixes) if prior.is_compatible(hypothesis)]
+        if within or not prior.is_revisable:
+            return within
+        yield
+        fixes = yield from relocalizer.anywhere(features, None, None)
+        fixes = [fix for fix in fixes if self._is_reliable(fix)]
+        if not prior.is_contradicted(self._observations(fixes), self._track, self._lookalikes):
+            return []
+        self._prior = None
+        self._candidates.reset()  # what they name must be confirmed as without a prior
+        return fixes
 
     def _is_reliable(self, fix: Fix) -> bool:
         return is_reliable(fix, self._settings.fix, self._track.strong_inliers)
@@ -316,7 +324,7 @@ class Localizer:
 
     def _update_confirmed(
         self, fixes: list[Fix], map_from_body: Array, covariance: Array, *, is_near: bool
-    ) -> _QueryResult:
+    ) -> QueryResult:
         """Kalman update of the confirmed pose at the frame of the query. Fixes beyond its chi-square gate are refused, and so are
         several within it: long without the map, the gate may hold the pose's own alias.
 
@@ -333,9 +341,9 @@ class Localizer:
         if len(gated) != 1:
             self._detect_kidnapping(fixes)
             if gated:
-                return _QueryResult(None, f"{len(gated)} places agree with what was seen", innovation)
+                return QueryResult(None, f"{len(gated)} places agree with what was seen", innovation)
             reason = f"the fix is {off_m:.2f} m off, more than its covariance admits"
-            return _QueryResult(None, reason, innovation, off_m if is_near else None)
+            return QueryResult(None, reason, innovation, off_m if is_near else None)
         _, cov_fix = self._at_body(fix)
         gain = np.linalg.solve(covariance + cov_fix, covariance).T  # K = P (P + R)^-1
         rest = np.eye(6) - gain
@@ -343,7 +351,7 @@ class Localizer:
         support = self._confirmed.support + 1
         self._confirmed = PoseHypothesis.at_query(self._query_frame, boxplus(map_from_body, gain @ error), updated)
         self._confirmed.support = support
-        return _QueryResult(fix, "", innovation, off_m)
+        return QueryResult(fix, "", innovation, off_m)
 
     def _innovation(self, fix: Fix, map_from_body: Array, covariance: Array) -> tuple[Array, float]:
         """(6,) innovation of a fix, and its squared Mahalanobis distance."""
@@ -364,21 +372,21 @@ class Localizer:
 
     # --- confirmation -------------------------------------------------------------------------------------------------
 
-    def _update_candidates(self, fixes: list[Fix]) -> TimeSliced[_QueryResult]:
+    def _update_candidates(self, fixes: list[Fix]) -> TimeSliced[QueryResult]:
         """Updates the candidates, and confirms the one without competitors that has enough support or a tight prior."""
         candidates = self._candidates
         is_excluded = self._lookalikes is not None and self._is_lookalike_excluded()
         candidates.lookalikes = LookAlikes(0.0, 0.0) if is_excluded else self._lookalikes
         yield from candidates.update(self._observations(fixes), self._odom_from_body())
         if not fixes:
-            return _QueryResult(None, "nothing in the map agrees with this frame")
+            return QueryResult(None, "nothing in the map agrees with this frame")
         (best, *_), competitors = candidates.ranking()
         if competitors:
-            return _QueryResult(None, f"{len(competitors) + 1} places agree with what was seen")
+            return QueryResult(None, f"{len(competitors) + 1} places agree with what was seen")
         moved_m = None
         has_prior = self._prior is not None and self._prior.is_tight(self._track.tight_prior_sigma_m)
         if not has_prior and candidates.may_be_lookalike(best):
-            return _QueryResult(None, "a place that is not in the map may look as much like this one")
+            return QueryResult(None, "a place that is not in the map may look as much like this one")
         if has_prior or candidates.is_confirmed(best, fixes):
             moved_m = candidates.moved_m(best)
             candidates.reset()
@@ -387,5 +395,5 @@ class Localizer:
         best_m = best.now_map_from_body[:3, 3]
         for fix, hypothesis in self._observations(fixes):
             if np.linalg.norm(hypothesis.now_map_from_body[:3, 3] - best_m) < _OWN_FIX_M:
-                return _QueryResult(fix, moved_m=moved_m)
-        return _QueryResult(None, "the fix does not agree with those before", moved_m=moved_m)
+                return QueryResult(fix, moved_m=moved_m)
+        return QueryResult(None, "the fix does not agree with those before", moved_m=moved_m)

@@ -54,4 +54,6 @@ class DockCheck:
 def _is_exact(prior: PositionPrior) -> bool:
     """Whether this is a dock's report, not a zone or an operator's estimate."""
     covariance = prior.cov_rot_trans[3:5, 3:5]
-    return bool(np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[-1] <= _EXACT_M**2)
+    return not prior.is_revisable and bool(
+        np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[-1] <= _EXACT_M**2
+    )

@@ -165,6 +165,8 @@ class Robot:
         """Results of a bundle with a frame; None without one. RecordingError for images that cannot be read."""
         self.localizer.handle_imu(bundle.imu)
         self.localizer.handle_wheel(bundle.wheel)
+        if bundle.forget:
+            self.localizer.forget_pose()
         for prior in bundle.priors:
             self.localizer.handle_prior(prior)
         if bundle.frame is None:

@@ -1,18 +1,22 @@
 """The bus between server and robots: `Bus` is the contract, `ZenohBus` the network, `MemoryBus` the same in one process."""
 
+from fleetmap.bus.endpoints import check_endpoint, has_tls, is_loopback
 from fleetmap.bus.memory import MemoryBus, MemoryHub
-from fleetmap.bus.protocol import MAX_MESSAGE_BYTES, Answer, Bus, Handle, Listen
+from fleetmap.bus.protocol import MAX_MESSAGE_BYTES, Answer, Bus, Handle, LatchedPublisher, Listen
+from fleetmap.bus.ros2_node import Ros2Node
 from fleetmap.bus.tls import TlsFiles, handshake_fault
-from fleetmap.bus.zenoh_bus import ZenohBus, check_endpoint, has_tls, is_loopback
+from fleetmap.bus.zenoh_bus import ZenohBus
 
 __all__ = [
     "MAX_MESSAGE_BYTES",
     "Answer",
     "Bus",
     "Handle",
+    "LatchedPublisher",
     "Listen",
     "MemoryBus",
     "MemoryHub",
+    "Ros2Node",
     "TlsFiles",
     "ZenohBus",
     "check_endpoint",

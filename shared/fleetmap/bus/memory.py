@@ -6,8 +6,10 @@ from typing import Any
 from fleetmap.access import Access, Act, Direction, key_includes
 from fleetmap.bus.protocol import (
     Answer,
+    Attach,
     Bus,
     Handle,
+    LatchedPublisher,
     Listen,
     answer_query,
     check_size,
@@ -52,8 +54,8 @@ class MemoryBus(Bus):
         self._handles: list[Handle] | None = []
         hub.certificates.append(certificate)
 
-    def queryable(self, key_expr: str, answer: Answer) -> Handle:
-        """See Bus."""
+    def queryable(self, key_expr: str, answer: Answer, attach: Attach | None = None) -> Handle:
+        """See Bus; nothing here carries attachments."""
         return self._declare(self._hub.queryables, (key_expr, answer, self._certificate))
 
     def get(self, key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
@@ -92,6 +94,18 @@ class MemoryBus(Bus):
         if hub.reachable and hub.passes(self._certificate, Direction.IN, Act.PUT, key):
             for listen in listeners:
                 deliver(listen, key, payload)
+
+    def latched_publisher(self, key: str) -> LatchedPublisher:
+        """See Bus; nobody here asks for what was published before."""
+
+        def put(payload: bytes, attachment: bytes) -> None:
+            self.publish(key, payload, may_drop=True, attachment=attachment)
+
+        return LatchedPublisher(put, lambda: None)
+
+    def session_id(self) -> str:
+        """See Bus."""
+        return f"{id(self):x}"
 
     def subscribe(self, key_expr: str, listen: Listen) -> Handle:
         """See Bus."""

@@ -13,7 +13,11 @@ Answer = Callable[[str, bytes], bytes]
 Listen = Callable[[str, bytes], None]
 """Takes (key, payload) of what was published. Runs on a thread of the bus."""
 
+Attach = Callable[[bytes], bytes]
+"""The attachment of an answer, by that of its question; empty for none."""
+
 MAX_MESSAGE_BYTES = 1 << 20  # larger content is sent in parts, because one large message delays all others behind it
+MAX_LATCHED_BYTES = 1 << 26  # a robot's own programs take a map in one message
 
 _log = logging.getLogger(__name__)
 
@@ -35,6 +39,22 @@ class Handle:
             undo()
 
 
+class LatchedPublisher(Handle):
+    """Publishes under one key, and keeps the last message for subscribers who come later and ask for it."""
+
+    def __init__(self, put: Callable[[bytes, bytes], None], undo: Callable[[], None]) -> None:
+        super().__init__(undo)
+        self._put = put
+
+    def put(self, payload: bytes, attachment: bytes = b"") -> None:
+        """Publishes; LinkError for more than MAX_LATCHED_BYTES, or on a closed bus."""
+        if len(payload) > MAX_LATCHED_BYTES:
+            raise LinkError(
+                f"{len(payload)} bytes are more than the {MAX_LATCHED_BYTES} that are kept for late subscribers"
+            )
+        self._put(payload, attachment)
+
+
 class Bus(ABC):
     """One participant. Must be closed, best as a context manager. Messages hold at most MAX_MESSAGE_BYTES.
 
@@ -42,7 +62,7 @@ class Bus(ABC):
     """
 
     @abstractmethod
-    def queryable(self, key_expr: str, answer: Answer) -> Handle:
+    def queryable(self, key_expr: str, answer: Answer, attach: Attach | None = None) -> Handle:
         """Answers questions for keys that match `key_expr` (`*` is one chunk, `**` any number)."""
 
     @abstractmethod
@@ -59,6 +79,14 @@ class Bus(ABC):
 
         attachment: beside the payload, for what other programs want there; no subscriber of this class is shown it.
         """
+
+    @abstractmethod
+    def latched_publisher(self, key: str) -> LatchedPublisher:
+        """A publisher under `key` that keeps its last message."""
+
+    @abstractmethod
+    def session_id(self) -> str:
+        """Names this participant on its network."""
 
     @abstractmethod
     def subscribe(self, key_expr: str, listen: Listen) -> Handle:

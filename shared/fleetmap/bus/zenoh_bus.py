@@ -2,23 +2,25 @@
 
 import json
 import logging
-import socket
 import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from ipaddress import ip_address
 from typing import Any, Self
 
 import zenoh
+import zenoh.ext
 
 from fleetmap.access import Access
+from fleetmap.bus.endpoints import check_endpoint, has_tls, is_loopback, with_free_port
 from fleetmap.bus.fair_queue import FairQueue, sender_of
 from fleetmap.bus.protocol import (
     MAX_MESSAGE_BYTES,
     Answer,
+    Attach,
     Bus,
     Handle,
+    LatchedPublisher,
     Listen,
     answer_query,
     check_size,
@@ -32,6 +34,7 @@ from fleetmap.errors import LinkError, UsageError
 _RETRY_S = 0.05
 _REOPEN_WITHIN_S = 10.0
 _MAX_ALIVE = 1 << 17
+_HEARTBEAT_S = 0.5  # after which a subscriber notices that the last message was lost; rmw_zenoh's own
 _MAX_SESSIONS = 20_000  # zenoh's default is 1000: the next robot would find silence
 _MAX_RECEIVED_BYTES = 2 * MAX_MESSAGE_BYTES
 _BUSY = b"later: too much of this sender is waiting already"
@@ -60,15 +63,17 @@ class ZenohBus(Bus):
         is_server: bool = False,
         tls: TlsFiles | None = None,
         access: Access | None = None,
+        is_ros: bool = False,
     ) -> None:
-        """Not open yet: see `open`. tls: mutual TLS; access: who may say what, for a server with mutual TLS.
+        """Not open yet: see `open`. tls: mutual TLS; access: who may say what, for a server with mutual TLS. is_ros: towards the router
+        of a robot's ROS 2; one on another machine must be there when the bus is opened.
 
         Raises UsageError for something that is no endpoint, and for TLS without its files.
         """
         self.endpoint = check_endpoint(endpoint)
         if has_tls(endpoint) and tls is None and is_server:
             raise UsageError(f"endpoint {endpoint}: without a certificate nobody can listen with TLS")
-        self._is_server, self._tls, self.access = is_server, tls, access
+        self._is_server, self._tls, self.access, self._is_ros = is_server, tls, access, is_ros
         self._lock = threading.RLock()
         self._session: Any = None
         self._is_closed = False
@@ -86,9 +91,9 @@ class ZenohBus(Bus):
         return bus
 
     @classmethod
-    def connect(cls, endpoint: str, *, tls: TlsFiles | None = None) -> Self:
+    def connect(cls, endpoint: str, *, tls: TlsFiles | None = None, is_ros: bool = False) -> Self:
         """A robot's side. Returns at once; connects, and after every loss connects again, in the background."""
-        bus = cls(endpoint, tls=tls)
+        bus = cls(endpoint, tls=tls, is_ros=is_ros)
         bus.open()
         return bus
 
@@ -97,7 +102,7 @@ class ZenohBus(Bus):
         wanted = self.endpoint
         with self._lock:
             for attempt in range(5):
-                self.endpoint = _with_free_port(wanted)
+                self.endpoint = with_free_port(wanted)
                 try:
                     self._open()
                     return
@@ -136,7 +141,7 @@ class ZenohBus(Bus):
                         raise LinkError(f"cannot listen on {self.endpoint} again ({error}); trying on") from error
                     time.sleep(_RETRY_S)
 
-    def queryable(self, key_expr: str, answer: Answer) -> Handle:
+    def queryable(self, key_expr: str, answer: Answer, attach: Attach | None = None) -> Handle:
         """See Bus."""
 
         def reply(query: Any, key: str) -> None:
@@ -148,7 +153,9 @@ class ZenohBus(Bus):
                     if data is None:
                         query.reply_err(reason.encode("utf-8", "replace"))
                     else:
-                        query.reply(key, data)
+                        asked = b"" if query.attachment is None else query.attachment.to_bytes()
+                        beside = attach(asked) if attach is not None else b""
+                        query.reply(key, data, attachment=beside or None)
                 except zenoh.ZError as error:
                     _log.debug("the session that asked for %r is gone: %s", key[:200], error)  # the asker asks again
 
@@ -190,6 +197,28 @@ class ZenohBus(Bus):
         beside = {"attachment": attachment} if attachment else {}
         check_size(payload, key)
         self._guarded(lambda session: session.put(key, payload, congestion_control=control, **beside))
+
+    def latched_publisher(self, key: str) -> LatchedPublisher:
+        """See Bus. Who is late asks with an AdvancedSubscriber that has a history, as rmw_zenoh and zenoh-bridge-ros2dds do."""
+        declared = self._declared_now(
+            lambda session: zenoh.ext.declare_advanced_publisher(
+                session,
+                key,
+                reliability=zenoh.Reliability.RELIABLE,
+                cache=zenoh.ext.CacheConfig(max_samples=1),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
+                publisher_detection=True,
+            )
+        )
+
+        def put(payload: bytes, attachment: bytes) -> None:
+            self._guarded(lambda _: declared.current.put(payload, attachment=attachment or None))
+
+        return LatchedPublisher(put, partial(self._undeclare, declared))
+
+    def session_id(self) -> str:
+        """See Bus."""
+        return str(self._guarded(lambda session: session.zid()))
 
     def subscribe(self, key_expr: str, listen: Listen) -> Handle:
         """See Bus."""
@@ -253,26 +282,30 @@ class ZenohBus(Bus):
             entries |= _SERVER
             if self.access is not None:
                 entries |= {"transport/link/rx/max_message_size": _MAX_RECEIVED_BYTES, **self.access.zenoh_config()}
+        if self._is_ros:
+            entries |= _ROS_HERE if is_loopback(self.endpoint) else _ROS_AWAY
         self._session = zenoh.open(_config(entries))
         for entry in self._declared:
             entry.current = entry.declare(self._session)
 
     def _declare(self, declare: Callable[[Any], Any], stop: Callable[[], None] = lambda: None) -> Handle:
+        return Handle(partial(self._undeclare, self._declared_now(declare, stop)))
+
+    def _declared_now(self, declare: Callable[[Any], Any], stop: Callable[[], None] = lambda: None) -> _Declared:
         declared = _Declared(declare, stop)
         with self._lock:
             if self._session is not None:
                 declared.current = self._guarded(declare)
             self._declared.append(declared)
+        return declared
 
-        def undo() -> None:
-            with self._lock:
-                if declared in self._declared:
-                    self._declared.remove(declared)
-                    if declared.current is not None and not self._session.is_closed():
-                        declared.current.undeclare()
-            stop()
-
-        return Handle(undo)
+    def _undeclare(self, declared: _Declared) -> None:
+        with self._lock:
+            if declared in self._declared:
+                self._declared.remove(declared)
+                if declared.current is not None and not self._session.is_closed():
+                    declared.current.undeclare()
+        declared.stop()
 
     def _guarded(self, call: Callable[[Any], Any]) -> Any:
         while True:
@@ -288,52 +321,16 @@ class ZenohBus(Bus):
                         raise LinkError(f"the bus at {self.endpoint} refused ({error}); is it closed?") from error
 
 
-def check_endpoint(endpoint: str) -> str:
-    """`endpoint` itself; raises UsageError unless it reads like tcp/HOST:PORT (also tls, quic, udp)."""
-    protocol, slash, address = endpoint.partition("/")
-    host, _, port = address.rpartition(":")
-    if not slash or protocol not in {"tcp", "tls", "quic", "udp"} or not host or not port.isdecimal():
-        raise UsageError(f"endpoint {endpoint!r}: write it like tcp/127.0.0.1:7447")
-    if int(port) > 65535:
-        raise UsageError(f"endpoint {endpoint!r}: port {port} is above 65535")
-    return endpoint
-
-
 def _ask(session: Any, *, key: str, payload: bytes, timeout_s: float) -> Any:
     # The answer travels with the question's congestion control; what may be dropped would lose large answers.
     control = zenoh.CongestionControl.BLOCK
     return session.get(key, timeout=timeout_s, payload=payload, congestion_control=control)
 
 
-def has_tls(endpoint: str) -> bool:
-    """Whether an endpoint's protocol has TLS in it."""
-    return endpoint.startswith(("tls/", "quic/"))
-
-
-def is_loopback(endpoint: str) -> bool:
-    """Whether nobody but this machine is at an endpoint."""
-    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
-    try:
-        return host == "localhost" or ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
 def _size(message: Any, key: str) -> int:
     """What a sample or question keeps in memory while it waits: what came beside its payload too."""
     parts = (message.payload, message.attachment)
     return len(key) + sum(len(part) for part in parts if part is not None)
-
-
-def _with_free_port(endpoint: str) -> str:
-    protocol, _, address = endpoint.partition("/")
-    host, _, port = address.rpartition(":")
-    if port != "0":
-        return endpoint
-    family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as probe:
-        probe.bind((host.strip("[]"), 0))
-        return f"{protocol}/{host}:{probe.getsockname()[1]}"
 
 
 _COMMON: dict[str, Any] = {
@@ -351,6 +348,11 @@ _COMMON: dict[str, Any] = {
     "transport/shared_memory/enabled": False,
     "adminspace/enabled": False,
 }
+# A router of ROS 2 does not pass on what one peer says to another: its programs hear of each other by the router's gossip, and connect.
+# So does a robot's side, which itself listens nowhere. From another machine they cannot be reached: there the router serves a client.
+_ROS: dict[str, Any] = {"timestamping/enabled": True}
+_ROS_HERE = _ROS | {"scouting/gossip/enabled": True, "scouting/gossip/target": {"router": [], "peer": ["router"]}}
+_ROS_AWAY = _ROS | {"mode": "client", "connect/timeout_ms": 10_000, "connect/exit_on_failure": True}
 _SERVER: dict[str, Any] = {"mode": "router", "transport/unicast/max_sessions": _MAX_SESSIONS}
 
 

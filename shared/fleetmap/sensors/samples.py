@@ -84,12 +84,14 @@ def wheel_between(samples: Sequence[WheelSample], start_ns: int, end_ns: int) ->
 class PositionPrior:
     """A coarse place in `map` from a dock, tag, zone or operator.
 
-    map_from_base (4, 4); cov_rot_trans (6, 6) of a perturbation in map axes; infinite where unknown.
+    map_from_base (4, 4); cov_rot_trans (6, 6) of a perturbation in map axes; infinite where unknown. is_revisable: from a person, who
+    may err: it takes the place of what the robot believed, and fixes may contradict it.
     """
 
     stamp_ns: int
     map_from_base: Array
     cov_rot_trans: Array
+    is_revisable: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,7 +58,7 @@ class Intake:
         self._imu, self._last_imu_ns, self._last_frame_ns = _ImuQueue(), -(2**62), -(2**62)
         self._wheel: list[WheelSample] = []
         self._priors: list[PositionPrior] = []
-        self._finished = False
+        self._finished = self._forget = False
 
     def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
         """A frame; the oldest that waits makes room. One that is not newer than all before is refused and counted."""
@@ -103,6 +103,12 @@ class Intake:
             self._priors.append(prior)
             del self._priors[:-10]
 
+    def put_forget(self) -> None:
+        """The robot is to forget its place, and priors that wait, and to search for itself from the next frame on."""
+        with self._changed:
+            self._priors.clear()
+            self._forget = True
+
     def count_unreadable(self) -> None:
         """A message or picture that could not be read."""
         with self._changed:
@@ -139,8 +145,9 @@ class Intake:
             priors = [prior for prior in self._priors if prior.stamp_ns <= frame.stamp_ns]
             self._wheel = [sample for sample in self._wheel if sample.stamp_ns > body_ns]
             self._priors = [prior for prior in self._priors if prior.stamp_ns > frame.stamp_ns]
+            forget, self._forget = self._forget, False
             self._changed.notify_all()
-            return SensorBundle(frame, imu, wheel, priors)
+            return SensorBundle(frame, imu, wheel, priors, forget)
 
     def _imu_is_there(self) -> bool:
         """Up to the oldest frame, which may be another one than when the wait began."""

@@ -1,4 +1,4 @@
-"""Sensors as ROS 2 topics over zenoh, as rmw_zenoh sends them: CDR under `<domain>/<topic>/<type>/<hash>`."""
+"""Sensors as ROS 2 topics over zenoh: CDR under the keys of rmw_zenoh, or of a bridge to DDS."""
 
 from collections.abc import Callable
 from functools import partial
@@ -7,14 +7,14 @@ from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings import StoredFrame, Topics
 from fleetmap.recordings.ros2 import messages
-from fleetmap.recordings.ros2.keys import ros_key_expr, type_of_key
+from fleetmap.recordings.ros2.graph import KeyLayout
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.stereo_pairs import StereoPairs
 
 _IDLE_S = 1.0
-Take = Callable[[Intake, str, bytes], None]
+Take = Callable[[Intake, bool, bytes], None]
 
 
 class Ros2Source:
@@ -23,7 +23,7 @@ class Ros2Source:
     def __init__(
         self,
         bus: Bus,
-        domain: int,
+        layout: KeyLayout,
         topics: Topics,
         calibration: RigCalibration,
         *,
@@ -34,7 +34,7 @@ class Ros2Source:
 
         A calibration of one camera takes left images alone.
         """
-        self._bus, self._domain = bus, domain
+        self._bus, self._layout = bus, layout
         self.calibration, self.has_depth = calibration, has_depth
         self._pairs = StereoPairs()
         self._topics: list[tuple[str, Take]] = [(topics.wheel, _take_wheel), (topics.prior, _take_prior)]
@@ -58,7 +58,7 @@ class Ros2Source:
     def subscribe(self, intake: Intake) -> list[Handle]:
         """Subscriptions that put samples into the intake, until they are closed."""
         return [
-            self._bus.subscribe(ros_key_expr(self._domain, topic), partial(self._handle, intake, take))
+            self._bus.subscribe(self._layout.subscription(topic), partial(self._handle, intake, take))
             for topic, take in self._topics
             if topic
         ]
@@ -69,15 +69,16 @@ class Ros2Source:
 
     def _handle(self, intake: Intake, take: Take, key: str, payload: bytes) -> None:
         try:
-            take(intake, type_of_key(key), payload)
+            # A bridge's key names no type.
+            is_compressed = (self._layout.type_of(key) or key).endswith(("CompressedImage", "/compressed"))
+            take(intake, is_compressed, payload)
         except (ValueError, FleetmapError):
             # An unreadable message is skipped; the health report has their number.
             intake.count_unreadable()
 
-    def _take_image(self, side: str, intake: Intake, type_name: str, payload: bytes) -> None:
+    def _take_image(self, side: str, intake: Intake, is_compressed: bool, payload: bytes) -> None:
         stamp_ns, _ = messages.header_of(payload)
-        compressed = type_name == "sensor_msgs/CompressedImage"
-        decode = messages.decode_compressed_image if compressed else messages.decode_image
+        decode = messages.decode_compressed_image if is_compressed else messages.decode_image
         image = decode(payload, f"{side} at {stamp_ns}")
         if not self.has_depth and len(self.calibration.cameras) == 1:
             intake.put_frame(StoredFrame(stamp_ns, image))
@@ -87,14 +88,14 @@ class Ros2Source:
             intake.put_frame(StoredFrame(frame.stamp_ns, frame.left, None, frame.right) if self.has_depth else frame)
 
 
-def _take_imu(intake: Intake, _: str, payload: bytes) -> None:
+def _take_imu(intake: Intake, _is_compressed: bool, payload: bytes) -> None:
     stamps_ns, gyro_radps, accel_mps2, _ = messages.decode_imu([payload])
     intake.put_imu(ImuSamples(stamps_ns, gyro_radps, accel_mps2))
 
 
-def _take_wheel(intake: Intake, _: str, payload: bytes) -> None:
+def _take_wheel(intake: Intake, _is_compressed: bool, payload: bytes) -> None:
     intake.put_wheel(messages.decode_odometry(payload))
 
 
-def _take_prior(intake: Intake, _: str, payload: bytes) -> None:
+def _take_prior(intake: Intake, _is_compressed: bool, payload: bytes) -> None:
     intake.put_prior(messages.decode_prior(payload))

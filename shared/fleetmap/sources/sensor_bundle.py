@@ -8,9 +8,10 @@ from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Whe
 
 @dataclass(frozen=True, slots=True)
 class SensorBundle:
-    """A frame, None where none came in time, and the samples to handle before it."""
+    """A frame, None where none came in time, and the samples to handle before it. forget: first, what was believed of the place."""
 
     frame: CameraFrame | StoredFrame | None = None
     imu: ImuSamples = field(default_factory=ImuSamples.empty)
     wheel: list[WheelSample] = field(default_factory=list)
     priors: list[PositionPrior] = field(default_factory=list)
+    forget: bool = False

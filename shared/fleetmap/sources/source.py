@@ -11,6 +11,7 @@ from fleetmap.bus import ZenohBus
 from fleetmap.config import Section
 from fleetmap.errors import UsageError
 from fleetmap.recordings import OpenOptions, Topics, open_recording, read_calibration
+from fleetmap.recordings.ros2.graph import key_layout
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.playback import RecordingSource
@@ -26,6 +27,7 @@ class SourceSection(Section, frozen=True):
     calibration: str | None = None
     endpoint: str = "tcp/127.0.0.1:7447"
     domain: int = 0
+    keys: str = "rmw_zenoh"
     recording: str | None = None
     speed: float = 1.0
     device: str = "/dev/video0"
@@ -58,8 +60,8 @@ def _recording(section: SourceSection, topics: Topics) -> Source:
 
 def _ros2(section: SourceSection, topics: Topics) -> Source:
     calibration = _calibration(section)
-    bus = ZenohBus.connect(section.endpoint)
-    return Ros2Source(bus, section.domain, topics, calibration, has_depth=section.sensors == "rgbd")
+    layout, bus = key_layout(section.keys, section.domain), ZenohBus.connect(section.endpoint, is_ros=True)
+    return Ros2Source(bus, layout, topics, calibration, has_depth=section.sensors == "rgbd")
 
 
 def _uvc(section: SourceSection, topics: Topics) -> Source:
@@ -69,7 +71,8 @@ def _uvc(section: SourceSection, topics: Topics) -> Source:
         )
     calibration = _calibration(section)
     device: int | str = int(section.device) if section.device.isdecimal() else section.device
-    topic_source = Ros2Source(ZenohBus.connect(section.endpoint), section.domain, topics, calibration, images=False)
+    layout, bus = key_layout(section.keys, section.domain), ZenohBus.connect(section.endpoint, is_ros=True)
+    topic_source = Ros2Source(bus, layout, topics, calibration, images=False)
     mode = VideoMode(section.width_px, section.height_px, section.rate_hz, section.delay_s)
     return UvcSource(lambda: cv2.VideoCapture(device), calibration, mode, topic_source)
 

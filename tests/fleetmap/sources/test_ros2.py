@@ -11,6 +11,7 @@ from fleetmap.bus import MemoryBus, MemoryHub, ZenohBus
 from fleetmap.errors import UsageError
 from fleetmap.recordings import StoredFrame, Topics
 from fleetmap.recordings.images import decode_frame, depth_image, grey_image, png_image
+from fleetmap.recordings.ros2.graph import RmwZenohKeys
 from fleetmap.recordings.ros2.keys import attachment, ros_key
 from fleetmap.recordings.ros2.messages import (
     encode_compressed_image,
@@ -52,7 +53,7 @@ def test_topics_of_a_driver_become_moments(buses: tuple[ZenohBus, ZenohBus]) -> 
         sent += 1
         driver.publish(ros_key(7, topic, type_name), payload, attachment=attachment(sent, sent, GID))
 
-    source = Ros2Source(robot, 7, TOPICS, calibration())
+    source = Ros2Source(robot, RmwZenohKeys(7), TOPICS, calibration())
     handles = source.subscribe(queue)
     deadline = time.monotonic() + 20
     while not queue.counts.imu_samples and time.monotonic() < deadline:  # until the subscription stands
@@ -98,7 +99,7 @@ def test_topics_of_a_driver_become_moments(buses: tuple[ZenohBus, ZenohBus]) -> 
 def test_running_ends_when_it_is_told_and_hears_nothing_more() -> None:
     hub = MemoryHub()
     with MemoryBus(hub) as bus, MemoryBus(hub) as driver:
-        queue, source = intake(), Ros2Source(bus, 0, TOPICS, calibration())
+        queue, source = intake(), Ros2Source(bus, RmwZenohKeys(0), TOPICS, calibration())
         payload = encode_imu(5, "imu", np.ones(3), np.ones(3))
 
         def publish_and_stop(_: float) -> bool:
@@ -131,7 +132,7 @@ def test_one_camera_needs_no_right_image(has_depth: bool) -> None:
     depth_m = np.full((6, 8), 1.5, np.float32)
     with MemoryBus(hub) as driver:
         rig = replace(calibration(), cameras=calibration().cameras[:1])
-        source = Ros2Source(MemoryBus(hub), 7, TOPICS, rig, has_depth=has_depth)
+        source = Ros2Source(MemoryBus(hub), RmwZenohKeys(7), TOPICS, rig, has_depth=has_depth)
         source.subscribe(queue)
         for topic, image in (("left", grey_image(LEFT)), ("right", grey_image(RIGHT)), ("depth", depth_image(depth_m))):
             name = {"left": TOPICS.left, "right": TOPICS.right, "depth": TOPICS.depth}[topic]

@@ -12,11 +12,19 @@ from fleetmap.messages import Cause, EstimateMessage, Status, decode_message
 from fleetmap.recordings.ros2.cdr import CdrReader
 from fleetmap.recordings.ros2.keys import ros_key
 from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior
-from locclient.daemon.publishers import OutputSection, open_publisher
+from fleetmap.sources.intake import Intake
+from locclient.daemon.output_section import OutputSection
+from locclient.daemon.publishers import PublisherInputs, open_publisher
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
+from support.recordings.recording_samples import calibration
 
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([0.2, 0.0, 0.5]))
+
+
+def inputs(bus: MemoryBus) -> PublisherInputs:
+    intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
+    return PublisherInputs(bus, "hall", "r1", calibration(), intake)
 
 
 def published(section: OutputSection, *estimates: object) -> dict[str, list[bytes]]:
@@ -24,9 +32,10 @@ def published(section: OutputSection, *estimates: object) -> dict[str, list[byte
     hub, heard = MemoryHub(), {}  # type: ignore[var-annotated]
     with MemoryBus(hub) as bus, MemoryBus(hub) as other:
         other.subscribe("**", lambda key, payload: heard.setdefault(key, []).append(payload))
-        publisher, odom = open_publisher(bus, "hall", "r1", section), ContinuousOdom(BASE_FROM_BODY)
+        publisher, odom = open_publisher(inputs(bus), section), ContinuousOdom(BASE_FROM_BODY)
         for one in estimates:
             publisher.publish(one, odom.handle(one), BASE_FROM_BODY)  # type: ignore[arg-type]
+        publisher.close()
     return heard
 
 
@@ -50,15 +59,14 @@ def test_ros_topics_hold_the_same() -> None:
     tracked = estimate(5.0, x_m=2.0, sigma_m=0.1)
     told = published(OutputSection(format="ros2", domain=3), tracked, estimate(6.0, Status.LOST, known=False))
     expected = tracked.map_from_body @ se3_inverse(BASE_FROM_BODY)
-    stamped = told[ros_key(3, "/localization/pose", "geometry_msgs/PoseWithCovarianceStamped")]
+    stamped = told[ros_key(3, "/amcl_pose", "geometry_msgs/PoseWithCovarianceStamped")]
     assert len(stamped) == 1
     prior = decode_prior(stamped[0])
     np.testing.assert_allclose(prior.map_from_base, expected, atol=1e-12)
     np.testing.assert_allclose(np.diag(prior.cov_rot_trans), [1e-4] * 3 + [0.01] * 3)
-    first, second = (decode_frame_links(payload) for payload in told[ros_key(3, "/tf", "tf2_msgs/TFMessage")])
-    assert [(link.parent, link.child) for link in first] == [("map", "odom"), ("odom", "base_link")]
-    np.testing.assert_allclose(first[0].parent_from_child @ first[1].parent_from_child, expected, atol=1e-12)
-    assert [(link.parent, link.child) for link in second] == [("odom", "base_link")]
+    links = [link for payload in told[ros_key(3, "/tf", "tf2_msgs/TFMessage")] for link in decode_frame_links(payload)]
+    assert [(link.parent, link.child) for link in links] == [("map", "odom"), *[("odom", "base_link")] * 2]
+    np.testing.assert_allclose(links[0].parent_from_child @ links[1].parent_from_child, expected, atol=1e-12)
     states = told[ros_key(3, "/localization/status", "std_msgs/String")]
     assert [CdrReader(state).text() for state in states] == ["TRACKING", "LOST"]
 
@@ -68,7 +76,7 @@ def test_ros_topics_hold_the_same() -> None:
 )
 def test_what_cannot_be_told_is_refused_at_once(section: dict[str, str], said: str) -> None:
     with MemoryBus(MemoryHub()) as bus, pytest.raises(UsageError, match=said):
-        open_publisher(bus, "hall", "r1", OutputSection(**section))
+        open_publisher(inputs(bus), OutputSection(**section))
 
 
 def test_odom_is_continuous_once_a_place_was_named() -> None:

@@ -68,6 +68,12 @@ class Listener:
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: np.ndarray) -> None:
         self.estimates.append(estimate)
 
+    def alive(self, is_silent: bool) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
 
 @dataclass
 class World:

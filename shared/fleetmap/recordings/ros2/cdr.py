@@ -81,10 +81,22 @@ class CdrWriter:
         """A uint8 or bool."""
         return self._pack("<B", 1, value)
 
+    def long_unsigned(self, value: int) -> "CdrWriter":
+        """A uint64."""
+        return self._pack("<Q", 8, value)
+
+    def single(self, value: float) -> "CdrWriter":
+        """A float32."""
+        return self._pack("<f", 4, value)
+
+    def time(self, stamp_ns: int) -> "CdrWriter":
+        """builtin_interfaces/Time."""
+        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+        return self._pack("<i", 4, seconds).unsigned(nanoseconds)
+
     def header(self, stamp_ns: int, frame_id: str) -> "CdrWriter":
         """std_msgs/Header."""
-        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-        return self._pack("<i", 4, seconds).unsigned(nanoseconds).text(frame_id)
+        return self.time(stamp_ns).text(frame_id)
 
     def text(self, value: str) -> "CdrWriter":
         """A string."""
@@ -111,7 +123,7 @@ class CdrWriter:
         """All that was put in."""
         return bytes(self._out)
 
-    def _pack(self, code: str, size: int, value: int) -> "CdrWriter":
+    def _pack(self, code: str, size: int, value: float) -> "CdrWriter":
         self._align(size)
         self._out += struct.pack(code, value)
         return self

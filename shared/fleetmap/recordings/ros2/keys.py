@@ -16,20 +16,26 @@ from fleetmap.recordings.ros2.definitions import DEFINITIONS
 # type_description_interfaces/FieldType: numbers of the types, and what is added for fixed and for unbounded arrays.
 _NUMBERS = "int8 uint8 int16 uint16 int32 uint32 int64 uint64 float32 float64"
 _TYPE_IDS = dict(zip(_NUMBERS.split(), range(2, 12), strict=True)) | {"bool": 15, "byte": 16, "string": 17}
-_NESTED, _FIXED_ARRAY, _SEQUENCE = 1, 48, 144
-_FIELD = re.compile(r"^([\w/]+)(?:\[(\d*)\])? (\w+)")
+_NESTED, _FIXED_ARRAY, _BOUNDED, _SEQUENCE = 1, 48, 96, 144
+_FIELD = re.compile(r"^([\w/]+)(?:\[(<=)?(\d*)\])? (\w+)")
 _GID_BYTES = 16
+_ATTACHMENT = struct.Struct("<qqB")
 
 
 def ros_key(domain: int, topic: str, type_name: str) -> str:
-    """The key under which a publisher of `topic` with messages of `type_name` (sensor_msgs/Imu) sends."""
-    package, _, name = type_name.partition("/")
-    return f"{domain}/{_chunks(topic)}/{package}::msg::dds_::{name}_/RIHS01_{type_hash(type_name)}"
+    """The key of a topic with messages of `type_name` (sensor_msgs/Imu), or of a service (std_srvs/srv/Empty)."""
+    return f"{domain}/{topic_chunks(topic)}/{dds_type(type_name)}/RIHS01_{type_hash(type_name)}"
+
+
+def dds_type(type_name: str) -> str:
+    """The name of a type as DDS has it, such as sensor_msgs::msg::dds_::Imu_."""
+    package, kind, name = _long(type_name).split("/")
+    return f"{package}::{kind}::dds_::{name}_"
 
 
 def ros_key_expr(domain: int, topic: str) -> str:
     """Matches the keys of a topic, whatever its type."""
-    return f"{domain}/{_chunks(topic)}/*/*"
+    return f"{domain}/{topic_chunks(topic)}/*/*"
 
 
 def type_of_key(key: str) -> str:
@@ -42,13 +48,20 @@ def type_of_key(key: str) -> str:
 def attachment(sequence: int, source_ns: int, gid: bytes) -> bytes:
     """The attachment of a message: its number and time at the publisher, whose name is 16 bytes."""
     assert len(gid) == _GID_BYTES
-    return struct.pack("<qqB", sequence, source_ns, _GID_BYTES) + gid
+    return _ATTACHMENT.pack(sequence, source_ns, _GID_BYTES) + gid
+
+
+def answer_attachment(question: bytes, source_ns: int) -> bytes:
+    """The attachment of a service's answer: number and name of the question's; empty where the question has none of rmw_zenoh."""
+    if len(question) != _ATTACHMENT.size + _GID_BYTES or question[_ATTACHMENT.size - 1] != _GID_BYTES:
+        return b""
+    return attachment(_ATTACHMENT.unpack_from(question)[0], source_ns, question[_ATTACHMENT.size :])
 
 
 @cache
 def type_hash(type_name: str) -> str:
     """RIHS01 of a type in DEFINITIONS, without its prefix: SHA-256 of the type's description as canonical JSON."""
-    nested = sorted(_nested(type_name))
+    nested = sorted(_nested(type_name), key=_long)
     described = {
         "type_description": _description(type_name),
         "referenced_type_descriptions": [_description(name) for name in nested],
@@ -63,8 +76,9 @@ def _description(type_name: str) -> dict[str, Any]:
 def _field(line: str) -> dict[str, Any]:
     match = _FIELD.match(line)
     assert match is not None, line
-    base, count, name = match.groups()
-    type_id = _TYPE_IDS.get(base, _NESTED) + (0 if count is None else _FIXED_ARRAY if count else _SEQUENCE)
+    base, is_bounded, count, name = match.groups()
+    array = 0 if count is None else _BOUNDED if is_bounded else _FIXED_ARRAY if count else _SEQUENCE
+    type_id = _TYPE_IDS.get(base, _NESTED) + array
     nested = "" if base in _TYPE_IDS else _long(base)
     shape = {"type_id": type_id, "capacity": int(count or 0), "string_capacity": 0, "nested_type_name": nested}
     return {"name": name, "type": shape}
@@ -80,10 +94,11 @@ def _nested(type_name: str) -> set[str]:
 
 
 def _long(type_name: str) -> str:
-    return type_name.replace("/", "/msg/")
+    return type_name if type_name.count("/") == 2 else type_name.replace("/", "/msg/")
 
 
-def _chunks(topic: str) -> str:
+def topic_chunks(topic: str) -> str:
+    """The chunks of a topic's or service's name in a key; UsageError for what is no name."""
     chunks = topic.strip("/")
     if not chunks or not all(re.fullmatch(r"[A-Za-z_]\w*", chunk) for chunk in chunks.split("/")):
         raise UsageError(f"topic {topic!r}: write it like /cam0/image_raw, of letters, digits and _")

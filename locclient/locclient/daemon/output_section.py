@@ -1,0 +1,29 @@
+"""Settings of what a robot tells its own programs."""
+
+from fleetmap.config import Section
+
+
+class OutputSection(Section, frozen=True):
+    """Format and endpoint of estimates. Without an endpoint they go to the map server's, or nowhere where there is none."""
+
+    format: str = "messagepack"
+    endpoint: str | None = None
+    map: str | None = None
+    autostart: bool = True
+    domain: int = 0
+    keys: str = "rmw_zenoh"
+    namespace: str = ""
+    node: str = "fleetmap_localizer"
+    pose_topic: str = "amcl_pose"
+    initial_pose_topic: str = "initialpose"
+    odom_topic: str = "visual_odom"
+    status_topic: str = "localization/status"
+    map_topic: str = "map"
+    tf_topic: str = "tf"
+    map_frame: str = "map"
+    odom_frame: str = "odom"
+    base_frame: str = "base_link"
+    sensor_frames: str = "fleetmap_"
+    publish_odom: bool = True
+    is_map_server: bool = False
+    transform_tolerance_s: float = 0.0

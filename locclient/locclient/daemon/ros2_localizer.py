@@ -1,0 +1,297 @@
+"""The robot's localization as a managed node of ROS 2 and a drop-in for nav2's: topics, services, lifecycle, bond, diagnostics."""
+
+import logging
+import threading
+import time
+import uuid
+from collections import deque
+from pathlib import Path
+from urllib.parse import unquote, urlparse
+
+import numpy as np
+
+from fleetmap.bus import Bus, Ros2Node
+from fleetmap.errors import FleetmapError
+from fleetmap.failure_definition import radius_95_m
+from fleetmap.geometry import Array, se3_inverse, so3_log
+from fleetmap.messages import Status
+from fleetmap.occupancy_grid import GridImageError, MissingGridError, OccupancyGrid, read_grid
+from fleetmap.odometry import OdometryStatus
+from fleetmap.recordings.ros2.cdr import CdrWriter
+from fleetmap.recordings.ros2.graph import LATCHED, Qos, key_layout
+from fleetmap.recordings.ros2.messages import FrameLink, encode_frame_links, encode_prior, encode_text
+from fleetmap.recordings.ros2.navigation_messages import (
+    EMPTY,
+    BondStatus,
+    Diagnosis,
+    Motion,
+    decode_bond,
+    decode_initial_pose,
+    decode_text,
+    encode_bond,
+    encode_diagnostics,
+    encode_grid,
+    encode_loaded_map,
+    encode_motion,
+)
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import PositionPrior
+from fleetmap.sources.intake import Intake
+from locclient.daemon.lifecycle import (
+    TRANSITIONS,
+    LifecycleState,
+    Transition,
+    encode_events,
+    encode_state,
+    encode_states,
+    encode_transitions,
+    requested,
+)
+from locclient.daemon.output_section import OutputSection
+from locclient.localization.estimate import Estimate
+from locclient.robot.continuous_odom import PublishedPose
+
+_BOND_PERIOD_S, _BOND_TIMEOUT_S = 0.1, 4.0  # nav2's own
+_STUCK_S = 3.0  # without a word from the thread that localizes, after which the bond is not renewed
+_OK, _WARN, _ERROR = 0, 1, 2
+_LEVELS = {Status.TRACKING: _OK, Status.LOST: _ERROR}
+# nav2_msgs/srv/LoadMap
+_LOADED, _NO_MAP, _BAD_IMAGE, _BAD_ENTRIES = 0, 1, 2, 3
+# Of the motion between two frames: radians, metres, share of the distance; and where the odometry does not hold.
+_MEASURED, _GUESSED = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
+_log = logging.getLogger(__name__)
+
+
+class Ros2Localizer:
+    """A Publisher whose node shows in the graph from the start, and publishes while it is active.
+
+    Localization goes on in every state: an active node has a pose at once. Commands reach the robot through its intake.
+    """
+
+    def __init__(
+        self, bus: Bus, robot: str, section: OutputSection, calibration: RigCalibration, intake: Intake
+    ) -> None:
+        """Raises UsageError for names that are none, and FleetmapError for a grid that cannot be read."""
+        self._section, self._robot, self._calibration, self._intake = section, robot, calibration, intake
+        self._grid = None if section.map is None else read_grid(Path(section.map))
+        self._state = LifecycleState.ACTIVE if section.autostart else LifecycleState.UNCONFIGURED
+        self._lock = threading.Lock()  # of the state
+        self._last: tuple[Estimate, PublishedPose] | None = None
+        self._refused: deque[str] = deque(maxlen=1)
+        self._alive_s = time.monotonic()
+        self._bond: BondStatus | None = None
+        self._ended = threading.Event()
+        self._node = node = Ros2Node(bus, key_layout(section.keys, section.domain), section.node, section.namespace)
+        try:
+            self._declare(node)
+        except FleetmapError:
+            node.close()
+            raise
+        self._beats = threading.Thread(target=self._beat, name="bond", daemon=True)
+        self._beats.start()
+        if section.autostart:
+            self._send_latched()
+
+    def _declare(self, node: Ros2Node) -> None:
+        section = self._section
+        stamped = "geometry_msgs/PoseWithCovarianceStamped"
+        self._send_placement = node.publisher(section.pose_topic, stamped, LATCHED)
+        self._send_tf = node.publisher(section.tf_topic, "tf2_msgs/TFMessage", Qos(100))
+        self._send_tf_static = node.publisher(f"{section.tf_topic}_static", "tf2_msgs/TFMessage", LATCHED)
+        self._send_odom = node.publisher(section.odom_topic, "nav_msgs/Odometry")
+        self._send_status = node.publisher(section.status_topic, "std_msgs/String")
+        self._send_map = node.publisher(section.map_topic, "nav_msgs/OccupancyGrid", LATCHED)
+        self._send_diagnostics = node.publisher("/diagnostics", "diagnostic_msgs/DiagnosticArray")
+        self._send_bond = node.publisher("bond", "bond/Status")
+        self._send_event = node.publisher("~/transition_event", "lifecycle_msgs/TransitionEvent")
+        node.subscribe("bond", "bond/Status", self._hear_bond)
+        node.subscribe(section.initial_pose_topic, stamped, self._take_initial_pose)
+        node.serve("~/get_state", "lifecycle_msgs/srv/GetState", lambda _: encode_state(self._state))
+        node.serve("~/change_state", "lifecycle_msgs/srv/ChangeState", self._change_state)
+        node.serve("~/get_available_states", "lifecycle_msgs/srv/GetAvailableStates", lambda _: encode_states())
+        transitions = "lifecycle_msgs/srv/GetAvailableTransitions"
+        node.serve("~/get_available_transitions", transitions, lambda _: encode_transitions(self._next_transitions()))
+        graph = encode_transitions(TRANSITIONS, with_success=True)
+        node.serve("~/get_transition_graph", transitions, lambda _: graph)
+        node.serve("set_initial_pose", "nav2_msgs/srv/SetInitialPose", self._set_initial_pose)
+        node.serve("reinitialize_global_localization", "std_srvs/srv/Empty", self._search_anew)
+        node.serve("request_nomotion_update", "std_srvs/srv/Empty", lambda _: EMPTY)
+        for name in ("~/load_map", *(["map_server/load_map"] if section.is_map_server else [])):
+            node.serve(name, "nav2_msgs/srv/LoadMap", self._load_map)
+
+    # --- called by the thread that localizes --------------------------------------------------------------------------
+
+    def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
+        """See Publisher. A pose is sent only with its covariance, and is that of the base in the map."""
+        before, self._last = self._last, (estimate, published)
+        if self._state is not LifecycleState.ACTIVE:
+            return
+        section, stamp_ns = self._section, estimate.stamp_ns
+        if published.map_from_odom is not None:
+            ahead_ns = stamp_ns + int(section.transform_tolerance_s * 1e9)
+            link = FrameLink(section.map_frame, section.odom_frame, published.map_from_odom)
+            self._send_tf(encode_frame_links(ahead_ns, [link]))
+            if estimate.cov_rot_trans is not None:
+                map_from_base = published.map_from_odom @ published.odom_from_base
+                prior = PositionPrior(stamp_ns, map_from_base, np.asarray(estimate.cov_rot_trans))
+                self._send_placement(encode_prior(prior, section.map_frame))
+        if section.publish_odom:
+            link = FrameLink(section.odom_frame, section.base_frame, published.odom_from_base)
+            self._send_tf(encode_frame_links(stamp_ns, [link]))
+        if before is not None and estimate.odometry.scale_known and stamp_ns > before[0].stamp_ns:
+            motion = motion_between(before, (estimate, published), base_from_body)
+            self._send_odom(encode_motion(stamp_ns, section.odom_frame, section.base_frame, motion))
+        self._send_status(encode_text(estimate.status.value))
+
+    def alive(self, is_silent: bool) -> None:
+        """See Publisher."""
+        self._alive_s = time.monotonic()
+        self._send_diagnostics(encode_diagnostics(time.time_ns(), [self._diagnosis(is_silent)]))
+
+    def _diagnosis(self, is_silent: bool) -> Diagnosis:
+        estimate = None if self._last is None else self._last[0]
+        level, words = _WARN, "no frame yet"
+        values = {"lifecycle": self._state.name.lower()}
+        if estimate is not None:
+            level = _LEVELS.get(estimate.status, _WARN)
+            words = f"{estimate.status.value}: {estimate.cause.value}" if estimate.cause else estimate.status.value
+            values |= {
+                "status": estimate.status.value,
+                "cause": estimate.cause.value,
+                "map_version": "none" if estimate.map_version is None else str(estimate.map_version),
+                "refused": estimate.refused,
+                "calibration": estimate.calibration.text,
+            }
+            if estimate.cov_rot_trans is not None:
+                values["radius_95_m"] = f"{radius_95_m(estimate.cov_rot_trans):.3f}"
+        if is_silent:
+            level, words = _ERROR, "no frames come"
+        if self._refused:
+            values["refused_initial_pose"] = self._refused[0]
+        return Diagnosis(level, f"{self._section.node}: localization", words, self._robot, values)
+
+    def close(self) -> None:
+        """See Publisher."""
+        self._ended.set()
+        self._beats.join()
+        self._break_bond()
+        self._node.close()
+
+    # --- called by threads of the bus ---------------------------------------------------------------------------------
+
+    def _next_transitions(self) -> list[Transition]:
+        return [transition for transition in TRANSITIONS if transition.start is self._state]
+
+    def _change_state(self, request: bytes) -> bytes:
+        with self._lock:
+            transition = requested(request, self._state)
+            if transition is None:
+                _log.warning("a transition was asked for that does not begin at %s", self._state.name.lower())
+                return CdrWriter().byte(0).message()
+            if transition.start is LifecycleState.ACTIVE:
+                self._break_bond()
+            self._state = transition.goal
+            if transition.goal is LifecycleState.ACTIVE:
+                self._send_latched()
+                self._bond = BondStatus(self._section.node, str(uuid.uuid4()), is_active=True)
+        for event in encode_events(time.time_ns(), transition):
+            self._send_event(event)
+        _log.info("the node is %s", transition.goal.name.lower())
+        return CdrWriter().byte(1).message()
+
+    def _set_initial_pose(self, request: bytes) -> bytes:
+        self._take_initial_pose(request)
+        return EMPTY
+
+    def _take_initial_pose(self, message: bytes) -> None:
+        try:
+            prior = decode_initial_pose(message, self._section.map_frame)
+        except (FleetmapError, ValueError) as error:
+            self._refused.append(str(error))
+            raise
+        self._refused.clear()
+        self._intake.put_prior(prior)
+
+    def _search_anew(self, _: bytes) -> bytes:
+        self._intake.put_forget()
+        return EMPTY
+
+    def _load_map(self, request: bytes) -> bytes:
+        result, grid = _LOADED, None
+        try:
+            grid = _grid_at(decode_text(request))
+        except FleetmapError as error:
+            _log.warning("load_map: %s", error)
+            kinds = {MissingGridError: _NO_MAP, GridImageError: _BAD_IMAGE}
+            result = kinds.get(type(error), _BAD_ENTRIES)
+        if grid is not None:
+            self._grid = grid
+            if self._state is LifecycleState.ACTIVE:
+                self._send_latched()
+        return encode_loaded_map(time.time_ns(), self._section.map_frame, grid, result)
+
+    def _send_latched(self) -> None:
+        now_ns = time.time_ns()
+        if self._section.sensor_frames:
+            links = sensor_links(self._section, self._calibration)
+            self._send_tf_static(encode_frame_links(now_ns, links))
+        if self._grid is not None:
+            self._send_map(encode_grid(now_ns, self._section.map_frame, self._grid))
+
+    # --- bond ---------------------------------------------------------------------------------------------------------
+
+    def _beat(self) -> None:
+        while not self._ended.wait(_BOND_PERIOD_S):
+            bond = self._bond
+            if bond is not None and time.monotonic() - self._alive_s < _STUCK_S:
+                self._tell_bond(bond)
+
+    def _hear_bond(self, message: bytes) -> None:
+        """Acknowledges the end of the other side, as bondcpp does; the node stays active."""
+        other, own = decode_bond(message), self._bond
+        if own is not None and other.bond == own.bond and other.instance != own.instance and not other.is_active:
+            self._break_bond()
+
+    def _break_bond(self) -> None:
+        bond, self._bond = self._bond, None
+        if bond is not None:
+            self._tell_bond(BondStatus(bond.bond, bond.instance, is_active=False))
+
+    def _tell_bond(self, bond: BondStatus) -> None:
+        try:
+            self._send_bond(encode_bond(time.time_ns(), bond, _BOND_TIMEOUT_S, _BOND_PERIOD_S))
+        except FleetmapError as error:
+            _log.debug("the bond was not renewed: %s", error)
+
+
+def motion_between(
+    before: tuple[Estimate, PublishedPose], after: tuple[Estimate, PublishedPose], base_from_body: Array
+) -> Motion:
+    """The motion of two frames one after another: a mean velocity over the time between them."""
+    (earlier, then), (estimate, now) = before, after
+    odometry, seconds = estimate.odometry, (estimate.stamp_ns - earlier.stamp_ns) * 1e-9
+    step = se3_inverse(then.odom_from_base) @ now.odom_from_base
+    twist = np.concatenate([step[:3, 3], so3_log(step[:3, :3])]) / seconds
+    turn_rad, floor_m, share = _GUESSED if odometry.status is OdometryStatus.DEGRADED else _MEASURED
+    sigma_m = floor_m + share * float(np.linalg.norm(step[:3, 3]))
+    twist_cov = np.diag([(sigma_m / seconds) ** 2] * 3 + [(turn_rad / seconds) ** 2] * 3)
+    # The odometry's own frame may be turned against the published one.
+    published_from_odometry = (now.odom_from_base @ base_from_body)[:3, :3] @ odometry.odom_from_body[:3, :3].T
+    both = np.kron(np.eye(2), published_from_odometry)
+    return Motion(now.odom_from_base, both @ odometry.cov_rot_trans @ both.T, twist, twist_cov)
+
+
+def sensor_links(section: OutputSection, calibration: RigCalibration) -> list[FrameLink]:
+    """base -> body, and body -> each camera, under names that no URDF has: PREFIXbody, PREFIXcam0 and so on."""
+    body = f"{section.sensor_frames}body"
+    links = [FrameLink(section.base_frame, body, calibration.base_from_body)]
+    for number, camera in enumerate(calibration.cameras):
+        links.append(FrameLink(body, f"{section.sensor_frames}cam{number}", camera.body_from_cam))
+    return links
+
+
+def _grid_at(url: str) -> OccupancyGrid:
+    parsed = urlparse(url)
+    if parsed.scheme not in {"", "file"}:
+        raise MissingGridError(f"{url!r}: without ROS only files are found; write file:///path/to/map.yaml")
+    return read_grid(Path(unquote(parsed.path)))

@@ -1,0 +1,94 @@
+"""A node of ROS 2's graph without ROS: publishers, subscriptions and services on a participant of the bus."""
+
+import hashlib
+import logging
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from itertools import count
+
+from fleetmap.bus.protocol import Bus
+from fleetmap.errors import FleetmapError, RecordingError
+from fleetmap.recordings.ros2.graph import PUBLISHER, SERVICE, SUBSCRIPTION, Endpoint, KeyLayout, NodeName, Qos
+from fleetmap.recordings.ros2.keys import answer_attachment, attachment
+
+Send = Callable[[bytes], None]
+_GID_BYTES = 16
+_log = logging.getLogger(__name__)
+
+
+class Ros2Node:
+    """Everything that is declared shows in ROS's graph until `close`. Names resolve as in ROS: /absolute, relative, ~/private."""
+
+    def __init__(self, bus: Bus, layout: KeyLayout, name: str, namespace: str = "") -> None:
+        """namespace: empty or /like/this."""
+        self._bus, self._layout = bus, layout
+        self.name = NodeName(bus.session_id(), name, namespace.rstrip("/"))
+        self._numbers = count(1)
+        self._declared = ExitStack()
+        self._declared.callback(bus.declare_alive(layout.node_token(self.name)).close)
+
+    def resolved(self, name: str) -> str:
+        """The fully qualified name of a topic or service."""
+        if name.startswith("~/"):
+            return f"{self.name.namespace}/{self.name.name}{name[1:]}"
+        return name if name.startswith("/") else f"{self.name.namespace}/{name}"
+
+    def publisher(self, topic: str, type_name: str, qos: Qos = Qos()) -> Send:  # noqa: B008 - a value
+        """Sends messages. Of latched ones the last is kept; of others one that cannot be sent at once is dropped."""
+        endpoint = self._endpoint(PUBLISHER, topic, type_name, qos)
+        key = self._layout.key(endpoint.name, type_name)
+        # Subscribers of rmw_zenoh count lost messages by name and number of their publisher: each needs its own.
+        gid = hashlib.sha256(self._layout.token(self.name, endpoint).encode()).digest()[:_GID_BYTES]
+        numbers = count(1)
+        latched = self._bus.latched_publisher(key) if qos.is_transient_local else None
+        if latched is not None:
+            self._declared.callback(latched.close)
+
+        def send(payload: bytes) -> None:
+            note = attachment(next(numbers), time.time_ns(), gid)
+            if latched is not None:
+                latched.put(payload, note)
+            else:
+                self._bus.publish(key, payload, may_drop=True, attachment=note)
+
+        self._show(endpoint)
+        return send
+
+    def subscribe(self, topic: str, type_name: str, listen: Callable[[bytes], None]) -> None:
+        """Calls `listen` with every message, on a thread of the bus; one that it refuses (FleetmapError) or cannot read is logged."""
+        endpoint = self._endpoint(SUBSCRIPTION, topic, type_name, Qos())
+
+        def take(_: str, payload: bytes) -> None:
+            try:
+                listen(payload)
+            except (FleetmapError, ValueError) as error:
+                _log.warning("%s: %s", endpoint.name, error)
+
+        self._declared.callback(self._bus.subscribe(self._layout.key(endpoint.name, type_name), take).close)
+        self._show(endpoint)
+
+    def serve(self, service: str, type_name: str, answer: Callable[[bytes], bytes]) -> None:
+        """Answers requests, on a thread of the bus. A request that cannot be read or is refused gets an error: its client logs it."""
+        endpoint = self._endpoint(SERVICE, service, type_name, Qos())
+
+        def reply(_: str, payload: bytes) -> bytes:
+            try:
+                return answer(payload)
+            except ValueError as error:
+                raise RecordingError(f"{endpoint.name}: the request is no {type_name} ({error})") from error
+
+        key = self._layout.key(endpoint.name, type_name)
+        echo = lambda question: answer_attachment(question, time.time_ns())  # noqa: E731
+        self._declared.callback(self._bus.queryable(key, reply, echo).close)
+        self._show(endpoint)
+
+    def close(self) -> None:
+        """Takes everything back."""
+        self._declared.close()
+
+    def _endpoint(self, kind: str, name: str, type_name: str, qos: Qos) -> Endpoint:
+        return Endpoint(kind, self.resolved(name), type_name, next(self._numbers), qos)
+
+    def _show(self, endpoint: Endpoint) -> None:
+        self._declared.callback(self._bus.declare_alive(self._layout.token(self.name, endpoint)).close)

@@ -1,0 +1,134 @@
+"""Names of a ROS 2 node in zenoh: keys of its topics and services, and the liveliness tokens that show them in ROS's graph.
+
+Sources: rmw_zenoh's design document (topic and service names, graph cache); the README of zenoh-plugin-ros2dds, whose bridge carries topics
+and services of DDS under their bare names.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from fleetmap.errors import UsageError
+from fleetmap.recordings.ros2.keys import dds_type, ros_key, ros_key_expr, topic_chunks, type_hash, type_of_key
+
+PUBLISHER, SUBSCRIPTION, SERVICE = "MP", "MS", "SS"
+
+
+@dataclass(frozen=True, slots=True)
+class Qos:
+    """Quality of service, always reliable: how many messages are kept, and whether late subscribers get them (transient local)."""
+
+    depth: int = 10
+    is_transient_local: bool = False
+
+
+LATCHED = Qos(1, is_transient_local=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """One publisher, subscription or service of a node. name: fully qualified, such as /tf; number: its own in the node, above 0."""
+
+    kind: str
+    name: str
+    type_name: str
+    number: int
+    qos: Qos = Qos()
+
+
+@dataclass(frozen=True, slots=True)
+class NodeName:
+    """A node in ROS's graph. namespace: empty or /like/this; session: the id of its zenoh session."""
+
+    session: str
+    name: str
+    namespace: str = ""
+
+
+class KeyLayout(Protocol):
+    """How keys are made of ROS names."""
+
+    def key(self, name: str, type_name: str) -> str:
+        """The key of a topic or service."""
+
+    def subscription(self, topic: str) -> str:
+        """Matches the keys of a topic, whatever its type."""
+
+    def type_of(self, key: str) -> str:
+        """The message type of a key; empty where it names none."""
+
+    def node_token(self, node: NodeName) -> str:
+        """The token of a node."""
+
+    def token(self, node: NodeName, endpoint: Endpoint) -> str:
+        """The token of one of its endpoints."""
+
+
+class RmwZenohKeys:
+    """Keys as rmw_zenoh makes them, from ROS 2 Iron on: earlier ones have no hashes of types."""
+
+    def __init__(self, domain: int) -> None:
+        self._domain = domain
+
+    def key(self, name: str, type_name: str) -> str:
+        """See KeyLayout."""
+        return ros_key(self._domain, name, type_name)
+
+    def subscription(self, topic: str) -> str:
+        """See KeyLayout."""
+        return ros_key_expr(self._domain, topic)
+
+    def type_of(self, key: str) -> str:
+        """See KeyLayout."""
+        return type_of_key(key)
+
+    def node_token(self, node: NodeName) -> str:
+        """See KeyLayout."""
+        return f"@ros2_lv/{self._domain}/{node.session}/0/0/NN/{self._place(node)}"
+
+    def token(self, node: NodeName, endpoint: Endpoint) -> str:
+        """See KeyLayout. The quality of service leaves out what is rmw_zenoh's default: reliable 1, volatile 2, keep last 1, 42."""
+        name, kind = f"%{topic_chunks(endpoint.name).replace('/', '%')}", dds_type(endpoint.type_name)
+        qos = f":{'1' if endpoint.qos.is_transient_local else ''}:,{endpoint.qos.depth}:,:,:,,"
+        start = f"@ros2_lv/{self._domain}/{node.session}/0/{endpoint.number}/{endpoint.kind}"
+        return f"{start}/{self._place(node)}/{name}/{kind}/RIHS01_{type_hash(endpoint.type_name)}/{qos}"
+
+    @staticmethod
+    def _place(node: NodeName) -> str:
+        return f"%/{node.namespace.replace('/', '%') or '%'}/{node.name}"
+
+
+class BridgedDdsKeys:
+    """Keys as zenoh-bridge-ros2dds makes them for robots on DDS."""
+
+    def key(self, name: str, _: str) -> str:
+        """See KeyLayout."""
+        return topic_chunks(name)
+
+    def subscription(self, topic: str) -> str:
+        """See KeyLayout."""
+        return topic_chunks(topic)
+
+    def type_of(self, _: str) -> str:
+        """See KeyLayout."""
+        return ""
+
+    def node_token(self, node: NodeName) -> str:
+        """See KeyLayout. To a bridge a node is another bridge."""
+        return f"@/{node.session}/@ros2_lv"
+
+    def token(self, node: NodeName, endpoint: Endpoint) -> str:
+        """See KeyLayout. The quality of service is in Cyclone DDS's numbers: reliable 1, transient local 1, keep last 0."""
+        name, (package, *_, short) = topic_chunks(endpoint.name).replace("/", "§"), endpoint.type_name.split("/")
+        if endpoint.kind == SERVICE:
+            return f"@/{node.session}/@ros2_lv/SS/{name}/{package}§srv§{short}"
+        qos = f":1:{int(endpoint.qos.is_transient_local)}:0,{endpoint.qos.depth}:typehash=RIHS01_{type_hash(endpoint.type_name)};"
+        return f"@/{node.session}/@ros2_lv/{endpoint.kind}/{name}/{package}§msg§{short}/{qos}"
+
+
+def key_layout(name: str, domain: int) -> KeyLayout:
+    """`rmw_zenoh` or `ros2dds`; UsageError for another name."""
+    if name == "ros2dds":
+        return BridgedDdsKeys()
+    if name != "rmw_zenoh":
+        raise UsageError(f"keys = {name!r}; known are rmw_zenoh and, for robots on DDS, ros2dds")
+    return RmwZenohKeys(domain)
