@@ -1,30 +1,65 @@
 """Inner loops of corner selection and orientation."""
 
+from collections.abc import Callable
+from typing import Any, cast
+
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetmap.numerics.kernel import kernel
 
+HALF_WINDOW = 3
+
+
+def _gradient_sums_at(typing_context: Any, pixel: Any, row_bytes: Any) -> Any:
+    """Sums of xx, xy, yy of the gradients in the window around the pixel at an address: a row of eight pixels at once, less the last."""
+    return cast(Any, types).UniTuple(types.int64, 3)(types.int64, types.int64), _emit_gradient_sums
+
+
+def _emit_gradient_sums(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    pixel, row_bytes = arguments
+    narrow, word = ir.VectorType(ir.IntType(8), 8), ir.IntType(64)
+    lane, counted = ir.VectorType(ir.IntType(32), 8), ir.VectorType(ir.IntType(32), 8)([-1] * 7 + [0])
+
+    def grey(u: int, v: int) -> Any:
+        at = builder.add(builder.add(pixel, builder.mul(row_bytes, word(v))), word(u))
+        return builder.zext(builder.load(builder.inttoptr(at, narrow.as_pointer()), align=1), lane)
+
+    rows = range(-HALF_WINDOW, HALF_WINDOW + 1)
+    centres = {v: grey(-HALF_WINDOW, v) for v in range(-HALF_WINDOW - 1, HALF_WINDOW + 2)}
+    along = [builder.sub(grey(1 - HALF_WINDOW, v), grey(-1 - HALF_WINDOW, v)) for v in rows]
+    down = [builder.sub(centres[v + 1], centres[v - 1]) for v in rows]
+    sums = []
+    for one, other in ((along, along), (along, down), (down, down)):
+        total = lane(None)
+        for a, b in zip(one, other, strict=True):
+            total = builder.add(total, builder.mul(a, b))
+        total = builder.and_(total, counted)
+        for step in (4, 2, 1):
+            order = ir.VectorType(ir.IntType(32), 8)([(k + step) % 8 for k in range(8)])
+            total = builder.add(total, builder.shuffle_vector(total, lane(ir.Undefined), order))
+        sums.append(builder.sext(builder.extract_element(total, ir.IntType(32)(0)), word))
+    return context.make_tuple(builder, signature.return_type, sums)
+
+
+_gradient_sums = cast(Callable[..., tuple[int, int, int]], intrinsic(_gradient_sums_at))
+
 
 @kernel
-def min_eigenvalue_scores(image: NDArray[np.uint8], pixels: NDArray[np.float32], half: int) -> Array:
-    """(N,) smaller eigenvalue of the gradient matrix in a (2 half + 1)^2 window. Source: Shi and Tomasi 1994."""
+def min_eigenvalue_scores(image: NDArray[np.uint8], pixels: NDArray[np.float32]) -> Array:
+    """(N,) smaller eigenvalue of the gradient matrix in a window of HALF_WINDOW. Source: Shi and Tomasi 1994."""
     height, width = image.shape
-    scores = np.zeros(len(pixels))
+    scores, rim = np.zeros(len(pixels)), HALF_WINDOW + 1
+    image_at, row_bytes = np.int64(image.ctypes.data), np.int64(image.strides[0])
     for n in range(len(pixels)):
         x, y = int(pixels[n, 0]), int(pixels[n, 1])
-        if x < half + 1 or y < half + 1 or x >= width - half - 1 or y >= height - half - 1:
-            continue
-        xx, xy, yy = np.int64(0), np.int64(0), np.int64(0)
-        window = image[y - half - 1 : y + half + 2, x - half - 1 : x + half + 2]
-        for v in range(1, 2 * half + 2):
-            for u in range(1, 2 * half + 2):
-                gx = np.int32(window[v, u + 1]) - np.int32(window[v, u - 1])
-                gy = np.int32(window[v + 1, u]) - np.int32(window[v - 1, u])
-                xx += gx * gx
-                xy += gx * gy
-                yy += gy * gy
+        if x < rim or y < rim or x >= width - rim or y >= height - rim:
+            continue  # of the eighth pixel of a row the window's last row but one still has a next row behind it
+        xx, xy, yy = _gradient_sums(image_at + y * row_bytes + x, row_bytes)
         mean = 0.5 * (xx + yy)
         scores[n] = mean - np.sqrt(max(mean * mean - (float(xx) * float(yy) - float(xy) * float(xy)), 0.0))
     return scores

@@ -10,7 +10,6 @@ from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Image
 
 Pixels = NDArray[np.float32]
-_HALF_WINDOW = 3
 
 
 def fast_corners(image: Image, threshold: int, border_px: int = 3, free: NDArray[np.uint8] | None = None) -> Pixels:
@@ -57,7 +56,7 @@ def spread_corners(
         held, free = taken.astype(np.float32), np.full(image.shape, 255, np.uint8)
         clear_discs(free, held, min_distance_px)
     candidates = corner_candidates(image, 2 * count, threshold, border_px, free)
-    scores = min_eigenvalue_scores(image, candidates, _HALF_WINDOW)
+    scores = min_eigenvalue_scores(image, candidates)
     shown = scores > 0
     return select_best(candidates[shown], scores[shown], held, min_distance_px, count, (width, height))
 

@@ -111,6 +111,6 @@ def _detect_level(
         else np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
     )
     candidates = corner_candidates(scaled, 2 * quota, settings.fast_threshold, _BORDER_PX)
-    scores, nothing = min_eigenvalue_scores(scaled, candidates, 3), np.zeros((0, 2), np.float32)
+    scores, nothing = min_eigenvalue_scores(scaled, candidates), np.zeros((0, 2), np.float32)
     chosen = select_best(candidates, scores, nothing, settings.min_distance_px, quota, (width, height))
     return (scale * chosen.astype(np.float64)).astype(np.float32), centroid_angles_deg(scaled, chosen, _PATCH_RADIUS)

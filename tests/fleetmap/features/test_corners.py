@@ -56,8 +56,8 @@ def test_scores_are_the_smaller_eigenvalue(image: NDArray[np.uint8]) -> None:
         window = np.s_[y - 3 : y + 4, x - 3 : x + 4]
         gradients = np.stack([gx[window].ravel(), gy[window].ravel()])
         expected.append(np.linalg.eigvalsh(gradients @ gradients.T)[0])
-    np.testing.assert_allclose(min_eigenvalue_scores(image, pixels, 3), expected, rtol=1e-9, atol=1e-6)
-    assert min_eigenvalue_scores(image, np.array([[1.0, 1.0]], np.float32), 3)[0] == 0
+    np.testing.assert_allclose(min_eigenvalue_scores(image, pixels), expected, rtol=1e-9, atol=1e-6)
+    assert min_eigenvalue_scores(image, np.array([[1.0, 1.0]], np.float32))[0] == 0
 
 
 def test_angles_turn_with_the_picture(image: NDArray[np.uint8]) -> None:
@@ -138,7 +138,7 @@ def test_corners_are_those_of_the_whole_image(image: NDArray[np.uint8], taken_co
         everywhere = fast_corners(image, 6)
     size = np.array([WIDTH, HEIGHT])
     found = everywhere[((everywhere >= border_px) & (everywhere < size - border_px)).all(axis=1)]
-    scores = min_eigenvalue_scores(image, found, 3)
+    scores = min_eigenvalue_scores(image, found)
     order = np.argsort(-scores, kind="stable")
     order = order[scores[order] > 0]
     expected = found[select_spread(found, order, taken, distance_px, count, WIDTH, HEIGHT)]
