@@ -1,6 +1,6 @@
 """Selection of keyframe pairs to match, and checks of the measured motion against the predicted one."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -120,7 +120,7 @@ class NearPlaces:
             reach_m, place_m = max(float(self._reach_m[j]), width_m), self._positions_m[j, :2]
             low, high = (np.floor((place_m + side * reach_m) / width_m).astype(np.int64) for side in (-1.0, 1.0))
             (x, y), (columns, rows) = low.tolist(), (high - low + 1).tolist()
-            around = cells.values()
+            around: Iterable[list[int]] = cells.values()
             if columns * rows < len(cells):
                 around = [cells.get((x + n % columns, y + n // columns), _NOBODY) for n in range(columns * rows)]
             found += [k for cell in around for k in cell]
