@@ -1,0 +1,209 @@
+"""Every ROS 2 message that the project writes is read by rosbags, an independent library, with the values that went in."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from fleetmap.geometry import quat_wxyz_from_rotation, se3, so3_exp
+from fleetmap.occupancy_grid import OccupancyGrid
+from fleetmap.recordings.images import grey_image, png_image
+from fleetmap.recordings.ros2 import messages
+from fleetmap.recordings.ros2.definitions import DEFINITIONS, service_definitions
+from fleetmap.recordings.ros2.graph import LATCHED, BridgedDdsKeys, Endpoint, NodeName, Qos, RmwZenohKeys
+from fleetmap.recordings.ros2.keys import type_hash
+from fleetmap.recordings.ros2.navigation_messages import (
+    EMPTY,
+    BondStatus,
+    Diagnosis,
+    Motion,
+    decode_bond,
+    encode_bond,
+    encode_diagnostics,
+    encode_grid,
+    encode_loaded_map,
+    encode_motion,
+)
+from fleetmap.sensors.samples import PositionPrior, WheelSample
+from locclient.daemon.lifecycle import (
+    TRANSITIONS,
+    LifecycleState,
+    encode_events,
+    encode_state,
+    encode_states,
+    encode_transitions,
+)
+from support.fleet.nav2_client import message_name, typestore
+from support.recordings.recording_samples import calibration
+
+STAMP_NS = 1_700_000_000_123_456_789
+PLACE = se3(so3_exp(np.array([0.1, -0.2, 0.7])), np.array([1.5, -2.5, 0.25]))
+COV = np.diag([1.0, 2, 3, 4, 5, 6])
+MOTION = Motion(PLACE, COV, np.arange(6.0), np.diag(np.arange(6.0)))
+GRID = OccupancyGrid(np.array([[0, 100, -1], [50, 0, 0]], np.int8), 0.05, PLACE)
+DIAGNOSES = [Diagnosis(2, "a", "bc", "r1", {"k": "v", "": "ü"}), Diagnosis(0, "", "", "", {})]
+STORE = typestore()
+
+
+@dataclass(frozen=True)
+class Written:
+    """Bytes of one message, its type, and what must be read from it, by path."""
+
+    type_name: str
+    data: bytes
+    expected: dict[str, object]
+
+
+def response(service: str) -> str:
+    return message_name(service, "Response")
+
+
+def stamped(type_name: str, data: bytes, frame: str, /, **expected: object) -> Written:
+    wanted = {"header.stamp.sec": 1_700_000_000, "header.stamp.nanosec": 123_456_789, "header.frame_id": frame}
+    return Written(type_name, data, wanted | {key.replace("__", "."): value for key, value in expected.items()})
+
+
+def written() -> list[Written]:
+    camera, wheel = calibration().cameras[0], WheelSample(STAMP_NS, np.array([1.0, 2, 3]), 0.5, 0.1, 0.2)
+    link = messages.FrameLink("map", "odom", PLACE)
+    xyzw = quat_wxyz_from_rotation(PLACE[:3, :3])[[1, 2, 3, 0]]
+    image, prior = grey_image(np.arange(6, dtype=np.uint8).reshape(2, 3)), PositionPrior(STAMP_NS, PLACE, COV)
+    event = encode_events(STAMP_NS, TRANSITIONS[2])[0]
+    transitions = encode_transitions(TRANSITIONS, with_success=True)
+    return [
+        stamped("sensor_msgs/msg/Image", messages.encode_image(STAMP_NS, "c", image), "c", width=3, height=2, data=np.arange(6)),
+        stamped(
+            "sensor_msgs/msg/CompressedImage",
+            messages.encode_compressed_image(STAMP_NS, "c", png_image(np.eye(3, dtype=np.uint8)), "png"), "c", format="png",
+        ),
+        stamped("sensor_msgs/msg/CameraInfo", messages.encode_camera_info(STAMP_NS, "c", camera), "c", width=camera.width_px),
+        stamped(
+            "sensor_msgs/msg/Imu", messages.encode_imu(STAMP_NS, "i", np.arange(3.0), np.arange(3.0, 6.0)), "i",
+            angular_velocity__z=2.0, linear_acceleration__x=3.0,
+        ),
+        stamped("nav_msgs/msg/Odometry", messages.encode_odometry(wheel, "o", "b"), "o", twist__twist__linear__y=2.0),
+        stamped(
+            "nav_msgs/msg/Odometry", encode_motion(STAMP_NS, "o", "b", MOTION), "o", child_frame_id="b",
+            pose__pose__position__y=-2.5, pose__pose__orientation__z=xyzw[2],
+            pose__covariance=np.diag([4.0, 5, 6, 1, 2, 3]).ravel(), twist__twist__linear__z=2.0,
+            twist__twist__angular__z=5.0, twist__covariance=np.diag(np.arange(6.0)).ravel(),
+        ),
+        stamped(
+            "geometry_msgs/msg/PoseWithCovarianceStamped", messages.encode_prior(prior, "map"), "map",
+            pose__pose__orientation__w=xyzw[3], pose__covariance=np.diag([4.0, 5, 6, 1, 2, 3]).ravel(),
+        ),
+        stamped("geometry_msgs/msg/PoseStamped", messages.encode_pose(STAMP_NS, "map", PLACE), "map", pose__position__x=1.5),
+        Written("tf2_msgs/msg/TFMessage", messages.encode_frame_links(STAMP_NS, [link]), {"transforms.0.child_frame_id": "odom"}),
+        stamped("nav_msgs/msg/Path", messages.encode_path(STAMP_NS, "map", np.ones((2, 3))), "map", poses__1__pose__position__z=1.0),
+        stamped("sensor_msgs/msg/PointCloud2", messages.encode_points(STAMP_NS, "map", np.ones((2, 3))), "map", width=2, is_dense=True),
+        Written("std_msgs/msg/String", messages.encode_text("LOST"), {"data": "LOST"}),
+        stamped(
+            "nav_msgs/msg/OccupancyGrid", encode_grid(STAMP_NS, "map", GRID), "map", info__width=3, info__height=2,
+            info__resolution=np.float32(0.05), info__origin__orientation__x=xyzw[0], data=np.array([0, 100, -1, 50, 0, 0]),
+        ),
+        stamped(
+            "diagnostic_msgs/msg/DiagnosticArray", encode_diagnostics(STAMP_NS, DIAGNOSES), "", status__0__message="bc",
+            status__0__values__1__value="ü", status__1__hardware_id="",
+        ),
+        stamped(
+            "bond/msg/Status", encode_bond(STAMP_NS, BondStatus("n", "i", is_active=True), 4.0, 0.5), "", id="n",
+            instance_id="i", active=True, heartbeat_timeout=4.0, heartbeat_period=0.5,
+        ),
+        Written("lifecycle_msgs/msg/TransitionEvent", event, {"timestamp": STAMP_NS, "goal_state.label": "activating"}),
+        Written(
+            response("lifecycle_msgs/srv/GetState"), encode_state(LifecycleState.ACTIVE),
+            {"current_state.id": 3, "current_state.label": "active"},
+        ),
+        Written(response("lifecycle_msgs/srv/GetAvailableStates"), encode_states(), {"available_states.10.label": "errorprocessing"}),
+        Written(
+            response("lifecycle_msgs/srv/GetAvailableTransitions"), transitions,
+            {"available_transitions.0.goal_state.id": 10, "available_transitions.7.transition.label": "transition_success"},
+        ),
+        Written(response("nav2_msgs/srv/LoadMap"), encode_loaded_map(STAMP_NS, "map", GRID, 0), {"result": 0, "map.info.width": 3}),
+        Written(response("nav2_msgs/srv/LoadMap"), encode_loaded_map(STAMP_NS, "map", None, 2), {"result": 2, "map.info.width": 0}),
+        Written(response("std_srvs/srv/Empty"), EMPTY, {}),
+    ]  # fmt: skip
+
+
+def at(message: Any, path: str) -> Any:
+    for part in path.split("."):
+        message = message[int(part)] if part.isdecimal() else getattr(message, part)
+    return message
+
+
+@pytest.mark.parametrize("one", written(), ids=lambda one: one.type_name)
+def test_an_independent_library_reads_what_is_written(one: Written) -> None:
+    message = STORE.deserialize_cdr(one.data, one.type_name)
+    for path, value in one.expected.items():
+        if isinstance(value, np.ndarray | float):
+            np.testing.assert_allclose(at(message, path), value, atol=1e-12)
+        else:
+            assert at(message, path) == value, path
+    assert bytes(STORE.serialize_cdr(message, one.type_name)) == one.data, "to the byte"
+
+
+def test_a_bond_is_read_back() -> None:
+    status = BondStatus("node", "instance", is_active=False)
+    assert decode_bond(encode_bond(STAMP_NS, status, 4.0, 0.1)) == status
+
+
+def test_hashes_of_messages_are_those_of_an_independent_library() -> None:
+    jazzy = get_typestore(Stores.ROS2_JAZZY)
+    # rosbags has no bond; it takes service_msgs' char for another type than rosidl's, as the services below show.
+    names = [
+        name
+        for name in DEFINITIONS
+        if name.count("/") == 1 and name not in ("bond/Status", "service_msgs/ServiceEventInfo")
+    ]
+    assert len(names) > 30
+    wrong = {name for name in names if jazzy.hash_rihs01(name.replace("/", "/msg/")) != f"RIHS01_{type_hash(name)}"}
+    assert wrong == set()
+    assert STORE.hash_rihs01("bond/msg/Status") == f"RIHS01_{type_hash('bond/Status')}"
+
+
+def test_hashes_of_services_are_those_that_ros_announces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """AddTwoInts: rmw_zenoh's design document. BasicTypes: a bag that rosbag2's own tests recorded."""
+    numbers = " ".join(f"{kind}{bits} {kind}{bits}_value\n" for bits in (8, 16, 32, 64) for kind in ("int", "uint"))
+    basic = "bool bool_value\nbyte byte_value\nuint8 char_value\nfloat32 float32_value\nfloat64 float64_value\n"
+    basic += "\n".join(line.strip() for line in numbers.splitlines()) + "\nstring string_value"
+    for name, fields in {
+        "example_interfaces/srv/AddTwoInts": ("int64 a\nint64 b", "int64 sum"),
+        "test_msgs/srv/BasicTypes": (basic, basic),
+    }.items():
+        for key, text in service_definitions(name, *fields).items():
+            monkeypatch.setitem(DEFINITIONS, key, text)
+    assert type_hash("example_interfaces/srv/AddTwoInts").startswith(
+        "e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30"
+    )
+    assert type_hash("test_msgs/srv/BasicTypes_Event").startswith(
+        "5b9988a4805a06ae22dff12903a774ccda710e9514926b826ffc8"
+    )
+
+
+def test_tokens_are_those_of_rmw_zenoh_and_of_the_bridge() -> None:
+    """As the design document of the one and the plugin's own key expressions have them."""
+    text, talker = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18", NodeName("8b20", "talker")
+    chatter = Endpoint("MP", "/chatter", "std_msgs/String", 10, Qos(7))
+    rmw, bridge = RmwZenohKeys(2), BridgedDdsKeys()
+    assert rmw.node_token(talker) == "@ros2_lv/2/8b20/0/0/NN/%/%/talker"
+    assert rmw.token(talker, chatter) == (
+        f"@ros2_lv/2/8b20/0/10/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/{text}/::,7:,:,:,,"
+    )
+    named = NodeName("8b20", "talker", "/robot1")
+    assert "/%/%robot1/talker/%robot1%chatter/" in rmw.token(
+        named, Endpoint("MS", "/robot1/chatter", "std_msgs/String", 1)
+    )
+    assert rmw.key("/robot1/chatter", "std_msgs/String") == f"2/robot1/chatter/std_msgs::msg::dds_::String_/{text}"
+    assert rmw.key("/n/get_state", "lifecycle_msgs/srv/GetState").startswith(
+        "2/n/get_state/lifecycle_msgs::srv::dds_::GetState_/"
+    )
+    latched = Endpoint("MP", "/robot1/chatter", "std_msgs/String", 1, LATCHED)
+    assert (
+        bridge.token(talker, latched)
+        == f"@/8b20/@ros2_lv/MP/robot1§chatter/std_msgs§msg§String/:1:1:0,1:typehash={text};"
+    )
+    service = Endpoint("SS", "/n/get_state", "lifecycle_msgs/srv/GetState", 1)
+    assert bridge.token(talker, service) == "@/8b20/@ros2_lv/SS/n§get_state/lifecycle_msgs§srv§GetState"
+    assert bridge.key("/n/get_state", "lifecycle_msgs/srv/GetState") == "n/get_state"
