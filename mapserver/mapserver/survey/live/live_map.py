@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3, se3_inverse
+from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse
 from fleetmap.live_survey import LivePart, LiveRevisit
 from fleetmap.messages import Cause, Status
 from fleetmap.sensors.rectification import RectifiedFrame
-from mapserver.survey.bundle.bundle_adjustment import RelativeTerm, optimize
+from mapserver.survey.bundle.bundle_adjustment import MotionPrior, RelativeTerm, optimize
 from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState, apply_result, bundle_problem
 from mapserver.survey.keyframes.connected_components import MIN_SHARED, SigmaBetween, bridges
 from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, make_keyframe, without_pictures
@@ -166,13 +166,13 @@ class LiveMap:
             if self._depths is not None:
                 self._depths.release(len(self._keyframes) - _WINDOW - 1)
         self._news.append(new)
-        self._level = new.level_from_frame
         self._points_body.append(np.zeros((0, 3)))
         self._seeing = np.append(self._seeing, False)
         for parts in (self._parts, self._joined):
             parts.grow(len(self))
         if len(self._keyframes) == 1:
             self._chain_from_body.append(new.frame_from_body)
+            self._level = self._upright()
             self._map_from_body = new.frame_from_body[None].copy()
             return
         before = self._news[-2]
@@ -180,6 +180,7 @@ class LiveMap:
         assert new.step_cov is not None
         self._walked_m2.append(self._walked_m2[-1] + float(np.trace(new.step_cov[3:, 3:])))
         self._chain_from_body.append(self._chain_from_body[-1] @ motion)
+        self._level = self._upright()
         first = max(0, len(self._keyframes) - _WINDOW)
         self._place_features(first)
         found = self._matched(first)
@@ -190,6 +191,12 @@ class LiveMap:
         self._follow(first)
         self._connect(first)
         self._close()
+
+    def _upright(self) -> Array:
+        """(3, 3) turn of the chain that makes the newest keyframe as upright as odometry knows it: windows have turned the chain."""
+        new, up = self._news[-1], np.array([0.0, 0.0, 1.0])
+        up_body = (new.level_from_frame @ new.frame_from_body[:3, :3]).T @ up
+        return rotation_between_vectors(self._chain_from_body[-1][:3, :3] @ up_body, up)
 
     def _matched(self, first: int) -> list[PairMatch]:
         """The newest keyframe with those of the window that see the same."""
@@ -235,7 +242,16 @@ class LiveMap:
             return
         held = min(_HELD, len(state.stamps_ns) - 1) if first else 1
         free = np.arange(len(state.stamps_ns)) >= held
-        result = optimize(bundle_problem(state, self._settings, free), self._settings.rough_bundle)
+        # With an IMU nothing of the chain's beginning is sure but where it is: with the tilt, the speed and the accelerometer bias that
+        # odometry began with, held, the scale of one camera would take up their errors.
+        is_open = first == 0 and state.motion.inertial
+        free |= is_open
+        problem = bundle_problem(state, self._settings, None if is_open else free)
+        if is_open and problem.inertial is not None:  # a second of it does not show the bias
+            sigma = np.full(9, np.inf)
+            sigma[6:] = self._settings.odometry.filter.initial_accel_bias_sigma_mps2
+            problem.inertial.priors.append(MotionPrior(0, np.zeros(9), sigma))
+        result = optimize(problem, self._settings.rough_bundle)
         keep = result.squared_sigmas < self._settings.noise.cut_sigmas**2
         state = apply_result(state, result)
         level_from_body = state.map_from_body
