@@ -1,13 +1,15 @@
 """A survey under way: frames are tracked as they come, the map grows beside, everybody may look, and a build ends it."""
 
+import gc
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from rich.console import Console
 
@@ -145,7 +147,9 @@ class _Survey:
         scratch = LiveTracking(drive.calibration, rectifier, request.settings)
         for frame in warm_up:
             scratch.handle(frame, ImuSamples.empty(), ())
-        with MappingProcess(self._maker(rig), rig, warm_up) as mapping:
+        del scratch
+        # One thread a process, and no search for garbage among what lives as long as the survey: a frame would wait for either.
+        with _one_thread(), MappingProcess(self._maker(rig), rig, warm_up) as mapping:
             self._track(LiveTracking(drive.calibration, rectifier, request.settings), mapping, is_stopped)
             mapping.finish()
             self._look(mapping)
@@ -274,6 +278,19 @@ class _Survey:
             map_from_odom=None if placed is None else Placement.of(placed @ se3_inverse(odom_from_body)),
             cov_rot_trans=None if cov is None else tuple(cov.ravel().tolist()),
         )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        cv2.setNumThreads(before)
 
 
 def frozen_version(store: Path, site: str, version: int) -> FrozenVersion:

@@ -1,6 +1,8 @@
 """Mapping beside tracking: a process of its own, so that no frame waits for it. It takes every keyframe, in order."""
 
+import gc
 import multiprocessing
+import os
 import queue
 import signal
 import threading
@@ -10,6 +12,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import NamedTuple, Protocol, Self
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +28,9 @@ _STOP_WITHIN_S = 120.0  # for the keyframes that wait
 MOST_PLACES = MAX_ARRAY_BYTES // 8  # x and y as float32
 _LOOK_EVERY_S = 2.0  # at what the drive lacks
 _MAX_WAITING = 256  # pictures of keyframes, 0.6 MB each
+_SHOW_WITHIN_S = 0.5  # a map that is behind is shown so often; one that is not, after every keyframe
+_DOCTOR_WAITING = 32  # keyframes that the doctor may look at later; the oldest go
+_NICENESS = 5  # below tracking, which answers frames
 
 
 class GrowingMap(Protocol):
@@ -101,7 +107,7 @@ class MappingProcess:
         self._waiting: queue.Queue[_Item | None] = queue.Queue()
         self._sent = 0
         self._latest, self._failed = NO_SKETCH, ""
-        self._put_s: deque[float] = deque()
+        self._put_s: deque[float] = deque()  # of keyframes that no sketch holds yet
         self.longest_lag_s = 0.0  # from a keyframe to the sketch that holds it
         self._threads = [threading.Thread(target=work, daemon=True) for work in (self._send, self._receive)]
 
@@ -182,8 +188,9 @@ class MappingProcess:
                 if isinstance(answer, str):
                     self._failed = answer
                     return
+                shown = answer.keyframes - self._latest.keyframes
                 self._latest = answer
-                if self._put_s:  # the last sketch of all answers no keyframe
+                for _ in range(shown):
                     self.longest_lag_s = max(self.longest_lag_s, time.monotonic() - self._put_s.popleft())
         except (EOFError, OSError):
             self._failed = self._failed or "the mapping process ended; the finished map is built all the same"
@@ -192,18 +199,33 @@ class MappingProcess:
 def _map(pipe: Connection, make: MakeMap, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...]) -> None:
     """The process: answers every keyframe with the map that it makes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the survey's own process says when it is over
+    os.nice(_NICENESS)
+    cv2.setNumThreads(1)  # the other core is tracking's
     _warm(make(), warm_up)
-    growing, doctor, quality, looked_s = make(), DriveDoctor(rig), _NO_QUALITY, 0.0
+    gc.freeze()
+    growing, doctor, quality, looked_s, shown_s = make(), DriveDoctor(rig), _NO_QUALITY, 0.0, 0.0
+    unseen: deque[_Item] = deque(maxlen=_DOCTOR_WAITING)
     try:
         pipe.send("ready")
-        while (item := pipe.recv()) is not None:
-            frame, keyframe, stamps_ns = item
+        while True:
+            if unseen and not pipe.poll():
+                doctor.take(*unseen.popleft())  # while nobody waits for the map
+                continue
+            item = pipe.recv()
+            if item is None:
+                break
+            frame, keyframe, _ = item
             growing.add(frame, keyframe)
-            if time.monotonic() - looked_s >= _LOOK_EVERY_S:
-                looked_s = time.monotonic()
-                quality = _quality(growing, rig, doctor)
+            unseen.append(item)
+            now_s = time.monotonic()
+            if pipe.poll() and now_s - shown_s < _SHOW_WITHIN_S:
+                continue
+            if now_s - looked_s >= _LOOK_EVERY_S:
+                looked_s, quality = now_s, _quality(growing, rig, doctor)
             pipe.send(sketch_of(growing, quality))
-            doctor.take(frame, keyframe, stamps_ns)  # after the answer, which nobody waits for it with
+            shown_s = time.monotonic()
+        for item in unseen:
+            doctor.take(*item)
         pipe.send(sketch_of(growing, _quality(growing, rig, doctor)))
         pipe.send(None)
     except (EOFError, OSError):  # the survey was killed
