@@ -79,7 +79,7 @@ def live(
     with (
         _drive(recording, sensors, record, build, speed) as (drive, settings),
         _bus(server, store) as bus,
-        _bus(ros2, store) as viewers,
+        _bus(ros2, store, is_ros=True) as viewers,
     ):
         request = LiveRequest(site, store, settings, build, version)
         result = run_live(request, drive, _teller(bus, viewers), is_stopped, Console(stderr=True))
@@ -132,13 +132,13 @@ def _stopping() -> Callable[[], bool]:
     return lambda: stopped
 
 
-def _bus(server: str | None, store: Path) -> "AbstractContextManager[Bus | None]":
+def _bus(server: str | None, store: Path, *, is_ros: bool = False) -> "AbstractContextManager[Bus | None]":
     from fleetmap.bus import ZenohBus, check_endpoint, has_tls
 
     if server is None:
         return nullcontext(None)
     if not has_tls(check_endpoint(server)):
-        return ZenohBus.connect(server)
+        return ZenohBus.connect(server, is_ros=is_ros)
     from mapserver.store import MapStore
     from mapserver.trust.enrolment import RobotRegister
 
