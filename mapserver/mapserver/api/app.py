@@ -18,6 +18,7 @@ from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT
 from mapserver.api import describe, problems
 from mapserver.api.body_limit import BodyLimit
 from mapserver.api.bytes_response import bytes_response
+from mapserver.api.file_routes import install_file_routes
 from mapserver.api.fleet_routes import install_fleet_routes
 from mapserver.api.guard import Guard
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
@@ -68,6 +69,7 @@ def create_app(
     _install_service_routes(app, store, fleet, metrics, bus)
     _install_list_routes(app, store, fleet)
     _install_map_routes(app, store)
+    install_file_routes(app, store)
     install_version_routes(app, store, settings)
     install_fleet_routes(app, store, settings.resurvey)
     describe.install(app)

@@ -1,70 +1,19 @@
-"""One version as one file, to carry it to another store.
-
-    offset  type   content
-    0       4 s    magic FMEX
-    4       u16    format number, 1
-    6       u16    0
-    8       u32    size of the head
-    12      ...    head, JSON: site, version, and of every blob its kind, SHA-256 and size
-    ...     ...    the blobs' bytes in that order: manifest, vocabulary, tiles, archive (if it is taken along)
-    end-32  32 s   SHA-256 of everything before
-
-Little-endian. The file names no paths: where bytes go follows from their SHA-256. Reading holds one map blob at a time in
-memory, whatever the file claims; the archive passes in pieces.
-"""
+"""One version as one file, to carry it to another store or to a robot; fleetmap.version_file describes and reads it."""
 
 import hashlib
-import os
-import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
-from itertools import accumulate
 from pathlib import Path
-from typing import Annotated, Literal
 
-import msgspec
-
-from fleetmap.errors import MapFormatError, NewerFormatError, StoreError, disk_errors
-from fleetmap.mapformat import Manifest, check_name, decode_manifest, decode_tile, verified
-from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Name, Positive, Sha256
+from fleetmap.errors import MapFormatError, disk_errors
+from fleetmap.mapformat import Manifest
+from fleetmap.version_file import ExportBlob, ExportHead
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.files import write_atomically
 from mapserver.store.rows import VersionInfo
 
-EXPORT_MAGIC = b"FMEX"
-EXPORT_FORMAT = 1
-MAX_BLOB_BYTES = {"manifest": MAX_MANIFEST_BYTES, "vocabulary": 256 << 20, "tile": 64 << 20, "archive": 1 << 33}
-_START = struct.Struct("<4sHHI")
-_MAX_HEAD_BYTES = 64 << 20
-_DIGEST_BYTES = 32
-_CHUNK_BYTES = 1 << 20
 
-
-class ExportBlob(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One blob in the file."""
-
-    kind: Literal["manifest", "vocabulary", "tile", "archive"]
-    sha256: Sha256
-    bytes: Positive
-
-
-class ExportHead(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is in the file."""
-
-    site: Name
-    version: Annotated[int, msgspec.Meta(ge=1, le=1 << 31)]
-    blobs: tuple[ExportBlob, ...]
-
-    def archive(self) -> ExportBlob | None:
-        """The archive, if it was taken along."""
-        return next((blob for blob in self.blobs if blob.kind == "archive"), None)
-
-
-def write_export(path: Path, info: VersionInfo, manifest: Manifest, blobs: BlobFolder, *, archive: bool) -> int:
-    """Writes a version into the file at `path`, whole or not at all, and returns its size.
-
-    Raises StoreError where the disk refuses, MapFormatError for damaged bytes in the store.
-    """
+def export_head(info: VersionInfo, manifest: Manifest, blobs: BlobFolder, *, archive: bool) -> ExportHead:
+    """What the file of a version holds; StoreError where the store lacks its archive."""
     entries = [ExportBlob(kind="manifest", sha256=info.manifest_sha256, bytes=info.manifest_bytes)]
     entries.append(ExportBlob(kind="vocabulary", sha256=manifest.vocabulary.sha256, bytes=manifest.vocabulary.bytes))
     tiles = {tile.sha256: tile.bytes for tile in manifest.tiles}
@@ -72,15 +21,22 @@ def write_export(path: Path, info: VersionInfo, manifest: Manifest, blobs: BlobF
     if archive and info.archive_sha256 is not None:
         size = sum(len(chunk) for chunk in blobs.chunks(info.archive_sha256))
         entries.append(ExportBlob(kind="archive", sha256=info.archive_sha256, bytes=size))
-    head = ExportHead(site=info.site, version=info.version, blobs=tuple(entries))
+    return ExportHead(site=info.site, version=info.version, blobs=tuple(entries))
+
+
+def write_export(path: Path, head: ExportHead, blobs: BlobFolder) -> int:
+    """Writes a version into the file at `path`, whole or not at all, and returns its size.
+
+    Raises StoreError where the disk refuses, MapFormatError for damaged bytes in the store.
+    """
     with disk_errors(f"{path} cannot be written", "check the folder, its space and rights"):
-        write_atomically(path, _export_chunks(head, blobs))
+        write_atomically(path, export_chunks(head, blobs))
         return path.stat().st_size
 
 
-def _export_chunks(head: ExportHead, blobs: BlobFolder) -> Iterator[bytes]:
-    text = msgspec.json.encode(head, order="deterministic")
-    start = _START.pack(EXPORT_MAGIC, EXPORT_FORMAT, 0, len(text)) + text
+def export_chunks(head: ExportHead, blobs: BlobFolder) -> Iterator[bytes]:
+    """The bytes of the file in pieces; MapFormatError, before its end, for damaged bytes in the store."""
+    start = head.start()
     whole = hashlib.sha256(start)
     yield start
     for blob in head.blobs:
@@ -93,112 +49,3 @@ def _export_chunks(head: ExportHead, blobs: BlobFolder) -> Iterator[bytes]:
         if own.hexdigest() != blob.sha256 or size != blob.bytes:
             raise MapFormatError(f"{blob.kind} {blob.sha256} in the store is damaged; run `mapserver verify`")
     yield whole.digest()
-
-
-class ExportReader:
-    """An open export file. Its content is used only after it was checked."""
-
-    def __init__(self, descriptor: int, path: Path) -> None:
-        self._descriptor = descriptor
-        self._path = path
-        self._size = os.fstat(descriptor).st_size
-        self.head, body = self._read_head()
-        self._starts = list(accumulate((blob.bytes for blob in self.head.blobs), initial=body))
-
-    def check_whole(self) -> None:
-        """Raises MapFormatError unless the file's own SHA-256 is right; reads it all once."""
-        whole = hashlib.sha256()
-        for chunk in self._span(0, self._size - _DIGEST_BYTES):
-            whole.update(chunk)
-        if whole.digest() != b"".join(self._span(self._size - _DIGEST_BYTES, self._size)):
-            raise self._damaged("its SHA-256 is not that of its bytes")
-
-    def manifest(self) -> Manifest:
-        """The manifest, which must name exactly the blobs of the head; raises MapFormatError otherwise."""
-        blob = self.head.blobs[0]
-        manifest = decode_manifest(self.data(0))
-        named = {("vocabulary", manifest.vocabulary.sha256, manifest.vocabulary.bytes)}
-        named |= {("tile", tile.sha256, tile.bytes) for tile in manifest.tiles}
-        held = [(b.kind, b.sha256, b.bytes) for b in self.head.blobs if b.kind not in {"manifest", "archive"}]
-        if (manifest.site, manifest.version) != (self.head.site, self.head.version) or blob.kind != "manifest":
-            raise self._damaged("its manifest is that of another version")
-        if len(held) != len(named) or set(held) != named:
-            raise self._damaged("it does not hold exactly what its manifest names")
-        if len({(tile.x, tile.y) for tile in manifest.tiles}) != len(manifest.tiles):
-            raise self._damaged("its manifest names a tile twice")
-        check_name(manifest.site, "site")
-        return manifest
-
-    def check_tiles(self, manifest: Manifest) -> None:
-        """Raises MapFormatError unless every tile can be read and is what the manifest says."""
-        number_of = {blob.sha256: number for number, blob in enumerate(self.head.blobs)}
-        for entry in manifest.tiles:
-            tile = decode_tile(self.data(number_of[entry.sha256]))
-            if (tile.tile_x, tile.tile_y, len(tile)) != (entry.x, entry.y, entry.landmarks):
-                raise self._damaged(f"tile {entry.x},{entry.y} is not the one that its manifest names")
-
-    def data(self, number: int) -> bytes:
-        """The bytes of a blob; raises MapFormatError for damaged ones."""
-        blob = self.head.blobs[number]
-        return verified(b"".join(self.chunks(number)), blob.sha256)
-
-    def chunks(self, number: int) -> Iterator[bytes]:
-        """The bytes of a blob in pieces, unverified."""
-        return self._span(self._starts[number], self._starts[number + 1])
-
-    def _read_head(self) -> tuple[ExportHead, int]:
-        if self._size < _START.size + _DIGEST_BYTES:
-            raise self._damaged(f"{self._size} bytes are too few")
-        magic, number, reserved, head_bytes = _START.unpack(b"".join(self._span(0, _START.size)))
-        if magic != EXPORT_MAGIC:
-            raise self._damaged(f"it begins {magic!r}, not {EXPORT_MAGIC!r}")
-        if number > EXPORT_FORMAT:
-            raise NewerFormatError(
-                f"{self._path} has export format {number}, this fleetmap reads up to {EXPORT_FORMAT}; update fleetmap"
-            )
-        if number < 1 or reserved != 0 or head_bytes > min(_MAX_HEAD_BYTES, self._size):
-            raise self._damaged(f"format {number}, head of {head_bytes} bytes")
-        body = _START.size + head_bytes
-        try:
-            head = msgspec.json.decode(b"".join(self._span(_START.size, body)), type=ExportHead)
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            raise self._damaged(str(error)) from error
-        self._check_head(head, body)
-        return head, body
-
-    def _check_head(self, head: ExportHead, body: int) -> None:
-        kinds = [blob.kind for blob in head.blobs]
-        if kinds[:1] != ["manifest"] or kinds.count("manifest") != 1 or kinds.count("archive") > 1:
-            raise self._damaged("it does not begin with one manifest, or has several archives")
-        if any(blob.bytes > MAX_BLOB_BYTES[blob.kind] for blob in head.blobs):
-            raise self._damaged("a blob is larger than its kind may be")
-        if body + sum(blob.bytes for blob in head.blobs) + _DIGEST_BYTES != self._size:
-            raise self._damaged(f"its head does not fit its {self._size} bytes")
-
-    def _span(self, start: int, end: int) -> Iterator[bytes]:
-        while start < end:
-            chunk = os.pread(self._descriptor, min(_CHUNK_BYTES, end - start), start)
-            if not chunk:
-                raise self._damaged("it became shorter while it was read")
-            start += len(chunk)
-            yield chunk
-
-    def _damaged(self, why: str) -> MapFormatError:
-        return MapFormatError(f"{self._path} is no whole export: {why}; export it again")
-
-
-@contextmanager
-def open_export(path: Path) -> Iterator[ExportReader]:
-    """A reader of the file at `path`.
-
-    Raises StoreError where it cannot be read, NewerFormatError for a newer format, MapFormatError for anything else
-    that is no whole export.
-    """
-    with disk_errors(f"{path} cannot be read", "check the path"):
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        yield ExportReader(descriptor, path)
-    except OSError as error:
-        raise StoreError(f"{path} cannot be read ({error.strerror}); check the disk") from error
-    finally:
-        os.close(descriptor)

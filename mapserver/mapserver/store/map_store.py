@@ -30,7 +30,8 @@ from fleetmap.mapformat import (
     encode_manifest,
     encode_tile,
 )
-from mapserver.store.export_import import open_export, write_export
+from fleetmap.version_file import ExportHead, open_export
+from mapserver.store.export_import import export_chunks, export_head, write_export
 from mapserver.store.files import (
     check_no_link,
     is_plain_file,
@@ -202,8 +203,15 @@ class MapStore(StoreQueries):
 
     def export_version(self, site: str, version: int, path: Path, *, archive: bool = True) -> int:
         """Writes a version into one file and returns its size; errors as of `manifest`, StoreError for the disk."""
-        info, manifest = self.version(site, version), self.manifest(site, version)
-        return write_export(path, info, manifest, self._blobs, archive=archive)
+        return write_export(path, self._export_head(site, version, archive=archive), self._blobs)
+
+    def version_file(self, site: str, version: int) -> tuple[ExportHead, Callable[[], Iterator[bytes]]]:
+        """The file of a version without its archive: its head, and its bytes in pieces, the same ones every time."""
+        head = self._export_head(site, version, archive=False)
+        return head, lambda: export_chunks(head, self._blobs)
+
+    def _export_head(self, site: str, version: int, *, archive: bool) -> ExportHead:
+        return export_head(self.version(site, version), self.manifest(site, version), self._blobs, archive=archive)
 
     def import_version(self, path: Path, *, actor: Actor = NOBODY) -> VersionInfo:
         """Takes a version out of an export file, as a draft of its site with its own number; publishing comes after.

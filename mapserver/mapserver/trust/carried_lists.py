@@ -8,7 +8,7 @@ import msgspec
 from fleetmap.errors import UntrustedError, UsageError, disk_errors
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import TrustedMap, site_role
-from mapserver.store.export_import import open_export
+from fleetmap.version_file import open_export
 from mapserver.store.files import write_atomically
 from mapserver.trust.lists import TIMESTAMP, SignedLists
 

@@ -1,5 +1,6 @@
 """The HTTP API: answers, validators, ranges, problem documents."""
 
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -310,3 +311,19 @@ def test_the_document_has_examples(server: Server) -> None:
                 assert parameter["in"] != "path" or shown, f"{path}: {parameter['name']} has no example"
     for path in ("/v1/sites", "/v1/jobs", "/v1/sites/{site}/current"):
         assert "example" in paths[path]["get"]["responses"]["200"]["content"]["application/json"]
+
+
+def test_a_version_is_one_file_under_an_address_that_stays(server: Server, tmp_path: Path) -> None:
+    offered = server.client.get("/v1/sites/lab/versions/1/vda5050").json()
+    assert (offered["mapId"], offered["mapVersion"]) == ("lab", "1")
+    answer = server.client.get(offered["mapDownloadLink"])
+    assert hashlib.sha256(answer.content).hexdigest() == offered["mapHash"]
+    assert answer.headers["etag"] == f'"{offered["mapHash"]}"'
+    server.store.export_version("lab", 1, tmp_path / "file", archive=False)
+    assert answer.content == (tmp_path / "file").read_bytes()
+    head = server.client.head("/v1/sites/lab/versions/1/file")
+    assert head.headers["content-length"] == str(len(answer.content))
+    again = server.client.get("/v1/sites/lab/versions/1/file", headers={"If-None-Match": answer.headers["etag"]})
+    assert again.status_code == 304
+    check_problem(server.client.get("/v1/sites/lab/versions/2/file"), 409, "is a draft")
+    check_problem(server.client.get("/v1/sites/lab/versions/9/file"), 404, "no version 9")

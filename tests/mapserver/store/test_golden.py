@@ -11,10 +11,10 @@ import pytest
 
 from fleetmap.errors import NewerFormatError
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_manifest, decode_tile, encode_manifest, pack
+from fleetmap.version_file import EXPORT_FORMAT
 from mapserver import releases
 from mapserver.store import Actor, FailureFilter, MapStore
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
-from mapserver.store.export_import import EXPORT_FORMAT
 from mapserver.store.migrations import MIGRATIONS
 from support.storage.map_samples import save_sample_draft
 

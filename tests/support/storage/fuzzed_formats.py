@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import decode_manifest, decode_tile, pack, unpack
+from fleetmap.version_file import open_export
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
-from mapserver.store.export_import import open_export
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 MAX_CPU_SECONDS = 2.0
