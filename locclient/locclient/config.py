@@ -14,6 +14,7 @@ from locclient.localization.settings import LocalizerSettings
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
 from locclient.maps.tile_selection import TileSelectionSettings
 from locclient.robot.version_trial import TrialSettings
+from locclient.vda5050.settings import Vda5050Section
 
 TIERS = {
     "user": {
@@ -22,6 +23,8 @@ TIERS = {
         "source": "kind sensors calibration endpoint recording device",
         "output": "format endpoint map autostart",
         "topics": "*",
+        "vda5050": "broker manufacturer serial_number interface username password_file ca map_id versions download_from "
+        "download_token_file download_ca robot_actions factsheet",
     },
     "tuning": {
         "run": "spool_bytes frame_queue imu_wait_s",
@@ -30,6 +33,7 @@ TIERS = {
         "source": "domain keys speed width_px height_px rate_hz delay_s",
         "output": "domain keys namespace node pose_topic initial_pose_topic odom_topic status_topic map_topic tf_topic "
         "map_frame odom_frame base_frame sensor_frames publish_odom is_map_server transform_tolerance_s",
+        "vda5050": "mqtt state_interval_s robot_silent_s initialize_s initial_sigma_m initial_sigma_rad",
         "localizer": "seed",
         "localizer.orb": "extractor count",
         "localizer.stereo": "min_depth_m depth_sigma_px",
@@ -74,6 +78,7 @@ class LocclientConfig(Section, frozen=True):
     source: SourceSection = SourceSection()
     output: OutputSection = OutputSection()
     topics: Topics = Topics()
+    vda5050: Vda5050Section = Vda5050Section()
     localizer: LocalizerSettings = LocalizerSettings()
 
 

@@ -23,7 +23,6 @@ from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from mapserver.trust import init_here
 from support.fleet.nav2_client import ACTIVE, LifecycleManager, eventually, rmw_router
-from support.recordings.recording_samples import Sample, write_euroc
 from support.worlds import robot_world
 
 PATIENCE_S = 240.0  # the first start of all compiles every kernel
@@ -31,15 +30,7 @@ PATIENCE_S = 240.0  # the first start of all compiles every kernel
 
 def write_walk(folder: Path, frames: int, dark: range) -> Path:
     """The robot's ride as a recording."""
-    bundles = list(robot_world.bundles(frames, dark=dark))
-    imu = [bundle.imu for bundle in bundles]
-    sample = Sample(
-        np.array([bundle.frame.stamp_ns for bundle in bundles]), [bundle.frame.left for bundle in bundles],
-        [bundle.frame.right for bundle in bundles], np.concatenate([part.stamps_ns for part in imu]),
-        np.concatenate([part.gyro_radps for part in imu]), np.concatenate([part.accel_mps2 for part in imu]),
-        [robot_world.truth(number) for number in range(frames)],
-    )  # fmt: skip
-    return write_euroc(folder, sample)
+    return robot_world.write(folder, robot_world.bundles(frames, dark=dark))
 
 
 def configuration(folder: Path, recording: Path, endpoint: str, *, speed: float) -> Path:

@@ -30,6 +30,11 @@ from locclient.prior_option import parse_prior
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.jit_warmup import gc_frozen, warm_up_kernels
 from locclient.robot.robot import Robot
+from locclient.vda5050.adapter import AdapterParts, FleetAdapter
+from locclient.vda5050.factsheet import read_factsheet
+from locclient.vda5050.fleet_maps import FleetMaps
+from locclient.vda5050.mqtt_link import MqttLink
+from locclient.vda5050.settings import check_section, origins_of
 
 _PATIENCE_S = 120.0  # in the middle of fetching a version; from the next part on it goes on where it was
 _log = logging.getLogger(__name__)
@@ -69,6 +74,12 @@ def check_run(config: LocclientConfig) -> MapAddress:
             f"[run.trial] contradicting_looks = {run.trial.contradicting_looks} must be below [localizer.track] kidnap_fixes = "
             f"{config.localizer.track.kidnap_fixes}: a version must be given up before the robot believes that it was carried away"
         )
+    if config.vda5050.broker is not None:
+        check_section(config.vda5050, insecure=run.insecure)
+        if address.store is not None:
+            raise UsageError(
+                "[vda5050] needs a map server: its signed lists say which maps may be run; set server, not store"
+            )
     return address
 
 
@@ -125,6 +136,9 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         if told_bus is not None:
             publisher = open_publisher(PublisherInputs(told_bus, site, name, calibration, intake), config.output)
             stack.callback(publisher.close)
+        fleet_manager: MqttLink | None = None
+        if server is not None and config.vda5050.broker is not None:
+            fleet_manager = _fleet_manager(config, site, server, caches[0], intake)
         yield RuntimeParts(
             profile=RobotProfile(
                 site, name, robot.base_from_body, rectifier.body_from_cam, rectifier.camera, config.localizer
@@ -139,6 +153,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             first=first,
             failures_folder=None if run.failures is None else Path(run.failures),
             caches=caches,
+            fleet_manager=fleet_manager,
         )
 
 
@@ -152,6 +167,29 @@ def _upkeep(address: MapAddress, bus: Bus) -> Callable[[], None]:
             _log.info("the certificate is renewed until %s", identity.certificate().ends)
 
     return renew
+
+
+def _fleet_manager(
+    config: LocclientConfig, site: str, server: ServerSync, cache: TileCache, intake: Intake
+) -> MqttLink:
+    """The connection of [vda5050], and the server's choice of versions given up for the fleet manager's where that is set."""
+    section, insecure, client, maps = config.vda5050, config.run.insecure, server.client, None
+    if section.versions == "fleet manager":
+        server.follows = False
+        folder = cache_folder(config.run.cache) / "incoming"
+        maps = FleetMaps(cache, site, folder, origins_of(section, insecure=insecure), client.check_admitted)
+    parts = AdapterParts(
+        site=site,
+        maps=maps,
+        active=client.active,
+        offer=server.fetched.append,
+        put_prior=intake.put_prior,
+        lost_radius_m=config.localizer.track.lost_radius_m,
+    )
+    adapter = FleetAdapter(section, parts)
+    server.on_change = adapter.changed_version
+    sheet = None if section.factsheet is None else read_factsheet(Path(section.factsheet))
+    return MqttLink(check_section(section, insecure=insecure), section, adapter, sheet)
 
 
 def configured_outbox(run: RunSection, site: str, robot: str) -> Path:

@@ -26,6 +26,7 @@ from locclient.maps.tile_selection import Cell, PositionBound, PositionBoundTrac
 from locclient.robot.failure_report import RobotProfile, failure_report
 from locclient.robot.health_report import Figure, HealthFigures
 from locclient.robot.robot import FailureContext, Outcome, Robot
+from locclient.vda5050.mqtt_link import MqttLink
 
 _TAKE_S, _IDLE_S = 0.2, 0.1
 _HEALTH_EVERY_S, _POSE_EVERY_NS = 1.0, 500_000_000
@@ -37,7 +38,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RuntimeParts:
-    """All that a daemon is made of. server: None for a robot that reads a store's folder. first: the version to begin with."""
+    """All that a daemon is made of. server: None for a robot that reads a store's folder. first: the version to begin with.
+
+    fleet_manager: the connection to one that speaks VDA 5050; only with a server.
+    """
 
     profile: RobotProfile
     source: Source
@@ -50,6 +54,7 @@ class RuntimeParts:
     first: WantedVersion | None
     failures_folder: Path | None = None
     caches: tuple[TileCache, ...] = ()
+    fleet_manager: MqttLink | None = None
 
 
 @dataclass
@@ -92,6 +97,8 @@ class Runtime:
         threads = [self._start("sensors", self._run_sensors), self._start("disk", self._run_disk)]
         if self._parts.server is not None:
             threads.append(self._start("network", partial(self._run_network, self._parts.server)))
+        if self._parts.fleet_manager is not None:
+            self._parts.fleet_manager.start()
         self._manager.ready()
         self._last_frame_s = time.monotonic()
         try:
@@ -102,6 +109,8 @@ class Runtime:
             self.stop()
             for thread in threads:
                 thread.join(_DRAIN_S)
+            if self._parts.fleet_manager is not None:
+                self._parts.fleet_manager.stop()
             self._queue_failures()
             _log.info("stopped: %s", self._health(is_silent=False))
         if self._shared.errors:
@@ -135,6 +144,9 @@ class Runtime:
         parts, estimate = self._parts, outcome.estimate
         if parts.publisher is not None:
             _send(partial(parts.publisher.publish, estimate, outcome.published, parts.robot.base_from_body))
+        if parts.fleet_manager is not None:
+            held = frozenset(loaded.version for loaded in parts.robot.held)
+            parts.fleet_manager.adapter.after_frame(outcome, held)
         self._figures.handle(outcome)
         self._shared.bound = self._bound_tracker.handle(estimate)
         self._note_failure(outcome.failure, 0.0)
@@ -155,6 +167,8 @@ class Runtime:
             return
         self._health_s = now_s
         is_silent = self._last_frame_s is not None and now_s - self._last_frame_s > _SILENT_S
+        if is_silent and self._parts.fleet_manager is not None:
+            self._parts.fleet_manager.adapter.silence()
         if self._parts.server is not None:
             self._parts.server.health.append(self._health(is_silent))
         if self._parts.publisher is not None:
@@ -267,6 +281,8 @@ class Runtime:
     def _run_network(self, server: ServerSync) -> None:
         while not self._stop.wait(_IDLE_S):
             server.step()
+            if self._parts.fleet_manager is not None:
+                self._parts.fleet_manager.adapter.work()
         server.step()  # a last time: changes of versions and failures since, if the server is there
         server.close()
 

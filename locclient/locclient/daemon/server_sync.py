@@ -36,6 +36,8 @@ class ServerSync:
         upkeep: Callable[[], None] = lambda: None,
     ) -> None:
         """retry_s: when a postponed version is offered again. upkeep: called once an hour; what it refuses goes into the log."""
+        self.follows = True  # the server's choice of a version; False: somebody else's, whom the server is told
+        self.on_change: Callable[[VersionChange], None] = lambda _: None
         self._upkeep, self._upkeep_at_s = upkeep, 0.0
         self.client, self._outbox, self._retry_s = client, outbox, retry_s
         self._clock_s, self._wall_ns = clock_s, wall_ns
@@ -93,6 +95,10 @@ class ServerSync:
         sha256 = wanted.manifest_sha256
         if sha256 is None:
             return
+        if not self.follows:
+            running = None if self._running is None else self._running.version
+            self._last_ack = (running, "" if wanted == self._running else "the fleet manager chooses (VDA 5050)")
+            return self._acknowledge()
         if sha256 in self._offered or now_s < self._not_before_s.get(sha256, 0.0):
             return self._acknowledge_again()
         try:
@@ -130,6 +136,7 @@ class ServerSync:
                     self._offered.discard(sha256)
                     self._not_before_s[sha256] = self._clock_s() + self._retry_s
                 self._refuse(change.wanted, change.reason)
+            self.on_change(change)
 
     def _adopt(self, wanted: WantedVersion) -> None:
         self._running = wanted

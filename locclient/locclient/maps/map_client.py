@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from fleetmap.bus import Bus, Handle
-from fleetmap.errors import LinkError, MapFormatError, StoreError, UnreachableError
+from fleetmap.errors import LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
 from fleetmap.mapformat import (
     MAX_MANIFEST_BYTES,
     Manifest,
@@ -63,6 +63,13 @@ class MapClient(MapSource):
     def require(self, trust: TrustedMap | None) -> None:
         """From now on takes only new versions that the site's signed list admits; None: any. What is active goes on in any case."""
         self._trust = trust
+
+    def check_admitted(self, wanted: WantedVersion) -> None:
+        """Asks for the signed lists, and raises UntrustedError or UnreachableError unless they admit this version now."""
+        if self._trust is None:
+            raise UntrustedError("signature", "this robot believes no signed lists; it needs a server, not a folder")
+        self._trust.refresh()
+        self._trust.admitted(wanted)
 
     @property
     def word_hours(self) -> float | None:

@@ -29,7 +29,7 @@ class ActiveVersion(msgspec.Struct, frozen=True):
 
 
 class TileCache:
-    """Files below one folder. Above `max_bytes` the least recently used are evicted, but never those of an active or reserved version.
+    """Files below one folder. Above `max_bytes` the least recently used are evicted, never those of an active, kept or reserved version.
 
     Bytes are verified whenever they are read. A disk that fails costs the cache, not the robot's map: `take_faults` has the reasons.
     For one thread at a time, but for `take_faults`. One process should use a folder; a second one does no harm but may evict what
@@ -47,6 +47,7 @@ class TileCache:
             folder.mkdir(parents=True, exist_ok=True)
             self._sizes = self._scan()
             self._active = self._read_active()
+            self._kept = self._read_kept()
 
     def __contains__(self, sha256: str) -> bool:
         return sha256 in self._sizes
@@ -111,6 +112,33 @@ class TileCache:
         """The site's version that this robot has whole, None before the first one."""
         return self._active.get(site)
 
+    def keep(self, site: str, version: int, blobs: Sequence[str]) -> None:
+        """Keeps a whole version until `release`, however full the cache is; errors as of `activate`."""
+        missing = [sha256 for sha256 in blobs if sha256 not in self._sizes]
+        record = ActiveVersion(version, tuple(blobs))
+        if missing or not self._write(self._kept_path(site, version), msgspec.json.encode(record)):
+            raise StoreError(
+                f"version {version} of {site} is not kept: {self._last_fault or f'{missing[0]} is missing'}"
+            )
+        self._kept[site, version] = record
+
+    def release(self, site: str, version: int) -> None:
+        """Takes back `keep`, and removes what no other version needs; raises StoreError where the disk refuses."""
+        with disk_errors(f"version {version} of {site} cannot be removed from the cache", "check its rights"):
+            self._kept_path(site, version).unlink(missing_ok=True)
+            _sync_folder(self._kept_path(site, version).parent)
+        gone = self._kept.pop((site, version), None)
+        for sha256 in () if gone is None else set(gone.blobs) - self._used():
+            self._remove(sha256)
+
+    def kept(self, site: str) -> list[ActiveVersion]:
+        """The site's kept versions, oldest first."""
+        return [record for (of, _), record in sorted(self._kept.items()) if of == site]
+
+    def room_bytes(self) -> int:
+        """Bytes that can be put beside what must stay."""
+        return self._max_bytes - sum(self._sizes.get(sha256, 0) for sha256 in self._used())
+
     def take_faults(self) -> list[str]:
         """What went wrong with the disk since the last call, in words. For any thread."""
         return [self._faults.popleft() for _ in range(len(self._faults))]
@@ -121,7 +149,7 @@ class TileCache:
 
     def _scan(self) -> dict[str, int]:
         found = []
-        for leftover in self._folder.glob("*/*/.*.tmp"):
+        for leftover in (*self._folder.glob("*/*/.*.tmp"), *self._folder.glob("sites/*/kept/.*.tmp")):
             leftover.unlink(missing_ok=True)  # by a process that died while writing
         for path in self._folder.glob("blobs/??/*"):
             if len(path.name) == 64:
@@ -130,22 +158,35 @@ class TileCache:
         return {name: size for _, name, size in sorted(found)}
 
     def _read_active(self) -> dict[str, ActiveVersion]:
+        found = ((path.parent.name, self._read_record(path)) for path in self._folder.glob("sites/*/active"))
+        return {site: record for site, record in found if record is not None}
+
+    def _read_kept(self) -> dict[tuple[str, int], ActiveVersion]:
         found = {}
-        for path in self._folder.glob("sites/*/active"):
-            try:
-                record = msgspec.json.decode(path.read_bytes(), type=ActiveVersion)
-                found[path.parent.name] = msgspec.structs.replace(
-                    record, blobs=tuple(check_sha256(sha256) for sha256 in record.blobs)
-                )
-            except (msgspec.MsgspecError, UnicodeDecodeError, MapFormatError) as error:
-                self._note(f"{path} is damaged ({error}); the version has to be fetched again")
+        for path in self._folder.glob("sites/*/kept/[0-9]*"):
+            record = self._read_record(path)
+            if record is not None:
+                found[path.parent.parent.name, record.version] = record
         return found
+
+    def _read_record(self, path: Path) -> ActiveVersion | None:
+        try:
+            record = msgspec.json.decode(path.read_bytes(), type=ActiveVersion)
+            return msgspec.structs.replace(record, blobs=tuple(check_sha256(sha256) for sha256 in record.blobs))
+        except (msgspec.MsgspecError, UnicodeDecodeError, MapFormatError) as error:
+            self._note(f"{path} is damaged ({error}); the version has to be fetched again")
+            return None
+
+    def _used(self) -> set[str]:
+        """Addresses that must stay."""
+        records = (*self._active.values(), *self._kept.values())
+        return set().union(*self._reserved.values(), *(record.blobs for record in records))
 
     def _evict(self, keep: str) -> None:
         total = self.total_bytes
         if total <= self._max_bytes:
             return
-        used = {keep}.union(*self._reserved.values(), *(record.blobs for record in self._active.values()))
+        used = self._used() | {keep}
         for sha256 in list(self._sizes):
             if total <= self._max_bytes:
                 return
@@ -172,6 +213,9 @@ class TileCache:
 
     def _active_path(self, site: str) -> Path:
         return self._folder / "sites" / check_name(site, "site") / "active"
+
+    def _kept_path(self, site: str, version: int) -> Path:
+        return self._folder / "sites" / check_name(site, "site") / "kept" / str(version)
 
     def _remove(self, sha256: str) -> None:
         self._sizes.pop(sha256, None)

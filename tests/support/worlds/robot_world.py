@@ -1,8 +1,9 @@
 """A robot that drives to and fro in a painted room for as long as wanted, and maps of that room in its truth. Made once."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -21,7 +22,7 @@ from locclient.robot.robot import Robot
 from locclient.robot.version_trial import TrialSettings
 from mapserver import releases
 from mapserver.store import DraftContent, MapStore
-from support.recordings.recording_samples import FOCAL, HEIGHT, WIDTH, Sample, calibration
+from support.recordings.recording_samples import FOCAL, HEIGHT, WIDTH, Sample, calibration, write_euroc
 from support.storage.map_samples import draft_details
 from support.worlds.box_room import out_and_back, points_seen, ride_sample
 
@@ -79,6 +80,19 @@ def carried(frames: int, at: int) -> Iterator[SensorBundle]:
         still = ImuSamples(bundle.imu.stamps_ns, gyro, accel + np.array([0.0, 0.0, 9.81]))
         left, right = _noisy(sample.left[40], rng), _noisy(sample.right[40], rng)
         yield SensorBundle(CameraFrame(bundle.frame.stamp_ns, left, right), still)
+
+
+def write(folder: Path, ride: Iterable[SensorBundle]) -> Path:
+    """A ride as a recording."""
+    bundles = list(ride)
+    imu = [bundle.imu for bundle in bundles]
+    sample = Sample(
+        np.array([bundle.frame.stamp_ns for bundle in bundles]), [bundle.frame.left for bundle in bundles],
+        [bundle.frame.right for bundle in bundles], np.concatenate([part.stamps_ns for part in imu]),
+        np.concatenate([part.gyro_radps for part in imu]), np.concatenate([part.accel_mps2 for part in imu]),
+        [truth(number) for number in range(len(bundles))],
+    )  # fmt: skip
+    return write_euroc(folder, sample)
 
 
 def _noisy(picture: Image, rng: np.random.Generator) -> Image:

@@ -1,0 +1,126 @@
+"""A version's file over HTTP, from servers that the robot's owner named. What it holds is not believed here."""
+
+import hashlib
+import http.client
+import ssl
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+from urllib.parse import SplitResult, urlsplit
+
+from fleetmap.bus import is_loopback
+from fleetmap.errors import LinkError, UnreachableError, UsageError, disk_errors
+
+_CHUNK_BYTES = 1 << 18
+_STALL_S = 30.0  # without a byte
+_MIN_BYTES_PER_S = 20_000  # over the whole file, behind _STALL_S: nobody may hold the robot's network thread for a day
+
+
+class TooLargeError(LinkError):
+    """A file that is larger than there is room for."""
+
+
+class Target(Protocol):
+    """Something to write into."""
+
+    def write(self, data: bytes, /) -> int:
+        """Writes all of it."""
+
+
+@dataclass(frozen=True)
+class Origins:
+    """Servers that files may come from. token: sent to them as a bearer's; ca: file of authorities, None for the machine's."""
+
+    allowed: Sequence[str]
+    token: str | None = None
+    ca: Path | None = None
+    insecure: bool = False
+
+    def check(self) -> None:
+        """Raises UsageError for an origin that is none."""
+        for text in self.allowed:
+            origin = _origin(urlsplit(text))
+            if origin is None or urlsplit(text).path not in {"", "/"}:
+                raise UsageError(f"{text!r} is not like https://HOST or https://HOST:PORT")
+            if origin[0] == "http" and not (self.insecure or is_loopback(f"tcp/{origin[1]}:{origin[2]}")):
+                raise UsageError(f"{text} is on another machine and without TLS; use https, or --insecure")
+
+    def admit(self, link: str) -> SplitResult:
+        """The parts of a link; LinkError unless it leads to one of the servers."""
+        try:
+            parts = urlsplit(link)
+            origin = _origin(parts)
+        except ValueError:
+            origin = None
+        if origin is None or any(ord(sign) < 33 or ord(sign) > 126 for sign in link):
+            raise LinkError(f"the link {link[:200]!r} is no plain address by http or https")
+        if origin not in {_origin(urlsplit(text)) for text in self.allowed}:
+            raise LinkError(
+                f"the link leads to {parts.netloc[:200]!r}, and the robot takes maps from "
+                f"{', '.join(self.allowed) or 'nowhere'}; [vda5050] download_from names the servers"
+            )
+        return parts
+
+
+def download(link: str, origins: Origins, target: Target, *, max_bytes: int) -> str:
+    """Writes the bytes behind a link into `target` and returns their SHA-256. Redirections are not followed.
+
+    Raises LinkError for a link or answer that is refused or longer than max_bytes, UnreachableError where the server does not answer or
+    stalls, StoreError where the disk refuses.
+    """
+    parts = origins.admit(link)
+    connection = _connection(parts, origins)
+    headers = {"User-Agent": "fleetmap", "Accept-Encoding": "identity"}
+    if origins.token is not None:
+        headers["Authorization"] = f"Bearer {origins.token}"
+    path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
+    try:
+        connection.request("GET", path, headers=headers)
+        answer = connection.getresponse()
+        if answer.status != http.client.OK:
+            raise LinkError(f"{link[:200]} answers {answer.status} {answer.reason[:80]}")
+        return _receive(answer, link, target, max_bytes)
+    except (OSError, http.client.HTTPException) as error:
+        raise UnreachableError(f"{link[:200]} cannot be fetched ({error or type(error).__name__})") from error
+    finally:
+        connection.close()
+
+
+def _receive(answer: http.client.HTTPResponse, link: str, target: Target, max_bytes: int) -> str:
+    whole, received, begun_s = hashlib.sha256(), 0, time.monotonic()
+    if answer.length is not None and answer.length > max_bytes:
+        raise TooLargeError(f"{link[:200]} has {answer.length} bytes, the limit is {max_bytes}")
+    while chunk := answer.read1(_CHUNK_BYTES):
+        received += len(chunk)
+        if received > max_bytes:
+            raise TooLargeError(f"{link[:200]} has more than {max_bytes} bytes")
+        late_s = time.monotonic() - begun_s - _STALL_S
+        if late_s > 0 and received < late_s * _MIN_BYTES_PER_S:
+            raise UnreachableError(f"{link[:200]} comes too slowly: {received} bytes in {late_s + _STALL_S:.0f} s")
+        whole.update(chunk)
+        with disk_errors("the downloaded map cannot be written", "make space for the cache"):
+            target.write(chunk)
+    if answer.length:
+        raise UnreachableError(f"{link[:200]} ended {answer.length} bytes early")
+    return whole.hexdigest()
+
+
+def _connection(parts: SplitResult, origins: Origins) -> http.client.HTTPConnection:
+    host, port = str(parts.hostname), parts.port
+    if parts.scheme == "http":
+        return http.client.HTTPConnection(host, port, timeout=_STALL_S)
+    with disk_errors(f"the authorities in {origins.ca} cannot be read", "check [vda5050] ca", UsageError):
+        context = ssl.create_default_context(cafile=None if origins.ca is None else str(origins.ca))
+    return http.client.HTTPSConnection(host, port, timeout=_STALL_S, context=context)
+
+
+def _origin(parts: SplitResult) -> tuple[str, str, int] | None:
+    """Scheme, host and port; None for what is no address of a web server, or one with a name and password in it."""
+    try:
+        port = parts.port or (443 if parts.scheme == "https" else 80)
+    except ValueError:
+        return None
+    is_plain = parts.scheme in {"http", "https"} and "@" not in parts.netloc
+    return (parts.scheme, parts.hostname, port) if is_plain and parts.hostname else None

@@ -1,0 +1,118 @@
+"""Instant actions that concern maps and position: their parameters, their states, and the errors that they leave."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from fleetmap.errors import LinkError
+from locclient.vda5050.messages import Action, ActionState, Error, Reference
+
+PARAMETERS: Mapping[str, Mapping[str, str]] = {
+    "downloadMap": {"mapId": "STRING", "mapVersion": "STRING", "mapDownloadLink": "STRING", "mapHash": "STRING?"},
+    "enableMap": {"mapId": "STRING", "mapVersion": "STRING"},
+    "deleteMap": {"mapId": "STRING", "mapVersion": "STRING"},
+    "initializePosition": {"x": "NUMBER", "y": "NUMBER", "theta": "NUMBER", "mapId": "STRING", "lastNodeId": "STRING"},
+    "stateRequest": {},
+    "factsheetRequest": {},
+    "clearInstantActions": {},
+}
+"""By action, its parameters and their types; `?`: may be left out."""
+MAP_ACTIONS = ("downloadMap", "enableMap", "deleteMap")
+OVER = ("FINISHED", "FAILED")
+_MOST_STATES = 200
+_MOST_SIGNS = 2000
+
+
+def parameters(action: Action) -> dict[str, Any]:
+    """The action's parameters by name; LinkError for missing, unknown or impossible ones."""
+    kinds = PARAMETERS[action.action_type]
+    given = {parameter.key: parameter.value for parameter in action.action_parameters}
+    for key in given:
+        if key not in kinds:
+            raise LinkError(f"{action.action_type} has no parameter {key[:80]!r}; it has {', '.join(kinds) or 'none'}")
+    for key, kind in kinds.items():
+        if key not in given and not kind.endswith("?"):
+            raise LinkError(f"{action.action_type} needs the parameter {key}")
+        if key in given and not _fits(given[key], kind.rstrip("?")):
+            raise LinkError(
+                f"{key} = {str(given[key])[:80]!r} of {action.action_type} must be a {kind.rstrip('?').lower()}"
+            )
+    return given
+
+
+def _fits(value: object, kind: str) -> bool:
+    if kind == "STRING":
+        return isinstance(value, str) and 0 < len(value) <= _MOST_SIGNS
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+class ActionBook:
+    """States of the instant actions that came, and errors by what ends them. For one thread at a time."""
+
+    def __init__(self) -> None:
+        self._states: dict[str, ActionState] = {}
+        self._errors: dict[str, list[Error]] = {}
+
+    def __contains__(self, action_id: str) -> bool:
+        return action_id in self._states
+
+    def set(self, action: Action, status: str, result: str = "") -> None:
+        """The state of an action; those that are over longest are forgotten where there are too many."""
+        self._states[action.action_id] = ActionState(
+            action_id=action.action_id,
+            action_type=action.action_type,
+            action_descriptor=action.action_descriptor or None,
+            action_status=status,  # type: ignore[arg-type]
+            action_result=result[:_MOST_SIGNS] or None,
+        )
+        over = [key for key, state in self._states.items() if state.action_status in OVER]
+        for key in over[: max(0, len(self._states) - _MOST_STATES)]:
+            del self._states[key]
+
+    def clear(self) -> None:
+        """Forgets what is finished or failed."""
+        self._states = {key: state for key, state in self._states.items() if state.action_status not in OVER}
+
+    def fail(self, action: Action, error_type: str, words: str, level: str = "WARNING") -> None:
+        """The action has failed, and the error says why until another action of its kind is accepted."""
+        self.set(action, "FAILED", words)
+        shown = {"actionId": action.action_id} | {
+            parameter.key: str(parameter.value)[:_MOST_SIGNS] for parameter in action.action_parameters[:20]
+        }
+        topic = "map" if action.action_type in MAP_ACTIONS else "instant"
+        self.add_error(topic, error_type, words, shown, level)
+
+    def accepted(self, action: Action) -> None:
+        """Ends the errors that last until an action of this kind is accepted."""
+        self.end("instant")
+        if action.action_type in MAP_ACTIONS:
+            self.end("map")
+
+    def add_error(
+        self, until: str, error_type: str, words: str, references: Mapping[str, str], level: str = "WARNING"
+    ) -> None:
+        """An error that stands until `end(until)`, at most as many as actions."""
+        error = Error(
+            error_type=error_type,
+            error_level=level,  # type: ignore[arg-type]
+            error_references=[
+                Reference(reference_key=key[:200], reference_value=str(value)) for key, value in references.items()
+            ],
+            error_description=words[:_MOST_SIGNS],
+        )
+        self._errors.setdefault(until, []).append(error)
+        del self._errors[until][:-_MOST_STATES]
+
+    def end(self, until: str) -> None:
+        """Ends errors."""
+        self._errors.pop(until, None)
+
+    @property
+    def states(self) -> list[ActionState]:
+        """In the order in which the actions came."""
+        return list(self._states.values())
+
+    @property
+    def errors(self) -> list[Error]:
+        """Those that stand."""
+        return [error for errors in self._errors.values() for error in errors]

@@ -1,0 +1,362 @@
+"""The adapter: instant actions and the robot's own part in, the state out. Knows no MQTT; may be called from any thread."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from fleetmap.errors import FleetmapError, LinkError
+from fleetmap.failure_definition import is_driving
+from fleetmap.geometry import se3, so3_exp
+from fleetmap.messages import Status, WantedVersion
+from fleetmap.sensors.samples import PositionPrior
+from locclient.robot.robot import Change, Outcome, VersionChange
+from locclient.vda5050.actions import MAP_ACTIONS, PARAMETERS, ActionBook, parameters
+from locclient.vda5050.fleet_maps import DuplicateMapError, FleetMaps, NoRoomError
+from locclient.vda5050.localization import Localization, Position
+from locclient.vda5050.messages import Action, Error, InstantActions, Order, RobotPart, decode
+from locclient.vda5050.settings import Vda5050Section
+
+_MOST_JOBS = 16
+_ENABLE_S = 120.0  # for the trial of a version, and for the trial of the one before that follows where it fails
+_TILT_SIGMA_RAD, _HEIGHT_SIGMA_M = 0.05, 0.2  # of a floor, which is all that x, y and theta say about it
+_SIGMAS = 3.7  # as far from where the fleet manager put it a robot still agrees
+_UNKNOWN: dict[str, Any] = {
+    "operatingMode": "STARTUP",
+    "powerSupply": {"stateOfCharge": 0.0, "charging": False},
+    "safetyState": {"activeEmergencyStop": "NONE", "fieldViolation": True},
+}
+"""While the robot's own program has said nothing: in STARTUP the standard lets values be incomplete or invalid."""
+_EMPTY: dict[str, Any] = {
+    **{"orderId": "", "orderUpdateId": 0, "lastNodeId": "", "lastNodeSequenceId": 0},
+    **{"nodeStates": [], "edgeStates": [], "actionStates": []},
+}
+
+
+@dataclass(frozen=True)
+class AdapterParts:
+    """maps: None where the map server chooses the version. offer: gives a version to the localizer; put_prior: a pose.
+
+    active: the version that the robot has whole, from the thread that calls `work`. lost_radius_m: of 95 %, beyond which it is LOST.
+    """
+
+    site: str
+    maps: FleetMaps | None
+    active: Callable[[], WantedVersion | None]
+    offer: Callable[[WantedVersion], None]
+    put_prior: Callable[[PositionPrior], None]
+    lost_radius_m: float
+
+
+@dataclass
+class _Pending:
+    """Actions that wait for the localizer."""
+
+    enable: tuple[Action, WantedVersion, float] | None = None
+    position: tuple[Action, Position, float] | None = None
+
+
+@dataclass
+class _Robot:
+    """What came of the robot's own program last, and when."""
+
+    part: RobotPart | None = None
+    heard_s: float = 0.0
+    last_node: tuple[str, str] | None = None  # by initializePosition, and what the robot said then
+
+
+@dataclass
+class _Known:
+    localization: Localization = field(default_factory=Localization)
+    versions: list[tuple[int, bool]] = field(default_factory=list)
+    in_use: frozenset[int] = frozenset()
+    robot: _Robot = field(default_factory=_Robot)
+
+
+class FleetAdapter:
+    """Takes what comes from the fleet manager, the robot's program and the localizer, works at maps in `work`, and says what the state is.
+
+    changed: set whenever a new state should leave at once. factsheet_wanted: set when somebody asks for it.
+    """
+
+    def __init__(
+        self, section: Vda5050Section, parts: AdapterParts, clock_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._section, self._parts, self._clock_s = section, parts, clock_s
+        self.map_id = section.map_id or parts.site
+        self.changed, self.factsheet_wanted = threading.Event(), threading.Event()
+        self._lock = threading.RLock()
+        self._book, self._known, self._pending = ActionBook(), _Known(), _Pending()
+        self._jobs: deque[tuple[Action, dict[str, Any]]] = deque()
+        self._last_said: object = None
+        self._untold: Localization | None = None  # a loss that no state has told yet, however short it was
+
+    # --- from the fleet manager ---------------------------------------------------------------------------------------
+
+    def instant_actions(self, payload: bytes) -> None:
+        """Topic instantActions."""
+        with self._lock:
+            try:
+                message = decode(payload, InstantActions)
+            except LinkError as error:
+                self._book.add_error("instant", "VALIDATION_FAILURE", str(error), {"topic": "instantActions"})
+            else:
+                for action in message.actions:
+                    if action.action_id not in self._book and action.action_type not in self._section.robot_actions:
+                        self._begin(action)
+            self.changed.set()
+
+    def order(self, payload: bytes) -> None:
+        """Topic order: only whether its maps are known. The robot's own program executes it, and says what is wrong with it otherwise."""
+        with self._lock:
+            try:
+                message = decode(payload, Order)
+            except LinkError:
+                return
+            self._book.end("order")
+            named = {node.node_position.map_id for node in message.nodes if node.node_position is not None}
+            known = {self.map_id} if self._known.versions else set()
+            for map_id in sorted(named - known)[:20]:
+                words = f"the order {message.order_id[:200]!r} names a map that is not on the robot: {map_id[:200]!r}"
+                references = {"orderId": message.order_id, "mapId": map_id}
+                self._book.add_error("order", "UNKNOWN_MAP_ID", words, references)
+            self.changed.set()
+
+    def robot_part(self, payload: bytes) -> None:
+        """The robot's own part of the state; one that cannot be passed on is refused, with an error, and the last one stands."""
+        with self._lock:
+            self._book.end("robot")
+            try:
+                part = decode(payload, RobotPart)
+            except LinkError as error:
+                self._book.add_error("robot", "ROBOT_PART_INVALID", str(error), {"topic": "robotState"}, "CRITICAL")
+            else:
+                self._known.robot.part, self._known.robot.heard_s = part, self._clock_s()
+            self.changed.set()
+
+    def _begin(self, action: Action) -> None:
+        kind = action.action_type
+        if kind not in PARAMETERS:
+            known = ", ".join([*PARAMETERS, *self._section.robot_actions])
+            return self._book.fail(
+                action, "INVALID_INSTANT_ACTION", f"{kind[:80]!r} is unknown here; known are {known}"
+            )
+        try:
+            given = parameters(action)
+        except LinkError as error:
+            return self._book.fail(action, "INVALID_INSTANT_ACTION", str(error))
+        self._book.accepted(action)
+        if kind in MAP_ACTIONS:
+            return self._queue(action, given)
+        if kind == "initializePosition":
+            return self._initialize(action, given)
+        if kind == "clearInstantActions":
+            self._book.clear()
+        if kind == "factsheetRequest":
+            if self._section.factsheet is None:
+                return self._book.fail(action, "FACTSHEET_MISSING", "[vda5050] factsheet names no file on this robot")
+            self.factsheet_wanted.set()
+        self._book.set(action, "FINISHED")
+        return None
+
+    # --- maps ---------------------------------------------------------------------------------------------------------
+
+    def _queue(self, action: Action, given: dict[str, Any]) -> None:
+        if self._parts.maps is None:
+            words = 'the map server chooses this robot\'s map: [vda5050] versions = "map server"'
+            return self._book.fail(action, "MAP_ACTION_FAILED", words)
+        if given["mapId"] != self.map_id or not (given["mapVersion"].isascii() and given["mapVersion"].isdecimal()):
+            words = f"map {given['mapId'][:80]!r} version {given['mapVersion'][:80]!r}: this robot's are {self.map_id!r} 1, 2, 3..."
+            return self._book.fail(action, "UNKNOWN_MAP_ID", words)
+        if len(self._jobs) >= _MOST_JOBS:
+            return self._book.fail(
+                action, "MAP_ACTION_FAILED", f"{_MOST_JOBS} actions on maps wait already; send it again later"
+            )
+        self._book.set(action, "WAITING")
+        self._jobs.append((action, given))
+        return None
+
+    def work(self) -> None:
+        """One action on maps, which may take as long as a download; from the thread that owns the cache."""
+        maps = self._parts.maps
+        active = self._parts.active()
+        versions = [] if active is None or active.version is None else [(active.version, True)]
+        with self._lock:
+            self._known.versions = versions if maps is None else maps.versions()
+            self._end_enabling()
+            if maps is None or not self._jobs or (self._pending.enable and self._jobs[0][0].action_type == "enableMap"):
+                return
+            action, given = self._jobs.popleft()
+            self._book.set(action, "RUNNING")
+            self.changed.set()
+        try:
+            self._act(maps, action, given)
+        except FleetmapError as error:
+            kind, level = "MAP_ACTION_FAILED", "WARNING"
+            if isinstance(error, DuplicateMapError):
+                kind = "DUPLICATE_MAP"
+            elif isinstance(error, NoRoomError):
+                kind, level = "INSUFFICIENT_MEMORY", "URGENT"
+            with self._lock:
+                self._book.fail(action, kind, str(error), level)
+        with self._lock:
+            self._known.versions = maps.versions()
+            self.changed.set()
+
+    def _act(self, maps: FleetMaps, action: Action, given: dict[str, Any]) -> None:
+        version = int(given["mapVersion"][:12])
+        if action.action_type == "downloadMap":
+            maps.download(version, given["mapDownloadLink"], given.get("mapHash"))
+        elif action.action_type == "deleteMap":
+            with self._lock:
+                enabling = self._pending.enable
+                in_use = set(self._known.in_use) | ({enabling[1].version or 0} if enabling else set())
+            maps.delete(version, in_use)
+        elif (version, True) not in maps.versions():
+            wanted = maps.wanted(version)
+            with self._lock:
+                self._pending.enable = (action, wanted, self._clock_s() + _ENABLE_S)
+            return self._parts.offer(wanted)
+        with self._lock:
+            self._book.set(action, "FINISHED")
+        return None
+
+    def changed_version(self, change: VersionChange) -> None:
+        """A version was adopted, refused or postponed by the localizer, and the disk knows; from the thread of `work`."""
+        with self._lock:
+            enabling = self._pending.enable
+            if enabling is None or enabling[1].manifest_sha256 != change.wanted.manifest_sha256:
+                return
+            self._pending.enable = None
+            if change.change is Change.ADOPTED:
+                self._book.set(enabling[0], "FINISHED")
+            else:
+                self._book.fail(enabling[0], "MAP_ACTION_FAILED", f"the robot did not take it: {change.reason}")
+            self.changed.set()
+
+    def _end_enabling(self) -> None:
+        enabling = self._pending.enable
+        if enabling is not None and self._clock_s() > enabling[2]:
+            self._pending.enable = None
+            words = f"after {_ENABLE_S:.0f} s the robot has not confirmed it; does it see anything?"
+            self._book.fail(enabling[0], "MAP_ACTION_FAILED", words)
+            self.changed.set()
+
+    # --- position -----------------------------------------------------------------------------------------------------
+
+    def _initialize(self, action: Action, given: dict[str, Any]) -> None:
+        now, section = self._known.localization, self._section
+        if given["mapId"] != self.map_id or not any(is_enabled for _, is_enabled in self._known.versions):
+            return self._book.fail(
+                action, "INITIALIZE_POSITION_FAILED", f"map {given['mapId'][:80]!r} is not enabled here"
+            )
+        if abs(given["theta"]) > np.pi + 1e-6:
+            return self._book.fail(
+                action, "INITIALIZE_POSITION_FAILED", f"theta = {given['theta']} is beyond -pi to pi"
+            )
+        if now.stamp_ns is None or now.is_silent:
+            return self._book.fail(action, "INITIALIZE_POSITION_FAILED", "no images come from the cameras")
+        if self._pending.position is not None:
+            self._book.set(self._pending.position[0], "FAILED", "another initializePosition came")
+        place = Position(float(given["x"]), float(given["y"]), float(given["theta"]))
+        self._pending.position = (action, place, self._clock_s() + section.initialize_s)
+        self._book.set(action, "RUNNING")
+        if now.status == Status.TRACKING:  # a pose that fixes confirm is not given up for what somebody says
+            return self._judge_position(is_last=True)
+        sigmas = [_TILT_SIGMA_RAD] * 2 + [section.initial_sigma_rad] + [section.initial_sigma_m] * 2 + [_HEIGHT_SIGMA_M]
+        map_from_base = se3(so3_exp(np.array([0.0, 0.0, place.theta_rad])), np.array([place.x_m, place.y_m, 0.0]))
+        self._parts.put_prior(PositionPrior(now.stamp_ns + 1, map_from_base, np.diag(np.square(sigmas))))
+        return None
+
+    def after_frame(self, outcome: Outcome, in_use: frozenset[int]) -> None:
+        """The results of a frame, and the versions that the localizer holds; from the thread that localizes."""
+        with self._lock:
+            self._known.in_use = in_use
+            self._see(self._known.localization.after(outcome, is_driving=is_driving(outcome.speed_mps)))
+            self._judge_position()
+
+    def silence(self) -> None:
+        """No frames come."""
+        with self._lock:
+            self._see(replace(self._known.localization, is_silent=True))
+            self._judge_position()
+
+    def _see(self, localization: Localization) -> None:
+        self._known.localization = localization
+        said = localization.error(), localization.is_driving
+        if said != self._last_said:
+            if localization.error() is not None:
+                self._untold = localization
+            self._last_said = said
+            self.changed.set()
+
+    def _judge_position(self, *, is_last: bool = False) -> None:
+        """Whether the robot has come to be where it was put; is_last: there is no time left for it."""
+        pending, now = self._pending.position, self._known.localization
+        if pending is None:
+            return
+        action, wanted, until_s = pending
+        section, words = self._section, "the robot is not localized there; is it there?"
+        if now.is_localized and not now.is_silent and now.position is not None:
+            off_m, off_rad = now.position.away_from(wanted)
+            reach_m = _SIGMAS * section.initial_sigma_m + now.position.radius_m
+            if off_m <= reach_m and off_rad <= _SIGMAS * section.initial_sigma_rad:
+                node, part = parameters(action)["lastNodeId"], self._known.robot.part
+                self._known.robot.last_node = (node, "" if part is None else part.last_node_id)
+                self._pending.position = None
+                self._book.set(action, "FINISHED")
+                return self.changed.set()
+            words = f"what the robot sees puts it {off_m:.2f} m and {off_rad:.2f} rad from there"
+        if is_last or self._clock_s() > until_s:
+            self._pending.position = None
+            self._book.fail(action, "INITIALIZE_POSITION_FAILED", words)
+            self.changed.set()
+        return None
+
+    # --- the state ----------------------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """The state without its header."""
+        with self._lock:
+            known, now = self._known, self._untold or self._known.localization
+            if self._untold is not None:
+                self._untold = None
+                self.changed.set()
+            lost = now.error()
+            errors = [*([lost] if lost else []), *self._book.errors]
+            found: dict[str, Any] = {**_EMPTY, "driving": now.is_driving, **self._robots_own()}
+            node = known.robot.last_node
+            if node is not None and found["lastNodeId"] == node[1]:
+                found["lastNodeId"] = node[0]
+            found["maps"] = [
+                {"mapId": self.map_id, "mapVersion": str(number), "mapStatus": "ENABLED" if on else "DISABLED"}
+                for number, on in known.versions
+            ]
+            place = now.mobile_robot_position(self.map_id, self._parts.lost_radius_m)
+            if place is not None:
+                found["mobileRobotPosition"] = place
+            found["errors"] = msgspec.to_builtins(errors) + found.get("errors", [])
+            found["instantActionStates"] = msgspec.to_builtins(self._book.states) + found.get("instantActionStates", [])
+            return found
+
+    def _robots_own(self) -> dict[str, Any]:
+        part, age_s = self._known.robot.part, self._clock_s() - self._known.robot.heard_s
+        if part is not None and age_s <= self._section.robot_silent_s:
+            own: dict[str, Any] = msgspec.to_builtins(part)
+            return own
+        return {**_UNKNOWN, "errors": msgspec.to_builtins([_silent(part is None, age_s)])}
+
+
+def _silent(is_first: bool, age_s: float) -> Error:
+    since = "has said nothing yet" if is_first else f"has said nothing for {age_s:.0f} s"
+    return Error(
+        error_type="ROBOT_PART_MISSING",
+        error_level="CRITICAL",
+        error_description=f"the robot's own program {since}; battery, safety and operating mode are unknown",
+        error_hint="it publishes them on the topic robotState",
+    )

@@ -1,0 +1,123 @@
+"""Versions that a fleet manager had the robot download. All of them stay on the disk until it deletes them."""
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
+from fleetmap.errors import LinkError, MapFormatError, StateError, StoreError, disk_errors
+from fleetmap.messages import WantedVersion
+from fleetmap.version_file import ExportReader, open_export
+from locclient.maps.tile_cache import ActiveVersion, TileCache
+from locclient.maps.version_download import Origins, TooLargeError, download
+
+_TOGETHER = 2  # a file, and the blobs that are taken out of it
+
+
+class NoRoomError(StoreError):
+    """A version that does not fit into the cache."""
+
+
+class DuplicateMapError(StateError):
+    """A version that is on the robot already."""
+
+
+class FleetMaps:
+    """For the thread that owns the cache. check_admitted: raises UntrustedError for what the site's signed list does not admit."""
+
+    def __init__(
+        self,
+        cache: TileCache,
+        site: str,
+        folder: Path,
+        origins: Origins,
+        check_admitted: Callable[[WantedVersion], None],
+    ) -> None:
+        """folder: for files on their way. Raises StoreError where the disk refuses, UsageError for origins that are none."""
+        origins.check()
+        self._cache, self._site, self._folder, self._origins = cache, site, folder, origins
+        self._check_admitted = check_admitted
+        with disk_errors(f"{folder} cannot be used", "choose another cache"):
+            folder.mkdir(parents=True, exist_ok=True)
+            for leftover in folder.glob("*.fmex"):
+                leftover.unlink()
+        active = cache.active(site)
+        if active is not None and active not in cache.kept(site):
+            cache.keep(site, active.version, active.blobs)
+
+    def versions(self) -> list[tuple[int, bool]]:
+        """The versions on the disk, oldest first, and which of them is enabled."""
+        active = self._cache.active(self._site)
+        return [(record.version, record == active) for record in self._cache.kept(self._site)]
+
+    def download(self, version: int, link: str, sha256: str | None) -> None:
+        """Fetches a version's file, checks it by the signed list, and keeps the version. No other version is touched.
+
+        sha256: of the file, None where nobody told it.
+
+        Raises DuplicateMapError, NoRoomError, LinkError, UntrustedError, MapFormatError, StoreError.
+        """
+        if self._find(version) is not None:
+            raise DuplicateMapError(f"version {version} is on the robot already; delete it before another download")
+        room_bytes = self._cache.room_bytes() // _TOGETHER
+        with disk_errors(f"{self._folder} cannot be written", "make space for the cache"), self._file() as file:
+            try:
+                got = download(link, self._origins, file, max_bytes=max(room_bytes, 1))
+            except TooLargeError as error:
+                raise NoRoomError(
+                    f"{error}: half of the room in the cache; delete a map, or raise [run] cache_bytes"
+                ) from error
+            file.flush()
+            if sha256 is not None and got != sha256.lower():
+                raise LinkError(
+                    f"the file behind {link[:200]} has SHA-256 {got}, the fleet manager named {sha256[:64]}"
+                )
+            with open_export(Path(file.name)) as reader:
+                self._take(reader, version)
+
+    def _file(self) -> "tempfile._TemporaryFileWrapper[bytes]":
+        return tempfile.NamedTemporaryFile(dir=self._folder, suffix=".fmex")
+
+    def _take(self, reader: ExportReader, version: int) -> None:
+        head = reader.head
+        if (head.site, head.version) != (self._site, version):
+            raise MapFormatError(
+                f"the file holds version {head.version} of {head.site}, wanted was {version} of {self._site}"
+            )
+        self._check_admitted(WantedVersion(site=head.site, version=version, manifest_sha256=head.blobs[0].sha256))
+        manifest = reader.manifest()
+        reader.check_tiles(manifest)
+        new = [blob for blob in head.blobs if blob.kind != "archive" and blob.sha256 not in self._cache]
+        if sum(blob.bytes for blob in new) > self._cache.room_bytes():
+            raise NoRoomError(
+                f"version {version} does not fit into the cache; delete a map, or raise [run] cache_bytes"
+            )
+        for number, blob in enumerate(head.blobs):
+            if blob in new:
+                self._cache.put(blob.sha256, reader.data(number))
+        vocabulary = manifest.vocabulary.sha256
+        words = [] if shipped_vocabulary(vocabulary) else [vocabulary]
+        self._cache.keep(self._site, version, [head.blobs[0].sha256, *words, *(tile.sha256 for tile in manifest.tiles)])
+
+    def wanted(self, version: int) -> WantedVersion:
+        """A version that may be run now; StateError for one that is not on the disk, UntrustedError for one that was withdrawn."""
+        wanted = self._get(version).wanted(self._site)
+        self._check_admitted(wanted)
+        return wanted
+
+    def delete(self, version: int, in_use: set[int]) -> None:
+        """Removes a version; StateError where it is enabled, in use or not there."""
+        record = self._get(version)
+        if version in in_use or record == self._cache.active(self._site):
+            raise StateError(f"version {version} is in use; enable another one first")
+        self._cache.release(self._site, version)
+
+    def _get(self, version: int) -> ActiveVersion:
+        record = self._find(version)
+        if record is None:
+            known = ", ".join(str(known) for known, _ in self.versions()) or "none"
+            raise StateError(f"version {version} is not on the robot, which has {known}")
+        return record
+
+    def _find(self, version: int) -> ActiveVersion | None:
+        return next((record for record in self._cache.kept(self._site) if record.version == version), None)

@@ -1,0 +1,112 @@
+"""What VDA 5050 says of a robot's localization, from its estimates: the position and LOCALIZATION_ERROR. Pure."""
+
+from dataclasses import dataclass
+from math import atan2, hypot, pi
+
+from fleetmap.failure_definition import radius_95_m
+from fleetmap.geometry import Array
+from fleetmap.messages import Cause, Status
+from locclient.robot.robot import Outcome
+from locclient.vda5050.messages import Error
+
+_NO_FRAMES = "no images come from the cameras; look at them and their cables"
+_NO_MAP = "the robot has no map; download and enable one"
+_WORDS = {
+    Cause.DARK: "the images are dark: lights out, or a covered lens",
+    Cause.GLARE: "the images are overexposed",
+    Cause.FROZEN: "a camera repeats its last image",
+    Cause.BLURRED: "the images are blurred; clean the lenses",
+    Cause.OCCLUDED: "something stands close before the cameras",
+    Cause.ODOMETRY: "the odometry has lost its hold",
+    Cause.UNMATCHED: "nothing in the map agrees with what is seen: changed, not mapped, or seen from another side only",
+    Cause.CALIBRATION: "what is seen contradicts the map as only a wrong calibration does; check the cameras' mounting",
+}
+_STATUS_WORDS = {
+    Status.AMBIGUOUS: "several places agree with what is seen; drive on, or send initializePosition",
+    Status.INITIALISING: "the robot has not found itself yet; drive on, or send initializePosition",
+    Status.LOST: "the robot has lost itself; drive on, or send initializePosition",
+}
+
+
+@dataclass(frozen=True)
+class Position:
+    """A pose of the base in `map`. radius_m: of 95 %, infinite where the robot is not localized."""
+
+    x_m: float
+    y_m: float
+    theta_rad: float
+    radius_m: float = float("inf")
+
+    def away_from(self, other: "Position") -> tuple[float, float]:
+        """Metres, and radians from 0 to pi."""
+        turn = abs(self.theta_rad - other.theta_rad) % (2 * pi)
+        return hypot(self.x_m - other.x_m, self.y_m - other.y_m), min(turn, 2 * pi - turn)
+
+
+@dataclass(frozen=True)
+class Localization:
+    """The last estimate. position: also of a robot that is not localized, the last one that it knew; None before the first."""
+
+    status: str = Status.INITIALISING
+    cause: str = ""
+    stamp_ns: int | None = None
+    position: Position | None = None
+    is_localized: bool = False
+    is_driving: bool = True
+    is_silent: bool = True
+    has_map: bool = False
+
+    def after(self, outcome: Outcome, *, is_driving: bool) -> "Localization":
+        """With the results of one frame."""
+        estimate, published = outcome.estimate, outcome.published
+        position, is_localized = self.position, False
+        if published.map_from_odom is not None and estimate.cov_rot_trans is not None:
+            map_from_base = published.map_from_odom @ published.odom_from_base
+            position = _position(map_from_base, radius_95_m(estimate.cov_rot_trans))
+            is_localized = estimate.status in {Status.TRACKING, Status.DEGRADED}
+        return Localization(
+            estimate.status,
+            estimate.cause,
+            estimate.stamp_ns,
+            position,
+            is_localized,
+            is_driving,
+            is_silent=False,
+            has_map=estimate.map_version is not None,
+        )
+
+    def mobile_robot_position(self, map_id: str, lost_radius_m: float) -> dict[str, object] | None:
+        """The object of the state; None before the first pose. The score is 1 for an exact pose, 0 at lost_radius_m."""
+        place, is_localized = self.position, self.is_localized and not self.is_silent
+        if place is None:
+            return None
+        found: dict[str, object] = {"x": place.x_m, "y": place.y_m, "theta": place.theta_rad, "mapId": map_id}
+        found |= {"localized": is_localized, "localizationScore": 0.0}
+        if is_localized:
+            found["localizationScore"] = max(0.0, 1.0 - place.radius_m / lost_radius_m)
+            found["deviationRange"] = place.radius_m
+        return found
+
+    def error(self) -> Error | None:
+        """LOCALIZATION_ERROR with its cause in words; None for a robot that is localized."""
+        if self.is_localized and not self.is_silent:
+            return None
+        hint = _WORDS.get(Cause(self.cause)) if self.cause in set(Cause) else self.cause
+        if self.is_silent:
+            hint = _NO_FRAMES
+        elif not self.has_map:
+            hint = _NO_MAP
+        elif not hint:
+            hint = _STATUS_WORDS.get(Status(self.status), "the robot has no pose that can be relied upon")
+        said = "no images" if self.is_silent else self.status
+        return Error(
+            error_type="LOCALIZATION_ERROR",
+            error_level="FATAL",
+            error_description=f"the robot is not localized ({said})",
+            error_hint=hint,
+        )
+
+
+def _position(map_from_base: Array, radius_m: float) -> Position:
+    x_m, y_m = (float(value) for value in map_from_base[:2, 3])
+    return Position(x_m, y_m, float(atan2(map_from_base[1, 0], map_from_base[0, 0])), radius_m)

@@ -1,0 +1,147 @@
+"""The adapter's connection to the broker, by paho-mqtt: topics, headers, last will, states at their time."""
+
+import logging
+import ssl
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from fleetmap.errors import UsageError, disk_errors
+from locclient.vda5050.adapter import FleetAdapter
+from locclient.vda5050.messages import MAJOR, MAX_PAYLOAD_BYTES, VERSION, timestamp
+from locclient.vda5050.settings import Broker, Vda5050Section
+
+if TYPE_CHECKING:
+    from paho.mqtt.client import Client
+
+ROBOT_TOPIC = "robotState"
+_LEAST_S = 0.1  # between two states
+_GOODBYE_S = 2.0
+_KEEPALIVE_S = 15
+_log = logging.getLogger(__name__)
+
+
+class MqttLink:
+    """Connects in the background, again and again; what cannot be sent now is not sent later, because the next state replaces it."""
+
+    def __init__(
+        self, broker: Broker, section: Vda5050Section, adapter: FleetAdapter, factsheet: dict[str, Any] | None
+    ) -> None:
+        """Raises UsageError where paho-mqtt is missing, or the broker's authorities cannot be read."""
+        self.adapter, self._broker, self._section, self._factsheet = adapter, broker, section, factsheet
+        self._prefix = f"{section.interface}/{MAJOR}/{section.manufacturer}/{section.serial_number}"
+        self._sent: Counter[str] = Counter()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="vda5050", daemon=True)
+        self._heard: dict[str, Callable[[bytes], None]] = {
+            "instantActions": adapter.instant_actions,
+            "order": adapter.order,
+            ROBOT_TOPIC: adapter.robot_part,
+        }
+        self._client = self._new_client()
+
+    def start(self) -> None:
+        """Begins to connect, and returns at once."""
+        self._connect()
+        self._client.loop_start()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Says OFFLINE, where anybody hears it, and ends the connection."""
+        self._stop.set()
+        self.adapter.changed.set()
+        self._thread.join(_GOODBYE_S)
+        if self._client.is_connected():
+            said = self._publish("connection", {"connectionState": "OFFLINE"}, qos=1, retain=True)
+            said.wait_for_publish(_GOODBYE_S)
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def _new_client(self) -> "Client":
+        try:
+            from paho.mqtt import client as mqtt
+            from paho.mqtt.enums import CallbackAPIVersion
+        except ImportError as error:
+            raise UsageError(
+                "[vda5050] needs paho-mqtt, which is not installed: pip install '.[client,vda5050]'"
+            ) from error
+        protocol = mqtt.MQTTv5 if self._section.mqtt == "5" else mqtt.MQTTv311
+        name = f"{self._section.manufacturer}-{self._section.serial_number}"
+        client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=name, protocol=protocol)
+        client.suppress_exceptions = True  # they would end paho's thread; its logger has them
+        client.enable_logger(_log)
+        client.reconnect_delay_set(1, 30)
+        if self._broker.username is not None:
+            client.username_pw_set(self._broker.username, self._broker.password)
+        if self._broker.is_tls:
+            ca = None if self._broker.ca is None else str(self._broker.ca)
+            with disk_errors(f"[vda5050] ca {ca} cannot be read", "check the path", UsageError):
+                client.tls_set_context(ssl.create_default_context(cafile=ca))
+        client.on_pre_connect = lambda *_: self._set_will()
+        client.on_connect = self._on_connect
+        client.on_message = self._on_message
+        return client
+
+    def _connect(self) -> None:
+        where = (self._broker.host, self._broker.port, _KEEPALIVE_S)
+        if self._section.mqtt == "5":
+            from paho.mqtt.packettypes import PacketTypes
+            from paho.mqtt.properties import Properties
+
+            limits = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            limits.MaximumPacketSize = MAX_PAYLOAD_BYTES + 4096  # the broker keeps larger ones back
+            self._set_will()
+            self._client.connect_async(*where, clean_start=True, properties=limits)
+        else:
+            self._client.connect_async(*where)
+
+    def _set_will(self) -> None:
+        will = self._encoded("connection", {"connectionState": "CONNECTION_BROKEN"})
+        self._client.will_set(f"{self._prefix}/connection", will, qos=1, retain=True)
+
+    def _on_connect(self, client: "Client", _: object, __: object, reason: Any, ___: object) -> None:
+        if reason.is_failure:
+            _log.warning("the broker %s refuses the robot: %s", self._broker.host, reason)
+            return
+        for topic in self._heard:
+            client.subscribe(f"{self._prefix}/{topic}", qos=0)
+        self._publish("connection", {"connectionState": "ONLINE"}, qos=1, retain=True)
+        if self._factsheet is not None:
+            self.adapter.factsheet_wanted.set()
+        self.adapter.changed.set()
+
+    def _on_message(self, _: object, __: object, message: Any) -> None:
+        handle = self._heard.get(message.topic.rpartition("/")[2])
+        if handle is not None and not message.retain:  # what was retained may be of another day
+            handle(message.payload)
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            self.adapter.changed.wait(self._section.state_interval_s)
+            self.adapter.changed.clear()
+            if not self._client.is_connected() or self._stop.is_set():
+                self._stop.wait(_LEAST_S)
+                continue
+            if self._factsheet is not None and self.adapter.factsheet_wanted.is_set():
+                self.adapter.factsheet_wanted.clear()
+                self._publish("factsheet", self._factsheet, qos=0, retain=True)
+            self._publish("state", self.adapter.state(), qos=0, retain=False)
+            self._stop.wait(_LEAST_S)
+
+    def _publish(self, topic: str, content: dict[str, Any], *, qos: int, retain: bool) -> Any:
+        return self._client.publish(f"{self._prefix}/{topic}", self._encoded(topic, content), qos=qos, retain=retain)
+
+    def _encoded(self, topic: str, content: dict[str, Any]) -> bytes:
+        header = {
+            "headerId": self._sent[topic] & 0xFFFFFFFF,
+            "timestamp": timestamp(time.time_ns()),
+            "version": VERSION,
+            "manufacturer": self._section.manufacturer,
+            "serialNumber": self._section.serial_number,
+        }
+        self._sent[topic] += 1
+        return msgspec.json.encode({**header, **content})

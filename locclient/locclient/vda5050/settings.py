@@ -1,0 +1,100 @@
+"""Settings of the connection to a fleet manager, and of what is said there of the robot."""
+
+import re
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from fleetmap.bus import is_loopback
+from fleetmap.config import Section
+from fleetmap.errors import UsageError, disk_errors
+from locclient.maps.version_download import Origins
+
+_LEVEL = re.compile(r"[^/+#\0]{1,128}")
+_BROKER = re.compile(r"(mqtts?)://([^/:@\s]+|\[[0-9a-fA-F:]+\])(?::(\d{1,5}))?/?")
+_MAX_SECRET_BYTES = 4096
+_LEAST_SIGMA_M = 0.15  # up to 0.1 a prior is a dock's, against which estimates are checked
+
+
+class Vda5050Section(Section, frozen=True):
+    """The broker, the robot's name there, and who chooses its map. Without a broker nothing is said."""
+
+    broker: str | None = None
+    manufacturer: str = ""
+    serial_number: str = ""
+    interface: str = "vda5050"
+    username: str | None = None
+    password_file: str | None = None
+    ca: str | None = None
+    map_id: str | None = None
+    versions: Literal["fleet manager", "map server"] = "fleet manager"
+    download_from: tuple[str, ...] = ()
+    download_token_file: str | None = None
+    download_ca: str | None = None
+    mqtt: Literal["5", "3.1.1"] = "5"
+    robot_actions: tuple[str, ...] = ()
+    factsheet: str | None = None
+    state_interval_s: float = 1.0
+    robot_silent_s: float = 10.0
+    initialize_s: float = 15.0
+    initial_sigma_m: float = 0.5
+    initial_sigma_rad: float = 0.2
+
+
+class Broker(NamedTuple):
+    """Where to connect. ca: file of the authorities, None for the machine's."""
+
+    host: str
+    port: int
+    is_tls: bool
+    ca: Path | None
+    username: str | None
+    password: str | None
+
+
+def check_section(section: Vda5050Section, *, insecure: bool) -> Broker:
+    """Where the section leads; UsageError for what is missing or cannot be right."""
+    match = _BROKER.fullmatch(section.broker or "")
+    if match is None:
+        raise UsageError(f"[vda5050] broker = {section.broker!r} is not like mqtts://HOST or mqtts://HOST:PORT")
+    for name in ("interface", "manufacturer", "serial_number"):
+        value = getattr(section, name)
+        if not _LEVEL.fullmatch(value):
+            raise UsageError(f"[vda5050] {name} = {value!r}: a level of an MQTT topic, without / + and #, is needed")
+    for name in ("state_interval_s", "robot_silent_s", "initialize_s", "initial_sigma_m", "initial_sigma_rad"):
+        if not 0 < getattr(section, name) <= 3600:
+            raise UsageError(f"[vda5050] {name} = {getattr(section, name)} must be between 0 and 3600")
+    if section.initial_sigma_m < _LEAST_SIGMA_M:
+        raise UsageError(
+            f"[vda5050] initial_sigma_m = {section.initial_sigma_m}: at least {_LEAST_SIGMA_M}, or it is a dock's"
+        )
+    if section.state_interval_s > 30:
+        raise UsageError(f"[vda5050] state_interval_s = {section.state_interval_s}: VDA 5050 wants 30 at most")
+    scheme, host, port = match[1], match[2].strip("[]"), int(match[3] or (8883 if match[1] == "mqtts" else 1883))
+    if scheme == "mqtt" and not insecure and not is_loopback(f"tcp/{host}:{port}"):
+        raise UsageError(
+            f"[vda5050] broker = {section.broker!r} is on another machine and without TLS; use mqtts://, or --insecure"
+        )
+    if (section.username is None) != (section.password_file is None):
+        raise UsageError("[vda5050] username and password_file belong together")
+    ca = None if section.ca is None else Path(section.ca)
+    password = None if section.password_file is None else read_secret(section.password_file)
+    return Broker(host, port, scheme == "mqtts", ca, section.username, password)
+
+
+def origins_of(section: Vda5050Section, *, insecure: bool) -> Origins:
+    """Servers that maps may come from; UsageError where a file cannot be read or an origin is none."""
+    token = None if section.download_token_file is None else read_secret(section.download_token_file)
+    ca = None if section.download_ca is None else Path(section.download_ca)
+    origins = Origins(section.download_from, token, ca, insecure)
+    origins.check()
+    return origins
+
+
+def read_secret(path: str) -> str:
+    """The first line of a file; UsageError where it cannot be one."""
+    with disk_errors(f"[vda5050] {path} cannot be read", "check the path and its rights", UsageError):
+        data = Path(path).read_bytes()[: _MAX_SECRET_BYTES + 1]
+    lines = data.decode("utf-8", "replace").splitlines()
+    if not lines or len(data) > _MAX_SECRET_BYTES or not lines[0].isprintable():
+        raise UsageError(f"[vda5050] {path} holds no line of at most {_MAX_SECRET_BYTES} bytes")
+    return lines[0]

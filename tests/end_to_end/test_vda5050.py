@@ -1,0 +1,155 @@
+"""A fleet manager of VDA 5050, a real mosquitto, the map server over HTTP and the bus, and the robot's daemon as a process."""
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import uvicorn
+
+from fleetmap.bus import ZenohBus
+from mapserver.api.app import create_app
+from mapserver.api.metrics import Metrics
+from mapserver.fleet.fleet import Fleet
+from mapserver.serving.bus_service import BusService
+from mapserver.store import MapStore
+from mapserver.trust import init_here
+from support.fleet_manager.vda5050_master import Master, mosquitto, until
+from support.worlds import robot_world
+
+START_S = 60.0  # the first start of all compiles every kernel
+FRAMES, CARRIED_AT = 1100, 490
+
+
+@contextmanager
+def http_server(store: MapStore, fleet: Fleet) -> Iterator[str]:
+    app = create_app(store, fleet, Metrics(store, fleet), None)
+    server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning"))
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    until(lambda: server.started)
+    try:
+        yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    finally:
+        server.should_exit = True
+        thread.join(10)
+
+
+@contextmanager
+def robot(folder: Path, endpoint: str, broker: int, http: str) -> Iterator[subprocess.Popen[bytes]]:
+    recording = robot_world.write(folder / "ride", robot_world.carried(FRAMES, CARRIED_AT))
+    config = folder / "robot.toml"
+    config.write_text(
+        f'[run]\nserver = "{endpoint}"\nsite = "room"\nrobot = "r1"\ncache = "{folder}/cache"\nspool = "{folder}/outbox"\n'
+        f'[source]\nkind = "recording"\nrecording = "{recording}"\n'
+        f'[vda5050]\nbroker = "mqtt://127.0.0.1:{broker}"\nmanufacturer = "acme"\nserial_number = "0001"\n'
+        f'download_from = ["{http}"]\nstate_interval_s = 0.5\ninitialize_s = 10.0\n'
+    )
+    arguments = [sys.executable, "-m", "locclient.cli", "run", "--config", str(config), "--verbose"]
+    environment = {**os.environ, "PYTHONPATH": ":".join(sys.path)}
+    with (folder / "log").open("wb") as log, subprocess.Popen(arguments, env=environment, stderr=log) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+            print((folder / "log").read_text("utf-8", "replace")[-4000:])  # what pytest shows of a failure
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_fleet_manager_gives_a_robot_its_maps_and_hears_that_it_was_carried_away(tmp_path: Path) -> None:
+    with (
+        mosquitto(tmp_path) as broker,
+        MapStore.open(tmp_path / "store", create=True) as store,
+        ZenohBus.listen("tcp/127.0.0.1:0") as bus,
+    ):
+        robot_world.save(store)
+        init_here(store)
+        fleet = Fleet(store)
+        service = BusService(store, fleet, bus, lambda *_: None)
+        master = Master(broker)
+        try:
+            with http_server(store, fleet) as http, robot(tmp_path, bus.endpoint, broker, http) as process:
+                _story(master, store, http)
+                process.kill()
+                until(lambda: master.connections[-1] == "CONNECTION_BROKEN")
+        finally:
+            master.close()
+            service.close()
+        assert master.faults == []
+
+
+def _is_lost(state: dict[str, Any]) -> bool:
+    return any(error["errorType"] == "LOCALIZATION_ERROR" and error["errorHint"] for error in state["errors"])
+
+
+def _story(master: Master, store: MapStore, http: str) -> None:
+    until(lambda: bool(master.states), "no state", START_S)
+    assert master.connections[-1] == "ONLINE"
+    assert master.state["operatingMode"] == "STARTUP"
+    assert master.errors("ROBOT_PART_MISSING")
+    assert master.errors("LOCALIZATION_ERROR")[0]["errorLevel"] == "FATAL"
+    assert master.maps() == {}
+    master.begin_robot_part()
+
+    offered = httpx.get(f"{http}/v1/sites/room/versions/1/vda5050").json()
+    first = master.act("downloadMap", **offered)
+    master.done(first)
+    assert master.maps() == {"1": "DISABLED"}, "downloading enables nothing"
+    until(lambda: master.state["operatingMode"] == "AUTOMATIC")
+    assert "no map" in master.errors("LOCALIZATION_ERROR")[0]["errorHint"]
+
+    again = master.done(master.act("downloadMap", **offered), "FAILED")
+    assert [error["errorLevel"] for error in again["errors"] if error["errorType"] == "DUPLICATE_MAP"] == ["WARNING"]
+
+    master.done(master.act("enableMap", mapId="room", mapVersion="1"))
+    assert master.maps() == {"1": "ENABLED"}
+    assert not master.errors("DUPLICATE_MAP"), "it ends when another action on maps is accepted"
+    until(lambda: master.state["mobileRobotPosition"]["localized"] if "mobileRobotPosition" in master.state else False)
+    assert not master.errors("LOCALIZATION_ERROR")
+    place = master.state["mobileRobotPosition"]
+    assert 0 < place["deviationRange"] < 0.5
+    assert place["localizationScore"] > 0.8
+    assert place["mapId"] == "room"
+
+    before = len(master.states)
+    until(lambda: any(map(_is_lost, master.states[before:])), "the kidnapping was not told", 150.0)
+    told = next(state for state in master.states[before:] if _is_lost(state))
+    assert told["mobileRobotPosition"]["localized"] is False
+    assert [error["errorLevel"] for error in told["errors"] if error["errorType"] == "LOCALIZATION_ERROR"] == ["FATAL"]
+
+    truth = robot_world.truth(40)
+    yaw_rad = float(np.arctan2(truth[1, 0], truth[0, 0]))
+    x_m, y_m = (float(value) for value in truth[:2, 3])
+    until(lambda: not master.errors("LOCALIZATION_ERROR"), "it finds itself where it was carried to")
+    there = master.act("initializePosition", x=x_m + 0.1, y=y_m - 0.1, theta=yaw_rad, mapId="room", lastNodeId="n-9")
+    master.done(there)
+    assert master.state["lastNodeId"] == "n-9"
+    until(lambda: not master.errors("LOCALIZATION_ERROR"))
+    until(lambda: abs(master.state["mobileRobotPosition"]["x"] - x_m) < 0.1, lambda: master.state)
+    assert abs(master.state["mobileRobotPosition"]["y"] - y_m) < 0.1
+    elsewhere = master.act("initializePosition", x=x_m + 9, y=y_m, theta=yaw_rad, mapId="room", lastNodeId="n-3")
+    assert "what the robot sees puts it" in str(master.done(elsewhere, "FAILED")["errors"])
+
+    robot_world.save(store)
+    init_here(store)
+    offered = httpx.get(f"{http}/v1/sites/room/versions/2/vda5050").json()
+    master.done(master.act("downloadMap", **offered))
+    assert master.maps() == {"1": "ENABLED", "2": "DISABLED"}
+    change = master.act("enableMap", mapId="room", mapVersion="2")
+    master.done(change)
+    assert "RUNNING" in master.seen(change), "a version is tried before it replaces another one"
+    assert master.maps() == {"1": "DISABLED", "2": "ENABLED"}
+    assert "in use" in str(master.done(master.act("deleteMap", mapId="room", mapVersion="2"), "FAILED")["errors"])
+    master.done(master.act("deleteMap", mapId="room", mapVersion="1"))
+    assert master.maps() == {"2": "ENABLED"}
+    assert "not on the robot" in str(
+        master.done(master.act("deleteMap", mapId="room", mapVersion="1"), "FAILED")["errors"]
+    )

@@ -1,0 +1,324 @@
+"""What the adapter says is what the official schemas allow, whatever came; each wrong input gets an error of its own."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from fleetmap.errors import UsageError
+from fleetmap.messages import Cause, Status, WantedVersion
+from fleetmap.sensors.samples import PositionPrior
+from locclient.vda5050.adapter import AdapterParts, FleetAdapter
+from locclient.vda5050.factsheet import read_factsheet
+from locclient.vda5050.localization import Localization, Position
+from locclient.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
+from locclient.vda5050.settings import Vda5050Section, check_section
+from support.fleet_manager.vda5050_master import validator
+
+HEADER = {
+    "headerId": 1, "timestamp": timestamp(1_767_323_045_123_456_789), "version": "3.0.0", "manufacturer": "acme", "serialNumber": "1",
+}  # fmt: skip
+PART = {
+    "operatingMode": "AUTOMATIC",
+    "powerSupply": {"stateOfCharge": 50, "charging": True, "range": 12.5},
+    "safetyState": {"activeEmergencyStop": "NONE", "fieldViolation": False},
+}
+TRACKING = Localization(
+    Status.TRACKING,
+    "",
+    10,
+    Position(1.0, 2.0, 3.14159265358979, 0.12),
+    True,
+    is_driving=False,
+    is_silent=False,
+    has_map=True,
+)
+
+
+class FakeMaps:
+    """Versions without bytes."""
+
+    def __init__(self) -> None:
+        self.held = [(1, True), (2, False)]
+
+    def versions(self) -> list[tuple[int, bool]]:
+        return self.held
+
+    def wanted(self, version: int) -> WantedVersion:
+        return WantedVersion(site="hall", version=version, manifest_sha256=f"{version:064x}")
+
+    def delete(self, version: int, in_use: set[int]) -> None:
+        self.held = [entry for entry in self.held if entry[0] != version]
+
+
+class Adapter(FleetAdapter):
+    """With a clock to turn, and everything that it asks for kept."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.now_s, self.offers, self.priors = 100.0, [], []
+        self.schema = validator("state")
+        parts = AdapterParts(
+            "hall", FakeMaps(), lambda: None, self.offers.append, self.priors.append, 3.0  # type: ignore[arg-type]
+        )  # fmt: skip
+        super().__init__(Vda5050Section(**settings), parts, lambda: self.now_s)
+        self.work()
+        self._see(TRACKING)
+
+    def said(self) -> dict[str, Any]:
+        """The state as it leaves."""
+        state = json.loads(msgspec.json.encode({**HEADER, **self.state()}))
+        assert list(self.schema.iter_errors(state)) == []
+        return state
+
+    def ask(self, kind: str = "enableMap", name: str = "a", **parameters: Any) -> dict[str, Any]:
+        listed = [{"key": key, "value": value} for key, value in parameters.items()]
+        action = {"actionId": name, "actionType": kind, "blockingType": "NONE", "actionParameters": listed}
+        self.instant_actions(json.dumps({**HEADER, "actions": [action]}).encode())
+        self.work()
+        return next(state for state in self.said()["instantActionStates"] if state["actionId"] == name)
+
+    def error_types(self) -> list[str]:
+        return [error["errorType"] for error in self.said()["errors"]]
+
+
+def test_a_position_is_said_as_sure_as_it_is() -> None:
+    adapter = Adapter()
+    adapter.robot_part(json.dumps(PART).encode())
+    place = adapter.said()["mobileRobotPosition"]
+    assert (place["x"], place["y"], place["mapId"], place["localized"]) == (1.0, 2.0, "hall", True)
+    assert place["deviationRange"] == 0.12
+    assert place["localizationScore"] == pytest.approx(0.96)
+    assert adapter.error_types() == []
+    assert adapter.said()["powerSupply"] == PART["powerSupply"]
+
+
+@pytest.mark.parametrize("status", [Status.LOST, Status.AMBIGUOUS, Status.INITIALISING])
+@pytest.mark.parametrize("cause", [*Cause, "something that a later fleetmap says"])
+def test_a_robot_that_is_not_localized_says_why(status: Status, cause: str) -> None:
+    adapter = Adapter()
+    adapter._see(replace(TRACKING, status=status, cause=cause, is_localized=False))
+    state = adapter.said()
+    assert state["mobileRobotPosition"]["localized"] is False
+    assert "deviationRange" not in state["mobileRobotPosition"]
+    (error,) = (error for error in state["errors"] if error["errorType"] == "LOCALIZATION_ERROR")
+    assert error["errorLevel"] == "FATAL"
+    assert len(error["errorHint"]) > 10 or error["errorHint"] == cause
+
+
+def test_a_loss_between_two_states_is_told() -> None:
+    adapter = Adapter()
+    adapter.said()
+    adapter._see(replace(TRACKING, status=Status.LOST, is_localized=False))
+    adapter._see(TRACKING)
+    adapter.changed.clear()
+    assert adapter.said()["errors"][0]["errorType"] == "LOCALIZATION_ERROR"
+    assert adapter.changed.is_set(), "and what is true now follows at once"
+    assert adapter.said()["mobileRobotPosition"]["localized"] is True
+
+
+def test_without_images_or_a_map_it_is_not_localized() -> None:
+    adapter = Adapter()
+    adapter.silence()
+    assert "no images" in adapter.said()["errors"][0]["errorHint"]
+    assert adapter.said()["mobileRobotPosition"]["localized"] is False
+    adapter._see(replace(TRACKING, is_localized=False, has_map=False, position=None))
+    assert "no map" in adapter.said()["errors"][0]["errorHint"]
+    assert "mobileRobotPosition" not in adapter.said()
+
+
+def test_the_robots_own_part_is_missed_and_checked() -> None:
+    adapter = Adapter()
+    assert adapter.said()["operatingMode"] == "STARTUP"
+    assert adapter.said()["safetyState"]["fieldViolation"] is True, "nothing is said that looks safe"
+    assert adapter.error_types() == ["ROBOT_PART_MISSING"]
+    adapter.robot_part(json.dumps(PART).encode())
+    assert adapter.said()["operatingMode"] == "AUTOMATIC"
+    for wrong in (
+        {"operatingMode": "FLYING"}, {"powerSupply": {"stateOfCharge": 101, "charging": True}}, {"maps": []},
+        {"errors": [{"errorType": "X", "errorLevel": "MILD"}]}, {"nodeStates": [{"nodeId": "n"}]}, {"velocity": {"vx": "fast"}},
+    ):  # fmt: skip
+        adapter.robot_part(json.dumps({**PART, **wrong}).encode())
+        assert adapter.error_types() == ["ROBOT_PART_INVALID"], wrong
+        assert adapter.said()["operatingMode"] == "AUTOMATIC", "the last one stands"
+    adapter.robot_part(json.dumps({**PART, "errors": [{"errorType": "FORK_BENT", "errorLevel": "URGENT"}]}).encode())
+    assert adapter.error_types() == ["FORK_BENT"]
+    adapter.now_s += 11.0
+    assert adapter.error_types() == ["ROBOT_PART_MISSING"]
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"{",
+        b"\xff\xfe",
+        b"[]",
+        b'{"headerId": 1}',
+        b"[" * 200_000,
+        b'{"headerId":1,"actions":' + b" " * MAX_PAYLOAD_BYTES + b"[]}",
+    ],
+    ids=["empty", "cut", "no text", "list", "half", "deep", "huge"],
+)
+def test_malformed_messages_are_said_and_change_nothing(payload: bytes) -> None:
+    adapter = Adapter()
+    for take in (adapter.instant_actions, adapter.order):
+        take(payload)
+    assert adapter.error_types() == ["VALIDATION_FAILURE", "ROBOT_PART_MISSING"]
+    assert adapter.said()["instantActionStates"] == []
+    assert adapter.ask("stateRequest")["actionStatus"] == "FINISHED"
+    assert adapter.error_types() == ["ROBOT_PART_MISSING"], "it ends when another action is accepted"
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "error_type", "words"),
+    [
+        ("makeCoffee", {}, "INVALID_INSTANT_ACTION", "unknown here; known are downloadMap"),
+        ("enableMap", {"mapId": "hall"}, "INVALID_INSTANT_ACTION", "needs the parameter mapVersion"),
+        ("enableMap", {"mapId": "hall", "mapVersion": 2}, "INVALID_INSTANT_ACTION", "must be a string"),
+        ("enableMap", {"mapId": "hall", "mapVersion": "2", "x": 1}, "INVALID_INSTANT_ACTION", "no parameter 'x'"),
+        ("enableMap", {"mapId": "yard", "mapVersion": "2"}, "UNKNOWN_MAP_ID", "'yard'"),
+        ("enableMap", {"mapId": "hall", "mapVersion": "2.1"}, "UNKNOWN_MAP_ID", "'2.1'"),
+        ("initializePosition", {"x": True, "y": 0, "theta": 0, "mapId": "hall", "lastNodeId": "n"}, "INVALID_INSTANT_ACTION", "number"),
+        ("initializePosition", {"x": 1, "y": 2, "theta": 9, "mapId": "hall", "lastNodeId": "n"}, "INITIALIZE_POSITION_FAILED", "theta"),
+        ("initializePosition", {"x": 1, "y": 2, "theta": 0, "mapId": "yard", "lastNodeId": "n"}, "INITIALIZE_POSITION_FAILED", "'yard'"),
+        ("initializePosition", {"x": 99, "y": 2, "theta": 3, "mapId": "hall", "lastNodeId": "n"}, "INITIALIZE_POSITION_FAILED", "98.00 m"),
+        ("factsheetRequest", {}, "FACTSHEET_MISSING", "factsheet"),
+    ],
+)  # fmt: skip
+def test_actions_that_cannot_be_done_fail(kind: str, parameters: dict[str, Any], error_type: str, words: str) -> None:
+    adapter = Adapter()
+    state = adapter.ask(kind, **parameters)
+    assert state["actionStatus"] == "FAILED"
+    assert words in state["actionResult"]
+    (error,) = (error for error in adapter.said()["errors"] if error["errorType"] == error_type)
+    assert error["errorLevel"] == "WARNING"
+    assert {"referenceKey": "actionId", "referenceValue": "a"} in error["errorReferences"]
+    assert adapter.offers == adapter.priors == []
+
+
+def test_others_actions_repeated_actions_and_floods() -> None:
+    adapter = Adapter(robot_actions=("startPause",))
+    with pytest.raises(StopIteration):
+        adapter.ask("startPause")
+    adapter.ask("makeCoffee")
+    adapter.ask("makeCoffee")
+    assert adapter.error_types().count("INVALID_INSTANT_ACTION") == 1, "the same actionId again is the same action"
+    for number in range(300):
+        adapter.ask("stateRequest", f"s-{number}")
+    assert len(adapter.said()["instantActionStates"]) == 200
+    adapter.ask("clearInstantActions", "c")
+    assert [state["actionId"] for state in adapter.said()["instantActionStates"]] == ["c"]
+
+
+def test_a_version_on_trial_is_running_until_the_localizer_decides() -> None:
+    from locclient.robot.robot import Change, VersionChange
+
+    adapter = Adapter()
+    assert adapter.ask(name="a", mapId="hall", mapVersion="1")["actionStatus"] == "FINISHED", "it is enabled already"
+    assert adapter.ask(name="b", mapId="hall", mapVersion="2")["actionStatus"] == "RUNNING"
+    assert adapter.ask(name="c", mapId="hall", mapVersion="2")["actionStatus"] == "WAITING"
+    (wanted,) = adapter.offers
+    adapter.changed_version(VersionChange(wanted, Change.REFUSED, "fixes contradict it"))
+    by_name = {state["actionId"]: state for state in adapter.said()["instantActionStates"]}
+    assert "fixes contradict it" in by_name["b"]["actionResult"]
+    adapter.work()
+    adapter.now_s += 121.0
+    adapter.work()
+    assert "not confirmed" in str(adapter.said()["instantActionStates"])
+
+
+def test_a_position_is_reset_or_not() -> None:
+    adapter = Adapter(initialize_s=5.0)
+    given = {"x": 4.0, "y": 4.0, "theta": 1.0, "mapId": "hall", "lastNodeId": "n-7"}
+    adapter._see(replace(TRACKING, status=Status.LOST, is_localized=False))
+    assert adapter.ask("initializePosition", "a", **given)["actionStatus"] == "RUNNING"
+    prior: PositionPrior = adapter.priors[0]
+    assert prior.stamp_ns == 11
+    assert prior.map_from_base[:2, 3].tolist() == [4.0, 4.0]
+    adapter._see(replace(TRACKING, position=Position(4.2, 3.9, 1.1, 0.2)))
+    adapter._judge_position()
+    assert adapter.said()["instantActionStates"][0]["actionStatus"] == "FINISHED"
+    assert adapter.said()["lastNodeId"] == "n-7"
+    adapter._see(replace(TRACKING, status=Status.LOST, is_localized=False))
+    adapter.ask("initializePosition", "b", **given)
+    adapter.now_s += 6.0
+    adapter._judge_position()
+    assert "not localized there" in adapter.said()["instantActionStates"][1]["actionResult"]
+
+
+def test_an_order_on_a_map_that_is_not_here() -> None:
+    adapter = Adapter()
+    adapter.order(_order("hall", "yard"))
+    (error,) = (error for error in adapter.said()["errors"] if error["errorType"] == "UNKNOWN_MAP_ID")
+    assert {"referenceKey": "orderId", "referenceValue": "o-7"} in error["errorReferences"]
+    adapter.order(_order("hall"))
+    assert "UNKNOWN_MAP_ID" not in adapter.error_types()
+
+
+def _order(*map_ids: str) -> bytes:
+    nodes = [{"nodeId": "n", "sequenceId": 0, "nodePosition": {"x": 0, "y": 0, "mapId": map_id}} for map_id in map_ids]
+    return json.dumps({**HEADER, "orderId": "o-7", "orderUpdateId": 0, "nodes": nodes, "edges": []}).encode()
+
+
+def _sheet() -> dict[str, Any]:
+    return {
+        "typeSpecification": {
+            "seriesName": "T", "mobileRobotKinematics": "DIFFERENTIAL", "mobileRobotClass": "TUGGER", "maximumLoadMass": 500,
+            "localizationTypes": ["RFID"], "navigationTypes": ["FREELY_NAVIGATING"],
+        },
+        "physicalParameters": {
+            "minimumSpeed": 0, "maximumSpeed": 2, "maximumAcceleration": 1, "maximumDeceleration": 1, "minimumHeight": 1,
+            "maximumHeight": 1, "width": 1, "length": 2,
+        },
+        "protocolLimits": {
+            "maximumStringLengths": {}, "maximumArrayLengths": {}, "timing": {"minimumOrderInterval": 1, "minimumStateInterval": 1},
+        },
+        "protocolFeatures": {"optionalParameters": [], "mobileRobotActions": []},
+        "mobileRobotGeometry": {}, "loadSpecification": {},
+    }  # fmt: skip
+
+
+def test_a_factsheet_is_completed(tmp_path: Path) -> None:
+    path = tmp_path / "factsheet.json"
+    path.write_text(json.dumps(_sheet()))
+    sheet = read_factsheet(path)
+    assert list(validator("factsheet").iter_errors({**HEADER, **sheet})) == []
+    assert sheet["typeSpecification"]["localizationTypes"] == ["RFID", "NATURAL"]
+    assert "downloadMap" in [action["actionType"] for action in sheet["protocolFeatures"]["mobileRobotActions"]]
+    spoil: list[Callable[[dict[str, Any]], object]] = [
+        lambda s: s.pop("physicalParameters"), lambda s: s["typeSpecification"].pop("seriesName"),
+        lambda s: s["physicalParameters"].update(maximumSpeed=-1), lambda s: s.update(loadSpecification=[]),
+    ]  # fmt: skip
+    for change in spoil:
+        spoiled = _sheet()
+        change(spoiled)
+        path.write_text(json.dumps(spoiled))
+        with pytest.raises(UsageError, match="factsheet"):
+            read_factsheet(path)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"broker": "tcp://x"}, "not like mqtts"),
+        ({"broker": "mqtt://10.0.0.9"}, "without TLS"),
+        ({"broker": "mqtts://x", "serial_number": "a/b"}, "serial_number"),
+        ({"broker": "mqtts://x", "username": "u"}, "belong together"),
+        ({"broker": "mqtts://x", "state_interval_s": 31.0}, "30 at most"),
+        ({"broker": "mqtts://x", "initial_sigma_m": 0.05}, "a dock's"),
+        ({"broker": "mqtts://x", "username": "u", "password_file": "/nowhere"}, "cannot be read"),
+    ],
+)
+def test_settings_that_cannot_be_right(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        check_section(Vda5050Section(**{"manufacturer": "acme", "serial_number": "1", **settings}), insecure=False)
+
+
+def test_moments_are_written_as_the_standard_does() -> None:
+    assert timestamp(1_767_323_045_123_456_789) == "2026-01-02T03:04:05.123Z"
+    assert datetime.strptime(timestamp(0), "%Y-%m-%dT%H:%M:%S.%f%z") == datetime(1970, 1, 1, tzinfo=UTC)

@@ -1,0 +1,169 @@
+"""A fleet manager of VDA 5050 over a real mosquitto: everything that a robot says is validated against the official schemas."""
+
+import json
+import shutil
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import jsonschema_rs
+import pytest
+
+SCHEMAS = Path(__file__).resolve().parents[4] / "shared" / "data" / "conformance" / "vda5050" / "json_schemas"
+PREFIX = "vda5050/v3/acme/0001"
+PATIENCE_S = 60.0
+
+
+def validator(topic: str) -> jsonschema_rs.Draft202012Validator:
+    """The official schema of a topic; skips where it is not here."""
+    path = SCHEMAS / f"{topic}.schema"
+    if not path.is_file():
+        pytest.skip(f"the schemas of VDA 5050 are not in {SCHEMAS}")
+    return jsonschema_rs.Draft202012Validator(json.loads(path.read_text("utf-8")), validate_formats=True)
+
+
+@contextmanager
+def mosquitto(folder: Path) -> Iterator[int]:
+    """A broker on a free port of this machine; skips where Debian's package is missing."""
+    program = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
+    if program is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto): VDA 5050 is NOT tested over a broker")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    config = folder / "mosquitto.conf"
+    config.write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nuser root\n")
+    with subprocess.Popen([program, "-c", str(config)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as broker:
+        try:
+            until(lambda: _answers(port), "mosquitto does not answer")
+            yield port
+        finally:
+            broker.terminate()
+
+
+def _answers(port: int) -> bool:
+    try:
+        socket.create_connection(("127.0.0.1", port), 0.5).close()
+    except OSError:
+        return False
+    return True
+
+
+def until(found: Callable[[], bool], words: object = "", patience_s: float = PATIENCE_S) -> None:
+    deadline = time.monotonic() + patience_s
+    while not found():
+        assert time.monotonic() < deadline, words() if callable(words) else words
+        time.sleep(0.02)
+
+
+class Master:
+    """Hears one robot, and sends to it."""
+
+    def __init__(self, port: int) -> None:
+        mqtt = pytest.importorskip("paho.mqtt.client")
+        self.states: list[dict[str, Any]] = []
+        self.connections: list[str] = []
+        self.factsheets: list[dict[str, Any]] = []
+        self.faults: list[str] = []
+        self.retained: list[str] = []
+        self._schemas = {topic: validator(topic) for topic in ("state", "connection", "factsheet", "instantActions")}
+        self._count = 0
+        self._robot_part: bytes | None = None
+        self._client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, client_id="master")
+        self._client.on_message = self._hear
+        self._client.connect("127.0.0.1", port)
+        self._client.subscribe(f"{PREFIX}/#")
+        self._client.loop_start()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._speak_for_the_robot, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._stop.set()
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def _hear(self, _: object, __: object, message: Any) -> None:
+        topic = message.topic.rpartition("/")[2]
+        if topic not in {"state", "connection", "factsheet"}:
+            return
+        content = json.loads(message.payload)
+        self.faults += [
+            f"{topic}: {error.message} at {list(error.instance_path)}"
+            for error in self._schemas[topic].iter_errors(content)
+        ]
+        if topic == "state":
+            self.states.append(content)
+        elif topic == "connection":
+            self.connections.append(content["connectionState"])
+            self.retained += [topic] * message.retain
+        else:
+            self.factsheets.append(content)
+
+    def _speak_for_the_robot(self) -> None:
+        """The part of the state that is the robot's own program's."""
+        while not self._stop.wait(0.5):
+            if self._robot_part is not None:
+                self.send("robotState", self._robot_part)
+
+    def begin_robot_part(self, **changed: Any) -> None:
+        part = {
+            "operatingMode": "AUTOMATIC",
+            "powerSupply": {"stateOfCharge": 71.5, "charging": False},
+            "safetyState": {"activeEmergencyStop": "NONE", "fieldViolation": False},
+            "orderId": "o-1", "lastNodeId": "n-1", "driving": False, "loads": [],
+        } | changed  # fmt: skip
+        self._robot_part = json.dumps(part).encode()
+        self.send("robotState", self._robot_part)
+
+    def send(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
+        self._client.publish(f"{PREFIX}/{topic}", payload, retain=retain).wait_for_publish(5)
+
+    def act(self, action_type: str, *, is_valid: bool = True, **parameters: Any) -> str:
+        """Sends an instant action and returns its id."""
+        self._count += 1
+        action = {
+            "actionId": f"a-{self._count}", "actionType": action_type, "blockingType": "NONE",
+            "actionParameters": [{"key": key, "value": value} for key, value in parameters.items()],
+        }  # fmt: skip
+        stamp = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.") + "000Z"
+        message = {"headerId": self._count, "timestamp": stamp, "version": "3.0.0", "manufacturer": "acme"}
+        message |= {"serialNumber": "0001", "actions": [action]}
+        assert self._schemas["instantActions"].is_valid(message) is is_valid
+        self.send("instantActions", json.dumps(message).encode())
+        return f"a-{self._count}"
+
+    @property
+    def state(self) -> dict[str, Any]:
+        return self.states[-1] if self.states else {}
+
+    def action(self, action_id: str) -> dict[str, Any]:
+        found = [state for state in self.state.get("instantActionStates", []) if state["actionId"] == action_id]
+        return found[0] if found else {"actionStatus": "UNSEEN"}
+
+    def done(self, action_id: str, status: str = "FINISHED", patience_s: float = PATIENCE_S) -> dict[str, Any]:
+        """The state that first shows the action finished or failed."""
+        until(lambda: self.action(action_id)["actionStatus"] in {"FINISHED", "FAILED"}, lambda: self.state, patience_s)
+        assert self.action(action_id)["actionStatus"] == status, self.state
+        return self.state
+
+    def seen(self, action_id: str) -> list[str]:
+        """The statuses of an action in all states, each once."""
+        found: list[str] = []
+        for state in self.states:
+            for action in state["instantActionStates"]:
+                if action["actionId"] == action_id and action["actionStatus"] not in found:
+                    found.append(action["actionStatus"])
+        return found
+
+    def errors(self, error_type: str) -> list[dict[str, Any]]:
+        return [error for error in self.state.get("errors", []) if error["errorType"] == error_type]
+
+    def maps(self) -> dict[str, str]:
+        return {entry["mapVersion"]: entry["mapStatus"] for entry in self.state.get("maps", [])}
