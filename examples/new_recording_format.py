@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap import RECORDING_FORMATS, OpenOptions, Recording, RecordingFormat, open_recording, read_calibration
 from fleetmap.recordings.finalize import RecordingParts, finalize
@@ -25,17 +26,22 @@ class NumberedPairs:
     """Access to the images, still encoded or decoded, in any order (a FrameSource)."""
 
     lefts: list[Path]
+    stamps_ns: NDArray[np.int64]
 
     def stored(self, index: int) -> StoredFrame:
         """A pair as it is stored."""
         left = self.lefts[index]
         right = left.with_name(left.name.replace("left", "right"))
         images = [StoredImage("file", file.read_bytes(), str(file)) for file in (left, right)]
-        return StoredFrame(index * PERIOD_NS, *images)
+        return StoredFrame(int(self.stamps_ns[index]), *images)
 
     def frame(self, index: int) -> CameraFrame:
         """A pair, decoded."""
         return decode_frame(self.stored(index))
+
+    def part(self, indices: NDArray[np.int64]) -> "NumberedPairs":
+        """Some of the pairs, for a process that reads them beside others."""
+        return NumberedPairs([self.lefts[int(index)] for index in indices], self.stamps_ns[indices])
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
         """Feeds every byte that was read to the recording's content hash."""
@@ -53,7 +59,9 @@ def open_numbered_pairs(path: Path, options: OpenOptions) -> Recording:
     log, lefts = ReadLog(), sorted(path.glob("*_left.png"))
     calibration = read_calibration(options.calibration_file or path / "calibration.yaml")
     stamps_ns = np.arange(len(lefts), dtype=np.int64) * PERIOD_NS
-    parts = RecordingParts(path, "numbered-pairs", calibration, stamps_ns, NumberedPairs(lefts), has_right=True)
+    parts = RecordingParts(
+        path, "numbered-pairs", calibration, stamps_ns, NumberedPairs(lefts, stamps_ns), has_right=True
+    )
     return finalize(parts, log)  # checks the first image against the calibration
 
 

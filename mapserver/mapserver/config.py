@@ -31,6 +31,7 @@ TIERS = {
         "survey.orb": "extractor count",
         "survey.stereo": "min_depth_m depth_sigma_px",
         "survey.keyframes": "policy every_nth min_overlap max_rotation_deg max_parallax max_interval_s",
+        "survey.segments": "*",
         "survey.loops": "top min_gap_keyframes repeats_every_m",
         "survey.noise": "disparity_sigma_px",
         "survey.sessions": "fade_probability min_confirmations",

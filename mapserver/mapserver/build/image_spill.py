@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.errors import StoreError, disk_errors
 from fleetmap.features.patch_align import half_pyramid
@@ -186,6 +187,10 @@ class KeptFrames:
             self.keeps = self._file.size < _KEPT_BYTES
         except (OSError, StoreError):  # no room: what is not kept is decoded again
             self.keeps = False
+
+    def part(self, indices: NDArray[np.int64]) -> "FrameSource":
+        """See FrameSource; it decodes them again."""
+        return self._source.part(indices)
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
         """See FrameSource."""

@@ -4,6 +4,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fleetmap.errors import RecordingError, UsageError
 from fleetmap.recordings import OpenOptions, Recording, open_recording
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
@@ -75,6 +78,9 @@ class _Reduced:
     def frame(self, index: int) -> CameraFrame:
         frame = self.source.frame(index)
         return CameraFrame(frame.stamp_ns, frame.left) if self.single else frame
+
+    def part(self, indices: NDArray[np.int64]) -> "_Reduced":
+        return replace(self, source=self.source.part(indices))
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
         self.source.hash_into(digest)

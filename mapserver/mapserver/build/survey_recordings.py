@@ -1,6 +1,6 @@
 """Surveys of recordings: each is opened, checked, surveyed and closed, one after the other."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +17,7 @@ from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
-from fleetmap.sensors.samples import DataIssue, SensorSet, Trajectory
+from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps, Trajectory
 from mapserver.build.admission import checked
 from mapserver.build.draft_evidence import HeldOut, held_out_of
 from mapserver.build.image_spill import KeptFrames
@@ -31,11 +31,12 @@ from mapserver.calibration.recordings import LONGEST_S, Follow, stretch_of_chain
 from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
 from mapserver.quality.figures import RigEvidence
 from mapserver.store import MapStore
+from mapserver.survey.chain import AdjustedChain
 from mapserver.survey.executor import SERIAL
 from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey_by_priors
 from mapserver.survey.finish.map_transform import scaled, scaled_state
 from mapserver.survey.merge.multi_session import Joined, chained
-from mapserver.survey.pipeline import AdjustedChain, Survey, begin_survey, finish_survey, survey
+from mapserver.survey.pipeline import Survey, begin_survey, finish_survey, survey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
 
@@ -68,8 +69,10 @@ class Surveyed:
         turned = [
             f"corrected: disparities by {-yaw.shift_px:+.2f} px, sigma {yaw.sigma_px:.2f}, as the adjusted survey says"
         ]
+        apart = [c for c in self.survey.odometry.cuts if c.refused is not None]
+        whole = [f"not cut after {c.after_s:.0f} s, surveyed as one with what comes before: {c.refused}" for c in apart]
         left_out = [component.remark() for component in self.survey.components if not component.kept]
-        return [*self.findings, *(turned if yaw.corrected else ()), *left_out]
+        return [*self.findings, *(turned if yaw.corrected else ()), *whole, *left_out]
 
     def evidence(self) -> RigEvidence:
         """What is known of its calibration: the pair is doubted where the survey's disparities deny the angle that the doctor let pass."""
@@ -79,6 +82,34 @@ class Surveyed:
             return self.calibration
         words = f"the survey's disparities are {-yaw.shift_px:+.2f} px from what its motion says, which the doctor did not find"
         return msgspec.structs.replace(self.calibration, doubted=self.calibration.doubted | {"pair geometry": words})
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedParts:
+    """The selected frames (F,) of a recording as FrameParts: each part reads files of its own, and carries nothing of the others."""
+
+    recording: Recording
+    indices: NDArray[np.int64]
+
+    @property
+    def stamps_ns(self) -> Stamps:
+        """See FrameParts."""
+        return self.recording.frame_stamps_ns[self.indices]
+
+    def part(self, first: int, end: int) -> Iterable[CameraFrame]:
+        """See FrameParts."""
+        part = self.recording.part(self.indices[first:end])
+        return _Frames(replace(part, imu=ImuSamples.empty(), wheel=(), priors=(), ground_truth=None, issues=()))
+
+
+@dataclass(frozen=True, slots=True)
+class _Frames:
+    recording: Recording
+
+    def __iter__(self) -> Iterator[CameraFrame]:
+        with self.recording as recording:
+            for index in range(len(recording)):
+                yield recording.read_frame(index)
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,7 +335,8 @@ def _inputs(
     recording: Recording, indices: NDArray[np.int64], rectifier: Rectifier, given: Trajectory | None
 ) -> SurveyInputs:
     frames = read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices)
-    return SurveyInputs(frames, len(indices), recording.imu, recording.calibration, rectifier, recording.wheel, given)
+    samples = recording.imu, recording.calibration, rectifier, recording.wheel
+    return SurveyInputs(frames, len(indices), *samples, given, RecordedParts(recording, indices))
 
 
 def _aligned(done: Survey, recording: Recording) -> tuple[Survey, Array | None]:

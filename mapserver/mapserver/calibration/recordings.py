@@ -16,7 +16,8 @@ from mapserver.calibration.parameters import COLUMNS, INDEX, CalibrationParamete
 from mapserver.calibration.problem import CalibrationData
 from mapserver.calibration.survey_data import stretch_of_survey, thinned
 from mapserver.survey.bundle.bundle_rounds import state_of
-from mapserver.survey.pipeline import AdjustedChain, begin_survey
+from mapserver.survey.chain import AdjustedChain
+from mapserver.survey.pipeline import begin_survey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 

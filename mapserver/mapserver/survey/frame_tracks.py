@@ -34,6 +34,11 @@ class FrameTracks:
         pixels = np.concatenate([np.zeros((0, 3), np.float32), *(f.pixels for f in frames)])
         return cls(np.cumsum([len(i) for i in ids]), np.concatenate(ids), pixels)
 
+    def part(self, first: int, end: int) -> "FrameTracks":
+        """Those of the frames first..end - 1."""
+        a, b = self.starts[[first, end]]
+        return FrameTracks(self.starts[first : end + 1] - a, self.ids[a:b], self.pixels[a:b])
+
     def of(self, frames: Indices) -> tuple[Indices, Indices, Array]:
         """What some frames saw: track ids (m,), which of the frames (m,) by its place in `frames`, pixels (m, 3)."""
         counts = self.starts[frames + 1] - self.starts[frames]

@@ -1,6 +1,6 @@
 """Odometry over all frames, with the keyframes chosen on the way: the first stage of a survey."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,13 +22,22 @@ _NO_IDS = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
+class Cut:
+    """A frame at which a survey was to be cut into segments, seconds after its first one; refused: why it could not, None where it was."""
+
+    frame: int
+    after_s: float
+    refused: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class OdometryPass:
     """Odometry of F frames and K keyframes.
 
     odom_from_body (F, 4, 4), covariances (F, 6, 6) in odom axes, rotation first; tracked (F,): whether the frame is tied to the
     ones before; inertial: whether gravity was found; scale_known: whether lengths are metres; has_wheels: whether wheel odometry
-    took part; tracks: the points that were followed, None of given poses. Of one camera only tracked frames are in one frame and
-    scale, and only they give keyframes.
+    took part; tracks: the points that were followed, None of given poses; cuts: where segments were to begin. Of one camera only tracked
+    frames are in one frame and scale, and only they give keyframes.
     """
 
     estimates: list[OdometryEstimate]
@@ -40,6 +49,7 @@ class OdometryPass:
     scale_known: bool = True
     has_wheels: bool = False
     tracks: FrameTracks | None = None
+    cuts: tuple[Cut, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +66,17 @@ class TrackedFrame:
 class OdometryRun:
     """Odometry of a recording or of sensors, one frame after the other, with the choice of keyframes."""
 
-    def __init__(self, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings) -> None:
+    def __init__(
+        self,
+        calibration: RigCalibration,
+        rectifier: Rectifier,
+        settings: SurveySettings,
+        keyframes_at: Container[int] = (),
+    ) -> None:
+        """keyframes_at: numbers of frames, counted from 0, that become keyframes whatever they show."""
         mounting = rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s
         self._odometry = make_odometry(calibration, *mounting, settings.odometry, settings.stereo)
-        self._policy = KeyframePolicy(settings.keyframes)
+        self._policy = KeyframePolicy(settings.keyframes, keyframes_at)
         self.chain = FrameChain()
 
     def handle(self, frame: RectifiedFrame, imu: ImuSamples, wheel: Sequence[WheelSample]) -> TrackedFrame:
@@ -91,7 +108,7 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
     While the odometry goes on, the executor finds the features of the keyframes that it has chosen.
     """
     rectifier = inputs.rectifier
-    run = OdometryRun(inputs.calibration, rectifier, settings)
+    run = OdometryRun(inputs.calibration, rectifier, settings, inputs.keyframes_at)
     feed = SampleFeed(inputs.imu, inputs.wheel, rectifier.imu_minus_cam_s)
     seen: list[FrameTracks] = []
 

@@ -1,21 +1,27 @@
 """The survey from end to end: the list of its stages, each a function from a state to a new one."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
-from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
-from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState, bundle_rounds, local_windows
-from mapserver.survey.bundle.odometry_factors import blackout_factors, chain_edges, odometry_factors
+from mapserver.survey.bundle.bundle_rounds import SurveyState
+from mapserver.survey.bundle.odometry_factors import chain_edges, odometry_factors
 from mapserver.survey.bundle.stereo_yaw_check import NO_YAW, StereoYaw, estimate_stereo_yaw, without_stereo_yaw
+from mapserver.survey.chain import (
+    ADJUSTED_SIGMA_RAD,
+    AdjustedChain,
+    adjusted_chain,
+    pair_finder,
+    posed_keyframes,
+    progress_of,
+    with_depths,
+)
 from mapserver.survey.finish.culling import Culled
 from mapserver.survey.finish.frame_adjustment import place_frames
 from mapserver.survey.finish.map_assembly import assemble
-from mapserver.survey.given_poses import poses_as_odometry
 from mapserver.survey.keyframes.connected_components import (
     Component,
     SigmaBetween,
@@ -25,24 +31,20 @@ from mapserver.survey.keyframes.connected_components import (
     find_parts,
     only_kept,
 )
-from mapserver.survey.keyframes.keyframes import PosedKeyframes
 from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.loops.loops import LoopCloser, Loops
 from mapserver.survey.loops.sim3_loops import Sim3LoopCloser, gate_covariances, rigid, solve_scaled
-from mapserver.survey.odometry_pass import OdometryPass, run_odometry
+from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import optimize_pose_graph
+from mapserver.survey.segments.segmented import begun_in_segments
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
 from mapserver.survey.survey_map import SurveyMap
-from mapserver.survey.tracks.matching import PairFinder, drift_allowance_m, fixed_allowance_m
-from mapserver.survey.tracks.mono_depths import MonoDepths, survey_camera
+from mapserver.survey.tracks.matching import PairFinder, fixed_allowance_m
+from mapserver.survey.tracks.mono_depths import MonoDepths
 from mapserver.survey.tracks.pairs import PairMatch
 from mapserver.survey.tracks.tracks import build_landmarks, no_landmarks, refine_observations, tracks_of
-
-_MIN_KEYFRAMES = 2
-_MIN_LANDMARKS = 30
-_ADJUSTED_SIGMA_RAD = 0.02  # of the rotation between adjusted keyframes, and between neighbours with an IMU
 
 
 @dataclass(frozen=True)
@@ -65,16 +67,6 @@ class Survey:
     seen: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class AdjustedChain:
-    """The keyframes of a survey before its loops are closed: matched holds the pairs that were matched already."""
-
-    odometry: OdometryPass
-    state: SurveyState
-    matched: set[tuple[int, int]]
-    depths: MonoDepths | None
-
-
 def survey(inputs: SurveyInputs, options: SurveyConfig, tools: SurveyTools | None = None) -> Survey:
     """Maps one recording. Raises SurveyError where it holds too little to map."""
     tools = tools or SurveyTools()
@@ -83,11 +75,7 @@ def survey(inputs: SurveyInputs, options: SurveyConfig, tools: SurveyTools | Non
 
 def begin_survey(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> AdjustedChain:
     """The stages before loops are looked for: `finish_survey` goes on. Raises SurveyError where there is too little."""
-    if inputs.initial_trajectory is None:
-        odometry = run_odometry(inputs, settings, tools)
-    else:
-        odometry = poses_as_odometry(inputs.initial_trajectory, inputs, settings, tools)
-    return adjusted_chain(odometry, inputs, settings, tools)
+    return begun_in_segments(inputs, settings, tools)
 
 
 def survey_from(
@@ -119,112 +107,11 @@ def finish_survey(chain: AdjustedChain, options: SurveyConfig, tools: SurveyTool
     return Survey(survey_map, options.vocabulary, loops, odometry, state, culled, stereo_yaw, every, placed.seen)
 
 
-def adjusted_chain(
-    odometry: OdometryPass, inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools
-) -> AdjustedChain:
-    """Keyframes matched with their neighbours and adjusted, before loops are looked for; SurveyError where there is too little."""
-    if len(odometry.keyframes) < _MIN_KEYFRAMES:
-        raise SurveyError(
-            f"{len(odometry.estimates)} frames gave {len(odometry.keyframes)} keyframe(s) that belong together; a map needs "
-            f"motion, at least {_MIN_KEYFRAMES}"
-        )
-    state = _initial_state(odometry, inputs)
-    depths = None
-    if inputs.rectifier.camera.baseline_m == 0:
-        depths = MonoDepths(odometry.keyframes, state.camera, settings)
-    odometry = _with_depths(odometry, state, depths)
-    pairs = _match_neighbours(odometry, state, settings, tools)
-    state = _first_landmarks(odometry, state, pairs, settings, tools)
-    matched = {(p.i, p.j) for p in pairs}
-    del pairs  # as large as all else in a long survey
-    tools.at("local adjustment", 0, 1)
-    state = local_windows(state, settings)
-    if state.motion.inertial:
-        state = bundle_rounds(state, settings, rounds=2)
-    odometry = _with_depths(odometry, state, depths)
-    return AdjustedChain(odometry, state, matched, depths)
-
-
-def _initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
-    """Keyframes where odometry put them, no landmarks yet."""
-    rectifier, numbers = inputs.rectifier, [k.frame_index for k in odometry.keyframes]
-    estimates = [odometry.estimates[n] for n in numbers]
-    map_from_body = odometry.odom_from_body[numbers]
-    body_velocities = [e.odom_from_body[:3, :3].T @ e.velocity_odom_mps for e in estimates]
-    motion = KeyframeMotion(
-        inertial=odometry.inertial,
-        imu=inputs.imu,
-        noise=inputs.calibration.imu,
-        imu_minus_cam_s=rectifier.imu_minus_cam_s,
-        velocities_mps=np.einsum("kij,kj->ki", map_from_body[:, :3, :3], np.array(body_velocities)),
-        gyro_bias_radps=np.array([e.gyro_bias_radps for e in estimates]),
-        accel_bias_mps2=np.array([e.accel_bias_mps2 for e in estimates]),
-        relative=[] if odometry.inertial else odometry_factors(odometry, map_from_body),
-    )
-    return SurveyState(
-        stamps_ns=np.array([k.stamp_ns for k in odometry.keyframes], np.int64),
-        map_from_body=map_from_body.copy(),
-        body_from_cam=rectifier.body_from_cam,
-        camera=survey_camera(rectifier.camera),
-        motion=motion,
-        landmarks=no_landmarks(),
-        is_depth_camera=rectifier.has_depth,
-    )
-
-
-def _with_depths(odometry: OdometryPass, state: SurveyState, depths: MonoDepths | None) -> OdometryPass:
-    """The keyframes of one camera with depths by where they are now; unchanged for rigs that measure depth."""
-    if depths is None:
-        return odometry
-    return replace(odometry, keyframes=depths.keyframes_at(state.map_from_body, state.body_from_cam))
-
-
-def _finder(odometry: OdometryPass, state: SurveyState, settings: SurveySettings, tools: SurveyTools) -> PairFinder:
-    return PairFinder(odometry.keyframes, state.camera, state.body_from_cam, settings.pairs, tools.executor)
-
-
-def _match_neighbours(
-    odometry: OdometryPass, state: SurveyState, settings: SurveySettings, tools: SurveyTools
-) -> list[PairMatch]:
-    finder, previous = _finder(odometry, state, settings, tools), settings.pairs.previous
-    near = max(settings.loops.min_gap_keyframes, previous)
-    candidates = finder.candidates(state.map_from_body, previous=previous, only_near=near)
-    covariances = odometry.covariances[[k.frame_index for k in odometry.keyframes]]
-    allowed_m = drift_allowance_m(covariances, state.map_from_body[:, :3, 3])
-    sigma_rad = _ADJUSTED_SIGMA_RAD if odometry.inertial else None
-    report = _progress(tools, "matching", len(candidates))
-    return finder.match(candidates, state.map_from_body, allowed_m, rotation_sigma_rad=sigma_rad, progress=report)
-
-
 def _match_all(state: SurveyState, finder: PairFinder, settings: SurveySettings, tools: SurveyTools) -> list[PairMatch]:
     candidates = finder.candidates(state.map_from_body, previous=settings.pairs.previous)
-    allowed_m, report = fixed_allowance_m(state.map_from_body), _progress(tools, "matching again", len(candidates))
-    sigma_rad = _ADJUSTED_SIGMA_RAD
+    allowed_m, report = fixed_allowance_m(state.map_from_body), progress_of(tools, "matching again", len(candidates))
+    sigma_rad = ADJUSTED_SIGMA_RAD
     return finder.match(candidates, state.map_from_body, allowed_m, rotation_sigma_rad=sigma_rad, progress=report)
-
-
-def _progress(tools: SurveyTools, stage: str, total: int) -> Callable[[int], None]:
-    return lambda number: tools.at(stage, number + 1, total)
-
-
-def _first_landmarks(
-    odometry: OdometryPass, state: SurveyState, pairs: list[PairMatch], settings: SurveySettings, tools: SurveyTools
-) -> SurveyState:
-    """The landmarks of neighbouring keyframes; SurveyError where they are too few."""
-    landmarks = build_landmarks(_posed(odometry, state), tracks_of(pairs), settings, tools.executor)
-    state = replace(state, landmarks=landmarks)
-    if odometry.inertial:
-        state = replace(state, motion=replace(state.motion, relative=blackout_factors(odometry, state)))
-    if len(landmarks.points_map) < _MIN_LANDMARKS:
-        raise SurveyError(
-            f"{len(odometry.keyframes)} keyframes share only {len(landmarks.points_map)} landmarks; look at the recording with "
-            "`mapserver doctor`: dark, blurred, or the wrong calibration?"
-        )
-    return state
-
-
-def _posed(odometry: OdometryPass, state: SurveyState) -> PosedKeyframes:
-    return PosedKeyframes(odometry.keyframes, state.map_from_body, state.body_from_cam, state.camera)
 
 
 def _sigmas_m(odometry: OdometryPass) -> SigmaBetween:
@@ -242,7 +129,7 @@ def _close_loops(
         kind, known = Sim3LoopCloser, gate_covariances(chain, scale_walk)
     marginals = GraphMarginals(state.map_from_body, known)
     parts = find_parts(covisibility_of(state), _sigmas_m(odometry), options.settings.join_sigma_m)
-    closer = kind(_posed(odometry, state), options, marginals, matched, tools.executor, parts)
+    closer = kind(posed_keyframes(odometry, state), options, marginals, matched, tools.executor, parts)
     for i in range(len(odometry.keyframes)):
         closer.close(i)
         tools.at("loops", i + 1, len(odometry.keyframes))
@@ -272,14 +159,14 @@ def _adjust_globally(
 ) -> tuple[OdometryPass, SurveyState, StereoYaw]:
     """Matches all views where the loops put them and adjusts them together, twice: the first result gives the stereo yaw error."""
     yaw, redundant = NO_YAW, np.zeros(len(odometry.keyframes), bool)
-    finder = _finder(odometry, state, settings, tools)
+    finder = pair_finder(odometry, state, settings, tools)
     for round_number in range(2):
         tools.at("global adjustment", round_number, 2)
         search = round_number == 0 or depths is not None
         if depths is not None:
-            odometry = _with_depths(odometry, state, depths)
-            finder = _finder(odometry, state, settings, tools)
-        posed = _posed(odometry, state)
+            odometry = with_depths(odometry, state, depths)
+            finder = pair_finder(odometry, state, settings, tools)
+        posed = posed_keyframes(odometry, state)
         if search:
             tracks = tracks_of(_match_all(state, finder, settings, tools))
             redundant = redundant_keyframes(tracks, odometry.keyframes, settings)

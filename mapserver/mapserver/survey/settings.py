@@ -136,6 +136,19 @@ class SessionSettings(Section, frozen=True):
     new_place_landmarks: int = 40  # new landmarks that make a new keyframe a place
 
 
+class SegmentSettings(Section, frozen=True):
+    """How a long survey is cut into segments, which are followed and adjusted in parallel."""
+
+    seconds: float = 0.0  # of a segment, at least; 0: never cut. A survey shorter than two of them stays whole
+    overlap_s: float = 10.0  # before its first frame, in which its odometry starts
+
+    def __post_init__(self) -> None:
+        if self.seconds and not 0 < self.overlap_s <= self.seconds / 2:
+            raise ValueError(
+                f"an overlap of {self.overlap_s} s is no more than half of a segment of {self.seconds} s, and above 0"
+            )
+
+
 class SurveySettings(Section, frozen=True):
     """All of it."""
 
@@ -145,6 +158,7 @@ class SurveySettings(Section, frozen=True):
     stereo: StereoSettings = StereoSettings()
     align: AlignSettings = AlignSettings()
     keyframes: KeyframeSettings = KeyframeSettings()
+    segments: SegmentSettings = SegmentSettings()
     pairs: PairSettings = PairSettings()
     loops: LoopSettings = LoopSettings()
     monocular: SingleCameraSettings = SingleCameraSettings()

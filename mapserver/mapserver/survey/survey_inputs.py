@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from fleetmap.bow import Vocabulary
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, Trajectory, WheelSample
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, Stamps, Trajectory, WheelSample
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.keyframes.keyframes import ImageStore
 from mapserver.survey.loops.zones import Zones
@@ -20,11 +21,23 @@ def no_progress(stage: str, done: int, total: int) -> None:
     """Reports nothing."""
 
 
+class FrameParts(Protocol):
+    """The frames of a recording by their number."""
+
+    @property
+    def stamps_ns(self) -> Stamps:
+        """(F,) of all."""
+
+    def part(self, first: int, end: int) -> Iterable[CameraFrame]:
+        """Those from first to before end, to be gone through once, in any process: it can be pickled."""
+
+
 @dataclass(frozen=True)
 class SurveyInputs:
     """One recording: frames in order, raw or rectified ahead of the survey, and how many; IMU, wheels, calibration.
 
-    initial_trajectory: frame_from_body of every frame by another system, in metres; None to run the odometry.
+    initial_trajectory: frame_from_body of every frame by another system, in metres; None to run the odometry. parts: the same frames in
+    parts, None where they come only once. keyframes_at: frames that become keyframes whatever they show.
     """
 
     frames: Iterable[CameraFrame | RectifiedFrame]
@@ -34,6 +47,8 @@ class SurveyInputs:
     rectifier: Rectifier
     wheel: Sequence[WheelSample] = ()
     initial_trajectory: Trajectory | None = None
+    parts: FrameParts | None = None
+    keyframes_at: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)

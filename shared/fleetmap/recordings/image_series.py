@@ -58,6 +58,11 @@ class SeriesFrames(Generic[T]):
         self._load = load
         self.left, self.right, self.depth = left, right, depth
 
+    def taken(self, indices: NDArray[np.int64]) -> tuple[ImageSeries[T], ImageSeries[T] | None, ImageSeries[T] | None]:
+        """left, right, depth of the frames at indices (K,)."""
+        right, depth = (None if series is None else series.take(indices) for series in (self.right, self.depth))
+        return self.left.take(indices), right, depth
+
     def stored(self, index: int) -> StoredFrame:
         """Frame `index` with its images as they are stored."""
         left, right, depth = (

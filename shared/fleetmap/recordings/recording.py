@@ -1,7 +1,7 @@
 """A recording in memory, whatever format it came in, and a selection of its frames."""
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -55,6 +55,9 @@ class FrameSource(Protocol):
 
     def frame(self, index: int) -> CameraFrame:
         """Frame `index`, decoded; RecordingError naming the image that cannot be."""
+
+    def part(self, indices: NDArray[np.int64]) -> "FrameSource":
+        """The frames at indices (K,), numbered anew, to be read and closed apart from this source: in other threads and processes too."""
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
         """Feeds all that was read of the recording, images included, to `digest`, in an order that never changes."""
@@ -116,6 +119,10 @@ class Recording:
         """Frame `index` with its images as they were stored, for copying without loss."""
         self._check_index(index)
         return self.frames.stored(index)
+
+    def part(self, indices: NDArray[np.int64]) -> "Recording":
+        """The frames at indices (K,), numbered anew, with everything else whole; see `FrameSource.part`."""
+        return replace(self, frame_stamps_ns=self.frame_stamps_ns[indices], frames=self.frames.part(indices))
 
     def content_hash(self) -> str:
         """SHA-256 (hex) over the content that was read, the images included; the same on every machine."""

@@ -204,6 +204,10 @@ class _ProcessedFrames:
     def frame(self, index: int) -> CameraFrame:
         return process_frame(self.source.frame(index), self.pipeline, self.seed)
 
+    def part(self, indices: NDArray[np.int64]) -> "_ProcessedFrames":
+        """See FrameSource."""
+        return replace(self, source=self.source.part(indices))
+
     def hash_into(self, digest: "hashlib._Hash") -> None:
         """The other source's content, then pipeline and seed."""
         self.source.hash_into(digest)

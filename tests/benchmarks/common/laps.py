@@ -26,6 +26,10 @@ class _Laps:
     def frame(self, index: int) -> CameraFrame:
         return decode_frame(self.stored(index))
 
+    def part(self, indices: NDArray[np.int64]) -> "_Laps":
+        part = self.recording.part(self.index[indices])
+        return _Laps(part, np.arange(len(indices)), self.later_ns[indices])
+
     def hash_into(self, digest: Any) -> None:
         self.recording.frames.hash_into(digest)
 

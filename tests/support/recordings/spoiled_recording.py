@@ -27,6 +27,9 @@ class _Frames:
     def frame(self, index: int) -> CameraFrame:
         return decode_frame(self.stored(index))
 
+    def part(self, indices: NDArray[np.int64]) -> "_Frames":
+        return _Frames(self.source.part(self.indices[indices]), np.arange(len(indices)), self.spoil)
+
     def hash_into(self, digest: "hashlib._Hash") -> None:
         self.source.hash_into(digest)
 

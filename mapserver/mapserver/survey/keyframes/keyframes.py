@@ -1,7 +1,7 @@
 """Keyframe selection, and the data that is kept of each keyframe."""
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Protocol
@@ -195,8 +195,9 @@ class FrameSummary:
 class KeyframePolicy:
     """Chooses by overlap with the last keyframe, by motion, or by count; never a blurred frame unless tracking would break."""
 
-    def __init__(self, settings: KeyframeSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: KeyframeSettings, required: Container[int] = ()) -> None:
+        """required: numbers of frames, counted from 0, that are chosen whatever they show."""
+        self._settings, self._required = settings, required
         self._last: FrameSummary | None = None
         self._sharpness: deque[float] = deque(maxlen=31)
         self._count = -1
@@ -212,7 +213,7 @@ class KeyframePolicy:
 
     def _chooses(self, frame: FrameSummary) -> bool:
         s, last = self._settings, self._last
-        if last is None or frame.after_gap or s.policy == "every":
+        if last is None or frame.after_gap or self._count in self._required or s.policy == "every":
             return True
         if s.policy == "every-nth":
             return self._count % s.every_nth == 0

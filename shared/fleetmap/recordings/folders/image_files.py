@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, pair_images
@@ -56,6 +57,10 @@ class FileFrames(SeriesFrames[Path]):
     ) -> None:
         super().__init__(_load, left, right, depth)
         self.root, self.read_files = root, read_files
+
+    def part(self, indices: NDArray[np.int64]) -> "FileFrames":
+        """See FrameSource."""
+        return FileFrames(self.root, self.read_files, *self.taken(indices))
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
         """Names, sizes and bytes of all files read, in the order of their names."""

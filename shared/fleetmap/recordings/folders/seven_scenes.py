@@ -128,6 +128,10 @@ class RegisteredFrames:
         depth_mm = self._registered_mm(frame.depth_m, stored)
         return replace(frame, depth_m=depth_mm.astype(np.float32) / np.float32(1000.0))
 
+    def part(self, indices: NDArray[np.int64]) -> "RegisteredFrames":
+        """See FrameSource."""
+        return RegisteredFrames(self._files.part(indices), self._registration)
+
     def hash_into(self, digest: "hashlib._Hash") -> None:
         """The files as they are."""
         self._files.hash_into(digest)

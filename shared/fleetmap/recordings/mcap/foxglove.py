@@ -27,6 +27,10 @@ class FoxgloveCodec:
     def __init__(self) -> None:
         self._classes: dict[int, Any] = {}
 
+    def __reduce__(self) -> tuple[type["FoxgloveCodec"], tuple[()]]:
+        """Classes made of the file's descriptors are made again where it is unpickled."""
+        return FoxgloveCodec, ()
+
     def stamp_ns(self, channel: Channel, data: memoryview) -> int:
         """The field `timestamp`."""
         return _stamp_ns(self._parse(channel, bytes(data)))

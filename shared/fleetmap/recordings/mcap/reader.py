@@ -156,11 +156,14 @@ def open_mcap(path: Path, options: OpenOptions) -> Recording:
 
 
 class McapFrames(SeriesFrames[tuple[_Stream, Location]]):
-    """A FrameSource over the image messages of an open file. `read_files`: the files that the content's hash covers."""
+    """A FrameSource over the image messages of an open file, or of one that the first read opens.
+
+    `read_files`: the files that the content's hash covers, the recording first.
+    """
 
     def __init__(
         self,
-        file: BinaryIO,
+        file: BinaryIO | None,
         read_files: Sequence[Path],
         left: _Images,
         right: _Images | None = None,
@@ -168,7 +171,11 @@ class McapFrames(SeriesFrames[tuple[_Stream, Location]]):
     ) -> None:
         super().__init__(self._image, left, right, depth)
         self._path, self._file, self._read_files = read_files[0], file, read_files
-        self._reader = MessageReader(self._path, file)
+        self._reader = None if file is None else MessageReader(self._path, file)
+
+    def part(self, indices: NDArray[np.int64]) -> "McapFrames":
+        """See FrameSource."""
+        return McapFrames(None, self._read_files, *self.taken(indices))
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
         """The bytes of the whole file, then those of the calibration file where one was given."""
@@ -177,11 +184,15 @@ class McapFrames(SeriesFrames[tuple[_Stream, Location]]):
 
     def close(self) -> None:
         """Closes the file."""
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
 
     def _image(self, source: tuple[_Stream, Location], stamp_ns: int) -> StoredImage:
         stream, location = source
         where = f"{self._path}: {stream.channel.topic} at {stamp_ns}"
+        if self._file is None or self._reader is None:
+            self._file = _opened(self._path)
+            self._reader = MessageReader(self._path, self._file)
         if self._file.closed:
             raise RecordingError(
                 f"{where} was asked for after the recording was closed; keep it open while frames are read"
@@ -192,6 +203,13 @@ class McapFrames(SeriesFrames[tuple[_Stream, Location]]):
             raise RecordingError(
                 f"{where}: {error}; the message is damaged, leave the frame out with --frames"
             ) from error
+
+
+def _opened(path: Path) -> BinaryIO:
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read any more ({error.strerror}); was the recording moved?") from error
 
 
 def _open(
@@ -294,7 +312,12 @@ def _with_hints(topics: Topics, given: CalibrationFile | None, present: set[str]
 
 def _images(streams: Sequence[_Stream], what: str, log: ReadLog) -> _Images:
     stamps_ns = np.array([stamp for stream in streams for stamp in stream.stamps_ns], np.int64)
-    sources = tuple((stream, location) for stream in streams for location in stream.locations)
+    sources = tuple(
+        (bare, location)
+        for stream in streams
+        for bare in [_Stream(stream.channel, stream.codec)]
+        for location in stream.locations
+    )
     return _Images(stamps_ns, sources).forward(what, log)
 
 
