@@ -110,7 +110,7 @@ class TrustedMap:
     def _refresh(self) -> None:
         from fleetmap.trust.tuf_client import update_lists
 
-        before = self._changing()
+        before = self._files()
         update_lists(self._folder, self._site, self._root(), self._ask)
         now_s = max(self._wall_s(), self._clock_s)
         files = ("root", "timestamp", "snapshot", "targets", site_role(self._site))
@@ -121,10 +121,10 @@ class TrustedMap:
                 raise UntrustedError("freeze", f"{name} expired at {expires:%Y-%m-%d %H:%M} UTC by the robot's clock")
         self._list = read_site_list((self._folder / f"{files[-1]}.json").read_bytes(), self._site)
         self._clock_s = now_s
-        if self._changing() != before or now_s > self._kept_clock_s + _CLOCK_EVERY_S:
+        if self._files() != before or now_s > self._kept_clock_s + _CLOCK_EVERY_S:
             self._write("clock", str(now_s).encode())
             self._kept_clock_s = now_s
-            self._sync()
+            self._sync(before)
 
     def _check_delegated(self) -> None:
         """A site that nobody signs for any more keeps its last list in the folder, where python-tuf does not look at it."""
@@ -140,17 +140,17 @@ class TrustedMap:
                 data = self._ask(FIRST_ROOT)
                 if data is None or len(data) > _MAX_ROOT_BYTES:
                     raise UntrustedError("signature", "the server has no signed lists; update it, or serve it anew")
+                before = self._files()
                 self._write(path.name, data)
-                self._sync()
+                self._sync(before)
                 _log.warning("first use: the keys of site %s are trusted from now on, pinned in %s", self._site, path)
             self._pinned_root = path.read_bytes()
         return self._pinned_root
 
-    def _changing(self) -> tuple[bytes, int]:
-        """Something that is another after anything changed: every change comes with a timestamp or a root."""
-        timestamp = self._folder / "timestamp.json"
-        roots = len(list(self._folder.glob("root_history/*.root.json")))
-        return timestamp.read_bytes() if timestamp.is_file() else b"", roots
+    def _files(self) -> dict[Path, bytes]:
+        """What is kept; every file is small."""
+        names = [*self._folder.glob("*.json"), *self._folder.glob("root_history/*.json"), *self._folder.glob("clock")]
+        return {path: path.read_bytes() for path in names if not path.is_symlink()}
 
     def _read_clock(self) -> float:
         try:
@@ -163,11 +163,13 @@ class TrustedMap:
         temporary.write_bytes(data)
         temporary.replace(self._folder / name)
 
-    def _sync(self) -> None:
-        """python-tuf renames without fsync: after a power cut the guard against rollback would be gone."""
-        folders = [self._folder, self._folder / "root_history"]
-        files = [path for folder in folders for path in folder.glob("*") if path.is_file()]
-        for path in [*files, *(folder for folder in folders if folder.is_dir())]:
+    def _sync(self, before: dict[Path, bytes]) -> None:
+        """python-tuf renames without fsync: after a power cut the guard against rollback would be gone.
+
+        before: what was on the disk already.
+        """
+        changed = [path for path, data in self._files().items() if before.get(path) != data]
+        for path in [*changed, *sorted({path.parent for path in changed})]:
             descriptor = os.open(path, os.O_RDONLY)
             try:
                 os.fsync(descriptor)
