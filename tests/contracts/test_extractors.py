@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import UsageError
-from fleetmap.features import EXTRACTORS, extract, extract_in_slices
+from fleetmap.features.extraction import EXTRACTORS, extract, extract_in_slices
 from fleetmap.features.matching import match_mutual
-from fleetmap.features.orb import OrbSettings
+from fleetmap.features.settings import OrbSettings
 from fleetmap.numerics.time_sliced import finished
 from support.worlds.synthetic_texture import picture, pixel_grid, smooth_texture
 

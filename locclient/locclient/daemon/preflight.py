@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fleetmap.bus import handshake_fault
 from fleetmap.errors import FleetmapError, LinkError, UnreachableError
-from fleetmap.features.orb import OrbSettings
+from fleetmap.features.settings import OrbSettings
 from fleetmap.recordings import StoredFrame
 from fleetmap.recordings.images import decode_frame
 from fleetmap.sensors.calibration import RigCalibration, stereo_baseline_m

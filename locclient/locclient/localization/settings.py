@@ -1,8 +1,7 @@
 """Settings of the localization client; the same for every robot."""
 
 from fleetmap.config import Section
-from fleetmap.features.orb import OrbSettings
-from fleetmap.features.stereo import StereoSettings
+from fleetmap.features.settings import OrbSettings, StereoSettings
 from fleetmap.odometry import OdometrySettings
 from fleetmap.relocalization.settings import STRONG_INLIERS, FixSettings, RelocalizerSettings
 from locclient.localization.image_quality import ImageQualitySettings

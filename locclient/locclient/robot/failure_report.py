@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import extract
+from fleetmap.features.extraction import extract
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.messages import MAX_THUMBNAIL_BYTES, Cause, FailureReport, Placement, Thumbnail

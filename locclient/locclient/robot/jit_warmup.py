@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
-from fleetmap.features import extract, orb
+from fleetmap.features import orb
+from fleetmap.features.extraction import extract
 from fleetmap.geometry import se3
 from fleetmap.mapformat import Tile
 from fleetmap.relocalization.map_view import CovisibleLandmarks

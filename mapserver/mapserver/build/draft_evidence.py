@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
 from fleetmap.errors import RecordingError
-from fleetmap.features.orb import OrbSettings
+from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Manifest, RecordingEntry, Tile, decode_tile, encode_tile
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording

@@ -13,7 +13,8 @@ from msgspec import structs
 
 from fleetmap.errors import RecordingError
 from fleetmap.features.matching import hamming_knn2
-from fleetmap.features.orb import Features, OrbSettings, detect
+from fleetmap.features.orb import Features, detect
+from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, se3
 from fleetmap.recordings import Recording
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration

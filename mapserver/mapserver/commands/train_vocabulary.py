@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from fleetmap.features.orb import OrbSettings
+    from fleetmap.features.settings import OrbSettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ def train_vocabulary(
 
 def _descriptors(path: Path, frames: str, orb: "OrbSettings") -> "Iterator[NDArray[np.uint8]]":
     """Descriptors (N, 32) of each selected left picture, rectified."""
-    from fleetmap.features import extract
+    from fleetmap.features.extraction import extract
     from fleetmap.recordings import FrameSelection, open_recording
     from fleetmap.sensors.rectification import Rectifier
     from fleetmap.sensors.samples import SensorSet

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 
 from fleetmap.features.flow import Pyramid, follow, forward_backward_check
-from fleetmap.features.stereo import StereoSettings, disparities
+from fleetmap.features.settings import StereoSettings
+from fleetmap.features.stereo import disparities
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 

@@ -7,7 +7,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features.orb import Features, OrbSettings
+from fleetmap.features.orb import Features
+from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
 from fleetmap.numerics.time_sliced import finished
 from fleetmap.relocalization.frame_features import FrameFeatures, features_with_depth

@@ -3,11 +3,9 @@
 from typing import Literal
 
 from fleetmap.config import Section
-from fleetmap.features.orb import OrbSettings
-from fleetmap.features.patch_align import AlignSettings
-from fleetmap.features.stereo import StereoSettings
+from fleetmap.features.settings import AlignSettings, OrbSettings, StereoSettings
 from fleetmap.odometry import OdometrySettings
-from mapserver.survey.bundle.bundle_adjustment import BundleSettings
+from mapserver.survey.bundle.settings import BundleSettings
 
 
 class KeyframeSettings(Section, frozen=True):

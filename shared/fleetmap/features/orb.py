@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.config import Section
 from fleetmap.features.corner_kernels import centroid_angles_deg, min_eigenvalue_scores
 from fleetmap.features.corners import corner_candidates, select_best
+from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
 from fleetmap.numerics.time_sliced import TimeSliced, finished
 from fleetmap.sensors.samples import Image
@@ -17,16 +17,6 @@ from fleetmap.sensors.samples import Image
 SCALE_FACTOR = 1.2
 _PATCH_RADIUS = 15
 _BORDER_PX = 19
-
-
-class OrbSettings(Section, frozen=True):
-    """The extractor, a name in `EXTRACTORS`, how many features it finds and where."""
-
-    extractor: str = "grid-orb"
-    count: int = 1000
-    levels: int = 8  # of the image pyramid, 1.2 apart
-    fast_threshold: int = 12  # grey levels; halved where too few corners are found
-    min_distance_px: float = 7.0  # between features of a level
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,23 +6,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.config import Section
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.features.patch_align_kernels import align_patches
+from fleetmap.features.settings import AlignSettings
 from fleetmap.geometry import Array, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Image
 
 Pyramid = tuple[Image, ...]
 _LEVELS = 3
-
-
-class AlignSettings(Section, frozen=True):
-    """Window and acceptance of patch alignment."""
-
-    half_window_px: int = 4  # half of the patch
-    max_shift_px: float = 3.0  # from the initial position
-    min_correlation: float = 0.8  # of the aligned patches
 
 
 def half_pyramid(image: Image) -> Pyramid:

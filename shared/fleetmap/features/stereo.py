@@ -2,25 +2,10 @@
 
 import numpy as np
 
-from fleetmap.config import Section
+from fleetmap.features.settings import StereoSettings
 from fleetmap.features.stereo_kernels import match_rows
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
-
-
-class StereoSettings(Section, frozen=True):
-    """Windows and limits of the row matcher. Small windows: large ones shift the scale of the map at depth edges."""
-
-    min_depth_m: float = 0.3
-    min_disparity_px: float = 0.7  # smaller disparities count as unknown depth
-    min_correlation: float = 0.75  # of the two patches
-    uniqueness: float = 0.93  # second best over best correlation
-    wide_half_px: int = 5  # half of the wide window
-    narrow_half_px: int = 4  # half of the narrow window
-    agreement_px: float = 0.25  # largest difference between the windows' disparities
-    # The random error of a structured-light sensor's depth is 1.4e-3 z^2 in metres (Khoshelham and Elberink, 2012): this much
-    # disparity over the base of 0.08 m that stands for such a sensor, with f = 525 px.
-    depth_sigma_px: float = 0.06
 
 
 def disparities(

@@ -1,9 +1,16 @@
-"""Odometry of stereo and single cameras, with and without IMU: run live by the robot and as initial trajectory by the survey."""
+"""Odometry of stereo and single cameras, with and without IMU: run live by the robot and as initial trajectory by the survey.
 
-from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate, OdometryStatus
-from fleetmap.odometry.mono.mono_modes import MonocularOdometry, make_odometry
-from fleetmap.odometry.odometry import Odometry
-from fleetmap.odometry.settings import OdometrySettings
+Names are imported when they are first used: settings are read by programs that compute nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate, OdometryStatus
+    from fleetmap.odometry.mono.mono_modes import MonocularOdometry, make_odometry
+    from fleetmap.odometry.odometry import Odometry
+    from fleetmap.odometry.settings import OdometrySettings
 
 __all__ = [
     "ContinuousFrame",
@@ -14,3 +21,17 @@ __all__ = [
     "OdometryStatus",
     "make_odometry",
 ]
+_NAMES = {
+    "estimate": "ContinuousFrame OdometryEstimate OdometryStatus",
+    "mono.mono_modes": "MonocularOdometry make_odometry",
+    "odometry": "Odometry",
+    "settings": "OdometrySettings",
+}
+_MODULES = {name: f"fleetmap.odometry.{module}" for module, names in _NAMES.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> object:
+    """Imports a public name when it is first used (PEP 562)."""
+    if name not in _MODULES:
+        raise AttributeError(f"module 'fleetmap.odometry' has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fleetmap.features.stereo import StereoSettings
+from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.odometry.filter.nav_state import NavState

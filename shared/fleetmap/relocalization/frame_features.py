@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import extract, extract_in_slices, orb, stereo
-from fleetmap.features.stereo import StereoSettings
+from fleetmap.features import orb, stereo
+from fleetmap.features.extraction import extract, extract_in_slices
+from fleetmap.features.settings import OrbSettings, StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 
@@ -42,7 +43,7 @@ class FrameFeatures:
         return FrameFeatures(self.features, np.column_stack([self.pixels[:, :2], np.full(len(self.pixels), np.nan)]))
 
 
-def extract_features(frame: RectifiedFrame, settings: orb.OrbSettings) -> Generator[None, None, FrameFeatures]:
+def extract_features(frame: RectifiedFrame, settings: OrbSettings) -> Generator[None, None, FrameFeatures]:
     """The features of one frame, no depth measured yet, in slices."""
     features = yield from extract_in_slices(frame.left, settings)
     pixels = np.column_stack([features.pixels, np.full(len(features), np.nan)])
@@ -50,7 +51,7 @@ def extract_features(frame: RectifiedFrame, settings: orb.OrbSettings) -> Genera
 
 
 def features_with_depth(
-    frame: RectifiedFrame, camera: StereoCamera, settings: orb.OrbSettings, stereo_settings: StereoSettings
+    frame: RectifiedFrame, camera: StereoCamera, settings: OrbSettings, stereo_settings: StereoSettings
 ) -> FrameFeatures:
     """The features of one frame with the depth of all of them; the frame itself is not kept."""
     features = extract(frame.left, settings)

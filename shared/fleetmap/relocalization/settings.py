@@ -3,8 +3,7 @@
 from typing import NamedTuple
 
 from fleetmap.config import Section
-from fleetmap.features.orb import OrbSettings
-from fleetmap.features.stereo import StereoSettings
+from fleetmap.features.settings import OrbSettings, StereoSettings
 
 STRONG_INLIERS = 60  # of a fix that may name a place however many landmarks it lacks
 

@@ -18,6 +18,7 @@ import numpy as np
 from fleetmap.features import orb
 from fleetmap.features.matching import match_mutual
 from fleetmap.features.orb import Features
+from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
 from fleetsim.render.optics import make_optics
 from fleetsim.render.painter import Look, Painter
@@ -57,7 +58,7 @@ def picture_features(world: World, aisle: int, xs_m: tuple[float, ...], noise_ke
         placed: Array = map_from_body @ camera.body_from_cam
         scene = world.scene_around(x_m, world.layout.aisle_y_m(aisle))
         shot = painter.shoot(scene, np.ones(3), lambda _, at=placed: at, 0.0, _EXPOSURE, noise_key + number)  # type: ignore[misc]
-        found.append(orb.detect(shot.image, orb.OrbSettings()))
+        found.append(orb.detect(shot.image, OrbSettings()))
     return found
 
 

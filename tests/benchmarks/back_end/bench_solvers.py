@@ -23,7 +23,8 @@ import numpy as np
 from benchmarks.back_end.bal_reference import reference_cost
 from fleetmap.bow import BowVector, PlaceIndex
 from fleetmap.geometry import Array, align_points, se3, se3_inverse, so3_exp, transform_points
-from mapserver.survey.bundle.bundle_adjustment import BundleProblem, BundleSettings, optimize
+from mapserver.survey.bundle.bundle_adjustment import BundleProblem, optimize
+from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
 from support.problems.bal import BalProblem, optimize_bal, parse_bal
 from support.problems.g2o import parse_g2o

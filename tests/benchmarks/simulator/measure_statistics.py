@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fleetmap.features import orb, stereo
+from fleetmap.features.settings import OrbSettings, StereoSettings
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracking.tracker import Tracker
@@ -125,7 +126,7 @@ class SeenSums:
 
 def compare(camera: StereoCamera, one: View, other: View, sums: SeenSums) -> None:
     """Features of one view looked for in another that shows the same surfaces."""
-    first, second = orb.detect(one.frame.left, orb.OrbSettings()), orb.detect(other.frame.left, orb.OrbSettings())
+    first, second = orb.detect(one.frame.left, OrbSettings()), orb.detect(other.frame.left, OrbSettings())
     points = one.points_map(first.pixels, camera)
     expected = other.expected(points, camera)
     inside = np.isfinite(expected).all(axis=1)
@@ -215,10 +216,10 @@ def main() -> None:
             camera, views = take_views(session, [start_s + n / 15.0 for n in range(20)])
             follow(camera, views, sums)
         report_flow(f"{robot}, {light}", sums)
-        features = [orb.detect(view.frame.left, orb.OrbSettings()) for view in views[::10]]
+        features = [orb.detect(view.frame.left, OrbSettings()) for view in views[::10]]
         known = []
         for view, found in zip(views[::10], features, strict=True):
-            disparities = stereo.disparities(view.frame, camera, found.pixels, stereo.StereoSettings())
+            disparities = stereo.disparities(view.frame, camera, found.pixels, StereoSettings())
             known.append(np.isfinite(disparities[:, 0]).mean())
         print(f"  features: {np.mean([len(f) for f in features]):.0f}, stereo known {np.mean(known):.3f}")
         session.renderer.close()

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.features import stereo
 from fleetmap.features.patch_align_kernels import align_patches
+from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
@@ -119,7 +120,7 @@ def _measured(
         left = np.ascontiguousarray(marks.obs_pixels[usable[own], :2])
         before = left[:, 0] - marks.obs_pixels[usable[own], 2]
         for n, half in enumerate(HALF_WINDOWS_PX):
-            windows = stereo.StereoSettings(wide_half_px=half + 1, narrow_half_px=half, agreement_px=0.5)
+            windows = StereoSettings(wide_half_px=half + 1, narrow_half_px=half, agreement_px=0.5)
             out[own, n] = stereo.disparities(frame, camera, left, windows, before)[:, 0]
         right = np.column_stack([left[:, 0] - before, left[:, 1]])
         same, back, there = np.tile(np.eye(2), (len(own), 1, 1)), np.empty((len(own), 4)), np.empty((len(own), 4))

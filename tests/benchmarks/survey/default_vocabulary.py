@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary, encode_vocabulary, train_vocabulary, vocabulary_hash
-from fleetmap.features.orb import OrbSettings, detect
+from fleetmap.features.orb import detect
+from fleetmap.features.settings import OrbSettings
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from fleetsim.recorder import Order, prepare

@@ -9,7 +9,8 @@ import pytest
 
 from fleetmap.bow import PlaceIndex, train_vocabulary
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
-from fleetmap.features.orb import OrbSettings, detect
+from fleetmap.features.orb import detect
+from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, rotation_angle_rad, rotation_from_quat_wxyz
 from support.recordings.realdata import real_data
 

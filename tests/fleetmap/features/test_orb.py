@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from fleetmap.features import orb
 from fleetmap.features.matching import match_mutual
+from fleetmap.features.settings import OrbSettings
 from support.worlds.synthetic_texture import picture, pixel_grid, smooth_texture
 
 WIDTH, HEIGHT = 320, 240
@@ -27,14 +28,14 @@ def occupied(pixels: NDArray[np.floating]) -> int:
 
 
 def test_features_spread_better_than_plain_orb(image: NDArray[np.uint8]) -> None:
-    features = orb.detect(image, orb.OrbSettings(count=300))
+    features = orb.detect(image, OrbSettings(count=300))
     plain = cv2.ORB.create(nfeatures=300).detect(image, None)
     assert 200 < len(features) <= 310
     assert occupied(features.pixels) > 1.3 * occupied(np.array([k.pt for k in plain]))
 
 
 def test_arrays_belong_together(image: NDArray[np.uint8]) -> None:
-    features = orb.detect(image, orb.OrbSettings(count=200))
+    features = orb.detect(image, OrbSettings(count=200))
     count = len(features)
     assert features.pixels.shape == (count, 2)
     assert features.descriptors.shape == (count, 32)
@@ -54,8 +55,8 @@ def test_features_are_found_again_in_a_turned_or_larger_picture(scale: float, an
     second_from_first = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     centre = np.array([WIDTH / 2, HEIGHT / 2])
     first_uv = (np.stack([u, v], -1) - centre) @ np.linalg.inv(second_from_first).T + centre
-    first = orb.detect(picture(texture, u, v), orb.OrbSettings(count=400))
-    second = orb.detect(picture(texture, first_uv[..., 0], first_uv[..., 1]), orb.OrbSettings(count=400))
+    first = orb.detect(picture(texture, u, v), OrbSettings(count=400))
+    second = orb.detect(picture(texture, first_uv[..., 0], first_uv[..., 1]), OrbSettings(count=400))
     pairs = match_mutual(first.descriptors, second.descriptors, 60, 0.85)
     expected = (first.pixels[pairs[:, 0]] - centre) @ second_from_first.T + centre
     good = np.linalg.norm(expected - second.pixels[pairs[:, 1]], axis=1) < 4.0
@@ -69,7 +70,7 @@ def test_features_are_found_again_in_a_turned_or_larger_picture(scale: float, an
 
 
 def test_features_are_deterministic_and_none_are_found_on_nothing(image: NDArray[np.uint8]) -> None:
-    first, second = (orb.detect(picture, orb.OrbSettings(count=150)) for picture in (image, image.copy()))
+    first, second = (orb.detect(picture, OrbSettings(count=150)) for picture in (image, image.copy()))
     np.testing.assert_array_equal(first.pixels, second.pixels)
     np.testing.assert_array_equal(first.descriptors, second.descriptors)
-    assert len(orb.detect(np.full((HEIGHT, WIDTH), 7, np.uint8), orb.OrbSettings())) == 0
+    assert len(orb.detect(np.full((HEIGHT, WIDTH), 7, np.uint8), OrbSettings())) == 0

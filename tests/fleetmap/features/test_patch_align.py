@@ -6,13 +6,14 @@ import pytest
 from fleetmap.features import orb, patch_align
 from fleetmap.features.corners import spread_corners
 from fleetmap.features.patch_align import Patches, half_pyramid
+from fleetmap.features.settings import AlignSettings
 from fleetmap.geometry import Array, se3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from support.worlds.synthetic_texture import Texture, picture, pixel_grid, smooth_texture
 
 WIDTH, HEIGHT = 320, 240
 CENTRE = np.array([160.0, 120.0])
-SETTINGS = patch_align.AlignSettings()
+SETTINGS = AlignSettings()
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,8 @@ import pytest
 
 from fleetmap.features import stereo_kernels
 from fleetmap.features.corners import spread_corners
-from fleetmap.features.stereo import StereoSettings, disparities
+from fleetmap.features.settings import StereoSettings
+from fleetmap.features.stereo import disparities
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from support.worlds.synthetic_texture import Texture, picture, pixel_grid, smooth_texture

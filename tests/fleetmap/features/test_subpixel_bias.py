@@ -9,6 +9,7 @@ import pytest
 
 from fleetmap.features import flow, stereo
 from fleetmap.features.patch_align_kernels import align_patches
+from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, Image
@@ -69,7 +70,7 @@ def _check(found: Array) -> None:
 @pytest.mark.parametrize("name", IMAGE_PIPELINES)
 def test_disparities_of_a_plane_are_right_whatever_the_camera_makes_of_it(name: str) -> None:
     left, right = _processed(name)
-    found = stereo.disparities(RectifiedFrame(0, left, right, None), CAMERA, PIXELS, stereo.StereoSettings())
+    found = stereo.disparities(RectifiedFrame(0, left, right, None), CAMERA, PIXELS, StereoSettings())
     _check(found[:, 0])
 
 

@@ -11,7 +11,8 @@ import pytest
 from fleetmap import features
 from fleetmap.bow import decode_vocabulary
 from fleetmap.bow.shipped_vocabulary import default_vocabulary_bytes
-from fleetmap.features.orb import Features, OrbSettings, detect_in_slices
+from fleetmap.features.orb import Features, detect_in_slices
+from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, se3, so3_exp, transform_points
 from fleetmap.mapformat import BlobEntry, CameraEntry, Manifest, RecordingEntry, Tile, TileEntry, encode_tile
 from fleetmap.numerics.time_sliced import TimeSliced

@@ -5,6 +5,7 @@ import pytest
 
 from fleetmap.features import patch_align
 from fleetmap.features.matching import packed
+from fleetmap.features.settings import AlignSettings
 from fleetmap.geometry import se3, so3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.finish.map_assembly_kernels import mark_duplicates, medoids
@@ -70,7 +71,7 @@ def test_patches_are_aligned_as_one_by_one() -> None:
     warp[unknown] = patch_align.similarity_from_features(octaves, angles, own_octaves, own_angles)[unknown]
     first = patch_align.Patches(pyramid, pixels, octaves)
     current = patch_align.Patches(pyramid, own_pixels, own_octaves)
-    expected = patch_align.refine_matches(first, current, warp, patch_align.AlignSettings())
+    expected = patch_align.refine_matches(first, current, warp, AlignSettings())
     assert np.isfinite(expected[:, 0]).sum() > count // 3
     np.testing.assert_allclose(found, expected, atol=1e-6)
 

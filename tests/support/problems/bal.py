@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import AnyArray, Array, so3_exp
-from mapserver.survey.bundle.problem import BundleSettings
 from mapserver.survey.bundle.reduced_system import ReducedSystem, build_chains, solve_dense, solve_sparse
 from mapserver.survey.bundle.schur_kernels import ObservationTable, invert_landmarks
+from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.bundle.sparsity import Structure, block_pattern
 from support.problems import bal_kernels
 from support.problems.bal_kernels import CAMERA_UNKNOWNS

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fleetmap.features.orb import OrbSettings
+from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.messages import Cause, Status
 from fleetmap.numerics.time_sliced import TimeSliced

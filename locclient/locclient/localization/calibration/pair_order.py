@@ -4,8 +4,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from fleetmap.features import extract, orb
+from fleetmap.features.extraction import extract
 from fleetmap.features.matching import match_mutual
+from fleetmap.features.settings import OrbSettings
 from fleetmap.sensors.rectification import RectifiedFrame
 
 REVERSED_TEXT = (
@@ -27,7 +28,7 @@ class PairOrder(StrEnum):
     REVERSED = "reversed"
 
 
-def pair_order(frame: RectifiedFrame, settings: orb.OrbSettings) -> PairOrder:
+def pair_order(frame: RectifiedFrame, settings: OrbSettings) -> PairOrder:
     """The order that one frame shows, at half its size; UNKNOWN for a single camera, and where too little is seen or all of it is far."""
     if frame.right is None:
         return PairOrder.UNKNOWN

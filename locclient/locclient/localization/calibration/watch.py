@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleetmap.features import stereo
-from fleetmap.features.stereo import StereoSettings
+from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.pnp.pnp import Correspondences

@@ -12,7 +12,6 @@ from mapserver.survey.bundle.factors import Normal, State, Terms, pack_terms
 from mapserver.survey.bundle.problem import (
     BundleProblem,
     BundleResult,
-    BundleSettings,
     InertialTerms,
     MotionPrior,
     PriorTerm,
@@ -29,6 +28,7 @@ from mapserver.survey.bundle.reprojection_kernels import (
     step_poses,
 )
 from mapserver.survey.bundle.schur_kernels import Eliminated, View, invert_landmarks, reduce_to_poses
+from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.bundle.sparsity import Structure, build_structure
 
 __all__ = [

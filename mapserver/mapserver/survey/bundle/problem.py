@@ -5,13 +5,11 @@ map_from_body that is R <- Exp(rot) R, p <- p + trans, both in map axes; for i_f
 """
 
 from dataclasses import dataclass, field, replace
-from math import inf
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.config import Section
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.inertial import Preintegrated, preintegrate
 from fleetmap.sensors.calibration import ImuNoise
@@ -90,21 +88,6 @@ class BundleProblem:
     priors: list[PriorTerm] = field(default_factory=list)
     gauge: Literal["pose", "yaw_position"] = "pose"
     points_held: bool = False
-
-
-class BundleSettings(Section, frozen=True):
-    """How hard bundle adjustment tries. Widths are in sigmas of an observation's residual."""
-
-    max_iterations: int = 10  # Levenberg-Marquardt steps
-    huber_sigmas: float = 2.5  # where the loss turns from quadratic to linear
-    cutoff_sigmas: float = inf  # observations farther off have no influence
-    lambda_start: float = 1e-4  # first damping
-    relative_cost_tolerance: float = 1e-4  # relative gain of the last step
-    dense_unknowns: int = 1500  # reduced systems up to this size are solved by dense Cholesky
-    # For each keyframe; up to so many sparse factorisation is quicker than conjugate gradients.
-    sparse_couplings: float = 40.0
-    pcg_tolerance: float = 1e-4  # relative residual at the end
-    pcg_max_iterations: int = 300  # then the step is solved again by sparse factorisation
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from fleetmap.geometry import AnyArray, Array
-from mapserver.survey.bundle.problem import BundleSettings
 from mapserver.survey.bundle.reduced_system_kernels import (
     ChainFactors,
     Numbers,
@@ -20,6 +19,7 @@ from mapserver.survey.bundle.reduced_system_kernels import (
     fill_lower,
     lay_out,
 )
+from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.bundle.sparsity import Structure
 
 

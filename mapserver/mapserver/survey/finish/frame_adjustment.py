@@ -14,7 +14,6 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.inertial import preintegrate
 from mapserver.survey.bundle.bundle_adjustment import (
     BundleProblem,
-    BundleSettings,
     InertialTerms,
     MotionPrior,
     RelativeTerm,
@@ -23,6 +22,7 @@ from mapserver.survey.bundle.bundle_adjustment import (
 )
 from mapserver.survey.bundle.bundle_rounds import SurveyState, scaled_noise
 from mapserver.survey.bundle.odometry_factors import edge_covariance
+from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.bundle.stereo_yaw_check import disparity_shift
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.finish.trajectory import frame_trajectory

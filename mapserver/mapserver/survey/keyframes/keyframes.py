@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import extract, orb, patch_align, stereo
+from fleetmap.features import orb, patch_align, stereo
+from fleetmap.features.extraction import extract
 from fleetmap.geometry import AnyArray, Array, rotation_angle_rad, se3_inverse
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from mapserver.survey.executor import SERIAL, Executor

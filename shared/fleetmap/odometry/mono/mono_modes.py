@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features.stereo import StereoSettings
+from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter import msckf_kernels

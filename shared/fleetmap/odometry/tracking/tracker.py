@@ -6,9 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import extract, flow, orb, patch_align, stereo
+from fleetmap.features import flow, orb, patch_align, stereo
 from fleetmap.features.corners import spread_corners
+from fleetmap.features.extraction import extract
 from fleetmap.features.matching import match_mutual
+from fleetmap.features.settings import AlignSettings, OrbSettings, StereoSettings
 from fleetmap.geometry import Array, transform_points
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracking import tracker_kernels
@@ -79,12 +81,12 @@ class Tracker:
     """Feeds on rectified frames in order; ids never repeat."""
 
     def __init__(
-        self, camera: StereoCamera, settings: TrackerSettings, stereo_settings: stereo.StereoSettings | None = None
+        self, camera: StereoCamera, settings: TrackerSettings, stereo_settings: StereoSettings | None = None
     ) -> None:
         self._camera = camera
         self._settings = settings
-        self._stereo = stereo_settings or stereo.StereoSettings()
-        self._orb = orb.OrbSettings(count=settings.match_features)
+        self._stereo = stereo_settings or StereoSettings()
+        self._orb = OrbSettings(count=settings.match_features)
         self._previous: RectifiedFrame | None = None
         nothing = flow.Pyramid(np.zeros((0, 0), np.uint8))
         self._pyramids = [nothing, nothing]  # of the previous frame and of this one
@@ -255,7 +257,7 @@ class Tracker:
         warp = patch_align.similarity_from_features(before.octaves, before.angles_deg, now.octaves, now.angles_deg)
         reference = patch_align.Patches(old.pyramid, before.pixels, before.octaves)
         patches = patch_align.Patches(current.pyramid, now.pixels, now.octaves)
-        refined = patch_align.refine_matches(reference, patches, warp, patch_align.AlignSettings())
+        refined = patch_align.refine_matches(reference, patches, warp, AlignSettings())
         sure = np.isfinite(refined[:, 0])
         a, b = a[sure], b[sure]
         if len(a) < self._settings.min_inliers_known_rotation:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fleetmap.features.orb import OrbSettings
+from fleetmap.features.settings import OrbSettings
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import Image
 from locclient.localization.calibration.pair_order import PairOrder, pair_order

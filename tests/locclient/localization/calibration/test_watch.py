@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from fleetmap.features.stereo import StereoSettings
+from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Cause, Status
 from fleetmap.relocalization.frame_features import FrameFeatures

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from fleetmap.geometry import so3_log
-from mapserver.survey.bundle.bundle_adjustment import BundleSettings, keyframe_covariances, optimize
+from mapserver.survey.bundle.bundle_adjustment import keyframe_covariances, optimize
+from mapserver.survey.bundle.settings import BundleSettings
 from support.worlds.bundle_scene import make_scene
 
 

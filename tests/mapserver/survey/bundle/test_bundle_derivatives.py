@@ -6,7 +6,6 @@ import pytest
 from fleetmap.geometry import Array, se3_exp, se3_inverse
 from mapserver.survey.bundle.bundle_adjustment import (
     BundleProblem,
-    BundleSettings,
     MotionPrior,
     PriorTerm,
     RelativeTerm,
@@ -14,6 +13,7 @@ from mapserver.survey.bundle.bundle_adjustment import (
 )
 from mapserver.survey.bundle.bundle_adjustment import _Bundle as Bundle
 from mapserver.survey.bundle.reduced_system import SparseLayout, dense_lower, solve_dense, solve_pcg, solve_sparse
+from mapserver.survey.bundle.settings import BundleSettings
 from support.worlds.bundle_scene import disturbed, make_scene, plain_residuals
 
 NO_ROBUSTNESS = BundleSettings(huber_sigmas=1e9)

@@ -7,7 +7,7 @@ import pytest
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import so3_exp
-from mapserver.survey.bundle.bundle_adjustment import BundleSettings
+from mapserver.survey.bundle.settings import BundleSettings
 from support.problems import bal_kernels
 from support.problems.bal import optimize_bal, parse_bal
 from support.recordings.realdata import real_data

@@ -8,8 +8,9 @@ import pytest
 
 from fleetmap.features.orb import Features
 from fleetmap.geometry import se3_exp
-from mapserver.survey.bundle.bundle_adjustment import BundleSettings, optimize
+from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_rounds
+from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.keyframes.keyframes import Keyframe, MemoryImageStore
 from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.settings import CullSettings, LoopSettings, SurveySettings

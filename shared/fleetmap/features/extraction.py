@@ -1,0 +1,26 @@
+"""Features by the extractor that the settings name. To add one: a file beside this one and a line in EXTRACTORS."""
+
+from collections.abc import Callable
+
+from fleetmap.errors import UsageError
+from fleetmap.features import orb
+from fleetmap.features.settings import OrbSettings
+from fleetmap.numerics.time_sliced import TimeSliced, finished
+from fleetmap.sensors.samples import Image
+
+Extractor = Callable[[Image, OrbSettings], TimeSliced[orb.Features]]
+"""Features of a rectified grey image (H, W); the same image and settings give the same features."""
+
+EXTRACTORS: dict[str, Extractor] = {"grid-orb": orb.detect_in_slices}
+
+
+def extract(image: Image, settings: OrbSettings) -> orb.Features:
+    """The features of an image by the extractor of the settings; UsageError for one that does not exist."""
+    return finished(extract_in_slices(image, settings))
+
+
+def extract_in_slices(image: Image, settings: OrbSettings) -> TimeSliced[orb.Features]:
+    """As `extract`, in slices."""
+    if settings.extractor not in EXTRACTORS:
+        raise UsageError(f"there is no feature extractor {settings.extractor!r}; choose one of {', '.join(EXTRACTORS)}")
+    return EXTRACTORS[settings.extractor](image, settings)
