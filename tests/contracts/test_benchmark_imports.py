@@ -19,9 +19,9 @@ def test_a_benchmark_imports_what_exists(path: Path) -> None:
     for node in froms:
         if node.level or node.module is None or node.module.split(".")[0] not in PACKAGES:
             continue
-        names = vars(import_module(node.module))
+        module = import_module(node.module)
         for alias in node.names:
-            if alias.name not in names:
+            if not hasattr(module, alias.name):
                 try:
                     import_module(f"{node.module}.{alias.name}")
                 except ModuleNotFoundError:

@@ -75,7 +75,7 @@ def test_a_build_loads_no_library_that_it_does_not_need() -> None:
 
 
 def test_a_configuration_is_read_without_what_surveys_compute_with() -> None:
-    """Every command reads one; numba and the kernels take most of a second, and 100 MB of the server."""
+    """Every command reads one, and the server keeps it; numba and the kernels take most of a second, and 100 MB of the server."""
     script = "import sys, mapserver.config; print([m for m in ('numba', 'cv2', 'gtsam') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"

@@ -10,7 +10,8 @@ from urllib.parse import unquote, urlparse
 
 import numpy as np
 
-from fleetmap.bus import Bus, Ros2Node
+from fleetmap.bus import Bus
+from fleetmap.bus.ros2_node import Ros2Node
 from fleetmap.errors import FleetmapError
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse, so3_log

@@ -3,7 +3,6 @@
 from fleetmap.bus.endpoints import check_endpoint, has_tls, is_loopback
 from fleetmap.bus.memory import MemoryBus, MemoryHub
 from fleetmap.bus.protocol import MAX_MESSAGE_BYTES, Answer, Bus, Handle, LatchedPublisher, Listen
-from fleetmap.bus.ros2_node import Ros2Node
 from fleetmap.bus.tls import TlsFiles, handshake_fault
 from fleetmap.bus.zenoh_bus import ZenohBus
 
@@ -16,7 +15,6 @@ __all__ = [
     "Listen",
     "MemoryBus",
     "MemoryHub",
-    "Ros2Node",
     "TlsFiles",
     "ZenohBus",
     "check_endpoint",
