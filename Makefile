@@ -1,9 +1,10 @@
-# Five verbs. Each makes .venv itself; all that is needed is Python >= 3.11 (with venv) and make.
+# Verbs. Each makes .venv itself; all that is needed is Python >= 3.11 (with venv) and make.
 #
 #   make demo                  survey a simulated warehouse, serve its map, localize the robots of the next day in it
 #   make demo RECORDING=PATH   build a map of half of a recording, serve it, localize the other half in it
 #   make test                  every test
 #   make check                 format, lint, types, import contracts
+#   make kernels               compile what everything computes with, once for all processes; tests and demo do it as they go
 #   make bench                 how fast and how exact, in numbers
 #   make conformance SUITE=DIR robots' client of signed lists against a checkout of tuf-conformance (needs faketime)
 #   make clean                 remove everything that the other verbs made
@@ -24,7 +25,7 @@ INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-recording test check bench conformance clean
+.PHONY: help demo demo-recording test check kernels bench conformance clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -44,6 +45,10 @@ check: $(DEV_STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+kernels: $(DEV_STAMP)
+	$(BIN)/mapserver prepare
+	$(BIN)/locclient prepare
 
 bench: $(DEV_STAMP)
 	$(BIN)/python -m pytest $(BENCHMARKS) -s $(PYTEST_ARGS)
