@@ -20,7 +20,7 @@ from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
-from mapserver.trust import init_here
+from mapserver.trust import init_here, update_lists
 from support.fleet_manager.vda5050_master import Master, mosquitto, until
 from support.worlds import robot_world
 
@@ -139,7 +139,7 @@ def _story(master: Master, store: MapStore, http: str) -> None:
     assert "what the robot sees puts it" in str(master.done(elsewhere, "FAILED")["errors"])
 
     robot_world.save(store)
-    init_here(store)
+    update_lists(store)
     offered = httpx.get(f"{http}/v1/sites/room/versions/2/vda5050").json()
     master.done(master.act("downloadMap", **offered))
     assert master.maps() == {"1": "ENABLED", "2": "DISABLED"}

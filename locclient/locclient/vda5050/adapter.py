@@ -223,6 +223,7 @@ class FleetAdapter:
                 self._pending.enable = (action, wanted, self._clock_s() + _ENABLE_S)
             return self._parts.offer(wanted)
         with self._lock:
+            self._known.versions = maps.versions()  # before the action is finished, in any state
             self._book.set(action, "FINISHED")
         return None
 
@@ -233,6 +234,8 @@ class FleetAdapter:
             if enabling is None or enabling[1].manifest_sha256 != change.wanted.manifest_sha256:
                 return
             self._pending.enable = None
+            if self._parts.maps is not None:
+                self._known.versions = self._parts.maps.versions()
             if change.change is Change.ADOPTED:
                 self._book.set(enabling[0], "FINISHED")
             else:
@@ -277,7 +280,11 @@ class FleetAdapter:
         """The results of a frame, and the versions that the localizer holds; from the thread that localizes."""
         with self._lock:
             self._known.in_use = in_use
-            self._see(self._known.localization.after(outcome, is_driving=is_driving(outcome.speed_mps)))
+            self._see(
+                self._known.localization.after(
+                    outcome, self._parts.lost_radius_m, is_driving=is_driving(outcome.speed_mps)
+                )
+            )
             self._judge_position()
 
     def silence(self) -> None:

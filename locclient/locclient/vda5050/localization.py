@@ -56,14 +56,14 @@ class Localization:
     is_silent: bool = True
     has_map: bool = False
 
-    def after(self, outcome: Outcome, *, is_driving: bool) -> "Localization":
-        """With the results of one frame."""
+    def after(self, outcome: Outcome, lost_radius_m: float, *, is_driving: bool) -> "Localization":
+        """With the results of one frame. Beyond lost_radius_m (95 %) nobody can drive by a position, whatever the status."""
         estimate, published = outcome.estimate, outcome.published
         position, is_localized = self.position, False
         if published.map_from_odom is not None and estimate.cov_rot_trans is not None:
             map_from_base = published.map_from_odom @ published.odom_from_base
             position = _position(map_from_base, radius_95_m(estimate.cov_rot_trans))
-            is_localized = estimate.status in {Status.TRACKING, Status.DEGRADED}
+            is_localized = estimate.status in {Status.TRACKING, Status.DEGRADED} and position.radius_m <= lost_radius_m
         return Localization(
             estimate.status,
             estimate.cause,

@@ -5,14 +5,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from fleetmap.errors import UsageError
 from fleetmap.messages import Cause, Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
+from locclient.robot.continuous_odom import PublishedPose
 from locclient.vda5050.adapter import AdapterParts, FleetAdapter
 from locclient.vda5050.factsheet import read_factsheet
 from locclient.vda5050.localization import Localization, Position
@@ -108,6 +111,19 @@ def test_a_robot_that_is_not_localized_says_why(status: Status, cause: str) -> N
     (error,) = (error for error in state["errors"] if error["errorType"] == "LOCALIZATION_ERROR")
     assert error["errorLevel"] == "FATAL"
     assert len(error["errorHint"]) > 10 or error["errorHint"] == cause
+
+
+@pytest.mark.parametrize(("sigma_m", "is_localized"), [(0.1, True), (2.0, False)])
+def test_a_position_beyond_the_lost_radius_is_none(sigma_m: float, is_localized: bool) -> None:
+    """The check of the calibration widens covariances of estimates that keep their status."""
+    estimate = SimpleNamespace(
+        status=Status.DEGRADED, cause=Cause.CALIBRATION, stamp_ns=7, cov_rot_trans=np.eye(6) * sigma_m**2, map_version=1
+    )
+    outcome = SimpleNamespace(estimate=estimate, published=PublishedPose(np.eye(4), np.eye(4)), speed_mps=0.0)
+    adapter = Adapter()
+    adapter.after_frame(outcome, frozenset({1}))  # type: ignore[arg-type]
+    assert adapter.said()["mobileRobotPosition"]["localized"] is is_localized
+    assert ("LOCALIZATION_ERROR" in adapter.error_types()) is not is_localized
 
 
 def test_a_loss_between_two_states_is_told() -> None:
@@ -223,10 +239,18 @@ def test_a_version_on_trial_is_running_until_the_localizer_decides() -> None:
     assert adapter.ask(name="b", mapId="hall", mapVersion="2")["actionStatus"] == "RUNNING"
     assert adapter.ask(name="c", mapId="hall", mapVersion="2")["actionStatus"] == "WAITING"
     (wanted,) = adapter.offers
+    adapter._parts.maps.held = [(1, False), (2, True)]
+    adapter.changed_version(VersionChange(wanted, Change.ADOPTED))
+    assert [entry["mapStatus"] for entry in adapter.said()["maps"]] == ["DISABLED", "ENABLED"], (
+        "finished and enabled in one state"
+    )
+    adapter._parts.maps.held = [(1, True), (2, False)]
+    adapter.work()
     adapter.changed_version(VersionChange(wanted, Change.REFUSED, "fixes contradict it"))
     by_name = {state["actionId"]: state for state in adapter.said()["instantActionStates"]}
-    assert "fixes contradict it" in by_name["b"]["actionResult"]
-    adapter.work()
+    assert by_name["b"]["actionStatus"] == "FINISHED"
+    assert "fixes contradict it" in by_name["c"]["actionResult"]
+    adapter.ask(name="d", mapId="hall", mapVersion="2")
     adapter.now_s += 121.0
     adapter.work()
     assert "not confirmed" in str(adapter.said()["instantActionStates"])
