@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleetmap import features
 from fleetmap.bow import decode_vocabulary
 from fleetmap.bow.shipped_vocabulary import default_vocabulary_bytes
+from fleetmap.features import extraction
 from fleetmap.features.orb import Features, detect_in_slices
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, se3, so3_exp, transform_points
@@ -231,7 +231,7 @@ def test_probes_are_extracted_as_the_survey_did(monkeypatch: pytest.MonkeyPatch)
         asked.append(settings)
         return (yield from detect_in_slices(image, settings))
 
-    monkeypatch.setitem(features.EXTRACTORS, "other", other)
+    monkeypatch.setitem(extraction.EXTRACTORS, "other", other)
     rectifier = Rectifier(calibration())
     sample = ride_sample(two_walls, 2, FRAME_S)
     frame = rectifier.rectify(CameraFrame(int(sample.stamps_ns[0]), sample.left[0], sample.right[0]))
