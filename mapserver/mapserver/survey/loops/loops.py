@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import BowVector, PlaceIndex
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, se3_inverse, se3_log
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, without_pictures
 from mapserver.survey.loops.parts import Parts, Revisit, WaitingRevisits
-from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
+from mapserver.survey.loops.repetition import Repetition
+from mapserver.survey.pose_graph.graph_marginals import CHI2_3_0999, GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
 from mapserver.survey.survey_inputs import SurveyConfig
 from mapserver.survey.tracks.matching import median_depth_m
@@ -24,6 +25,10 @@ _CORRELATION = 3.0
 _CHUNK = 64  # candidates that are gated at once
 _SIDES = 16  # to which the site may repeat
 _ALIAS_SCORE = 0.7  # of a candidate's score, from which on another place looks the same
+_ALIAS_REACH, _ALIAS_GATE = (
+    0.5,
+    4.0,
+)  # of the view's reach, and of the gate, beyond which a match is of another place for certain
 _WORTH_LEARNING = 1.0  # variance against the measurement's: below, a loop changes what the gate knows by less than half
 # Known so well, no place can be taken for another: the gate need not learn more. Doubled with every so many loops that it has
 # learned, as they cost memory with their square; what it does not learn leaves it wider, and the next loop can still be learned.
@@ -102,6 +107,7 @@ class LoopCloser:
         """
         self.parts = parts
         self._waiting = WaitingRevisits()
+        self._repetition = Repetition()
         self._camera, self._vocabulary = posed.camera, options.vocabulary
         self._body_from_cam, self._cam_from_body = posed.body_from_cam, se3_inverse(posed.body_from_cam)
         self._settings, self._zones = options.settings.loops, options.zones
@@ -221,6 +227,7 @@ class LoopCloser:
         edge = self._edge(match)
         innovation = self._marginals.innovation_squared(edge)
         if innovation > self._settings.max_innovation:
+            self._learn_repetition(edge, count, innovation)
             reason = f"matches, but from where the robot cannot be (innovation {innovation:.0f})"
             return refuse(LoopVerdict.GATED_OUT, reason, count)
         supported = self._neighbours_agree(match)
@@ -237,18 +244,42 @@ class LoopCloser:
         """How far off the robot could be too if the site repeats as it is seen to, or said to; None where it cannot be.
 
         Twins look like the old keyframe; those that lie elsewhere count. The way to each of them is a step by which the site repeats,
-        perhaps also to a place where no keyframe is yet: a first visit must not be taken for a return.
+        perhaps also to a place where no keyframe is yet: a first visit must not be taken for a return. So are the steps that aliases
+        anywhere in the site have shown.
         """
         ways = np.zeros((0, 3))
         if len(aliases):
             aliases = aliases[self._are_apart(edge.j, aliases)]
             ways = self._map_from_body[aliases, :3, 3] - self._map_from_body[edge.j, :3, 3]
-        steps = np.concatenate([ways, -ways, _around(self._settings.repeats_every_m)])
+        learnt = self._repetition.steps_m if self._are_of_one_part(edge) else np.zeros((0, 3))
+        steps = np.concatenate([ways, -ways, learnt, _around(self._settings.repeats_every_m)])
         if not len(steps):
             return None
         possible = self._marginals.innovations_squared_beside(edge, steps) <= self._settings.max_innovation
         lengths_m = np.linalg.norm(steps[possible], axis=1)
         return float(lengths_m.min()) if len(lengths_m) else None
+
+    def _learn_repetition(self, edge: PoseEdge, count: int, innovation: float) -> None:
+        """What matches from where the robot cannot be is an alias of its place: the way between the two is a step of the site.
+
+        Not where the graph may misjudge a true revisit: aliases are far apart, seen by what both see, and by what the graph knows. Both
+        must be turned alike: a site repeats by steps, and not by turns.
+        """
+        here = self._map_from_body[edge.i]
+        step_m = (self._map_from_body[edge.j] @ se3_inverse(edge.i_from_j))[:3, 3] - here[:3, 3]
+        reach_m = self._settings.view_range_depths * float(self._depths_m[[edge.i, edge.j]].max())
+        is_far = (
+            np.linalg.norm(step_m) > _ALIAS_REACH * reach_m and innovation > _ALIAS_GATE * self._settings.max_innovation
+        )
+        if not is_far or count < self._settings.alone_inliers or not self._are_of_one_part(edge):
+            return
+        off = se3_log(edge.i_from_j @ se3_inverse(self._map_from_body[edge.j]) @ here)
+        cov = self._marginals.relative_cov(edge.i, edge.j) + edge.cov_rot_trans
+        if off[:3] @ np.linalg.solve(cov[:3, :3], off[:3]) <= CHI2_3_0999:
+            self._repetition.see(edge.i, step_m, float(np.trace(cov[3:, 3:])) / 3)
+
+    def _are_of_one_part(self, edge: PoseEdge) -> bool:
+        return self.parts is None or self.parts.of(edge.i) == self.parts.of(edge.j)
 
     def _cam_from_cam(self, j: int, i: int) -> Array:
         map_from_body = self._map_from_body
@@ -294,7 +325,7 @@ class LoopCloser:
                 self.loops.records.append(replace(record, verdict=LoopVerdict.AMBIGUOUS, reason=reason))
                 continue
             self.loops.records.append(record)
-            if self.parts is None or self.parts.of(edge.i) == self.parts.of(edge.j):
+            if self.parts is None or self._are_of_one_part(edge):
                 self._accept([edge])
                 continue
             number = len(self.loops.records) - 1
