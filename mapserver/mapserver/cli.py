@@ -20,6 +20,7 @@ from mapserver.commands.releases.inspect import diff, inspect, versions
 from mapserver.commands.releases.promote import promote, publish, rollback
 from mapserver.commands.releases.signer import signer
 from mapserver.commands.serve import serve
+from mapserver.commands.site.align import align
 from mapserver.commands.store.audit import audit
 from mapserver.commands.store.export import export, import_
 from mapserver.commands.store.gc import gc
@@ -52,6 +53,7 @@ COMMANDS: Commands = {
     "calibrate": calibrate,
     "evaluate": evaluate,
     "train-vocabulary": train_vocabulary,
+    "align": align,
     "fleet": FLEET,
     "robots": ROBOTS,
     "operators": OPERATORS,

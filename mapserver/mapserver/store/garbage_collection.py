@@ -102,5 +102,5 @@ def _write_down(transactions: Transactions, connection: sqlite3.Connection, garb
 def _mentioned(transactions: Transactions, leaving: set[tuple[str, int]]) -> set[str]:
     rows = transactions.query("SELECT site, version, sha256 FROM version_blobs")
     kept = {row["sha256"] for row in rows if (row["site"], row["version"]) not in leaving}
-    vocabularies = transactions.query("SELECT vocabulary_sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL")
-    return kept | {row["vocabulary_sha256"] for row in vocabularies}
+    of_sites = "SELECT vocabulary_sha256 sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL UNION SELECT sha256 FROM site_files"
+    return kept | {row["sha256"] for row in transactions.query(of_sites)}

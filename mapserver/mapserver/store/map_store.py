@@ -11,10 +11,10 @@ Bytes are on the disk before the transaction that mentions them, so a crash leav
 
 import sqlite3
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import msgspec
 
@@ -30,6 +30,7 @@ from fleetmap.mapformat import (
     encode_manifest,
     encode_tile,
 )
+from fleetmap.mapformat.building import BUILDING_KEY
 from fleetmap.version_file import ExportHead, open_export
 from mapserver.store.export_import import export_chunks, export_head, write_export
 from mapserver.store.files import (
@@ -143,7 +144,8 @@ class MapStore(StoreQueries):
                     parent=None if current is None else current.version,
                     tiles=tuple(entries),
                     vocabulary=vocabulary,
-                    **{name: getattr(details, name) for name in details.__struct_fields__},
+                    **{name: getattr(details, name) for name in details.__struct_fields__}
+                    | {"configuration": details.configuration | ({} if current is None else self._building(site))},
                 )
                 draft = self._draft_row(manifest, archive_sha256, content.job)
                 log = LogEntry("saved", f"draft {manifest.version}", manifest.version, actor)
@@ -154,6 +156,22 @@ class MapStore(StoreQueries):
                         (site, manifest.version, msgspec.json.encode(content.evidence).decode()),
                     )
         return draft
+
+    def keep_site_files(
+        self, site: str, files: Mapping[str, bytes | None], detail: str, *, actor: Actor = NOBODY
+    ) -> None:
+        """Keeps what belongs to a site beside its versions, by kind, all of it or nothing; None takes a kind away. detail: for the log.
+
+        Raises UsageError for an unknown site, StoreError where the disk refuses.
+        """
+        self._check_site(site)
+        with self._locked(shared=True):
+            addresses = {kind: self._blobs.put(data) for kind, data in files.items() if data is not None}
+            with self._transactions.write() as connection:
+                connection.executemany("DELETE FROM site_files WHERE site = ? AND kind = ?", [(site, k) for k in files])
+                rows = [(site, kind, sha256) for kind, sha256 in addresses.items()]
+                connection.executemany("INSERT INTO site_files (site, kind, sha256) VALUES (?, ?, ?)", rows)
+                self._transactions.log(connection, site, LogEntry(" and ".join(files), detail, None, actor))
 
     def change_releases(self, site: str, decide: Callable[[SiteReleases], ReleaseChanges]) -> ReleaseChanges:
         """Writes what `decide` makes of a site's rows, in the one transaction that reads them; on the disk when this returns.
@@ -237,6 +255,14 @@ class MapStore(StoreQueries):
                 log = LogEntry("saved", f"import as draft {manifest.version}", manifest.version, actor)
                 insert_draft(self._transactions, connection, manifest, draft, log)
         return self.version(manifest.site, manifest.version)
+
+    def _building(self, site: str) -> dict[str, Any]:
+        """The part of a new manifest's configuration that says where the map lies in the building; nothing where that is not known.
+
+        A first version, without a current one before it, has a frame of its own.
+        """
+        alignment = self.alignment(site)
+        return {} if alignment is None else {BUILDING_KEY: msgspec.to_builtins(alignment.frame)}
 
     def _put_tile(self, tile: Tile) -> TileEntry:
         data = encode_tile(tile)

@@ -222,4 +222,14 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
             for name in ("operator", "address", "sha256")
         ),
     ),
+    (
+        # What belongs to a site and to no version, such as the drawing of its building: bytes by their address.
+        """CREATE TABLE site_files (
+            site TEXT NOT NULL REFERENCES sites(site),
+            kind TEXT NOT NULL,
+            sha256 TEXT NOT NULL,
+            PRIMARY KEY (site, kind)) WITHOUT ROWID""",
+        # The named area in which a failure happened, as the site's areas are now.
+        "ALTER TABLE failures ADD COLUMN area TEXT",
+    ),
 )

@@ -10,6 +10,7 @@ import msgspec
 
 from fleetmap.errors import UsageError
 from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest
+from mapserver.floor_plan.alignment import ALIGNMENT, Alignment, decode_alignment
 from mapserver.quality.figures import Evidence
 from mapserver.store.access.chain import AuditLine, AuditMark
 from mapserver.store.access.operators import OperatorQueries
@@ -146,6 +147,16 @@ class StoreQueries:
             (site,),
         )
         return self._blobs.get(rows[0]["sha256"]) if rows else None
+
+    def site_file(self, site: str, kind: str) -> bytes | None:
+        """What a site keeps beside its versions under this kind, such as `plan`; None without. Errors as of `blob`."""
+        rows = self._transactions.query("SELECT sha256 FROM site_files WHERE site = ? AND kind = ?", (site, kind))
+        return self._blobs.get(rows[0]["sha256"]) if rows else None
+
+    def alignment(self, site: str) -> Alignment | None:
+        """Where the site's map lies in the drawing of its building; None for a site that was not aligned."""
+        data = self.site_file(site, ALIGNMENT)
+        return None if data is None else decode_alignment(data)
 
     def verdicts(self, site: str, version: int) -> list[VerdictRow]:
         """What the gate said about a version, oldest first; raises UsageError where it does not exist."""

@@ -1,28 +1,12 @@
 """The commands that change and check a store, from the command line."""
 
 import json
-import sys
 from pathlib import Path
 
-import pytest
-
 from fleetmap.mapformat import blob_path
-from mapserver import cli, releases
+from mapserver import releases
 from mapserver.store import MapStore
 from support.storage.map_samples import save_sample_draft
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    def run(*arguments: object, status: int = 0) -> str:
-        monkeypatch.setattr(sys, "argv", ["mapserver", *(str(a) for a in arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        told = capsys.readouterr()
-        assert int(end.value.code or 0) == status, told.err
-        return told.out + told.err
-
-    return run
 
 
 def test_a_life_of_versions(run, tmp_path: Path) -> None:

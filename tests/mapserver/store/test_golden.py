@@ -112,7 +112,8 @@ def test_a_draft_of_an_older_store_is_known_by_the_job_that_its_log_names(tmp_pa
         connection.execute(f"ALTER TABLE tallies DROP COLUMN {name}")
     for name in ("operator", "address", "sha256"):
         connection.execute(f"ALTER TABLE events DROP COLUMN {name}")
-    for name in ("tokens", "sessions", "operators"):
+    connection.execute("ALTER TABLE failures DROP COLUMN area")
+    for name in ("tokens", "sessions", "operators", "site_files"):
         connection.execute(f"DROP TABLE {name}")
     connection.execute("PRAGMA user_version = 4")
     connection.close()

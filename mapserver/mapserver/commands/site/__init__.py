@@ -1,0 +1,1 @@
+"""Commands over a site: its building and its areas."""

@@ -1,0 +1,130 @@
+"""`mapserver align`: where a site's map lies in the drawing of its building."""
+
+from dataclasses import dataclass
+from math import degrees
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleetmap.cli_options import expand_options
+from fleetmap.errors import UsageError
+from mapserver.commands.options import ActorOptions, Json, SiteOptions, print_json
+
+if TYPE_CHECKING:
+    from fleetmap.geometry import Array
+    from mapserver.floor_plan.alignment import Alignment
+    from mapserver.floor_plan.pins import Fit
+    from mapserver.store import MapStore
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanOptions:
+    """The drawing and what is known of it."""
+
+    plan: Annotated[Path | None, typer.Option(metavar="FILE", help="Picture of the building from above.")] = None
+    pin: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PX,PY:X,Y", help="Point of the plan (pixels) and of the map (metres); repeat it."),
+    ] = None
+    metres_per_pixel: Annotated[
+        float | None, typer.Option(min=1e-6, max=1e3, help="Scale of the plan; default: the pins give it.")
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShowOptions:
+    """What to print."""
+
+    show: Annotated[bool, typer.Option("--show", help="Print the alignment that is kept; change nothing.")] = False
+    level: Annotated[str, typer.Option(metavar="NAME", help="Name of the level for Open-RMF.")] = "L1"
+    json: Json = False
+
+
+@expand_options
+def align(
+    where: SiteOptions,
+    given: PlanOptions,
+    shown: ShowOptions,
+    by: ActorOptions,
+    forget: Annotated[bool, typer.Option("--forget", help="Forget the alignment and the plan.")] = False,
+) -> None:
+    """Find where the map lies in the drawing of its building, and keep it; maps that are built from now on carry it."""
+    from mapserver.floor_plan.alignment import ALIGNMENT, PLAN, encode_alignment
+    from mapserver.store import MapStore
+
+    named = given.plan is not None or bool(given.pin)
+    if shown.show + forget + named != 1:
+        raise UsageError("name --pin (and --plan) to align, --show to print what is kept, or --forget")
+    with MapStore.open(where.store, read_only=shown.show) as maps:
+        corners = _corners(maps, where.site)
+        if forget:
+            maps.keep_site_files(where.site, {ALIGNMENT: None, PLAN: None}, "forgotten", actor=by.named())
+            typer.echo(f"site {where.site}: the alignment is forgotten; versions that carry it keep it")
+            return
+        if named:
+            found, data = _aligned(given, corners)
+            files = {ALIGNMENT: encode_alignment(found), PLAN: data}
+            maps.keep_site_files(where.site, files, _words(found), actor=by.named())
+        alignment = maps.alignment(where.site)
+    if alignment is None:
+        raise UsageError(f"site {where.site} is not aligned; `mapserver align --plan FILE --pin ...` does it")
+    if shown.json:
+        print_json(alignment)
+    else:
+        _print(alignment, corners, shown.level)
+
+
+def _corners(maps: "MapStore", site: str) -> "Array":
+    """Of the current version, in whose frame pins are: a draft without one before it has a frame of its own."""
+    from mapserver.floor_plan.alignment import map_corners_m
+
+    current = maps.current(site)
+    if current is None:
+        raise UsageError(f"site {site} has no current version, whose frame stays; publish one first")
+    return map_corners_m(maps.manifest(site, current.version))
+
+
+def _aligned(given: PlanOptions, corners: "Array") -> "tuple[Alignment, bytes | None]":
+    from mapserver.floor_plan.alignment import Alignment
+    from mapserver.floor_plan.pins import fit_pins, parse_pin
+    from mapserver.floor_plan.plan_file import read_plan
+
+    pins = [parse_pin(text) for text in given.pin or ()]
+    plan = None if given.plan is None else read_plan(given.plan)
+    if plan is not None:
+        plan.check_pins(pins)
+    fit = fit_pins(pins, given.metres_per_pixel, corners)
+    _say_checks(fit)
+    name, data = (None, None) if plan is None else (plan.name, plan.data)
+    return Alignment(
+        frame=fit.frame, metres_per_unit=fit.metres_per_unit, method="pins", plan=name, off_m=fit.off_m
+    ), data
+
+
+def _say_checks(fit: "Fit") -> None:
+    if not fit.is_checked:
+        typer.echo(
+            "note: the pins lie on one line: a mirrored plan would not show; add a pin beside the line", err=True
+        )
+    typer.echo(f"at the far end of the map positions in the building are known to {2 * fit.far_sigma_m:.2f} m (95 %)")
+
+
+def _words(found: "Alignment") -> str:
+    frame = found.frame
+    turned = f"turned by {degrees(frame.yaw_rad):.3f} degrees +- {degrees(frame.sigma_rad):.3f}"
+    at = f"the map's origin at {frame.x_m:.3f}, {frame.y_m:.3f} m of the building"
+    return f"by {found.method}: {at}, {turned}, {found.metres_per_unit:.6g} m per pixel"
+
+
+def _print(found: "Alignment", corners: "Array", level: str) -> None:
+    from mapserver.floor_plan.alignment import reference_coordinates
+
+    typer.echo(_words(found))
+    for name, off_m in found.off_m.items():
+        typer.echo(f"pin {name}: {off_m:.3f} m left")
+    frame = found.frame
+    typer.echo(f"\n# Open-RMF, fleet adapter\n{reference_coordinates(frame, level, corners)}")
+    typer.echo("\n# ROS 2: building -> map, if no robot publishes it")
+    numbers = f"--x {frame.x_m:.4f} --y {frame.y_m:.4f} --yaw {frame.yaw_rad:.6f}"
+    typer.echo(f"ros2 run tf2_ros static_transform_publisher {numbers} --frame-id building --child-frame-id map")

@@ -1,0 +1,59 @@
+"""Where a site's map lies in the drawing of its building, as the store keeps it. Pure."""
+
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from fleetmap.errors import StoreError
+from fleetmap.geometry import Array, transform_points
+from fleetmap.mapformat import Manifest
+from fleetmap.mapformat.building import BuildingFrame
+
+ALIGNMENT, PLAN = "alignment", "plan"
+"""Kinds of a site's files in the store."""
+
+
+class Alignment(msgspec.Struct, frozen=True, kw_only=True):
+    """What `mapserver align` found. metres_per_unit: of the drawing, whose units are pixels or its own metres.
+
+    off_m: what is left at each pin; plan: the file's name, for people.
+    """
+
+    frame: BuildingFrame
+    metres_per_unit: Annotated[float, msgspec.Meta(gt=0)]
+    method: str
+    plan: str | None = None
+    off_m: dict[str, float] = {}
+
+
+def encode_alignment(alignment: Alignment) -> bytes:
+    """As JSON."""
+    return msgspec.json.encode(alignment, order="deterministic")
+
+
+def decode_alignment(data: bytes) -> Alignment:
+    """What `encode_alignment` made. StoreError for anything else."""
+    try:
+        return msgspec.json.decode(data, type=Alignment)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise StoreError(f"the site's alignment cannot be read ({error}); run `mapserver align` again") from error
+
+
+def map_corners_m(manifest: Manifest) -> Array:
+    """(4, 2) corners of the rectangle that a version's tiles cover; one tile at the origin for a version without any."""
+    cells = np.array([(tile.x, tile.y) for tile in manifest.tiles] or [(0, 0)], float)
+    (x0, y0), (x1, y1) = cells.min(axis=0) * manifest.tile_size_m, (cells.max(axis=0) + 1) * manifest.tile_size_m
+    return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
+
+
+def reference_coordinates(frame: BuildingFrame, level: str, corners_m: Array) -> str:
+    """The block of an Open-RMF fleet adapter's config.yaml: four points in both frames, from which it fits the transform."""
+    points_map = np.concatenate([corners_m, np.zeros((len(corners_m), 1))], axis=1)
+    points_building = transform_points(frame.building_from_map, points_map)
+
+    def listed(points: Array) -> str:
+        return ", ".join(f"[{x:.4f}, {y:.4f}]" for x, y, *_ in points)
+
+    rows = ["reference_coordinates:", f"  {level}:", f"    rmf: [{listed(points_building)}]"]
+    return "\n".join([*rows, f"    robot: [{listed(points_map)}]"])

@@ -1,0 +1,59 @@
+"""The file of a plan: a picture (PNG, JPEG, TIFF, BMP, PGM), looked at before it is decoded."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import UsageError, disk_errors
+from fleetmap.recordings.images import image_size
+from mapserver.floor_plan.pins import Pin
+
+MAX_PLAN_BYTES = 64 << 20
+MAX_PLAN_PIXELS = 100_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class PlanFile:
+    """data: as it came. grey (H, W)."""
+
+    name: str
+    data: bytes
+    grey: NDArray[np.uint8]
+
+    def check_pins(self, pins: list[Pin]) -> None:
+        """UsageError for a pin beside the picture."""
+        height, width = self.grey.shape
+        for pin in pins:
+            if not (0 <= pin.drawing[0] <= width and 0 <= pin.drawing[1] <= height):
+                x, y = pin.drawing
+                raise UsageError(
+                    f"--pin {pin.name}: {x:g},{y:g} is not in {self.name}, which has {width}x{height} pixels"
+                )
+
+
+def read_plan(path: Path) -> PlanFile:
+    """The plan of a file. UsageError for what is none, is too large, or is damaged."""
+    with (
+        disk_errors(f"--plan {path} cannot be read", "check the path and its rights", UsageError),
+        path.open("rb") as file,
+    ):
+        data = file.read(MAX_PLAN_BYTES + 1)
+    if len(data) > MAX_PLAN_BYTES:
+        raise UsageError(f"--plan {path} has more than {MAX_PLAN_BYTES} bytes; save it smaller")
+    size = image_size(data)
+    if size is None:
+        raise UsageError(f"--plan {path} is no PNG, JPEG, TIFF, BMP or PGM picture; save it as one of these")
+    if not 0 < size[0] * size[1] <= MAX_PLAN_PIXELS:
+        raise UsageError(
+            f"--plan {path} has {size[0]}x{size[1]} pixels, the limit is {MAX_PLAN_PIXELS}; save it smaller"
+        )
+    try:
+        grey = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        grey = None
+    if grey is None or grey.shape != (size[1], size[0]):
+        raise UsageError(f"--plan {path} cannot be decoded; it is damaged, save it again")
+    return PlanFile(path.name, data, np.asarray(grey, np.uint8))
