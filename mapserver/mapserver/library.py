@@ -113,7 +113,7 @@ def settings_for(request: BuildRequest) -> SurveySettings:
     options = request.options
     if options.settings is not None:
         return options.settings
-    return survey_settings(options.config, options.use or sensor_set_of(request.recordings[0], options.calibration))
+    return survey_settings(options.config, options.use or sensor_set_of(request.recordings[0], options.reading.opening))
 
 
 @dataclass(frozen=True)

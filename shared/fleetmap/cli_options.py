@@ -177,6 +177,11 @@ ConfigFile = Annotated[
     typer.Option("--config", metavar="FILE", is_eager=True, callback=take_defaults, help="TOML file with settings."),
 ]
 
+TopicNames = Annotated[
+    list[str] | None,
+    typer.Option("--topic", metavar="ROLE=NAME", help="Topic of a sensor, such as left=/camera/left; repeatable."),
+]
+
 
 def config_path(context: typer.Context) -> Path | None:
     """The file that --config named, behind the command or before it."""

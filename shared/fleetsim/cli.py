@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from fleetmap.cli_exit import run_cli
-from fleetmap.cli_options import expand_options
+from fleetmap.cli_options import TopicNames, expand_options
 from fleetmap.errors import UsageError
 
 app = typer.Typer(
@@ -124,14 +124,15 @@ def reprocess(
     out: Annotated[Path, Option(help="File to write (.mcap).")],
     camera_pipeline: Annotated[str, Option(metavar="NAME", help="As of `fleetsim record`.")],
     seed: Annotated[int, Option(min=0, help="The noise follows from it.")] = 0,
+    topic: TopicNames = None,
 ) -> None:
     """Puts a recording's pictures through an image pipeline without rendering them again."""
     if out.exists() or out.suffix != ".mcap":
         raise UsageError(f"{out} {'exists already' if out.exists() else 'should end in .mcap'}; choose another name")
-    from fleetmap.recordings import open_recording
+    from fleetmap.recordings import OpenOptions, named_topics, open_recording
     from fleetsim.imaging.pipelines import reprocess
 
-    with open_recording(recording) as opened:
+    with open_recording(recording, OpenOptions(topics=named_topics(topic))) as opened:
         reprocess(opened, out, camera_pipeline, seed)
         typer.echo(f"{out}: {len(opened)} frames through {camera_pipeline}")
 

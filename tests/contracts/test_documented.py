@@ -75,6 +75,14 @@ def test_options_are_documented(path: str) -> None:
     assert {word for word in documented if not word.startswith("--")} == _arguments(command)
 
 
+def test_every_command_that_reads_a_recording_takes_the_names_of_its_topics() -> None:
+    commands = {path: _command(path) for path in _documented_commands()}
+    readers = {path: command for path, command in commands.items() if "RECORDING" in str(_arguments(command))}
+    assert len(readers) >= 7
+    for path, command in (readers | {"mapserver nightly": _command("mapserver nightly")}).items():
+        assert "--topic" in {option for parameter in command.params for option in parameter.opts}, path
+
+
 def test_endpoints_are_documented(tmp_path: Path) -> None:
     from mapserver.api.app import create_app
     from mapserver.api.metrics import Metrics

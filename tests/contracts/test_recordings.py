@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import RECORDING_FORMATS, Recording, open_recording
 from fleetmap.recordings.mcap.writer import copy_to_mcap
+from support.recordings.bag_samples import write_rosbag2
 from support.recordings.recording_samples import (
     make_sample,
     world_from_cam0,
@@ -29,12 +31,23 @@ def _write_mcap(folder: Path) -> Path:
     return folder / "copy.mcap"
 
 
+def _write_rosbag2(folder: Path) -> Path:
+    """The messages of an MCAP file, and its calibration as /tf_static and CameraInfo have it."""
+    with _write_mcap(folder).open("rb") as file:
+        messages = [
+            (channel.topic, (schema.name if schema else "").replace("/msg/", "/"), message.log_time, message.data)
+            for schema, channel, message in make_reader(file).iter_messages(log_time_order=False)
+        ]
+    return write_rosbag2(folder / "bag", messages)
+
+
 WRITERS: dict[str, Callable[[Path], Path]] = {
     "euroc": lambda folder: write_euroc(folder, SAMPLE),
     "tumvi": lambda folder: write_tumvi(folder, SAMPLE),
     "kitti": lambda folder: write_kitti(folder, SAMPLE),
     "7scenes": lambda folder: write_seven_scenes(folder, SAMPLE),
     "mcap": _write_mcap,
+    "rosbag2-sqlite": _write_rosbag2,
 }
 
 

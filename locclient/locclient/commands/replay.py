@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, expand_options, settings_of
+from fleetmap.cli_options import ConfigFile, TopicNames, expand_options, settings_of
 from fleetmap.errors import UsageError
 from locclient.commands.options import IdentityFolder, Insecure
 
@@ -56,6 +56,7 @@ class PlaybackOptions:
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration file to use instead of the recording's own.")
     ] = None
+    topic: TopicNames = None
     prior: Annotated[str | None, typer.Option(help="Start of the robot: X,Y,YAW,SIGMA_M (metres, radians).")] = None
     reverse: Annotated[bool, typer.Option("--reverse", help="Play backwards, with new stamps and without IMU.")] = False
     realtime: Annotated[
@@ -83,7 +84,7 @@ class ResultFiles:
 @expand_options
 def replay(
     context: typer.Context,
-    recording: Annotated[Path, typer.Argument(help="A folder (the parent of mav0 for EuRoC) or an .mcap file.")],
+    recording: Annotated[Path, typer.Argument(help="Folder (the parent of mav0 for EuRoC) or file.")],
     map_options: MapOptions,
     playback: PlaybackOptions,
     files: ResultFiles,
@@ -109,7 +110,7 @@ def _run(
     from rich.console import Console
     from rich.progress import Progress
 
-    from fleetmap.recordings import FrameSelection, OpenOptions, open_recording
+    from fleetmap.recordings import FrameSelection, OpenOptions, named_topics, open_recording
     from fleetmap.recordings.tum import write_tum
     from fleetmap.sources.replay_source import ReplaySource
     from locclient.maps.connection import connected
@@ -120,7 +121,7 @@ def _run(
     address, map_options = map_from
     prior = parse_prior(playback.prior, "--prior")
     selection = FrameSelection.parse(playback.frames)
-    opening = OpenOptions(calibration_file=playback.calibration, topics=settings.topics)
+    opening = OpenOptions(playback.calibration, named_topics(playback.topic, settings.topics))
     console = Console(stderr=True)
     with (
         open_recording(path, opening) as recording,

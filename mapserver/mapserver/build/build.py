@@ -3,7 +3,7 @@
 import resource
 import time
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from fleetmap.bow import encode_vocabulary
 from fleetmap.config import to_dict
 from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError, disk_errors
 from fleetmap.mapformat import CameraEntry, Tile
+from fleetmap.recordings import OpenOptions, Topics
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import SensorSet
@@ -82,6 +83,7 @@ class BuildOptions:
 
     frames: str = "::"
     calibration: Path | None = None
+    topics: Topics = field(default_factory=Topics)
     zones: Path | None = None
     vocabulary: Path | None = None
     report: Path | None = None
@@ -103,9 +105,8 @@ class BuildOptions:
     @property
     def reading(self) -> RecordingOptions:
         """How the recordings are read."""
-        return RecordingOptions(
-            self.frames, self.calibration, self.use, self.trajectory_source, self.initial_trajectory
-        )
+        opening = OpenOptions(self.calibration, self.topics)
+        return RecordingOptions(self.frames, opening, self.use, self.trajectory_source, self.initial_trajectory)
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,7 +328,7 @@ def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None)
     options, camera = run.request.options, built.joined.map.camera
     replayed = []
     if before is not None:
-        reading = options.frames, options.calibration, options.use
+        reading = options.frames, options.reading.opening, options.use
         replayed = replayed_probes(options.replay, before, *reading, (camera, run.settings.orb))
     trajectories = map_trajectories(built.joined)
     sessions = [JudgedSession(t, s.held_out, s.survey) for t, s in zip(trajectories, built.taken, strict=True)]
@@ -352,15 +353,20 @@ def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
     options = run.request.options
     kept = parent is not None and bool(parent.manifest.configuration.get("frame_from_ground_truth"))
     source = {} if options.trajectory_source == "odometry" else {"trajectory_source": options.trajectory_source}
-    return source | {
-        "frames": options.frames,
-        "own_vocabulary": options.vocabulary is not None,
-        "frame_from_ground_truth": options.frame_from_ground_truth or kept,
-        "own_calibration": options.calibration is not None,
-        "use": None if options.use is None else options.use.value,
-        "zones": {name: polygon.tolist() for name, polygon in run.zones.polygons.items()},
-        "survey": to_dict(run.settings),
-    }
+    topics = {} if options.topics == Topics() else {"topics": to_dict(options.topics)}
+    return (
+        source
+        | topics
+        | {
+            "frames": options.frames,
+            "own_vocabulary": options.vocabulary is not None,
+            "frame_from_ground_truth": options.frame_from_ground_truth or kept,
+            "own_calibration": options.calibration is not None,
+            "use": None if options.use is None else options.use.value,
+            "zones": {name: polygon.tolist() for name, polygon in run.zones.polygons.items()},
+            "survey": to_dict(run.settings),
+        }
+    )
 
 
 def picture_png(site: str, draft: Draft, built: Built) -> bytes:

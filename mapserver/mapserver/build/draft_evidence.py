@@ -113,7 +113,7 @@ def replayed_probes(
     paths: Sequence[Path],
     before: Before,
     frames: str,
-    calibration: Path | None,
+    opening: OpenOptions,
     use: SensorSet | None,
     seen_by: tuple[StereoCamera, OrbSettings],
 ) -> list[Probe]:
@@ -124,7 +124,7 @@ def replayed_probes(
     probes: list[Probe] = []
     pinhole, orb = seen_by
     for path in paths:
-        with open_recording(path, OpenOptions(calibration_file=calibration)) as opened:
+        with open_recording(path, opening) as opened:
             recording = reduced(opened, use)
             selected = FrameSelection.parse(frames).apply(recording)
             entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(selected))

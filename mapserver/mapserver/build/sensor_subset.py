@@ -29,9 +29,9 @@ _INERTIAL = (SensorSet.STEREO_INERTIAL, SensorSet.MONO_INERTIAL)
 _SINGLE = (SensorSet.MONO, SensorSet.MONO_INERTIAL)
 
 
-def sensor_set_of(path: Path, calibration: Path | None = None) -> SensorSet:
+def sensor_set_of(path: Path, options: OpenOptions | None = None) -> SensorSet:
     """What the recording at `path` carries; errors as of `open_recording`."""
-    with open_recording(path, OpenOptions(calibration_file=calibration)) as recording:
+    with open_recording(path, options) as recording:
         return recording.sensor_set
 
 

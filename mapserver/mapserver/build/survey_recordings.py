@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, Self
 
@@ -167,12 +167,12 @@ class SurveyBeginnings:
 
 @dataclass(frozen=True, slots=True)
 class RecordingOptions:
-    """How recordings are read: frames A:B:C, another calibration file, only the sensors of a poorer set,
+    """How recordings are read: frames A:B:C, how they are opened, only the sensors of a poorer set,
     and where their initial trajectory comes from, an entry of TRAJECTORY_SOURCES with its file.
     """
 
     frames: str = "::"
-    calibration: Path | None = None
+    opening: OpenOptions = field(default_factory=OpenOptions)
     use: SensorSet | None = None
     trajectory_source: str = "odometry"
     initial_trajectory: Path | None = None
@@ -184,7 +184,7 @@ class RecordingOptions:
 
     def opened(self, path: Path) -> tuple[Recording, NDArray[np.int64]]:
         """The recording at `path`, to be closed, and the indices of its selected frames."""
-        whole = open_recording(path, OpenOptions(calibration_file=self.calibration))
+        whole = open_recording(path, self.opening)
         try:
             recording = reduced(whole, self.use)
             return recording, FrameSelection.parse(self.frames).apply(recording)

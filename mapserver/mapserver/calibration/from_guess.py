@@ -16,7 +16,7 @@ from fleetmap.features.matching import hamming_knn2
 from fleetmap.features.orb import Features, detect
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, se3
-from fleetmap.recordings import Recording
+from fleetmap.recordings.recording import Recording
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration.epipolar_guess import RawMatches, guessed_rig

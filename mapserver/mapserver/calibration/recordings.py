@@ -7,7 +7,7 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings import Recording
+from fleetmap.recordings.recording import Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import ImuSamples, SensorSet, Stamps

@@ -43,7 +43,7 @@ class BuildCommandOptions(SurveyOptions):
 @expand_options
 def build(
     context: typer.Context,
-    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folder or .mcap file to survey.")],
+    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folder or file to survey.")],
     options: BuildCommandOptions,
     config: ConfigFile = None,
 ) -> None:
@@ -57,7 +57,7 @@ def build(
     from mapserver.build.sensor_subset import named_sensor_set
 
     use = None if options.use is None else named_sensor_set(options.use)
-    asked = vars(options) | {"use": use, "replay": tuple(options.replay or ()), "config": config_path(context)}
+    asked = options.asked() | {"use": use, "replay": tuple(options.replay or ()), "config": config_path(context)}
     site, store = asked.pop("site"), asked.pop("store")
     built = build_map(recordings, store, site, BuildOptions(**asked))
     if options.keys is not None:

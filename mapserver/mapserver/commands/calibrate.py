@@ -2,39 +2,48 @@
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, config_path
+from fleetmap.cli_options import ConfigFile, TopicNames, config_path, expand_options
 from fleetmap.errors import RecordingError
 from mapserver.commands.options import Calibration, check_output
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from fleetmap.recordings import Topics
     from mapserver.calibration import CalibrationEstimate
     from mapserver.survey.survey_inputs import SurveyTools
 
 
-def calibrate(
-    context: typer.Context,
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="RECORDING...", help="Folders or .mcap files of one rig.")
-    ],
+@dataclass(frozen=True, kw_only=True)
+class CalibrateOptions:
+    """Options of `calibrate`."""
+
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE.yaml", help="Write the corrected calibration here, as a Kalibr camchain."),
-    ] = None,
-    calibration: Calibration = None,
+    ] = None
+    calibration: Calibration = None
+    topic: TopicNames = None
     guess: Annotated[
         str | None,
         typer.Option(
             metavar="WxH:M",
             help="No calibration is at hand: size of the raw images and metres between the cameras, 752x480:0.11.",
         ),
-    ] = None,
+    ] = None
+
+
+@expand_options
+def calibrate(
+    context: typer.Context,
+    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folders or files of one rig.")],
+    options: CalibrateOptions,
     config: ConfigFile = None,
 ) -> None:
     """Measure the calibration of cameras, IMU and wheels from recordings with turns, and write it.
@@ -42,20 +51,23 @@ def calibrate(
     What the recordings do not show keeps its value. With --guess nothing else is known: lenses and the pair's
     angles are found from focal length = image width, by the images alone.
     """
+    out, guess = options.out, options.guess
     check_output("--out", out)
+    from fleetmap.recordings import OpenOptions, named_topics, open_recording
+
+    topics = named_topics(options.topic)
     if guess is not None:
-        _from_guess(recordings, out, guess, config_path(context))
+        _from_guess(recordings, out, guess, config_path(context), topics)
         return
     from rich.console import Console
 
-    from fleetmap.recordings import OpenOptions, open_recording
     from mapserver.calibration import estimate_calibration
     from mapserver.calibration.calibration_file import corrected_file
     from mapserver.config import survey_settings
 
     with ExitStack() as opened:
         sources = [
-            opened.enter_context(open_recording(path, OpenOptions(calibration_file=calibration))) for path in recordings
+            opened.enter_context(open_recording(path, OpenOptions(options.calibration, topics))) for path in recordings
         ]
         settings = survey_settings(config_path(context), sources[0].sensor_set)
         estimate = estimate_calibration(sources, settings, opened.enter_context(_shown()))
@@ -92,7 +104,7 @@ def _write(out: Path, text: str, advice: str) -> None:
     typer.echo(f"{out}: written; {advice}")
 
 
-def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Path | None) -> None:
+def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Path | None, topics: "Topics") -> None:
     import re
     from tempfile import TemporaryDirectory
 
@@ -113,7 +125,7 @@ def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Pa
         first = Path(folder) / "guess.yaml"
         rig = first_rig(int(known[1]), int(known[2]), baseline_m)
         first.write_text(format_calibration(rig), encoding="utf-8")
-        with open_recording(recordings[0], OpenOptions(calibration_file=first)) as recording:
+        with open_recording(recordings[0], OpenOptions(first, topics)) as recording:
             found = calibration_from_guess(recording, survey_settings(config, recording.sensor_set), tools)
             name = recording.name
     typer.echo("\n".join(guessed_in_words(found)))

@@ -5,15 +5,17 @@ from typing import Annotated
 
 import typer
 
+from fleetmap.cli_options import TopicNames
 from fleetmap.errors import UsageError
 
 
 def convert(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Folder or .mcap file to read.")],
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Folder or file to read.")],
     out: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="MCAP file to write.")],
     calibration: Annotated[
         Path | None, typer.Option("--calibration", metavar="FILE", help="Kalibr camchain to use and to store.")
     ] = None,
+    topic: TopicNames = None,
     force: Annotated[bool, typer.Option("--force", help="Replace OUT.mcap if it exists.")] = False,
 ) -> None:
     """Write RECORDING as an MCAP file in the style of rosbag2, images as they were encoded."""
@@ -26,11 +28,11 @@ def convert(
     from rich.console import Console
     from rich.progress import Progress
 
-    from fleetmap.recordings import OpenOptions, open_recording
+    from fleetmap.recordings import OpenOptions, named_topics, open_recording
     from fleetmap.recordings.mcap.writer import copy_to_mcap
 
     console = Console(stderr=True)
-    with open_recording(recording, OpenOptions(calibration_file=calibration)) as source:
+    with open_recording(recording, OpenOptions(calibration, named_topics(topic))) as source:
         for issue in source.issues:
             console.print(f"issue: {issue.what}: {issue.detail}", markup=False)
         with Progress(console=console) as progress:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fleetmap.cli_options import TopicNames
 from fleetmap.errors import UsageError
 
 if TYPE_CHECKING:
@@ -17,13 +18,14 @@ EXIT_STATUS_BAD_RECORDING = 3
 
 
 def doctor(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Folder or .mcap file to run_checks.")],
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Folder or file to check.")],
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the findings here as JSON too.")
     ] = None,
     calibration: Annotated[
         Path | None, typer.Option("--calibration", metavar="FILE", help="Kalibr camchain to check against.")
     ] = None,
+    topic: TopicNames = None,
 ) -> None:
     """Check RECORDING: rates, gaps, clocks, gravity, stereo and gyro against the images.
 
@@ -34,13 +36,13 @@ def doctor(
     from rich.console import Console
     from rich.progress import Progress
 
-    from fleetmap.recordings import OpenOptions, open_recording
+    from fleetmap.recordings import OpenOptions, named_topics, open_recording
     from mapserver.doctor import Verdict, run_checks
     from mapserver.doctor.calibration import followed_frames
     from mapserver.doctor.findings import worst
     from mapserver.doctor.run_checks import SAMPLED_FRAMES, TURN_FRAMES
 
-    with open_recording(recording, OpenOptions(calibration_file=calibration)) as source:
+    with open_recording(recording, OpenOptions(calibration, named_topics(topic))) as source:
         with Progress(console=Console(stderr=True), transient=True) as progress:
             wanted = min(SAMPLED_FRAMES, len(source)) + (min(TURN_FRAMES, len(source)) if len(source.imu) else 0)
             task = progress.add_task("frames, and steps of the adjustment", total=wanted + followed_frames(source))

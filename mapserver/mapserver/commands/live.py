@@ -51,9 +51,7 @@ class LiveCommandOptions(SurveyOptions):
 def live(
     context: typer.Context,
     options: LiveCommandOptions,
-    recording: Annotated[
-        Path | None, typer.Argument(metavar="[RECORDING]", help="Folder or .mcap file to play.")
-    ] = None,
+    recording: Annotated[Path | None, typer.Argument(metavar="[RECORDING]", help="Folder or file to play.")] = None,
     config: ConfigFile = None,
 ) -> None:
     """Map a survey while it drives; Ctrl-C ends the drive, and what was seen becomes a draft."""
@@ -71,7 +69,7 @@ def live(
     from mapserver.live import LiveRequest, run_live
 
     use = None if options.use is None else named_sensor_set(options.use)
-    asked = vars(options) | {"config": config_path(context), "use": use}
+    asked = options.asked() | {"config": config_path(context), "use": use}
     site, store, speed, server, sensors, record, version, ros2, _ = (
         asked.pop(name) for name in ("site", "store", "speed", "server", "sensors", "record", "map", "ros2", "frozen")
     )

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fleetmap.cli_options import TopicNames
 from fleetmap.errors import UsageError
 
 if TYPE_CHECKING:
@@ -61,6 +62,7 @@ class SurveyOptions(SiteOptions):
     store: NewStoreFolder
     frames: Annotated[str, typer.Option(metavar="A:B:C", help="Slice of the frames to use.")] = "::"
     calibration: Calibration = None
+    topic: TopicNames = None
     zones: Annotated[
         Path | None, typer.Option(metavar="FILE", help="TOML file with areas that cannot see each other.")
     ] = None
@@ -72,6 +74,14 @@ class SurveyOptions(SiteOptions):
     ] = None
 
     keys: BuilderKeys = None
+
+    def asked(self) -> dict[str, Any]:
+        """All options by their names, topics as Topics."""
+        from fleetmap.recordings import named_topics
+
+        values = dict(vars(self))
+        values["topics"] = named_topics(values.pop("topic"))
+        return values
 
     def check(self) -> None:
         """Raises UsageError for a report that cannot be written and for an impossible name of the site."""

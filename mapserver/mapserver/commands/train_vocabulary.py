@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, expand_options, settings_of
+from fleetmap.cli_options import ConfigFile, TopicNames, expand_options, settings_of
 from fleetmap.errors import UsageError, disk_errors
 
 if TYPE_CHECKING:
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fleetmap.features.settings import OrbSettings
+    from fleetmap.recordings import OpenOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,9 +32,10 @@ class VocabularyOptions:
 @expand_options
 def train_vocabulary(
     context: typer.Context,
-    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folders or .mcap files.")],
+    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folders or files.")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="File to write.")],
     options: VocabularyOptions,
+    topic: TopicNames = None,
     config: ConfigFile = None,
 ) -> None:
     """Train a vocabulary on the images of recordings, for `build --vocabulary`."""
@@ -49,9 +51,10 @@ def train_vocabulary(
 
     from fleetmap.bow import encode_vocabulary, vocabulary_hash
     from fleetmap.bow import train_vocabulary as train
+    from fleetmap.recordings import OpenOptions, named_topics
 
-    orb = settings_of(context).survey.orb
-    pictures = [rows for recording in recordings for rows in _descriptors(recording, options.frames, orb)]
+    orb, opening = settings_of(context).survey.orb, OpenOptions(topics=named_topics(topic))
+    pictures = [rows for recording in recordings for rows in _descriptors(recording, opening, options.frames, orb)]
     images = np.repeat(np.arange(len(pictures)), [len(rows) for rows in pictures])
     rows = np.concatenate(pictures)
     vocabulary = train(rows, branching, levels, np.random.default_rng(options.seed), images)
@@ -64,14 +67,14 @@ def train_vocabulary(
     )
 
 
-def _descriptors(path: Path, frames: str, orb: "OrbSettings") -> "Iterator[NDArray[np.uint8]]":
+def _descriptors(path: Path, opening: "OpenOptions", frames: str, orb: "OrbSettings") -> "Iterator[NDArray[np.uint8]]":
     """Descriptors (N, 32) of each selected left picture, rectified."""
     from fleetmap.features.extraction import extract
     from fleetmap.recordings import FrameSelection, open_recording
     from fleetmap.sensors.rectification import Rectifier
     from fleetmap.sensors.samples import SensorSet
 
-    with open_recording(path) as recording:
+    with open_recording(path, opening) as recording:
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
         for index in FrameSelection.parse(frames).apply(recording):
             yield extract(rectifier.rectify(recording.read_frame(int(index))).left, orb).descriptors

@@ -1,6 +1,6 @@
 """The folder into which recordings are copied, and the folders where each goes from there. Nothing is ever deleted.
 
-    INBOX/NAME             a recording: an .mcap file, or a folder
+    INBOX/NAME             a recording: a folder, or a file with a suffix such as .mcap
     INBOX/done/HASH-NAME   it is in a version
     INBOX/held/HASH-NAME   it is sound, but could not be joined, or its draft was refused; move it back to try again
     INBOX/bad/NAME         it cannot be read, or `doctor` says that it should not be used
@@ -18,7 +18,7 @@ from pathlib import Path
 
 from fleetmap.errors import RecordingError, UsageError, disk_errors
 from fleetmap.log_lines import printable
-from fleetmap.recordings import OpenOptions, open_recording
+from fleetmap.recordings import FILE_SUFFIXES, OpenOptions, open_recording
 from mapserver.store.files import make_folder, sync_folder, write_atomically
 
 DONE, HELD, BAD = "done", "held", "bad"
@@ -44,17 +44,17 @@ class Recorded:
     sha256: str
 
 
-def identify(path: Path, calibration: Path | None) -> Recorded | str:
+def identify(path: Path, options: OpenOptions) -> Recorded | str:
     """A recording with its hash, or why it cannot be read."""
     try:
-        with open_recording(path, OpenOptions(calibration_file=calibration)) as recording:
+        with open_recording(path, options) as recording:
             return Recorded(path, recording.content_hash())
     except RecordingError as error:
         return str(error)
 
 
 def arrivals(inbox: Path, settle_s: float, now_ns: int) -> Arrivals:
-    """What is in the inbox now. Hidden names and other files than .mcap are ignored.
+    """What is in the inbox now. Hidden names and files with other suffixes than FILE_SUFFIXES are ignored.
 
     A recording is whole when nothing in it changed for `settle_s`, no file in it bears the name of a half copied one, and
     no process has one open for writing, as far as the system tells. Raises UsageError where there is no such folder.
@@ -65,7 +65,7 @@ def arrivals(inbox: Path, settle_s: float, now_ns: int) -> Arrivals:
     for path in sorted(inbox.iterdir()):
         if path.name.startswith(".") or path.name in (DONE, HELD, BAD):
             continue
-        if path.suffix in _UNFINISHED or path.is_dir() or path.suffix == ".mcap":
+        if path.suffix in _UNFINISHED or path.is_dir() or path.suffix in FILE_SUFFIXES:
             if reason := _unfinished(path, settle_s, now_ns):
                 waiting.append((path, reason))
             else:
@@ -134,7 +134,7 @@ def is_safe_name(name: str) -> bool:
 
 
 def _safe_name(path: Path) -> str:
-    suffix = ".mcap" if path.suffix == ".mcap" else ""
+    suffix = path.suffix if path.suffix in FILE_SUFFIXES else ""
     return f"unnamed-{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:_HASH_SIGNS]}{suffix}"
 
 

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, SurveyError
 from fleetmap.log_lines import printable
+from fleetmap.recordings import OpenOptions, Topics
 from mapserver import releases
 from mapserver.build.build import BuildOptions, BuildRequest, build_draft
 from mapserver.build.job_lock import INTERRUPTED, end_interrupted, held, only_one
@@ -27,7 +28,7 @@ from mapserver.trust.builder_folder import BuilderFolder
 from mapserver.trust.signing import sign_as_builder
 
 JOB = "nightly"
-_SHARED_WITH_BUILDS = ("frames", "calibration", "zones", "threads", "scheduler", "config", "keys")
+_SHARED_WITH_BUILDS = ("frames", "calibration", "topics", "zones", "threads", "scheduler", "config", "keys")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +42,7 @@ class NightRequest:
     settle_s: float = 300.0
     frames: str = "::"
     calibration: Path | None = None
+    topics: Topics = field(default_factory=Topics)
     zones: Path | None = None
     threads: int | None = None
     scheduler: str | None = None
@@ -152,7 +154,7 @@ class _Night:
             if not boxes.is_safe_name(path.name):
                 self._put_away(path, boxes.BAD, None, f"its name {path.name} is no usable one; name it anew")
                 continue
-            recorded = boxes.identify(path, self._request.calibration)
+            recorded = boxes.identify(path, OpenOptions(self._request.calibration, self._request.topics))
             if isinstance(recorded, str):
                 self._put_away(path, boxes.BAD, None, recorded)
             elif recorded.sha256 in found:

@@ -1,4 +1,4 @@
-"""Recordings of camera robots: EuRoC, TUM-VI, KITTI and 7-Scenes folders, and MCAP.
+"""Recordings of camera robots: EuRoC, TUM-VI, KITTI and 7-Scenes folders, MCAP, and rosbag2 in SQLite.
 
 To add a format: a module whose function reads the folder or file into `RecordingParts` and hands them to `finalize`,
 and a line in RECORDING_FORMATS (examples/new_recording_format.py is one).
@@ -9,13 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fleetmap.errors import RecordingError
+from fleetmap.recordings.bags import sqlite
 from fleetmap.recordings.calibration_files import format_calibration, read_calibration
 from fleetmap.recordings.folders import euroc, kitti, seven_scenes, tumvi
 from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap import reader
-from fleetmap.recordings.recording import FrameSelection, FrameSource, OpenOptions, Recording, Topics
+from fleetmap.recordings.recording import FrameSelection, FrameSource, OpenOptions, Recording, Topics, named_topics
 
 __all__ = [
+    "FILE_SUFFIXES",
     "RECORDING_FORMATS",
     "FrameSelection",
     "FrameSource",
@@ -26,6 +28,7 @@ __all__ = [
     "StoredImage",
     "Topics",
     "format_calibration",
+    "named_topics",
     "open_recording",
     "read_calibration",
 ]
@@ -48,7 +51,9 @@ RECORDING_FORMATS = {
         "a folder with frame-NNNNNN.color.* and .depth.png", seven_scenes.recognises, seven_scenes.open_seven_scenes
     ),
     "mcap": RecordingFormat("an .mcap file, or a folder with one in it", reader.recognises, reader.open_mcap),
+    "rosbag2-sqlite": RecordingFormat("a rosbag2 .db3 file, or its folder", sqlite.recognises, sqlite.open_sqlite),
 }
+FILE_SUFFIXES = (".mcap", ".db3")  # of recordings that are one file
 
 
 def open_recording(path: Path | str, options: OpenOptions | None = None) -> Recording:
@@ -63,7 +68,7 @@ def open_recording(path: Path | str, options: OpenOptions | None = None) -> Reco
     path, options = Path(path), options or OpenOptions()
     if not path.exists():
         raise RecordingError(
-            f"{path} does not exist; a recording is a folder (the parent of mav0 for EuRoC) or an .mcap file"
+            f"{path} does not exist; a recording is a folder (the parent of mav0 for EuRoC) or a file such as .mcap"
         )
     for recording_format in RECORDING_FORMATS.values():
         if recording_format.recognises(path):

@@ -1,10 +1,12 @@
 """A recording in memory, whatever format it came in, and a selection of its frames."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +27,7 @@ from fleetmap.sensors.samples import (
 
 
 class Topics(Section, frozen=True):
-    """Topic names in an MCAP file. An image topic also stands for itself with `/compressed` behind it."""
+    """Topic names in MCAP files and ROS bags. An image topic also stands for itself with `/compressed` behind it."""
 
     left: str = "/cam0/image_raw"
     right: str = "/cam1/image_raw"
@@ -37,6 +39,19 @@ class Topics(Section, frozen=True):
     prior: str = "/prior"
     ground_truth: str = "/ground_truth"
     tf_static: str = "/tf_static"
+
+
+def named_topics(words: Sequence[str] | None, others: Topics | None = None) -> Topics:
+    """Topics by words such as `left=/camera/left`, or `imu=` for none; the rest is as in `others`. UsageError for other words."""
+    roles, found = Topics.__struct_fields__, {}
+    for word in words or ():
+        role, sign, name = word.partition("=")
+        if role not in roles or not sign:
+            raise UsageError(
+                f"--topic {word}: write ROLE=NAME, such as left=/camera/left; roles are {', '.join(roles)}"
+            )
+        found[role] = name
+    return msgspec.structs.replace(others or Topics(), **found)
 
 
 @dataclass(frozen=True)

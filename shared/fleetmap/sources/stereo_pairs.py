@@ -2,7 +2,7 @@
 
 from collections import deque
 
-from fleetmap.recordings import StoredFrame, StoredImage
+from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS
 
 _WAITING = 8

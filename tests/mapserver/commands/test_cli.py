@@ -186,7 +186,7 @@ def test_build_takes_its_settings_from_the_file(
         return Draft(1, "done", {}, {}), None
 
     monkeypatch.setattr("mapserver.library.build_draft", build)
-    monkeypatch.setattr("mapserver.library.sensor_set_of", lambda path, calibration: SensorSet.STEREO)
+    monkeypatch.setattr("mapserver.library.sensor_set_of", lambda path, options: SensorSet.STEREO)
     file = tmp_path / "site.toml"
     file.write_text(
         f'[build]\nsite = "lab"\nstore = "{tmp_path}"\nframes = "::3"\nframe_from_ground_truth = true\n'

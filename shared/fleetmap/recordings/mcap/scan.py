@@ -11,11 +11,12 @@ from bisect import bisect_right
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import zstandard
 
 from fleetmap.errors import RecordingError
+from fleetmap.recordings.bags.container import MAX_MESSAGE_BYTES, Channel, KeptBytes, Message, Schema
 from fleetmap.sensors.samples import DataIssue
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -25,44 +26,17 @@ _RECORD_HEAD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _FOOTER_BYTES = 9 + 20 + len(MAGIC)
 _LARGEST_RECORD_BYTES = 1 << 31  # beyond it the bytes are no record at all
-MAX_CHUNK_BYTES = 64 << 20  # one raw image of 64 megapixels; recorders write chunks of 1 to 4 MiB
+MAX_CHUNK_BYTES = MAX_MESSAGE_BYTES  # recorders write chunks of 1 to 4 MiB
 MAX_ATTACHMENT_BYTES = 16 << 20
 _MAX_RECORD_BYTES = MAX_CHUNK_BYTES + (64 << 10)  # a chunk that is not compressed, with its head
-# What is kept of a file beside its images (schemas, metadata, IMU and the rest), by the size of the file. Messages of zeros are
-# the limit: zstd makes 1 of 8 bytes of recorded odometry, which is mostly empty covariances, and 1 of 30,000 zeros.
-_KEPT_BYTES, _KEPT_PER_FILE_BYTE = 64 << 20, 32
-_KEPT_RECORD_BYTES = 256  # of a record's place, stamp and object in memory
 
 
-@dataclass(frozen=True, slots=True)
-class Schema:
-    """The type of a channel's messages."""
-
-    name: str
-    encoding: str
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class Channel:
-    """One topic's channel."""
-
-    id: int
-    topic: str
-    message_encoding: str
-    schema: Schema
-
-
-@dataclass(frozen=True, slots=True)
-class Location:
+class Location(NamedTuple):
     """Position of a message's bytes: in the file itself, or in a compressed chunk (chunk_at >= 0) after decompression."""
 
     at: int
     length: int
     chunk_at: int = -1
-
-
-Message = tuple[Channel, int, Location, memoryview]
 
 
 @dataclass(slots=True)
@@ -94,30 +68,19 @@ class Damage:
         return found
 
 
-class McapScan:
+class McapScan(KeptBytes):
     """One walk through a file: `messages()` fills channels, attachments, metadata and damage on its way to the end."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
-        self.path, self._file = path, file
-        self.size = path.stat().st_size
+        super().__init__(path, path.stat().st_size)
+        self._file = file
         self.channels: dict[int, Channel] = {}
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self.damage = Damage()
         self._schemas: dict[int, Schema] = {}
         self._chunk_starts: list[int] | None = None
-        self._kept_bytes = 0
         self._has_ended = False
-
-    def keep(self, size: int) -> None:
-        """Counts a record of `size` bytes that stays in memory; RecordingError where the file unpacks to more than a recording can."""
-        self._kept_bytes += size + _KEPT_RECORD_BYTES
-        limit = _KEPT_BYTES + _KEPT_PER_FILE_BYTE * self.size
-        if self._kept_bytes > limit:
-            raise RecordingError(
-                f"{self.path}: {self.size} bytes unpack to more than {limit} bytes beside the images; no recorder writes "
-                "that, leave the file out"
-            )
 
     def messages(self) -> Iterator[Message]:
         """Channel, log time in ns, place and bytes of every message that is whole, in file order."""

@@ -12,6 +12,7 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from fleetmap.errors import RecordingError
+from fleetmap.recordings.bags.container import CALIBRATION_ATTACHMENT
 from fleetmap.recordings.calibration_files import format_calibration
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_grey, file_kind, grey_image, store_frame
 from fleetmap.recordings.recording import Recording, Topics
@@ -20,7 +21,6 @@ from fleetmap.recordings.ros2.definitions import ros2msg
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
 
-CALIBRATION_ATTACHMENT = "calibration.yaml"
 BODY_FRAME, BASE_FRAME, MAP_FRAME, ODOM_FRAME = "body", "base", "map", "odom"
 _CHUNK_BYTES = 1 << 20  # what one flipped bit costs at most
 

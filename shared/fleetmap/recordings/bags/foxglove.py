@@ -13,8 +13,8 @@ import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3
+from fleetmap.recordings.bags.container import Channel
 from fleetmap.recordings.images import StoredImage
-from fleetmap.recordings.mcap.scan import Channel
 from fleetmap.recordings.ros2.messages import CameraInfo, FrameLink
 from fleetmap.sensors.samples import PositionPrior, Stamps, WheelSample
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings.mcap.scan import Channel
+from fleetmap.recordings.bags.container import Channel
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import Topics
 
@@ -48,12 +48,12 @@ def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str, log: 
             chosen[role] = found
         elif name and name != getattr(Topics(), role):
             raise RecordingError(
-                f"{where} has no topic {name} of type {' or '.join(types)}; it has {_listed(by_topic)}"
+                f"{where} has no topic {name} of type {' or '.join(types)} for --topic {role}; it has {_listed(by_topic)}"
             )
         elif role in _ALONE and name and len(candidates) == 1:
             chosen[role] = candidates[0]
         elif role in _ALONE and name and candidates:
-            log.note(f"{role} not chosen", f"{', '.join(candidates)} could be it; name one of them")
+            log.note(f"{role} not chosen", f"{', '.join(candidates)} could be it; name one with --topic {role}=/NAME")
     _choose_images(by_topic, chosen, where)
     _choose_infos(by_topic, chosen)
     return {role: [channel.id for channel in by_topic[topic]] for role, topic in chosen.items()}
@@ -79,7 +79,9 @@ def _choose_images(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str]
     elif not lefts and len(others) == 1:
         chosen["left"] = others[0]
     else:
-        raise RecordingError(f"{where}: no topic is clearly the left image; name it. There is {_listed(by_topic)}")
+        raise RecordingError(
+            f"{where}: no topic is clearly the left image; name it with --topic left=/NAME. There is {_listed(by_topic)}"
+        )
     if len(depth) == 1 and "right" not in chosen:
         chosen.setdefault("depth", depth[0])
 

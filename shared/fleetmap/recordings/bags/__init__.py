@@ -1,0 +1,1 @@
+"""Recordings as messages on topics, whatever file they lie in."""
