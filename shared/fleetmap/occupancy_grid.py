@@ -1,5 +1,6 @@
 """Occupancy grids of planners: a map_server YAML file and its image. Source: nav2_map_server's documented file format."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,19 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from fleetmap.errors import MapFormatError, RecordingError, disk_errors
-from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.errors import MapFormatError, RecordingError, StoreError, disk_errors
+from fleetmap.geometry import Array, se3, so3_exp, so3_log
+from fleetmap.recordings.images import image_size
 
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
 _MAX_BYTES, _MAX_CELLS = 1 << 16, 1 << 25
+_MAX_IMAGE_BYTES = 16 * _MAX_CELLS  # four channels of four bytes, more than any picture of so many cells takes
 _MODES = ("trinary", "scale", "raw")
+# Those of map_saver, but for free_thresh: with its 0.25 the grey of unknown cells is read as free.
+_SHADES = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
+_OCCUPIED_THRESH, _FREE_THRESH = 0.65, 0.196
+_GAP = rb"(?:\s|#[^\n]*\n)+"
+_PGM = re.compile(rb"P5" + _GAP + rb"\d{1,10}" + _GAP + rb"\d{1,10}" + _GAP + rb"(\d{1,5})\s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +67,31 @@ def read_grid(path: Path) -> OccupancyGrid:
     return OccupancyGrid(np.ascontiguousarray(cells[::-1]), resolution_m, corner)
 
 
+def write_grid(path: Path, grid: OccupancyGrid) -> None:
+    """Writes a map_server YAML file and its image beside it, NAME.yaml and NAME.pgm, which `read_grid` reads as the same cells.
+
+    Mode trinary where cells are free, occupied or unknown, else raw. Raises StoreError where the disk refuses.
+    """
+    values, trinary = grid.cells[::-1], bool(np.isin(grid.cells, list(_SHADES)).all())
+    shades = np.where(values < 0, 255, values).astype(np.uint8)
+    if trinary:
+        shades = np.select([values == value for value in _SHADES], list(_SHADES.values())).astype(np.uint8)
+    height, width = shades.shape
+    x, y, _ = (float(v) for v in grid.map_from_grid[:3, 3])
+    entries = {
+        "image": path.with_suffix(".pgm").name,
+        "mode": "trinary" if trinary else "raw",
+        "resolution": grid.resolution_m,
+        "origin": [x, y, float(so3_log(grid.map_from_grid[:3, :3])[2])],
+        "negate": 0,
+        "occupied_thresh": _OCCUPIED_THRESH,
+        "free_thresh": _FREE_THRESH,
+    }
+    with disk_errors(f"{path} cannot be written", "check the folder, its space and rights", StoreError):
+        path.with_suffix(".pgm").write_bytes(b"P5\n%d %d\n255\n" % (width, height) + shades.tobytes())
+        path.write_text(yaml.safe_dump(entries, sort_keys=False), "utf-8")
+
+
 def _entries(path: Path, text: bytes) -> dict[str, Any]:
     try:
         entries = yaml.safe_load(text) if len(text) <= _MAX_BYTES else None
@@ -80,11 +113,29 @@ def _number(path: Path, entries: dict[str, Any], key: str) -> float:
 
 
 def _image(path: Path, name: object) -> NDArray[np.uint8]:
+    """Nothing is decoded before its header has said how large it is."""
     file = path.parent / str(name)
-    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) if name and file.is_file() else None
-    if image is None or image.dtype != np.uint8 or image.shape[0] * image.shape[1] > _MAX_CELLS:
-        raise GridImageError(f"{path}: its image {name!r} is no picture of 8 bits and at most {_MAX_CELLS} pixels")
+    wanted = f"a whole picture of 8 bits and at most {_MAX_CELLS} pixels"
+    if not name or not file.is_file() or file.stat().st_size > _MAX_IMAGE_BYTES:
+        raise GridImageError(f"{path}: its image {name!r} is no file of {wanted}")
+    with disk_errors(f"{file} cannot be read", "check its rights", RecordingError):
+        data = file.read_bytes()
+    size = image_size(data)
+    if size is None or not 0 < size[0] * size[1] <= _MAX_CELLS or _is_cut(data, size[0] * size[1]):
+        raise GridImageError(f"{path}: its image {name!r} is not {wanted}; it says {size} and has {len(data)} bytes")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None or image.dtype != np.uint8:
+        kind = "cannot be decoded" if image is None else f"has pixels of {image.dtype}"
+        raise GridImageError(f"{path}: its image {name!r} {kind}; it must be {wanted}")
     return np.asarray(image, np.uint8)
+
+
+def _is_cut(data: bytes, pixels: int) -> bool:
+    """Whether the end is missing, which OpenCV fills with grey and says nothing."""
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" not in data[-64:]
+    header = _PGM.match(data[:4096])
+    return header is not None and len(data) - header.end() < pixels * (1 + (int(header[1]) > 255))
 
 
 def _cells(

@@ -1,0 +1,71 @@
+"""Disparities of whole pictures, and the floor below the camera. Source of the matcher: Hirschmueller 2008, as OpenCV has it."""
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.features.settings import StereoSettings
+from fleetmap.geometry import Array
+from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+
+DENSE_SIGMA_PX = 0.3  # of a disparity of the matcher on textured surfaces
+_NEAREST_M, _BLOCK_PX, _FRACTIONS = 0.6, 5, 16
+_MIN_TEXTURE, _TEXTURE_PX = 3.0, 9  # mean horizontal gradient in grey levels, of a square around the pixel
+_FLOOR_REACH_M, _FLOOR_BIN_M, _MIN_FLOOR_POINTS = 4.0, 0.02, 400
+_FLOOR_APART_M, _FLOOR_SHARE = 0.05, 0.6
+
+
+def dense_disparity(
+    frame: RectifiedFrame, camera: StereoCamera, settings: StereoSettings
+) -> tuple[NDArray[np.float32], float]:
+    """(H, W) disparities of the left picture, NaN where unknown, and their standard deviation in pixels.
+
+    Of the depth sensor where there is one. A pair is matched both ways, and where it shows no texture nothing is known.
+    """
+    if frame.disparity_px is not None:
+        return frame.disparity_px, settings.depth_sigma_px
+    assert frame.right is not None
+    nearest_px = min(camera.focal_px * camera.baseline_m / _NEAREST_M, 0.4 * camera.width_px)
+    smooth = _BLOCK_PX * _BLOCK_PX
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=16 * int(np.ceil(nearest_px / 16)),
+        blockSize=_BLOCK_PX,
+        P1=8 * smooth,
+        P2=32 * smooth,
+        disp12MaxDiff=1,
+        preFilterCap=31,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.StereoSGBM_MODE_SGBM_3WAY,
+    )
+    disparity = matcher.compute(frame.left, frame.right).astype(np.float32) / np.float32(_FRACTIONS)
+    gradient = np.abs(cv2.Sobel(frame.left, cv2.CV_32F, 1, 0, ksize=3)) / np.float32(8.0)
+    is_known = (disparity > 0.5) & (cv2.blur(gradient, (_TEXTURE_PX, _TEXTURE_PX)) >= _MIN_TEXTURE)
+    return np.where(is_known, disparity, np.float32(np.nan)), DENSE_SIGMA_PX
+
+
+def floor_distance_m(views: Iterable[tuple[NDArray[np.float32], Array]], camera: StereoCamera) -> float | None:
+    """How far below the camera the floor is, from disparities (H, W) and map_from_cam (4, 4) of some views.
+
+    In each the height at which most near points below the camera lie; their median, where most views agree on it. None where
+    they do not: the camera is carried by hand, or the map is not level.
+    """
+    found = []
+    for disparity_px, map_from_cam in views:
+        v, u = np.nonzero(disparity_px > camera.focal_px * camera.baseline_m / _FLOOR_REACH_M)
+        pixels = np.stack([u, v], axis=1).astype(np.float64)
+        points = camera.point_from_pixel(pixels, disparity_px[v, u].astype(np.float64))
+        below_m = -(points @ map_from_cam[2, :3])
+        counts = np.bincount((below_m[below_m > 0.1] / _FLOOR_BIN_M).astype(np.int64), minlength=3)
+        smooth = np.convolve(counts, np.ones(3), "same")
+        if smooth.max() >= _MIN_FLOOR_POINTS:
+            near = np.abs(below_m - (int(smooth.argmax()) + 0.5) * _FLOOR_BIN_M) < 1.5 * _FLOOR_BIN_M
+            found.append(float(np.median(below_m[near])))
+    if not found:
+        return None
+    middle = float(np.median(found))
+    return middle if np.mean(np.abs(np.array(found) - middle) < _FLOOR_APART_M) >= _FLOOR_SHARE else None

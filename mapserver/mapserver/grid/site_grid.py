@@ -1,0 +1,148 @@
+"""The grid of a site: what surveys saw of each cell, tile by tile, and what it is for a robot of some height."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import UsageError
+from fleetmap.geometry import Array, se3
+from fleetmap.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from fleetmap.sensors.rectification import StereoCamera
+from mapserver.grid.grid_kernels import (
+    CELL_M,
+    FLOOR_M,
+    HEIGHT_STEP_M,
+    LOWEST_M,
+    SLICE_M,
+    SLICES,
+    Counts,
+    add_view,
+    cast_view,
+)
+from mapserver.tiles.tiling import TILE_SIZE_M
+
+TILE_CELLS = round(TILE_SIZE_M / CELL_M)
+TOP_M = FLOOR_M + SLICES * SLICE_M
+_RANGE_CELLS = 160  # of a view
+# A view that hits a voxel counts as two that pass it: passes also come of its rim. What was decided before counts as so many
+# views, and stays until as many speak against it: one night takes away what moved.
+_HIT, _DECIDED = 2, 4
+_SAME_STEPS = 10  # heights that differ by less stay as they were
+_MAX_CELLS = 1 << 25
+Tiles = dict[tuple[int, int], Counts]
+"""By (x, y) of the tile: (N, N, 4) bits of occupied voxels, bits of free ones, codes of the lowest and the highest surface."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionViews:
+    """Counts of the views of one recording, by tile: hits and passes (N, N, SLICES), heights (N, N, 4)."""
+
+    tiles: dict[tuple[int, int], tuple[Counts, Counts, Counts]] = field(default_factory=dict)
+
+    def add(
+        self, disparity: tuple[NDArray[np.float32], float], camera: StereoCamera, map_from_cam: Array, floor_m: float
+    ) -> None:
+        """One view. disparity: as of `dense_disparity`; floor_m: how far below the camera the floor is."""
+        size = 2 * _RANGE_CELLS + 1
+        points, passes = np.zeros((size, size, SLICES), np.uint16), np.zeros((size, size, SLICES), np.uint8)
+        heights = np.zeros((size, size, 2), np.uint8)
+        at_cells = map_from_cam[:2, 3] / CELL_M
+        corner = np.floor(at_cells).astype(np.int64) - _RANGE_CELLS
+        place = np.array([*(at_cells - corner), floor_m])
+        turn = np.ascontiguousarray(map_from_cam[:3, :3])
+        cast_view(*disparity, camera.lens, turn, place, points, passes, heights)
+        first, last = corner // TILE_CELLS, (corner + size - 1) // TILE_CELLS
+        for x in range(int(first[0]), int(last[0]) + 1):
+            for y in range(int(first[1]), int(last[1]) + 1):
+                start = np.array([y * TILE_CELLS - corner[1], x * TILE_CELLS - corner[0]])
+                low, high = np.maximum(start, 0), start + TILE_CELLS
+                part = slice(low[0], high[0]), slice(low[1], high[1])
+                if passes[part].any() or points[part].any():
+                    add_view(points, passes, heights, start, *self._tile(x, y))
+
+    def _tile(self, x: int, y: int) -> tuple[Counts, Counts, Counts]:
+        if (x, y) not in self.tiles:
+            shapes = ((SLICES,), (SLICES,), (4,))
+            hits, passes, heights = (np.zeros((TILE_CELLS, TILE_CELLS, *shape), np.uint8) for shape in shapes)
+            self.tiles[x, y] = hits, passes, heights
+        return self.tiles[x, y]
+
+
+def updated(before: Mapping[tuple[int, int], Counts], views: SessionViews) -> Tiles:
+    """The tiles with what a session saw; what it did not see stays as it was."""
+    tiles = dict(before)
+    for place, (hits, passes, heights) in views.tiles.items():
+        old = before.get(place, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8))
+        was_occupied, was_free = (np.unpackbits(old[..., i, None], axis=-1, bitorder="little") > 0 for i in (0, 1))
+        score = _HIT * hits.astype(np.int16) - passes + _DECIDED * (was_occupied.astype(np.int16) - was_free)
+        occupied = (score >= _DECIDED) | (was_occupied & (score > -_DECIDED))
+        free = ~occupied & ((score <= -_DECIDED) | was_free)
+        bits = [np.packbits(mask, axis=-1, bitorder="little")[..., 0] for mask in (occupied, free)]
+        low, high = (_height(old[..., 2 + i], heights[..., 1 + 2 * i]) for i in (0, 1))
+        # What stood there in some views alone has left no voxel.
+        levels = np.where(bits[0] > 0, np.log2(np.maximum(bits[0], 1)).astype(np.int64) + 1, 0)
+        top = 1 + ((FLOOR_M + SLICE_M * levels - LOWEST_M) / HEIGHT_STEP_M).astype(np.uint8)
+        tiles[place] = np.stack([*bits, np.minimum(low, top), np.minimum(high, top)], axis=-1)
+    return tiles
+
+
+def _height(old: Counts, new: Counts) -> Counts:
+    is_same = (old > 0) & (np.abs(old.astype(np.int16) - new) < _SAME_STEPS)
+    return np.where((new == 0) | is_same, old, new)
+
+
+def occupancy(tiles: Mapping[tuple[int, int], Counts], robot_height_m: float) -> OccupancyGrid:
+    """What a robot of this height may drive on, in `map`, cut to what is known.
+
+    A cell is occupied where something is between floor and robot, free where all of that was seen to be empty, else unknown.
+    Raises UsageError for a height that the grid does not reach, and for a grid with more cells than a planner's map may have.
+    """
+    levels = int(np.ceil((robot_height_m - FLOOR_M) / SLICE_M - 1e-9))
+    if not 1 <= levels <= SLICES:
+        raise UsageError(
+            f"a robot of {robot_height_m} m; the grid tells heights above {FLOOR_M} m and up to {TOP_M:.2f} m"
+        )
+    below = np.uint8((1 << levels) - 1)
+
+    def states(cells: Counts) -> NDArray[np.int8]:
+        is_free = (cells[..., 1] & below) == below
+        return np.where(cells[..., 0] & below, OCCUPIED, np.where(is_free, FREE, UNKNOWN)).astype(np.int8)
+
+    return _whole({place: states(cells) for place, cells in tiles.items()}, UNKNOWN)
+
+
+def height_map(tiles: Mapping[tuple[int, int], Counts]) -> tuple[Array, OccupancyGrid]:
+    """(2, H, W) metres over the floor of the lowest and the highest surface, NaN where none was seen, and where that lies."""
+    layers = []
+    for layer in (2, 3):
+        codes = _whole({place: cells[..., layer].view(np.int8) for place, cells in tiles.items()}, 0, is_cut=False)
+        known = codes.cells.view(np.uint8).astype(np.float64)
+        layers.append(np.where(known > 0, LOWEST_M + (known - 0.5) * HEIGHT_STEP_M, np.nan))
+    return np.stack(layers), codes
+
+
+def _whole(parts: Mapping[tuple[int, int], NDArray[np.int8]], empty: int, *, is_cut: bool = True) -> OccupancyGrid:
+    places = np.array(list(parts))
+    first, last = places.min(axis=0), places.max(axis=0) + 1
+    columns, rows = ((last - first) * TILE_CELLS).tolist()
+    if columns * rows > _MAX_CELLS:
+        raise UsageError(f"the grid has {columns} x {rows} cells; planners' maps have at most {_MAX_CELLS}")
+    cells = np.full((rows, columns), empty, np.int8)
+    for (x, y), part in parts.items():
+        row, column = (y - first[1]) * TILE_CELLS, (x - first[0]) * TILE_CELLS
+        cells[row : row + TILE_CELLS, column : column + TILE_CELLS] = part
+    low = np.zeros(2, np.int64)
+    if is_cut and (cells != empty).any():
+        seen = np.argwhere(cells != empty)
+        low, high = seen.min(axis=0), seen.max(axis=0) + 1
+        cells = np.ascontiguousarray(cells[low[0] : high[0], low[1] : high[1]])
+    corner = first * TILE_SIZE_M + low[::-1] * CELL_M
+    return OccupancyGrid(cells, CELL_M, se3(np.eye(3), np.array([*corner, 0.0])))
+
+
+def area_m2(grid: OccupancyGrid) -> Iterator[float]:
+    """Square metres that are occupied, then those that are free."""
+    for state in (OCCUPIED, FREE):
+        yield float((grid.cells == state).sum()) * grid.resolution_m**2
