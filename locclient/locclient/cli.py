@@ -5,13 +5,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fleetmap.cli_exit import run_cli
-from fleetmap.cli_options import Commands, Options, make_app
+from fleetmap.cli_options import Commands, Options, Version, make_app
 from locclient.commands.check import check
 from locclient.commands.config import CONFIG
 from locclient.commands.enrol import enrol
 from locclient.commands.prepare import prepare
 from locclient.commands.replay import replay
 from locclient.commands.run import run
+from locclient.commands.status import status
 
 if TYPE_CHECKING:
     from locclient.config import LocclientConfig
@@ -21,12 +22,13 @@ COMMANDS: Commands = {
     "check": check,
     "replay": replay,
     "run": run,
+    "status": status,
     "prepare": prepare,
     "config": CONFIG,
 }
 
 
-def locclient() -> None:
+def locclient(version: Version = False) -> None:
     """Localize a camera robot in the maps of its fleet."""
 
 

@@ -1,11 +1,12 @@
 """The command `mapserver`. Heavy imports happen inside the commands, after their arguments are checked."""
 
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fleetmap.cli_exit import run_cli
-from fleetmap.cli_options import Commands, ConfigFile, Options, make_app
+from fleetmap.cli_exit import require_extra, run_cli
+from fleetmap.cli_options import Commands, ConfigFile, Options, Version, make_app
 from mapserver.commands.build import build
 from mapserver.commands.calibrate import calibrate
 from mapserver.commands.config import CONFIG
@@ -65,7 +66,7 @@ COMMANDS: Commands = {
 }
 
 
-def mapserver(config: ConfigFile = None) -> None:
+def mapserver(config: ConfigFile = None, version: Version = False) -> None:
     """Build, keep and serve the maps of a fleet of camera robots.
 
     Every option can also be set in the TOML file of --config, in a section named after its command.
@@ -85,8 +86,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def main() -> None:
-    """Runs the command line."""
-    run_cli(app)
+    """Runs the command line. Where a robot's libraries alone are installed it answers `--version`, and else says what to install."""
+    run_cli(_run)
+
+
+def _run() -> None:
+    if sys.argv[1:] != ["--version"]:
+        require_extra("server", "mapserver")
+    app()
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
 """Exit of the commands `mapserver`, `locclient` and `fleetsim`: errors become messages and statuses."""
 
+import re
 import sys
 from collections.abc import Callable
+from importlib import metadata
 
-from fleetmap.errors import FleetmapError
+from fleetmap.errors import FleetmapError, UsageError
 
 INTERRUPTED = 130  # the status that shells use for Ctrl-C
 
@@ -29,3 +31,27 @@ def run_cli(app: Callable[[], object]) -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(INTERRUPTED)
+
+
+def require_extra(extra: str, program: str) -> None:
+    """UsageError where libraries of an extra are not installed, with what to install; a source tree that is not installed passes."""
+    try:
+        project = metadata.distribution("fleetmap")
+    except metadata.PackageNotFoundError:
+        return
+    marked = [line for line in project.requires or () if re.search(rf"extra == ['\"]{extra}['\"]", line)]
+    names = [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in marked]
+    missing = [name for name in names if not _is_installed(name)]
+    if missing:
+        raise UsageError(
+            f"{program} needs the extra `{extra}`, of which {', '.join(missing)} are not installed; install it with "
+            f"pip install './fleetmap-{project.version}-py3-none-any.whl[{extra}]', or '.[{extra}]' in fleetmap's source folder"
+        )
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        metadata.distribution(name)
+    except metadata.PackageNotFoundError:
+        return False
+    return True

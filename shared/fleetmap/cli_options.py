@@ -183,6 +183,19 @@ TopicNames = Annotated[
 ]
 
 
+def _print_version(context: typer.Context, is_asked: bool) -> None:
+    if is_asked and not context.resilient_parsing:
+        import fleetmap
+
+        typer.echo(f"{context.find_root().info_name} {fleetmap.__version__}")
+        raise typer.Exit
+
+
+Version = Annotated[
+    bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version, and end.")
+]
+
+
 def config_path(context: typer.Context) -> Path | None:
     """The file that --config named, behind the command or before it."""
     path: Path | None = context.meta.get(_FILE)

@@ -8,13 +8,16 @@ from typing import Annotated
 import typer
 
 from fleetmap.cli_exit import run_cli
-from fleetmap.cli_options import TopicNames, expand_options
+from fleetmap.cli_options import TopicNames, Version, expand_options
 from fleetmap.errors import UsageError
 
-app = typer.Typer(
-    no_args_is_help=True, add_completion=False, help="The warehouse simulator: recordings with exact truth."
-)
+app = typer.Typer(no_args_is_help=True, add_completion=False)
 Option = typer.Option
+
+
+@app.callback()
+def fleetsim(version: Version = False) -> None:
+    """The warehouse simulator: recordings with exact truth."""
 
 
 @dataclass(frozen=True, kw_only=True)

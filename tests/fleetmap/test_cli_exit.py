@@ -1,8 +1,12 @@
 """Exit of a command line: errors become messages and statuses, bugs stay tracebacks."""
 
+from importlib import metadata
+from types import SimpleNamespace
+from typing import NoReturn
+
 import pytest
 
-from fleetmap.cli_exit import run_cli
+from fleetmap.cli_exit import require_extra, run_cli
 from fleetmap.errors import GateRefusedError
 
 
@@ -30,3 +34,33 @@ def test_errors_become_messages(
 def test_a_module_of_our_own_that_is_missing_is_a_bug() -> None:
     with pytest.raises(ModuleNotFoundError):
         run_cli(lambda: failing(ModuleNotFoundError("No module named 'mapserver.gone'", name="mapserver.gone")))
+
+
+def distribution(*requires: str) -> SimpleNamespace:
+    return SimpleNamespace(requires=list(requires), version="9.9")
+
+
+def test_a_program_whose_extra_is_missing_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = {
+        "fleetmap": distribution("numpy>=2", 'no-such-sim>=1; extra == "sim"', "numpy; extra == 'server'",
+                                 "no_such.one[tls]<3,>=2; python_version > '3' and extra == 'server'"),
+    }  # fmt: skip
+    installed = metadata.distribution
+    monkeypatch.setattr(metadata, "distribution", lambda name: known[name] if name in known else installed(name))
+    with pytest.raises(SystemExit) as end:
+        run_cli(lambda: require_extra("server", "mapserver"))
+    assert end.value.code == 2
+    said = capsys.readouterr().err
+    assert "extra `server`, of which no_such.one are not installed" in said
+    assert "'./fleetmap-9.9-py3-none-any.whl[server]'" in said
+    require_extra("client", "locclient")
+
+
+def test_a_source_tree_that_is_not_installed_is_asked_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(name: str) -> NoReturn:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "distribution", none)
+    require_extra("server", "mapserver")

@@ -26,7 +26,7 @@ def run(
 
     check_run(settings)
     from locclient.daemon.runtime import Runtime
-    from locclient.daemon.systemd_notify import ServiceManager
+    from locclient.daemon.service_manager import ServiceManager
 
     with daemon_parts(settings) as parts:
         runtime = Runtime(parts, ServiceManager())

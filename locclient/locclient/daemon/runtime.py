@@ -16,7 +16,7 @@ from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import Source
 from locclient.daemon.publishers import Publisher
 from locclient.daemon.server_sync import ServerSync
-from locclient.daemon.systemd_notify import ServiceManager
+from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.delivery.report_delivery import write_failure
 from locclient.maps.loaded_map import LoadedMap

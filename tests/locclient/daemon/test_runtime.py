@@ -16,7 +16,7 @@ from fleetmap.sources.intake import Intake
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.daemon.runtime import Runtime, RuntimeParts
 from locclient.daemon.server_sync import ServerSync
-from locclient.daemon.systemd_notify import ServiceManager
+from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox
 from locclient.localization.estimate import Estimate
 from locclient.maps.map_client import MapClient

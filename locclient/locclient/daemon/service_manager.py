@@ -1,0 +1,79 @@
+"""What the daemon tells whoever runs it: systemd by datagrams (sd_notify), and others by a file that `locclient status` reads."""
+
+import os
+import socket
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from fleetmap.errors import FleetmapError, disk_errors
+
+_FILE = "status"
+_SILENT_S = 10.0  # as WatchdogSec of deploy/locclient.service
+
+
+class ServiceManager:
+    """Ready, status, watchdog, stopping. Source: the documented protocol of sd_notify(3)."""
+
+    def __init__(self, address: str | None = None, folder: Path | None = None) -> None:
+        """address: of systemd's socket, folder: of the file; those of the environment without them."""
+        given = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
+        self._address = "\0" + given[1:] if given.startswith("@") else given
+        self._folder = folder or runtime_folder()
+
+    def ready(self) -> None:
+        """The service is ready."""
+        self._tell("READY=1")
+
+    def alive(self, status: str) -> None:
+        """Resets the watchdog; status: a line for `systemctl status` and `locclient status`."""
+        self._tell(f"WATCHDOG=1\nSTATUS={status}")
+        self._write(status)
+
+    def stopping(self) -> None:
+        """The service is stopping."""
+        self._tell("STOPPING=1")
+        if self._folder is not None:
+            with suppress(OSError):
+                (self._folder / _FILE).unlink(missing_ok=True)
+
+    def _tell(self, text: str) -> None:
+        if not self._address:
+            return
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            try:
+                sender.connect(self._address)
+                sender.send(text.encode())
+            except OSError:
+                pass  # nobody listens any more: the service goes on, and its manager will judge by the watchdog
+
+    def _write(self, status: str) -> None:
+        if self._folder is None:
+            return
+        with suppress(OSError):  # the robot drives on, and whoever reads the file finds it old
+            fresh = self._folder / f"{_FILE}.new"
+            # Of the clock since the machine's start, which nobody sets.
+            fresh.write_text(f"{time.monotonic():.1f} {status}\n", encoding="utf-8")
+            fresh.replace(self._folder / _FILE)
+
+
+def runtime_folder() -> Path | None:
+    """The folder of RUNTIME_DIRECTORY, the first where there are several."""
+    given = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
+    return Path(given) if given else None
+
+
+def last_status(folder: Path) -> str:
+    """What the daemon of this folder last said, and when; FleetmapError where that is not of the last ten seconds."""
+    path = folder / _FILE
+    advice = "start `locclient run` with this folder as its RUNTIME_DIRECTORY, as deploy/locclient.service does"
+    with disk_errors(f"no daemon has written {path}", advice, FleetmapError):
+        said_s, _, status = path.read_text(encoding="utf-8", errors="replace").strip().partition(" ")
+    try:
+        age_s = time.monotonic() - float(said_s)
+    except ValueError as error:
+        raise FleetmapError(f"{path} holds {said_s[:40]!r} and no status of a daemon; {advice}") from error
+    if not 0.0 <= age_s <= _SILENT_S:
+        when = f"{age_s:.0f} s ago" if age_s > 0.0 else "before this machine was started"
+        raise FleetmapError(f"the daemon last said {status[:80]!r} {when}; it hangs or was killed, see its log")
+    return f"{status}, {age_s:.1f} s ago"

@@ -1,0 +1,84 @@
+"""Messages to systemd, and the file that `locclient status` reads."""
+
+import re
+import socket
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from locclient import cli
+from locclient.daemon.service_manager import ServiceManager
+
+
+@pytest.mark.parametrize("abstract", [False, True])
+def test_the_manager_is_told(tmp_path: Path, abstract: bool) -> None:
+    path = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind("\0" + path if abstract else path)
+        listener.settimeout(5)
+        manager = ServiceManager("@" + path if abstract else path)
+        manager.ready()
+        manager.alive("TRACKING")
+        manager.stopping()
+        assert [listener.recv(100) for _ in range(3)] == [b"READY=1", b"WATCHDOG=1\nSTATUS=TRACKING", b"STOPPING=1"]
+
+
+def test_without_a_manager_nothing_happens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    ServiceManager().ready()
+    ServiceManager(str(tmp_path / "gone")).alive("x")
+
+
+def status(monkeypatch: pytest.MonkeyPatch, folder: Path) -> int:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", f"{folder}:/somewhere/else")
+    monkeypatch.setattr(sys, "argv", ["locclient", "status"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+def test_what_the_daemon_says_can_be_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert status(monkeypatch, tmp_path) == 3
+    assert re.search(r"no daemon has written .*; start `locclient run`", capsys.readouterr().err)
+    manager = ServiceManager()
+    manager.alive("AMBIGUOUS")
+    manager.alive("TRACKING")
+    assert status(monkeypatch, tmp_path) == 0
+    assert re.fullmatch(r"TRACKING, 0\.\d s ago\n", capsys.readouterr().out)
+    manager.stopping()
+    assert status(monkeypatch, tmp_path) == 3, "a daemon that was stopped says nothing any more"
+
+
+@pytest.mark.parametrize(
+    ("later_s", "text", "words"),
+    [
+        (11.0, "{now} TRACKING", "last said 'TRACKING' 11 s ago; it hangs"),
+        (-1e6, "{now} TRACKING", "before this machine was started"),
+        (0.0, "nan TRACKING", "last said"),
+        (0.0, "", "holds '' and no status of a daemon"),
+        (0.0, "\x00\udcff" * 99, "no status of a daemon"),
+    ],
+)
+def test_an_old_or_broken_status_is_none(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    later_s: float,
+    text: str,
+    words: str,
+) -> None:
+    now_s = time.monotonic()
+    content = text.format(now=now_s).encode("utf-8", "surrogateescape")
+    (tmp_path / "status").write_bytes(content)
+    monkeypatch.setattr(time, "monotonic", lambda: now_s + later_s)
+    assert status(monkeypatch, tmp_path) == 3
+    assert words in capsys.readouterr().err
+
+
+def test_a_status_that_cannot_be_written_stops_nobody(tmp_path: Path) -> None:
+    ServiceManager(folder=tmp_path / "gone").alive("TRACKING")
+    ServiceManager(folder=tmp_path / "gone").stopping()
