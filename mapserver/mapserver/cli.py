@@ -22,6 +22,7 @@ from mapserver.commands.releases.promote import promote, publish, rollback
 from mapserver.commands.releases.signer import signer
 from mapserver.commands.serve import serve
 from mapserver.commands.site.align import align
+from mapserver.commands.site.areas import AREAS_GROUP
 from mapserver.commands.store.audit import audit
 from mapserver.commands.store.export import export, import_
 from mapserver.commands.store.gc import gc
@@ -55,6 +56,7 @@ COMMANDS: Commands = {
     "evaluate": evaluate,
     "train-vocabulary": train_vocabulary,
     "align": align,
+    "areas": AREAS_GROUP,
     "fleet": FLEET,
     "robots": ROBOTS,
     "operators": OPERATORS,

@@ -1,4 +1,4 @@
-"""Endpoints of the fleet's health: figures by site, robot, version, tile or cause, failures with their pictures, tiles to survey again."""
+"""Endpoints of the fleet's health: figures by site, robot, version, tile, area or cause, failures, tiles to survey again."""
 
 import time
 from typing import Annotated, Any
@@ -36,7 +36,7 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
     def fleet_measures(
         by: Axis = "site", site: SiteFilter = None, hours: Hours = 24, limit: Limit = 100, cursor: NameCursor = None
     ) -> KpisList:
-        """Failures per robot-day with interval, availability and the rest, by site, robot, version, tile or cause."""
+        """Failures per robot-day with interval, availability and the rest, by site, robot, version, tile, area or cause."""
         found = store.fleet.counters(site, by, since_hour=_since(hours))
         chosen = [(f"{key[0]}/{key[1]}", key, counts) for key, counts in found.items()]
         chosen = sorted(item for item in chosen if cursor is None or item[0] > cursor)
@@ -52,7 +52,7 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
         limit: Limit = 100,
         cursor: NumberCursor = None,
     ) -> HourList:
-        """The same figures hour by hour, of a site or of one of its robots, versions, tiles or causes."""
+        """The same figures hour by hour, of a site or of one of its robots, versions, tiles, areas or causes."""
         store.current(site)  # an unknown site is not an empty one
         found = store.fleet.hours(site, by, key=key, since_hour=max(_since(hours), (cursor or -1) + 1))
         shown, following = page(list(found.items()), limit, lambda item: str(item[0]))
@@ -75,6 +75,12 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
         """A picture of a failure, as JPEG."""
         headers = {"Cache-Control": "private, max-age=86400", **PICTURE_HEADERS}
         return Response(store.fleet.picture(number, place), media_type="image/jpeg", headers=headers)
+
+    @app.get("/v1/sites/{site}/areas")
+    def areas(site: Site) -> dict[str, Any]:
+        """The named areas of a site as GeoJSON, metres in `map` in the place of degrees."""
+        store.current(site)  # an unknown site is not an empty one
+        return store.areas(site).geojson(site)
 
     @app.get("/v1/sites/{site}/resurvey")
     def resurvey(site: Site) -> ResurveyList:

@@ -1,6 +1,6 @@
 """Prometheus metrics of the server.
 
-Labels take values from fixed sets, or names of sites, which only builds make, versions that the store has, causes (at most some
+Labels take values from fixed sets, or names of sites, which only builds make, versions and areas that the store has, causes (at most some
 dozens) and statuses.
 """
 
@@ -12,11 +12,12 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessColl
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from fleetmap.errors import StateError, StoreError
+from fleetmap.errors import FleetmapError, StateError, StoreError
 from fleetmap.messages import Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.kpis import Counters
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS, calibration_figures
+from mapserver.floor_plan.areas import OUTSIDE
 from mapserver.store import MapStore
 from mapserver.trust.status import trust_status
 
@@ -46,6 +47,11 @@ _VERSION_SUMS: tuple[tuple[str, str, Callable[[Counters], float]], ...] = (
     ("failures", "Failures on a version.", lambda counts: counts.failures),
     ("silent_failures_estimated", "Silent failures, an estimate.", lambda counts: counts.silent_estimated),
     ("driving_seconds", "Driving with a version.", lambda counts: counts.driving_ms / 1e3),
+)
+_AREA_SUMS: tuple[tuple[str, str, Callable[[Counters], float]], ...] = (
+    ("failures", "Failures in a named area.", lambda counts: counts.failures),
+    ("driving_seconds", "Driving in a named area.", lambda counts: counts.driving_ms / 1e3),
+    ("driving_localised_seconds", "Of that localised.", lambda counts: counts.found_ms / 1e3),
 )
 _SITE_ROBOTS: tuple[tuple[str, str, Callable[[list[RobotStatus]], float]], ...] = (
     ("robots", "Robots that ever reported.", len),
@@ -120,9 +126,18 @@ class _FleetCollector(Collector):
         kept = {(info.site, str(version.version)) for info in sites for version in self._store.versions(info.site)}
         by_version = [(key, counts) for key, counts in counters(None, "version").items() if key in kept]
         yield from _sums("version", _VERSION_SUMS, ["site", "version"], by_version)
+        named = {(info.site, name) for info in sites for name in (*self._area_names(info.site), OUTSIDE)}
+        by_area = [(key, counts) for key, counts in counters(None, "area").items() if key in named]
+        yield from _sums("area", _AREA_SUMS, ["site", "area"], by_area)
         by_cause = counters(None, "cause").items()
         family = CounterMetricFamily("fleetmap_site_cause_failures", "Failures by cause.", labels=["site", "cause"])
         yield _filled(family, ((key, counts.failures + counts.suspected) for key, counts in by_cause))
+
+    def _area_names(self, site: str) -> list[str]:
+        try:
+            return self._store.areas(site).names
+        except FleetmapError:  # areas in a building that the map is no longer aligned with
+            return []
 
     def _robots(self, sites: list[str]) -> Iterator[Metric]:
         robots = self._fleet.robots()

@@ -18,14 +18,14 @@ Sha256 = Annotated[str, Path(pattern=SHA256_PATTERN, examples=["5e" * 32])]
 Number = Annotated[int, Path(ge=1, le=1 << 62, examples=[12])]
 PictureNumber = Annotated[int, Path(ge=0, le=100, examples=[1])]
 Axis = Annotated[
-    Literal["site", "robot", "version", "tile", "cause"],
+    Literal["site", "robot", "version", "tile", "area", "cause"],
     Query(description="what the figures are for", examples=["version"]),
 ]
 Hours = Annotated[
     int, Query(ge=1, le=24 * 400, description="so many hours back, the running one included", examples=[24])
 ]
 KeyFilter = Annotated[
-    str | None, Query(max_length=64, description="this robot, version, tile or cause alone", examples=[None])
+    str | None, Query(max_length=64, description="this robot, version, tile, area or cause alone", examples=[None])
 ]
 VersionFilter = Annotated[int | None, Query(ge=1, le=1 << 31, description="on this version alone", examples=[None])]
 Limit = Annotated[int, Query(ge=1, le=1000, description="items of a page", examples=[100])]
@@ -41,6 +41,7 @@ class FailureQuery(BaseModel):
     robot: KeyFilter = None
     version: VersionFilter = None
     tile: KeyFilter = None
+    area: KeyFilter = None
     cause: KeyFilter = None
     kind: KeyFilter = None
     limit: Limit = 100

@@ -303,20 +303,17 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         # A robot downloads the manifest: what it says about the build is short.
         report={key: value for key, value in msgspec.to_builtins(report).items() if key not in _NOT_FOR_ROBOTS},
     )
+    job = run.request.options.job
     content = DraftContent(
-        tiles=tiles,
-        vocabulary=vocabulary,
-        details=details,
-        archive=archive,
-        evidence=evidence,
-        job=run.request.options.job,
+        tiles=tiles, vocabulary=vocabulary, details=details, archive=archive, evidence=evidence, job=job
     )
     version = record_built(maps.save(site, content, actor=run.request.options.actor), run.request.options.keys)
     report = msgspec.structs.replace(report, map_bytes=maps.version(site, version).map_bytes)
     run.times.begin("writing")
+    words = sentence(site, version, None if parent is None else parent.manifest.version, report)
     draft = Draft(
         version,
-        sentence(site, version, None if parent is None else parent.manifest.version, report),
+        maps.areas(site).name_tiles(words, TILE_SIZE_M),
         msgspec.to_builtins(report),
         {s.entry.sha256: o.reason for s, o in zip(built.surveyed, built.joined.outcomes, strict=True) if not o.joined},
     )

@@ -98,7 +98,7 @@ def resurvey(
         print_json(found)
         return
     for concern in found.tiles:
-        typer.echo(f"tile {concern.tile}: {'; '.join(concern.reasons)}")
+        typer.echo(f"{concern.name}: {'; '.join(concern.reasons)}")
     typer.echo(f"{len(found.tiles)} tiles to survey again, {len(found.route)} waypoints")
 
 

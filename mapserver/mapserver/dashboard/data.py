@@ -8,6 +8,7 @@ from fleetmap.errors import StateError, UsageError
 from fleetmap.mapformat import Manifest, decode_tile
 from mapserver import releases
 from mapserver.dashboard.plan import Plan, make_plan
+from mapserver.floor_plan.areas import Areas
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
 from mapserver.store import Actor, CanaryRow, Event, JobInfo, MapStore, SiteInfo, VerdictRow, VersionInfo
@@ -101,6 +102,10 @@ class MapData:
             while len(self._plans) > _CACHED_PLANS:
                 self._plans.popitem(last=False)
         return plan
+
+    def areas(self, site: str) -> Areas:
+        """The named areas of a site."""
+        return self._store.areas(site)
 
     def difference(self, site: str, before: int, after: int) -> Difference:
         """The difference between two versions."""

@@ -8,6 +8,7 @@ from markupsafe import Markup
 from fleetmap.geometry import Array
 from mapserver.dashboard.markup import joined
 from mapserver.dashboard.plan import Plan
+from mapserver.floor_plan.areas import Area, Areas
 
 
 class Mark(NamedTuple):
@@ -77,6 +78,32 @@ def coverage(plan: Plan) -> Markup:
     words = [f"tile {tile.x},{tile.y}: {tile.landmarks} landmarks" for tile in plan.tiles]
     named = zip(plan.tiles, words, strict=True)
     return joined(_cell(plan, (tile.x, tile.y), "tile", name, tile.landmarks / most) for tile, name in named)
+
+
+def areas(plan: Plan, found: Areas) -> Markup:
+    """Outlines of named areas, with their names where these have room."""
+    letter = 0.014 * max(plan.size_m)
+    return joined(_area(area, letter) for area in reversed(found.areas))
+
+
+def _area(area: Area, letter: float) -> Markup:
+    ways = "".join("M" + "L".join(f"{x:.3f} {-y:.3f}" for x, y in ring.tolist()) + "Z" for ring in area.rings)
+    (x0, y0), (x1, y1) = area.rings[0].min(axis=0), area.rings[0].max(axis=0)
+    across, upright = x1 - x0, y1 - y0
+    x, y, length = (x0 + x1) / 2, -(y0 + y1) / 2, 0.6 * letter * len(area.name)  # as wide as letters usually are
+    words = Markup("")
+    if max(across, upright) > length and min(across, upright) > letter:
+        turned = (
+            Markup("")
+            if across >= min(length, upright)
+            else Markup(' transform="rotate(-90 {:.3f} {:.3f})"').format(x, y)
+        )
+        words = Markup('<text x="{:.3f}" y="{:.3f}" font-size="{:.3f}"{}>{}</text>').format(
+            x, y, letter, turned, area.name
+        )
+    return Markup('<g class="area"><path fill-rule="evenodd" d="{}"><title>{}</title></path>{}</g>').format(
+        ways, area.name, words
+    )
 
 
 def cells(plan: Plan, kinds: Mapping[tuple[int, int], str]) -> Markup:

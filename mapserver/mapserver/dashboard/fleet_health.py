@@ -45,6 +45,7 @@ class FilterChoices:
     robots: list[str]
     versions: list[str]
     tiles: list[str]
+    areas: list[str]
     causes: list[str]
 
 
@@ -86,7 +87,13 @@ class HealthData:
         def numbers_first(key: str) -> tuple[int, str]:
             return (int(key), "") if key.isdecimal() else (1 << 40, key)
 
-        return FilterChoices(keys("robot"), sorted(keys("version"), key=numbers_first), keys("tile"), keys("cause"))
+        return FilterChoices(
+            keys("robot"),
+            sorted(keys("version"), key=numbers_first),
+            keys("tile"),
+            self._store.areas(site).names,
+            keys("cause"),
+        )
 
     def _site(self, site: str) -> SiteHealth:
         now_ns = self._clock_ns()

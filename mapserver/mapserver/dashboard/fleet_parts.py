@@ -98,7 +98,7 @@ def resurvey(concerns: Sequence[TileConcern], tile_address: Callable[[str], str]
         return Markup("<h2>Survey again</h2><p>{} No tile stands out.</p>").format(badge("good", "nothing"))
     rows = [
         (
-            concern.tile if tile_address is None else link(tile_address(concern.tile), f"Tile {concern.tile}"),
+            concern.name if tile_address is None else link(tile_address(concern.tile), concern.name),
             "; ".join(concern.reasons),
             format_rate(concern.failures),
             format_rate(concern.failures_before),

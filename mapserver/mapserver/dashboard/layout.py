@@ -19,6 +19,7 @@ from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
 from mapserver.dashboard.markup import address, joined, link
 from mapserver.dashboard.plan import Plan
+from mapserver.floor_plan.areas import Areas
 from mapserver.serving.live_surveys import LiveSurveys
 
 T = TypeVar("T")
@@ -104,10 +105,11 @@ async def show(
         html(notice("bad", str(error)))
 
 
-def show_map(context: PageContext, plan: Plan, version: int, layer: Markup) -> ui.html:
-    """A version's map with a layer over it; returns the layer, whose content may change."""
+def show_map(context: PageContext, plan: Plan, version: int, layer: Markup, areas: Areas) -> ui.html:
+    """A version's map and the named areas with a layer over them; returns the layer, whose content may change."""
+    name, drawn = f"Map of {context.site}, version {version}", drawing.areas(plan, areas)
     with ui.element("div"), ui.element("div").classes("planbox"):
-        html(drawing.site_map(plan, f"Map of {context.site}, version {version}", context.plan_picture(version)))
+        html(drawing.site_map(plan, name, context.plan_picture(version), drawn))
         return html(layer, classes="over")
 
 

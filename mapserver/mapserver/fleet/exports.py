@@ -126,7 +126,7 @@ _TOPICS = {
 def _messages(store: MapStore, found: FailureDetail) -> Iterator[tuple[str, dict[str, Any]]]:
     row, placed = found.failure, found.report.map_from_base
     stamp = {"sec": max(0, row.happened_ns) // 10**9, "nsec": max(0, row.happened_ns) % 10**9}
-    words = f"{row.kind}: {row.cause}, {row.duration_s:.1f} s, version {row.version}, tile {row.tile}"
+    words = f"{row.kind}: {row.cause}, {row.duration_s:.1f} s, version {row.version}, {row.where or 'outside'}"
     level = _LOG_WARNING if row.kind == FailureKind.SUSPECTED else _LOG_ERROR
     yield (
         "/failures/log",

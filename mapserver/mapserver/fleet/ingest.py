@@ -14,14 +14,12 @@ from fleetmap.messages import FailureKind, FailureReport, PoseMessage, RobotHeal
 from mapserver.fleet_statistics.clock_skew import server_time_ns
 from mapserver.fleet_statistics.health_stream import HealthStream
 from mapserver.fleet_statistics.kpis import Counters, hour_of
+from mapserver.floor_plan.areas import OUTSIDE, Areas
 from mapserver.store import CanaryRow, CounterKey, FleetBatch, FleetRetention, MapStore, TraceRow, tile_key
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
-OUTSIDE = "outside"
-"""Key of the tiles of positions that no tile of the version covers."""
-
-_CANARIES_KEPT_NS = 1_000_000_000
+_CANARIES_KEPT_NS = _AREAS_KEPT_NS = 1_000_000_000
 _LEAST_BETWEEN_TRACES_NS = 900_000_000
 _MAX_CAUSES = 64
 _MAX_KEPT_TRACES = 200_000
@@ -87,6 +85,7 @@ class Ingest:
         self._grids: dict[tuple[str, int], _Grid | None] = {}
         self._canaries: dict[str, CanaryRow] = {}
         self._canaries_ns = -(1 << 62)
+        self._areas: dict[str, tuple[int, Areas]] = {}
         self._causes: dict[str, set[str]] = {}
 
     def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
@@ -110,7 +109,7 @@ class Ingest:
         """Counts a report; `report` and `version` are what the store shall show of the robot."""
         site, robot, hour = health.site, health.robot, hour_of(now_ns)
         grid = self._grid(site, health.version)
-        canary = self._canary(site, now_ns)
+        canary, areas = self._canary(site, now_ns), self._areas_of(site, now_ns)
         with self._lock:
             stream = self._streams.setdefault((site, robot), _Stream())
             is_continued = stream.health.in_failure and stream.hour is not None and hour > stream.hour
@@ -125,6 +124,8 @@ class Ingest:
                 self._batch.add(site, axis, key, hour, counts)
             if grid is not None and place is not None:
                 self._batch.add(site, "tile", grid.key(place[0], place[1]), hour, counts)
+                if areas:
+                    self._batch.add(site, "area", areas.at(place[0], place[1]) or OUTSIDE, hour, counts)
             if self._is_trace_due(stream, health, now_ns):
                 self._batch.traces.append(_trace(health, place, hour))
 
@@ -141,9 +142,13 @@ class Ingest:
         keys.append(("cause", self._cause(report.site, report.cause)))
         if grid is not None and report.tile is not None:
             keys.append(("tile", grid.cell_key(report.tile)))
+        areas, area = self._areas_of(report.site, now_ns), None
+        if areas and grid is not None and report.map_from_base is not None:
+            area = areas.at(*report.map_from_base.position_m[:2])
+            keys.append(("area", area or OUTSIDE))
         counters: dict[CounterKey, Counters] = {(report.site, *key, hour_of(happened_ns)): counts for key in keys}
         times_ns = (now_ns, happened_ns)
-        return self._store.fleet.add_failure(report, times_ns, counters, self._settings.retention())
+        return self._store.fleet.add_failure(report, times_ns, counters, self._settings.retention(), area)
 
     def has_counted(self) -> bool:
         """Whether there is something to bring to the disk."""
@@ -203,6 +208,17 @@ class Ingest:
             self._canaries = {row.site: row for row in self._store.canaries(running=True)}
             self._canaries_ns = now_ns
         return self._canaries.get(site)
+
+    def _areas_of(self, site: str, now_ns: int) -> Areas:
+        """The areas of a site; none where they cannot be read, so that reports are counted all the same."""
+        known = self._areas.get(site)
+        if known is None or not 0 <= now_ns - known[0] < _AREAS_KEPT_NS:
+            try:
+                found = self._store.areas(site)
+            except FleetmapError:
+                found = Areas()
+            known = self._areas[site] = (now_ns, found)
+        return known[1]
 
     def _cause(self, site: str, cause: str) -> str:
         with self._lock:

@@ -1,7 +1,7 @@
 """The re-survey list of a site, from the store's counters, and a route through the current map."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import TileEntry, decode_tile
@@ -38,6 +38,8 @@ def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns
         return ResurveyList(site, None, found, [])
     manifest = store.manifest(site, current.version)
     entries = {f"{tile.x},{tile.y}": tile for tile in manifest.tiles}
+    areas = store.areas(site)
+    found = [replace(concern, name=areas.name_tiles(concern.name, manifest.tile_size_m)) for concern in found]
     tiles = [concern.tile for concern in found if concern.tile in entries]
     places = {tile: _place(store, entries[tile], manifest.tile_size_m) for tile in tiles}
     return ResurveyList(site, current.version, found, route(found, places))

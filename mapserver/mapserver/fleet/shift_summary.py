@@ -25,6 +25,7 @@ class FleetSummary:
     before: Kpis
     robots: list[tuple[str, Kpis]]
     versions: list[tuple[str, Kpis]]
+    areas: list[tuple[str, Kpis]]
     causes: list[tuple[str, Kpis]]
     by_hour: list[tuple[int, Kpis]]
     failures: list[FailureRow]
@@ -54,6 +55,7 @@ def summarise(store: MapStore, site: str, hours: int, now_ns: int, settings: Sum
         before=_total(store, site, since - hours, since),
         robots=_table(store, site, "robot", since),
         versions=_table(store, site, "version", since),
+        areas=_table(store, site, "area", since),
         causes=_table(store, site, "cause", since),
         by_hour=[(hour, kpis(counts)) for hour, counts in store.fleet.hours(site, "site", since_hour=since).items()],
         failures=store.fleet.failures(wanted, limit=_SHOWN_FAILURES),

@@ -37,7 +37,10 @@ class ResurveySettings(Section, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class TileConcern:
-    """A tile "x,y" that should be surveyed again. landmarks_seen_*: share found of those looked for, None where none was."""
+    """A tile "x,y" that should be surveyed again. landmarks_seen_*: share found of those looked for, None where none was.
+
+    name: as people know the tile, by the areas that it lies in.
+    """
 
     tile: str
     reasons: list[str]
@@ -45,6 +48,7 @@ class TileConcern:
     failures_before: Rate
     landmarks_seen_share: float | None
     landmarks_seen_share_before: float | None
+    name: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +59,7 @@ class Waypoint:
     x_map_m: float
     y_map_m: float
     reason: str
+    name: str = ""
 
 
 def concerns(
@@ -74,7 +79,7 @@ def concerns(
         if reasons:
             old, new = kpis(then).landmarks_seen_share, kpis(now).landmarks_seen_share
             both = (rate(now.events, now.robot_days), rate(then.events, then.robot_days))
-            found.append(TileConcern(tile, reasons, *both, new, old))
+            found.append(TileConcern(tile, reasons, *both, new, old, f"tile {tile}"))
     return sorted(found, key=lambda concern: (-concern.failures.events, concern.tile))
 
 
@@ -86,7 +91,7 @@ def route(concerned: Sequence[TileConcern], places: Mapping[str, tuple[float, fl
         here = (way[-1].x_map_m, way[-1].y_map_m) if way else places[left[0].tile]
         best = min(left, key=lambda concern: (math.dist(here, places[concern.tile]), concern.tile))
         left.remove(best)
-        way.append(Waypoint(best.tile, *places[best.tile], "; ".join(best.reasons)))
+        way.append(Waypoint(best.tile, *places[best.tile], "; ".join(best.reasons), best.name))
     return way
 
 
@@ -105,7 +110,7 @@ def route_geojson(site: str, version: int, way: Sequence[Waypoint]) -> dict[str,
         {
             "type": "Feature",
             "geometry": {"type": "Point", "coordinates": [round(p.x_map_m, 3), round(p.y_map_m, 3)]},
-            "properties": {"number": number, "tile": p.tile, "reason": p.reason},
+            "properties": {"number": number, "tile": p.tile, "name": p.name, "reason": p.reason},
         }
         for number, p in enumerate(way, start=1)
     ]

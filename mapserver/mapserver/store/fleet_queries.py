@@ -11,6 +11,7 @@ import msgspec
 from fleetmap.errors import UsageError
 from fleetmap.messages import FailureReport
 from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters, hour_of
+from mapserver.floor_plan.areas import Areas
 from mapserver.store.database import Transactions
 from mapserver.store.rows import AXES, FailureDetail, FailureFilter, FailureRow, FleetRetention, PictureRow, TraceRow
 
@@ -77,18 +78,19 @@ class FleetQueries:
         times_ns: tuple[int, int],
         counters: Mapping[CounterKey, Counters],
         retention: FleetRetention = _USUAL_RETENTION,
+        area: str | None = None,
     ) -> bool:
         """Keeps a failure and its sums, durably; False (and nothing done) for one that is known already.
 
-        times_ns: when it was received and when it happened. Older failures of the robot, and the oldest pictures of all, go where
-        there are too many.
+        times_ns: when it was received and when it happened; area: where. Older failures of the robot, and the oldest
+        pictures of all, go where there are too many.
         """
         received_ns, happened_ns = times_ns
         x_map_m, y_map_m = (None, None) if report.map_from_base is None else report.map_from_base.position_m[:2]
         row = {
             **{name: getattr(report, name) for name in _REPORT_COLUMNS},
             **{"failure_id": report.id, "received_ns": received_ns, "happened_ns": happened_ns},
-            **{"tile": tile_key(report.tile), "x_map_m": x_map_m, "y_map_m": y_map_m},
+            **{"tile": tile_key(report.tile), "x_map_m": x_map_m, "y_map_m": y_map_m, "area": area},
             "report": msgspec.msgpack.encode(msgspec.structs.replace(report, thumbnails=())),
         }
         with self._transactions.write() as connection:
@@ -135,7 +137,7 @@ class FleetQueries:
                 WHERE (?1 IS NULL OR site = ?1) AND (?2 IS NULL OR robot = ?2) AND (?3 IS NULL OR version = ?3)
                 AND (?4 IS NULL OR tile = ?4) AND (?5 IS NULL OR cause = ?5) AND (?6 IS NULL OR kind = ?6)
                 AND (?7 IS NULL OR happened_ns >= ?7) AND (?8 IS NULL OR happened_ns < ?8)
-                AND (?9 IS NULL OR number < ?9) ORDER BY number DESC LIMIT ?10""",
+                AND (?9 IS NULL OR area = ?9) AND (?10 IS NULL OR number < ?10) ORDER BY number DESC LIMIT ?11""",
             (*astuple(wanted), before, limit),
         )
 
@@ -194,6 +196,15 @@ class FleetQueries:
             row = connection.execute("SELECT id FROM tally_keys WHERE site = ? AND axis = ? AND key = ?", key)
             found[key] = int(row.fetchone()[0])
         return found
+
+
+def name_failures(connection: sqlite3.Connection, site: str, areas: Areas) -> None:
+    """Gives failures of a site the areas that hold them now, within a transaction."""
+    query = (
+        "SELECT number, x_map_m, y_map_m FROM failures WHERE site = ? AND x_map_m IS NOT NULL AND y_map_m IS NOT NULL"
+    )
+    placed = connection.execute(query, (site,)).fetchall()
+    connection.executemany("UPDATE failures SET area = ? WHERE number = ?", [(areas.at(x, y), n) for n, x, y in placed])
 
 
 def keep_last_reports(connection: sqlite3.Connection, reports: LastReports) -> None:

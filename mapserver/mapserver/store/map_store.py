@@ -45,6 +45,7 @@ from mapserver.store.files import (
     sync_folder,
     write_atomically,
 )
+from mapserver.store.fleet_queries import name_failures
 from mapserver.store.garbage_collection import Garbage, Retention, collect
 from mapserver.store.queries import StoreQueries
 from mapserver.store.rows import (
@@ -162,7 +163,8 @@ class MapStore(StoreQueries):
     ) -> None:
         """Keeps what belongs to a site beside its versions, by kind, all of it or nothing; None takes a kind away. detail: for the log.
 
-        Raises UsageError for an unknown site, StoreError where the disk refuses.
+        Failures are named by the areas as they are then. Raises UsageError for an unknown site and for areas that are none or need
+        an alignment that is not there, StoreError where the disk refuses.
         """
         self._check_site(site)
         with self._locked(shared=True):
@@ -171,6 +173,7 @@ class MapStore(StoreQueries):
                 connection.executemany("DELETE FROM site_files WHERE site = ? AND kind = ?", [(site, k) for k in files])
                 rows = [(site, kind, sha256) for kind, sha256 in addresses.items()]
                 connection.executemany("INSERT INTO site_files (site, kind, sha256) VALUES (?, ?, ?)", rows)
+                name_failures(connection, site, self.areas(site))
                 self._transactions.log(connection, site, LogEntry(" and ".join(files), detail, None, actor))
 
     def change_releases(self, site: str, decide: Callable[[SiteReleases], ReleaseChanges]) -> ReleaseChanges:

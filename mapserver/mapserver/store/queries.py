@@ -11,6 +11,7 @@ import msgspec
 from fleetmap.errors import UsageError
 from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest
 from mapserver.floor_plan.alignment import ALIGNMENT, Alignment, decode_alignment
+from mapserver.floor_plan.areas import AREAS, Areas, read_areas
 from mapserver.quality.figures import Evidence
 from mapserver.store.access.chain import AuditLine, AuditMark
 from mapserver.store.access.operators import OperatorQueries
@@ -46,6 +47,7 @@ class StoreQueries:
         self._blobs = BlobFolder(root)
         self._transactions = Transactions(root / "store.sqlite3", clock_ns, read_only=read_only)
         self.fleet = FleetQueries(self._transactions)
+        self._areas: dict[str, tuple[tuple[str, ...], Areas]] = {}  # by the addresses of what they were read from
         self.operators = OperatorQueries(self._transactions)
 
     @property
@@ -157,6 +159,17 @@ class StoreQueries:
         """Where the site's map lies in the drawing of its building; None for a site that was not aligned."""
         data = self.site_file(site, ALIGNMENT)
         return None if data is None else decode_alignment(data)
+
+    def areas(self, site: str) -> Areas:
+        """The named areas of a site, in `map` as it is aligned now; none for a site without. UsageError where they need an alignment."""
+        query = "SELECT sha256 FROM site_files WHERE site = ? AND kind IN (?, ?) ORDER BY kind"
+        key = tuple(row["sha256"] for row in self._transactions.query(query, (site, AREAS, ALIGNMENT)))
+        known = self._areas.get(site)
+        if known is None or known[0] != key:
+            data, alignment = self.site_file(site, AREAS), self.alignment(site)
+            frame = None if alignment is None else alignment.frame
+            known = self._areas[site] = (key, Areas() if data is None else read_areas(data, frame))
+        return known[1]
 
     def verdicts(self, site: str, version: int) -> list[VerdictRow]:
         """What the gate said about a version, oldest first; raises UsageError where it does not exist."""

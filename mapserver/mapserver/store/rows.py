@@ -143,13 +143,16 @@ class DraftContent:
     job: int | None = None
 
 
-AXES = ("site", "robot", "version", "tile", "cause", "arm")
+AXES = ("site", "robot", "version", "tile", "area", "cause", "arm")
 """What the sums are kept by, each for itself: never robot and tile together, so that they stay small."""
 
 
 @dataclass(frozen=True, slots=True)
 class FailureRow:
-    """One failure. happened_ns: when it began, by the server's clock; tile: "x,y"; kind `suspected`: an estimate."""
+    """One failure. happened_ns: when it began, by the server's clock; tile: "x,y"; kind `suspected`: an estimate.
+
+    area: the named area of the position, as the site's areas are now.
+    """
 
     number: int
     site: str
@@ -165,6 +168,12 @@ class FailureRow:
     tile: str | None
     x_map_m: float | None
     y_map_m: float | None
+    area: str | None = None
+
+    @property
+    def where(self) -> str | None:
+        """The area's name, or the tile where no area is."""
+        return self.area or (None if self.tile is None else f"tile {self.tile}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,6 +207,7 @@ class FailureFilter:
     kind: str | None = None
     since_ns: int | None = None
     until_ns: int | None = None
+    area: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,11 @@ import yaml
 
 from fleetmap.mapformat import decode_manifest, encode_manifest
 from fleetmap.mapformat.building import building_frame
+from fleetmap.messages import FailureReport, Placement
 from mapserver import releases
-from mapserver.store import MapStore, Retention
+from mapserver.api.metrics import Metrics
+from mapserver.fleet.fleet import Fleet
+from mapserver.store import FailureFilter, MapStore, Retention
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 # The map's x axis points up in the picture, 0.05 m a pixel, its origin at 10, -20 m.
@@ -24,6 +27,13 @@ def site(tmp_path: Path) -> tuple[str, ...]:
         publish_samples(store, 1)
     cv2.imwrite(str(tmp_path / "plan.png"), np.full((500, 600), 255, np.uint8))
     return ("--site", "lab", "--store", str(tmp_path / "store"))
+
+
+def placed_failure(failure_id: str, x_m: float, y_m: float) -> FailureReport:
+    return FailureReport(
+        site="lab", robot="r1", id=failure_id, stamp_ns=5, wall_ns=6, duration_s=2.5, kind="blind", status="LOST",
+        cause="dark", version=1, map_from_base=Placement(position_m=(x_m, y_m, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0)),
+    )  # fmt: skip
 
 
 def pins(*chosen: str) -> list[str]:
@@ -86,3 +96,62 @@ def test_what_gives_no_alignment_is_refused_and_changes_nothing(run, site, tmp_p
         assert words in run("align", *site, *arguments, status=2)
     assert "has no site" in run("align", "--site", "hall", *site[2:], *pins(*PINS), status=2)
     assert run("align", *site, "--show") == before
+
+
+def aisle(name: str, x0: float, y0: float, x1: float, y1: float) -> dict[str, object]:
+    ring = [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]
+    return {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [ring]}, "properties": {"name": name}}
+
+
+def write_areas(path: Path, frame: str, *features: object) -> Path:
+    path.write_text(json.dumps({"type": "FeatureCollection", "frame": frame, "features": features}))
+    return path
+
+
+def test_failures_and_figures_are_named_by_areas(run, site, tmp_path: Path) -> None:
+    """From the import on, also those of before; and anew when the map is aligned otherwise."""
+    with MapStore.open(tmp_path / "store") as store:
+        fleet = Fleet(store)
+        fleet.take_failure("lab", "r1", placed_failure("f1", 3.0, 4.0))
+    aisles = write_areas(tmp_path / "map.json", "map", aisle("aisle 5", 0, 0, 8, 8), aisle("gate", 20, 0, 24, 8))
+    assert "2 areas (aisle 5, gate)" in run("areas", "import", aisles, *site)
+    with MapStore.open(tmp_path / "store") as store:
+        fleet = Fleet(store)
+        fleet.take_failure("lab", "r1", placed_failure("f2", 21.0, 4.0))
+        fleet.take_failure("lab", "r1", placed_failure("f3", 90.0, 4.0))
+        assert [row.where for row in store.fleet.failures(FailureFilter())] == [None, "gate", "aisle 5"]
+        assert [row.failure_id for row in store.fleet.failures(FailureFilter(area="gate"))] == ["f2"]
+        assert {key: c.failures for (_, key), c in store.fleet.counters("lab", "area").items()} == {
+            "gate": 1,
+            "outside": 1,
+        }
+        text = Metrics(store, fleet).text().decode()
+        assert 'fleetmap_area_failures_total{area="gate",site="lab"} 1.0' in text
+    out = tmp_path / "failures.jsonl"
+    run("fleet", "export", out, "--store", tmp_path / "store")
+    assert [json.loads(line)["area"] for line in out.read_text().splitlines()] == ["aisle 5", "gate", None]
+    run("fleet", "report", tmp_path / "shift.html", *site)
+    assert "gate" in (tmp_path / "shift.html").read_text()
+    run("align", *site, *pins(*PINS))
+    drawn = write_areas(tmp_path / "building.json", "building", aisle("hall", 0, -25, 12, -10))
+    run("areas", "import", drawn, *site)
+    with MapStore.open(tmp_path / "store") as store:
+        assert [row.area for row in store.fleet.failures(FailureFilter())] == [None, None, "hall"]
+    assert "run `mapserver align` first" in run("align", *site, "--forget", status=2)
+    run("align", *site, *pins("a=200,400:50,0", "b=200,0:70,0", "c=0,400:50,10"))  # 50 m along x of the map
+    with MapStore.open(tmp_path / "store") as store:
+        assert [row.area for row in store.fleet.failures(FailureFilter())] == [None, None, None]
+    assert "hall: 180.0 m2" in run("areas", "list", *site)
+    assert json.loads(run("areas", "list", *site, "--json"))["frame"] == "map"
+    run("areas", "remove", *site)
+    assert run("areas", "list", *site) == "0 areas\n"
+
+
+def test_areas_that_are_none_change_nothing(run, site, tmp_path: Path) -> None:
+    run("areas", "import", write_areas(tmp_path / "good.json", "map", aisle("aisle 5", 0, 0, 8, 8)), *site)
+    degrees = write_areas(tmp_path / "wgs84.json", "wgs84", aisle("aisle 5", 13.4, 52.5, 13.5, 52.6))
+    crossed = write_areas(tmp_path / "crossed.json", "map", aisle("a", 0, 0, 1, 1), aisle("a", 0, 0, 1, 1))
+    for file, words in ((degrees, "frame"), (crossed, "twice"), (tmp_path / "none.json", "cannot be read")):
+        assert words in run("areas", "import", file, *site, status=2)
+    assert run("areas", "list", *site) == "aisle 5: 64.0 m2\n1 areas\n"
+    assert "has no site" in run("areas", "list", "--site", "hall", *site[2:], status=2)

@@ -24,6 +24,7 @@ from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.canary_test import CanarySettings
 from mapserver.fleet_statistics.kpis import Counters
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+from mapserver.floor_plan.areas import Areas
 from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore
 from support.fleet.dashboard_scene import LENGTH_M, SITE, build_report, fill_store, hall_tiles
@@ -85,13 +86,13 @@ def test_a_plan_shows_landmarks_where_they_are(store: MapStore) -> None:
 
 def test_the_map_page_names_the_way_that_nobody_drove(store: MapStore) -> None:
     plan = MapData(store, GateSettings(), 0.05).plan(SITE, 2)
-    made = one_way(plan)
+    made = one_way(plan, Areas())
     assert {tuple(found.missing) for found in plan.directions} == {("W",)}
     for found in plan.directions:
-        assert f"<td>{found.tile[0]},{found.tile[1]}</td><td>E</td><td>W</td>" in made
+        assert f"<td>tile {found.tile[0]},{found.tile[1]}</td><td>E</td><td>W</td>" in made
     both = replace(plan, directions=tuple(msgspec.structs.replace(found, missing={}) for found in plan.directions))
-    assert "<td>" not in one_way(both)
-    assert "surveyed in both directions" in one_way(both)
+    assert "<td>" not in one_way(both, Areas())
+    assert "surveyed in both directions" in one_way(both, Areas())
 
 
 def test_a_plan_without_tiles_and_one_without_places(store: MapStore) -> None:

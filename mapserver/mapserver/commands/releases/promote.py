@@ -49,6 +49,7 @@ def publish(
         info = maps.version(where.site, published)
         verdict = maps.verdicts(where.site, published)[-1]
         evidence = maps.evidence(where.site, published)
+        areas, size_m = maps.areas(where.site), maps.manifest(where.site, published).tile_size_m
     directions = () if evidence is None else evidence.directions or ()
     sizes = f"{info.tiles} tiles, {info.landmarks} landmarks, {info.map_bytes} bytes"
     typer.echo(f"site {where.site}: version {published} is current ({sizes})")
@@ -57,7 +58,7 @@ def publish(
     if verdict.report.get("not_judged"):
         typer.echo(f"not judged, evidence missing: {', '.join(verdict.report['not_judged'])}")
     if one_way := one_way_words(directions):
-        typer.echo(one_way)
+        typer.echo(areas.name_tiles(one_way, size_m))
     if alike := lookalike_words(None if evidence is None else evidence.starts):
         typer.echo(alike)
 

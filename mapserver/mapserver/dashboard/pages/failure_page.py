@@ -53,6 +53,7 @@ def install(services: Services) -> None:
                 version=number(query.get("version"), "version"),
                 tile=query.get("tile") or None,
                 cause=query.get("cause") or None,
+                area=query.get("area") or None,
             )
             html(Markup("<h1>Failures of {}</h1>").format(context.site))
             html(_filters(context, wanted, await load(services.health.choices, context.site)))
@@ -86,13 +87,14 @@ def _site_of(services: Services, failure: str, site: str | None) -> str | None:
 
 def _filters(context: PageContext, wanted: FailureFilter, known: FilterChoices) -> Markup:
     return Markup(
-        '<form class="ask" method="get" action="{}"><input type="hidden" name="site" value="{}">{}{}{}{}'
+        '<form class="ask" method="get" action="{}"><input type="hidden" name="site" value="{}">{}{}{}{}{}'
         '<button type="submit">Show</button> <a href="{}">Show all</a></form>'
     ).format(
         f"{context.root}/failures",
         context.site,
         choices("robot", "Robot", known.robots, wanted.robot),
         choices("version", "Map version", known.versions, None if wanted.version is None else str(wanted.version)),
+        choices("area", "Area", known.areas, wanted.area) if known.areas or wanted.area else "",
         choices("tile", "Tile", known.tiles, wanted.tile),
         choices("cause", "Cause", known.causes, wanted.cause),
         context.to("failures"),
@@ -106,7 +108,8 @@ async def _list(services: Services, context: PageContext, wanted: FailureFilter,
     plan = None if version is None else await load(services.maps.plan, context.site, version)
     layer = None
     if plan is not None and version is not None:
-        layer = show_map(context, plan, version, _layer(context, plan, shown))
+        areas = await load(services.maps.areas, context.site)
+        layer = show_map(context, plan, version, _layer(context, plan, shown), areas)
     listed = html(_rows(context, wanted, shown))
 
     async def refresh() -> None:
@@ -150,16 +153,16 @@ def _rows(context: PageContext, wanted: FailureFilter, found: list[FailureRow]) 
             row.cause.replace("_", " "),
             _kind(row),
             row.version,
-            row.tile,
+            row.where,
             f"{row.duration_s:.0f} s",
         )
         for row in shown
     ]
-    head = ("Failure", "When", "Robot", "Cause", "Kind", "Map version", "Tile", "Duration")
+    head = ("Failure", "When", "Robot", "Cause", "Kind", "Map version", "Where", "Duration")
     listed = table(head, rows, empty="No failures match these filters.", name="Failures")
     if len(found) <= FAILURES_SHOWN:
         return listed
-    filters = {name: getattr(wanted, name) for name in ("robot", "version", "tile", "cause")}
+    filters = {name: getattr(wanted, name) for name in ("robot", "version", "tile", "area", "cause")}
     older = context.to("failures", **filters, before=shown[-1].number)
     return Markup("{}<p>{}</p>").format(listed, link(older, "Older failures"))
 
@@ -192,6 +195,7 @@ def _summary(context: PageContext, detail: FailureDetail) -> Markup:
                 ("State of the robot", STATUSES.get(row.status, (row.status,))[0]),
                 ("Robot", same("robot", row.robot)),
                 ("Map version", same("version", row.version)),
+                ("Area", same("area", row.area) or "–"),
                 ("Tile", same("tile", row.tile)),
                 ("Believed uncertainty when it began (95 % radius)", figure(report.radius_95_m, " m")),
                 ("Believed position was wrong by", figure(report.wrong_by_m, " m")),
@@ -222,7 +226,8 @@ async def _position(services: Services, context: PageContext, detail: FailureDet
     if row.x_map_m is not None and row.y_map_m is not None:
         found.append(Mark(row.x_map_m, row.y_map_m, _tone(row), "cross", "believed position"))
     address, marks = context.plan_picture(version), drawing.marks(plan, found)
-    picture = drawing.site_map(plan, f"Position of failure {row.number}", address, marks)
+    outlines = drawing.areas(plan, await load(services.maps.areas, context.site))
+    picture = drawing.site_map(plan, f"Position of failure {row.number}", address, outlines, marks)
     return Markup(
         '<div><h2>Position</h2><div class="planbox">{}</div><p class="quiet">Cross: where the robot believed to be when it began. '
         "Dots: fixes until the report. Map version {}.</p></div>"

@@ -97,7 +97,9 @@ async def _plan(services: Services, context: PageContext, live: LiveSite) -> tup
         html(Markup('<p class="notice">No map is published yet: robots cannot be shown on it.</p>'))
         return None
     plan = await load(services.maps.plan, context.site, version)
-    return plan, show_map(context, plan, version, _robots(plan, context, live))
+    return plan, show_map(
+        context, plan, version, _robots(plan, context, live), await load(services.maps.areas, context.site)
+    )
 
 
 def _robots(plan: Plan, context: PageContext, live: LiveSite) -> Markup:

@@ -13,6 +13,7 @@ from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services
 from mapserver.dashboard.markup import badge, choices, facts, joined, link, moment, share, size, table
 from mapserver.dashboard.pages.confirm import change_button
 from mapserver.dashboard.plan import Plan
+from mapserver.floor_plan.areas import Areas
 from mapserver.quality.directions import missing_words
 from mapserver.releases import Difference
 from mapserver.store import CanaryRow, VersionInfo
@@ -149,9 +150,9 @@ def _versions(context: PageContext, versions: list[VersionInfo], shown: int | No
 
 async def _one_version(maps: MapData, context: PageContext, version: int) -> None:
     quality = await load(maps.quality, context.site, version)
-    plan = await load(maps.plan, context.site, version)
+    plan, areas = await load(maps.plan, context.site, version), await load(maps.areas, context.site)
     name, address = f"Tiles, landmarks and places of version {version}", context.plan_picture(version)
-    picture = drawing.site_map(plan, name, address, below=drawing.coverage(plan))
+    picture = drawing.site_map(plan, name, address, drawing.areas(plan, areas), below=drawing.coverage(plan))
     left = Markup(
         '<div><h2>Coverage of version {}</h2><div class="planbox">{}</div><p class="quiet">Grey: landmarks. Blue dots: places that robots '
         "recognise. Squares: tiles, darker with more landmarks.</p></div>"
@@ -160,13 +161,18 @@ async def _one_version(maps: MapData, context: PageContext, version: int) -> Non
         version, _quality_facts(quality, plan), _verdicts(quality)
     )
     html(Markup('<div class="pair">{}{}</div>').format(left, right))
-    html(one_way(plan))
+    html(one_way(plan, areas))
 
 
-def one_way(plan: Plan) -> Markup:
+def one_way(plan: Plan, areas: Areas) -> Markup:
     """Tiles in which robots coming from the other side will not localize."""
     rows = [
-        (f"{found.tile[0]},{found.tile[1]}", ", ".join(found.seen), ", ".join(found.missing), missing_words(found))
+        (
+            areas.tile_words(found.tile, plan.tile_size_m),
+            ", ".join(found.seen),
+            ", ".join(found.missing),
+            missing_words(found),
+        )
         for found in plan.directions
         if found.missing
     ]

@@ -31,6 +31,7 @@ def html_page(summary: FleetSummary) -> str:
         _by_hour(summary),
         _kpis_table("Robots, the worst first", "Robot", summary.robots),
         _kpis_table("Map versions", "Version", summary.versions),
+        _kpis_table("Areas, the worst first", "Area", summary.areas),
         _causes(summary),
         fleet_parts.resurvey(summary.resurvey.tiles),
         _failures(summary),
@@ -122,12 +123,12 @@ def _failures(summary: FleetSummary) -> Markup:
             row.kind.replace("_", " "),
             row.cause.replace("_", " "),
             row.version,
-            row.tile,
+            row.where,
             f"{row.duration_s:.1f} s",
         )
         for row in summary.failures
     ]
-    head = ("When", "Robot", "Kind", "Cause", "Map version", "Tile", "Duration")
+    head = ("When", "Robot", "Kind", "Cause", "Map version", "Where", "Duration")
     shown = table(head, rows, empty="No failures were reported.", name="Last failures")
     return Markup("<h2>Last failures</h2>{}").format(shown)
 

@@ -1,0 +1,266 @@
+"""The areas of a site that people have names for, such as aisles: read from GeoJSON, asked by position or by tile. Pure.
+
+GeoJSON (RFC 7946) means degrees of WGS 84. Here coordinates are metres, and a member of its own says in which frame.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import UsageError
+from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.mapformat.building import BuildingFrame
+
+AREAS = "areas"
+"""Kind of a site's file in the store."""
+OUTSIDE = "outside"
+"""Key of what no area and no tile holds."""
+
+MAX_AREAS_BYTES = 8 << 20
+_MAX_AREAS, _MAX_CORNERS, _MAX_RING = 2000, 50_000, 2000
+_MAX_NAME = 64
+_MAX_M = 1e6
+_SAMPLES = 16  # a tile's area is known by as many points each way
+_LEAST_SHARE = 0.1  # of a tile, for an area to give it its name
+_NAMED = 3
+_TILE = re.compile(r"\btile (-?\d{1,10}),(-?\d{1,10})\b", re.ASCII)
+
+
+class _Polygon(msgspec.Struct, tag_field="type", tag="Polygon"):
+    coordinates: list[list[list[float]]]
+
+
+class _MultiPolygon(msgspec.Struct, tag_field="type", tag="MultiPolygon"):
+    coordinates: list[list[list[list[float]]]]
+
+
+class _Properties(msgspec.Struct):
+    name: str
+
+
+class _Feature(msgspec.Struct):
+    type: Literal["Feature"]
+    geometry: _Polygon | _MultiPolygon
+    properties: _Properties
+
+
+class _Collection(msgspec.Struct):
+    type: Literal["FeatureCollection"]
+    features: list[_Feature]
+    frame: Literal["map", "building"] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """rings: (V, 2) corners in `map`, metres, not repeated at the end; a place is inside by the even-odd rule over all rings."""
+
+    name: str
+    rings: tuple[Array, ...]
+
+    @property
+    def size_m2(self) -> float:
+        """Sum over the outlines; holes are small beside them."""
+        return max(abs(_doubled_area(ring)) for ring in self.rings) / 2
+
+    def holds(self, points_m: Array) -> NDArray[np.bool_]:
+        """(N,) of points (N, 2)."""
+        inside = np.zeros(len(points_m), bool)
+        x, y = points_m[:, :1], points_m[:, 1:]
+        for ring in self.rings:
+            (x0, y0), (x1, y1) = ring.T, np.roll(ring, -1, axis=0).T
+            crosses = (y0 > y) != (y1 > y)
+            left = x < x0 + (y - y0) / np.where(y1 == y0, 1.0, y1 - y0) * (x1 - x0)
+            inside ^= (np.count_nonzero(crosses & left, axis=1) % 2).astype(bool)
+        return inside
+
+
+@dataclass(frozen=True, slots=True)
+class Areas:
+    """Areas, the smallest first: of those that hold a place it is the one that people mean."""
+
+    areas: tuple[Area, ...] = ()
+    _boxes_m: Array = field(default_factory=lambda: np.zeros((0, 4)))
+
+    @classmethod
+    def of(cls, areas: Sequence[Area]) -> "Areas":
+        """In order."""
+        ordered = tuple(sorted(areas, key=lambda area: (area.size_m2, area.name)))
+        corners = [np.concatenate(area.rings) for area in ordered]
+        boxes = [(*points.min(axis=0), *points.max(axis=0)) for points in corners]
+        return cls(ordered, np.array(boxes, float).reshape(-1, 4))
+
+    def __bool__(self) -> bool:
+        return bool(self.areas)
+
+    @property
+    def names(self) -> list[str]:
+        """In order of the alphabet."""
+        return sorted(area.name for area in self.areas)
+
+    def at(self, x_m: float, y_m: float) -> str | None:
+        """Name of the area that holds a place in `map`; None outside of all, and for what is no number."""
+        point = np.array([[x_m, y_m]])
+        for area in self._near((x_m, y_m, x_m, y_m)):
+            if area.holds(point)[0]:
+                return area.name
+        return None
+
+    def of_tile(self, tile: tuple[int, int], size_m: float) -> list[str]:
+        """Names of the areas that hold a tenth of a tile or more, those with the larger shares first."""
+        corner = np.array(tile) * size_m
+        steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES * size_m
+        points = corner + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        left, shares = np.ones(len(points), bool), {}
+        for area in self._near((*corner, *(corner + size_m))):
+            mine = left & area.holds(points)
+            left &= ~mine
+            shares[area.name] = float(mine.mean())
+        return sorted((n for n, share in shares.items() if share >= _LEAST_SHARE), key=lambda n: (-shares[n], n))
+
+    def tile_words(self, tile: tuple[int, int], size_m: float) -> str:
+        """A tile as people know it: "aisle 5 (tile 3,-2)"; "tile 3,-2" where no area is."""
+        names, plain = self.of_tile(tile, size_m), f"tile {tile[0]},{tile[1]}"
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        return f"{', '.join(names[:_NAMED])}{more} ({plain})" if names else plain
+
+    def name_tiles(self, text: str, size_m: float) -> str:
+        """A sentence with every "tile 3,-2" in it as `tile_words`."""
+        if not self.areas:
+            return text
+        return _TILE.sub(lambda found: self.tile_words((int(found[1]), int(found[2])), size_m), text)
+
+    def geojson(self, site: str) -> dict[str, Any]:
+        """All areas in `map`; a polygon for each ring, so that holes are listed as such."""
+        features = [
+            {
+                "type": "Feature",
+                "geometry": {"type": "Polygon", "coordinates": [_closed(ring) for ring in area.rings]},
+                "properties": {"name": area.name},
+            }
+            for area in self.areas
+        ]
+        return {"type": "FeatureCollection", "site": site, "frame": "map", "units": "metres", "features": features}
+
+    def _near(self, box_m: tuple[float, ...]) -> list[Area]:
+        """Areas whose boxes meet a box (low x, low y, high x, high y)."""
+        low, high = self._boxes_m[:, :2], self._boxes_m[:, 2:]
+        meets = ((low <= np.array(box_m[2:])) & (high >= np.array(box_m[:2]))).all(axis=1)
+        return [self.areas[n] for n in np.flatnonzero(meets)]
+
+
+def read_areas(data: bytes, building: BuildingFrame | None) -> Areas:
+    """The areas of a file. building: where the map lies in it, for areas that are drawn there.
+
+    Raises UsageError, naming the area, for anything that is not closed, simple, named once and within the limits.
+    """
+    if len(data) > MAX_AREAS_BYTES:
+        raise UsageError(f"areas of more than {MAX_AREAS_BYTES} bytes; draw them with fewer corners")
+    try:
+        collection = msgspec.json.decode(data, type=_Collection)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise UsageError(
+            f"areas: {error}; give a GeoJSON FeatureCollection of polygons with properties.name"
+        ) from error
+    if collection.frame is None:
+        words = 'add "frame": "map" or "frame": "building" beside "features", and write metres'
+        raise UsageError(
+            f"areas: the file does not say where its coordinates are (GeoJSON alone means degrees); {words}"
+        )
+    if collection.frame == "building" and building is None:
+        raise UsageError("areas drawn in the building need the map's place in it; run `mapserver align` first")
+    map_from_building = None
+    if collection.frame == "building" and building is not None:
+        map_from_building = se3_inverse(building.building_from_map)
+    if not 1 <= len(collection.features) <= _MAX_AREAS:
+        raise UsageError(f"areas: {len(collection.features)} features; give 1 to {_MAX_AREAS}")
+    areas: dict[str, Area] = {}
+    corners = 0
+    for feature in collection.features:
+        area = _area(feature, map_from_building)
+        corners += sum(len(ring) for ring in area.rings)
+        if area.name in areas:
+            raise UsageError(
+                f"area {area.name!r} is there twice; give each its own name, or make one MultiPolygon of them"
+            )
+        if corners > _MAX_CORNERS:
+            raise UsageError(f"areas of more than {_MAX_CORNERS} corners; draw them with fewer")
+        areas[area.name] = area
+    return Areas.of(list(areas.values()))
+
+
+def _area(feature: _Feature, map_from_building: Array | None) -> Area:
+    name = feature.properties.name.strip()
+    if not 1 <= len(name) <= _MAX_NAME or not name.isprintable() or name == OUTSIDE:
+        raise UsageError(
+            f"area {name[:80]!r}: a name has 1 to {_MAX_NAME} printable characters, and is not {OUTSIDE!r}"
+        )
+    geometry = feature.geometry
+    polygons = [geometry.coordinates] if isinstance(geometry, _Polygon) else geometry.coordinates
+    rings = [_ring(ring, f"area {name!r}") for polygon in polygons for ring in polygon]
+    if not rings:
+        raise UsageError(f"area {name!r} has no corners; draw it as a polygon")
+    if map_from_building is not None:
+        rings = [transform_points(map_from_building, np.c_[ring, np.zeros(len(ring))])[:, :2] for ring in rings]
+    return Area(name, tuple(rings))
+
+
+def _ring(positions: list[list[float]], where: str) -> Array:
+    """(V, 2) without the repeated end."""
+    if len(positions) < 4 or any(len(position) not in (2, 3) for position in positions):
+        raise UsageError(f"{where}: a ring has 4 or more positions [x, y], the last one as the first")
+    if len(positions) > _MAX_RING:
+        raise UsageError(f"{where}: a ring of {len(positions)} corners, the limit is {_MAX_RING}; draw it with fewer")
+    ring = np.array([position[:2] for position in positions], float)
+    if not (np.abs(ring) <= _MAX_M).all():
+        raise UsageError(f"{where}: a corner further than {_MAX_M:g} m from the origin; write metres")
+    if (ring[0] != ring[-1]).any():
+        raise UsageError(f"{where} is not closed: it begins at {ring[0].tolist()} and ends at {ring[-1].tolist()}")
+    ring = ring[:-1]
+    if (ring == np.roll(ring, 1, axis=0)).all(axis=1).any():
+        raise UsageError(f"{where}: two corners one after the other are the same; remove one")
+    crossing = _crossing(ring)
+    if crossing is not None:
+        raise UsageError(f"{where}: its outline crosses itself near {ring[crossing].tolist()}; draw it anew there")
+    if abs(_doubled_area(ring)) < 2e-4:
+        raise UsageError(f"{where} is a line without any area; give it a width")
+    return ring
+
+
+def _doubled_area(ring: Array) -> float:
+    following = np.roll(ring, -1, axis=0)
+    return float((ring[:, 0] * following[:, 1] - following[:, 0] * ring[:, 1]).sum())
+
+
+def _crossing(ring: Array) -> int | None:
+    """A corner whose edge meets another edge that is not its neighbour, None in a simple ring."""
+    following = np.roll(ring, -1, axis=0)
+
+    def side(start: Array, end: Array, point: Array) -> Array:
+        along, to = end - start, point - start
+        return np.asarray(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
+
+    count = len(ring)
+    for n in range(count - 1):
+        others = np.arange(n + 1, count)
+        a, b = ring[n], following[n]
+        c, d = ring[others], following[others]
+        sides = [np.sign(side(a, b, c)), np.sign(side(a, b, d)), np.sign(side(c, d, a)), np.sign(side(c, d, b))]
+        apart = (sides[0] * sides[1] > 0) | (sides[2] * sides[3] > 0)
+        in_line = np.all([values == 0 for values in sides], axis=0)
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        apart |= in_line & ((np.maximum(c, d) < low) | (np.minimum(c, d) > high)).any(axis=1)
+        # Neighbours share a corner; they meet elsewhere only where one runs back along the other.
+        shares = (others == n + 1) | ((n == 0) & (others == count - 1))
+        runs_back = in_line & (((b - a) * (d - c)).sum(axis=1) < 0)
+        if (np.where(shares, runs_back, ~apart)).any():
+            return n
+    return None
+
+
+def _closed(ring: Array) -> list[list[float]]:
+    return [[round(x, 4), round(y, 4)] for x, y in (*ring.tolist(), ring[0].tolist())]

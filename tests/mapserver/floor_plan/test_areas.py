@@ -1,0 +1,111 @@
+"""Named areas: what is read, what is refused, and which one holds a place or a tile."""
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import UsageError
+from fleetmap.mapformat.building import BuildingFrame
+from mapserver.floor_plan.areas import Areas, read_areas
+
+
+def box(x0: float, y0: float, x1: float, y1: float) -> list[list[float]]:
+    return [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]
+
+
+def feature(name: object, *rings: Sequence[Sequence[float]], kind: str = "Polygon") -> dict[str, object]:
+    coordinates = list(rings) if kind == "Polygon" else [[ring] for ring in rings]
+    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": {"name": name}}
+
+
+def collection(*features: object, frame: str | None = "map") -> bytes:
+    said = {} if frame is None else {"frame": frame}
+    return json.dumps({"type": "FeatureCollection", "features": list(features), **said}).encode()
+
+
+def aisles() -> Areas:
+    hall = feature("hall", box(0, 0, 64, 32), box(40, 10, 50, 20))
+    both = feature("docks", box(-8, 0, -4, 4), box(-8, 20, -4, 24), kind="MultiPolygon")
+    found = [feature(f"aisle {n}", box(2, 4 * n, 30, 4 * n + 3)) for n in range(1, 5)]
+    return read_areas(collection(hall, both, *found), None)
+
+
+def test_the_smallest_area_holds_a_place() -> None:
+    areas = aisles()
+    assert areas.at(10, 5) == "aisle 1"
+    assert areas.at(10, 7.5) == areas.at(60, 30) == "hall"
+    assert areas.at(-5, 22) == areas.at(-5, 2) == "docks"
+    assert areas.at(45, 15) is None  # a hole
+    assert areas.at(-5, 12) is areas.at(1e9, 0) is areas.at(float("nan"), 0) is None
+    assert Areas().at(0, 0) is None
+
+
+def test_a_point_is_inside_exactly_where_winding_says_so() -> None:
+    rng = np.random.default_rng(3)
+    angles = np.sort(rng.uniform(0, 2 * np.pi, 40))
+    star = np.c_[np.cos(angles), np.sin(angles)] * rng.uniform(2, 9, (40, 1))
+    areas = read_areas(collection(feature("star", [*star.tolist(), star[0].tolist()])), None)
+    for x, y in rng.uniform(-10, 10, (300, 2)):
+        turned = np.diff(np.unwrap(np.arctan2(*(np.r_[star, star[:1]] - (x, y)).T[::-1]))).sum()
+        assert (areas.at(x, y) == "star") is bool(abs(turned) > np.pi)
+
+
+def test_tiles_are_named_by_the_areas_that_they_lie_in() -> None:
+    areas = aisles()
+    assert areas.tile_words((0, 0), 16.0) == "hall, aisle 1, aisle 2 and 1 more (tile 0,0)"
+    assert areas.tile_words((3, 1), 16.0) == "hall (tile 3,1)"
+    assert areas.tile_words((9, 9), 16.0) == "tile 9,9"
+    said = areas.name_tiles("2 tiles (tile 3,1: 4 places; tile -9,-9: 2 places)", 16.0)
+    assert said == "2 tiles (hall (tile 3,1): 4 places; tile -9,-9: 2 places)"
+
+
+def test_areas_of_the_building_come_into_the_map() -> None:
+    frame = BuildingFrame(x_m=10.0, y_m=-20.0, yaw_rad=np.pi / 2)
+    areas = read_areas(collection(feature("gate", box(8, -20, 10, -15)), frame="building"), frame)
+    assert areas.at(2.5, 1.0) == "gate"  # five metres up in the building are along x of the map
+    assert areas.at(9.0, -18.0) is None
+    again = read_areas(json.dumps(areas.geojson("hall")).encode(), None)
+    assert again.at(2.5, 1.0) == "gate"
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"{", "give a GeoJSON FeatureCollection"),
+        (b'{"type": "Feature"}', "FeatureCollection"),
+        (b"[" * 100_000, "areas"),
+        (collection(), "0 features"),
+        (collection(feature("a", box(0, 0, 1, 1)), frame=None), "does not say where"),
+        (collection(feature("a", box(0, 0, 1, 1)), frame="EPSG:4326"), "frame"),
+        (collection(feature("a", box(0, 0, 1, 1)), frame="building"), "run `mapserver align` first"),
+        (collection(feature("a", box(0, 0, 1, 1)), feature("a", box(3, 3, 4, 4))), "'a' is there twice"),
+        (collection(feature("a", box(0, 0, 1, 1)[:-1])), "not closed"),
+        (collection(feature("a", box(0, 0, 1, 1)[:2])), "4 or more positions"),
+        (collection(feature("a", [[0, 0], [4, 4], [4, 0], [0, 4], [0, 0]])), "crosses itself"),
+        (collection(feature("a", [[0, 0], [4, 0], [2, 0], [2, 3], [0, 0]])), "crosses itself"),
+        (collection(feature("a", [[0, 0], [0, 0], [4, 0], [0, 4], [0, 0]])), "are the same"),
+        (collection(feature("a", [[0, 0], [4, 0], [8, 1e-5], [4, 1e-5], [0, 0]])), "without any area"),
+        (collection(feature("a", [[0, 0, 0, 0], [4, 0], [4, 4], [0, 0]])), "positions"),
+        (collection(feature("a", [["0", 0], [4, 0], [4, 4], [0, 0]])), "Expected"),
+        (collection(feature("a", box(13.4, 52.5, 2e6, 53))), "write metres"),
+        (collection(feature("a")), "no corners"),
+        (collection(feature("", box(0, 0, 1, 1))), "a name has 1 to 64"),
+        (collection(feature("a\nb", box(0, 0, 1, 1))), "printable"),
+        (collection(feature("outside", box(0, 0, 1, 1))), "is not 'outside'"),
+        (collection(feature(5, box(0, 0, 1, 1))), "Expected `str`"),
+        (
+            collection(
+                {"type": "Feature", "geometry": {"type": "Point", "coordinates": [0, 0]}, "properties": {"name": "a"}}
+            ),
+            "Point",
+        ),
+        (collection(*(feature(f"a{n}", box(0, 0, 1, 1)) for n in range(2001))), "2001 features"),
+        (collection(feature("a", [[n, (n % 2) + (n > 0)] for n in range(2001)] + [[0, 0]])), "the limit is 2000"),
+        (b" " * (9 << 20), "more than"),
+    ],
+)
+def test_what_is_no_area_is_refused(data: bytes, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        read_areas(data, None)
