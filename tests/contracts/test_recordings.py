@@ -11,7 +11,8 @@ from mcap.reader import make_reader
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import RECORDING_FORMATS, Recording, open_recording
 from fleetmap.recordings.mcap.writer import copy_to_mcap
-from support.recordings.bag_samples import write_rosbag2
+from support.recordings.bag_samples import write_rosbag1, write_rosbag2
+from support.recordings.mcap_samples import Message
 from support.recordings.recording_samples import (
     make_sample,
     world_from_cam0,
@@ -31,14 +32,13 @@ def _write_mcap(folder: Path) -> Path:
     return folder / "copy.mcap"
 
 
-def _write_rosbag2(folder: Path) -> Path:
-    """The messages of an MCAP file, and its calibration as /tf_static and CameraInfo have it."""
+def _messages(folder: Path) -> list[Message]:
+    """Those of an MCAP file, its calibration as /tf_static and CameraInfo have it."""
     with _write_mcap(folder).open("rb") as file:
-        messages = [
+        return [
             (channel.topic, (schema.name if schema else "").replace("/msg/", "/"), message.log_time, message.data)
             for schema, channel, message in make_reader(file).iter_messages(log_time_order=False)
         ]
-    return write_rosbag2(folder / "bag", messages)
 
 
 WRITERS: dict[str, Callable[[Path], Path]] = {
@@ -47,7 +47,8 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "kitti": lambda folder: write_kitti(folder, SAMPLE),
     "7scenes": lambda folder: write_seven_scenes(folder, SAMPLE),
     "mcap": _write_mcap,
-    "rosbag2-sqlite": _write_rosbag2,
+    "rosbag2-sqlite": lambda folder: write_rosbag2(folder / "bag", _messages(folder)),
+    "rosbag1": lambda folder: write_rosbag1(folder / "a.bag", _messages(folder)),
 }
 
 

@@ -1,4 +1,4 @@
-"""Recordings of camera robots: EuRoC, TUM-VI, KITTI and 7-Scenes folders, MCAP, and rosbag2 in SQLite.
+"""Recordings of camera robots: EuRoC, TUM-VI, KITTI and 7-Scenes folders, MCAP, rosbag2 in SQLite, ROS 1 bags.
 
 To add a format: a module whose function reads the folder or file into `RecordingParts` and hands them to `finalize`,
 and a line in RECORDING_FORMATS (examples/new_recording_format.py is one).
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings.bags import sqlite
+from fleetmap.recordings.bags import ros1, sqlite
 from fleetmap.recordings.calibration_files import format_calibration, read_calibration
 from fleetmap.recordings.folders import euroc, kitti, seven_scenes, tumvi
 from fleetmap.recordings.images import StoredFrame, StoredImage
@@ -52,8 +52,9 @@ RECORDING_FORMATS = {
     ),
     "mcap": RecordingFormat("an .mcap file, or a folder with one in it", reader.recognises, reader.open_mcap),
     "rosbag2-sqlite": RecordingFormat("a rosbag2 .db3 file, or its folder", sqlite.recognises, sqlite.open_sqlite),
+    "rosbag1": RecordingFormat("a ROS 1 .bag file", ros1.recognises, ros1.open_bag),
 }
-FILE_SUFFIXES = (".mcap", ".db3")  # of recordings that are one file
+FILE_SUFFIXES = (".mcap", ".db3", ".bag")  # of recordings that are one file
 
 
 def open_recording(path: Path | str, options: OpenOptions | None = None) -> Recording:

@@ -3,12 +3,15 @@
 from collections.abc import Iterable
 from pathlib import Path
 
+from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from support.recordings.mcap_samples import Message
 
 _STORE = get_typestore(Stores.ROS2_JAZZY)
+_STORE1 = get_typestore(Stores.ROS1_NOETIC)
+_STORE1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 
 
 def write_rosbag2(
@@ -28,3 +31,21 @@ def write_rosbag2(
                 connections[topic] = writer.add_connection(topic, kind, typestore=_STORE)
             writer.write(connections[topic], stamp_ns, data)
     return folder
+
+
+def write_rosbag1(
+    path: Path, messages: Iterable[Message], compression: Writer1.CompressionFormat | None = None
+) -> Path:
+    """A ROS 1 bag, in chunks of 20 kB."""
+    writer = Writer1(path)
+    writer.chunk_threshold = 20_000
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
+        connections = {}
+        for topic, name, stamp_ns, data in messages:
+            kind = name.replace("/", "/msg/")
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=_STORE1)
+            writer.write(connections[topic], stamp_ns, _STORE.cdr_to_ros1(data, kind))
+    return path

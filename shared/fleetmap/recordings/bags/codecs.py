@@ -1,8 +1,11 @@
 """Messages of one file as values: ROS 2's CDR, ROS 1 by way of it, Foxglove's protobuf."""
 
+import struct
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from functools import cache
+from typing import Any, Protocol
 
+from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.bags.container import Channel
 from fleetmap.recordings.bags.foxglove import FoxgloveCodec
@@ -84,4 +87,48 @@ class RosCodec:
         return ros_messages.decode_prior(self.cdr(channel, data))
 
 
-CODECS: dict[str, Callable[[], Codec]] = {"cdr": RosCodec, "protobuf": FoxgloveCodec}
+class Ros1Codec(RosCodec):
+    """ROS 1 messages, which rosbags turns into CDR."""
+
+    def cdr(self, channel: Channel, data: bytes) -> bytes:
+        """See RosCodec; ValueError where the bytes are no such message."""
+        try:
+            # By ROS 2's definitions: of those that are decoded here the header alone is another, which rosbags knows
+            return bytes(_store("ROS2_JAZZY").ros1_to_cdr(data, type_name(channel).replace("/", "/msg/")))
+        except (struct.error, ArithmeticError, LookupError, MemoryError) as error:
+            raise ValueError(str(error)) from error
+        except Exception as error:
+            # SerdeError cannot be named before rosbags is imported
+            if type(error).__name__ == "SerdeError":
+                raise ValueError(str(error)) from error
+            raise
+
+    def stamp_ns(self, channel: Channel, data: memoryview) -> int:
+        """From the message's header, behind its sequence number."""
+        if len(data) < 12:
+            raise ValueError(f"a message of {len(data)} bytes has no header")
+        seconds, nanoseconds = struct.unpack_from("<II", data, 4)
+        return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+@cache
+def _store(name: str) -> Any:
+    try:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError as error:
+        raise RecordingError(
+            "ROS 1 messages need a library more: pip install '.[bags]' in fleetmap's source folder"
+        ) from error
+    store = get_typestore(Stores[name])
+    if name == "ROS1_NOETIC":  # rosbags ships it without
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    return store
+
+
+@cache
+def ros1_digest(type_name: str) -> str:
+    """The MD5 by which ROS 1 knows the definition of a type that is decoded here, such as sensor_msgs/msg/Imu."""
+    return str(_store("ROS1_NOETIC").generate_msgdef(type_name)[1])
+
+
+CODECS: dict[str, Callable[[], Codec]] = {"cdr": RosCodec, "ros1": Ros1Codec, "protobuf": FoxgloveCodec}

@@ -10,27 +10,12 @@ import zstandard
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from fleetmap.errors import RecordingError, UsageError
-from fleetmap.recordings import OpenOptions, Recording, Topics, named_topics, open_recording
+from fleetmap.recordings import OpenOptions, Topics, named_topics, open_recording
 from support.recordings.bag_samples import write_rosbag2
 from support.recordings.mcap_samples import SAMPLE, foreign_messages
 from support.recordings.realdata import real_data
+from support.recordings.samples_alike import assert_same
 from support.storage.memory_limit import memory_at_most
-
-
-def assert_same(first: Recording, second: Recording) -> None:
-    """The same samples to the bit."""
-    assert first.sensor_set == second.sensor_set
-    np.testing.assert_array_equal(first.frame_stamps_ns, second.frame_stamps_ns)
-    for name in ("stamps_ns", "gyro_radps", "accel_mps2"):
-        np.testing.assert_array_equal(getattr(first.imu, name), getattr(second.imu, name))
-    for index in (3, 0, 1, 1):
-        ours, theirs = first.read_frame(index), second.read_frame(index)
-        np.testing.assert_array_equal(ours.left, theirs.left)
-        assert ours.right is not None
-        np.testing.assert_array_equal(ours.right, theirs.right)
-    for ours_camera, other in zip(first.calibration.cameras, second.calibration.cameras, strict=True):
-        np.testing.assert_array_equal(ours_camera.body_from_cam, other.body_from_cam)
-        np.testing.assert_array_equal(ours_camera.intrinsics_px, other.intrinsics_px)
 
 
 def test_the_same_sensors_give_the_same_samples_through_mcap_and_sqlite(tmp_path: Path) -> None:

@@ -1,0 +1,191 @@
+"""ROS 1 bags of rosbags' writer: the samples of MCAP; cut, locked, packed and lying ones."""
+
+import bz2
+import pickle
+import re
+import struct
+import sys
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Reader, Writer
+
+from fleetmap.errors import RecordingError
+from fleetmap.recordings import open_recording
+from fleetmap.recordings.bags import ros1
+from support.recordings.bag_samples import write_rosbag1
+from support.recordings.mcap_samples import SAMPLE, foreign_messages, write_foreign
+from support.recordings.samples_alike import assert_same
+from support.storage.memory_limit import memory_at_most
+
+
+@pytest.mark.parametrize("compression", [None, *Writer.CompressionFormat])
+def test_the_same_sensors_give_the_same_samples_through_mcap_and_bag(
+    tmp_path: Path, compression: Writer.CompressionFormat | None
+) -> None:
+    bag = write_rosbag1(tmp_path / "a.bag", foreign_messages(), compression)
+    with open_recording(bag) as first, open_recording(write_foreign(tmp_path / "a.mcap", foreign_messages())) as second:
+        assert (first.issues, first.format, first.name) == ((), "rosbag1", "a")
+        assert_same(first, second)
+        np.testing.assert_array_equal(first.read_frame(2).left, SAMPLE.left[2])
+        with pickle.loads(pickle.dumps(first.part(np.array([3, 1])))) as part:
+            np.testing.assert_array_equal(part.read_frame(1).left, SAMPLE.left[1])
+
+
+def test_ros_1_messages_in_mcap(tmp_path: Path) -> None:
+    """As `mcap convert` makes them of a bag."""
+    with (
+        Reader(write_rosbag1(tmp_path / "a.bag", foreign_messages())) as reader,
+        (tmp_path / "a.mcap").open("wb") as file,
+    ):
+        writer = McapWriter(file)
+        writer.start(profile="ros1", library="test")
+        channels = {}
+        for c in reader.connections:
+            schema = writer.register_schema(c.msgtype.replace("/msg/", "/"), "ros1msg", c.msgdef.data.encode())
+            channels[c.id] = writer.register_channel(c.topic, "ros1", schema)
+        for c, stamp_ns, data in reader.messages():
+            writer.add_message(channels[c.id], stamp_ns, bytes(data), stamp_ns)
+        writer.finish()
+    with open_recording(tmp_path / "a.bag") as first, open_recording(tmp_path / "a.mcap") as second:
+        assert_same(first, second)
+
+
+def test_messages_of_one_moment_are_told_apart(tmp_path: Path) -> None:
+    """A recorder that stamps two images alike."""
+    now = int(SAMPLE.stamps_ns[-1])
+    same = [(topic, name, now, data) for topic, name, _, data in foreign_messages()]
+    with open_recording(write_rosbag1(tmp_path / "a.bag", same)) as recording:
+        for index in (2, 0, 3):
+            np.testing.assert_array_equal(recording.read_frame(index).left, SAMPLE.left[index])
+
+
+def spoiled(path: Path, before: bytes, after: bytes) -> Path:
+    data = path.read_bytes()
+    assert data.count(before) >= 1
+    assert len(before) == len(after)
+    path.write_bytes(data.replace(before, after))
+    return path
+
+
+def header(**fields: bytes) -> bytes:
+    rows = [f"{name}=".encode() + value for name, value in fields.items()]
+    content = b"".join(struct.pack("<I", len(row)) + row for row in rows)
+    return struct.pack("<I", len(content)) + content
+
+
+def test_what_cannot_be_read_gets_the_command_that_makes_it_readable(tmp_path: Path) -> None:
+    bag = write_rosbag1(tmp_path / "a.bag", foreign_messages())
+    sound = bag.read_bytes()
+    at = sound.index(b"index_pos=") + len(b"index_pos=")
+    cases = {
+        "open.bag": (sound[:at] + bytes(8) + sound[at + 8 :], "not indexed.*`rosbag reindex .*open.bag`"),
+        "zip.bag": (sound.replace(b"compression=none", b"compression=zipp"), "Compression 'zipp'.*`rosbag decompress"),
+        "old.bag": (sound.replace(b"#ROSBAG V2.0", b"#ROSBAG V1.2"), "version"),
+        "empty.bag": (b"", "empty"),
+        "other.bag": (b"\0" * 5000, "magic"),
+        "cut.bag": (sound[:-500], "damaged: `rosbag reindex"),
+        "half.bag": (sound[: len(sound) // 2], "`rosbag reindex"),
+    }
+    fixed = {"op": b"\x03", "index_pos": bytes(8), "conn_count": bytes(4), "chunk_count": bytes(4)}
+    locked = b"#ROSBAG V2.0\n" + header(**fixed, encryptor=b"rosbag/Aes") + bytes(4)
+    cases["locked.bag"] = (locked, "encryption 'rosbag/Aes'.*`rosbag decrypt")
+    for name, (data, words) in cases.items():
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(RecordingError, match=words) as caught:
+            open_recording(tmp_path / name)
+        assert name in str(caught.value)
+
+
+def test_other_definitions_and_types_are_not_guessed(tmp_path: Path) -> None:
+    bag = write_rosbag1(tmp_path / "a.bag", foreign_messages())
+    digest = ros1.ros1_digest("sensor_msgs/msg/Imu").encode()
+    with open_recording(spoiled(bag, digest, b"0" * 32)) as recording:
+        assert len(recording.imu) == 0
+        assert any("another definition" in i.what and "/imu0" in i.detail for i in recording.issues)
+    other = write_rosbag1(tmp_path / "b.bag", [m for m in foreign_messages() if m[0] == "/imu0"])
+    spoiled(other, b"sensor_msgs/Imu", b"sensor_msgs/Umi")
+    with pytest.raises(RecordingError, match=r"no topic of a known type: /imu0 \(sensor_msgs/msg/Umi\)"):
+        open_recording(other)
+
+
+@pytest.mark.parametrize("kind", ["bz2", "lz4"])
+def test_a_chunk_unpacks_to_no_more_than_its_limit(tmp_path: Path, kind: str) -> None:
+    image = [m for m in foreign_messages() if m[0] == "/cam0/image_raw"][:1]
+    topic, name, stamp_ns, data = image[0]
+    form = Writer.CompressionFormat[kind.upper()]
+    bag = write_rosbag1(tmp_path / "a.bag", [(topic, name, stamp_ns, data)], form)
+    sound = bag.read_bytes()
+    at = sound.index(b"compression=" + kind.encode())
+    size_at = sound.index(b"size=", at) + 5 + 4  # the uncompressed size, then that of the data
+    (size,) = struct.unpack_from("<I", sound, size_at)
+    zeros = bytes(400 << 20)
+    bomb = bz2.compress(zeros, 1) if kind == "bz2" else lz4.frame.compress(zeros)
+    grown = len(bomb) - size
+    data = sound[:size_at] + struct.pack("<I", len(bomb)) + bomb + sound[size_at + 4 + size :]
+    index_at = data.index(b"index_pos=") + 10
+    (index_pos,) = struct.unpack_from("<Q", data, index_at)
+    bag.write_bytes(data[:index_at] + struct.pack("<Q", index_pos + grown) + data[index_at + 8 :])
+    del zeros, data
+    with memory_at_most(300 << 20):
+        with pytest.raises(RecordingError, match=r"unpacks to more than"):
+            open_recording(bag)
+        with pytest.raises((MemoryError, RuntimeError)), Reader(bag) as reader:  # the control
+            list(reader.messages())
+
+
+def test_a_record_of_gigabytes_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "sparse.bag"
+    with path.open("wb") as file:
+        file.write(b"#ROSBAG V2.0\n" + struct.pack("<I", 1 << 31))
+        file.truncate(3 << 30)
+    with memory_at_most(300 << 20), pytest.raises(RecordingError, match="record of 2147483648 bytes"):
+        open_recording(path)
+    with path.open("wb") as file:
+        file.truncate(3 << 30)
+    with memory_at_most(300 << 20), pytest.raises(RecordingError, match="magic"):
+        open_recording(path)
+
+
+def test_an_index_that_counts_a_chunk_again_and_again_is_refused(tmp_path: Path) -> None:
+    few = [m for m in foreign_messages() if m[0] == "/imu0"][:30]
+    bag = write_rosbag1(tmp_path / "a.bag", few)
+    data = bag.read_bytes()
+    (count,) = struct.unpack_from("<I", data, data.index(b"chunk_count=") + 12)
+    infos = [m.start() for m in re.finditer(rb"chunk_pos=", data)]
+    first = data[data.rindex(b"\x04\x00\x00\x00op=\x06", 0, infos[0]) - 4 :] if count == 1 else None
+    assert first is not None, "one chunk, whose place in the index is the rest of the file"
+    at = data.index(b"chunk_count=") + 12
+    bag.write_bytes(data[:at] + struct.pack("<I", 400) + data[at + 4 :] + 399 * first)
+    with pytest.raises(RecordingError, match="index is larger than the file"):
+        open_recording(bag)
+
+
+def test_flipped_bytes_never_end_in_an_error_of_the_library(tmp_path: Path) -> None:
+    sound, rng = write_rosbag1(tmp_path / "a.bag", foreign_messages()).read_bytes(), np.random.default_rng(5)
+    (index_at,) = struct.unpack_from("<Q", sound, sound.index(b"index_pos=") + 10)
+    for number in range(90):
+        data = bytearray(sound)
+        low, high = [(13, 90), (4096, index_at), (index_at, len(data))][number % 3]
+        for at in rng.integers(low, high, 1 + number % 7):
+            data[at] = rng.integers(256)
+        path = tmp_path / "flipped.bag"
+        path.write_bytes(data)
+        try:
+            with open_recording(path) as recording:
+                for index in range(len(recording)):
+                    recording.read_frame(index)
+        except RecordingError:
+            pass
+
+
+def test_without_the_library_the_message_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag = write_rosbag1(tmp_path / "a.bag", foreign_messages())
+    ros1._bounded_reader.cache_clear()
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
+    with pytest.raises(RecordingError, match=r"pip install .\.\[bags\]"):
+        open_recording(bag)
+    ros1._bounded_reader.cache_clear()
