@@ -23,6 +23,7 @@ from mapserver.commands.releases.signer import signer
 from mapserver.commands.serve import serve
 from mapserver.commands.site.align import align
 from mapserver.commands.site.areas import AREAS_GROUP
+from mapserver.commands.site.grid import GRID
 from mapserver.commands.store.audit import audit
 from mapserver.commands.store.export import export, import_
 from mapserver.commands.store.gc import gc
@@ -59,6 +60,7 @@ COMMANDS: Commands = {
     "areas": AREAS_GROUP,
     "fleet": FLEET,
     "robots": ROBOTS,
+    "grid": GRID,
     "operators": OPERATORS,
     "audit": audit,
     "prepare": prepare,

@@ -27,7 +27,7 @@ TIERS = {
         "ingest": "trace_every_s trace_days tally_days failure_days picture_bytes",
         "canary": "share margin_ratio margin_per_robot_day min_robot_days max_days",
         "resurvey": "recent_days before_days min_failures rising_ratio fading",
-        "survey": "seed",
+        "survey": "seed occupancy_grid",
         "survey.orb": "extractor count",
         "survey.stereo": "min_depth_m depth_sigma_px",
         "survey.keyframes": "policy every_nth min_overlap max_rotation_deg max_parallax max_interval_s",

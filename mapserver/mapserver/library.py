@@ -27,8 +27,8 @@ from mapserver.build.build import (
     Draft,
     build_draft,
     picture_png,
-    write_file,
 )
+from mapserver.build.report import write_file
 from mapserver.build.sensor_subset import sensor_set_of
 from mapserver.config import survey_settings
 from mapserver.quality.gate import GateSettings

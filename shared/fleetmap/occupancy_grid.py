@@ -68,9 +68,17 @@ def read_grid(path: Path) -> OccupancyGrid:
 
 
 def write_grid(path: Path, grid: OccupancyGrid) -> None:
-    """Writes a map_server YAML file and its image beside it, NAME.yaml and NAME.pgm, which `read_grid` reads as the same cells.
+    """Writes NAME.yaml and NAME.pgm beside it, as of `map_server_files`. Raises StoreError where the disk refuses."""
+    text, image = map_server_files(grid, path.with_suffix(".pgm").name)
+    with disk_errors(f"{path} cannot be written", "check the folder, its space and rights", StoreError):
+        path.with_suffix(".pgm").write_bytes(image)
+        path.write_bytes(text)
 
-    Mode trinary where cells are free, occupied or unknown, else raw. Raises StoreError where the disk refuses.
+
+def map_server_files(grid: OccupancyGrid, image_name: str) -> tuple[bytes, bytes]:
+    """A map_server YAML file and its PGM image, which `read_grid` reads as the same cells.
+
+    Mode trinary where cells are free, occupied or unknown, else raw.
     """
     values, trinary = grid.cells[::-1], bool(np.isin(grid.cells, list(_SHADES)).all())
     shades = np.where(values < 0, 255, values).astype(np.uint8)
@@ -79,7 +87,7 @@ def write_grid(path: Path, grid: OccupancyGrid) -> None:
     height, width = shades.shape
     x, y, _ = (float(v) for v in grid.map_from_grid[:3, 3])
     entries = {
-        "image": path.with_suffix(".pgm").name,
+        "image": image_name,
         "mode": "trinary" if trinary else "raw",
         "resolution": grid.resolution_m,
         "origin": [x, y, float(so3_log(grid.map_from_grid[:3, :3])[2])],
@@ -87,9 +95,7 @@ def write_grid(path: Path, grid: OccupancyGrid) -> None:
         "occupied_thresh": _OCCUPIED_THRESH,
         "free_thresh": _FREE_THRESH,
     }
-    with disk_errors(f"{path} cannot be written", "check the folder, its space and rights", StoreError):
-        path.with_suffix(".pgm").write_bytes(b"P5\n%d %d\n255\n" % (width, height) + shades.tobytes())
-        path.write_text(yaml.safe_dump(entries, sort_keys=False), "utf-8")
+    return yaml.safe_dump(entries, sort_keys=False).encode(), b"P5\n%d %d\n255\n" % (width, height) + shades.tobytes()
 
 
 def _entries(path: Path, text: bytes) -> dict[str, Any]:

@@ -2,11 +2,11 @@
 
     offset  type   content
     0       4 s    magic FMEX
-    4       u16    format number, 1
+    4       u16    format number: 2 with a grid, else 1
     6       u16    0
     8       u32    size of the head
     12      ...    head, JSON: site, version, and of every blob its kind, SHA-256 and size
-    ...     ...    the blobs' bytes in that order: manifest, vocabulary, tiles, archive (if it is taken along)
+    ...     ...    the blobs' bytes in that order: manifest, vocabulary, tiles, grid and archive (if they are taken along)
     end-32  32 s   SHA-256 of everything before
 
 Little-endian. The file names no paths: where bytes go follows from their SHA-256. Reading holds one map blob at a time in
@@ -29,8 +29,16 @@ from fleetmap.mapformat import Manifest, check_name, decode_manifest, decode_til
 from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Name, Positive, Sha256
 
 EXPORT_MAGIC = b"FMEX"
-EXPORT_FORMAT = 1
-MAX_BLOB_BYTES = {"manifest": MAX_MANIFEST_BYTES, "vocabulary": 256 << 20, "tile": 64 << 20, "archive": 1 << 33}
+EXPORT_FORMAT = 2
+BlobKind = Literal["manifest", "vocabulary", "tile", "grid", "archive"]
+MAX_BLOB_BYTES: dict[BlobKind, int] = {
+    "manifest": MAX_MANIFEST_BYTES,
+    "vocabulary": 256 << 20,
+    "tile": 64 << 20,
+    "grid": 64 << 20,
+    "archive": 1 << 33,
+}
+_UNNAMED = {"manifest", "archive", "grid"}
 DIGEST_BYTES = 32
 _START = struct.Struct("<4sHHI")
 _MAX_HEAD_BYTES = 64 << 20
@@ -40,7 +48,7 @@ _CHUNK_BYTES = 1 << 20
 class ExportBlob(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One blob in the file."""
 
-    kind: Literal["manifest", "vocabulary", "tile", "archive"]
+    kind: BlobKind
     sha256: Sha256
     bytes: Positive
 
@@ -59,7 +67,8 @@ class ExportHead(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     def start(self) -> bytes:
         """The bytes of the file before the first blob."""
         text = msgspec.json.encode(self, order="deterministic")
-        return _START.pack(EXPORT_MAGIC, EXPORT_FORMAT, 0, len(text)) + text
+        number = 2 if any(blob.kind == "grid" for blob in self.blobs) else 1
+        return _START.pack(EXPORT_MAGIC, number, 0, len(text)) + text
 
     def file_bytes(self) -> int:
         """The size of the whole file."""
@@ -90,7 +99,7 @@ class ExportReader:
         manifest = decode_manifest(self.data(0))
         named = {("vocabulary", manifest.vocabulary.sha256, manifest.vocabulary.bytes)}
         named |= {("tile", tile.sha256, tile.bytes) for tile in manifest.tiles}
-        held = [(b.kind, b.sha256, b.bytes) for b in self.head.blobs if b.kind not in {"manifest", "archive"}]
+        held = [(b.kind, b.sha256, b.bytes) for b in self.head.blobs if b.kind not in _UNNAMED]
         if (manifest.site, manifest.version) != (self.head.site, self.head.version) or blob.kind != "manifest":
             raise self._damaged("its manifest is that of another version")
         if len(held) != len(named) or set(held) != named:

@@ -9,6 +9,7 @@ from pathlib import Path
 GOLDEN = Path(__file__).resolve().parent
 sys.path[:0] = [str(GOLDEN.parent), *(str(GOLDEN.parents[1] / part) for part in ("shared", "mapserver", "locclient"))]
 
+import msgspec  # noqa: E402
 import numpy as np  # noqa: E402
 
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_tile, encode_tile  # noqa: E402
@@ -16,6 +17,8 @@ from fleetmap.messages import FailureReport, Thumbnail  # noqa: E402
 from fleetmap.version_file import EXPORT_FORMAT  # noqa: E402
 from mapserver import releases  # noqa: E402
 from mapserver.fleet.fleet import Fleet  # noqa: E402
+from mapserver.grid.grid_codec import encode_grid, grid_report  # noqa: E402
+from mapserver.grid.site_grid import TILE_CELLS  # noqa: E402
 from mapserver.quality.figures import Compared, Evidence, ProbeFigures, TrajectoryBreaks  # noqa: E402
 from mapserver.store import DraftContent, MapStore  # noqa: E402
 from mapserver.store.archive import ARCHIVE_FORMAT, encode_archive  # noqa: E402
@@ -32,9 +35,10 @@ def write_store(folder: Path) -> None:
         for seed in (1, 2, 3):
             rng = np.random.default_rng(seed)
             tiles = [random_tile(rng, landmarks=8, places=1, cell=(x, 0)) for x in range(2)]
-            details = draft_details(path_m=12.5)
+            grid = encode_grid({(0, 0): np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8)})
+            details = draft_details(path_m=12.5, grid=msgspec.to_builtins(grid_report(grid, {})))
             store.save_draft(
-                "lab", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive %d" % seed,
+                "lab", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive %d" % seed, grid=grid,
                 evidence=EVIDENCE if seed == 3 else None),
             )  # fmt: skip
             if seed < 3:

@@ -8,8 +8,13 @@ from fastapi import FastAPI, Request, Response
 from starlette.responses import StreamingResponse
 
 from fleetmap.errors import StateError
+from fleetmap.mapformat import sha256_hex
+from fleetmap.occupancy_grid import map_server_files
 from fleetmap.version_file import ExportHead
-from mapserver.api.parameters import Site, Version
+from mapserver.api.bytes_response import bytes_response
+from mapserver.api.parameters import RobotHeight, Site, Version
+from mapserver.grid.grid_codec import grid_of
+from mapserver.grid.site_grid import occupancy
 from mapserver.store import MapStore
 
 _DIGESTS_KEPT = 256
@@ -50,6 +55,22 @@ def install_file_routes(app: FastAPI, store: MapStore) -> None:
             return Response(headers=headers, media_type="application/octet-stream")
         chunks = store.version_file(site, version)[1]()
         return StreamingResponse(chunks, headers=headers, media_type="application/octet-stream")
+
+    def grid_file(request: Request, version: tuple[str, int], height_m: float, which: int) -> Response:
+        grid = occupancy(grid_of(store.manifest(*version), store.blob), height_m)
+        data = map_server_files(grid, "grid.pgm")[which]
+        kind = ("application/yaml", "image/x-portable-graymap")[which]
+        return bytes_response(request, data, sha256_hex(data), kind, immutable=True)
+
+    @app.get("/v1/sites/{site}/versions/{version}/grid.yaml", response_class=Response)
+    def grid_yaml(request: Request, site: Site, version: Version, robot_height_m: RobotHeight = 1.1) -> Response:
+        """The grid of planners as nav2's map_server reads it, for robots up to this height; its image is `grid.pgm`."""
+        return grid_file(request, (site, version), robot_height_m, 0)
+
+    @app.get("/v1/sites/{site}/versions/{version}/grid.pgm", response_class=Response)
+    def grid_pgm(request: Request, site: Site, version: Version, robot_height_m: RobotHeight = 1.1) -> Response:
+        """The image of `grid.yaml`."""
+        return grid_file(request, (site, version), robot_height_m, 1)
 
     @app.get("/v1/sites/{site}/versions/{version}/vda5050")
     def vda5050(request: Request, site: Site, version: Version) -> dict[str, str]:

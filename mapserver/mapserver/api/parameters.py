@@ -7,6 +7,8 @@ from fastapi import Path, Query
 from pydantic import BaseModel
 
 from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
+from mapserver.grid.grid_kernels import FLOOR_M
+from mapserver.grid.site_grid import TOP_M
 from mapserver.store import FailureFilter
 
 Item = TypeVar("Item")
@@ -14,6 +16,9 @@ Item = TypeVar("Item")
 Site = Annotated[str, Path(pattern=NAME_PATTERN, examples=["hall"])]
 SiteFilter = Annotated[str | None, Query(pattern=NAME_PATTERN, description="of this site alone", examples=["hall"])]
 Version = Annotated[int, Path(ge=1, le=1 << 31, examples=[3])]
+RobotHeight = Annotated[
+    float, Query(gt=FLOOR_M, le=TOP_M, description="metres; what hangs higher is no obstacle", examples=[1.1])
+]
 Sha256 = Annotated[str, Path(pattern=SHA256_PATTERN, examples=["5e" * 32])]
 Number = Annotated[int, Path(ge=1, le=1 << 62, examples=[12])]
 PictureNumber = Annotated[int, Path(ge=0, le=100, examples=[1])]

@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from fleetmap.bow import encode_vocabulary
 from fleetmap.config import to_dict
-from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError, disk_errors
+from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError
 from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.recordings import OpenOptions, Topics
 from fleetmap.recordings.tum import write_tum
@@ -35,6 +33,7 @@ from mapserver.build.report import (
     make_report,
     report_details,
     sentence,
+    write_file,
 )
 from mapserver.build.survey_recordings import (
     Admission,
@@ -52,6 +51,9 @@ from mapserver.build.survey_recordings import (
 from mapserver.build.vocabulary_selection import ChosenVocabulary, choose_vocabulary, judged
 from mapserver.build.worker import open_executor
 from mapserver.build.zones_file import read_zones
+from mapserver.grid.grid_codec import GridReport, encode_grid, grid_report
+from mapserver.grid.site_grid import Tiles
+from mapserver.grid.survey_grid import GridSession, grow_grid
 from mapserver.quality.figures import Evidence, merged
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
@@ -59,7 +61,6 @@ from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.loops.zones import Zones
-from mapserver.survey.merge.initial_history import history_of
 from mapserver.survey.merge.multi_session import Joined, Session, join_sessions
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
@@ -279,9 +280,11 @@ def _say_left_out(run: _Run, surveyed: list[Surveyed], joined: Joined) -> None:
 def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Draft:
     """Cuts the map into tiles, measures them, stores the draft and writes the files that were asked for."""
     site, survey_map, camera = run.request.site, built.joined.map, built.joined.map.camera
-    wanted = _wanted_ids(parent, survey_map)
+    wanted = None if parent is None else parent.wanted_ids(survey_map)
     for_robots = choose_landmarks(survey_map, run.settings.budget, TILE_SIZE_M, wanted)
     tiles = tiles_from_survey(survey_map, chosen=for_robots)
+    run.times.begin("grid")
+    grid, grid_said = _grid(run, built, {} if parent is None else parent.grid)
     run.times.begin("examining")
     evidence = _evidence(run, built, tiles, parent)
     run.times.begin("storing")
@@ -293,6 +296,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
     )
     report = make_report(built.surveyed, built.joined, built.accuracy, cost, evidence)
+    report = msgspec.structs.replace(report, grid=grid_said)
     details = DraftDetails(
         created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
         tile_size_m=TILE_SIZE_M,
@@ -305,7 +309,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     )
     job = run.request.options.job
     content = DraftContent(
-        tiles=tiles, vocabulary=vocabulary, details=details, archive=archive, evidence=evidence, job=job
+        tiles=tiles, vocabulary=vocabulary, details=details, archive=archive, grid=grid, evidence=evidence, job=job
     )
     version = record_built(maps.save(site, content, actor=run.request.options.actor), run.request.options.keys)
     report = msgspec.structs.replace(report, map_bytes=maps.version(site, version).map_bytes)
@@ -321,6 +325,17 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     return draft
 
 
+def _grid(run: _Run, built: Built, before: Tiles) -> tuple[list[bytes], GridReport | None]:
+    """The grid of the version before, with what the recordings saw if that is wanted; its bytes, and words about it."""
+    sessions = []
+    if run.settings.occupancy_grid:
+        places = [trajectory.frame_from_body for trajectory in map_trajectories(built.joined)]
+        sessions = [GridSession(s.entry.name, s.survey, p) for s, p in zip(built.taken, places, strict=True)]
+    tiles, without = grow_grid(before, sessions, run.settings.stereo)
+    blobs = encode_grid(tiles)
+    return blobs, grid_report(blobs, without) if blobs or without else None
+
+
 def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None) -> Evidence:
     options, camera = run.request.options, built.joined.map.camera
     replayed = []
@@ -332,17 +347,6 @@ def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None)
     evidence = examine_draft(tiles, camera, built.vocabulary.vocabulary, before, sessions, replayed)
     known = [] if before is None else before.calibrations
     return msgspec.structs.replace(evidence, calibrations=merged([*known, *(s.evidence() for s in built.taken)]))
-
-
-def _wanted_ids(parent: Before | None, survey_map: SurveyMap) -> NDArray[np.uint32] | None:
-    """Landmarks that come before others in the budget: those that robots have, and those that the map has just gained.
-
-    The new ones compete with the published ones; what else the archive knows would only take the place of its like.
-    """
-    if parent is None:
-        return None
-    new = survey_map.landmark_ids[survey_map.landmark_ids >= history_of(parent.survey).next_landmark_id]
-    return np.unique(np.concatenate([new, *(tile.landmark_ids for tile in parent.tiles)])).astype(np.uint32)
 
 
 def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
@@ -389,9 +393,3 @@ def _write_files(run: _Run, built: Built, draft: Draft) -> None:
         full["vocabulary"] = {"source": built.vocabulary.source, "sha256": built.vocabulary.sha256()}
         full["vocabulary"]["trial"] = msgspec.to_builtins(built.vocabulary.trial)
         write_file(options.report, msgspec.json.format(msgspec.json.encode(full), indent=2) + b"\n")
-
-
-def write_file(path: Path, data: bytes) -> None:
-    """Writes a result of a build; StoreError where the disk refuses."""
-    with disk_errors(f"{path} cannot be written", "the draft is stored all the same"):
-        path.write_bytes(data)

@@ -1,7 +1,7 @@
 """Evidence about a draft: frames read from recordings, relocalized in the tiles as robots get them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,11 +20,14 @@ from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver.build.sensor_subset import reduced
+from mapserver.grid.grid_codec import known_grid
+from mapserver.grid.site_grid import Tiles as Grid
 from mapserver.quality.directions import tile_directions
 from mapserver.quality.evidence import Probes, examine, trajectory_breaks
 from mapserver.quality.figures import Evidence, RigEvidence, TrajectoryBreaks
 from mapserver.quality.probes import Probe, held_out_frames, probe_features, probes_of_map, spread
 from mapserver.store import MapStore
+from mapserver.survey.merge.initial_history import history_of
 from mapserver.survey.pipeline import Survey
 from mapserver.survey.survey_map import SurveyMap
 
@@ -78,12 +81,13 @@ def _read(
 
 @dataclass(frozen=True, slots=True)
 class Before:
-    """The version that a draft is built on: its manifest, its survey, its tiles, and the calibrations judged up to it."""
+    """The version that a draft is built on: its manifest, survey, tiles and grid, and the calibrations judged up to it."""
 
     manifest: Manifest
     survey: SurveyMap
     tiles: list[Tile]
     calibrations: list[RigEvidence]
+    grid: Grid = field(default_factory=dict)
 
     @classmethod
     def of(cls, maps: MapStore, manifest: Manifest, survey: SurveyMap) -> "Before":
@@ -91,7 +95,16 @@ class Before:
         evidence = maps.evidence(manifest.site, manifest.version)
         known = () if evidence is None else evidence.calibrations or ()
         judged = [RigEvidence(rig.rig, rig.judged) for rig in known if rig.judged]
-        return cls(manifest, survey, [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles], judged)
+        tiles = [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles]
+        return cls(manifest, survey, tiles, judged, known_grid(manifest, maps.blob))
+
+    def wanted_ids(self, survey_map: SurveyMap) -> NDArray[np.uint32]:
+        """Landmarks that come before others in the budget: those that robots have, and those that the map has just gained.
+
+        The new ones compete with the published ones; what else the archive knows would only take the place of its like.
+        """
+        new = survey_map.landmark_ids[survey_map.landmark_ids >= history_of(self.survey).next_landmark_id]
+        return np.unique(np.concatenate([new, *(tile.landmark_ids for tile in self.tiles)])).astype(np.uint32)
 
     def trajectory_of(self, entry: RecordingEntry) -> tuple[Array, NDArray[np.bool_]] | None:
         """(F, 4, 4) map_from_body of a recording's frames when this version was made of it, and which (F,) may be offered.

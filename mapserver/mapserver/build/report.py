@@ -3,15 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib import metadata
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 
-from fleetmap.errors import RecordingError
+from fleetmap.errors import RecordingError, disk_errors
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Trajectory
 from mapserver.evaluation.trajectory_error import AteResult, absolute_trajectory_error, paired
+from mapserver.grid.grid_codec import GridReport
 from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence, Starts, TileDirections
 from mapserver.quality.probes import lookalike_words
@@ -42,7 +44,8 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     calibration, by recording and parameter, in radians, seconds, pixels or shares. culled: what the surveys did not
     hand on. sessions: what became of every recording, and of the map's landmarks by it. joins: the verdict on each that is in the map.
     directions: which way the places of each tile look, and which way none does. starts: robots that start without a prior where nothing
-    is mapped; lookalike_recall: of these, what a start must exceed to be believed, None where nothing could tell.
+    is mapped; lookalike_recall: of these, what a start must exceed to be believed, None where nothing could tell. grid: that of planners,
+    None without one.
     """
 
     recordings: list[str]
@@ -69,6 +72,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     directions: list[TileDirections]
     starts: Starts | None = None
     lookalike_recall: float | None = None
+    grid: GridReport | None = None
 
 
 class Accuracy(msgspec.Struct, frozen=True):
@@ -267,3 +271,9 @@ def library_versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:  # a source tree that is not installed, or a library by another name
             versions[name] = "not installed as a package"
     return versions
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Writes a result of a build; StoreError where the disk refuses."""
+    with disk_errors(f"{path} cannot be written", "the draft is stored all the same"):
+        path.write_bytes(data)

@@ -10,7 +10,7 @@ from fleetmap.cli_options import TopicNames
 from fleetmap.errors import UsageError
 
 if TYPE_CHECKING:
-    from mapserver.store import Actor
+    from mapserver.store import Actor, MapStore
 
 
 SiteName = Annotated[str, typer.Option(help="Name of the site.")]
@@ -89,6 +89,16 @@ class SurveyOptions(SiteOptions):
 
         check_output("--report", self.report)
         check_name(self.site, "site")
+
+
+def version_named(maps: "MapStore", site: str, version: int | None) -> int:
+    """The version that is asked for, the current one for None; UsageError for a site without one."""
+    if version is not None:
+        return version
+    current = maps.current(site)
+    if current is None:
+        raise UsageError(f"site {site} has no current version; name one with --version")
+    return current.version
 
 
 def check_output(option: str, path: Path | None) -> None:

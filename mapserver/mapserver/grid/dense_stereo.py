@@ -12,7 +12,7 @@ from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 
 DENSE_SIGMA_PX = 0.3  # of a disparity of the matcher on textured surfaces
 _NEAREST_M, _BLOCK_PX, _FRACTIONS = 0.6, 5, 16
-_MIN_TEXTURE, _TEXTURE_PX = 3.0, 9  # mean horizontal gradient in grey levels, of a square around the pixel
+_MIN_TEXTURE, _TEXTURE_PX = 1.5, 9  # mean horizontal gradient in grey levels, of a square around the pixel
 _FLOOR_REACH_M, _FLOOR_BIN_M, _MIN_FLOOR_POINTS = 4.0, 0.02, 400
 _FLOOR_APART_M, _FLOOR_SHARE = 0.05, 0.6
 

@@ -1,6 +1,6 @@
 """The grid of a site: what surveys saw of each cell, tile by tile, and what it is for a robot of some height."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -142,7 +142,6 @@ def _whole(parts: Mapping[tuple[int, int], NDArray[np.int8]], empty: int, *, is_
     return OccupancyGrid(cells, CELL_M, se3(np.eye(3), np.array([*corner, 0.0])))
 
 
-def area_m2(grid: OccupancyGrid) -> Iterator[float]:
-    """Square metres that are occupied, then those that are free."""
-    for state in (OCCUPIED, FREE):
-        yield float((grid.cells == state).sum()) * grid.resolution_m**2
+def area_m2(grid: OccupancyGrid, state: int) -> float:
+    """Square metres of the cells in this state."""
+    return float((grid.cells == state).sum()) * grid.resolution_m**2

@@ -1,26 +1,27 @@
 """One version as one file, to carry it to another store or to a robot; fleetmap.version_file describes and reads it."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from fleetmap.errors import MapFormatError, disk_errors
 from fleetmap.mapformat import Manifest
-from fleetmap.version_file import ExportBlob, ExportHead
+from fleetmap.version_file import BlobKind, ExportBlob, ExportHead
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.files import write_atomically
 from mapserver.store.rows import VersionInfo
 
 
-def export_head(info: VersionInfo, manifest: Manifest, blobs: BlobFolder, *, archive: bool) -> ExportHead:
-    """What the file of a version holds; StoreError where the store lacks its archive."""
+def export_head(
+    info: VersionInfo, manifest: Manifest, blobs: BlobFolder, kept: Sequence[tuple[BlobKind, str]]
+) -> ExportHead:
+    """What the file of a version holds. kept: kind and address of what robots do not fetch; StoreError where the store lacks it."""
     entries = [ExportBlob(kind="manifest", sha256=info.manifest_sha256, bytes=info.manifest_bytes)]
     entries.append(ExportBlob(kind="vocabulary", sha256=manifest.vocabulary.sha256, bytes=manifest.vocabulary.bytes))
     tiles = {tile.sha256: tile.bytes for tile in manifest.tiles}
     entries += [ExportBlob(kind="tile", sha256=sha256, bytes=size) for sha256, size in tiles.items()]
-    if archive and info.archive_sha256 is not None:
-        size = sum(len(chunk) for chunk in blobs.chunks(info.archive_sha256))
-        entries.append(ExportBlob(kind="archive", sha256=info.archive_sha256, bytes=size))
+    for kind, sha256 in kept:
+        entries.append(ExportBlob(kind=kind, sha256=sha256, bytes=sum(len(chunk) for chunk in blobs.chunks(sha256))))
     return ExportHead(site=info.site, version=info.version, blobs=tuple(entries))
 
 

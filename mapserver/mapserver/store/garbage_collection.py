@@ -94,13 +94,14 @@ def _write_down(transactions: Transactions, connection: sqlite3.Connection, garb
         set_state(connection, (site, version), "retired", transactions.now_ns())
         transactions.log(connection, site, LogEntry("retired", f"version {version}", version, actor))
     for site, version in garbage.removed:
-        for table in ("currents", "verdicts", "evidence", "version_blobs", "versions"):
+        for table in ("currents", "verdicts", "evidence", "grid_blobs", "version_blobs", "versions"):
             connection.execute(f"DELETE FROM {table} WHERE site = ? AND version = ?", (site, version))
         transactions.log(connection, site, LogEntry("removed", f"version {version}", version, actor))
 
 
 def _mentioned(transactions: Transactions, leaving: set[tuple[str, int]]) -> set[str]:
-    rows = transactions.query("SELECT site, version, sha256 FROM version_blobs")
+    tables = ("version_blobs", "grid_blobs")
+    rows = [row for t in tables for row in transactions.query(f"SELECT site, version, sha256 FROM {t}")]
     kept = {row["sha256"] for row in rows if (row["site"], row["version"]) not in leaving}
     of_sites = "SELECT vocabulary_sha256 sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL UNION SELECT sha256 FROM site_files"
     return kept | {row["sha256"] for row in transactions.query(of_sites)}

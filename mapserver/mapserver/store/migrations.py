@@ -232,4 +232,13 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
         # The named area in which a failure happened, as the site's areas are now.
         "ALTER TABLE failures ADD COLUMN area TEXT",
     ),
+    (
+        # The grid of a version: its index and tiles, which no robot fetches.
+        """CREATE TABLE grid_blobs (
+            site TEXT NOT NULL,
+            version INTEGER NOT NULL,
+            sha256 TEXT NOT NULL,
+            PRIMARY KEY (site, version, sha256),
+            FOREIGN KEY (site, version) REFERENCES versions(site, version)) WITHOUT ROWID""",
+    ),
 )

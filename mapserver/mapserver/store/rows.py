@@ -133,12 +133,13 @@ class DraftDetails(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DraftContent:
-    """A new draft. archive: the whole survey; evidence: what the gate judges it by; job: the number of the job that made it."""
+    """A new draft. archive: the whole survey; grid: as of `encode_grid`; evidence: for the gate; job: number of the one that made it."""
 
     tiles: Sequence[Tile]
     vocabulary: bytes
     details: DraftDetails
     archive: bytes | None = None
+    grid: Sequence[bytes] = ()
     evidence: Evidence | None = None
     job: int | None = None
 

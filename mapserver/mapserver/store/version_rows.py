@@ -2,6 +2,7 @@
 
 import json
 import sqlite3
+from collections.abc import Iterable
 
 from fleetmap.mapformat import Manifest
 from mapserver.store.database import Transactions
@@ -94,6 +95,12 @@ def insert_draft(
         [(draft.site, draft.version, kind, sha256) for kind, sha256 in sorted(references(draft, manifest))],
     )
     transactions.log(connection, draft.site, log)
+
+
+def insert_grid(connection: sqlite3.Connection, draft: VersionInfo, addresses: Iterable[str]) -> None:
+    """The bytes of a draft's grid, within a transaction."""
+    rows = [(draft.site, draft.version, sha256) for sha256 in sorted(set(addresses))]
+    connection.executemany("INSERT INTO grid_blobs (site, version, sha256) VALUES (?, ?, ?)", rows)
 
 
 def references(info: VersionInfo, manifest: Manifest) -> set[tuple[str, str]]:

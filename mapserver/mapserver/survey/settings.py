@@ -151,6 +151,7 @@ class SurveySettings(Section, frozen=True):
     """All of it."""
 
     seed: int = 0
+    occupancy_grid: bool = False
     odometry: OdometrySettings = OdometrySettings()
     orb: OrbSettings = OrbSettings(count=1200)
     stereo: StereoSettings = StereoSettings()

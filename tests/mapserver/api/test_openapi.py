@@ -19,7 +19,7 @@ from mapserver.api.metrics import Metrics
 from mapserver.api.version_routes import ApiSettings
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import save_grid_draft, save_sample_draft
 
 CHECKS = (not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance)
 
@@ -59,7 +59,7 @@ def test_no_question_breaks_the_server(tmp_path: Path) -> None:
         for seed in range(2):
             save_sample_draft(store, site="hall", seed=seed)
             releases.publish(store, "hall")
-        save_sample_draft(store, site="hall", seed=2)
+        save_grid_draft(store, site="hall")
         store.update_job(store.begin_job("hall", "nightly"), "done", "version 2 is published", {})
         fleet = Fleet(store)
         assert not fleet.take_failure("hall", "r1", FAILURE).refused

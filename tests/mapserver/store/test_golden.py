@@ -13,6 +13,7 @@ from fleetmap.errors import NewerFormatError
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_manifest, decode_tile, encode_manifest, pack
 from fleetmap.version_file import EXPORT_FORMAT
 from mapserver import releases
+from mapserver.grid.grid_codec import known_grid
 from mapserver.store import Actor, FailureFilter, MapStore
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
 from mapserver.store.migrations import MIGRATIONS
@@ -67,9 +68,11 @@ def test_archives(file: Path) -> None:
     assert survey.map_from_body.shape == (3, 4, 4)
 
 
-def test_exports(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", range(1, EXPORT_FORMAT + 1))
+def test_exports(number: int, tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
-        info = store.import_version(GOLDEN / "version-1.fmex", actor=Actor("ada"))
+        info = store.import_version(GOLDEN / f"version-{number}.fmex", actor=Actor("ada"))
+        assert list(known_grid(store.manifest("lab", 1), store.blob)) == ([(0, 0)] if number >= 2 else [])
         assert (info.site, info.version, info.state, info.tiles) == ("lab", 1, "draft", 2)
         assert store.archive("lab", 1) == b"archive 1"
         assert releases.publish(store, "lab") == 1
@@ -113,7 +116,7 @@ def test_a_draft_of_an_older_store_is_known_by_the_job_that_its_log_names(tmp_pa
     for name in ("operator", "address", "sha256"):
         connection.execute(f"ALTER TABLE events DROP COLUMN {name}")
     connection.execute("ALTER TABLE failures DROP COLUMN area")
-    for name in ("tokens", "sessions", "operators", "site_files"):
+    for name in ("tokens", "sessions", "operators", "site_files", "grid_blobs"):
         connection.execute(f"DROP TABLE {name}")
     connection.execute("PRAGMA user_version = 4")
     connection.close()

@@ -1,5 +1,6 @@
 """Made-up tiles, surveys and drafts for tests of the map's way from the survey to the robot."""
 
+import msgspec
 import numpy as np
 
 from fleetmap.geometry import se3_exp
@@ -7,6 +8,8 @@ from fleetmap.mapformat import CameraEntry, RecordingEntry, Tile
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
 from mapserver import releases
+from mapserver.grid.grid_codec import encode_grid, grid_report
+from mapserver.grid.site_grid import TILE_CELLS
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.survey.survey_map import SurveyMap
 
@@ -95,6 +98,19 @@ def save_sample_draft(
     tiles = [random_tile(rng, cell=(1, 0)), random_tile(rng, cell=(0, 0))]
     content = DraftContent(tiles=tiles, vocabulary=vocabulary, details=draft_details(path_m=12.5), archive=b"archive")
     return store.save_draft(site, content, actor=actor)
+
+
+def save_grid_draft(store: MapStore, seed: int = 0, *, site: str = "lab") -> int:
+    """A draft with a hall of 4 m x 2 m from (1, 3): free, with a box that reaches from 0.35 m to 0.6 m."""
+    cells = np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8)
+    cells[60:100, 20:100, 1] = 0xFF
+    cells[70:80, 40 + seed : 50, 0] = 0b10
+    cells[60:100, 20:100, 2:] = 17
+    grid = encode_grid({(0, 0): cells})
+    details = draft_details(path_m=12.5, grid=msgspec.to_builtins(grid_report(grid, {})))
+    tiles = [random_tile(np.random.default_rng(0), cell=(0, 0))]
+    content = DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", grid=grid)
+    return store.save_draft(site, content)
 
 
 def publish_samples(store: MapStore, count: int) -> None:

@@ -7,7 +7,7 @@ import typer
 
 from fleetmap.cli_options import expand_options
 from fleetmap.errors import UsageError
-from mapserver.commands.options import ActorOptions, NewStoreFolder, SiteName, StoreFolder
+from mapserver.commands.options import ActorOptions, NewStoreFolder, SiteName, StoreFolder, version_named
 
 
 def export(
@@ -29,11 +29,7 @@ def export(
     from mapserver.trust.carried_lists import carry_lists
 
     with MapStore.open(store, read_only=True) as maps:
-        if version is None:
-            current = maps.current(site)
-            if current is None:
-                raise UsageError(f"site {site} has no current version; name one with --version")
-            version = current.version
+        version = version_named(maps, site, version)
         if with_trust:
             carry_lists(maps.folder, site, file)
         size = maps.export_version(site, version, file, archive=not without_archive)

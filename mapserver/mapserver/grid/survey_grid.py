@@ -1,0 +1,63 @@
+"""What a build's recordings add to the grid of the version before: their keyframes are looked at again, where the final map has them."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.features.settings import StereoSettings
+from fleetmap.geometry import Array
+from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m
+from mapserver.grid.grid_kernels import Counts
+from mapserver.grid.site_grid import SessionViews, Tiles, updated
+from mapserver.survey.bundle.stereo_yaw_check import disparity_shift
+from mapserver.survey.pipeline import Survey
+
+_FLOOR_VIEWS = 15
+
+
+class GridSession(NamedTuple):
+    """A recording that is in the map: its name, its survey, and map_from_body (F, 4, 4) of its frames in the final frame."""
+
+    name: str
+    survey: Survey
+    map_from_body: Array
+
+
+def grow_grid(
+    before: Mapping[tuple[int, int], Counts], sessions: Sequence[GridSession], settings: StereoSettings
+) -> tuple[Tiles, dict[str, str]]:
+    """The tiles after all sessions, in their order, and by name why a recording adds nothing."""
+    tiles, without = dict(before), {}
+    for session in sessions:
+        views = _views(session, settings)
+        if isinstance(views, str):
+            without[session.name] = views
+        else:
+            tiles = updated(tiles, views)
+    return tiles, without
+
+
+def _views(session: GridSession, settings: StereoSettings) -> SessionViews | str:
+    survey, camera = session.survey, session.survey.state.camera
+    if not camera.baseline_m > 0:
+        return "one camera measures no depth; a grid needs a stereo pair or a depth camera"
+    keyframes = survey.odometry.keyframes
+    columns = np.arange(camera.width_px, dtype=np.float64)[:, None]
+    yaw_px = (survey.stereo_yaw.correction_px * disparity_shift(camera, columns)).astype(np.float32)
+
+    def seen(chosen: slice) -> Iterator[tuple[NDArray[np.float32], float, Array]]:
+        for keyframe in keyframes[chosen]:
+            disparity_px, sigma_px = dense_disparity(keyframe.frame, camera, settings)
+            map_from_cam = session.map_from_body[keyframe.frame_index] @ survey.state.body_from_cam
+            yield disparity_px - yaw_px, sigma_px, map_from_cam
+
+    few = slice(None, None, max(1, len(keyframes) // _FLOOR_VIEWS))
+    floor_m = floor_distance_m(((disparity, place) for disparity, _, place in seen(few)), camera)
+    if floor_m is None:
+        return "no floor at one height below the camera: it is carried by hand, looks past the floor, or its map is not level"
+    views = SessionViews()
+    for disparity_px, sigma_px, map_from_cam in seen(slice(None)):
+        views.add((disparity_px, sigma_px), camera, map_from_cam, floor_m)
+    return views

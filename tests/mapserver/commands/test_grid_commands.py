@@ -1,0 +1,76 @@
+"""The grid of a version: on its way through the store, written for planners, and refused where there is none."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.occupancy_grid import read_grid
+from mapserver import releases
+from mapserver.grid.site_grid import TILE_CELLS
+from mapserver.store import MapStore, Retention
+from support.storage.map_samples import save_grid_draft, save_sample_draft
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> tuple[str, ...]:
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        save_grid_draft(store)
+        releases.publish(store, "lab")
+    return ("--site", "lab", "--store", str(tmp_path / "store"))
+
+
+def test_a_grid_is_written_for_the_robots_height(run, site, tmp_path: Path) -> None:
+    said = run("grid", "export", *site, tmp_path / "a.yaml", "--heights", tmp_path / "a.npz")
+    assert "grid of version 1" in said
+    assert "80 x 40 cells of 0.05 m, 7.8 m2 free" in said
+    grid = read_grid(tmp_path / "a.yaml")
+    assert grid.cells.shape == (40, 80)
+    np.testing.assert_allclose(grid.map_from_grid[:3, 3], [1.0, 3.0, 0.0])
+    assert (grid.cells[10:20, 20:30] == 100).all()
+    assert (grid.cells == 0).sum() == 40 * 80 - 100
+    run("grid", "export", *site, tmp_path / "low.yaml", "--robot-height", "0.3")
+    assert (read_grid(tmp_path / "low.yaml").cells == 0).all()
+    heights = np.load(tmp_path / "a.npz")
+    row, column = ((np.array([4.0, 3.5])[::-1] - heights["corner_map_m"][::-1]) / heights["cell_m"]).astype(int)
+    assert heights["lowest_m"][row, column] == pytest.approx(0.005)
+    assert np.isnan(heights["highest_m"]).sum() == TILE_CELLS**2 - 40 * 80
+
+
+def test_wrong_orders_are_told(run, site, tmp_path: Path) -> None:
+    assert "has no version 7" in run("grid", "export", *site, tmp_path / "a.yaml", "--version", 7, status=2)
+    assert "up to 2.10 m" in run("grid", "export", *site, tmp_path / "a.yaml", "--robot-height", "3", status=2)
+    assert "above 0.1 m" in run("grid", "export", *site, tmp_path / "a.yaml", "--robot-height", "0.1", status=2)
+    assert "must end in .yaml" in run("grid", "export", *site, tmp_path / "a.pgm", status=2)
+    assert "folder that exists" in run("grid", "export", *site, tmp_path / "no" / "a.yaml", status=2)
+    with MapStore.open(tmp_path / "store") as store:
+        bare = save_sample_draft(store)
+    assert "occupancy_grid = true" in run("grid", "export", *site, tmp_path / "a.yaml", "--version", bare, status=2)
+    assert not list(tmp_path.glob("a.*"))
+
+
+def test_a_grid_travels_with_the_archive_and_goes_with_its_version(run, site, tmp_path: Path) -> None:
+    other = ("--site", "lab", "--store", str(tmp_path / "other"))
+    run("export", *site, tmp_path / "v.fmex")
+    run("import", "--store", tmp_path / "other", tmp_path / "v.fmex")
+    run("grid", "export", *other, tmp_path / "a.yaml", "--version", 1)
+    assert (read_grid(tmp_path / "a.yaml").cells == 100).any()
+    # Robots fetch a file without it, of the format that they know.
+    run("export", *site, tmp_path / "robots.fmex", "--without-archive")
+    assert (tmp_path / "robots.fmex").read_bytes()[4:6] == b"\x01\x00"
+    with MapStore.open(tmp_path / "store") as store:
+        assert store.verify().faults == []
+        for seed in (1, 2, 3):
+            save_grid_draft(store, seed)
+        before = store.verify()
+        gone = store.collect_garbage(Retention(keep_drafts=1, keep_days=0.0))
+        after = store.verify()
+        assert (gone.removed, after.faults) == ([("lab", 2), ("lab", 3)], [])
+        assert before.blobs - after.blobs >= 2 * 3  # manifest, index and tile of each
+    run("grid", "export", *site, tmp_path / "b.yaml", "--version", 4)
+    # What is damaged is told.
+    with MapStore.open(tmp_path / "store") as store:
+        manifest = store.manifest("lab", 4)
+    path = next((tmp_path / "store").glob(f"blobs/*/{manifest.report['grid']['sha256']}"))
+    path.write_bytes(b"{}")
+    assert "damaged" in run("grid", "export", *site, tmp_path / "b.yaml", "--version", 4, status=3)
