@@ -1,5 +1,7 @@
 """Letters, bar codes and noise for the textures: our own glyphs, because a library's change with its version."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,10 +60,17 @@ def noise(
 ) -> Texture:
     """(height, width) tileable noise, zero mean, unit variance: white noise through one Gaussian ring per octave."""
     width = width or height
-    frequency = np.hypot(np.fft.fftfreq(width)[None, :] * width, np.fft.fftfreq(height)[:, None] * height)
-    gain = np.zeros_like(frequency)
-    for octave in octaves:
-        gain += persistence**octave * np.exp(-0.5 * ((frequency - 2.0**octave) / (0.35 * 2.0**octave)) ** 2)
-    filtered = np.fft.ifft2(np.fft.fft2(rng.standard_normal((height, width))) * gain).real
+    spectrum = np.fft.fft2(rng.standard_normal((height, width))) * _gain(height, width, octaves, persistence)
+    filtered = np.fft.ifft2(spectrum).real
     # Rounded coarsely: the last bits of a Fourier transform depend on the machine, those of a texture must not.
     return np.asarray(np.round(filtered / filtered.std(), 4), np.float32)
+
+
+@lru_cache(maxsize=8)
+def _gain(height: int, width: int, octaves: range, persistence: float) -> NDArray[np.float64]:
+    """(height, width) of each frequency; many textures have the same size."""
+    frequency = np.hypot(np.fft.fftfreq(width)[None, :] * width, np.fft.fftfreq(height)[:, None] * height)
+    gain = np.zeros((height, width))
+    for octave in octaves:
+        gain += persistence**octave * np.exp(-0.5 * ((frequency - 2.0**octave) / (0.35 * 2.0**octave)) ** 2)
+    return gain

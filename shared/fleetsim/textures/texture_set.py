@@ -1,6 +1,7 @@
 """The warehouse's set of textures, painted from one seed."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -63,8 +64,12 @@ def _paint_skus(rng: np.random.Generator, atlas: AtlasBuilder) -> tuple[Sku, ...
     return tuple(skus)
 
 
+@lru_cache(maxsize=4)
 def paint_textures(seed: int, aisles: int, *, are_aisles_identical: bool = False) -> Textures:
-    """Every texture of a site with `aisles` aisles; identical aisles all carry the same sign and rack labels."""
+    """Every texture of a site with `aisles` aisles; identical aisles all carry the same sign and rack labels.
+
+    Painted once for all days and robots of a site, who only read them.
+    """
     rng = np.random.default_rng([seed, 1])
     atlas = AtlasBuilder()
     dirt = atlas.add(128 + 9 * noise(rng, 1024, range(2, 7), 0.85) + 5 * noise(rng, 1024, range(7, 9), 0.9))
