@@ -23,6 +23,7 @@ from mapserver.api.metrics import Metrics
 from mapserver.api.version_routes import ApiSettings
 from mapserver.operators.operators import Operators
 from mapserver.store import Actor
+from support.fleet.quick_passwords import use_quick_passwords
 from support.fleet.served_api import Server, check_problem, served_api
 
 PASSWORD = "a password of the test"
@@ -33,7 +34,8 @@ PUBLISH = "/v1/sites/lab/versions/2/publish"
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    use_quick_passwords(monkeypatch)
     with served_api(tmp_path) as made:
         yield made
 

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from argon2 import PasswordHasher
 
 from fleetmap.errors import UsageError
 from mapserver.operators import operators as module
 from mapserver.operators.binding import HttpBinding, binding_fault
 from mapserver.operators.operators import IDLE_S, LIFE_S, TRIES, TRY_EVERY_S, Operators
 from mapserver.store import Actor, MapStore
+from support.fleet.quick_passwords import use_quick_passwords
 
 PASSWORD = "ada has a long password"
 ADMIN = Actor("root")
@@ -32,15 +32,11 @@ def clock() -> Clock:
     return Clock()
 
 
-QUICK = PasswordHasher(time_cost=1, memory_cost=64, parallelism=1)
-
-
 @pytest.fixture(autouse=True)
 def quick(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """A cheap hash for all tests but those of time."""
     if request.node.get_closest_marker("slow") is None:
-        monkeypatch.setattr(module, "_hasher", lambda: QUICK)
-        monkeypatch.setattr(module, "_dummy", lambda: QUICK.hash("nobody"))
+        use_quick_passwords(monkeypatch)
 
 
 @pytest.fixture
