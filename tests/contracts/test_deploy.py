@@ -16,6 +16,7 @@ from support.fleet.contracts_documents import REPOSITORY
 UNITS = sorted((REPOSITORY / "deploy").glob("*.service"))
 TEXTS = [path for path in REPOSITORY.rglob("*.md") if ".venv" not in path.parts]
 PACKAGES = [REPOSITORY / "shared", REPOSITORY / "mapserver", REPOSITORY / "locclient"]
+OPENERS = {"pickle", "cloudpickle", "shelve", "marshal", "dill", "joblib"}
 BY_NAME = re.compile(r"pip install(?:\s+-\S+(?:\s+\S+)?)*\s+[\"']?fleetmap(?:\[|\s|\"|'|$)")
 
 
@@ -52,17 +53,13 @@ def test_units_keep_what_they_write_to_their_user(unit: Path) -> None:
 
 def opens_pickles(path: Path) -> bool:
     """Whether a module imports what runs code where it is opened."""
-    names = {
-        name.name.partition(".")[0]
-        for node in ast.walk(ast.parse(path.read_text("utf-8")))
-        if isinstance(node, ast.Import)
-        for name in node.names
-    } | {
-        (node.module or "").partition(".")[0]
-        for node in ast.walk(ast.parse(path.read_text("utf-8")))
-        if isinstance(node, ast.ImportFrom)
-    }
-    return bool(names & {"pickle", "cloudpickle", "shelve", "marshal", "dill", "joblib"})
+    text = path.read_text("utf-8")
+    if not any(word in text for word in OPENERS):
+        return False
+    imports = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Import | ast.ImportFrom)]
+    names = {name.name for node in imports if isinstance(node, ast.Import) for name in node.names}
+    names |= {node.module or "" for node in imports if isinstance(node, ast.ImportFrom)}
+    return bool({name.partition(".")[0] for name in names} & OPENERS)
 
 
 def test_pickles_are_opened_in_one_module_alone() -> None:
