@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# Before numpy is loaded. Tests run one process a core; threads of BLAS that wait for each other would take most of them.
+# Before numpy and OpenCV are loaded. Tests run one process a core; threads that wait for each other would take most of them.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
 
 settings.register_profile("same every time", derandomize=True, deadline=None)
 settings.load_profile("same every time")
