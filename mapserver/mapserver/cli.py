@@ -24,6 +24,7 @@ from mapserver.commands.serve import serve
 from mapserver.commands.site.align import align
 from mapserver.commands.site.areas import AREAS_GROUP
 from mapserver.commands.site.grid import GRID
+from mapserver.commands.site.masks import MASKS_GROUP
 from mapserver.commands.store.audit import audit
 from mapserver.commands.store.export import export, import_
 from mapserver.commands.store.gc import gc
@@ -61,6 +62,7 @@ COMMANDS: Commands = {
     "fleet": FLEET,
     "robots": ROBOTS,
     "grid": GRID,
+    "masks": MASKS_GROUP,
     "operators": OPERATORS,
     "audit": audit,
     "prepare": prepare,

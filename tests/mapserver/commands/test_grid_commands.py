@@ -1,5 +1,7 @@
 """The grid of a version: on its way through the store, written for planners, and refused where there is none."""
 
+import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -74,3 +76,69 @@ def test_a_grid_travels_with_the_archive_and_goes_with_its_version(run, site, tm
     path = next((tmp_path / "store").glob(f"blobs/*/{manifest.report['grid']['sha256']}"))
     path.write_bytes(b"{}")
     assert "damaged" in run("grid", "export", *site, tmp_path / "b.yaml", "--version", 4, status=3)
+
+
+def geojson(*features: dict[str, object], frame: str = "map") -> str:
+    """Rectangles: name, corners (low x, low y, high x, high y), further properties."""
+
+    def feature(name: str, box: tuple[float, ...], **more: object) -> dict[str, object]:
+        x0, y0, x1, y1 = box
+        ring = [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]
+        geometry = {"type": "Polygon", "coordinates": [ring]}
+        return {"type": "Feature", "geometry": geometry, "properties": {"name": name} | more}
+
+    return json.dumps({"type": "FeatureCollection", "frame": frame, "features": [feature(**f) for f in features]})
+
+
+DOCK = {"name": "dock", "box": (1.0, 2.0, 2.0, 3.0), "mask": "keep-out"}
+SLOW = {"name": "crossing", "box": (4.0, 2.0, 6.0, 3.0), "mask": "speed", "percent": 30}
+SLOWER = {"name": "door", "box": (5.0, 2.0, 7.0, 3.0), "mask": "speed", "percent": 10}
+
+
+def test_masks_stay_with_the_site_and_are_written_for_costmap_filters(run, site, tmp_path: Path) -> None:
+    (tmp_path / "masks.json").write_text(geojson(DOCK, SLOW, SLOWER))
+    assert "3 masks" in run("masks", "import", tmp_path / "masks.json", *site)
+    with MapStore.open(tmp_path / "store") as store:
+        save_grid_draft(store, 1)
+        releases.publish(store, "lab")
+        assert store.verify().faults == []
+    assert run("masks", "list", *site).splitlines() == [
+        "crossing: speed 30 %, 2.0 m2", "dock: keep-out, 1.0 m2", "door: speed 10 %, 2.0 m2", "3 masks",
+    ]  # fmt: skip
+    run("masks", "export", *site, "--keep-out", tmp_path / "keep.yaml", "--speed", tmp_path / "speed.yaml")
+    keep, speed = read_grid(tmp_path / "keep.yaml"), read_grid(tmp_path / "speed.yaml")
+    np.testing.assert_allclose(keep.map_from_grid[:2, 3], [1.0, 2.0])
+    assert (keep.cells[:20, :20] == 100).all()
+    values = speed.cells[10, [5, 15, 25, 35, 55]].tolist()
+    assert (speed.map_from_grid[0, 3], values) == (pytest.approx(4.0), [30, 30, 10, 10, 10])
+    run("masks", "remove", *site)
+    assert "0 masks" in run("masks", "list", *site)
+    assert "no speed mask" in run("masks", "export", *site, "--speed", tmp_path / "s.yaml", status=2)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (geojson(DOCK | {"box": (900.0, 2.0, 901.0, 3.0)}), "'dock' from .* outside of version 1"),
+        (geojson(DOCK | {"mask": "slow"}), "slow.*keep-out"),
+        (geojson({"name": "dock", "box": (1.0, 2.0, 2.0, 3.0)}), "mask.*keep-out"),
+        (geojson(DOCK | {"percent": 30}), "keep-out with percent 30"),
+        (geojson(SLOW | {"percent": None}), "speed with percent None"),
+        (geojson(SLOW | {"percent": 100}), "percent"),
+        (geojson(DOCK, frame="building"), "mapserver align"),
+        ("{}", "FeatureCollection"),
+    ],
+)
+def test_wrong_masks_are_refused_and_the_old_ones_stay(run, site, tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "good.json").write_text(geojson(DOCK))
+    run("masks", "import", tmp_path / "good.json", *site)
+    (tmp_path / "masks.json").write_text(text)
+    assert re.search(words, run("masks", "import", tmp_path / "masks.json", *site, status=2))
+    assert "1 masks" in run("masks", "list", *site)
+
+
+def test_masks_over_half_a_country_are_refused(run, site, tmp_path: Path) -> None:
+    far = DOCK | {"name": "far", "box": (0.0, 0.0, 5000.0, 5000.0)}
+    (tmp_path / "masks.json").write_text(geojson(DOCK, far))
+    run("masks", "import", tmp_path / "masks.json", *site)
+    assert "100001 x 100001 cells" in run("masks", "export", *site, "--keep-out", tmp_path / "k.yaml", status=2)
