@@ -1,6 +1,6 @@
 """The last steps that all formats share: which sensors take part, and the checks before a recording is handed out."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.calibration_files import CalibrationFile, load_calibration
+from fleetmap.recordings.images import is_mosaic
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording
 from fleetmap.sensors.calibration import RigCalibration
@@ -146,10 +147,10 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
         wheel=parts.wheel,
         priors=parts.priors,
         ground_truth=parts.ground_truth,
-        issues=tuple(log.issues),
     )
-    recording.read_frame(0)
-    return recording
+    if is_mosaic(recording.read_frame(0).left):
+        log.note("Bayer pattern", "a mosaic of colours remains in the left images; record them with its right encoding")
+    return replace(recording, issues=tuple(log.issues))
 
 
 def _sensor_set(parts: RecordingParts, imu: ImuSamples) -> SensorSet:

@@ -91,6 +91,21 @@ RAW_ENCODINGS = {
     "8UC3": (np.uint8, 3),
     "rgba8": (np.uint8, 4),
     "bgra8": (np.uint8, 4),
+    **{f"bayer_{order}8": (np.uint8, 1) for order in ("rggb", "bggr", "gbrg", "grbg")},
+    **{f"bayer_{order}16": (np.uint16, 1) for order in ("rggb", "bggr", "gbrg", "grbg")},
+    # Two bytes a pixel, of which one is luma; ROS's older names and newer ones
+    **dict.fromkeys(("yuv422", "uyvy", "yuv422_yuy2", "yuyv"), (np.uint8, 2)),
+    # A plane of luma, and colour behind it
+    **dict.fromkeys(("nv12", "nv21", "nv24"), (np.uint8, 1)),
+}
+_COLOUR_ROWS = {"nv12": (1, 2), "nv21": (1, 2), "nv24": (2, 1)}  # of colour for each row of luma
+_LUMA_AT = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
+# OpenCV names a mosaic by the second row, its newer names by the first as ROS does
+_GREY_FROM_MOSAIC = {
+    "rggb": cv2.COLOR_BayerRGGB2GRAY,
+    "bggr": cv2.COLOR_BayerBGGR2GRAY,
+    "gbrg": cv2.COLOR_BayerGBRG2GRAY,
+    "grbg": cv2.COLOR_BayerGRBG2GRAY,
 }
 _GREY_FROM = {
     "rgb8": cv2.COLOR_RGB2GRAY,
@@ -99,6 +114,7 @@ _GREY_FROM = {
     "rgba8": cv2.COLOR_RGBA2GRAY,
     "bgra8": cv2.COLOR_BGRA2GRAY,
 }
+_MOSAIC_SHARE, _LEAST_MOSAIC_PX, _LEAST_MOSAIC_GREY = 0.04, 100, 20.0
 MAX_PIXELS = 64_000_000  # the largest sensors of machine vision have 150, those of robots 5
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 # Images with sensor noise have no repetitions worth a search: run-length coding is faster and, measured, smaller.
@@ -144,9 +160,13 @@ def decode_frame(stored: StoredFrame) -> CameraFrame:
 
 
 def decode_grey(stored: StoredImage) -> Image:
-    """(H, W) uint8. 16-bit images keep their upper byte, colour becomes grey by the usual luma weights."""
+    """(H, W) uint8. 16-bit images keep their upper byte, colour becomes grey by the usual luma weights; of YUV luma is taken as it is."""
     pixels = _decode(stored)
-    if pixels.ndim == 3:
+    if stored.encoding.startswith("bayer_"):
+        pixels = cv2.cvtColor(pixels, _GREY_FROM_MOSAIC[stored.encoding[6:10]])
+    elif stored.encoding in _LUMA_AT:
+        pixels = pixels[:, :, _LUMA_AT[stored.encoding]]
+    elif pixels.ndim == 3:
         usual = cv2.COLOR_BGRA2GRAY if pixels.shape[2] == 4 else cv2.COLOR_BGR2GRAY
         pixels = cv2.cvtColor(pixels, _GREY_FROM.get(stored.encoding, usual))
     if pixels.dtype == np.uint16:
@@ -154,6 +174,18 @@ def decode_grey(stored: StoredImage) -> Image:
     if pixels.dtype != np.uint8:
         raise RecordingError(f"{stored.where}: {pixels.dtype} pixels are no camera image; known are 8 and 16 bits")
     return np.ascontiguousarray(pixels, np.uint8)
+
+
+def is_mosaic(image: Image) -> bool:
+    """Whether an image (H, W) holds the pattern of a Bayer mosaic: taken for grey, or its green for another colour.
+
+    The four pixels of 2x2 blocks then differ in the mean over the image, by 12 % in a mosaic of a coloured room, by at most 0.5 % in
+    images of five real cameras. Red and blue exchanged leave no pattern; grey then is a little off in coloured places.
+    """
+    if min(image.shape) < _LEAST_MOSAIC_PX:
+        return False
+    means = [float(image[row::2, column::2].mean()) for row in (0, 1) for column in (0, 1)]
+    return max(means) - min(means) > _MOSAIC_SHARE * max(_LEAST_MOSAIC_GREY, sum(means) / 4)
 
 
 def decode_depth(stored: StoredImage) -> NDArray[np.float32]:
@@ -217,11 +249,12 @@ def _decode(stored: StoredImage) -> AnyArray:
     wire_type = np.dtype(dtype).newbyteorder(">" if stored.big_endian else "<")
     row_bytes = stored.width_px * channels * wire_type.itemsize
     step = stored.step_bytes or row_bytes
-    needed = step * (stored.height_px - 1) + row_bytes
+    colour_rows, luma_rows = _COLOUR_ROWS.get(stored.encoding, (0, 1))
+    needed = step * (stored.height_px - 1) + row_bytes + step * (stored.height_px * colour_rows // luma_rows)
     if step < row_bytes or len(stored.data) < needed or 0 in (row_bytes, stored.height_px):
         raise RecordingError(
             f"{stored.where}: {len(stored.data)} bytes for {stored.width_px}x{stored.height_px} {stored.encoding} in "
-            f"rows of {step} bytes; the message is damaged"
+            f"rows of {step} bytes; the message is damaged, or its encoding is another"
         )
     _check_size(stored.width_px, stored.height_px, stored.where)
     if stored.height_px == 1:
