@@ -9,16 +9,18 @@ import pytest
 from mcap.reader import make_reader
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings import RECORDING_FORMATS, Recording, open_recording
+from fleetmap.recordings import RECORDING_FORMATS, OpenOptions, Recording, open_recording
 from fleetmap.recordings.mcap.writer import copy_to_mcap
 from support.recordings.bag_samples import write_rosbag1, write_rosbag2
 from support.recordings.mcap_samples import Message
 from support.recordings.recording_samples import (
+    kalibr_text,
     make_sample,
     world_from_cam0,
     write_euroc,
     write_kitti,
     write_seven_scenes,
+    write_tum_rgbd,
     write_tumvi,
 )
 
@@ -46,15 +48,27 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "tumvi": lambda folder: write_tumvi(folder, SAMPLE),
     "kitti": lambda folder: write_kitti(folder, SAMPLE),
     "7scenes": lambda folder: write_seven_scenes(folder, SAMPLE),
+    "tum-rgbd": lambda folder: write_tum_rgbd(folder, SAMPLE),
     "mcap": _write_mcap,
     "rosbag2-sqlite": lambda folder: write_rosbag2(folder / "bag", _messages(folder)),
     "rosbag1": lambda folder: write_rosbag1(folder / "a.bag", _messages(folder)),
 }
+WITHOUT_CALIBRATION = ("tum-rgbd",)
 
 
 @pytest.fixture(params=list(RECORDING_FORMATS))
 def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return WRITERS[request.param](tmp_path / "recording")
+
+
+def opened(path: Path) -> Recording:
+    """The recording, with the rig's calibration where its format holds none."""
+    formats = {name for name, f in RECORDING_FORMATS.items() if f.recognises(path)}
+    if not formats & set(WITHOUT_CALIBRATION):
+        return open_recording(path)
+    rig = path.parent / "rig.yaml"
+    rig.write_text(kalibr_text().partition("cam1:")[0])
+    return open_recording(path, OpenOptions(rig))
 
 
 def _assert_same_frames(first: Recording, second: Recording) -> None:
@@ -77,7 +91,7 @@ def test_exactly_its_own_format_recognises_it(path: Path) -> None:
 
 
 def test_stamps_increase_and_images_are_the_samples(path: Path) -> None:
-    recording = open_recording(path)
+    recording = opened(path)
     assert recording.issues == ()
     assert len(recording) == len(SAMPLE.left)
     assert (np.diff(recording.frame_stamps_ns) > 0).all()
@@ -92,20 +106,20 @@ def test_stamps_increase_and_images_are_the_samples(path: Path) -> None:
 
 
 def test_the_hash_is_that_of_a_copy_elsewhere_and_not_of_another_recording(path: Path, tmp_path: Path) -> None:
-    first = open_recording(path).content_hash()
+    first = opened(path).content_hash()
     elsewhere = tmp_path / "elsewhere"
     if path.is_dir():
         shutil.copytree(path, elsewhere)
     else:
         shutil.copy(path, elsewhere)
-    assert open_recording(elsewhere).content_hash() == first
+    assert opened(elsewhere).content_hash() == first
     image = max((p for p in path.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size) if path.is_dir() else path
     image.write_bytes(image.read_bytes() + b"\0")
-    assert open_recording(path).content_hash() != first
+    assert opened(path).content_hash() != first
 
 
 def test_truth_is_that_of_the_body(path: Path) -> None:
-    recording = open_recording(path)
+    recording = opened(path)
     assert recording.ground_truth is not None
     for index, stamp_ns in enumerate(recording.frame_stamps_ns):
         frame_from_body = recording.ground_truth.at(int(stamp_ns))
@@ -115,7 +129,7 @@ def test_truth_is_that_of_the_body(path: Path) -> None:
 
 
 def test_a_conversion_to_mcap_loses_nothing(path: Path, tmp_path: Path) -> None:
-    source = open_recording(path)
+    source = opened(path)
     copy_to_mcap(source, tmp_path / "converted.mcap")
     with open_recording(tmp_path / "converted.mcap") as copy:
         assert copy.issues == ()
@@ -140,13 +154,13 @@ def test_a_conversion_to_mcap_loses_nothing(path: Path, tmp_path: Path) -> None:
 
 
 def test_a_frame_outside_is_refused(path: Path) -> None:
-    recording = open_recording(path)
+    recording = opened(path)
     for index in (-1, len(recording)):
         with pytest.raises(RecordingError, match=str(index)):
             recording.read_frame(index)
 
 
 def test_closing_twice_is_fine(path: Path) -> None:
-    recording = open_recording(path)
+    recording = opened(path)
     recording.close()
     recording.close()

@@ -1,4 +1,4 @@
-"""Recordings of camera robots: EuRoC, TUM-VI, KITTI and 7-Scenes folders, MCAP, rosbag2 in SQLite, ROS 1 bags.
+"""Recordings of camera robots: EuRoC, TUM-VI, KITTI, 7-Scenes and TUM RGB-D folders, MCAP, rosbag2 in SQLite, ROS 1 bags.
 
 To add a format: a module whose function reads the folder or file into `RecordingParts` and hands them to `finalize`,
 and a line in RECORDING_FORMATS (examples/new_recording_format.py is one).
@@ -11,7 +11,7 @@ from pathlib import Path
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.bags import ros1, sqlite
 from fleetmap.recordings.calibration_files import format_calibration, read_calibration
-from fleetmap.recordings.folders import euroc, kitti, seven_scenes, tumvi
+from fleetmap.recordings.folders import euroc, kitti, seven_scenes, tum_rgbd, tumvi
 from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap import reader
 from fleetmap.recordings.recording import FrameSelection, FrameSource, OpenOptions, Recording, Topics, named_topics
@@ -49,6 +49,9 @@ RECORDING_FORMATS = {
     "kitti": RecordingFormat("a folder with image_l or image_0 and calib.txt", kitti.recognises, kitti.open_kitti),
     "7scenes": RecordingFormat(
         "a folder with frame-NNNNNN.color.* and .depth.png", seven_scenes.recognises, seven_scenes.open_seven_scenes
+    ),
+    "tum-rgbd": RecordingFormat(
+        "a folder with rgb.txt, depth.txt and their images", tum_rgbd.recognises, tum_rgbd.open_tum_rgbd
     ),
     "mcap": RecordingFormat("an .mcap file, or a folder with one in it", reader.recognises, reader.open_mcap),
     "rosbag2-sqlite": RecordingFormat("a rosbag2 .db3 file, or its folder", sqlite.recognises, sqlite.open_sqlite),

@@ -15,6 +15,7 @@ from fleetmap.sensors.samples import DataIssue, ImuSamples, Stamps, Trajectory
 
 _MAX_IMU_VALUE = 1e5  # no inertial sensor measures this in any unit; flipped bits do
 PAIR_TOLERANCE_NS = 5_000_000  # images of one rig that are further apart were not taken at one moment
+DEPTH_TOLERANCE_NS = 20_000_000  # depth and colour of consumer sensors are not triggered together
 V = TypeVar("V")
 
 

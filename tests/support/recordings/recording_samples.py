@@ -179,6 +179,31 @@ def write_seven_scenes(folder: Path, sample: Sample) -> Path:
     return folder
 
 
+def write_tum_rgbd(folder: Path, sample: Sample) -> Path:
+    """A TUM RGB-D folder without accelerometer, and beside it the camera as a camchain; depth comes 5 ms later."""
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir(parents=True)
+    lists: dict[str, list[str]] = {"rgb": ["# color images"], "depth": ["# depth maps"]}
+    depth = np.full((HEIGHT, WIDTH), 25000, np.uint16)
+    depth[:, : WIDTH // 2], depth[:20] = 10000, 0
+    for image, stamp in zip(sample.left, sample.stamps_ns.tolist(), strict=True):
+        pictures = {"rgb": (stamp, cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)), "depth": (stamp + 5_000_000, depth)}
+        for name, (stamp_ns, picture) in pictures.items():
+            text = f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
+            cv2.imwrite(str(folder / name / f"{text}.png"), picture)
+            lists[name].append(f"{text} {name}/{text}.png")
+    for name, rows in lists.items():
+        (folder / f"{name}.txt").write_text("\n".join(rows) + "\n")
+    rows = ["# timestamp tx ty tz qx qy qz qw"]
+    for stamp in sample.stamps_ns.tolist():
+        place = world_from_cam0(stamp)
+        w, *xyz = quat_wxyz_from_rotation(place[:3, :3])
+        numbers = " ".join(repr(float(v)) for v in (*place[:3, 3], *xyz, w))
+        rows.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {numbers}")
+    (folder / "groundtruth.txt").write_text("\n".join(rows) + "\n")
+    return folder
+
+
 def _euroc_yaml(camera: CameraCalibration, yaml_line: bool) -> str:
     data = ", ".join(repr(float(v)) for v in camera.body_from_cam.ravel())
     return (

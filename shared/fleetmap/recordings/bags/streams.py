@@ -20,12 +20,11 @@ from fleetmap.recordings.finalize import RecordingParts, calibration_of_options,
 from fleetmap.recordings.folders.image_files import hash_file
 from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, pair_images
 from fleetmap.recordings.images import StoredImage
-from fleetmap.recordings.ordering import ReadLog, clean_imu, trajectory_of_rows, values_forward
+from fleetmap.recordings.ordering import DEPTH_TOLERANCE_NS, ReadLog, clean_imu, trajectory_of_rows, values_forward
 from fleetmap.recordings.recording import OpenOptions, Recording, Topics
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
 
-DEPTH_TOLERANCE_NS = 20_000_000  # depth and colour of consumer sensors are not triggered together
 V = TypeVar("V")
 
 

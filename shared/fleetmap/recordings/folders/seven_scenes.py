@@ -10,6 +10,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -65,6 +66,13 @@ def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
     return finalize(parts, log)
 
 
+class Registration(Protocol):
+    """Makes depth images what frames hold."""
+
+    def registered(self, depth_m: Depth, where: str) -> Depth:
+        """(H, W) metres in the colour camera's pixels."""
+
+
 class DepthRegistration:
     """Brings depth images into the colour camera's pixels."""
 
@@ -109,7 +117,7 @@ class DepthRegistration:
 class RegisteredFrames:
     """A FrameSource that registers the depth images of `files` to colour."""
 
-    def __init__(self, files: FileFrames, registration: DepthRegistration) -> None:
+    def __init__(self, files: FileFrames, registration: Registration) -> None:
         self._files, self._registration = files, registration
 
     def stored(self, index: int) -> StoredFrame:
