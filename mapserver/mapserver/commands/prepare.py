@@ -31,9 +31,11 @@ def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
     from fleetmap.bow import train_vocabulary
     from fleetmap.preparation.painted_room import HEIGHT_PX, WIDTH_PX, Ride, write_ride
     from fleetmap.recordings import open_recording
+    from fleetmap.sensors.rectification import StereoCamera
     from fleetmap.sensors.samples import SensorSet
     from mapserver import BuildOptions, build_map
     from mapserver.config import survey_settings
+    from mapserver.grid.site_grid import SessionViews
     from mapserver.store import Actor
     from mapserver.survey.settings import SurveySettings
 
@@ -63,6 +65,11 @@ def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
         with open_recording(scene) as recording:
             recording.read_frame(0)
 
+    def look_at_grid() -> None:
+        disparity = np.full((HEIGHT_PX, WIDTH_PX), 20.0, np.float32)
+        camera = StereoCamera(WIDTH_PX, WIDTH_PX / 2, HEIGHT_PX / 2, 0.1, WIDTH_PX, HEIGHT_PX)
+        SessionViews().add((disparity, 0.3), camera, np.eye(4), 0.5)
+
     def train() -> None:
         descriptors = np.random.default_rng(0).integers(0, 256, (200, 32), dtype=np.uint8)
         train_vocabulary(descriptors, 4, 2, np.random.default_rng(0))
@@ -74,5 +81,6 @@ def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
         "survey with one camera": lambda: build("mono", SensorSet.MONO),
         "survey with a depth camera": lambda: build("depth", SensorSet.RGBD),
         "depth images of another camera": register_depth,
+        "grid of planners": look_at_grid,
         "vocabulary": train,
     }

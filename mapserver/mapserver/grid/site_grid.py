@@ -26,9 +26,9 @@ from mapserver.tiles.tiling import TILE_SIZE_M
 TILE_CELLS = round(TILE_SIZE_M / CELL_M)
 TOP_M = FLOOR_M + SLICES * SLICE_M
 _RANGE_CELLS = 160  # of a view
-# A view that hits a voxel counts as two that pass it: passes also come of its rim. What was decided before counts as so many
-# views, and stays until as many speak against it: one night takes away what moved.
-_HIT, _DECIDED = 2, 4
+# A view that hits a voxel counts as two that pass it, since passes also come of its rim. What was known counts as three views, and
+# stays until as many speak against it: one night takes away what moved.
+_HIT, _OCCUPIED, _FREE, _KNOWN = 2, 4, 3, 3
 _SAME_STEPS = 10  # heights that differ by less stay as they were
 _MAX_CELLS = 1 << 25
 Tiles = dict[tuple[int, int], Counts]
@@ -76,9 +76,9 @@ def updated(before: Mapping[tuple[int, int], Counts], views: SessionViews) -> Ti
     for place, (hits, passes, heights) in views.tiles.items():
         old = before.get(place, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8))
         was_occupied, was_free = (np.unpackbits(old[..., i, None], axis=-1, bitorder="little") > 0 for i in (0, 1))
-        score = _HIT * hits.astype(np.int16) - passes + _DECIDED * (was_occupied.astype(np.int16) - was_free)
-        occupied = (score >= _DECIDED) | (was_occupied & (score > -_DECIDED))
-        free = ~occupied & ((score <= -_DECIDED) | was_free)
+        score = _HIT * hits.astype(np.int16) - passes + _KNOWN * (was_occupied.astype(np.int16) - was_free)
+        occupied = (score >= _OCCUPIED) | (was_occupied & (score > -_FREE))
+        free = ~occupied & ((score <= -_FREE) | was_free)
         bits = [np.packbits(mask, axis=-1, bitorder="little")[..., 0] for mask in (occupied, free)]
         low, high = (_height(old[..., 2 + i], heights[..., 1 + 2 * i]) for i in (0, 1))
         # What stood there in some views alone has left no voxel.

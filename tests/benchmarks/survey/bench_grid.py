@@ -1,0 +1,155 @@
+"""The grid of planners against the truth of simulated warehouses, and what a night takes away of moved stock.
+
+    PYTHONPATH=tests python tests/benchmarks/survey/bench_grid.py SCENARIO:SEED ... [--every 6] [--height 1.1] [--picture FILE.png]
+    PYTHONPATH=tests python tests/benchmarks/survey/bench_grid.py SCENARIO:SEED --store DIR --site NAME [--version N] [--day N]
+
+Without --store every so many frames of the scenario's first run are rendered and looked at from their true poses: what dense stereo
+and the cells do, without a survey's error. With it the grid of a built version is judged, which must have been built with
+--frame-from-ground-truth. A path is planned by A* between two places of the drive, for a robot of 0.3 m radius.
+"""
+
+import argparse
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.ndimage import binary_dilation, distance_transform_edt
+
+from benchmarks.common.grid_truth import GridFigures, Mask, compare, in_hall, passable, plan, truth_mask
+from fleetmap.features.settings import StereoSettings
+from fleetmap.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import CameraFrame
+from fleetsim.recorder import Order, Session, prepare
+from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m
+from mapserver.grid.grid_codec import encode_grid, grid_of
+from mapserver.grid.grid_kernels import CELL_M
+from mapserver.grid.site_grid import SessionViews, Tiles, occupancy, updated
+from mapserver.store import MapStore
+
+RADIUS_M = 0.3
+
+
+def views_from_truth(session: Session, every: int) -> SessionViews:
+    """What the cameras see from where they really are."""
+    rectifier, seen = Rectifier(session.nominal), []
+    shoot_s = look_s = 0.0
+    for t in session.frame_times_s[::every]:
+        begun_s = time.process_time()
+        shot = session.renderer.shoot(t)
+        drawn_s = time.process_time()
+        frame = rectifier.rectify(CameraFrame(int(t * 1e9), shot.left, shot.right))
+        place = session.motion.map_from_body(np.array([t]))[0] @ rectifier.body_from_cam
+        seen.append((dense_disparity(frame, rectifier.camera, StereoSettings()), place))
+        shoot_s, look_s = shoot_s + drawn_s - begun_s, look_s + time.process_time() - drawn_s
+    few = seen[:: max(1, len(seen) // 15)]
+    floor_m = floor_distance_m([(disparity[0], place) for disparity, place in few], rectifier.camera)
+    assert floor_m is not None
+    views, begun_s = SessionViews(), time.process_time()
+    for disparity, place in seen:
+        views.add(disparity, rectifier.camera, place, floor_m)
+    cast_s = time.process_time() - begun_s
+    print(
+        f"  {len(seen)} views, floor {floor_m:.3f} m below the camera; CPU a view: rendering {1e3 * shoot_s / len(seen):.0f} ms, "
+        f"stereo {1e3 * look_s / len(seen):.0f} ms, cells {1e3 * cast_s / len(seen):.0f} ms",
+        flush=True,
+    )
+    return views
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """An estimated grid's figures; path: cells of a planned path, of which crossed are occupied in truth (rows, columns)."""
+
+    figures: GridFigures
+    path: int
+    crossed: int
+    truth: Mask
+
+
+def judge(grid: OccupancyGrid, session: Session, height_m: float) -> Judged:
+    """Against the hall on the session's day; prints what it finds."""
+    order = session.order
+    truth = truth_mask(session.world.layout, order.seed, order.day, height_m)
+    figures = compare(grid, truth)
+    print("  " + ", ".join(f"{name} {value:.4f}" for name, value in asdict(figures).items()), flush=True)
+    cells = in_hall(grid, truth.shape)
+    way_m = session.truth.positions_m[:, :2]
+    rows, columns = np.nonzero(passable(cells, RADIUS_M))
+    ends = []
+    for share in (0.12, 0.55):  # in two aisles of the loop
+        near = way_m[int(share * len(way_m))] / CELL_M
+        closest = int(np.hypot(columns - near[0], rows - near[1]).argmin())
+        ends.append((int(rows[closest]), int(columns[closest])))
+    path = plan(cells, ends[0], ends[1], RADIUS_M)
+    clear_m = distance_transform_edt(~truth)[tuple(np.array(path).T)].min() * CELL_M if path else np.nan
+    crossed = sum(bool(truth[place]) for place in path)
+    print(
+        f"  path from {ends[0]} to {ends[1]} of {len(path)} cells: {crossed} where something stands, clear by {clear_m:.2f} m",
+        flush=True,
+    )
+    return Judged(figures, len(path), crossed, truth)
+
+
+def judge_night(before: Tiles, after: Tiles, truths: tuple[Mask, Mask], height_m: float) -> tuple[int, int]:
+    """Occupied cells whose stock was moved, one cell and more from what stands there now, and how many are occupied still."""
+    first, second = (in_hall(occupancy(tiles, height_m), truths[0].shape) for tiles in (before, after))
+    around = np.ones((3, 3), bool)
+    moved = (first == OCCUPIED) & binary_dilation(truths[0], around) & ~binary_dilation(truths[1], around)
+    new = truths[1] & ~binary_dilation(truths[0], around) & binary_dilation(second == OCCUPIED, around)
+    sizes = [len(blob) for tiles in (before, after) for blob in encode_grid(tiles)]
+    known = set(encode_grid(before))
+    fresh = sum(len(blob) for blob in encode_grid(after) if blob not in known)
+    print(
+        f"  night: of {int(moved.sum())} occupied cells whose stock is gone {int((moved & (second == OCCUPIED)).sum())} are still "
+        f"occupied, {int((moved & (second == FREE)).sum())} are free; {int(new.sum())} cells of new stock found; "
+        f"grid {sum(sizes) // 2} bytes, {fresh} of it new",
+        flush=True,
+    )
+    return int(moved.sum()), int((moved & (second == OCCUPIED)).sum())
+
+
+def draw(path: Path, grid: OccupancyGrid, truth: Mask) -> None:
+    """The grid, and under it the truth, as map_server shades."""
+    cells = in_hall(grid, truth.shape)
+    shown = np.where(cells == FREE, 254, np.where(cells == OCCUPIED, 0, 205))
+    both = [shown[::-1], np.full((6, truth.shape[1]), 120), np.where(truth, 0, 254)[::-1]]
+    cv2.imwrite(str(path), np.concatenate(both).astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+def main() -> None:
+    """Prints the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("halls", nargs="+", metavar="SCENARIO:SEED")
+    parser.add_argument("--every", type=int, default=6)
+    parser.add_argument("--height", type=float, default=1.1)
+    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--store", type=Path)
+    parser.add_argument("--site", default="hall")
+    parser.add_argument("--version", type=int)
+    parser.add_argument("--day", type=int, default=0)
+    options = parser.parse_args()
+    for hall in options.halls:
+        scenario, _, seed = hall.partition(":")
+        print(f"{hall}, robots of {options.height} m", flush=True)
+        session = prepare(Order(scenario, seed=int(seed), day=options.day))
+        if options.store is not None:
+            with MapStore.open(options.store, read_only=True) as maps:
+                tiles = grid_of(maps.manifest(options.site, options.version or 1), maps.blob)
+        else:
+            tiles = updated({}, views_from_truth(session, options.every))
+        grid = occupancy(tiles, options.height)
+        judged = judge(grid, session, options.height)
+        if options.picture is not None:
+            draw(options.picture, grid, judged.truth)
+        if options.store is None:
+            night = prepare(Order(scenario, seed=int(seed), day=options.day + 1))
+            after = updated(tiles, views_from_truth(night, options.every))
+            judged_after = judge(occupancy(after, options.height), night, options.height)
+            judge_night(tiles, after, (judged.truth, judged_after.truth), options.height)
+
+
+if __name__ == "__main__":
+    main()
