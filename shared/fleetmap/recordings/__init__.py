@@ -6,9 +6,11 @@ and a line in RECORDING_FORMATS (examples/new_recording_format.py is one).
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from fleetmap.errors import RecordingError
+from fleetmap.recordings import archive
 from fleetmap.recordings.bags import ros1, sqlite
 from fleetmap.recordings.calibration_files import format_calibration, read_calibration
 from fleetmap.recordings.folders import euroc, kitti, seven_scenes, tum_rgbd, tumvi
@@ -57,7 +59,14 @@ RECORDING_FORMATS = {
     "rosbag2-sqlite": RecordingFormat("a rosbag2 .db3 file, or its folder", sqlite.recognises, sqlite.open_sqlite),
     "rosbag1": RecordingFormat("a ROS 1 .bag file", ros1.recognises, ros1.open_bag),
 }
-FILE_SUFFIXES = (".mcap", ".db3", ".bag")  # of recordings that are one file
+# Of what cannot be read: the command that makes it readable
+_ADVICE = {
+    (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz", ".tar.zst"): "`tar xf {path}` unpacks it",
+    (".7z", ".rar"): "`7z x {path}` unpacks it",
+    (".mcap.zst", ".mcap.zstd", ".bag.zst"): "`zstd -d {path}` unpacks it",
+    (".bag.active",): "`rosbag reindex {path}` finishes it",
+}
+FILE_SUFFIXES = (".mcap", ".db3", ".bag", ".zip")  # of recordings that are one file
 
 
 def open_recording(path: Path | str, options: OpenOptions | None = None) -> Recording:
@@ -74,10 +83,24 @@ def open_recording(path: Path | str, options: OpenOptions | None = None) -> Reco
         raise RecordingError(
             f"{path} does not exist; a recording is a folder (the parent of mav0 for EuRoC) or a file such as .mcap"
         )
-    for recording_format in RECORDING_FORMATS.values():
-        if recording_format.recognises(path):
-            return recording_format.open(path, options)
+    if archive.recognises(path):
+        return archive.open_zip(path, _format_of, partial(_open, options=options))
+    return _open(path, options)
+
+
+def _format_of(path: Path) -> RecordingFormat | None:
+    return next((each for each in RECORDING_FORMATS.values() if each.recognises(path)), None)
+
+
+def _open(path: Path, options: OpenOptions) -> Recording:
+    found = _format_of(path)
+    if found is not None:
+        return found.open(path, options)
     if path.is_dir() and not any(path.iterdir()):
         raise RecordingError(f"{path} is an empty folder; copy the recording again")
+    for suffixes, advice in _ADVICE.items():
+        if path.name.lower().endswith(suffixes):
+            words = advice.format(path=path, stem=path.stem)
+            raise RecordingError(f"{path} is in no format that is known; {words}")
     known = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in RECORDING_FORMATS.items())
-    raise RecordingError(f"{path} is in no format that is known. Known are {known}")
+    raise RecordingError(f"{path} is in no format that is known. Known are {known}; each also in a .zip file")
