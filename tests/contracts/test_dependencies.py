@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from support.fleet.contracts_documents import REPOSITORY, text
+from support.fleet.contracts_documents import REPOSITORY, code_words, rows, text
 
 OWN = {"fleetmap", "fleetsim", "mapserver", "locclient"}
 SHARED = ("shared/fleetmap", "shared/fleetsim", "locclient/locclient")
@@ -77,3 +77,8 @@ def test_nothing_is_declared_that_nothing_imports() -> None:
 def test_the_client_brings_nothing_that_the_server_alone_needs() -> None:
     assert declared("client") == set()
     assert not declared(None) & declared("server")
+
+
+def test_every_extra_is_documented() -> None:
+    named = {word for row in rows(text("docs/install.md").partition("## From")[0]) for word in code_words(row[0])}
+    assert named == set(PROJECT["optional-dependencies"])

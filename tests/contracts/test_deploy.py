@@ -120,8 +120,11 @@ def test_a_library_that_changed_on_the_index_is_not_installed(tmp_path: Path) ->
 
 def test_what_is_deployed_is_installed_by_hash() -> None:
     """From a lock that the deployer made: no file of the project names an index or the files of one."""
-    for unit in ("mapserver.service", "locclient.service"):
-        assert "--require-hashes" in (REPOSITORY / "deploy" / unit).read_text("utf-8"), unit
+    for name in ("mapserver.service", "locclient.service"):
+        assert re.search(
+            r"deploy/install\.sh dist/fleetmap-\S+\.whl ", (REPOSITORY / "deploy" / name).read_text("utf-8")
+        ), name
+    assert "--require-hashes" in (REPOSITORY / "deploy" / "install.sh").read_text("utf-8")
     deployed = (path for path in (REPOSITORY / "deploy").rglob("*") if path.is_file())
     places = [*deployed, REPOSITORY / "constraints.txt", REPOSITORY / "pyproject.toml"]
     for path in places:

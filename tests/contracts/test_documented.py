@@ -1,7 +1,6 @@
 """Commands, options, endpoints, metrics, bus keys and report keys stand in the documents, and no table row is stale."""
 
 import dataclasses
-import importlib
 import inspect
 import re
 import tomllib
@@ -10,7 +9,6 @@ from pathlib import Path
 import click
 import msgspec
 import pytest
-import typer
 
 from fleetmap import messages
 from fleetmap.messages import Cause
@@ -20,7 +18,7 @@ from mapserver.fleet_statistics.kpis import Kpis
 from mapserver.nightly.night import NightReport
 from mapserver.quality import figures
 from mapserver.survey.merge.pipeline import Counts
-from support.fleet.contracts_documents import REPOSITORY, code_words, rows, section, text
+from support.fleet.contracts_documents import REPOSITORY, click_command, code_words, rows, section, text
 
 ROOTS = ("shared", "mapserver", "locclient", "deploy", "docs", "examples", "tests")
 COMMANDS = "docs/command_line.md"
@@ -28,17 +26,6 @@ SERVICE = "docs/service.md"
 REPORTS = "docs/reports.md"
 DOCUMENTS = sorted(str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("docs/*.md"))
 LINKED = re.compile(r"\]\((?!https?:)([^)#]+)")
-
-
-def _command(path: str) -> click.Command:
-    """A command by its words, such as "mapserver build", as its script has it."""
-    script, *words = path.split()
-    project = tomllib.loads(text("pyproject.toml"))["project"]
-    module = project["scripts"][script].partition(":")[0]
-    found = typer.main.get_command(importlib.import_module(module).app)
-    for word in words:
-        found = found.commands[word]  # type: ignore[attr-defined]
-    return found
 
 
 def _scripts() -> list[str]:
@@ -51,7 +38,7 @@ def _documented_commands() -> list[str]:
 
 def _leaves(path: str) -> set[str]:
     """The command itself, or all commands of a group and its groups."""
-    groups = getattr(_command(path), "commands", None)
+    groups = getattr(click_command(path), "commands", None)
     return {path} if groups is None else {leaf for name in groups for leaf in _leaves(f"{path} {name}")}
 
 
@@ -68,7 +55,7 @@ def test_commands_are_documented(script: str) -> None:
 
 @pytest.mark.parametrize("path", _documented_commands())
 def test_options_are_documented(path: str) -> None:
-    command = _command(path)
+    command = click_command(path)
     options = {parameter.opts[0] for parameter in command.params if parameter.param_type_name == "option"}
     documented = {code_words(row[0])[0] for row in rows(section(COMMANDS, f"`{path}`"))}
     assert {word.split()[0] for word in documented if word.startswith("--")} == options - {"--help"}
@@ -76,10 +63,10 @@ def test_options_are_documented(path: str) -> None:
 
 
 def test_every_command_that_reads_a_recording_takes_the_names_of_its_topics() -> None:
-    commands = {path: _command(path) for path in _documented_commands()}
+    commands = {path: click_command(path) for path in _documented_commands()}
     readers = {path: command for path, command in commands.items() if "RECORDING" in str(_arguments(command))}
     assert len(readers) >= 7
-    for path, command in (readers | {"mapserver nightly": _command("mapserver nightly")}).items():
+    for path, command in (readers | {"mapserver nightly": click_command("mapserver nightly")}).items():
         assert "--topic" in {option for parameter in command.params for option in parameter.opts}, path
 
 

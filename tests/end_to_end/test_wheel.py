@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 import sys
-import venv
 from collections.abc import Sequence
 from pathlib import Path
 from zipfile import ZipFile
@@ -22,11 +21,10 @@ PACKAGES = {"fleetmap", "fleetsim", "mapserver", "locclient"}
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
-def run(command: Sequence[str | Path], folder: Path, *, sources: str | None = None) -> str:
-    """The standard output of a command that must succeed; `sources` is its PYTHONPATH."""
+def run(command: Sequence[str | Path], folder: Path, **settings: str) -> str:
+    """The standard output of a command that must succeed; `settings` go into its environment."""
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
-    if sources is not None:
-        environment["PYTHONPATH"] = sources
+    environment |= settings
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{' '.join(map(str, command))}\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
     return done.stdout
@@ -43,12 +41,10 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def robot(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The programs' folder of an environment with nothing but the wheel and what the extra `client` asks for."""
-    folder = tmp_path_factory.mktemp("robot")
-    venv.create(folder, with_pip=True)
+    folder = tmp_path_factory.mktemp("robot") / "environment"
+    settings = {"LOCK": str(folder.parent / "client.lock"), "PYTHON": sys.executable}
+    run([REPOSITORY / "deploy/install.sh", wheel, "client", folder], folder.parent, **settings)
     programs = folder / "bin"
-    constraints = REPOSITORY / "constraints.txt"
-    install = [programs / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-    run([*install, "-c", constraints, f"{wheel}[client]"], folder)
     (installed,) = folder.glob("lib/python*/site-packages")
     for source in (REPOSITORY / "shared/fleetmap", REPOSITORY / "locclient/locclient"):
         take_kernels(source, installed / source.name)
@@ -80,7 +76,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ["mapserver.cli", "publish", "--site", "lab", "--store", "store", *known_rig(folder)],
     ):
         start = f"from {module} import main; main()"
-        run([sys.executable, "-c", start, *arguments], folder, sources=SOURCES)
+        run([sys.executable, "-c", start, *arguments], folder, PYTHONPATH=SOURCES)
     return folder
 
 
@@ -93,7 +89,7 @@ def test_wheel_holds_the_four_packages_and_nothing_else(wheel: Path) -> None:
 
 
 def test_robot_has_what_the_extra_client_asks_for_and_nothing_else(robot: Path) -> None:
-    """All that is installed is the project, what it needs without an extra, what those need, and what venv brings."""
+    """All that is installed is the project, what it needs without an extra, and what those need."""
     script = """
 import json, re
 from importlib import metadata
@@ -101,20 +97,21 @@ plain = lambda name: re.sub(r"[-_.]+", "-", name).lower()
 print(json.dumps({plain(d.metadata["Name"]): [r.replace('"', "'") for r in d.requires or ()] for d in metadata.distributions()}))
 """
     installed: dict[str, list[str]] = json.loads(run([robot / "python", "-c", script], robot))
-    needed, waiting = {"pip", "setuptools"}, ["fleetmap"]
+    needed: set[str] = set()
+    waiting = ["fleetmap"]
     while waiting:
         name = waiting.pop()
         needed.add(name)
         for requirement in installed[name]:
-            asked = re.sub(r"[-_.]+", "-", re.split(r"[^\w.-]", requirement, maxsplit=1)[0]).lower()
+            name_asked = re.sub(r"[-_.]+", "-", re.split(r"[^\w.-]", requirement, maxsplit=1)[0]).lower()
             # Of others' extras securesystemslib[crypto] alone is asked for.
             is_asked = "extra ==" not in requirement or (name, "'crypto'" in requirement) == ("securesystemslib", True)
-            if is_asked and asked in installed and asked not in needed:
-                waiting.append(asked)
+            if is_asked and name_asked in installed and name_asked not in needed:
+                waiting.append(name_asked)
     assert set(installed) <= needed
-    of_server = [r for r in installed["fleetmap"] if "extra == 'server'" in r]
-    assert len(of_server) >= 10
-    assert not {re.split(r"[^\w.-]", r, maxsplit=1)[0].lower() for r in of_server} & set(installed)
+    asked = {re.split(r"[^\w.-]", r, maxsplit=1)[0].lower() for r in installed["fleetmap"] if "extra == 'server'" in r}
+    assert len(asked - set(installed)) >= 10
+    assert {"fastapi", "gtsam", "scipy", "nicegui"} <= asked - set(installed)
 
 
 @pytest.mark.parametrize("program", ["mapserver", "locclient", "fleetsim"])
@@ -128,6 +125,14 @@ def test_the_map_server_says_what_to_install(robot: Path, wheel: Path, arguments
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert "gtsam" in done.stderr
     assert f"pip install './{wheel.name}[server]'" in done.stderr
+
+
+def test_it_stays_small(robot: Path) -> None:
+    """Beside OpenCV, whose size is that of its wheel; docs/install.md has the table. Kernels included."""
+    files = [path for path in robot.parent.rglob("*") if path.is_file() and not path.is_symlink()]
+    ours = [path for path in files if not {"cv2", "opencv_python_headless.libs"} & set(path.parts)]
+    assert sum(path.stat().st_size for path in files) - sum(path.stat().st_size for path in ours) > 50e6, "the control"
+    assert sum(path.stat().st_size for path in ours) < 335e6
 
 
 def test_help(robot: Path) -> None:

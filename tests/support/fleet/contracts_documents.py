@@ -1,7 +1,12 @@
 """The project's documents, cut into sections and tables for the tests that compare them with the code."""
 
+import importlib
 import re
+import tomllib
 from pathlib import Path
+
+import click
+import typer
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 _HEADING = re.compile(r"^#{1,6} .*$", re.MULTILINE)
@@ -34,3 +39,14 @@ def rows(part: str) -> list[list[str]]:
 def code_words(cell: str) -> list[str]:
     """The words in backticks."""
     return re.findall(r"`([^`]+)`", cell)
+
+
+def click_command(path: str) -> click.Command:
+    """A command by its words, such as "mapserver build", as its script has it."""
+    script, *words = path.split()
+    project = tomllib.loads(text("pyproject.toml"))["project"]
+    module = project["scripts"][script].partition(":")[0]
+    found = typer.main.get_command(importlib.import_module(module).app)
+    for word in words:
+        found = found.commands[word]  # type: ignore[attr-defined]
+    return found
