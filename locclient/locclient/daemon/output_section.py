@@ -21,6 +21,7 @@ class OutputSection(Section, frozen=True):
     map_topic: str = "map"
     tf_topic: str = "tf"
     map_frame: str = "map"
+    building_frame: str = ""
     odom_frame: str = "odom"
     base_frame: str = "base_link"
     sensor_frames: str = "fleetmap_"

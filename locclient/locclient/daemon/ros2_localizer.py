@@ -81,6 +81,7 @@ class Ros2Localizer:
         self._refused: deque[str] = deque(maxlen=1)
         self._alive_s = time.monotonic()
         self._bond: BondStatus | None = None
+        self._building_from_map: Array | None = None
         self._ended = threading.Event()
         self._node = node = Ros2Node(bus, key_layout(section.keys, section.domain), section.node, section.namespace)
         try:
@@ -128,6 +129,8 @@ class Ros2Localizer:
         if self._state is not LifecycleState.ACTIVE:
             return
         section, stamp_ns = self._section, estimate.stamp_ns
+        if section.building_frame:
+            self._tell_building(published.building_from_map)
         if published.map_from_odom is not None:
             ahead_ns = stamp_ns + int(section.transform_tolerance_s * 1e9)
             link = FrameLink(section.map_frame, section.odom_frame, published.map_from_odom)
@@ -143,6 +146,13 @@ class Ros2Localizer:
             motion = motion_between(before, (estimate, published), base_from_body)
             self._send_odom(encode_motion(stamp_ns, section.odom_frame, section.base_frame, motion))
         self._send_status(encode_text(estimate.status.value))
+
+    def _tell_building(self, building_from_map: Array | None) -> None:
+        """The last one that was known stays in ROS's tree of frames: what is static there is never taken back."""
+        known = self._building_from_map
+        if building_from_map is not None and (known is None or not np.array_equal(known, building_from_map)):
+            self._building_from_map = building_from_map
+            self._send_static_frames()
 
     def alive(self, is_silent: bool) -> None:
         """See Publisher."""
@@ -232,12 +242,18 @@ class Ros2Localizer:
         return encode_loaded_map(time.time_ns(), self._section.map_frame, grid, result)
 
     def _send_latched(self) -> None:
-        now_ns = time.time_ns()
-        if self._section.sensor_frames:
-            links = sensor_links(self._section, self._calibration)
-            self._send_tf_static(encode_frame_links(now_ns, links))
+        self._send_static_frames()
         if self._grid is not None:
-            self._send_map(encode_grid(now_ns, self._section.map_frame, self._grid))
+            self._send_map(encode_grid(time.time_ns(), self._section.map_frame, self._grid))
+
+    def _send_static_frames(self) -> None:
+        """All in one message, of which late subscribers get the last one."""
+        section = self._section
+        links = sensor_links(section, self._calibration) if section.sensor_frames else []
+        if self._building_from_map is not None:
+            links.append(FrameLink(section.building_frame, section.map_frame, self._building_from_map))
+        if links:
+            self._send_tf_static(encode_frame_links(time.time_ns(), links))
 
     # --- bond ---------------------------------------------------------------------------------------------------------
 

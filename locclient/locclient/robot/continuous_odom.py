@@ -9,10 +9,14 @@ from locclient.localization.estimate import Estimate
 
 @dataclass(frozen=True, slots=True)
 class PublishedPose:
-    """One estimate in the published frames; map_from_odom is None while there is no single pose."""
+    """One estimate in the published frames; map_from_odom is None while there is no single pose.
+
+    building_from_map: of the map that the robot uses, None where that does not say it.
+    """
 
     odom_from_base: Array
     map_from_odom: Array | None
+    building_from_map: Array | None = None
 
 
 class ContinuousOdom:

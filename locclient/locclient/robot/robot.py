@@ -7,6 +7,7 @@ from enum import StrEnum
 
 from fleetmap.failure_definition import may_be_mapped, radius_95_m
 from fleetmap.geometry import Array
+from fleetmap.mapformat.building import building_frame
 from fleetmap.messages import Cause, PoseMessage, Status, WantedVersion
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.calibration import RigCalibration
@@ -124,6 +125,7 @@ class Robot:
         self._onsets = OnsetRecorder()
         self._last: tuple[RectifiedFrame, Estimate] | None = None
         self._speed = SpeedGauge()
+        self._building_from_map: Array | None = None
 
     @property
     def held(self) -> list[LoadedMap]:
@@ -180,7 +182,7 @@ class Robot:
         cpu_s = self._clock_s() - begun_s
         stage_s = {"decode": decoded_s - begun_s, "rectify": rectified_s - decoded_s, **estimate.stage_s}
         self._try(estimate, frame)
-        published = self._odom.handle(estimate)
+        published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map)
         speed_mps = self._speed.handle(bundle.wheel, estimate.odometry, published.odom_from_base)
         is_covered = self._may_be_mapped(estimate)
         failure = self.monitor.handle(estimate, speed_mps, may_be_mapped=is_covered)
@@ -219,6 +221,8 @@ class Robot:
 
     def _show(self, loaded: LoadedMap) -> None:
         focal_px, tiles = loaded.manifest.camera.focal_px, loaded.tiles.values()
+        frame = building_frame(loaded.manifest)
+        self._building_from_map = None if frame is None else frame.building_from_map
         self.localizer.handle_version(loaded.version, tiles, loaded.vocabulary, focal_px, loaded.lookalikes)
 
     def _new_trial(self) -> VersionTrial | None:

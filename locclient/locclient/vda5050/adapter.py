@@ -12,7 +12,7 @@ import numpy as np
 
 from fleetmap.errors import FleetmapError, LinkError
 from fleetmap.failure_definition import is_driving
-from fleetmap.geometry import se3, so3_exp
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.messages import Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.robot.robot import Change, Outcome, VersionChange
@@ -72,10 +72,13 @@ class _Robot:
 
 @dataclass
 class _Known:
+    """fleet_from_map: None while the map does not say where it lies in the frame that the fleet manager speaks."""
+
     localization: Localization = field(default_factory=Localization)
     versions: list[tuple[int, bool]] = field(default_factory=list)
     in_use: frozenset[int] = frozenset()
     robot: _Robot = field(default_factory=_Robot)
+    fleet_from_map: Array | None = None
 
 
 class FleetAdapter:
@@ -92,6 +95,7 @@ class FleetAdapter:
         self.changed, self.factsheet_wanted = threading.Event(), threading.Event()
         self._lock = threading.RLock()
         self._book, self._known, self._pending = ActionBook(), _Known(), _Pending()
+        self._known.fleet_from_map = np.eye(4) if section.frame == "map" else None
         self._jobs: deque[tuple[Action, dict[str, Any]]] = deque()
         self._last_said: object = None
         self._untold: Localization | None = None  # a loss that no state has told yet, however short it was
@@ -266,25 +270,30 @@ class FleetAdapter:
             return self._book.fail(action, "INITIALIZE_POSITION_FAILED", "no images come from the cameras")
         if self._pending.position is not None:
             self._book.set(self._pending.position[0], "FAILED", "another initializePosition came")
+        fleet_from_map = self._known.fleet_from_map
+        if fleet_from_map is None:
+            words = "the map does not say where it lies in the building, in which [vda5050] frame puts positions"
+            return self._book.fail(action, "INITIALIZE_POSITION_FAILED", words)
         place = Position(float(given["x"]), float(given["y"]), float(given["theta"]))
         self._pending.position = (action, place, self._clock_s() + section.initialize_s)
         self._book.set(action, "RUNNING")
         if now.status == Status.TRACKING:  # a pose that fixes confirm is not given up for what somebody says
             return self._judge_position(is_last=True)
         sigmas = [_TILT_SIGMA_RAD] * 2 + [section.initial_sigma_rad] + [section.initial_sigma_m] * 2 + [_HEIGHT_SIGMA_M]
-        map_from_base = se3(so3_exp(np.array([0.0, 0.0, place.theta_rad])), np.array([place.x_m, place.y_m, 0.0]))
+        fleet_from_base = se3(so3_exp(np.array([0.0, 0.0, place.theta_rad])), np.array([place.x_m, place.y_m, 0.0]))
+        map_from_base = se3_inverse(fleet_from_map) @ fleet_from_base
         self._parts.put_prior(PositionPrior(now.stamp_ns + 1, map_from_base, np.diag(np.square(sigmas))))
         return None
 
     def after_frame(self, outcome: Outcome, in_use: frozenset[int]) -> None:
         """The results of a frame, and the versions that the localizer holds; from the thread that localizes."""
         with self._lock:
-            self._known.in_use = in_use
-            self._see(
-                self._known.localization.after(
-                    outcome, self._parts.lost_radius_m, is_driving=is_driving(outcome.speed_mps)
-                )
-            )
+            known = self._known
+            known.in_use = in_use
+            if self._section.frame == "building":
+                known.fleet_from_map = outcome.published.building_from_map
+            how = (outcome, self._parts.lost_radius_m, known.fleet_from_map)
+            self._see(known.localization.after(*how, is_driving=is_driving(outcome.speed_mps)))
             self._judge_position()
 
     def silence(self) -> None:

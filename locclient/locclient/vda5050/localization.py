@@ -11,6 +11,7 @@ from locclient.vda5050.messages import Error
 
 _NO_FRAMES = "no images come from the cameras; look at them and their cables"
 _NO_MAP = "the robot has no map; download and enable one"
+_NO_BUILDING = "the map does not say where it lies in the building; align the site and build a version, or set [vda5050] frame to map"
 _WORDS = {
     Cause.DARK: "the images are dark: lights out, or a covered lens",
     Cause.GLARE: "the images are overexposed",
@@ -30,7 +31,7 @@ _STATUS_WORDS = {
 
 @dataclass(frozen=True)
 class Position:
-    """A pose of the base in `map`. radius_m: of 95 %, infinite where the robot is not localized."""
+    """A pose of the base in the fleet manager's frame. radius_m: of 95 %, infinite where the robot is not localized."""
 
     x_m: float
     y_m: float
@@ -55,14 +56,22 @@ class Localization:
     is_driving: bool = True
     is_silent: bool = True
     has_map: bool = False
+    is_aligned: bool = True
 
-    def after(self, outcome: Outcome, lost_radius_m: float, *, is_driving: bool) -> "Localization":
-        """With the results of one frame. Beyond lost_radius_m (95 %) nobody can drive by a position, whatever the status."""
+    def after(
+        self, outcome: Outcome, lost_radius_m: float, fleet_from_map: Array | None, *, is_driving: bool
+    ) -> "Localization":
+        """With the results of one frame. Beyond lost_radius_m (95 %) nobody can drive by a position, whatever the status.
+
+        fleet_from_map: None where the map does not know the fleet manager's frame, in which nothing can be said then.
+        """
         estimate, published = outcome.estimate, outcome.published
         position, is_localized = self.position, False
-        if published.map_from_odom is not None and estimate.cov_rot_trans is not None:
+        if fleet_from_map is None:
+            position = None
+        elif published.map_from_odom is not None and estimate.cov_rot_trans is not None:
             map_from_base = published.map_from_odom @ published.odom_from_base
-            position = _position(map_from_base, radius_95_m(estimate.cov_rot_trans))
+            position = _position(fleet_from_map @ map_from_base, radius_95_m(estimate.cov_rot_trans))
             is_localized = estimate.status in {Status.TRACKING, Status.DEGRADED} and position.radius_m <= lost_radius_m
         return Localization(
             estimate.status,
@@ -73,6 +82,7 @@ class Localization:
             is_driving,
             is_silent=False,
             has_map=estimate.map_version is not None,
+            is_aligned=fleet_from_map is not None,
         )
 
     def mobile_robot_position(self, map_id: str, lost_radius_m: float) -> dict[str, object] | None:
@@ -96,6 +106,8 @@ class Localization:
             hint = _NO_FRAMES
         elif not self.has_map:
             hint = _NO_MAP
+        elif not self.is_aligned:
+            hint = _NO_BUILDING
         elif not hint:
             hint = _STATUS_WORDS.get(Status(self.status), "the robot has no pose that can be relied upon")
         said = "no images" if self.is_silent else self.status
@@ -107,6 +119,6 @@ class Localization:
         )
 
 
-def _position(map_from_base: Array, radius_m: float) -> Position:
-    x_m, y_m = (float(value) for value in map_from_base[:2, 3])
-    return Position(x_m, y_m, float(atan2(map_from_base[1, 0], map_from_base[0, 0])), radius_m)
+def _position(fleet_from_base: Array, radius_m: float) -> Position:
+    x_m, y_m = (float(value) for value in fleet_from_base[:2, 3])
+    return Position(x_m, y_m, float(atan2(fleet_from_base[1, 0], fleet_from_base[0, 0])), radius_m)

@@ -27,6 +27,7 @@ class Vda5050Section(Section, frozen=True):
     ca: str | None = None
     map_id: str | None = None
     versions: Literal["fleet manager", "map server"] = "fleet manager"
+    frame: Literal["map", "building"] = "map"
     download_from: tuple[str, ...] = ()
     download_token_file: str | None = None
     download_ca: str | None = None

@@ -1,14 +1,16 @@
 """The building's frame, in which people and fleet managers speak of places: where the origin of `map` stands in it."""
 
 from math import pi
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import numpy as np
 
 from fleetmap.errors import MapFormatError
 from fleetmap.geometry import Array, se3, so3_exp
-from fleetmap.mapformat.manifest import Manifest
+
+if TYPE_CHECKING:
+    from fleetmap.mapformat.manifest import Manifest
 
 BUILDING_KEY = "building"
 """In `configuration` of a manifest, where readers of before look over it: format 1 refuses keys that it does not know elsewhere."""
@@ -36,7 +38,7 @@ class BuildingFrame(msgspec.Struct, frozen=True, kw_only=True):
         return se3(so3_exp(np.array([0.0, 0.0, self.yaw_rad])), np.array([self.x_m, self.y_m, 0.0]))
 
 
-def building_frame(manifest: Manifest) -> BuildingFrame | None:
+def building_frame(manifest: "Manifest") -> BuildingFrame | None:
     """The building's frame as the site knew it when the version was made; None without. MapFormatError for one that is none."""
     found = manifest.configuration.get(BUILDING_KEY)
     if found is None:
@@ -45,5 +47,5 @@ def building_frame(manifest: Manifest) -> BuildingFrame | None:
         return msgspec.convert(found, BuildingFrame)
     except msgspec.ValidationError as error:
         raise MapFormatError(
-            f"manifest of {manifest.site} version {manifest.version}: the building's frame: {error}; it is damaged"
+            f"manifest of {manifest.site} version {manifest.version}: configuration.building: {error}; it is damaged"
         ) from error

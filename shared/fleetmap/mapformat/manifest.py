@@ -5,6 +5,7 @@ from typing import Annotated, Any
 import msgspec
 
 from fleetmap.errors import MapFormatError, NewerFormatError
+from fleetmap.mapformat.building import building_frame
 from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
 
 MANIFEST_FORMAT = 1
@@ -111,6 +112,8 @@ def decode_manifest(data: bytes) -> Manifest:
             raise NewerFormatError(
                 f"manifest has format {number}, this fleetmap reads up to {MANIFEST_FORMAT}; update fleetmap to read it"
             )
-        return msgspec.json.decode(data, type=Manifest)
+        manifest = msgspec.json.decode(data, type=Manifest)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise MapFormatError(f"manifest: {error}; it is damaged or not a manifest") from error
+    building_frame(manifest)
+    return manifest

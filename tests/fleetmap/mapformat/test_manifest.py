@@ -85,6 +85,8 @@ def test_a_newer_manifest_is_refused_by_its_number() -> None:
         ("tiles", [{"x": 0, "y": 0, "sha256": "0" * 64, "bytes": -1, "landmarks": 1}]),
         ("unknown", 1),
         ("created", None),
+        ("configuration", {"building": {"x_m": "1", "y_m": 0, "yaw_rad": 0}}),
+        ("configuration", {"building": {"x_m": 1, "y_m": 0, "yaw_rad": 7}}),
     ],
 )
 def test_damaged_manifests_are_refused(key: str, value: object) -> None:

@@ -71,6 +71,27 @@ def test_ros_topics_hold_the_same() -> None:
     assert [CdrReader(state).text() for state in states] == ["TRACKING", "LOST"]
 
 
+def test_the_building_is_told_once_the_map_says_it() -> None:
+    """Beside the cameras' frames, in one message: late subscribers get the last one alone. Not again with every frame."""
+    building_from_map = se3(so3_exp(np.array([0.0, 0.0, 0.5])), np.array([3.0, -4.0, 0.0]))
+    hub, heard = MemoryHub(), []
+    key = ros_key(0, "/tf_static", "tf2_msgs/TFMessage")
+    with MemoryBus(hub) as bus, MemoryBus(hub) as other:
+        other.subscribe(key, lambda _, payload: heard.append(decode_frame_links(payload)))
+        publisher = open_publisher(inputs(bus), OutputSection(format="ros2", building_frame="building"))
+        odom = ContinuousOdom(BASE_FROM_BODY)
+        for known in (None, building_from_map, building_from_map.copy(), None):
+            one = estimate(5.0)
+            placed = replace(odom.handle(one), building_from_map=known)
+            publisher.publish(one, placed, BASE_FROM_BODY)  # type: ignore[arg-type]
+        publisher.close()
+    assert [len(links) for links in heard] == [3, 4]
+    assert (heard[1][3].parent, heard[1][3].child) == ("building", "map")
+    np.testing.assert_allclose(heard[1][3].parent_from_child, building_from_map, atol=1e-12)
+    told = published(OutputSection(format="ros2"), estimate(5.0))
+    assert [len(decode_frame_links(payload)) for payload in told[key]] == [3]
+
+
 @pytest.mark.parametrize(
     ("section", "said"), [({"format": "xml"}, "xml"), ({"format": "ros2", "tf_topic": "a b"}, "a b")]
 )

@@ -1,11 +1,14 @@
 """Versions on trial while a robot drives: it keeps its place whatever a new version turns out to be."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
+from fleetmap.geometry import se3, so3_exp
 from fleetmap.messages import Status
 from locclient.robot.robot import Change, Robot
 from mapserver.store import MapStore
@@ -39,6 +42,20 @@ def test_the_first_version_is_taken_and_the_robot_finds_itself(store: MapStore) 
     assert [change.change for change in robot.take_changes()] == [Change.ADOPTED]
     assert max(errors[45:]) < 0.05
     assert robot.take_changes() == []
+
+
+def test_a_robot_knows_where_its_map_lies_in_the_building(store: MapStore) -> None:
+    robot, loaded = robot_world.new_robot(), robot_world.loaded(store)
+    frame = {"x_m": 3.0, "y_m": -4.0, "yaw_rad": 0.5}
+    aligned = msgspec.structs.replace(loaded.manifest, configuration={"building": frame})
+    found = []
+    for one in (loaded, replace(loaded, manifest=aligned), loaded):
+        robot.use(one)
+        outcome = robot.handle(next(iter(robot_world.bundles(1))))
+        assert outcome is not None
+        found.append(outcome.published.building_from_map)
+    assert found[0] is found[2] is None
+    np.testing.assert_allclose(found[1], se3(so3_exp(np.array([0.0, 0.0, 0.5])), np.array([3.0, -4.0, 0.0])))
 
 
 def test_a_good_version_is_adopted_after_its_fixes(store: MapStore) -> None:

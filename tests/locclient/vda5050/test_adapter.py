@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import UsageError
+from fleetmap.geometry import se3, so3_exp
 from fleetmap.messages import Cause, Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.robot.continuous_odom import PublishedPose
@@ -124,6 +125,35 @@ def test_a_position_beyond_the_lost_radius_is_none(sigma_m: float, is_localized:
     adapter.after_frame(outcome, frozenset({1}))  # type: ignore[arg-type]
     assert adapter.said()["mobileRobotPosition"]["localized"] is is_localized
     assert ("LOCALIZATION_ERROR" in adapter.error_types()) is not is_localized
+
+
+def test_positions_are_in_the_building_where_that_is_asked_for() -> None:
+    adapter = Adapter(frame="building")
+    building_from_map = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([10.0, -20.0, 0.0]))
+    estimate = SimpleNamespace(
+        status=Status.TRACKING, cause=Cause.NONE, stamp_ns=7, cov_rot_trans=np.eye(6) * 1e-4, map_version=1
+    )
+    map_from_odom = se3(np.eye(3), np.array([3.0, 1.0, 0.0]))
+    given = {"x": 9.0, "y": -17.0, "theta": np.pi / 2, "mapId": "hall", "lastNodeId": "n"}
+
+    def drive(known: np.ndarray | None) -> dict[str, Any]:
+        placed = PublishedPose(np.eye(4), map_from_odom, known)
+        outcome = SimpleNamespace(estimate=estimate, published=placed, speed_mps=0.0)
+        adapter.after_frame(outcome, frozenset({1}))  # type: ignore[arg-type]
+        return adapter.said()
+
+    unknown = drive(None)
+    assert "mobileRobotPosition" not in unknown
+    (lost,) = (error for error in unknown["errors"] if error["errorType"] == "LOCALIZATION_ERROR")
+    assert "where it lies in the building" in lost["errorHint"]
+    assert adapter.ask("initializePosition", "a", **given)["actionStatus"] == "FAILED"
+    place = drive(building_from_map)["mobileRobotPosition"]
+    assert (place["x"], place["y"], place["theta"]) == pytest.approx((9.0, -17.0, np.pi / 2))
+    assert place["localized"] is True
+    estimate.status = Status.DEGRADED
+    drive(building_from_map)
+    adapter.ask("initializePosition", "b", **given)
+    np.testing.assert_allclose(adapter.priors[-1].map_from_base, map_from_odom, atol=1e-12)
 
 
 def test_a_loss_between_two_states_is_told() -> None:
