@@ -15,6 +15,7 @@ fleetmap/{site}/patches/{base}-{sha256}  asked by the robot, ChunkRequest: Part 
 fleetmap/{site}/trust/{file}             asked by the robot, ChunkRequest: Part of a file of the signed lists, empty where there is none
 """
 
+import math
 from enum import StrEnum
 from typing import Annotated, Any, Self, TypeVar
 
@@ -343,6 +344,15 @@ def report_dict(message: Message) -> dict[str, Any]:
     """The message as plain values, for reports."""
     built: dict[str, Any] = msgspec.to_builtins(message)
     return built
+
+
+def finite(value: Any) -> Any:
+    """Plain values with null for every number that JSON does not have."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def robot_key(site: str, robot: str, what: str) -> str:

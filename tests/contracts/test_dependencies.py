@@ -16,6 +16,7 @@ SHARED = ("shared/fleetmap", "shared/fleetsim", "locclient/locclient")
 DISTRIBUTIONS = {
     "argon2": "argon2-cffi",
     "cv2": "opencv-python-headless",
+    "foxglove": "foxglove-sdk",
     "google": "protobuf",
     "paho": "paho-mqtt",
     "yaml": "pyyaml",

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from fastapi import FastAPI, Query, Response
 
-from fleetmap.messages import report_dict
+from fleetmap.messages import finite, report_dict
 from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.parameters import (
     Axis,
@@ -22,7 +22,6 @@ from mapserver.api.parameters import (
     page,
 )
 from mapserver.api.views import FailureList, FailureView, HourList, HourView, KpisList, KpisView
-from mapserver.fleet.fleet import finite
 from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
 from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of, kpis
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings, route_geojson

@@ -19,6 +19,7 @@ from fleetmap.messages import (
     RobotHealth,
     WantedVersion,
     decode_message,
+    finite,
     report_dict,
 )
 from mapserver.fleet.ingest import Ingest, IngestSettings
@@ -261,15 +262,6 @@ def _status(key: tuple[str, str], robot: _Robot, assignment: VersionAssignment, 
         last_health=robot.report.get("health"),
         last_pose=None if robot.last_estimate is None else finite(report_dict(robot.last_estimate)),
     )
-
-
-def finite(value: Any) -> Any:
-    """Plain values with null for every number that JSON does not have."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _check_sender(site: str, robot: str, message: RobotAck | RobotHealth | FailureReport) -> None:

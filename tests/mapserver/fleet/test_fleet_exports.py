@@ -1,16 +1,16 @@
 """What leaves the server about the fleet: the page, JSON lines, MCAP, the commands that write them."""
 
-import base64
 import json
 import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
-import jsonschema_rs
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 from typer.testing import CliRunner
 
 from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
@@ -167,37 +167,35 @@ def test_json_lines_hold_every_failure_in_order(folder: tuple[Path, Known], tmp_
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_mcap_holds_what_foxglove_expects(folder: tuple[Path, Known], tmp_path: Path) -> None:
-    from mapserver.fleet.exports import write_mcap
+def test_mcap_holds_the_channels_of_viewers(folder: tuple[Path, Known], tmp_path: Path) -> None:
+    from fleetmap.foxglove.channels import CHANNELS
+    from mapserver.fleet.exports import failures_oldest_first, write_mcap
 
     path = tmp_path / "out.mcap"
     with MapStore.open(folder[0]) as store:
-        count = write_mcap(store, FailureFilter(site="hall"), path)
-    seen: dict[str, int] = {}
+        found = list(failures_oldest_first(store, FailureFilter(site="hall")))
+        assert write_mcap(store, FailureFilter(site="hall"), path) == len(found)
+        landmarks = store.manifest("hall", 1).landmarks
+    seen: dict[str, list[Any]] = {}
     with path.open("rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages():
-            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
-            value = json.loads(message.data)
-            jsonschema_rs.validate(json.loads(schema.data), value)
-            seen[channel.topic] = seen.get(channel.topic, 0) + 1
-            if "timestamp" in value:
-                assert value["timestamp"]["sec"] * 10**9 + value["timestamp"]["nsec"] == message.log_time
-            if schema.name == "foxglove.CompressedImage":
-                assert base64.b64decode(value["data"], validate=True).startswith(b"\xff\xd8")
-    assert seen == dict.fromkeys(("/failures/log", "/failures/place", "/failures/frame", "/failures/report"), count)
-
-
-def test_the_schemas_have_foxgloves_fields() -> None:
-    """Field by field as the published protobuf schemas of Foxglove have them."""
-    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-    from foxglove_schemas_protobuf.Log_pb2 import Log
-    from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-
-    from mapserver.fleet.exports import SCHEMAS
-
-    for message in (CompressedImage, Log, PoseInFrame):
-        fields = {field.name for field in message.DESCRIPTOR.fields}
-        assert set(SCHEMAS[message.DESCRIPTOR.full_name]["properties"]) == fields
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for schema, channel, _ in reader.iter_messages():
+            assert (schema.name, schema.data) == (CHANNELS[channel.topic].name, CHANNELS[channel.topic].data)
+        topics = [topic for topic in CHANNELS if topic != "/failures/report"]
+        for _, channel, message, decoded in reader.iter_decoded_messages(topics):
+            seen.setdefault(channel.topic, []).append((message.log_time, decoded))
+        reports = [json.loads(m.data) for _, _, m in reader.iter_messages(topics=["/failures/report"])]
+    (cloud,) = seen.pop("/map")
+    assert len(cloud[1].data) == 12 * landmarks > 0
+    assert set(seen) == {"/failures/log", "/failures/place", "/failures/frame"}
+    for messages in seen.values():
+        assert [log_time for log_time, _ in messages] == [each.failure.happened_ns for each in found]
+    for each, report, (_, placed), (_, frame) in zip(
+        found, reports, seen["/failures/place"], seen["/failures/frame"], strict=True
+    ):
+        assert report["id"] == each.failure.failure_id
+        assert (placed.pose.position.x, placed.pose.position.y) == (each.failure.x_map_m, each.failure.y_map_m)
+        assert frame.data.startswith(b"\xff\xd8")
 
 
 def test_the_grafana_dashboard_asks_for_metrics_that_exist(tmp_path: Path) -> None:

@@ -1,0 +1,49 @@
+"""Foxglove: channels of maps, robots, fixes, images and failures, the server that shows them, and MCAP files that hold them.
+
+All other modules here need the extra `foxglove`: call `require_foxglove` before they are imported.
+"""
+
+from ipaddress import ip_address
+from typing import NamedTuple
+
+from fleetmap.errors import UsageError
+
+LOOPBACK = "127.0.0.1"
+
+
+class ViewerAddress(NamedTuple):
+    """Where viewers connect to; port 0 picks a free one."""
+
+    host: str
+    port: int
+
+
+def viewer_address(text: str, *, insecure: bool) -> ViewerAddress:
+    """What `--foxglove` names: PORT on loopback, or HOST:PORT.
+
+    Raises UsageError for what is none, and for one that other machines reach, unless that is wanted: viewers do not sign in.
+    """
+    host, _, port = text.rpartition(":")
+    host = host.strip("[]") or LOOPBACK
+    if not (port.isascii() and port.isdecimal()) or int(port) > 65535:
+        raise UsageError(f"--foxglove {text!r}: write it like 8765 or {LOOPBACK}:8765")
+    try:
+        is_local = host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        is_local = False
+    if not (is_local or insecure):
+        raise UsageError(
+            f"--foxglove {text}: viewers do not sign in, and other machines could see everything; leave {host} out and come "
+            "through ssh -L, or say --insecure on a network that nobody else can reach"
+        )
+    return ViewerAddress(host, int(port))
+
+
+def require_foxglove(what: str) -> None:
+    """Raises UsageError where Foxglove's library is missing; what: what needs it."""
+    try:
+        import foxglove  # noqa: F401
+    except ImportError as error:
+        raise UsageError(
+            f"{what} needs {error.name}, which is not installed; pip install '.[foxglove]' in fleetmap's source folder"
+        ) from error

@@ -1,0 +1,383 @@
+"""Channels of maps, robots, fixes, images and failures: the same for viewers and in MCAP files.
+
+Messages are protobuf in Foxglove's own schemas; a failure's whole report is JSON, because it has none. Stamps are nanoseconds.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from foxglove import Schema
+from foxglove.messages import (
+    ArrowPrimitive,
+    CameraCalibration,
+    Color,
+    CompressedImage,
+    FrameTransform,
+    FrameTransforms,
+    ImageAnnotations,
+    LinePrimitive,
+    LinePrimitiveLineType,
+    Log,
+    LogLevel,
+    PackedElementField,
+    PackedElementFieldNumericType,
+    Point2,
+    Point3,
+    PointCloud,
+    PointsAnnotation,
+    PointsAnnotationType,
+    Pose,
+    PoseInFrame,
+    PosesInFrame,
+    Quaternion,
+    SceneEntity,
+    SceneEntityDeletion,
+    SceneEntityDeletionType,
+    SceneUpdate,
+    TextPrimitive,
+    Timestamp,
+    Vector3,
+)
+from mcap.writer import CompressionType, Writer
+
+from fleetmap.geometry import Array, quat_wxyz_from_rotation
+from fleetmap.live_survey import LiveSurveyState
+from fleetmap.messages import EstimateMessage, FailureKind, FailureReport, Status, finite, report_dict
+from fleetmap.recordings.images import jpeg_image
+from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.samples import Image
+
+MAP, ODOM, BASE, CAMERA, SURVEY = "map", "odom", "base_link", "camera", "survey"
+MAX_POINTS = 1_000_000  # of a map in one message of 12 MB; of larger ones every n-th
+_MAX_PATH = 2000
+_QUALITY = 80
+_LAST_S = (1 << 32) - 1
+REPORT = Schema(name="fleetmap.FailureReport", encoding="jsonschema", data=b"")
+CHANNELS: dict[str, Schema] = {
+    "/map": PointCloud.get_schema(),
+    "/path": PosesInFrame.get_schema(),
+    "/tf": FrameTransforms.get_schema(),
+    "/robots": SceneUpdate.get_schema(),
+    "/fixes": PoseInFrame.get_schema(),
+    "/camera": CompressedImage.get_schema(),
+    "/camera/calibration": CameraCalibration.get_schema(),
+    "/camera/matches": ImageAnnotations.get_schema(),
+    "/log": Log.get_schema(),
+    "/survey/landmarks": PointCloud.get_schema(),
+    "/survey/path": PosesInFrame.get_schema(),
+    "/survey/revisits": SceneUpdate.get_schema(),
+    "/survey/robot": SceneUpdate.get_schema(),
+    "/failures/log": Log.get_schema(),
+    "/failures/place": PoseInFrame.get_schema(),
+    "/failures/frame": CompressedImage.get_schema(),
+    "/failures/matches": CompressedImage.get_schema(),
+    "/failures/report": REPORT,
+}
+
+_GOOD, _WARN, _BAD = (0.15, 0.65, 0.35), (0.95, 0.65, 0.1), (0.85, 0.2, 0.2)
+_QUIET = (0.55, 0.55, 0.55)
+_COLOURS: dict[str, tuple[float, float, float]] = {
+    Status.TRACKING: _GOOD,
+    Status.DEGRADED: _WARN,
+    Status.AMBIGUOUS: _BAD,
+    Status.LOST: _BAD,
+}
+_LEVELS: dict[str, LogLevel] = {
+    Status.TRACKING: LogLevel.Info,
+    Status.INITIALISING: LogLevel.Info,
+    Status.DEGRADED: LogLevel.Warning,
+}
+
+
+class ChannelMessage(NamedTuple):
+    """A message of a topic of CHANNELS, encoded."""
+
+    topic: str
+    stamp_ns: int
+    data: bytes
+
+
+class Shown(NamedTuple):
+    """A message that is made when somebody sees it."""
+
+    topic: str
+    stamp_ns: int
+    make: Callable[[], ChannelMessage]
+
+    @classmethod
+    def now(cls, message: ChannelMessage) -> "Shown":
+        """One that is made already."""
+        return cls(message.topic, message.stamp_ns, lambda: message)
+
+
+class RobotMark(NamedTuple):
+    """A robot, or a place where it may be: map_from_base (4, 4), a Status by name; is_silent: nothing was heard of it lately."""
+
+    name: str
+    map_from_base: Array
+    status: str
+    is_silent: bool = False
+
+
+def encoding_of(schema: Schema) -> str:
+    """How the messages of a schema are encoded."""
+    return "json" if schema.encoding == "jsonschema" else "protobuf"
+
+
+def write_mcap(file: BinaryIO, messages: Iterable[ChannelMessage]) -> None:
+    """Writes an MCAP file; the same messages make the same bytes. A channel is in it with its first message."""
+    writer = Writer(file, compression=CompressionType.NONE)
+    writer.start(profile="", library="fleetmap")
+    schemas, channels = dict[str, int](), dict[str, int]()
+    for number, message in enumerate(messages):
+        topic, schema = message.topic, CHANNELS[message.topic]
+        if schema.name not in schemas:
+            schemas[schema.name] = writer.register_schema(schema.name, schema.encoding, schema.data)
+        if topic not in channels:
+            channels[topic] = writer.register_channel(topic, encoding_of(schema), schemas[schema.name])
+        stamp_ns = max(0, message.stamp_ns)
+        writer.add_message(channels[topic], stamp_ns, message.data, stamp_ns, number)
+    writer.finish()  # type: ignore[no-untyped-call]
+
+
+def points(stamp_ns: int, points_map: Array, topic: str = "/map", frame: str = MAP) -> ChannelMessage:
+    """Landmarks (N, 3), thinned evenly where there are too many."""
+    kept = points_map[:: max(1, math.ceil(len(points_map) / MAX_POINTS))]
+    kind = PackedElementFieldNumericType.Float32
+    fields = [PackedElementField(name=name, offset=4 * n, type=kind) for n, name in enumerate("xyz")]
+    data = np.ascontiguousarray(kept, "<f4").tobytes()
+    cloud = PointCloud(
+        timestamp=_stamp(stamp_ns), frame_id=frame, pose=_located(np.eye(4)), point_stride=12, fields=fields, data=data
+    )
+    return ChannelMessage(topic, stamp_ns, cloud.encode())
+
+
+def path(stamp_ns: int, positions_m: Array, topic: str = "/path", frame: str = MAP) -> ChannelMessage:
+    """Positions (N, 3) of a path, thinned evenly; the last one is among them."""
+    step = max(1, math.ceil(len(positions_m) / _MAX_PATH))
+    level = Quaternion(w=1.0)
+    kept = positions_m[::-1][::step][::-1].tolist()
+    found = [Pose(position=Vector3(x=x, y=y, z=z), orientation=level) for x, y, z in kept]
+    return ChannelMessage(
+        topic, stamp_ns, PosesInFrame(timestamp=_stamp(stamp_ns), frame_id=frame, poses=found).encode()
+    )
+
+
+def links(stamp_ns: int, given: Iterable[tuple[str, str, Array]]) -> ChannelMessage:
+    """Links between frames: parent, child, parent_from_child (4, 4)."""
+    found = []
+    for parent, child, parent_from_child in given:
+        translation, rotation = _parts(parent_from_child)
+        found.append(
+            FrameTransform(
+                timestamp=_stamp(stamp_ns),
+                parent_frame_id=parent,
+                child_frame_id=child,
+                translation=translation,
+                rotation=rotation,
+            )
+        )
+    return ChannelMessage("/tf", stamp_ns, FrameTransforms(transforms=found).encode())
+
+
+def robots(stamp_ns: int, marks: Sequence[RobotMark], topic: str = "/robots", frame: str = MAP) -> ChannelMessage:
+    """All robots as arrows with words, in the place of those that were shown before."""
+    entities = []
+    for mark in marks:
+        colour, above = _QUIET if mark.is_silent else _COLOURS.get(mark.status, _QUIET), mark.map_from_base.copy()
+        above[2, 3] += 0.6
+        arrow = ArrowPrimitive(
+            pose=_located(mark.map_from_base),
+            shaft_length=0.5,
+            shaft_diameter=0.15,
+            head_length=0.3,
+            head_diameter=0.35,
+            color=_colour(colour),
+        )
+        words = f"{mark.name}: {mark.status}{', silent' if mark.is_silent else ''}"
+        text = TextPrimitive(
+            pose=_located(above), billboard=True, font_size=14, scale_invariant=True, color=_colour(colour), text=words
+        )
+        entities.append(_entity(stamp_ns, frame, mark.name, arrows=[arrow], texts=[text]))
+    return ChannelMessage(topic, stamp_ns, _scene(stamp_ns, entities))
+
+
+def place(topic: str, stamp_ns: int, map_from_base: Array) -> ChannelMessage:
+    """A place (4, 4) in `map`: a fix, or where a failure began."""
+    found = PoseInFrame(timestamp=_stamp(stamp_ns), frame_id=MAP, pose=_located(map_from_base))
+    return ChannelMessage(topic, stamp_ns, found.encode())
+
+
+def picture(stamp_ns: int, left: Image) -> ChannelMessage:
+    """An image of the left camera, rectified, as `lens` has it."""
+    return jpeg("/camera", stamp_ns, jpeg_image(left, _QUALITY).data)
+
+
+def jpeg(topic: str, stamp_ns: int, data: bytes) -> ChannelMessage:
+    """A JPEG of the left camera."""
+    image = CompressedImage(timestamp=_stamp(stamp_ns), frame_id=CAMERA, data=data, format="jpeg")
+    return ChannelMessage(topic, stamp_ns, image.encode())
+
+
+def lens(stamp_ns: int, camera: StereoCamera) -> ChannelMessage:
+    """The rectified left camera, by which a viewer draws the map into its images."""
+    matrix = camera.matrix
+    calibration = CameraCalibration(
+        timestamp=_stamp(stamp_ns),
+        frame_id=CAMERA,
+        width=camera.width_px,
+        height=camera.height_px,
+        distortion_model="plumb_bob",
+        D=[0.0] * 5,
+        K=matrix.ravel().tolist(),
+        R=np.eye(3).ravel().tolist(),
+        P=np.pad(matrix, ((0, 0), (0, 1))).ravel().tolist(),
+    )
+    return ChannelMessage("/camera/calibration", stamp_ns, calibration.encode())
+
+
+def matches(stamp_ns: int, pixels: Array, expected: Array | None = None) -> ChannelMessage:
+    """Pixels (N, 2) at which landmarks were found; expected (N, 2): where the map has them, joined by lines."""
+    colour = _colour(_GOOD)
+    drawn = [_annotation(stamp_ns, pixels, PointsAnnotationType.Points, colour)]
+    if expected is not None:
+        ends = np.column_stack([pixels, expected]).reshape(-1, 2)
+        drawn.append(_annotation(stamp_ns, ends, PointsAnnotationType.LineList, _colour(_WARN)))
+    found = ImageAnnotations(timestamp=_stamp(stamp_ns), points=drawn)
+    return ChannelMessage("/camera/matches", stamp_ns, found.encode())
+
+
+def status_log(stamp_ns: int, robot: str, status: str, cause: str) -> ChannelMessage:
+    """A line that says a robot's status."""
+    words = f"{status}: {cause}" if cause else status
+    return _log("/log", stamp_ns, words, robot, _LEVELS.get(status, LogLevel.Error))
+
+
+def failure(
+    stamp_ns: int, report: FailureReport, pictures: Iterable[tuple[str, bytes]], where: str | None = None
+) -> list[ChannelMessage]:
+    """A failure: its line, place, pictures and report. pictures: kind (`frame`, `matches`) and JPEG; where: in words, else the tile."""
+    if where is None:
+        where = "nowhere" if report.tile is None else "tile {},{}".format(*report.tile)
+    words = f"{report.kind}: {report.cause}, {report.duration_s:.1f} s, version {report.version}, {where}"
+    level = LogLevel.Warning if report.kind == FailureKind.SUSPECTED else LogLevel.Error
+    found = [_log("/failures/log", stamp_ns, words, report.robot, level)]
+    if report.map_from_base is not None:
+        placed = report.map_from_base
+        if np.isfinite([*placed.position_m, *placed.quat_wxyz]).all():
+            found.append(place("/failures/place", stamp_ns, placed.target_from_source))
+    for kind, data in pictures:
+        found.append(jpeg("/failures/matches" if kind == "matches" else "/failures/frame", stamp_ns, data))
+    plain = report_dict(report)
+    plain.pop("thumbnails")
+    found.append(ChannelMessage("/failures/report", stamp_ns, json.dumps(finite(plain), sort_keys=True).encode()))
+    return found
+
+
+class SurveyChannels:
+    """Surveys under way, seen from above: in a frame `survey` of their own, or in `map` where they are localized in a version."""
+
+    def __init__(self, base_from_cam: Array | None = None) -> None:
+        """base_from_cam (4, 4): where the camera is, if that is known."""
+        self._base_from_cam = base_from_cam
+        self._status = ("", "")
+
+    def shown(self, state: LiveSurveyState) -> list[Shown]:
+        """One more state; a line of the log where its status is new."""
+        stamp_ns, estimate = state.stamp_ns, state.estimate
+        frame = SURVEY if state.frozen is None else MAP
+        found = [
+            Shown(
+                "/survey/landmarks",
+                stamp_ns,
+                lambda: points(stamp_ns, _from_above(state.landmarks()), "/survey/landmarks", frame),
+            ),
+            Shown("/survey/path", stamp_ns, lambda: path(stamp_ns, _from_above(state.path()), "/survey/path", frame)),
+            Shown("/survey/revisits", stamp_ns, lambda: _revisits(stamp_ns, state.loop_lines(), frame)),
+        ]
+        status = (state.phase, state.words) if estimate is None else (estimate.status, estimate.cause)
+        if status != self._status:
+            self._status = status
+            found.append(Shown("/log", stamp_ns, lambda: status_log(stamp_ns, state.recording, *status)))
+        if estimate is not None:
+            found += self._placed(estimate, frame, state.recording)
+        return found
+
+    def _placed(self, estimate: EstimateMessage, frame: str, name: str) -> list[Shown]:
+        odom_from_base, stamp_ns = estimate.odom_from_base.target_from_source, estimate.stamp_ns
+        joined, marks = [(ODOM, BASE, odom_from_base)], list[RobotMark]()
+        if self._base_from_cam is not None:
+            joined.append((BASE, CAMERA, self._base_from_cam))
+        if estimate.map_from_odom is not None:
+            map_from_odom = estimate.map_from_odom.target_from_source
+            joined.append((frame, ODOM, map_from_odom))
+            marks.append(RobotMark(name, map_from_odom @ odom_from_base, estimate.status))
+        return [
+            Shown("/survey/robot", stamp_ns, lambda: robots(stamp_ns, marks, "/survey/robot", frame)),
+            Shown("/tf", stamp_ns, lambda: links(stamp_ns, joined)),
+        ]
+
+
+def _log(topic: str, stamp_ns: int, words: str, name: str, level: LogLevel) -> ChannelMessage:
+    return ChannelMessage(
+        topic, stamp_ns, Log(timestamp=_stamp(stamp_ns), level=level, message=words, name=name).encode()
+    )
+
+
+def _from_above(rows: Array) -> Array:
+    return np.column_stack([rows[:, :2], np.zeros(len(rows))])
+
+
+def _revisits(stamp_ns: int, ends_m: Array, frame: str) -> ChannelMessage:
+    corners = [Point3(x=x, y=y) for x, y in ends_m.reshape(-1, 2).tolist()]
+    line = LinePrimitive(
+        type=LinePrimitiveLineType.LineList,
+        pose=_located(np.eye(4)),
+        thickness=2.0,
+        scale_invariant=True,
+        points=corners,
+        color=_colour(_WARN),
+    )
+    scene = _scene(stamp_ns, [_entity(stamp_ns, frame, "revisits", lines=[line])])
+    return ChannelMessage("/survey/revisits", stamp_ns, scene)
+
+
+def _scene(stamp_ns: int, entities: list[SceneEntity]) -> bytes:
+    gone = SceneEntityDeletion(timestamp=_stamp(stamp_ns), type=SceneEntityDeletionType.All)
+    return SceneUpdate(deletions=[gone], entities=entities).encode()
+
+
+def _entity(stamp_ns: int, frame: str, name: str, **drawn: Any) -> SceneEntity:
+    return SceneEntity(timestamp=_stamp(stamp_ns), frame_id=frame, id=name, frame_locked=True, **drawn)
+
+
+def _annotation(stamp_ns: int, pixels: Array, kind: PointsAnnotationType, colour: Color) -> PointsAnnotation:
+    corners = [Point2(x=u, y=v) for u, v in pixels.tolist()]
+    return PointsAnnotation(
+        timestamp=_stamp(stamp_ns), type=kind, points=corners, outline_color=colour, fill_color=colour, thickness=2.0
+    )
+
+
+def _stamp(stamp_ns: int) -> Timestamp:
+    """Times before 1970 are 1970, those after 2106 are that."""
+    return Timestamp(sec=min(max(0, stamp_ns) // 10**9, _LAST_S), nsec=max(0, stamp_ns) % 10**9)
+
+
+def _parts(target_from_source: Array) -> tuple[Vector3, Quaternion]:
+    (x, y, z), (qw, qx, qy, qz) = (
+        target_from_source[:3, 3].tolist(),
+        quat_wxyz_from_rotation(target_from_source[:3, :3]).tolist(),
+    )
+    return Vector3(x=x, y=y, z=z), Quaternion(x=qx, y=qy, z=qz, w=qw)
+
+
+def _located(target_from_source: Array) -> Pose:
+    position, orientation = _parts(target_from_source)
+    return Pose(position=position, orientation=orientation)
+
+
+def _colour(rgb: tuple[float, float, float]) -> Color:
+    return Color(r=rgb[0], g=rgb[1], b=rgb[2], a=1.0)

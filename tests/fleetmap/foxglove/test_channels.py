@@ -1,0 +1,211 @@
+"""Channels, read back by Foxglove's published schemas as another library has them."""
+
+import io
+
+import cv2
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from fleetmap.errors import UsageError
+from fleetmap.foxglove import ViewerAddress, channels, require_foxglove, viewer_address
+from fleetmap.foxglove.channels import CHANNELS, ChannelMessage, RobotMark, SurveyChannels
+from fleetmap.geometry import rotation_from_quat_wxyz, se3, so3_exp
+from fleetmap.live_survey import LiveSurveyState
+from fleetmap.messages import EstimateMessage, FailureReport, Placement
+from fleetmap.sensors.rectification import StereoCamera
+
+STAMP_NS = 1_700_000_000_123_456_789
+TURNED = se3(so3_exp(np.array([0.1, -0.2, 0.7])), np.array([1.0, -2.0, 3.0]))
+KNOWN = {
+    message.DESCRIPTOR.full_name: message
+    for message in (
+        CameraCalibration, CompressedImage, FrameTransforms, ImageAnnotations, Log, PointCloud, PoseInFrame, PosesInFrame, SceneUpdate
+    )
+}  # fmt: skip
+
+
+def decoded(message: ChannelMessage):
+    """By the other library's classes."""
+    return KNOWN[CHANNELS[message.topic].name].FromString(message.data)
+
+
+def ns(stamp) -> int:
+    return stamp.seconds * 10**9 + stamp.nanos
+
+
+def matrix(located) -> np.ndarray:
+    turn = located.orientation
+    return se3(rotation_from_quat_wxyz(np.array([turn.w, turn.x, turn.y, turn.z])), xyz(located.position))
+
+
+def xyz(vector) -> np.ndarray:
+    return np.array([vector.x, vector.y, vector.z])
+
+
+def test_landmarks_are_float32_and_thinned_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(0).normal(size=(1000, 3))
+    cloud = decoded(channels.points(STAMP_NS, points))
+    assert (ns(cloud.timestamp), cloud.frame_id, cloud.point_stride) == (STAMP_NS, "map", 12)
+    assert [(field.name, field.offset, field.type) for field in cloud.fields] == [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)]
+    np.testing.assert_array_equal(np.frombuffer(cloud.data, "<f4").reshape(-1, 3), points.astype(np.float32))
+    monkeypatch.setattr(channels, "MAX_POINTS", 300)
+    kept = np.frombuffer(decoded(channels.points(STAMP_NS, points)).data, "<f4").reshape(-1, 3)
+    np.testing.assert_array_equal(kept, points[::4].astype(np.float32))
+
+
+def test_a_long_path_keeps_its_last_position() -> None:
+    positions = np.cumsum(np.ones((5000, 3)), axis=0)
+    found = decoded(channels.path(STAMP_NS, positions))
+    assert 1000 < len(found.poses) <= 2000
+    np.testing.assert_array_equal(xyz(found.poses[-1].position), positions[-1])
+
+
+def test_frames_and_robots_stand_where_they_are() -> None:
+    link = decoded(channels.links(STAMP_NS, [("map", "odom", TURNED)])).transforms[0]
+    assert (link.parent_frame_id, link.child_frame_id, ns(link.timestamp)) == ("map", "odom", STAMP_NS)
+    np.testing.assert_allclose(xyz(link.translation), TURNED[:3, 3])
+    turn = np.array([link.rotation.w, link.rotation.x, link.rotation.y, link.rotation.z])
+    np.testing.assert_allclose(rotation_from_quat_wxyz(turn), TURNED[:3, :3], atol=1e-12)
+    marks = [RobotMark("a", TURNED, "TRACKING"), RobotMark("b", np.eye(4), "LOST", is_silent=True)]
+    scene = decoded(channels.robots(STAMP_NS, marks))
+    assert [deletion.type for deletion in scene.deletions] == [1], "those of before go"
+    assert [(entity.id, entity.frame_id) for entity in scene.entities] == [("a", "map"), ("b", "map")]
+    np.testing.assert_allclose(matrix(scene.entities[0].arrows[0].pose), TURNED, atol=1e-12)
+    assert [entity.texts[0].text for entity in scene.entities] == ["a: TRACKING", "b: LOST, silent"]
+    np.testing.assert_allclose(matrix(decoded(channels.place("/fixes", STAMP_NS, TURNED)).pose), TURNED, atol=1e-12)
+
+
+def test_images_have_their_lens_and_what_was_found_in_them() -> None:
+    camera = StereoCamera(400.0, 320.5, 240.5, 0.1, 640, 480)
+    lens = decoded(channels.lens(STAMP_NS, camera))
+    assert (lens.width, lens.height, len(lens.D), len(lens.R)) == (640, 480, 5, 9)
+    np.testing.assert_array_equal(np.reshape(lens.K, (3, 3)), camera.matrix)
+    np.testing.assert_array_equal(np.reshape(lens.P, (3, 4))[:, :3], camera.matrix)
+    left = np.tile(np.arange(64, dtype=np.uint8), (48, 1))
+    image = decoded(channels.picture(STAMP_NS, left))
+    assert (image.format, image.frame_id) == ("jpeg", "camera")
+    shown = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert np.abs(shown.astype(int) - left).max() < 10
+    pixels, expected = np.array([[1.5, 2.5], [3.0, 4.0]]), np.array([[1.0, 2.0], [3.5, 4.5]])
+    dots, lines = decoded(channels.matches(STAMP_NS, pixels, expected)).points
+    assert [(dot.x, dot.y) for dot in dots.points] == [(1.5, 2.5), (3.0, 4.0)]
+    assert [(end.x, end.y) for end in lines.points] == [(1.5, 2.5), (1.0, 2.0), (3.0, 4.0), (3.5, 4.5)]
+    assert (dots.type, lines.type) == (1, 4)
+
+
+def failure(**changes) -> FailureReport:
+    known = {
+        "site": "hall", "robot": "r1", "id": "x", "stamp_ns": 1, "wall_ns": 2, "duration_s": 3.0, "kind": "blind", "status": "LOST",
+        "cause": "dark", "version": 4, "tile": (1, -2), "map_from_base": Placement.of(TURNED), "radius_95_m": float("inf"),
+    }  # fmt: skip
+    return FailureReport(**(known | changes))
+
+
+def test_a_failure_has_line_place_pictures_and_report() -> None:
+    found = channels.failure(STAMP_NS, failure(), [("frame", b"one"), ("matches", b"two")])
+    topics = ["/failures/log", "/failures/place", "/failures/frame", "/failures/matches", "/failures/report"]
+    assert [message.topic for message in found] == topics
+    line = decoded(found[0])
+    assert (line.level, line.name, line.message) == (4, "r1", "blind: dark, 3.0 s, version 4, tile 1,-2")
+    np.testing.assert_allclose(matrix(decoded(found[1]).pose), TURNED, atol=1e-12)
+    assert [decoded(message).data for message in found[2:4]] == [b"one", b"two"]
+    assert b'"radius_95_m": null' in found[4].data
+    assert b"thumbnails" not in found[4].data
+
+
+def test_a_failure_nowhere_has_no_place() -> None:
+    nowhere = Placement(position_m=(float("nan"), 0.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0))
+    for placed in (None, nowhere):
+        found = channels.failure(STAMP_NS, failure(map_from_base=placed, kind="suspected", tile=None), [])
+        assert [message.topic for message in found] == ["/failures/log", "/failures/report"]
+        assert decoded(found[0]).level == 3
+
+
+@pytest.mark.parametrize("stamp_ns", [-5, 0, (1 << 62) - 1])
+def test_impossible_times_are_the_nearest_possible_ones(stamp_ns: int) -> None:
+    link = decoded(channels.links(stamp_ns, [("map", "odom", np.eye(4))])).transforms[0]
+    assert 0 <= link.timestamp.seconds < 1 << 32
+
+
+def test_surveys_are_shown_in_their_own_frame_or_in_the_map() -> None:
+    estimate = EstimateMessage(
+        stamp_ns=6, status="TRACKING", map_version=None, odom_from_base=Placement.of(TURNED), map_from_odom=Placement.of(TURNED),
+        cov_rot_trans=None,
+    )  # fmt: skip
+    plain = {
+        "site": "hall", "recording": "monday", "stamp_ns": 7, "phase": "tracking", "seconds": 2.0, "frames": 40, "keyframes": 2,
+        "path_m": np.array([[0, 1], [2, 3]], "<f4").tobytes(), "quality": b"\xff\xff", "landmarks_m": np.array([[4, 5]], "<f4").tobytes(),
+        "loops_m": np.array([[0, 1, 2, 3]], "<f4").tobytes(),
+    }  # fmt: skip
+    told = SurveyChannels(np.eye(4))
+    first = {shown.topic: decoded(shown.make()) for shown in told.shown(LiveSurveyState(**plain, estimate=estimate))}
+    assert set(first) == {"/survey/landmarks", "/survey/path", "/survey/revisits", "/survey/robot", "/log", "/tf"}
+    np.testing.assert_array_equal(np.frombuffer(first["/survey/landmarks"].data, "<f4"), [4, 5, 0])
+    assert [(p.position.x, p.position.y) for p in first["/survey/path"].poses] == [(0, 1), (2, 3)]
+    line = first["/survey/revisits"].entities[0].lines[0]
+    assert (line.type, [(p.x, p.y) for p in line.points]) == (2, [(0, 1), (2, 3)])
+    np.testing.assert_allclose(matrix(first["/survey/robot"].entities[0].arrows[0].pose), TURNED @ TURNED, atol=1e-12)
+    links = {(link.parent_frame_id, link.child_frame_id) for link in first["/tf"].transforms}
+    assert links == {("survey", "odom"), ("odom", "base_link"), ("base_link", "camera")}
+    again = [shown.topic for shown in told.shown(LiveSurveyState(**plain, estimate=estimate))]
+    assert "/log" not in again, "its status is the same"
+    frozen = {shown.topic: shown.make() for shown in told.shown(LiveSurveyState(**plain, estimate=estimate, frozen=3))}
+    assert decoded(frozen["/survey/landmarks"]).frame_id == "map"
+    lost = told.shown(LiveSurveyState(**plain))
+    assert {shown.topic for shown in lost} == {"/survey/landmarks", "/survey/path", "/survey/revisits", "/log"}
+
+
+def test_an_mcap_file_holds_the_same_channels() -> None:
+    messages = [
+        channels.points(STAMP_NS, np.ones((2, 3))),
+        channels.place("/fixes", STAMP_NS + 1, TURNED),
+        *channels.failure(STAMP_NS + 2, failure(), [("frame", b"one")]),
+    ]
+    files = [io.BytesIO(), io.BytesIO()]
+    for file in files:
+        channels.write_mcap(file, messages)
+        file.seek(0)
+    assert files[0].getvalue() == files[1].getvalue()
+    reader = make_reader(files[0], decoder_factories=[DecoderFactory()])
+    found = list(reader.iter_messages())
+    assert [(channel.topic, message.log_time) for _, channel, message in found] == [
+        (m.topic, m.stamp_ns) for m in messages
+    ]
+    for schema, channel, message in found:
+        assert (schema.name, schema.data) == (CHANNELS[channel.topic].name, CHANNELS[channel.topic].data)
+        assert message.data == next(m.data for m in messages if m.topic == channel.topic)
+    protobuf = list(reader.iter_decoded_messages(topics=["/fixes"]))
+    np.testing.assert_allclose(matrix(protobuf[0].decoded_message.pose), TURNED, atol=1e-12)
+
+
+def test_addresses() -> None:
+    assert viewer_address("8765", insecure=False) == ViewerAddress("127.0.0.1", 8765)
+    assert viewer_address("localhost:0", insecure=False) == ViewerAddress("localhost", 0)
+    assert viewer_address("[::1]:9", insecure=False) == ViewerAddress("::1", 9)
+    assert viewer_address("0.0.0.0:1", insecure=True) == ViewerAddress("0.0.0.0", 1)
+    for text in ("", "x", "127.0.0.1", "70000", "-1", "1:", "127.0.0.1:x", "²"):
+        with pytest.raises(UsageError, match="write it like 8765"):
+            viewer_address(text, insecure=False)
+    for text in ("0.0.0.0:1", "maps.example:1", "[::]:1"):
+        with pytest.raises(UsageError, match="--insecure"):
+            viewer_address(text, insecure=False)
+
+
+def test_without_the_library_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    require_foxglove("--foxglove")
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(UsageError, match=r"--foxglove needs foxglove.*pip install '\.\[foxglove\]'"):
+        require_foxglove("--foxglove")
