@@ -1,5 +1,7 @@
 """`locclient replay`: localization of a recording in a published map."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,8 +13,11 @@ from fleetmap.errors import UsageError
 from locclient.commands.options import IdentityFolder, Insecure
 
 if TYPE_CHECKING:
+    from fleetmap.foxglove import ViewerAddress
+    from fleetmap.sources.replay_source import ReplaySource
     from locclient.config import LocclientConfig
     from locclient.identity import MapAddress
+    from locclient.replay.run_viewer import RunViewer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +67,10 @@ class PlaybackOptions:
     realtime: Annotated[
         bool, typer.Option("--realtime", help="Play at the recorded speed; default: as fast as possible.")
     ] = False
+    foxglove: Annotated[
+        str | None,
+        typer.Option(metavar="[HOST:]PORT", help="Let Foxglove play and scrub the run there, until Ctrl-C."),
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,14 +80,17 @@ class ResultFiles:
     report: Annotated[Path | None, typer.Option(help="Write the report to this JSON file.")] = None
     trajectory: Annotated[Path | None, typer.Option(help="Write the localised frames to this TUM file.")] = None
     picture: Annotated[Path | None, typer.Option(help="Draw the run from above into this PNG file.")] = None
+    mcap: Annotated[Path | None, typer.Option(help="Write what --foxglove shows to this MCAP file.")] = None
 
     def check(self) -> None:
         """Raises UsageError for files that cannot be written."""
         for name, path in vars(self).items():
             if path is not None and not path.parent.is_dir():
                 raise UsageError(f"--{name} {path}: the folder {path.parent} does not exist; make it first")
-        if self.picture is not None and self.picture.suffix.lower() != ".png":
-            raise UsageError(f"--picture {self.picture} must end in .png")
+        for name, suffix in (("picture", ".png"), ("mcap", ".mcap")):
+            path = getattr(self, name)
+            if path is not None and path.suffix.lower() != suffix:
+                raise UsageError(f"--{name} {path} must end in {suffix}")
 
 
 @expand_options
@@ -94,7 +106,7 @@ def replay(
     settings = settings_of(context)
     address = map_options.address()
     files.check()
-    _print_table(_run(recording, (address, map_options), playback, files, settings))
+    _run(recording, (address, map_options), playback, files, settings)
 
 
 def _run(
@@ -103,7 +115,7 @@ def _run(
     playback: PlaybackOptions,
     files: ResultFiles,
     settings: "LocclientConfig",
-) -> dict[str, Any]:
+) -> None:
     import json
 
     import msgspec
@@ -119,29 +131,77 @@ def _run(
     from locclient.replay.replay import replay as play
 
     address, map_options = map_from
+    at = _viewer_address(playback, files, insecure=map_options.insecure)
     prior = parse_prior(playback.prior, "--prior")
     selection = FrameSelection.parse(playback.frames)
     opening = OpenOptions(playback.calibration, named_topics(playback.topic, settings.topics))
     console = Console(stderr=True)
-    with (
-        open_recording(path, opening) as recording,
-        connected(address, map_options.cache, map_options.cache_bytes) as connection,
-        Progress(console=console, disable=not console.is_terminal) as bar,
-    ):
-        for issue in recording.issues:
-            console.print(f"note: {issue.what} {issue.detail}".rstrip())
+    with open_recording(path, opening) as recording:
         source = ReplaySource.of(recording, selection, reverse=playback.reverse)
-        task = bar.add_task("replay", total=len(source))
-        options = ReplayOptions(settings.localizer, playback.realtime, lambda _: bar.advance(task))
-        result = play(source, connection, options, prior)
-    report = result.report
-    if files.report is not None:
-        files.report.write_text(json.dumps(msgspec.to_builtins(report), indent=2) + "\n")
-    if files.trajectory is not None:
-        write_tum(files.trajectory, result.trajectory)
-    if files.picture is not None:
-        result.save_picture(files.picture)
-    return report
+        with _viewing(source, at, is_wanted=files.mcap is not None) as viewer:
+            with (
+                connected(address, map_options.cache, map_options.cache_bytes) as connection,
+                Progress(console=console, disable=not console.is_terminal) as bar,
+            ):
+                for issue in recording.issues:
+                    console.print(f"note: {issue.what} {issue.detail}".rstrip())
+                task = bar.add_task("replay", total=len(source))
+                options = ReplayOptions(settings.localizer, playback.realtime, lambda _: bar.advance(task), viewer)
+                result = play(source, connection, options, prior)
+            report = result.report
+            if files.report is not None:
+                files.report.write_text(json.dumps(msgspec.to_builtins(report), indent=2) + "\n")
+            if files.trajectory is not None:
+                write_tum(files.trajectory, result.trajectory)
+            if files.picture is not None:
+                result.save_picture(files.picture)
+            if viewer is not None:
+                viewer.timeline.finish()
+                if files.mcap is not None:
+                    viewer.write_mcap(files.mcap)
+            _print_table(report)
+
+
+def _viewer_address(playback: PlaybackOptions, files: ResultFiles, *, insecure: bool) -> "ViewerAddress | None":
+    """Where viewers connect to, None for nowhere; UsageError as `viewer_address` and `require_foxglove`."""
+    from fleetmap.foxglove import require_foxglove, viewer_address
+
+    at = None if playback.foxglove is None else viewer_address(playback.foxglove, insecure=insecure)
+    if at is not None or files.mcap is not None:
+        require_foxglove("--mcap" if at is None else "--foxglove")
+    return at
+
+
+@contextmanager
+def _viewing(source: "ReplaySource", at: "ViewerAddress | None", *, is_wanted: bool) -> "Iterator[RunViewer | None]":
+    """What shows a replay, None where nobody wants it; with an address the block's end waits until the viewers' user is done."""
+    if at is None and not is_wanted:
+        yield None
+        return
+    import signal
+    import threading
+    from dataclasses import replace
+
+    import numpy as np
+
+    from fleetmap.foxglove.playback import Player
+    from fleetmap.foxglove.server import FoxgloveServer
+    from locclient.replay.run_viewer import RunViewer
+
+    recording = source.recording
+    with recording.part(np.arange(len(recording))) as images:
+        viewer = RunViewer(replace(source, recording=images))
+        if at is None:
+            yield viewer
+            return
+        with FoxgloveServer(at, recording.name, Player(viewer.timeline)) as server:
+            typer.echo(f"foxglove: {server.url}")
+            yield viewer
+            done = threading.Event()
+            for number in (signal.SIGTERM, signal.SIGINT):
+                signal.signal(number, lambda *_: done.set())
+            typer.echo("the run can be played and scrubbed in Foxglove; Ctrl-C ends")
+            done.wait()
 
 
 def _print_table(report: dict[str, Any]) -> None:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import cv2
 
@@ -25,16 +26,20 @@ from locclient.robot.jit_warmup import gc_frozen
 from locclient.robot.robot import Outcome, Robot
 from locclient.robot.version_trial import TrialSettings
 
+if TYPE_CHECKING:  # needs the extra `foxglove`
+    from locclient.replay.run_viewer import RunViewer
+
 TRUTH_FLAG = "frame_from_ground_truth"  # key of the configuration: the map lies in the frame of the recordings' truth
 
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Settings of the localizer, whether the recording is played at its own speed, and a call with the number of each frame."""
+    """Settings of the localizer, whether the recording is played at its own speed, a call with the number of each frame, who shows it."""
 
     settings: LocalizerSettings = field(default_factory=LocalizerSettings)
     realtime: bool = False
     progress: Callable[[int], None] = lambda _: None
+    viewer: "RunViewer | None" = None
 
 
 def load_map(source: MapSource) -> tuple[LoadedMap, FetchedTiles, str]:
@@ -71,6 +76,8 @@ def replay(
     mounting = (robot.base_from_body, rectifier.body_from_cam, rectifier.camera)
     profile = RobotProfile(connection.site, connection.robot, *mounting, options.settings)
     reporter = RunReporter(connection, result, profile)
+    if options.viewer is not None:
+        options.viewer.begin(loaded, profile, rectifier)
     has_truth = bool(loaded.manifest.configuration.get(TRUTH_FLAG))
     begun_s, first_ns = time.monotonic(), source.played_stamp_ns(source.recorded_stamp_ns(0))
     for number, imu in enumerate(source.imu_before_each()):
@@ -89,6 +96,8 @@ def replay(
         result.estimates.append(outcome.estimate)
         result.truths.append(truth)
         reporter.handle(outcome)
+        if options.viewer is not None:
+            options.viewer.handle(outcome)
         options.progress(number)
     reporter.finish()
     return result

@@ -1,0 +1,197 @@
+"""Foxglove's websocket server: shows what it is given to whoever subscribes, and never waits for a viewer."""
+
+import logging
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Iterable
+from typing import Self
+
+import foxglove
+from foxglove import Channel, Context
+from foxglove.websocket import (
+    Capability,
+    ChannelView,
+    Client,
+    PlaybackCommand,
+    PlaybackControlRequest,
+    PlaybackState,
+    PlaybackStatus,
+    ServerListener,
+)
+
+from fleetmap.errors import FleetmapError, UsageError
+from fleetmap.foxglove import ViewerAddress
+from fleetmap.foxglove.channels import CHANNELS, Shown, encoding_of
+from fleetmap.foxglove.playback import PlaybackPhase, PlaybackPoint, Player
+from fleetmap.log_lines import LogLimit
+
+_STEP_S = 0.02
+_WAITING = 32  # messages of a topic that nobody has encoded yet
+_BACKLOG = 256  # encoded messages that wait for one viewer; the library drops the oldest
+_STOP_WITHIN_S = 1.0
+_log = logging.getLogger(__name__)
+
+
+class FoxgloveServer:
+    """Encodes and sends in a thread of its own; methods may be called from any thread. Use it in `with`.
+
+    A new viewer gets the last message of each topic. dropped: messages that came too quickly to be encoded.
+    """
+
+    def __init__(self, address: ViewerAddress, name: str, player: Player | None = None) -> None:
+        """name: shown by viewers. player: what they play, pause and scrub. Raises UsageError where nothing can listen there."""
+        self.dropped = 0
+        self._player = player
+        self._context = Context()
+        self._channels: dict[str, Channel] = {}
+        self._waiting: dict[str, deque[Shown]] = {}
+        self._last: dict[str, Shown] = {}
+        self._subscribed: deque[str] = deque()  # without a lock: the library calls while it holds its own
+        self._lock, self._wake, self._ended = threading.Lock(), threading.Event(), False
+        self._faults = LogLimit(_log)
+        timeline = None if player is None else player.timeline
+        try:
+            self._server = foxglove.start_server(
+                name=name,
+                host=address.host,
+                port=address.port,
+                capabilities=[] if player is None else [Capability.PlaybackControl, Capability.Time],
+                playback_time_range=None if timeline is None else (timeline.first_ns, timeline.last_ns),
+                server_listener=_Listener(self),
+                message_backlog_size=_BACKLOG,
+                context=self._context,
+            )
+        except (RuntimeError, OSError) as error:
+            raise UsageError(
+                f"--foxglove {address.host}:{address.port}: cannot listen there ({error}); choose another"
+            ) from error
+        host = f"[{address.host}]" if ":" in address.host else address.host
+        self.url = f"ws://{host}:{self._server.port}"
+        self._thread = threading.Thread(target=self._serve, daemon=True, name="foxglove")
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended = True
+        self._wake.set()
+        self._thread.join()
+        # The library waits for each viewer to take what waits for it, and one that hangs never does.
+        stopping = threading.Thread(target=self._server.stop, daemon=True, name="foxglove stops")
+        stopping.start()
+        stopping.join(_STOP_WITHIN_S)
+        if self.dropped:
+            _log.warning("%d messages came too quickly for the viewers and were dropped", self.dropped)
+
+    def wants(self, topic: str) -> bool:
+        """Whether a viewer looks at a topic: what costs much is made for nobody else."""
+        return self._channel(topic).has_sinks()
+
+    def show(self, some: Iterable[Shown]) -> None:
+        """Shows messages soon, in the order of each topic; returns at once. Of what waits for too long the oldest is dropped."""
+        with self._lock:
+            for shown in some:
+                waiting = self._waiting.setdefault(shown.topic, deque(maxlen=_WAITING))
+                self.dropped += len(waiting) == _WAITING
+                waiting.append(shown)
+        self._wake.set()
+
+    def subscribed(self, topic: str) -> None:
+        """A viewer begins to look at a topic."""
+        self._subscribed.append(topic)
+        self._wake.set()
+
+    def control(self, request: PlaybackControlRequest) -> PlaybackState | None:
+        """The state of playback that answers a viewer's request."""
+        if self._player is None:
+            return None
+        point = self._player.control(
+            plays=request.playback_command == PlaybackCommand.Play,
+            speed=request.playback_speed,
+            seek_ns=request.seek_time,
+        )
+        self._wake.set()
+        return _state(point, did_seek=request.seek_time is not None, request_id=request.request_id)
+
+    def _channel(self, topic: str) -> Channel:
+        with self._lock:
+            if topic not in self._channels:
+                schema = CHANNELS[topic]
+                self._channels[topic] = Channel(
+                    topic, schema=schema, message_encoding=encoding_of(schema), context=self._context
+                )
+            return self._channels[topic]
+
+    def _serve(self) -> None:
+        """Outside the library's callbacks, which must not publish."""
+        told: tuple[PlaybackPhase, float] | None = None
+        while not self._ended:
+            self._wake.wait(None if self._player is None else _STEP_S)
+            self._wake.clear()
+            topics = {self._subscribed.popleft() for _ in range(len(self._subscribed))}
+            late = [self._last[topic] for topic in sorted(topics) if topic in self._last]
+            with self._lock:
+                fresh = [shown for waiting in self._waiting.values() for shown in waiting]
+                self._waiting.clear()
+            self._publish(late)
+            self._publish(fresh)
+            if self._player is None:
+                continue
+            for topic in self._player.timeline.topics:
+                self._channel(topic)  # viewers choose from all, not only from what has been played
+            due = self._player.advance(time.monotonic())
+            self._publish(self._newest(due))
+            point = self._player.point
+            if due:
+                self._server.broadcast_time(point.at_ns)
+            if topics or (point.phase, point.speed) != told:
+                self._server.broadcast_playback_state(_state(point, did_seek=False, request_id=None))
+            told = point.phase, point.speed
+
+    def _newest(self, due: list[Shown]) -> list[Shown]:
+        """Of a topic no more than can wait: fast playback must not keep a viewer from stopping it."""
+        counts, kept = Counter[str](), list[Shown]()
+        for shown in reversed(due):
+            counts[shown.topic] += 1
+            if counts[shown.topic] <= _WAITING:
+                kept.append(shown)
+        self.dropped += len(due) - len(kept)
+        return kept[::-1]
+
+    def _publish(self, some: Iterable[Shown]) -> None:
+        for shown in some:
+            self._last[shown.topic] = shown
+            channel = self._channel(shown.topic)
+            if not channel.has_sinks():
+                continue
+            try:
+                message = shown.make()
+            except FleetmapError as error:
+                self._faults.warning(shown.topic, "%s cannot be shown: %s", shown.topic, error)
+                continue
+            except Exception:  # a fault in one message must not end what others see
+                _log.exception("%s cannot be shown", shown.topic)
+                continue
+            channel.log(message.data, log_time=max(0, message.stamp_ns))
+
+
+def _state(point: PlaybackPoint, *, did_seek: bool, request_id: str | None) -> PlaybackState:
+    status: PlaybackStatus = getattr(PlaybackStatus, point.phase.value)
+    return PlaybackState(status, point.at_ns, point.speed, did_seek, request_id)
+
+
+class _Listener(ServerListener):
+    """What the library calls, from threads of its own."""
+
+    def __init__(self, server: FoxgloveServer) -> None:
+        self._server = server
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        """See the library's ServerListener."""
+        self._server.subscribed(channel.topic)
+
+    def on_playback_control_request(self, playback_control_request: PlaybackControlRequest) -> PlaybackState | None:
+        """See the library's ServerListener."""
+        return self._server.control(playback_control_request)

@@ -1,0 +1,187 @@
+"""The server against viewers of another library: what they see, several at once, and those that do not read."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import RecordingError, UsageError
+from fleetmap.foxglove import ViewerAddress, channels
+from fleetmap.foxglove.channels import ChannelMessage, Shown
+from fleetmap.foxglove.playback import Player, Timeline
+from fleetmap.foxglove.server import FoxgloveServer
+from support.fleet.foxglove_client import ENDED, PAUSED, PLAYING, FoxgloveClient
+
+FREE = ViewerAddress("127.0.0.1", 0)
+S = 1_000_000_000
+POINTS = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+HANGING = """
+import json, os, signal, sys
+from websockets.sync.client import connect
+with connect(sys.argv[1], subprotocols=["foxglove.sdk.v1"]) as viewer:
+    viewer.recv(), viewer.recv()
+    viewer.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": int(sys.argv[2])}]}))
+    viewer.recv()
+    print("hangs", flush=True)
+    os.kill(os.getpid(), signal.SIGSTOP)
+"""
+
+
+@pytest.fixture
+def server() -> Iterator[FoxgloveServer]:
+    with FoxgloveServer(FREE, "hall") as made:
+        yield made
+
+
+def place(stamp_ns: int) -> Shown:
+    return Shown("/fixes", stamp_ns, lambda: channels.place("/fixes", stamp_ns, np.eye(4)))
+
+
+def test_viewers_get_what_stands_there_and_what_comes(server: FoxgloveServer) -> None:
+    server.show([Shown.now(channels.points(5, POINTS))])
+    with FoxgloveClient(server.url) as first, FoxgloveClient(server.url) as second:
+        assert first.info["name"] == "hall"
+        assert first.info["capabilities"] == []
+        for viewer in (first, second):
+            viewer.subscribe(["/map"])
+            ((stamp_ns, cloud),) = viewer.wait_for("/map")
+            assert stamp_ns == 5
+            np.testing.assert_array_equal(np.frombuffer(cloud.data, "<f4").reshape(-1, 3), POINTS)
+        server.show([place(6)])
+        for viewer in (first, second):
+            viewer.subscribe(["/fixes"])
+            assert viewer.wait_for("/fixes")[0][0] == 6
+
+
+def test_nothing_is_made_that_nobody_looks_at(server: FoxgloveServer) -> None:
+    made: list[int] = []
+
+    def make() -> ChannelMessage:
+        made.append(1)
+        return channels.place("/fixes", 1, np.eye(4))
+
+    assert not server.wants("/fixes")
+    server.show([Shown("/fixes", 1, make)] * 3)
+    time.sleep(0.2)
+    assert made == []
+    with FoxgloveClient(server.url) as viewer:
+        viewer.subscribe(["/fixes"])
+        viewer.wait_for("/fixes")
+        assert made == [1]
+        assert server.wants("/fixes")
+
+
+def test_a_message_that_cannot_be_made_ends_nothing(server: FoxgloveServer) -> None:
+    def damaged() -> ChannelMessage:
+        raise RecordingError("an image is damaged; leave it out")
+
+    def broken() -> ChannelMessage:
+        raise ZeroDivisionError
+
+    assert not server.wants("/fixes")
+    with FoxgloveClient(server.url) as viewer:
+        viewer.subscribe(["/fixes"])
+        while not server.wants("/fixes"):
+            time.sleep(0.01)
+        server.show([Shown("/fixes", 1, damaged), Shown("/fixes", 2, broken), place(3)])
+        assert viewer.wait_for("/fixes")[0][0] == 3
+
+
+def test_a_viewer_that_hangs_keeps_nobody_waiting() -> None:
+    """It reads no more while 60 MB are shown; another viewer gets them all, giving them takes no time, nor does the end."""
+    data = os.urandom(60_000)
+    with ExitStack() as stack:
+        server = stack.enter_context(FoxgloveServer(FREE, "hall"))
+        server.show([Shown.now(channels.jpeg("/camera", 0, data))])
+        with FoxgloveClient(server.url, within_s=60.0) as viewer:
+            viewer.subscribe(["/camera"])
+            viewer.wait_for("/camera")
+            words = [sys.executable, "-c", HANGING, server.url, str(viewer.channels["/camera"]["id"])]
+            hanging = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+            try:
+                assert hanging.stdout.readline() == "hangs\n"
+                spent_s = 0.0
+                for number in range(1, 1001):
+                    begun_s = time.thread_time()
+                    server.show([Shown.now(channels.jpeg("/camera", number, data))])
+                    spent_s += time.thread_time() - begun_s
+                    if number % 20 == 0:
+                        viewer.read(0.02)
+                viewer.wait_until("/camera", 1000)
+                got = len({stamp_ns for stamp_ns, _ in viewer.messages["/camera"]})
+                assert got > 100
+                assert got + server.dropped >= 1001 - 256, (
+                    "what did not come was counted, or left the library's own queue"
+                )
+                assert spent_s < 2.0
+                begun_s = time.monotonic()
+                stack.close()
+                assert time.monotonic() - begun_s < 10.0
+            finally:
+                hanging.kill()
+                hanging.wait(10)
+                hanging.stdout.close()
+
+
+def test_what_comes_too_quickly_is_dropped_and_counted() -> None:
+    release = []
+
+    def slow() -> ChannelMessage:
+        while not release:
+            time.sleep(0.01)
+        return channels.place("/fixes", 1, np.eye(4))
+
+    with FoxgloveServer(FREE, "hall") as server:
+        assert not server.wants("/fixes")
+        with FoxgloveClient(server.url) as viewer:
+            viewer.subscribe(["/fixes"])
+            while not server.wants("/fixes"):
+                time.sleep(0.01)
+            server.show([Shown("/fixes", 1, slow)])
+            time.sleep(0.2)
+            server.show(place(stamp_ns) for stamp_ns in range(2, 102))
+            assert server.dropped == 100 - 32
+            release.append(True)
+            assert [stamp_ns for stamp_ns, _ in viewer.wait_for("/fixes", 33)] == [1, *range(70, 102)]
+
+
+def test_a_port_in_use_is_told_at_once(server: FoxgloveServer) -> None:
+    port = int(server.url.rpartition(":")[2])
+    with pytest.raises(UsageError, match=f"--foxglove 127.0.0.1:{port}: cannot listen there.*choose another"):
+        FoxgloveServer(ViewerAddress("127.0.0.1", port), "hall")
+    with pytest.raises(UsageError, match="cannot listen there"):
+        FoxgloveServer(ViewerAddress("no.such.name.invalid", 0), "hall")
+
+
+def test_playback_is_the_viewers() -> None:
+    timeline = Timeline(10 * S, 30 * S)
+    timeline.add(Shown.now(channels.points(10 * S, POINTS)))
+    for number in range(201):
+        timeline.add(place(10 * S + number * S // 10))
+    timeline.finish()
+    with FoxgloveServer(FREE, "ride", Player(timeline)) as server, FoxgloveClient(server.url) as viewer:
+        assert set(viewer.info["capabilities"]) >= {"playbackControl", "time"}
+        assert viewer.info["dataStartTime"] == {"sec": 10, "nsec": 0}
+        assert viewer.info["dataEndTime"] == {"sec": 30, "nsec": 0}
+        viewer.subscribe(["/map", "/fixes"])
+        viewer.wait_for("/map")
+        assert viewer.wait_for("/fixes")[0][0] == 10 * S
+        assert viewer.wait_for_playback(PAUSED, 0).at_ns == 10 * S
+        told = viewer.control(play=False, seek_ns=25 * S + 1)
+        assert (told.status, told.at_ns, told.did_seek) == (PAUSED, 25 * S + 1, True)
+        assert viewer.wait_for("/fixes", 2)[1][0] == 25 * S
+        count = len(viewer.messages["/fixes"])
+        viewer.read(0.3)
+        assert len(viewer.messages["/fixes"]) == count, "it is paused"
+        assert viewer.control(play=True, seek_ns=12 * S).status == PLAYING
+        stamps_ns = [stamp_ns for stamp_ns, _ in viewer.wait_for("/fixes", count + 6)[count:]]
+        assert stamps_ns == [12 * S + n * S // 10 for n in range(6)]
+        assert viewer.control(play=True, speed=50.0).speed == 50.0
+        assert viewer.wait_for_playback(ENDED).at_ns == 30 * S
+        viewer.wait_until("/fixes", 30 * S)  # states overtake messages
+        assert viewer.times_ns[-1] == 30 * S
