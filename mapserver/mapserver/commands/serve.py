@@ -2,6 +2,7 @@
 
 import ssl
 from collections.abc import AsyncIterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
     from fleetmap.bus import ZenohBus
+    from fleetmap.foxglove.server import FoxgloveServer
     from mapserver.api.guard import GuardSettings
     from mapserver.config import MapserverConfig
     from mapserver.operators.openid import Provider
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 _STOP_WITHIN_S = 5
 _SWITCH_INTERVAL_S = 0.001
 _RENEW_EVERY_S = 10.0
+_VIEW_EVERY_S = 0.5
 _INSECURE = (
     "This server was started with --insecure. Whoever reaches it may read everything and change the maps of the robots."
 )
@@ -38,7 +41,7 @@ _NO_TLS = "This server was started with --insecure. Passwords and sessions can b
 
 @dataclass(frozen=True, kw_only=True)
 class HttpOptions(OidcOptions):
-    """Where HTTP is served, and by which names."""
+    """Where HTTP is served, and by which names; and where viewers look at a site."""
 
     http: Annotated[str, typer.Option(help="HTTP address to listen on; port 0 picks a free port.")] = "127.0.0.1:8080"
     http_cert: Annotated[
@@ -52,6 +55,40 @@ class HttpOptions(OidcOptions):
         bool,
         typer.Option("--insecure", help="Serve other machines without TLS and operators, and say so on every page."),
     ] = False
+
+    foxglove: Annotated[
+        str | None, typer.Option(metavar="[HOST:]PORT", help="Show a site in Foxglove there; nobody signs in.")
+    ] = None
+    foxglove_site: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The site that --foxglove shows, where there are several.")
+    ] = None
+
+    def viewers(self) -> "AbstractContextManager[FoxgloveServer | None]":
+        """The server of viewers, None without one; UsageError as `viewer_address`, `require_foxglove` and `FoxgloveServer`."""
+        from fleetmap.errors import UsageError
+        from fleetmap.foxglove import require_foxglove, viewer_address
+        from fleetmap.mapformat import check_name
+
+        if self.foxglove_site is not None:
+            check_name(self.foxglove_site, "site")
+            if self.foxglove is None:
+                raise UsageError("--foxglove-site needs --foxglove PORT; give both")
+        if self.foxglove is None:
+            return nullcontext()
+        address = viewer_address(self.foxglove, insecure=self.insecure)
+        require_foxglove("--foxglove")
+        from fleetmap.foxglove.server import FoxgloveServer
+
+        return FoxgloveServer(address, "fleetmap")
+
+    def viewed_site(self, store: "MapStore") -> str:
+        """The site that viewers see; UsageError where none is named and there is not one alone."""
+        from fleetmap.errors import UsageError
+
+        sites = [info.site for info in store.sites()]
+        if self.foxglove_site is None and len(sites) != 1:
+            raise UsageError(f"--foxglove shows one site and the store has {len(sites)}; name it with --foxglove-site")
+        return self.foxglove_site or sites[0]
 
     def host_and_port(self) -> tuple[str, int]:
         """Where to listen; UsageError for what is no address."""
@@ -134,12 +171,19 @@ def serve(
 
     certificate, provider, settings = at.load_certificate(), at.load_provider(), settings_of(context)
     # The sockets come before the store is read, so that a wrong address is reported at once.
-    with _listening(host, port) as listener, MapStore.open(store) as maps:
+    with _listening(host, port) as listener, at.viewers() as viewers, MapStore.open(store) as maps:
+        shown = None if viewers is None else _Shown(viewers, at.viewed_site(maps))
         guard = at.guard(maps, certificate, provider, _OPEN_BUS if is_open else "")
         prepare_lists(maps, zenoh)
         bus, robots = prepare_bus(maps, zenoh, insecure=at.insecure)
         with bus:
-            _run(maps, (bus, robots), _Http(listener, guard, certificate, bool(at.http_name), signer), settings)
+            http = _Http(listener, guard, certificate, bool(at.http_name), signer, shown)
+            _run(maps, (bus, robots), http, settings)
+
+
+class _Shown(NamedTuple):
+    viewers: "FoxgloveServer"
+    site: str
 
 
 class _Http(NamedTuple):
@@ -148,6 +192,7 @@ class _Http(NamedTuple):
     certificate: "HttpCertificate | None"
     is_behind_proxy: bool
     signer: bool
+    shown: _Shown | None
 
 
 def _run(
@@ -185,11 +230,18 @@ def _run(
     async def lifespan(_: "FastAPI") -> AsyncIterator[None]:
         import asyncio
 
-        both = (tasks, admission_tasks(robots))
-        background = [asyncio.create_task(run_background_tasks(some)) for some in both]
+        groups = [tasks, admission_tasks(robots)]
+        if http.shown is not None:  # apart from the others: no robot waits for a viewer
+            from mapserver.serving.fleet_viewer import FleetViewer
+
+            viewer = FleetViewer(maps, fleet, bus_service.surveys, http.shown.site, http.shown.viewers)
+            groups.append([BackgroundTask("showing the site to viewers", _VIEW_EVERY_S, viewer.look)])
+        background = [asyncio.create_task(run_background_tasks(some)) for some in groups]
         host, port = http.listener.getsockname()[:2]
         typer.echo(f"http: {'https' if http.certificate else 'http'}://{f'[{host}]' if ':' in host else host}:{port}")
         typer.echo(f"zenoh: {bus.endpoint}")
+        if http.shown is not None:
+            typer.echo(f"foxglove: {http.shown.viewers.url}")
         typer.echo("ready")
         yield
         for task in background:
