@@ -1,4 +1,4 @@
-"""Recordings of camera robots: EuRoC, TUM-VI, KITTI, 7-Scenes and TUM RGB-D folders, MCAP, rosbag2 in SQLite, ROS 1 bags.
+"""Recordings of camera robots: folders of data sets, MCAP, rosbag2 in SQLite, ROS 1 bags, videos; zipped or not.
 
 To add a format: a module whose function reads the folder or file into `RecordingParts` and hands them to `finalize`,
 and a line in RECORDING_FORMATS (examples/new_recording_format.py is one).
@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings import archive
+from fleetmap.recordings import archive, video
 from fleetmap.recordings.bags import ros1, sqlite
 from fleetmap.recordings.calibration_files import format_calibration, read_calibration
 from fleetmap.recordings.folders import euroc, kitti, seven_scenes, tum_rgbd, tumvi
@@ -58,15 +58,19 @@ RECORDING_FORMATS = {
     "mcap": RecordingFormat("an .mcap file, or a folder with one in it", reader.recognises, reader.open_mcap),
     "rosbag2-sqlite": RecordingFormat("a rosbag2 .db3 file, or its folder", sqlite.recognises, sqlite.open_sqlite),
     "rosbag1": RecordingFormat("a ROS 1 .bag file", ros1.recognises, ros1.open_bag),
+    "video": RecordingFormat("an .mp4 video of one camera", video.recognises, video.open_video),
 }
 # Of what cannot be read: the command that makes it readable
 _ADVICE = {
     (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz", ".tar.zst"): "`tar xf {path}` unpacks it",
     (".7z", ".rar"): "`7z x {path}` unpacks it",
     (".mcap.zst", ".mcap.zstd", ".bag.zst"): "`zstd -d {path}` unpacks it",
+    (".avi", ".mkv", ".webm", ".ts", ".h264", ".264", ".265"): (
+        "`ffmpeg -i {path} -c copy {stem}.mp4` makes a video that can be read"
+    ),
     (".bag.active",): "`rosbag reindex {path}` finishes it",
 }
-FILE_SUFFIXES = (".mcap", ".db3", ".bag", ".zip")  # of recordings that are one file
+FILE_SUFFIXES = (".mcap", ".db3", ".bag", ".zip", *video.SUFFIXES)  # of recordings that are one file
 
 
 def open_recording(path: Path | str, options: OpenOptions | None = None) -> Recording:

@@ -3,9 +3,12 @@
 A textured wall 5 m before a stereo pair that turns about all three axes; nothing here uses the code under test.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -202,6 +205,24 @@ def write_tum_rgbd(folder: Path, sample: Sample) -> Path:
         rows.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {numbers}")
     (folder / "groundtruth.txt").write_text("\n".join(rows) + "\n")
     return folder
+
+
+def write_video(path: Path, images: Sequence[NDArray[np.uint8]], times_ms: Sequence[int], **options: str) -> Path:
+    """An MP4 of grey images by PyAV's encoder, without loss unless options of x264 say otherwise; key frames every five."""
+    movflags = options.pop("movflags", "")
+    chosen = {"qp": "0", "g": "5", "bf": "0", **options}
+    height, width = images[0].shape
+    with av.open(str(path), "w", options={"movflags": movflags} if movflags else {}) as container:
+        stream = container.add_stream("libx264", rate=20, options={k: v for k, v in chosen.items() if v})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+        for image, time_ms in zip(images, times_ms, strict=True):
+            planes = np.vstack([image, np.full((height // 2, width), 128, np.uint8)])
+            frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
+            frame.pts, frame.time_base = time_ms, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
 
 
 def _euroc_yaml(camera: CameraCalibration, yaml_line: bool) -> str:

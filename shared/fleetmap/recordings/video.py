@@ -1,0 +1,282 @@
+"""Opens a video of one camera, .mp4 or .mov, with a calibration file. Its stamps are the container's, and said to be uncertain.
+
+PyAV (FFmpeg) decodes it. Luma is taken as the decoder gives it, so that a frame is the same on every machine. Files may be hostile:
+no other demuxer than MP4's is asked, nothing but the file itself is read, tables have no more samples than the file has bytes, and
+pictures have the size that all images may have.
+"""
+
+import bisect
+import hashlib
+import re
+import struct
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
+from fleetmap.recordings.folders.image_files import hash_file
+from fleetmap.recordings.images import MAX_PIXELS, StoredFrame, decode_frame, grey_image
+from fleetmap.recordings.ordering import ReadLog
+from fleetmap.recordings.recording import OpenOptions, Recording
+from fleetmap.sensors.samples import CameraFrame, Image
+
+if TYPE_CHECKING:
+    import av
+
+SUFFIXES = (".mp4", ".m4v", ".mov")
+_PLANES = ("yuv4", "yuvj4", "nv12", "nv21", "gray")  # pixel formats whose first plane is luma
+_BOX = struct.Struct(">I4s")
+_NO_TABLES = (b"mdat", b"free", b"skip", b"wide")
+_COUNTS = re.compile(rb"(?:stsz|stz2).{8}(.{4})|trun.{4}(.{4})", re.DOTALL)  # how many samples
+_MAX_TABLE_BYTES = 256 << 20
+_UNEVEN = 1.5  # longest step over the median of a constant rate
+
+
+def recognises(path: Path) -> bool:
+    """Whether `path` is a file that is named, or begins, as an MP4 video."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return path.suffix.lower() in SUFFIXES or file.read(12)[4:8] == b"ftyp"
+
+
+def open_video(path: Path, options: OpenOptions) -> Recording:
+    """The recording in a video: one camera, no IMU."""
+    given = calibration_of_options(options)
+    if given is None:
+        raise CalibrationError(f"{path}: a video holds no calibration; pass one with --calibration FILE")
+    log = ReadLog(files=[path])
+    if options.calibration_file is not None:
+        log.files.append(options.calibration_file)
+    index = _index(path, log)
+    log.note("stamps uncertain", "they are the video's, which no exposure set and no other sensor shares")
+    frames = VideoFrames(log.files, index.keys, index.pts, index.stamps_ns)
+    try:
+        if frames.rotation():
+            log.note(
+                "video turned",
+                f"players turn it by {frames.rotation()} degrees; images are used as the sensor gave them",
+            )
+        parts = RecordingParts(
+            path=path,
+            name=path.stem,
+            format="video",
+            calibration=given.calibration,
+            frame_stamps_ns=np.array(index.stamps_ns, np.int64),
+            frames=frames,
+        )
+        return finalize(parts, log)
+    except BaseException:
+        frames.close()
+        raise
+
+
+class _Index(NamedTuple):
+    """Presentation times of a video's frames in its own unit and in ns, rising, and those of its key frames."""
+
+    pts: tuple[int, ...]
+    stamps_ns: tuple[int, ...]
+    keys: tuple[int, ...]
+
+
+class VideoFrames:
+    """A FrameSource that decodes forward, from the last key frame before where it is asked to go elsewhere.
+
+    read_files: the video first; keys: presentation times of all key frames; pts, stamps_ns: of the frames.
+    """
+
+    def __init__(
+        self, read_files: Sequence[Path], keys: Sequence[int], pts: Sequence[int], stamps_ns: Sequence[int]
+    ) -> None:
+        self._read_files, self._keys, self._pts, self._stamps_ns = read_files, keys, pts, stamps_ns
+        self._video: _Video | None = None
+        self._is_closed = False
+        self._decoded: Iterator[Any] = iter(())
+        self._last: Any = None
+
+    def rotation(self) -> int:
+        """Degrees by which players turn the pictures."""
+        return int(self._at(0).rotation)
+
+    def stored(self, index: int) -> StoredFrame:
+        """Frame `index`, decoded: nothing else of it can be copied without the frames around it."""
+        where = f"{self._read_files[0]} at {self._stamps_ns[index]}"
+        return StoredFrame(self._stamps_ns[index], grey_image(_luma(self._at(index)), where))
+
+    def frame(self, index: int) -> CameraFrame:
+        """Frame `index`."""
+        return decode_frame(self.stored(index))
+
+    def part(self, indices: NDArray[np.int64]) -> "VideoFrames":
+        """See FrameSource."""
+        chosen = indices.tolist()
+        pts, stamps_ns = (tuple(values[i] for i in chosen) for values in (self._pts, self._stamps_ns))
+        return VideoFrames(self._read_files, self._keys, pts, stamps_ns)
+
+    def hash_into(self, digest: "hashlib._Hash") -> None:
+        """The bytes of the video, then those of the calibration file."""
+        for path in self._read_files:
+            hash_file(path, digest)
+
+    def close(self) -> None:
+        """Closes the video."""
+        if self._video is not None:
+            self._video.close()
+        self._video, self._last, self._is_closed = None, None, True
+
+    def _at(self, index: int) -> Any:
+        wanted = self._pts[index]
+        where = f"{self._read_files[0]}: the frame at {self._stamps_ns[index]}"
+        if self._is_closed:
+            raise RecordingError(
+                f"{where} was asked for after the recording was closed; keep it open while frames are read"
+            )
+        if self._last is None or self._last.pts != wanted:
+            try:
+                self._last = self._decode(wanted)
+            except _errors() as error:
+                self._last = None
+                raise RecordingError(f"{where} cannot be decoded ({error}); leave it out with --frames") from error
+        if self._last is None:
+            raise RecordingError(f"{where} is not in the video's data; leave it out with --frames")
+        return self._last
+
+    def _decode(self, wanted: int) -> Any:
+        """The frame of that time; None where there is none."""
+        if self._video is None:
+            self._video = _opened(self._read_files[0])
+        container, stream, _ = self._video
+        last = -1 if self._last is None else self._last.pts
+        if not (last < wanted and bisect.bisect(self._keys, last) == bisect.bisect(self._keys, wanted) > 0):
+            container.seek(wanted, stream=stream)
+            self._decoded = iter(container.decode(stream))
+        for frame in self._decoded:
+            if frame.pts is not None and frame.pts >= wanted:
+                return frame if frame.pts == wanted else None
+        return None
+
+
+class _Video(NamedTuple):
+    """An open video and the file that it is read from."""
+
+    container: "av.container.InputContainer"
+    stream: "av.VideoStream"
+    file: BinaryIO
+
+    def close(self) -> None:
+        """Closes both."""
+        self.container.close()
+        self.file.close()
+
+
+def _opened(path: Path) -> _Video:
+    """The file by MP4's demuxer alone, which is given bytes and no name that it could follow."""
+    try:
+        import av
+    except ImportError as error:
+        raise RecordingError(
+            f"{path} needs a library more: pip install '.[video]' in fleetmap's source folder"
+        ) from error
+    file = path.open("rb")
+    try:
+        _check_tables(path, file)
+        container = av.open(file, mode="r", format="mp4")
+    except RecordingError:
+        file.close()
+        raise
+    except _errors() as error:
+        file.close()
+        raise RecordingError(f"{path} cannot be read as a video ({error}); {_conversion(path)}") from error
+    streams = container.streams.video
+    codec = streams[0].codec_context if streams else None
+    if codec is not None and codec.width * codec.height <= MAX_PIXELS:
+        codec.options = {"max_pixels": str(MAX_PIXELS)}
+        return _Video(container, streams[0], file)
+    problem = "it holds no pictures" if not streams else "its codec is not known"
+    if codec is not None:
+        problem = f"pictures of {codec.width}x{codec.height} are larger than the limit of {MAX_PIXELS} pixels"
+    container.close()
+    file.close()
+    raise RecordingError(f"{path} cannot be read as a video: {problem}; {_conversion(path)}")
+
+
+def _check_tables(path: Path, file: BinaryIO) -> None:
+    """RecordingError where tables tell of more samples than there are bytes: FFmpeg fills some 60 bytes of memory for each.
+
+    Tables are looked for by their names in all but the pictures, because FFmpeg takes them wherever they stand.
+    """
+    size, at, told = path.stat().st_size, 0, 0
+    while at + _BOX.size <= size:
+        file.seek(at)
+        length, kind = _BOX.unpack(file.read(_BOX.size))
+        if length == 1:  # a box of more than 4 GB
+            length = int.from_bytes(file.read(8), "big")
+        length = min(length if length >= _BOX.size else size, size - at)
+        if kind not in _NO_TABLES:
+            if length > _MAX_TABLE_BYTES:
+                raise RecordingError(
+                    f"{path}: a table of {length} bytes; the limit is {_MAX_TABLE_BYTES}. {_conversion(path)}"
+                )
+            content = file.read(length)
+            told += sum(int.from_bytes(found[1] or found[2], "big") for found in _COUNTS.finditer(content))
+            told += size * (b"cmov" in content)  # tables that are packed themselves
+        at += length
+    file.seek(0)
+    if told > size:
+        raise RecordingError(f"{path}: its tables tell of {told} samples in {size} bytes; {_conversion(path)}")
+
+
+def _conversion(path: Path) -> str:
+    return (
+        f"copy it again, or make one that can be read with `ffmpeg -i {path} -c:v libx264 -crf 12 {path.stem}-new.mp4`"
+    )
+
+
+def _errors() -> tuple[type[Exception], ...]:
+    """What PyAV raises of damaged files: FFmpeg's errors, and Python's where it is led to impossible places of the file."""
+    import av
+
+    return (av.error.FFmpegError, OSError, ValueError)
+
+
+def _index(path: Path, log: ReadLog) -> _Index:
+    """The stamps of all frames, by what the container says of its packets; RecordingError where one has none."""
+    video = _opened(path)
+    try:
+        container, stream, _ = video
+        packets = [(p.pts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
+        told, unit = stream.frames, stream.time_base
+    except _errors() as error:
+        raise RecordingError(f"{path} cannot be read as a video ({error}); {_conversion(path)}") from error
+    finally:
+        video.close()
+    if not packets:
+        raise RecordingError(f"{path} holds no frame; {_conversion(path)}")
+    if unit is None or any(pts is None for pts, _ in packets):
+        raise RecordingError(
+            f"{path} has frames without stamps; `ffmpeg -r RATE -i {path} -c copy {path.stem}-stamped.mp4` gives them a rate"
+        )
+    pts = tuple(sorted({pts for pts, _ in packets if pts is not None}))
+    if len(pts) < len(packets):
+        log.note("frames without a stamp of their own", f"{len(packets) - len(pts)} of {len(packets)} left out")
+    if told > len(packets):
+        log.note("the video ends early", f"{len(packets)} of {told} frames are there")
+    stamps_ns = tuple(round(p * unit * 1_000_000_000) for p in pts)
+    steps_ms = np.diff(stamps_ns) * 1e-6
+    if len(steps_ms) and steps_ms.max() > _UNEVEN * np.median(steps_ms):
+        log.note("variable frame rate", f"steps of {steps_ms.min():.1f} to {steps_ms.max():.1f} ms")
+    return _Index(pts, stamps_ns, tuple(sorted(pts for pts, is_key in packets if is_key and pts is not None)))
+
+
+def _luma(frame: Any) -> Image:
+    """(H, W) uint8."""
+    is_plane = frame.format.name.startswith(_PLANES) and frame.format.components[0].bits == 8
+    if not is_plane:
+        return np.ascontiguousarray(frame.to_ndarray(format="gray"))
+    plane = frame.planes[0]
+    rows = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
+    return np.ascontiguousarray(rows[:, : frame.width])
