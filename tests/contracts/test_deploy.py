@@ -120,7 +120,7 @@ def test_a_library_that_changed_on_the_index_is_not_installed(tmp_path: Path) ->
 
 def test_what_is_deployed_is_installed_by_hash() -> None:
     """From a lock that the deployer made: no file of the project names an index or the files of one."""
-    for name in ("mapserver.service", "locclient.service"):
+    for name in ("mapserver.service", "locclient.service", "Containerfile"):
         assert re.search(
             r"deploy/install\.sh dist/fleetmap-\S+\.whl ", (REPOSITORY / "deploy" / name).read_text("utf-8")
         ), name
