@@ -16,6 +16,8 @@ from fleetmap.sensors.samples import DataIssue, ImuSamples, Stamps, Trajectory
 _MAX_IMU_VALUE = 1e5  # no inertial sensor measures this in any unit; flipped bits do
 PAIR_TOLERANCE_NS = 5_000_000  # images of one rig that are further apart were not taken at one moment
 DEPTH_TOLERANCE_NS = 20_000_000  # depth and colour of consumer sensors are not triggered together
+# Of recordings whose stamps nobody took when the images were exposed
+UNCERTAIN_STAMPS = DataIssue("stamps uncertain", "they are a video's, which no exposure set and no other sensor shares")
 V = TypeVar("V")
 
 

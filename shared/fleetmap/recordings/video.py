@@ -20,7 +20,7 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.folders.image_files import hash_file
 from fleetmap.recordings.images import MAX_PIXELS, StoredFrame, decode_frame, grey_image
-from fleetmap.recordings.ordering import ReadLog
+from fleetmap.recordings.ordering import UNCERTAIN_STAMPS, ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import CameraFrame, Image
 
@@ -53,7 +53,7 @@ def open_video(path: Path, options: OpenOptions) -> Recording:
     if options.calibration_file is not None:
         log.files.append(options.calibration_file)
     index = _index(path, log)
-    log.note("stamps uncertain", "they are the video's, which no exposure set and no other sensor shares")
+    log.issues.append(UNCERTAIN_STAMPS)
     frames = VideoFrames(log.files, index.keys, index.pts, index.stamps_ns)
     try:
         if frames.rotation():

@@ -45,6 +45,14 @@ def test_empty_folder(tmp_path: Path) -> None:
         open_recording(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["../../../../secret.png", "/etc/passwd"])
+def test_names_outside_of_the_recording(euroc: Path, name: str) -> None:
+    table = euroc / "mav0/cam0/data.csv"
+    table.write_text(table.read_text() + f"1900000000000000000,{name}\n")
+    with pytest.raises(RecordingError, match=r"data\.csv, line \d+: .* is not inside the folder"):
+        open_recording(euroc)
+
+
 def test_missing_camera_folder(euroc: Path) -> None:
     shutil.rmtree(euroc / "mav0/cam0")
     with pytest.raises(RecordingError, match="cam0 is missing"):

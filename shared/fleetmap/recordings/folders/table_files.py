@@ -56,8 +56,15 @@ def read_name_table(path: Path) -> tuple[Stamps, list[str]]:
         if not stamp.strip().isdigit() or not name.strip():
             raise RecordingError(f"{path}, line {number}: {line[:60]!r} is no stamp in ns, a comma and a file name")
         stamps.append(int(stamp))
-        names.append(name.strip())
+        names.append(check_inside(name.strip(), f"{path}, line {number}"))
     return np.array(stamps, np.int64), names
+
+
+def check_inside(name: str, where: str) -> str:
+    """The name of a file that a list gives, if it stays below the list's folder; RecordingError else."""
+    if ".." in Path(name).parts or Path(name).is_absolute():
+        raise RecordingError(f"{where}: {name[:80]!r} is not inside the folder; name images below it")
+    return name
 
 
 def natural_key(name: str) -> tuple[object, ...]:

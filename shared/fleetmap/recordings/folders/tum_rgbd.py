@@ -13,6 +13,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.folders.image_files import FileFrames, ImageFiles, existing_images
 from fleetmap.recordings.folders.seven_scenes import Depth, RegisteredFrames
+from fleetmap.recordings.folders.table_files import check_inside
 from fleetmap.recordings.image_series import pair_images
 from fleetmap.recordings.ordering import DEPTH_TOLERANCE_NS, ReadLog, pair_stamps
 from fleetmap.recordings.recording import OpenOptions, Recording
@@ -89,11 +90,7 @@ def _images(path: Path, name: str, log: ReadLog) -> ImageFiles:
             raise RecordingError(
                 f"{table}, line {number}: {line[:80]!r} is no stamp in seconds and a file name"
             ) from error
-        if ".." in Path(file).parts or Path(file).is_absolute():
-            raise RecordingError(
-                f"{table}, line {number}: {file[:80]!r} is not inside the folder; name images below it"
-            )
-        files.append(path / file)
+        files.append(path / check_inside(file, f"{table}, line {number}"))
     if not files:
         raise RecordingError(f"{table} names no image; copy the recording again")
     log.files.append(table)

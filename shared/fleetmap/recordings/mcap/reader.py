@@ -8,6 +8,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings.bags.container import Message, Place
 from fleetmap.recordings.bags.streams import open_messages
 from fleetmap.recordings.mcap.scan import MAGIC, Location, McapScan, MessageReader
+from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import DataIssue
 
@@ -41,12 +42,16 @@ class McapFile:
     @property
     def name(self) -> str:
         """See Container."""
-        return self._scan.metadata.get("fleetmap", {}).get("name", "")
+        return self._written("name")
 
     @property
     def attachments(self) -> Mapping[str, bytes]:
         """See Container."""
         return self._scan.attachments
+
+    def _written(self, key: str) -> str:
+        """What McapRecordingWriter wrote of the whole recording."""
+        return self._scan.metadata.get("fleetmap", {}).get(key, "")
 
     def messages(self) -> Iterator[Message]:
         """See Container."""
@@ -54,7 +59,7 @@ class McapFile:
 
     def issues(self) -> list[DataIssue]:
         """See Container."""
-        return self._scan.damage.all()
+        return [*self._scan.damage.all(), *([UNCERTAIN_STAMPS] if self._written("stamps") else [])]
 
     def read(self, place: Place) -> bytes:
         """See Container."""

@@ -15,6 +15,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings.bags.container import CALIBRATION_ATTACHMENT
 from fleetmap.recordings.calibration_files import format_calibration
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_grey, file_kind, grey_image, store_frame
+from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
 from fleetmap.recordings.recording import Recording, Topics
 from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.definitions import ros2msg
@@ -31,7 +32,7 @@ class McapRecordingWriter:
     Samples of one kind must come in the order of their stamps; kinds may interleave in any way, ROS tools like them
     roughly in order. name: what the recording is called when it is opened again, the file's stem unless given.
     in_place: for sensors, whose samples come once: the file is there from the beginning, and what was written of it can be read even
-    where nobody closed it.
+    where nobody closed it. has_uncertain_stamps: it is noted where the file is opened.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class McapRecordingWriter:
         topics: Topics | None = None,
         name: str = "",
         in_place: bool = False,
+        has_uncertain_stamps: bool = False,
     ) -> None:
         self._path = path
         self._part = path if in_place else path.with_name(path.name + ".part")
@@ -57,7 +59,8 @@ class McapRecordingWriter:
             raise RecordingError(f"{self._part} cannot be written ({error.strerror}); choose another place") from error
         self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.NONE)
         self._writer.start(profile="ros2", library="fleetmap")
-        self._writer.add_metadata("fleetmap", {"name": name or path.stem})
+        stamps = {"stamps": "uncertain"} if has_uncertain_stamps else {}
+        self._writer.add_metadata("fleetmap", {"name": name or path.stem} | stamps)
         text = format_calibration(calibration).encode()
         self._writer.add_attachment(0, 0, CALIBRATION_ATTACHMENT, "application/yaml", text)
 
@@ -173,7 +176,10 @@ def copy_to_mcap(recording: Recording, path: Path, on_frame: Callable[[], None] 
     Samples go before the frame that follows them, so that the file is in the order of time to within one frame. The
     file appears at `path` only when it is complete.
     """
-    with McapRecordingWriter(path, recording.calibration, name=recording.name) as writer:
+    is_uncertain = UNCERTAIN_STAMPS in recording.issues
+    with McapRecordingWriter(
+        path, recording.calibration, name=recording.name, has_uncertain_stamps=is_uncertain
+    ) as writer:
         since_ns = -(1 << 62)
         for index, stamp_ns in enumerate(recording.frame_stamps_ns.tolist()):
             _write_between(recording, writer, since_ns, stamp_ns)
