@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+import locclient.identity as identity_module
 from fleetmap.bus import TlsFiles, ZenohBus
 from fleetmap.errors import LinkError, StateError, UnreachableError, UsageError
 from fleetmap.messages import robot_key
@@ -109,7 +110,8 @@ def test_lost_answers_do_no_harm(tmp_path: Path, server: Server) -> None:
     assert asks(identity, "r1")
 
 
-def test_a_server_that_is_not_the_bundles(tmp_path: Path, server: Server) -> None:
+def test_a_server_that_is_not_the_bundles(tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(identity_module, "_ANSWER_S", 5.0)
     bundle = msgspec.json.decode(server.bundle("r1"))
     with pytest.raises(UsageError, match="no enrolment bundle"):
         RobotIdentity.enrol(tmp_path / "a", b"PK\x03\x04")

@@ -148,8 +148,8 @@ def _place(moved: str | None) -> tuple[float, float]:
 def test_pages_with_300_robots_load_within_a_second(browser: Browser, served: Served) -> None:
     """With nothing in the browser's cache; what other programs take of the machine meanwhile is not counted."""
     for path in PAGES:
-        took_s = [_load_s(browser, f"{served.http}/dashboard/{path}") / _waiting() for _ in range(2)]
-        assert min(took_s) < 1.0, path
+        address = f"{served.http}/dashboard/{path}"
+        assert any(_load_s(browser, address) / _waiting() < 1.0 for _ in range(2)), path
 
 
 def _load_s(browser: Browser, address: str) -> float:
