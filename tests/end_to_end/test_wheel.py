@@ -12,10 +12,10 @@ from zipfile import ZipFile
 
 import pytest
 
-from support.storage.known_rig import known_rig
+from fleetsim import Order, record_order
+from mapserver import BuildOptions, GateSettings, build_map
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-SOURCES = os.pathsep.join(str(REPOSITORY / folder) for folder in ("shared", "mapserver", "locclient"))
 PACKAGES = {"fleetmap", "fleetsim", "mapserver", "locclient"}
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
@@ -70,13 +70,9 @@ def take_kernels(source: Path, installed: Path) -> None:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a recording of a few metres of warehouse, `clip.mcap`, and a published map of it, `store`."""
     folder = tmp_path_factory.mktemp("site")
-    for module, *arguments in (
-        ["fleetsim.cli", "record", "clip", "--out", "clip.mcap", "--frames", "60"],
-        ["mapserver.cli", "build", "clip.mcap", "--site", "lab", "--store", "store", "--frame-from-ground-truth"],
-        ["mapserver.cli", "publish", "--site", "lab", "--store", "store", *known_rig(folder)],
-    ):
-        start = f"from {module} import main; main()"
-        run([sys.executable, "-c", start, *arguments], folder, PYTHONPATH=SOURCES)
+    record_order(Order("clip", frames=60), folder / "clip.mcap", "mcap")
+    draft = build_map(folder / "clip.mcap", folder / "store", "lab", BuildOptions(frame_from_ground_truth=True))
+    draft.publish(gate=GateSettings(allow_unjudged_calibration=True))
     return folder
 
 
