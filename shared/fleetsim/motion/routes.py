@@ -11,6 +11,7 @@ from fleetsim.scene.layout import Layout
 
 STEP_M = 0.01
 _CREEP_MPS = 0.02  # speed at which a standing start begins
+_STRETCH = 256  # points of a path that are checked together
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,12 +129,16 @@ def check_clear(points_map: Array, layout: Layout, clearance_m: float) -> None:
     walls = np.minimum(np.minimum(x, layout.length_m - x), np.minimum(y, layout.width_m - y))
     gap, blocker = float(walls.min()), "a wall"
     worst = int(np.argmin(walls))
-    for x_min, y_min, x_max, y_max in layout.solid_rectangles():
-        outside_x, outside_y = np.maximum(x_min - x, x - x_max), np.maximum(y_min - y, y - y_max)
-        distance = np.hypot(np.maximum(outside_x, 0), np.maximum(outside_y, 0))
-        if distance.min() < gap:
-            gap, worst = float(distance.min()), int(np.argmin(distance))
-            blocker = f"the solid at x {x_min:.1f}..{x_max:.1f}, y {y_min:.1f}..{y_max:.1f} m"
+    solids = np.array(layout.solid_rectangles()).reshape(-1, 4)
+    for first in range(0, len(points_map), _STRETCH):
+        stretch = points_map[first : first + _STRETCH]
+        low, high = stretch.min(axis=0) - clearance_m, stretch.max(axis=0) + clearance_m
+        for solid in solids[((solids[:, :2] < high) & (solids[:, 2:] > low)).all(axis=1)]:
+            outside = np.maximum(np.maximum(solid[:2] - stretch, stretch - solid[2:]), 0.0)
+            distance = np.hypot(outside[:, 0], outside[:, 1])
+            if distance.min() < gap:
+                gap, worst = float(distance.min()), first + int(np.argmin(distance))
+                blocker = "the solid at x {0:.1f}..{2:.1f}, y {1:.1f}..{3:.1f} m".format(*solid)
     if gap < clearance_m:
         raise UsageError(
             f"the route passes {gap:.2f} m from {blocker} at ({x[worst]:.2f}, {y[worst]:.2f}) m, "
