@@ -8,17 +8,22 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import decode_manifest, decode_tile, pack, unpack
+from fleetmap.occupancy_grid import OccupancyGrid, map_server_files, read_grid
 from fleetmap.version_file import open_export
+from mapserver.grid.grid_codec import decode_grid_tile, encode_grid
+from mapserver.grid.site_grid import TILE_CELLS
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 MAX_CPU_SECONDS = 2.0
 MAX_GROWTH_BYTES = 256 << 20
+_YAML_BYTES = 300
 _NUMBERS = [0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, (1 << 63) - 1, (1 << 64) - 1]
 
 Edit = tuple[str, float, Any]
@@ -155,6 +160,28 @@ def exports() -> st.SearchStrategy[bytes]:
     )
 
 
+def planners_grids() -> st.SearchStrategy[bytes]:
+    """A map_server YAML file and its image, one after the other."""
+    cells = np.resize(np.array([-1, 0, 100], np.int8), (40, 50))
+    text, image = map_server_files(OccupancyGrid(cells, 0.05, np.eye(4)), "grid.pgm")
+    text += b"..." + b" " * (_YAML_BYTES - len(text) - 3)
+    return edits.map(lambda changes: edited(text + image, changes))
+
+
+def read_planners_grid(data: bytes, folder: Path) -> None:
+    """Both files, cut where the first one ends."""
+    (folder / "grid.yaml").write_bytes(data[:_YAML_BYTES])
+    (folder / "grid.pgm").write_bytes(data[_YAML_BYTES:])
+    read_grid(folder / "grid.yaml")
+
+
+def grid_tiles() -> st.SearchStrategy[bytes]:
+    """Tiles of the grid that the store keeps."""
+    cells = np.resize(np.arange(256, dtype=np.uint8), (TILE_CELLS, TILE_CELLS, 4))
+    whole = encode_grid({(1, -2): cells})[1]
+    return edits.map(lambda changes: edited(whole, changes))
+
+
 def read_export(data: bytes, folder: Path) -> None:
     """All checks that an import makes before it believes a file."""
     path = folder / "fuzzed.fmex"
@@ -169,6 +196,8 @@ FORMATS: dict[str, tuple[Callable[[], st.SearchStrategy[bytes]], Callable[[bytes
     "tile": (tiles, lambda data, _: decode_tile(data)),
     "archive": (archives, lambda data, _: decode_archive(data)),
     "export": (exports, read_export),
+    "grid tile": (grid_tiles, lambda data, _: decode_grid_tile(data)),
+    "planners' grid": (planners_grids, read_planners_grid),
 }
 
 
