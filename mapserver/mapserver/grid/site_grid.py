@@ -26,9 +26,10 @@ from mapserver.tiles.tiling import TILE_SIZE_M
 TILE_CELLS = round(TILE_SIZE_M / CELL_M)
 TOP_M = FLOOR_M + SLICES * SLICE_M
 _RANGE_CELLS = 160  # of a view
-# A view that hits a voxel counts as two that pass it, since passes also come of its rim. What was known counts as three views, and
-# stays until as many speak against it: one night takes away what moved.
-_HIT, _OCCUPIED, _FREE, _KNOWN = 2, 4, 3, 3
+# A view that hits a voxel counts as two that pass it, since passes also come of its rim. What was known counts as one view, and
+# stays unless a night decides otherwise: it takes away what moved.
+_HIT, _OCCUPIED, _FREE, _KNOWN = 2, 4, 3, 1
+_WIDTH_M, _STEP_M = 0.5, 1.5  # of what carries the camera; and between keyframes of one drive
 _SAME_STEPS = 10  # heights that differ by less stay as they were
 _MAX_CELLS = 1 << 25
 Tiles = dict[tuple[int, int], Counts]
@@ -61,6 +62,21 @@ class SessionViews:
                 part = slice(low[0], high[0]), slice(low[1], high[1])
                 if passes[part].any() or points[part].any():
                     add_view(points, passes, heights, start, *self._tile(x, y))
+
+    def add_path(self, cameras_map: Array, floor_m: float) -> None:
+        """The way of the camera (K, 2 or more): what carries it has been there, as wide as a person and as high as the camera."""
+        steps = np.linalg.norm(np.diff(cameras_map[:, :2], axis=0), axis=1) < _STEP_M
+        shares = np.linspace(0.0, 1.0, round(_STEP_M / CELL_M))[:, None, None]
+        way = cameras_map[:-1, :2][steps] * (1 - shares) + cameras_map[1:, :2][steps] * shares
+        reach = np.arange(-_WIDTH_M / 2, _WIDTH_M / 2 + 1e-9, CELL_M / 2)
+        disc = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 1, 2)
+        disc = disc[np.linalg.norm(disc[:, 0], axis=1) <= _WIDTH_M / 2]
+        cells = np.unique(np.floor((way.reshape(-1, 2) + disc).reshape(-1, 2) / CELL_M).astype(np.int64), axis=0)
+        levels = int(np.clip(np.ceil((floor_m - FLOOR_M) / SLICE_M), 0, SLICES))
+        for x, y in np.unique(cells // TILE_CELLS, axis=0).tolist():
+            mine = cells[(cells // TILE_CELLS == (x, y)).all(axis=1)] - np.array([x, y]) * TILE_CELLS
+            passes = self._tile(x, y)[1]
+            passes[mine[:, 1], mine[:, 0], :levels] = np.maximum(passes[mine[:, 1], mine[:, 0], :levels], _FREE)
 
     def _tile(self, x: int, y: int) -> tuple[Counts, Counts, Counts]:
         if (x, y) not in self.tiles:

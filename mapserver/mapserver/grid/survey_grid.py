@@ -60,4 +60,6 @@ def _views(session: GridSession, settings: StereoSettings) -> SessionViews | str
     views = SessionViews()
     for disparity_px, sigma_px, map_from_cam in seen(slice(None)):
         views.add((disparity_px, sigma_px), camera, map_from_cam, floor_m)
+    frames = [keyframe.frame_index for keyframe in keyframes]
+    views.add_path((session.map_from_body[frames] @ survey.state.body_from_cam)[:, :3, 3], floor_m)
     return views

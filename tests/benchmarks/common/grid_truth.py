@@ -52,9 +52,11 @@ def _span(half_m: float) -> Array:
 
 
 def _set(mask: Mask, points: Array) -> None:
-    cells = np.floor(points[:, 1::-1] / CELL_M + 1e-9).astype(int)
-    inside = ((cells >= 0) & (cells < mask.shape)).all(axis=1)
-    mask[cells[inside, 0], cells[inside, 1]] = True
+    """What lies on the border of two cells, as the walls do, is in both."""
+    for off in (-1e-6, 1e-6):
+        cells = np.floor(points[:, 1::-1] / CELL_M + off).astype(int)
+        inside = ((cells >= 0) & (cells < mask.shape)).all(axis=1)
+        mask[cells[inside, 0], cells[inside, 1]] = True
 
 
 def in_hall(grid: OccupancyGrid, shape: tuple[int, ...]) -> NDArray[np.int8]:

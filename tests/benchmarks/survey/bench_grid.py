@@ -26,10 +26,26 @@ from fleetsim.recorder import Order, Session, prepare
 from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m
 from mapserver.grid.grid_codec import encode_grid, grid_of
 from mapserver.grid.grid_kernels import CELL_M
-from mapserver.grid.site_grid import SessionViews, Tiles, occupancy, updated
+from mapserver.grid.site_grid import TILE_CELLS, SessionViews, Tiles, occupancy, updated
 from mapserver.store import MapStore
 
 RADIUS_M = 0.3
+
+
+def kept_views(session: Session, every: int, folder: Path | None) -> SessionViews:
+    """As `views_from_truth`, from a file of `folder` where it was made before."""
+    if folder is None:
+        return views_from_truth(session, every)
+    order = session.order
+    path = folder / f"{order.scenario}-{order.seed}-{order.day}-{every}.npz"
+    if path.exists():
+        with np.load(path) as kept:
+            places = {tuple(int(v) for v in name.split(",")[:2]) for name in kept}
+            return SessionViews({(x, y): tuple(kept[f"{x},{y},{n}"] for n in range(3)) for x, y in places})
+    views = views_from_truth(session, every)
+    arrays = {f"{x},{y},{n}": array for (x, y), three in views.tiles.items() for n, array in enumerate(three)}
+    np.savez_compressed(path, **arrays)
+    return views
 
 
 def views_from_truth(session: Session, every: int) -> SessionViews:
@@ -50,6 +66,7 @@ def views_from_truth(session: Session, every: int) -> SessionViews:
     views, begun_s = SessionViews(), time.process_time()
     for disparity, place in seen:
         views.add(disparity, rectifier.camera, place, floor_m)
+    views.add_path(np.array([place[:3, 3] for _, place in seen]), floor_m)
     cast_s = time.process_time() - begun_s
     print(
         f"  {len(seen)} views, floor {floor_m:.3f} m below the camera; CPU a view: rendering {1e3 * shoot_s / len(seen):.0f} ms, "
@@ -98,14 +115,16 @@ def judge_night(before: Tiles, after: Tiles, truths: tuple[Mask, Mask], height_m
     first, second = (in_hall(occupancy(tiles, height_m), truths[0].shape) for tiles in (before, after))
     around = np.ones((3, 3), bool)
     moved = (first == OCCUPIED) & binary_dilation(truths[0], around) & ~binary_dilation(truths[1], around)
-    new = truths[1] & ~binary_dilation(truths[0], around) & binary_dilation(second == OCCUPIED, around)
+    fresh = truths[1] & ~binary_dilation(truths[0], around) & binary_dilation(second == OCCUPIED, around)
     sizes = [len(blob) for tiles in (before, after) for blob in encode_grid(tiles)]
-    known = set(encode_grid(before))
-    fresh = sum(len(blob) for blob in encode_grid(after) if blob not in known)
+    none = np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8)
+    pairs = [(before.get(place, none), cells) for place, cells in after.items()]
+    changed = sum(int((old[..., :2] != new[..., :2]).any(axis=-1).sum()) for old, new in pairs)
+    known_cells = sum(int(cells[..., :2].any(axis=-1).sum()) for cells in after.values())
     print(
         f"  night: of {int(moved.sum())} occupied cells whose stock is gone {int((moved & (second == OCCUPIED)).sum())} are still "
-        f"occupied, {int((moved & (second == FREE)).sum())} are free; {int(new.sum())} cells of new stock found; "
-        f"grid {sum(sizes) // 2} bytes, {fresh} of it new",
+        f"occupied, {int((moved & (second == FREE)).sum())} are free; {int(fresh.sum())} cells of new stock found; "
+        f"{changed / known_cells:.1%} of the known cells changed; grid of {sum(sizes) // 2} bytes",
         flush=True,
     )
     return int(moved.sum()), int((moved & (second == OCCUPIED)).sum())
@@ -130,6 +149,8 @@ def main() -> None:
     parser.add_argument("--site", default="hall")
     parser.add_argument("--version", type=int)
     parser.add_argument("--day", type=int, default=0)
+    parser.add_argument("--next-day", type=int, default=1, help="day of the second session's stock")
+    parser.add_argument("--work", type=Path, help="folder that keeps what the cameras saw")
     options = parser.parse_args()
     for hall in options.halls:
         scenario, _, seed = hall.partition(":")
@@ -139,14 +160,14 @@ def main() -> None:
             with MapStore.open(options.store, read_only=True) as maps:
                 tiles = grid_of(maps.manifest(options.site, options.version or 1), maps.blob)
         else:
-            tiles = updated({}, views_from_truth(session, options.every))
+            tiles = updated({}, kept_views(session, options.every, options.work))
         grid = occupancy(tiles, options.height)
         judged = judge(grid, session, options.height)
         if options.picture is not None:
             draw(options.picture, grid, judged.truth)
         if options.store is None:
-            night = prepare(Order(scenario, seed=int(seed), day=options.day + 1))
-            after = updated(tiles, views_from_truth(night, options.every))
+            night = prepare(Order(scenario, seed=int(seed), day=options.next_day))
+            after = updated(tiles, kept_views(night, options.every, options.work))
             judged_after = judge(occupancy(after, options.height), night, options.height)
             judge_night(tiles, after, (judged.truth, judged_after.truth), options.height)
 

@@ -156,3 +156,13 @@ def test_the_floor_is_found_or_it_is_said_that_there_is_none() -> None:
     assert floor_distance_m([view(0.9)] * 5, lens) == pytest.approx(0.9, abs=0.011)
     assert floor_distance_m([view(height) for height in (0.6, 0.9, 1.2, 1.5, 1.1)], lens) is None
     assert floor_distance_m([], lens) is None
+
+
+def test_where_the_camera_drove_nothing_stands() -> None:
+    """From end to end of a drive, as high as the camera, in tiles of both signs; not where it was carried off and put down."""
+    views = SessionViews()
+    views.add_path(np.array([[-1.0, 0.0, 0.9], [0.0, 0.0, 0.9], [1.0, 0.2, 0.9], [9.0, 0.2, 0.9]]), 0.9)
+    grid = occupancy(updated({}, views), 0.8)
+    assert [cell(grid, *place) for place in ((-1.0, 0.1), (0.0, -0.2), (0.5, 0.1), (1.2, 0.2))] == [0, 0, 0, 0]
+    assert [cell(grid, *place) for place in ((0.0, 0.4), (5.0, 0.2), (9.0, 0.2))] == [-1, -1, -1]
+    assert (occupancy(updated({}, views), 1.3).cells == -1).all()
