@@ -14,9 +14,12 @@ from mapserver.commands.options import SurveyOptions
 
 if TYPE_CHECKING:
     from fleetmap.bus import Bus
+    from fleetmap.foxglove import ViewerAddress
+    from fleetmap.foxglove.server import FoxgloveServer
     from fleetmap.live_survey import LiveSurveyState
     from mapserver import BuildOptions
     from mapserver.live import Drive
+    from mapserver.live.live_viewer import LiveViewer
     from mapserver.survey.settings import SurveySettings
 
 
@@ -43,8 +46,12 @@ class LiveCommandOptions(SurveyOptions):
     ] = None
     ros2: Annotated[
         str | None,
-        typer.Option(metavar="ENDPOINT", help="zenoh endpoint to show the survey at as ROS 2 topics, for Foxglove."),
+        typer.Option(metavar="ENDPOINT", help="zenoh endpoint to show the survey at as ROS 2 topics."),
     ] = None
+    foxglove: Annotated[
+        str | None, typer.Option(metavar="[HOST:]PORT", help="Show the survey in Foxglove there; nobody signs in.")
+    ] = None
+    insecure: Annotated[bool, typer.Option("--insecure", help="Let other machines see what --foxglove shows.")] = False
 
 
 @expand_options
@@ -64,23 +71,34 @@ def live(
         raise UsageError("--map VERSION --frozen localizes in a version; without both of them a map is made")
     from rich.console import Console
 
+    from fleetmap.foxglove import require_foxglove, viewer_address
+
+    at = None if options.foxglove is None else viewer_address(options.foxglove, insecure=options.insecure)
+    if at is not None:
+        require_foxglove("--foxglove")
     from mapserver import BuildOptions
     from mapserver.build.sensor_subset import named_sensor_set
     from mapserver.live import LiveRequest, run_live
 
     use = None if options.use is None else named_sensor_set(options.use)
     asked = options.asked() | {"config": config_path(context), "use": use}
-    site, store, speed, server, sensors, record, version, ros2, _ = (
-        asked.pop(name) for name in ("site", "store", "speed", "server", "sensors", "record", "map", "ros2", "frozen")
+    site, store, speed, server, sensors, record, version, ros2 = (
+        asked.pop(name) for name in ("site", "store", "speed", "server", "sensors", "record", "map", "ros2")
     )
+    for name in ("frozen", "foxglove", "insecure"):
+        asked.pop(name)
     build, is_stopped = BuildOptions(**asked), _stopping()
     with (
+        _foxglove(at, site) as foxglove,
         _drive(recording, sensors, record, build, speed) as (drive, settings),
         _bus(server, store) as bus,
-        _bus(ros2, store, is_ros=True) as viewers,
+        _bus(ros2, store, is_ros=True) as ros2_bus,
     ):
         request = LiveRequest(site, store, settings, build, version)
-        result = run_live(request, drive, _teller(bus, viewers), is_stopped, Console(stderr=True))
+        viewer = None if foxglove is None else _viewer(foxglove, drive)
+        tell = _teller(bus, ros2_bus, viewer)
+        see = None if viewer is None else viewer.see
+        result = run_live(request, drive, tell, is_stopped, Console(stderr=True), see)
     typer.echo(result.figures.words())
     if result.built is not None:
         typer.echo(result.built.sentence)
@@ -145,13 +163,31 @@ def _bus(server: str | None, store: Path, *, is_ros: bool = False) -> "AbstractC
     return ZenohBus.connect(server, tls=tls)
 
 
-def _teller(bus: "Bus | None", viewers: "Bus | None") -> "Callable[[LiveSurveyState], None]":
+def _foxglove(at: "ViewerAddress | None", site: str) -> "AbstractContextManager[FoxgloveServer | None]":
+    if at is None:
+        return nullcontext(None)
+    from fleetmap.foxglove.server import FoxgloveServer
+
+    server = FoxgloveServer(at, site)
+    typer.echo(f"foxglove: {server.url}")
+    return server
+
+
+def _viewer(server: "FoxgloveServer", drive: "Drive") -> "LiveViewer":
+    from mapserver.live.live_viewer import LiveViewer
+
+    return LiveViewer(server, drive)
+
+
+def _teller(
+    bus: "Bus | None", ros2_bus: "Bus | None", viewer: "LiveViewer | None"
+) -> "Callable[[LiveSurveyState], None]":
     from fleetmap.errors import LinkError
     from fleetmap.live_survey import live_key
     from fleetmap.messages import encode_message
     from mapserver.live.ros2_view import Ros2View
 
-    view = None if viewers is None else Ros2View(viewers)
+    view = None if ros2_bus is None else Ros2View(ros2_bus)
 
     def tell(state: "LiveSurveyState") -> None:
         if bus is not None:
@@ -160,5 +196,7 @@ def _teller(bus: "Bus | None", viewers: "Bus | None") -> "Callable[[LiveSurveySt
         if view is not None:
             with suppress(LinkError):
                 view.show(state)
+        if viewer is not None:
+            viewer.tell(state)
 
     return tell

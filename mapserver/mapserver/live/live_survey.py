@@ -29,11 +29,12 @@ from mapserver.store import MapStore
 from mapserver.survey.live.frozen_map import FrozenMap, FrozenVersion
 from mapserver.survey.live.live_map import LiveMap
 from mapserver.survey.live.live_values import LiveEstimate, LiveRig
-from mapserver.survey.live.tracking import LiveTracking
+from mapserver.survey.live.tracking import LiveTracking, Tracked
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig
 
 Tell = Callable[[LiveSurveyState], None]
+See = Callable[[Tracked], None]
 
 _TELL_EVERY_S = 0.5
 
@@ -88,13 +89,19 @@ class LiveResult(NamedTuple):
 
 
 def run_live(
-    request: LiveRequest, drive: Drive, tell: Tell, is_stopped: Callable[[], bool], console: Console
+    request: LiveRequest,
+    drive: Drive,
+    tell: Tell,
+    is_stopped: Callable[[], bool],
+    console: Console,
+    see: See | None = None,
 ) -> LiveResult:
     """Follows a survey to its end, or until it is stopped, and builds the draft of what was seen.
 
-    tell: takes the state, twice a second. Raises the FleetmapErrors of a build, UsageError for what cannot be mapped live.
+    tell: takes the state, twice a second; see: every frame, and returns at once. Raises the FleetmapErrors of a build, UsageError for what
+    cannot be mapped live.
     """
-    survey = _Survey(request, drive, tell)
+    survey = _Survey(request, drive, tell, see)
     survey.follow(is_stopped)
     console.print(survey.figures().words(), markup=False)
     if request.frozen is not None:
@@ -117,8 +124,8 @@ def run_live(
 class _Survey:
     """One survey while it drives, and what can be said of it."""
 
-    def __init__(self, request: LiveRequest, drive: Drive, tell: Tell) -> None:
-        self._request, self._drive, self._tell = request, drive, tell
+    def __init__(self, request: LiveRequest, drive: Drive, tell: Tell, see: See | None) -> None:
+        self._request, self._drive, self._tell, self._see = request, drive, tell, see
         self._stamps_ns: list[int] = []
         self._most_behind = 0
         self._latencies_s: list[float] = []
@@ -179,6 +186,8 @@ class _Survey:
         tracked = tracking.handle(due.frame, due.imu, due.wheel)
         if due.due_s is not None:
             self._latencies_s.append(time.monotonic() - due.due_s)
+        if self._see is not None:
+            self._see(tracked)
         self._stamps_ns.append(due.frame.stamp_ns)
         self._stamps_since.append(due.frame.stamp_ns)
         self._worst = min(self._worst, tracked.quality)

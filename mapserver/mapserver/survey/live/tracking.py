@@ -22,13 +22,14 @@ class Tracked(NamedTuple):
     """One frame as tracking leaves it.
 
     frame_from_body (4, 4); quality: share of its points that agree, 0 while the odometry is lost; keyframe: what the map takes of it,
-    None where it is none.
+    None where it is none; pixels (N, 3), u_left v u_right, of the points that the odometry follows, None where it follows none.
     """
 
     frame: RectifiedFrame
     frame_from_body: Array
     quality: float
     keyframe: NewKeyframe | None
+    pixels: Array | None = None
 
 
 class _Before(NamedTuple):
@@ -61,7 +62,7 @@ class LiveTracking:
         if tracked.is_keyframe and self._has_place(estimate):
             keyframe = self._keyframe(tracked.number, estimate, covariance, tracked.frame_from_body)
         quality = 0.0 if estimate.status is OdometryStatus.DEGRADED else float(estimate.inlier_share)
-        return Tracked(tracked.frame, tracked.frame_from_body, quality, keyframe)
+        return Tracked(tracked.frame, tracked.frame_from_body, quality, keyframe, estimate.track_pixels)
 
     def _has_place(self, estimate: OdometryEstimate) -> bool:
         """Whether a frame lies to those before: of one camera not until it has started, with an IMU not until the scale is known."""
