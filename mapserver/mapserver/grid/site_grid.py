@@ -26,9 +26,9 @@ from mapserver.tiles.tiling import TILE_SIZE_M
 TILE_CELLS = round(TILE_SIZE_M / CELL_M)
 TOP_M = FLOOR_M + SLICES * SLICE_M
 _RANGE_CELLS = 160  # of a view
-# A view that hits a voxel counts as two that pass it, since passes also come of its rim. What was known counts as one view, and
-# stays unless a night decides otherwise: it takes away what moved.
-_HIT, _OCCUPIED, _FREE, _KNOWN = 2, 4, 3, 1
+# A view that hits a voxel counts as two that pass it, since passes also come of its rim. What was known stays until two views more
+# speak against it, and is unknown between that and what decides: into a slot that was emptied few views look, and one night must do.
+_HIT, _OCCUPIED, _FREE, _AGAINST = 2, 4, 3, 2
 _WIDTH_M, _STEP_M = 0.5, 1.5  # of what carries the camera; and between keyframes of one drive
 _SAME_STEPS = 10  # heights that differ by less stay as they were
 _MAX_CELLS = 1 << 25
@@ -92,9 +92,9 @@ def updated(before: Mapping[tuple[int, int], Counts], views: SessionViews) -> Ti
     for place, (hits, passes, heights) in views.tiles.items():
         old = before.get(place, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8))
         was_occupied, was_free = (np.unpackbits(old[..., i, None], axis=-1, bitorder="little") > 0 for i in (0, 1))
-        score = _HIT * hits.astype(np.int16) - passes + _KNOWN * (was_occupied.astype(np.int16) - was_free)
-        occupied = (score >= _OCCUPIED) | (was_occupied & (score > -_FREE))
-        free = ~occupied & ((score <= -_FREE) | was_free)
+        score = _HIT * hits.astype(np.int16) - passes
+        occupied = (score >= _OCCUPIED) | (was_occupied & (score > -_AGAINST))
+        free = ~occupied & ((score <= -_FREE) | (was_free & (score < _AGAINST)))
         bits = [np.packbits(mask, axis=-1, bitorder="little")[..., 0] for mask in (occupied, free)]
         low, high = (_height(old[..., 2 + i], heights[..., 1 + 2 * i]) for i in (0, 1))
         # What stood there in some views alone has left no voxel.
