@@ -13,6 +13,8 @@ from fleetmap.features import orb
 from fleetmap.features.extraction import extract
 from fleetmap.geometry import se3
 from fleetmap.mapformat import Tile
+from fleetmap.odometry.init.static_initialization import is_steady
+from fleetmap.odometry.settings import StartSettings
 from fleetmap.relocalization.map_view import CovisibleLandmarks
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
@@ -46,10 +48,12 @@ def warm_up_kernels(calibration: RigCalibration, rectifier: Rectifier, settings:
         if calibration.imu is not None:
             gyro_radps, accel_mps2 = np.zeros((len(stamps_ns), 3)), np.tile(upwards, (len(stamps_ns), 1))
             localizer.handle_imu(ImuSamples(stamps_ns, gyro_radps, accel_mps2))
-        localizer.handle_wheel([WheelSample(int(stamps_ns[0]), np.zeros(3), 0.0, 0.1, 0.1)])
+        # Near the frame, or the filter would leave it out.
+        localizer.handle_wheel([WheelSample(int(stamps_ns[-1]), np.zeros(3), 0.0, 0.1, 0.1)])
         frame = _view(wall, camera, number)
         found += localizer.handle_stereo(frame).fix is not None
     _disambiguate()
+    _rest()
     return found
 
 
@@ -75,6 +79,12 @@ def _disambiguate() -> None:
     shared = np.zeros(1, bool)
     mark_shared(one, other, shared, shared.copy())
     log_odds(one, other, shared, shared)
+
+
+def _rest() -> None:
+    """Runs what only a robot needs that has stood for a while."""
+    stamps_ns = np.arange(0, _FRAME_NS, _IMU_NS, dtype=np.int64)
+    is_steady(ImuSamples(stamps_ns, np.zeros((len(stamps_ns), 3)), np.ones((len(stamps_ns), 3))), StartSettings())
 
 
 def _wall(camera: StereoCamera) -> NDArray[np.uint8]:
