@@ -66,7 +66,7 @@ rm -rf "$OUT"
 mkdir -p "$OUT"
 
 build() {
-  "$BIN/mapserver" build "$@" --site demo --store "$OUT/store" --report "$OUT/build.json" --trajectory "$OUT/build.tum" \
+  "$BIN/mapserver" build "$@" --site demo --store "$OUT/store" --report "$OUT/build.json" --trajectory-out "$OUT/build.tum" \
     --picture "$OUT/build.png"
   say "publishing it"
   "$BIN/mapserver" publish --site demo --store "$OUT/store" ${publish_options[@]+"${publish_options[@]}"}

@@ -1,36 +1,35 @@
-"""A map from another SLAM system's poses: python examples/other_trajectory.py RECORDING POSES.tum STORE SITE
+"""A map from a planar robot's poses: python examples/other_trajectory.py RECORDING POSES.csv STORE SITE
 
-Many systems write the poses of the left camera as TUM text (t x y z qx qy qz qw), in a frame of their own. The survey
-takes them as its initial trajectory instead of its own odometry, and adjusts them together with the landmarks. Poses of
-the body need none of this: `mapserver build --trajectory-source tum --initial-trajectory POSES.tum` reads them.
+`mapserver build --trajectory` reads the files of many SLAM systems. This adds one of one's own: lines `seconds,x,y,yaw` of a robot that
+knows three degrees of freedom. Whose poses they are, which way the transform goes, their unit and their scale are found out by comparing
+with the recording; the survey then adjusts them together with the landmarks.
 """
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
-from fleetmap import Recording, Trajectory
-from fleetmap.geometry import se3_inverse
-from fleetmap.sensors.samples import Stamps
+import numpy as np
+
 from mapserver import BuildOptions, build_map
-from mapserver.build.trajectory_sources import TRAJECTORY_SOURCES
+from mapserver.build.trajectory import TRAJECTORY_FORMATS, OtherTrajectory, PoseRows
+from mapserver.build.trajectory.formats import billionths
 
 
-def camera_poses(recording: Recording, stamps_ns: Stamps, file: Path | None) -> Trajectory | None:
-    """frame_from_body at the frames' stamps, from a TUM file of frame_from_cam0."""
-    of_camera = TRAJECTORY_SOURCES["tum"](recording, stamps_ns, file)  # interpolated at the stamps
-    if of_camera is None:
-        return None
-    cam_from_body = se3_inverse(recording.calibration.cameras[0].body_from_cam)
-    return replace(of_camera, frame_from_body=of_camera.frame_from_body @ cam_from_body)
+def planar_rows(path: Path) -> PoseRows:
+    """The poses in a file of `seconds,x,y,yaw`; ValueError for anything else."""
+    fields = [line.split(",") for line in path.read_text("utf-8").splitlines()]
+    x, y, yaw = np.array([[float(value) for value in row[1:4]] for row in fields]).T
+    zero = np.zeros(len(fields))
+    xyzw = np.column_stack([zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)])
+    return PoseRows([billionths(row[0]) for row in fields], np.column_stack([x, y, zero]), xyzw)
 
 
-TRAJECTORY_SOURCES["tum-camera"] = camera_poses
+TRAJECTORY_FORMATS["planar"] = planar_rows
 
 
-def main(recording: str, poses: str, store: str, site: str) -> None:
+def main(recording: str, file: str, store: str, site: str) -> None:
     """Builds a draft from the poses and says what came of it."""
-    options = BuildOptions(trajectory_source="tum-camera", initial_trajectory=Path(poses))
+    options = BuildOptions(trajectory=OtherTrajectory(Path(file), "planar"))
     draft = build_map([recording], store, site, options)
     print(draft.sentence)
 

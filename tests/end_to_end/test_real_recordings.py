@@ -34,7 +34,7 @@ def run(app: Any, *arguments: object) -> None:
 def built(recording: Path, out: Path, *options: object) -> Report:
     """The report of a build, published as site `s` of `out`/store."""
     to_store = ["--site", "s", "--store", out / "store"]
-    files = ["--report", out / "b.json", "--trajectory", out / "b.tum"]
+    files = ["--report", out / "b.json", "--trajectory-out", out / "b.tum"]
     run(mapserver_app, "build", recording, *to_store, "--frame-from-ground-truth", *files, *options)
     run(mapserver_app, "publish", *to_store, *known_rig(out))
     report: Report = json.loads((out / "b.json").read_text())

@@ -91,7 +91,7 @@ class Nights:
 
     def build(self, night: int, option: str | None) -> str:
         """Builds and publishes one night's version."""
-        files = ["--report", self.folder / f"r{night}.json", "--trajectory", self.folder / f"t{night}.tum"]
+        files = ["--report", self.folder / f"r{night}.json", "--trajectory-out", self.folder / f"t{night}.tum"]
         options = [option] if option else []
         said = run("build", self.folder / f"night{night}", "--site", "lab", "--store", self.store, *files, *options)
         run("publish", "--site", "lab", "--store", self.store, *known_rig(self.folder))
@@ -218,7 +218,7 @@ def test_recordings_are_joined_and_a_foreign_one_is_left_out(nights: Nights, tmp
     """Two rides past one wall become one map; a ride through another world is named, with the reason."""
     write_euroc(tmp_path / "foreign", make_sample(20))
     rides = [nights.folder / "night1", tmp_path / "foreign", nights.folder / "night2"]
-    files = ["--report", tmp_path / "r.json", "--trajectory", tmp_path / "t.tum", "--picture", tmp_path / "p.png"]
+    files = ["--report", tmp_path / "r.json", "--trajectory-out", tmp_path / "t.tum", "--picture", tmp_path / "p.png"]
     said = run("build", *rides, "--site", "hall", "--store", tmp_path / "store", "--frame-from-ground-truth", *files)
     assert "left out" in said
     report = json.loads((tmp_path / "r.json").read_text())

@@ -85,7 +85,7 @@ class Site:
         ride = out_and_back(5.0, reach_m=2.1, start_m=(-1.0, 0.3, 0.15), yaw_rad=1.45)
         self.ride: Sample = ride_sample(ride, FRAMES, FRAME_S, seed=1)
         write_euroc(self.robot, self.ride)
-        files = ["--report", folder / "build.json", "--trajectory", folder / "build.tum"]
+        files = ["--report", folder / "build.json", "--trajectory-out", folder / "build.tum"]
         truth = "--frame-from-ground-truth"
         run(mapserver_app, "build", folder / "survey", "--site", "lab", "--store", self.store, truth, *files)
         run(mapserver_app, "publish", "--site", "lab", "--store", self.store, *known_rig(folder))

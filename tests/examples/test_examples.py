@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap import Trajectory, open_recording, read_tum, write_tum
+from fleetmap import open_recording, read_tum
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.recordings import format_calibration
+from fleetmap.recordings.tum import format_stamp
 from fleetsim import Order, record_order
 from mapserver import open_store
 from mapserver.fleet_statistics.kpis import Counters, hour_of
@@ -98,14 +99,17 @@ def test_fleet_figures(site: Path, tmp_path: Path) -> None:
 
 
 def test_other_trajectory(site: Path, tmp_path: Path) -> None:
-    """The true poses of the camera, in a frame that is turned and moved."""
+    """The true poses on the floor, in a frame that is turned and moved."""
     with open_recording(site / "survey.mcap") as recording:
-        truth, body_from_cam = recording.ground_truth, recording.calibration.cameras[0].body_from_cam
+        truth = recording.ground_truth
     assert truth is not None
     other_from_map = se3(so3_exp(np.array([0.0, 0.0, 1.0])), np.array([5.0, -3.0, 1.0]))
-    camera = Trajectory(truth.stamps_ns, other_from_map @ truth.frame_from_body @ body_from_cam)
-    write_tum(tmp_path / "poses.tum", camera)
-    said = run("other_trajectory", tmp_path, site / "survey.mcap", "poses.tum", "maps", "lab")
+    rows = []
+    for stamp, other_from_body in zip(truth.stamps_ns.tolist(), other_from_map @ truth.frame_from_body, strict=True):
+        (x, y), yaw = other_from_body[:2, 3], np.arctan2(other_from_body[1, 0], other_from_body[0, 0])
+        rows.append(f"{format_stamp(stamp)},{x},{y},{yaw}")
+    (tmp_path / "poses.csv").write_text("\n".join(rows))
+    said = run("other_trajectory", tmp_path, site / "survey.mcap", "poses.csv", "maps", "lab")
     assert "site lab: draft 1 of " in said
     assert float(said.partition("ATE ")[2].split()[0]) < 0.02
 

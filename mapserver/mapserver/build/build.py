@@ -48,6 +48,7 @@ from mapserver.build.survey_recordings import (
     survey_all,
     survey_recording,
 )
+from mapserver.build.trajectory import OtherTrajectory
 from mapserver.build.vocabulary_selection import ChosenVocabulary, choose_vocabulary, judged
 from mapserver.build.worker import open_executor
 from mapserver.build.zones_file import read_zones
@@ -76,8 +77,9 @@ _NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled", "directions", "starts")
 class BuildOptions:
     """Choices of a build. Files that are not named are not written.
 
-    frames: an A:B:C slice of each recording. use: only the sensors of a poorer set. trajectory_source, initial_trajectory: an entry of
-    TRAJECTORY_SOURCES and its file. replay: earlier recordings of the current version, of which frames are looked for in the draft.
+    frames: an A:B:C slice of each recording. use: only the sensors of a poorer set. trajectory: another system's poses to begin
+    with. trajectory_out: a TUM file for the poses of all frames. replay: earlier recordings of the current version, of which frames are
+    looked for in the draft.
     threads, scheduler: see worker.py. settings: those of the survey; for None the preset of the first recording's sensors with the [survey]
     section of the file `config` over it. job: its number, for the draft. keys: the builder's folder, if not the server's.
     """
@@ -88,12 +90,11 @@ class BuildOptions:
     zones: Path | None = None
     vocabulary: Path | None = None
     report: Path | None = None
-    trajectory: Path | None = None
+    trajectory_out: Path | None = None
     picture: Path | None = None
     frame_from_ground_truth: bool = False
     use: SensorSet | None = None
-    trajectory_source: str = "odometry"
-    initial_trajectory: Path | None = None
+    trajectory: OtherTrajectory | None = None
     replay: tuple[Path, ...] = ()
     actor: Actor = NOBODY
     threads: int | None = None
@@ -106,8 +107,7 @@ class BuildOptions:
     @property
     def reading(self) -> RecordingOptions:
         """How the recordings are read."""
-        opening = OpenOptions(self.calibration, self.topics)
-        return RecordingOptions(self.frames, opening, self.use, self.trajectory_source, self.initial_trajectory)
+        return RecordingOptions(self.frames, OpenOptions(self.calibration, self.topics), self.use, self.trajectory)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,6 +179,8 @@ def build_draft(
     a job of the store.
     """
     options, started_s = request.options, time.perf_counter()
+    if (given := options.trajectory) is not None and len(request.recordings) > 1:
+        raise UsageError(f"{given.file} is of one recording, {len(request.recordings)} are named; build each alone")
     zones = read_zones(options.zones)
     times, console = StageTimes(time.perf_counter), Console(stderr=True)
     with OpenRecordings(options.reading, request.store) as reading, ImageSpill(reading.folder) as images:
@@ -353,21 +355,18 @@ def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
     """What the map depends on besides the recordings; no paths, which mean nothing elsewhere."""
     options = run.request.options
     kept = parent is not None and bool(parent.manifest.configuration.get("frame_from_ground_truth"))
-    source = {} if options.trajectory_source == "odometry" else {"trajectory_source": options.trajectory_source}
+    given = {} if options.trajectory is None else {"trajectory_format": options.trajectory.format}
     topics = {} if options.topics == Topics() else {"topics": to_dict(options.topics)}
-    return (
-        source
-        | topics
-        | {
-            "frames": options.frames,
-            "own_vocabulary": options.vocabulary is not None,
-            "frame_from_ground_truth": options.frame_from_ground_truth or kept,
-            "own_calibration": options.calibration is not None,
-            "use": None if options.use is None else options.use.value,
-            "zones": {name: polygon.tolist() for name, polygon in run.zones.polygons.items()},
-            "survey": to_dict(run.settings),
-        }
-    )
+    always = {
+        "frames": options.frames,
+        "own_vocabulary": options.vocabulary is not None,
+        "frame_from_ground_truth": options.frame_from_ground_truth or kept,
+        "own_calibration": options.calibration is not None,
+        "use": None if options.use is None else options.use.value,
+        "zones": {name: polygon.tolist() for name, polygon in run.zones.polygons.items()},
+        "survey": to_dict(run.settings),
+    }
+    return given | topics | always
 
 
 def picture_png(site: str, draft: Draft, built: Built) -> bytes:
@@ -383,8 +382,8 @@ def picture_png(site: str, draft: Draft, built: Built) -> bytes:
 
 def _write_files(run: _Run, built: Built, draft: Draft) -> None:
     options, site = run.request.options, run.request.site
-    if options.trajectory is not None:
-        write_tum(options.trajectory, built.joined.map.trajectory)
+    if options.trajectory_out is not None:
+        write_tum(options.trajectory_out, built.joined.map.trajectory)
     if options.picture is not None:
         write_file(options.picture, picture_png(site, draft, built))
     if options.report is not None:

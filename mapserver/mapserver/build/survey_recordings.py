@@ -23,7 +23,7 @@ from mapserver.build.draft_evidence import HeldOut, held_out_of
 from mapserver.build.image_spill import KeptFrames
 from mapserver.build.report import check_truth
 from mapserver.build.sensor_subset import reduced
-from mapserver.build.trajectory_sources import trajectory_source
+from mapserver.build.trajectory import OtherTrajectory, given_poses
 from mapserver.build.worker import read_ahead
 from mapserver.calibration import CalibrationParameter
 from mapserver.calibration.problem import CalibrationData
@@ -125,7 +125,7 @@ class BegunSurvey:
 class Admission:
     """A recording fit to be surveyed: every statement of the doctor, the calibration to use, what was found of the given one.
 
-    begun: its survey, where the calibration was measured from that.
+    begun: its survey, where the calibration was measured from that. given: its initial trajectory, None for our own odometry.
     """
 
     statements: tuple[str, ...]
@@ -133,6 +133,7 @@ class Admission:
     calibration: RigEvidence
     corrections: dict[str, float]
     begun: BegunSurvey | None = None
+    given: Trajectory | None = None
 
 
 class SurveyBeginnings:
@@ -147,11 +148,11 @@ class SurveyBeginnings:
         self.executor = tools.executor
         self.last: BegunSurvey | None = None
 
-    def follow(self, recording: Recording, indices: NDArray[np.int64], given: Trajectory | None) -> Follow | None:
-        """How the calibration of these frames is to be followed; None where that takes a pass of its own."""
+    def follow(self, recording: Recording, indices: NDArray[np.int64], *, is_given: bool) -> Follow | None:
+        """How the calibration of these frames is to be followed; None where that takes a pass of its own, as with given poses."""
         self.last = None
         seconds = np.ptp(recording.frame_stamps_ns[indices]) * 1e-9 if len(indices) else 0.0
-        if not self._may_begin or given is not None or seconds > _SHARED_STRETCHES * LONGEST_S:
+        if not self._may_begin or is_given or seconds > _SHARED_STRETCHES * LONGEST_S:
             return None
 
         def followed(rig: RigCalibration) -> CalibrationData:
@@ -167,20 +168,14 @@ class SurveyBeginnings:
 
 @dataclass(frozen=True, slots=True)
 class RecordingOptions:
-    """How recordings are read: frames A:B:C, how they are opened, only the sensors of a poorer set,
-    and where their initial trajectory comes from, an entry of TRAJECTORY_SOURCES with its file.
+    """How recordings are read: frames A:B:C, how they are opened, only the sensors of a poorer set, and the initial trajectory, our own
+    odometry for None.
     """
 
     frames: str = "::"
     opening: OpenOptions = field(default_factory=OpenOptions)
     use: SensorSet | None = None
-    trajectory_source: str = "odometry"
-    initial_trajectory: Path | None = None
-
-    def given_trajectory(self, recording: Recording, indices: NDArray[np.int64]) -> Trajectory | None:
-        """Given poses of the selected frames, None where the odometry is to run."""
-        source = trajectory_source(self.trajectory_source)
-        return source(recording, recording.frame_stamps_ns[indices], self.initial_trajectory)
+    trajectory: OtherTrajectory | None = None
 
     def opened(self, path: Path) -> tuple[Recording, NDArray[np.int64]]:
         """The recording at `path`, to be closed, and the indices of its selected frames."""
@@ -203,7 +198,8 @@ class RecordingOptions:
 class Reading(Protocol):
     """How recordings are opened: `RecordingOptions` anew each time, `OpenRecordings` once."""
 
-    def given_trajectory(self, recording: Recording, indices: NDArray[np.int64]) -> Trajectory | None:
+    @property
+    def trajectory(self) -> OtherTrajectory | None:
         """See RecordingOptions."""
 
     def open(self, path: Path) -> AbstractContextManager[tuple[Recording, NDArray[np.int64]]]:
@@ -230,9 +226,10 @@ class OpenRecordings:
             self._opened[0].close()
             self._path = None
 
-    def given_trajectory(self, recording: Recording, indices: NDArray[np.int64]) -> Trajectory | None:
+    @property
+    def trajectory(self) -> OtherTrajectory | None:
         """See RecordingOptions."""
-        return self._options.given_trajectory(recording, indices)
+        return self._options.trajectory
 
     @contextmanager
     def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
@@ -286,15 +283,20 @@ def _admission(
             console.print(f"issue: {issue.what}: {issue.detail}", markup=False)
         if needs_truth:
             check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
-        given = options.given_trajectory(recording, indices)
-        follow = None if beginnings is None else beginnings.follow(recording, indices, given)
+        other = options.trajectory
+        follow = None if beginnings is None else beginnings.follow(recording, indices, is_given=other is not None)
         executor = SERIAL if beginnings is None else beginnings.executor
         result = checked(recording, executor=executor, follow=follow)
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
         begun = None if beginnings is None else beginnings.last
         begun = begun if begun is not None and begun.rig is result.rig else None
-        return Admission(tuple(result.statements()), result.rig, result.calibration, result.corrections, begun)
+        admission = Admission(tuple(result.statements()), result.rig, result.calibration, result.corrections, begun)
+        if other is None:
+            return admission
+        given = given_poses(replace(recording, calibration=result.rig), indices, other)
+        console.print(f"{recording.name}: {given.words}", markup=False)
+        return replace(admission, statements=(*admission.statements, given.words), given=given.trajectory)
 
 
 def survey_recording(
@@ -313,8 +315,7 @@ def survey_recording(
         else:
             has_depth = recording.sensor_set is SensorSet.RGBD
             rectifier = Rectifier(recording.calibration, has_depth=has_depth, pinhole=pinhole)
-            given = reading.given_trajectory(recording, indices)
-            done = survey(_inputs(recording, indices, rectifier, given), options, tools)
+            done = survey(_inputs(recording, indices, rectifier, admission.given), options, tools)
         done, map_from_survey = _aligned(done, recording)
         return Surveyed(
             entry=RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices)),

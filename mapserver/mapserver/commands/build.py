@@ -2,13 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fleetmap.cli_options import ConfigFile, config_path, expand_options, settings_of
 from fleetmap.errors import UsageError
 from mapserver.commands.options import SurveyOptions, check_output
+
+if TYPE_CHECKING:
+    from mapserver.build.trajectory import OtherTrajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +21,7 @@ class BuildCommandOptions(SurveyOptions):
     vocabulary: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Vocabulary of `train-vocabulary` for the site's first map.")
     ] = None
-    trajectory: Annotated[
+    trajectory_out: Annotated[
         Path | None, typer.Option(metavar="FILE.tum", help="Write the poses of all frames to this file.")
     ] = None
     picture: Annotated[
@@ -27,12 +30,6 @@ class BuildCommandOptions(SurveyOptions):
     frame_from_ground_truth: Annotated[
         bool, typer.Option("--frame-from-ground-truth", help="Align the finished map with the ground truth.")
     ] = False
-    trajectory_source: Annotated[
-        str, typer.Option(metavar="NAME", help="Source of the initial trajectory: `odometry`, or `tum` for a file.")
-    ] = "odometry"
-    initial_trajectory: Annotated[
-        Path | None, typer.Option(metavar="FILE.tum", help="Poses of another SLAM system to begin with.")
-    ] = None
     use: Annotated[str | None, typer.Option(metavar="SENSORS", help="Use only these sensors of the recording.")] = None
     replay: Annotated[
         list[Path] | None,
@@ -40,15 +37,58 @@ class BuildCommandOptions(SurveyOptions):
     ] = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class GivenTrajectoryOptions:
+    """Another system's poses to begin with, and what is known of them."""
+
+    trajectory: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Poses of another SLAM system to begin with.")
+    ] = None
+    trajectory_format: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Their format, such as tum or kitti.")
+    ] = None
+    trajectory_frame: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Poses of the `camera` or of the `body`.")
+    ] = None
+    trajectory_direction: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The transform written: `map-from-pose` or `pose-from-map`.")
+    ] = None
+    trajectory_quaternion: Annotated[str | None, typer.Option(metavar="ORDER", help="`xyzw` or `wxyz`.")] = None
+    trajectory_stamps: Annotated[
+        str | None, typer.Option(metavar="UNIT", help="`s`, `ms`, `us`, `ns`, `elapsed-s` or `frames`.")
+    ] = None
+    trajectory_scale: Annotated[
+        float | None, typer.Option(metavar="METRES", help="Metres in their unit of length.")
+    ] = None
+
+    def given(self) -> "OtherTrajectory | None":
+        """The trajectory that is named, None without one; UsageError for an incomplete name."""
+        from mapserver.build.trajectory import TRAJECTORY_FORMATS, OtherTrajectory
+
+        if self.trajectory is None:
+            said = [name for name, value in vars(self).items() if value is not None]
+            if said:
+                raise UsageError(f"--{said[0].replace('_', '-')} says something of --trajectory FILE, which is missing")
+            return None
+        if self.trajectory_format is None:
+            raise UsageError(
+                f"--trajectory {self.trajectory} is read; name its --trajectory-format, one of {', '.join(TRAJECTORY_FORMATS)}; the poses "
+                "of the map are written with --trajectory-out"
+            )
+        known = {name.removeprefix("trajectory_"): value for name, value in vars(self).items() if name != "trajectory"}
+        return OtherTrajectory(self.trajectory, **known)
+
+
 @expand_options
 def build(
     context: typer.Context,
     recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folder or file to survey.")],
     options: BuildCommandOptions,
+    trajectory: GivenTrajectoryOptions,
     config: ConfigFile = None,
 ) -> None:
     """Survey the recordings, join them to the site's current version, and store the map as a draft."""
-    check_output("--trajectory", options.trajectory)
+    check_output("--trajectory-out", options.trajectory_out)
     check_output("--picture", options.picture)
     if options.picture is not None and options.picture.suffix.lower() != ".png":
         raise UsageError(f"--picture {options.picture} must end in .png")
@@ -59,6 +99,7 @@ def build(
     use = None if options.use is None else named_sensor_set(options.use)
     asked = options.asked() | {"use": use, "replay": tuple(options.replay or ()), "config": config_path(context)}
     site, store = asked.pop("site"), asked.pop("store")
+    asked["trajectory"] = trajectory.given()
     built = build_map(recordings, store, site, BuildOptions(**asked))
     if options.keys is not None:
         from mapserver.releases.signer import note_verdict

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from fleetmap.features import stereo
-from fleetmap.geometry import Array, rotation_between_vectors, se3, so3_log
+from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse, so3_log
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory
@@ -17,6 +17,7 @@ from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 # Assumed drift of the poses, a random walk: standard deviations after one metre.
 _WALK_RAD, _WALK_M = 0.01, 0.05
+_UPRIGHT = np.cos(np.radians(20.0))  # what a ramp does not exceed
 _CORNERS, _UNKNOWN_DEPTH_M = 100, 5.0
 
 
@@ -25,13 +26,16 @@ def poses_as_odometry(
 ) -> OdometryPass:
     """The odometry pass that given poses of all F frames amount to; keyframes are chosen by motion alone.
 
-    With an IMU the poses are levelled by its mean specific force, and the gyro's bias is estimated from them; without one their
-    frame is taken to have z up.
+    With an IMU the poses are levelled by its mean specific force, and the gyro's bias is estimated from them; without one a frame in
+    which the body begins upright is kept, any other gives way to the body's axes at the first pose, as our odometry has them.
     """
     inertial = inputs.calibration.imu is not None and len(inputs.imu) > 0
     offset_ns = int(inputs.rectifier.imu_minus_cam_s * 1e9)
     gyro_bias = np.zeros(3)
     odom_from_body = given.frame_from_body
+    if not inertial and len(given) and odom_from_body[0, 2, 2] < _UPRIGHT:
+        start_from_frame = se3_inverse(given.frame_from_body[0])
+        odom_from_body = start_from_frame @ given.frame_from_body
     if inertial:
         moved = Trajectory(given.stamps_ns + offset_ns, given.frame_from_body)
         odom_from_body, gyro_bias = _levelled(moved, inputs), _gyro_bias(moved, inputs)

@@ -82,7 +82,7 @@ def survey(case: Case, recording: Path, folder: Path) -> dict[str, Any]:
     report = folder / f"{case.name}.json"
     run(
         "mapserver.cli", "build", recording, "--site", case.name, "--store", folder / "store", "--report", report,
-        "--trajectory", folder / f"{case.name}.tum",
+        "--trajectory-out", folder / f"{case.name}.tum",
     )  # fmt: skip
     found: dict[str, Any] = json.loads(report.read_text("utf-8"))
     with open_recording(recording) as opened:

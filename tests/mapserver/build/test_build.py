@@ -65,7 +65,7 @@ def read_tum(path: Path) -> Array:
 def done(euroc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with everything that one build in the truth's frame leaves."""
     out = tmp_path_factory.mktemp("out")
-    files = ["--report", out / "r.json", "--trajectory", out / "t.tum", "--picture", out / "p.png"]
+    files = ["--report", out / "r.json", "--trajectory-out", out / "t.tum", "--picture", out / "p.png"]
     said = built(euroc, "--site", "lab", "--store", out / "store", "--frame-from-ground-truth", *files)
     assert "draft 1" in said
     assert "mapserver publish --site lab" in said
@@ -208,7 +208,7 @@ def test_wrong_orders_are_refused_before_the_work(euroc: Path, tmp_path: Path) -
     for arguments, kind, said in (
         ([euroc, "--site", "La b", "--store", tmp_path / "store"], UsageError, "La b"),
         ([euroc, *to_store, "--report", tmp_path / "no/r.json"], UsageError, "--report"),
-        ([euroc, *to_store, "--trajectory", tmp_path], UsageError, "--trajectory"),
+        ([euroc, *to_store, "--trajectory-out", tmp_path], UsageError, "--trajectory-out"),
         ([euroc, *to_store, "--picture", tmp_path / "p.jpg"], UsageError, ".png"),
         ([euroc, *to_store, "--frames", "1:2:x"], UsageError, "1:2:x"),
         ([euroc, *to_store, "--frames", "900:"], UsageError, "900"),
