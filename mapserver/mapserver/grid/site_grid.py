@@ -28,7 +28,7 @@ TOP_M = FLOOR_M + SLICES * SLICE_M
 _RANGE_CELLS = 160  # of a view
 # A view that hits a voxel counts as two that pass it, since passes also come of its rim. What was known stays until two views more
 # speak against it, and is unknown between that and what decides: into a slot that was emptied few views look, and one night must do.
-_HIT, _OCCUPIED, _FREE, _AGAINST = 2, 4, 3, 2
+_HIT, _OCCUPIED, _FREE, _AGAINST = 2, 4, 4, 2
 _WIDTH_M, _STEP_M = 0.5, 1.5  # of what carries the camera; and between keyframes of one drive
 _SAME_STEPS = 10  # heights that differ by less stay as they were
 _MAX_CELLS = 1 << 25
