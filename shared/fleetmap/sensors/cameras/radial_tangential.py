@@ -1,5 +1,7 @@
 """Pinhole with radial-tangential distortion k1 k2 p1 p2 [k3]; none at all for an empty distortion. Source: Brown 1966, OpenCV's order."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from fleetmap.geometry import Array
@@ -22,9 +24,9 @@ def _distort(distortion: Array, x: Array, y: Array) -> tuple[Array, Array]:
     )
 
 
-def _radial_limit(distortion: Array) -> float:
-    """Largest r^2 up to which the distorted radius still grows; beyond it the polynomial folds back."""
-    k1, k2, _, _, k3 = _coefficients(distortion)
+@lru_cache(maxsize=16)
+def _radial_limit(k1: float, k2: float, _p1: float, _p2: float, k3: float) -> float:
+    """Largest r^2 up to which the distorted radius still grows; beyond it the polynomial folds back. The same in every frame."""
     # d/dr of r (1 + k1 r^2 + k2 r^4 + k3 r^6), as a polynomial in r^2
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     real = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
@@ -36,7 +38,7 @@ def pixel_from_ray(intrinsics_px: Array, distortion: Array, rays_cam: Array) -> 
     fx, fy, cx, cy = intrinsics_px
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y = rays_cam[:, 0] / rays_cam[:, 2], rays_cam[:, 1] / rays_cam[:, 2]
-        seen = (rays_cam[:, 2] > 1e-9) & (x * x + y * y < _radial_limit(distortion))
+        seen = (rays_cam[:, 2] > 1e-9) & (x * x + y * y < _radial_limit(*_coefficients(distortion)))
         distorted_x, distorted_y = _distort(distortion, x, y)
     pixels = np.stack([fx * distorted_x + cx, fy * distorted_y + cy], axis=1)
     pixels[~seen] = np.nan
@@ -50,7 +52,8 @@ def ray_from_pixel(intrinsics_px: Array, distortion: Array, pixels: Array) -> Ar
     x, y = np.empty_like(goal_x), np.empty_like(goal_y)
     undistort(_coefficients(distortion), (goal_x, goal_y), (x, y))
     back_x, back_y = _distort(distortion, x, y)
-    missed = ~((np.hypot(back_x - goal_x, back_y - goal_y) < 1e-7) & (x * x + y * y < _radial_limit(distortion)))
+    limit = _radial_limit(*_coefficients(distortion))
+    missed = ~((np.hypot(back_x - goal_x, back_y - goal_y) < 1e-7) & (x * x + y * y < limit))
     rays = np.stack([x, y, np.ones_like(x)], axis=1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     rays[missed] = np.nan
