@@ -29,7 +29,7 @@ _Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True)
 class Pin:
-    """One point. drawing: right and down from the upper left corner, in pixels, or metres right and up of a drawing that has metres."""
+    """One point. drawing: as it was said, for `fit_pins` right and up in the drawing's units, of a picture from its upper left corner."""
 
     name: str
     drawing: tuple[float, float]
@@ -59,7 +59,7 @@ def parse_pin(text: str) -> Pin:
     return Pin(match[1].strip(), (px, py), (mx, my))
 
 
-def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: Array, *, is_y_up: bool = False) -> Fit:
+def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: Array) -> Fit:
     """Least squares over a rotation, a shift and, without metres_per_unit, a scale. Source: Umeyama 1991, in the plane.
 
     map_corners_m: (N, 2) what the map covers. UsageError for pins that are too few, too close or contradict each other, which then names
@@ -67,7 +67,7 @@ def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: 
     """
     _check_names(pins)
     points = np.array([complex(*pin.map_m) for pin in pins])
-    drawn = np.array([complex(x, y if is_y_up else -y) for x, y in (pin.drawing for pin in pins)])
+    drawn = np.array([complex(*pin.drawing) for pin in pins])
     apart_m = max(abs(a - b) for a, b in combinations(points, 2))
     if apart_m < _LEAST_APART_M:
         raise UsageError(
@@ -135,9 +135,7 @@ def _contradiction(names: list[str], drawn: _Complex, points: _Complex, metres_p
         return "the plan is mirrored: its points fit the map's only as in a mirror; flip the picture, or check the order of x and y"
     if metres_per_unit is not None and _fits(drawn, points, None, everything):
         fitting = 1 / abs(_fitted(drawn, points, None)[0])
-        return (
-            f"the pins fit at {fitting:.5g} metres per pixel, not at {metres_per_unit:.5g}; correct --metres-per-pixel"
-        )
+        return f"the pins fit at {fitting:.5g} metres per unit of the plan, not at {metres_per_unit:.5g}; correct --metres-per-pixel"
     agreeing = _largest_agreeing(drawn, points, metres_per_unit)
     if len(agreeing) >= max(3, len(names) // 2 + 1):
         wrong = [n for n in everything if n not in agreeing]

@@ -1,4 +1,4 @@
-"""The file of a plan: a picture (PNG, JPEG, TIFF, BMP, PGM), looked at before it is decoded."""
+"""The file of a plan: a picture (PNG, JPEG, TIFF, BMP, PGM), looked at before it is decoded, or DXF."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.geometry import Array
 from fleetmap.recordings.images import image_size
+from mapserver.floor_plan.dxf_file import MAX_DXF_BYTES, DxfFile
 from mapserver.floor_plan.pins import Pin
 
 MAX_PLAN_BYTES = 64 << 20
@@ -27,8 +28,10 @@ class PlanFile:
     data: bytes
     grey: NDArray[np.uint8]
 
-    def check_pins(self, pins: list[Pin]) -> None:
-        """UsageError for a pin beside the picture."""
+    metres_per_unit = None
+
+    def drawn(self, pins: list[Pin]) -> list[Pin]:
+        """Right and up. UsageError for a pin beside the picture."""
         height, width = self.grey.shape
         for pin in pins:
             if not (0 <= pin.drawing[0] <= width and 0 <= pin.drawing[1] <= height):
@@ -36,6 +39,7 @@ class PlanFile:
                 raise UsageError(
                     f"--pin {pin.name}: {x:g},{y:g} is not in {self.name}, which has {width}x{height} pixels"
                 )
+        return upwards(pins)
 
     def lines(self) -> Array:
         """(S, 4) x0 y0 x1 y1 of straight lines in the picture, in pixels right and up (so negative); of a thick wall both edges."""
@@ -72,7 +76,12 @@ def _strokes_as_lines(lines: Array) -> Array:
     return moved
 
 
-def read_plan(path: Path) -> PlanFile:
+def upwards(pins: list[Pin]) -> list[Pin]:
+    """Pins that were said in a picture, where down is positive."""
+    return [Pin(pin.name, (pin.drawing[0], -pin.drawing[1]), pin.map_m) for pin in pins]
+
+
+def read_plan(path: Path) -> PlanFile | DxfFile:
     """The plan of a file. UsageError for what is none, is too large, or is damaged."""
     with (
         disk_errors(f"--plan {path} cannot be read", "check the path and its rights", UsageError),
@@ -81,6 +90,10 @@ def read_plan(path: Path) -> PlanFile:
         data = file.read(MAX_PLAN_BYTES + 1)
     if len(data) > MAX_PLAN_BYTES:
         raise UsageError(f"--plan {path} has more than {MAX_PLAN_BYTES} bytes; save it smaller")
+    if path.suffix.lower() == ".dxf":
+        if len(data) > MAX_DXF_BYTES:
+            raise UsageError(f"--plan {path} has more than {MAX_DXF_BYTES} bytes; leave out what is no wall")
+        return DxfFile(path, data)
     size = image_size(data)
     if size is None:
         raise UsageError(f"--plan {path} is no PNG, JPEG, TIFF, BMP or PGM picture; save it as one of these")

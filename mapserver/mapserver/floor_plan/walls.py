@@ -58,7 +58,7 @@ class _Place:
 
 
 def fit_walls(lines: Array, points_m: Array, metres_per_unit: float | None, pins: Sequence[Pin] = ()) -> WallFit:
-    """lines: (S, 4) x0 y0 x1 y1 in the drawing's units, y up; points_m: (N, 2) landmarks in `map`; pins: in a picture's pixels.
+    """lines: (S, 4) x0 y0 x1 y1 in the drawing's units, y up; points_m: (N, 2) landmarks in `map`; pins: as of `fit_pins`.
 
     Raises UsageError where there are too few walls, nothing fits, or several places fit about as well and no pin decides.
     """
@@ -97,7 +97,7 @@ def fit_walls(lines: Array, points_m: Array, metres_per_unit: float | None, pins
 
 def _agrees(place: _Place, pins: Sequence[Pin]) -> bool:
     """Whether all pins are near where they should be: here they choose a place, and do not place it."""
-    drawn = (place.scale * complex(pin.drawing[0], -pin.drawing[1]) for pin in pins)
+    drawn = (place.scale * complex(*pin.drawing) for pin in pins)
     moved = (place.turn * complex(*pin.map_m) + place.shift for pin in pins)
     return all(abs(a - b) <= _PIN_NEAR_M for a, b in zip(drawn, moved, strict=True))
 

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import cv2
+import ezdxf
 import numpy as np
 import pytest
 import yaml
@@ -157,3 +158,15 @@ def test_areas_that_are_none_change_nothing(run, site, tmp_path: Path) -> None:
         assert words in run("areas", "import", file, *site, status=2)
     assert run("areas", "list", *site) == "aisle 5: 64.0 m2\n1 areas\n"
     assert "has no site" in run("areas", "list", "--site", "hall", *site[2:], status=2)
+
+
+def test_a_dxf_plan_brings_its_own_scale_and_frame(run, site, tmp_path: Path) -> None:
+    document = ezdxf.new(units=4)
+    document.modelspace().add_line((0, 0), (40_000, 0))
+    document.saveas(tmp_path / "hall.dxf")
+    corners = pins("a=10000,-20000:0,0", "b=10000,0:20,0", "c=0,-20000:0,10")
+    said = run("align", *site, "--plan", tmp_path / "hall.dxf", *corners)
+    assert "the map's origin at 10.000, -20.000 m of the building, turned by 90.000 degrees" in said
+    assert "0.001 m per unit of the plan" in said
+    feet = run("align", *site, "--plan", tmp_path / "hall.dxf", "--metres-per-pixel", 0.3048, *corners, status=2)
+    assert "fit at 0.001 metres per unit" in feet

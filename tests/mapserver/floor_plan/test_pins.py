@@ -18,7 +18,7 @@ def building(points_map: np.ndarray) -> np.ndarray:
 
 def pins_at(points_map: np.ndarray, clicked_m: np.ndarray | float = 0.0, *, mirrored: bool = False) -> list[Pin]:
     right_up_m = building(points_map) + clicked_m
-    px = right_up_m / METRES_PER_PX * (1, -1)
+    px = right_up_m / METRES_PER_PX
     px = px * (-1, 1) if mirrored else px
     return [
         Pin(f"p{n}", tuple(a), tuple(b)) for n, (a, b) in enumerate(zip(px.tolist(), points_map.tolist(), strict=True))
@@ -73,7 +73,7 @@ def test_two_pins_are_enough_but_check_nothing() -> None:
         (pins_at(HALL[:3] * 0.04), None, "far end"),
         (pins_at(HALL[:3], mirrored=True), None, "mirrored"),
         (pins_at(HALL, mirrored=True), METRES_PER_PX, "mirrored"),
-        (pins_at(HALL[:3]), 0.05, "fit at 0.0213 metres per pixel, not at 0.05"),
+        (pins_at(HALL[:3]), 0.05, "fit at 0.0213 metres per unit of the plan, not at 0.05"),
         (pins_at(HALL[:3], np.array([(0, 0), (0, 0), (3.0, 0)])), METRES_PER_PX, "add a fourth"),
         (pins_at(HALL, np.array([(0, 0), (0, 2.0), (0, 0), (0, 0)])), None, "3 pins agree, off are: p1 by 2.0"),
         ([Pin("a", (0, 0), (0, 0)), Pin("a", (9, 9), (9, 9))], None, "two pins have the name 'a'"),

@@ -84,11 +84,11 @@ def test_a_plain_box_is_ambiguous_until_a_pin_says_which_way() -> None:
     points = points[(points < 0.2).any(axis=1) | (points[:, 0] > 59.8) | (points[:, 1] > 39.8)]  # without the racks
     with pytest.raises(UsageError, match=r"several ways \(turned by .*37.*-143|several ways \(turned by .*-143.*37"):
         fit_walls(plan.lines(), points, 0.03)
-    corner = Pin("corner", (origin[0] / 0.03, -origin[1] / 0.03), (0.4, -0.3))
+    corner = Pin("corner", (origin[0] / 0.03, origin[1] / 0.03), (0.4, -0.3))
     fit = fit_walls(plan.lines(), points, 0.03, [corner])
     assert worst(fit, 1 + 0j, 0j, origin, 0.03) < (0.10, 0.1)
     with pytest.raises(UsageError, match="do not fit"):
-        fit_walls(plan.lines(), points, 0.03, [Pin("wrong", (30, 30), (30.0, 20.0))])
+        fit_walls(plan.lines(), points, 0.03, [Pin("wrong", (30, -30), (30.0, 20.0))])
 
 
 def test_what_has_no_walls_in_common_is_refused() -> None:

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 class PlanOptions:
     """The drawing and what is known of it."""
 
-    plan: Annotated[Path | None, typer.Option(metavar="FILE", help="Picture of the building from above.")] = None
+    plan: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Drawing of the building from above: a picture, or DXF.")
+    ] = None
     pin: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=PX,PY:X,Y", help="Point of the plan (pixels) and of the map (metres); repeat it."),
@@ -94,22 +96,22 @@ def _corners(maps: "MapStore", site: str) -> "Array":
 def _aligned(given: PlanOptions, maps: "MapStore", site: str) -> "tuple[Alignment, bytes | None]":
     from mapserver.floor_plan.alignment import Alignment
     from mapserver.floor_plan.pins import fit_pins, parse_pin
-    from mapserver.floor_plan.plan_file import read_plan
+    from mapserver.floor_plan.plan_file import read_plan, upwards
 
     pins = [parse_pin(text) for text in given.pin or ()]
     plan = None if given.plan is None else read_plan(given.plan)
-    if plan is not None:
-        plan.check_pins(pins)
+    pins = upwards(pins) if plan is None else plan.drawn(pins)
     name, data = (None, None) if plan is None else (plan.name, plan.data)
+    scale = given.metres_per_pixel or (None if plan is None else plan.metres_per_unit)
     if given.walls:
         if plan is None:
             raise UsageError("--walls needs the plan; name it by --plan")
         from mapserver.floor_plan.walls import fit_walls
 
-        found = fit_walls(plan.lines(), _landmarks(maps, site), given.metres_per_pixel, pins)
+        found = fit_walls(plan.lines(), _landmarks(maps, site), scale, pins)
         typer.echo(f"{found.share:.0%} of the plan's {found.lines} longest lines have landmarks, where the map is")
         return Alignment(frame=found.frame, metres_per_unit=found.metres_per_unit, method="walls", plan=name), data
-    fit = fit_pins(pins, given.metres_per_pixel, _corners(maps, site))
+    fit = fit_pins(pins, scale, _corners(maps, site))
     _say_checks(fit)
     return Alignment(
         frame=fit.frame, metres_per_unit=fit.metres_per_unit, method="pins", plan=name, off_m=fit.off_m
@@ -140,7 +142,7 @@ def _words(found: "Alignment") -> str:
     frame = found.frame
     turned = f"turned by {degrees(frame.yaw_rad):.3f} degrees +- {degrees(frame.sigma_rad):.3f}"
     at = f"the map's origin at {frame.x_m:.3f}, {frame.y_m:.3f} m of the building"
-    return f"by {found.method}: {at}, {turned}, {found.metres_per_unit:.6g} m per pixel"
+    return f"by {found.method}: {at}, {turned}, {found.metres_per_unit:.6g} m per unit of the plan"
 
 
 def _print(found: "Alignment", corners: "Array", level: str) -> None:
