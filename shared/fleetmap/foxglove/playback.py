@@ -44,12 +44,6 @@ class Timeline:
         """Until when nothing is missing."""
         return self._known_ns
 
-    @property
-    def topics(self) -> list[str]:
-        """Of the messages so far."""
-        with self._lock:
-            return list(self._topics)
-
     def add(self, shown: Shown) -> None:
         """One more message, at or after first_ns."""
         with self._lock:

@@ -44,7 +44,11 @@ class FoxgloveServer:
         self.dropped = 0
         self._player = player
         self._context = Context()
-        self._channels: dict[str, Channel] = {}
+        # All before anybody connects: who subscribes at once to a channel that is made later may be told that there is none.
+        self._channels = {
+            topic: Channel(topic, schema=schema, message_encoding=encoding_of(schema), context=self._context)
+            for topic, schema in CHANNELS.items()
+        }
         self._waiting: dict[str, deque[Shown]] = {}
         self._last: dict[str, Shown] = {}
         self._subscribed: deque[str] = deque()  # without a lock: the library calls while it holds its own
@@ -87,7 +91,7 @@ class FoxgloveServer:
 
     def wants(self, topic: str) -> bool:
         """Whether a viewer looks at a topic: what costs much is made for nobody else."""
-        return self._channel(topic).has_sinks()
+        return self._channels[topic].has_sinks()
 
     def show(self, some: Iterable[Shown]) -> None:
         """Shows messages soon, in the order of each topic; returns at once. Of what waits for too long the oldest is dropped."""
@@ -115,15 +119,6 @@ class FoxgloveServer:
         self._wake.set()
         return _state(point, did_seek=request.seek_time is not None, request_id=request.request_id)
 
-    def _channel(self, topic: str) -> Channel:
-        with self._lock:
-            if topic not in self._channels:
-                schema = CHANNELS[topic]
-                self._channels[topic] = Channel(
-                    topic, schema=schema, message_encoding=encoding_of(schema), context=self._context
-                )
-            return self._channels[topic]
-
     def _serve(self) -> None:
         """Outside the library's callbacks, which must not publish."""
         told: tuple[PlaybackPhase, float] | None = None
@@ -139,8 +134,6 @@ class FoxgloveServer:
             self._publish(fresh)
             if self._player is None:
                 continue
-            for topic in self._player.timeline.topics:
-                self._channel(topic)  # viewers choose from all, not only from what has been played
             due = self._player.advance(time.monotonic())
             self._publish(self._newest(due))
             point = self._player.point
@@ -163,7 +156,7 @@ class FoxgloveServer:
     def _publish(self, some: Iterable[Shown]) -> None:
         for shown in some:
             self._last[shown.topic] = shown
-            channel = self._channel(shown.topic)
+            channel = self._channels[shown.topic]
             if not channel.has_sinks():
                 continue
             try:

@@ -125,6 +125,7 @@ def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:
 
     def serve_at(http: str, zenoh: str, **more: object) -> None:
         options = {"http_cert": None, "http_key": None, "http_name": None, "insecure": False} | asdict(OidcOptions())
+        options |= {"foxglove": None, "foxglove_site": None}
         serve(context=context, store=tmp_path, http=http, zenoh=zenoh, config=None, **options | more)
 
     with pytest.raises(UsageError, match="--http 'nonsense'"):

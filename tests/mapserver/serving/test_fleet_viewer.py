@@ -60,7 +60,7 @@ def test_a_site_is_seen_as_it_changes(store: MapStore) -> None:
         for number in range(3):
             assert fleet.take_failure("lab", "r1", failure(number)).refused == ""
         view.look()
-        with FoxgloveClient(server.url) as viewer:
+        with FoxgloveClient(server.url, within_s=60.0) as viewer:
             viewer.subscribe(["/map", "/failures/report", "/failures/matches", "/robots", "/tf"])
             cloud = viewer.wait_for("/map")[0][1]
             assert len(cloud.data) == 12 * store.manifest("lab", 1).landmarks > 0
@@ -107,7 +107,7 @@ def test_a_site_without_a_map_yet_is_waited_for(store: MapStore) -> None:
         view.look()
         releases.publish(store, "yard")
         view.look()
-        with FoxgloveClient(server.url) as viewer:
+        with FoxgloveClient(server.url, within_s=60.0) as viewer:
             viewer.subscribe(["/map"])
             assert viewer.wait_for("/map")[0][1].data
 
