@@ -23,7 +23,7 @@ from mapserver.build.draft_evidence import HeldOut, held_out_of
 from mapserver.build.image_spill import KeptFrames
 from mapserver.build.report import check_truth
 from mapserver.build.sensor_subset import reduced
-from mapserver.build.trajectory import OtherTrajectory, given_poses
+from mapserver.build.trajectory import OtherTrajectory, given_poses, with_depths
 from mapserver.build.worker import read_ahead
 from mapserver.calibration import CalibrationParameter
 from mapserver.calibration.problem import CalibrationData
@@ -182,7 +182,7 @@ class RecordingOptions:
         whole = open_recording(path, self.opening)
         try:
             recording = reduced(whole, self.use)
-            return recording, FrameSelection.parse(self.frames).apply(recording)
+            return with_depths(recording, FrameSelection.parse(self.frames).apply(recording), self.trajectory)
         except FleetmapError:
             whole.close()
             raise

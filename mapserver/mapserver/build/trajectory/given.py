@@ -74,6 +74,13 @@ class OtherTrajectory:
         """The items of a reading that are known."""
         return {name: getattr(self, name) for name in CHOICES}
 
+    def rows(self) -> PoseRows:
+        """What the file says; RecordingError where it cannot be read or is of another format."""
+        try:
+            return TRAJECTORY_FORMATS[self.format](self.file)
+        except ValueError as error:
+            raise RecordingError(f"{self.file} is no {self.format} trajectory: {error}") from error
+
 
 @dataclass(frozen=True, slots=True)
 class GivenPoses:
@@ -90,16 +97,15 @@ def given_poses(recording: Recording, indices: NDArray[np.int64], other: OtherTr
     open, and where too few frames have poses; RecordingError for a file that cannot be read or belongs to another recording.
     """
     if recording.sensor_set in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
-        raise UsageError(f"{recording.path} is {recording.sensor_set}; --trajectory needs stereo or depth")
-    try:
-        rows = TRAJECTORY_FORMATS[other.format](other.file)
-    except ValueError as error:
-        raise RecordingError(f"{other.file} is no {other.format} trajectory: {error}") from error
+        raise UsageError(
+            f"{recording.path} is {recording.sensor_set}; --trajectory needs stereo or depth, such as DROID's disps.npy beside its poses"
+        )
+    rows = other.rows()
     stamps_ns = recording.frame_stamps_ns[indices]
-    clock = _clock_of(rows, recording, indices, other)
+    clock = clock_of(rows, recording, indices, other)
     units = _units(rows, clock, stamps_ns, other)
     each = [covered(stamps_of(rows, unit, clock), stamps_ns) for unit in units]
-    _check_span(stamps_ns, np.any(each, axis=0), recording, other)
+    check_span(stamps_ns, np.any(each, axis=0), recording, other)
     known = np.all(each, axis=0)
     is_sparse = known.sum() < 2 or np.median(np.diff(stamps_ns[known])) > GAP_NS
     whole = is_sparse or len(stamps_ns) <= _WINDOWS * _WINDOW_FRAMES
@@ -108,7 +114,7 @@ def given_poses(recording: Recording, indices: NDArray[np.int64], other: OtherTr
     found, words = _judged(rows, units, clock, shown, recording, other)
     as_read = read_as(rows, found.reading, clock)
     is_placed = covered(as_read.stamps_ns, stamps_ns)
-    _check_span(stamps_ns, is_placed, recording, other)
+    check_span(stamps_ns, is_placed, recording, other)
     at_frames = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
     at_frames[is_placed] = [pose_at(as_read, int(stamp)) for stamp in stamps_ns[is_placed]]
     at_frames[:, :3, 3] *= found.scale
@@ -123,7 +129,7 @@ def given_poses(recording: Recording, indices: NDArray[np.int64], other: OtherTr
     return GivenPoses(Trajectory(stamps_ns, at_frames), words)
 
 
-def _clock_of(rows: PoseRows, recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory) -> Stamps:
+def clock_of(rows: PoseRows, recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory) -> Stamps:
     """Stamps of the frames that numbers of frames mean: all of the recording, or the selected ones where rows are as many."""
     stamps, count = recording.frame_stamps_ns, len(rows.positions)
     if rows.stamps is not None or count == len(stamps):
@@ -219,7 +225,8 @@ def _judged(
     return best, f"{words}: off our own odometry by {figures} in the median of {count} stretches{following}"
 
 
-def _check_span(stamps_ns: Stamps, is_placed: NDArray[np.bool_], recording: Recording, other: OtherTrajectory) -> None:
+def check_span(stamps_ns: Stamps, is_placed: NDArray[np.bool_], recording: Recording, other: OtherTrajectory) -> None:
+    """UsageError where the frames (F,) that have poses span less than half of the time of all."""
     times = stamps_ns[is_placed]
     if len(times) < 2 or np.ptp(times) < _LEAST_SPAN * np.ptp(stamps_ns):
         missing = [format_stamp(int(stamp)) for stamp in stamps_ns[~is_placed]]

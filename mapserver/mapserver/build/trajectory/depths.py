@@ -1,0 +1,205 @@
+"""Depths that DROID-SLAM keeps beside its poses, as depth images of a single camera's recording."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import RecordingError, UsageError
+from fleetmap.geometry import AnyArray, Array
+from fleetmap.recordings import Recording
+from fleetmap.sensors.calibration import CameraCalibration
+from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps
+from mapserver.build.trajectory.formats import PoseRows, array_in
+from mapserver.build.trajectory.given import OtherTrajectory, check_span, clock_of
+from mapserver.build.trajectory.readings import NEAR_NS, possible_units, stamps_of
+
+if TYPE_CHECKING:
+    import hashlib
+
+    from fleetmap.recordings.images import StoredFrame
+    from fleetmap.recordings.recording import FrameSource
+
+_MOST_SIDE = 8192
+_ASPECT_WITHIN = 0.1  # cropping to multiples of 8 px and rounding of sizes stay well below
+_NETWORK_STEP = 8  # px between the network's cells, in whose unit DROID writes intrinsics
+_EDGE_RATIO = 1.25  # between neighbouring depths: what lies between them is neither surface
+
+
+def with_depths(
+    recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory | None
+) -> tuple[Recording, NDArray[np.int64]]:
+    """A single camera's recording as one with depth, and those of the selected frames that `disps.npy` beside the poses has.
+
+    The same recording and selection where there is no such file or the recording needs none. The scale must be said, as one camera does
+    not show it: UsageError. RecordingError for a file that is not of these poses and this camera.
+    """
+    if (
+        other is None
+        or other.format != "droid"
+        or recording.sensor_set not in (SensorSet.MONO, SensorSet.MONO_INERTIAL)
+    ):
+        return recording, indices
+    file = (other.file if other.file.is_dir() else other.file.parent) / "disps.npy"
+    if not file.exists():
+        return recording, indices
+    if other.scale is None:
+        raise UsageError(
+            f"{file} holds depths of one camera, which does not show their unit; say the metres in it with --trajectory-scale"
+        )
+    rows, camera = other.rows(), recording.calibration.cameras[0]
+    _check(file, len(rows.positions), camera)
+    row_of_frame = _rows_of_frames(rows, recording, indices, other)
+    has_depth = row_of_frame[indices] >= 0
+    check_span(recording.frame_stamps_ns[indices], has_depth, recording, other)
+    left_out = f"{int((~has_depth).sum())} of {len(indices)} frames have none in {file.name} and are left out"
+    unused = "; the IMU is not used" if len(recording.imu) else ""
+    seen = replace(
+        recording,
+        sensor_set=SensorSet.RGBD,
+        calibration=replace(recording.calibration, cameras=(camera,), imu=None),
+        imu=ImuSamples.empty(),
+        frames=_DepthFrames(recording.frames, file, row_of_frame, camera, other.scale),
+        issues=(*recording.issues, DataIssue("depth of another system", left_out + unused)),
+    )
+    return seen, indices[has_depth]
+
+
+def _check(file: Path, count: int, camera: CameraCalibration) -> None:
+    """RecordingError unless the file holds one image of inverse depths per pose, each of the camera's shape."""
+    inverse = array_in(file)
+    if (
+        inverse.ndim != 3
+        or inverse.dtype.kind != "f"
+        or not 1 < min(inverse.shape[1:]) <= max(inverse.shape[1:]) <= _MOST_SIDE
+    ):
+        raise RecordingError(
+            f"{file} is of shape {inverse.shape} and type {inverse.dtype}; images of inverse depths (N, height, width) are expected"
+        )
+    if len(inverse) != count:
+        raise RecordingError(f"{file} has {len(inverse)} images for {count} poses; pass those of one run")
+    _pinhole(file, camera, inverse.shape[1:])
+    for number, image in enumerate(inverse):
+        if not (np.isfinite(image).all() and (image >= 0).all()):
+            raise RecordingError(
+                f"{file}: image {number + 1} has values that are no inverse depths: they must be finite and not negative"
+            )
+
+
+def _rows_of_frames(
+    rows: PoseRows, recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory
+) -> NDArray[np.int64]:
+    """(F,) for each frame of the recording the row of its pose, -1 without one, by the only unit of stamps that puts most at frames."""
+    clock, stamps_ns = clock_of(rows, recording, indices, other), recording.frame_stamps_ns
+    units = [None] if rows.stamps is None else [u for u in possible_units(rows, clock) if other.stamps in (None, u)]
+    frames = {unit: _frames_at(stamps_of(rows, unit, clock), stamps_ns) for unit in units}
+    fitting = {unit: found for unit, found in frames.items() if (found >= 0).mean() > 0.5}
+    if not fitting:
+        raise RecordingError(
+            f"{other.file} belongs to another recording: in no unit is most of its stamps at frames; pass the recording's own"
+        )
+    if len(fitting) > 1:
+        raise UsageError(
+            f"{other.file} may have its stamps in {' or '.join(map(str, fitting))}; say --trajectory-stamps"
+        )
+    (found,) = fitting.values()
+    out = np.full(len(stamps_ns), -1)
+    out[found[found >= 0]] = np.flatnonzero(found >= 0)
+    return out
+
+
+def _frames_at(stamps: Stamps, frame_stamps_ns: Stamps) -> NDArray[np.int64]:
+    """(N,) the frame at each moment, -1 for none."""
+    after = np.minimum(np.searchsorted(frame_stamps_ns, stamps), len(frame_stamps_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    off_ns = np.abs(frame_stamps_ns[[before, after]] - stamps)
+    return np.where(off_ns.min(axis=0) > NEAR_NS, -1, np.where(off_ns[0] < off_ns[1], before, after))
+
+
+def _pinhole(file: Path, camera: CameraCalibration, shape: tuple[int, ...]) -> Array:
+    """(4,) fx, fy, cx, cy of depth images (height, width): by `intrinsics.npy`, else of the whole picture resized.
+
+    DROID writes them for the network's cells, and the depths there or at eight times that; what fits the centre is taken.
+    """
+    written, (height, width) = file.with_name("intrinsics.npy"), shape
+    if written.exists():
+        cells = np.array(array_in(written), np.float64)
+        if cells.ndim != 2 or cells.shape[1] != 4 or not len(cells) or not (np.isfinite(cells) & (cells > 0)).all():
+            raise RecordingError(f"{written} is of shape {cells.shape}; rows of fx, fy, cx, cy above 0 are expected")
+        fitting = min((cells[0], _NETWORK_STEP * cells[0]), key=lambda pinhole: abs(pinhole[2] - width / 2))
+        if abs(fitting[2] - width / 2) > width / 4 or abs(fitting[3] - height / 2) > height / 4:
+            raise RecordingError(
+                f"{written} has its centre at {cells[0, 2:].tolist()}, outside the images of {file.name}"
+            )
+        return np.asarray(fitting)
+    per_px = np.array([width / camera.width_px, height / camera.height_px])
+    if abs(per_px[0] / per_px[1] - 1) > _ASPECT_WITHIN:
+        raise RecordingError(
+            f"{file} has images of {width}x{height}, the camera {camera.width_px}x{camera.height_px} px; put the run's intrinsics.npy "
+            "beside it, or pass depths of this camera"
+        )
+    return np.concatenate([camera.intrinsics_px[:2] * per_px, (camera.intrinsics_px[2:] + 0.5) * per_px - 0.5])
+
+
+@dataclass(frozen=True)
+class _DepthFrames:
+    """Frames of `source`, each with the depth image of its row (F,), unknown everywhere for row -1. What was recorded is hashed alone."""
+
+    source: "FrameSource"
+    file: Path
+    rows: NDArray[np.int64]
+    camera: CameraCalibration
+    scale: float
+
+    def stored(self, index: int) -> "StoredFrame":
+        return self.source.stored(index)
+
+    def frame(self, index: int) -> CameraFrame:
+        frame, row = self.source.frame(index), int(self.rows[index])
+        depth_m = np.zeros((self.camera.height_px, self.camera.width_px), np.float32)
+        if row >= 0:
+            depth_m = self._depth_m(np.array(self._inverse[row], np.float32))
+        return CameraFrame(frame.stamp_ns, frame.left, depth_m=depth_m)
+
+    def part(self, indices: NDArray[np.int64]) -> "_DepthFrames":
+        return replace(self, source=self.source.part(indices), rows=self.rows[indices])
+
+    def hash_into(self, digest: "hashlib._Hash") -> None:
+        self.source.hash_into(digest)
+
+    def close(self) -> None:
+        self.source.close()
+
+    def _depth_m(self, inverse: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Metres at recorded pixels: inverse depth is linear on planes, and so between neighbours that are of one surface."""
+        x, y = self._places
+        (height, width), ones = inverse.shape, np.ones((2, 2), np.uint8)
+        high, low = (each(inverse, ones, anchor=(0, 0)) for each in (cv2.dilate, cv2.erode))
+        one_surface = (low > 0) & (high <= _EDGE_RATIO * low)
+        known = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+        known[known] = one_surface[y[known].astype(np.int64), x[known].astype(np.int64)]
+        between = cv2.remap(inverse, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        with np.errstate(divide="ignore", over="ignore"):
+            depth_m = np.asarray(np.float32(self.scale) / between, np.float32)
+        return np.where(known & np.isfinite(depth_m), depth_m, np.float32(0))
+
+    @cached_property
+    def _inverse(self) -> AnyArray:
+        return array_in(self.file)
+
+    @cached_property
+    def _places(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """For each recorded pixel its place (x, y) in the depth images, which are of a camera without distortion; -9 for none."""
+        size = self.camera.height_px, self.camera.width_px
+        v, u = np.indices(size, np.float64)
+        rays = self.camera.ray_from_pixel(np.column_stack([u.ravel(), v.ravel()]))
+        pinhole = _pinhole(self.file, self.camera, self._inverse.shape[1:])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            places = pinhole[:2] * rays[:, :2] / rays[:, 2:] + pinhole[2:]
+        seen = (rays[:, 2] > 0) & np.isfinite(places).all(axis=1)
+        x, y = np.where(seen[:, None], places, -9.0).astype(np.float32).T
+        return x.reshape(size), y.reshape(size)
