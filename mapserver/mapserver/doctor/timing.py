@@ -7,7 +7,11 @@ import numpy as np
 from fleetmap.sensors.samples import DataIssue, Stamps
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
 
-_NOT_LOST = ("stamps uncertain", "Bayer pattern")  # issues of recordings that have all of their data
+_NOT_LOST = (
+    "stamps uncertain",
+    "Bayer pattern",
+    "depth of another system",
+)  # issues of recordings that have all of their data
 SPARSE_S = 0.35  # frames further apart than this are keyframes, not a video
 RECORD_IMU = "record an IMU"
 _ALL_FRAMES = "record every frame of the camera"

@@ -2,16 +2,19 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from fleetmap.errors import FleetmapError, RecordingError, UsageError
 from fleetmap.geometry import quat_wxyz_from_rotation, se3, se3_inverse, so3_exp
-from fleetmap.sensors.samples import SensorSet
+from fleetmap.sensors.calibration import CameraCalibration
+from fleetmap.sensors.samples import CameraFrame, SensorSet
 from mapserver import BuildOptions, build_map
 from mapserver.build.survey_recordings import RecordingOptions
 from mapserver.build.trajectory import OtherTrajectory
+from mapserver.build.trajectory.depths import _DepthFrames
 from support.recordings.recording_samples import BODY_FROM_CAM0, HEIGHT, WIDTH, Sample, write_euroc
 from support.worlds.box_room import out_and_back, points_seen, ride_sample
 
@@ -96,6 +99,25 @@ def test_between_two_surfaces_no_depth_is_made_up(recording: Path, run: Path) ->
     assert not depth_m[28, 28]
 
 
+@pytest.mark.parametrize(("width", "height"), [(94, 60), (512, 320)])
+def test_a_lens_bends_the_recorded_pixels_alone(tmp_path: Path, width: int, height: int) -> None:
+    """A slanted plane, whose depths the run wrote for the picture without distortion."""
+    bent = np.array([-0.28, 0.07, 2e-4, 2e-5])
+    camera = CameraCalibration("radial-tangential", 752, 480, np.array([458.0, 457, 367, 248]), bent, np.eye(4))
+    normal, distance_m, per_px = np.array([0.1, 0.2, 1.0]), 4.0, np.array([width / 752, height / 480])
+    places = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+    rays = ((places + 0.5) / per_px - 0.5 - camera.intrinsics_px[2:]) / camera.intrinsics_px[:2]
+    np.save(tmp_path / "disps.npy", ((rays @ normal[:2] + 1.0) * METRES / distance_m)[None].astype(np.float32))
+    picture = CameraFrame(0, np.zeros((480, 752), np.uint8))
+    source = SimpleNamespace(frame=lambda _: picture)
+    depth_m = _DepthFrames(source, tmp_path / "disps.npy", np.array([0]), camera, METRES).frame(0).depth_m
+    assert depth_m is not None
+    v, u = np.nonzero(depth_m)
+    assert len(v) > 0.65 * 480 * 752  # the corners lie outside of a picture without distortion
+    seen = camera.ray_from_pixel(np.column_stack([u, v]).astype(float))
+    np.testing.assert_allclose(depth_m[v, u], distance_m / (seen / seen[:, 2:] @ normal), rtol=1e-3)
+
+
 def test_a_single_camera_is_surveyed_with_them_in_metres(sample: Sample, recording: Path, run: Path) -> None:
     chosen = BuildOptions(use=SensorSet.MONO, trajectory=OtherTrajectory(run, "droid", scale=METRES), threads=1)
     done = build_map(recording, run / "maps", "hall", chosen)
@@ -103,6 +125,8 @@ def test_a_single_camera_is_surveyed_with_them_in_metres(sample: Sample, recordi
     assert done.report["keyframes"] > 5
     moved = np.ptp(done.trajectory.positions_m, axis=0).max()
     assert moved == pytest.approx(np.ptp(np.array(sample.world_from_body)[:, :3, 3], axis=0).max(), rel=0.02)
+    said = [words for words in done.report["findings"]["ride"] if "disps.npy" in words]
+    assert said == ["depth of another system: 30 of 61 frames have none in disps.npy and are left out"]
     assert any("pose-from-map" in words and f"scale {METRES}" in words for words in done.report["findings"]["ride"])
 
 
