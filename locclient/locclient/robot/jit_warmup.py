@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fleetmap.bow import Vocabulary
 from fleetmap.features import orb
 from fleetmap.features.extraction import extract
-from fleetmap.geometry import se3
+from fleetmap.geometry import Array, se3
 from fleetmap.mapformat import Tile
 from fleetmap.odometry.init.static_initialization import is_steady
 from fleetmap.odometry.settings import StartSettings
@@ -42,6 +42,7 @@ def warm_up_kernels(calibration: RigCalibration, rectifier: Rectifier, settings:
     depth = np.ones(blank.shape, np.float32) if len(calibration.cameras) == 1 else None
     rectifier.rectify(CameraFrame(0, blank, None if depth is not None else blank.copy(), depth))
     upwards = rectifier.body_from_cam[:3, :3] @ np.array([0.0, -9.81, 0.0])
+    glide_mps = calibration.base_from_body[:3, :3] @ rectifier.body_from_cam[:3, :3] @ _glide_mps(camera)
     found = 0
     for number in range(_FRAMES):
         stamps_ns = np.arange(number * _FRAME_NS, (number + 1) * _FRAME_NS, _IMU_NS, dtype=np.int64)
@@ -49,7 +50,8 @@ def warm_up_kernels(calibration: RigCalibration, rectifier: Rectifier, settings:
             gyro_radps, accel_mps2 = np.zeros((len(stamps_ns), 3)), np.tile(upwards, (len(stamps_ns), 1))
             localizer.handle_imu(ImuSamples(stamps_ns, gyro_radps, accel_mps2))
         # Near the frame, or the filter would leave it out.
-        localizer.handle_wheel([WheelSample(int(stamps_ns[-1]), np.zeros(3), 0.0, 0.1, 0.1)])
+        driven_mps = glide_mps if number >= _STATIONARY else np.zeros(3)
+        localizer.handle_wheel([WheelSample(int(stamps_ns[-1]), driven_mps, 0.0, 0.1, 0.1)])
         frame = _view(wall, camera, number)
         found += localizer.handle_stereo(frame).fix is not None
     _disambiguate()
@@ -101,6 +103,12 @@ def _view(wall: NDArray[np.uint8], camera: StereoCamera, number: int) -> Rectifi
     right = left + _DISPARITY_PX
     seen, beside = (np.ascontiguousarray(wall[:, begin : begin + camera.width_px]) for begin in (left, right))
     return RectifiedFrame((number + 1) * _FRAME_NS, seen, beside, None)
+
+
+def _glide_mps(camera: StereoCamera) -> Array:
+    """(3,) velocity of the camera of `_view` in its own axes."""
+    depth_m = float(camera.point_from_pixel(np.zeros((1, 2)), np.array([float(_DISPARITY_PX)]))[0, 2])
+    return np.array([_STEP_PX * depth_m / camera.focal_px / (_FRAME_NS * 1e-9), 0.0, 0.0])
 
 
 def _tile_of(left: NDArray[np.uint8], camera: StereoCamera, settings: LocalizerSettings) -> Tile:
