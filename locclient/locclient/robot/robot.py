@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from fleetmap.failure_definition import may_be_mapped, radius_95_m
 from fleetmap.geometry import Array
-from fleetmap.mapformat.building import building_frame
+from fleetmap.mapformat.manifest import building_frame
 from fleetmap.messages import Cause, PoseMessage, Status, WantedVersion
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.calibration import RigCalibration

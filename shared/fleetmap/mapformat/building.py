@@ -1,16 +1,12 @@
 """The building's frame, in which people and fleet managers speak of places: where the origin of `map` stands in it."""
 
 from math import pi
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from fleetmap.errors import MapFormatError
 from fleetmap.geometry import Array, se3, so3_exp
-
-if TYPE_CHECKING:
-    from fleetmap.mapformat.manifest import Manifest
 
 BUILDING_KEY = "building"
 """In `configuration` of a manifest, where readers of before look over it: format 1 refuses keys that it does not know elsewhere."""
@@ -36,16 +32,3 @@ class BuildingFrame(msgspec.Struct, frozen=True, kw_only=True):
     def building_from_map(self) -> Array:
         """(4, 4)."""
         return se3(so3_exp(np.array([0.0, 0.0, self.yaw_rad])), np.array([self.x_m, self.y_m, 0.0]))
-
-
-def building_frame(manifest: "Manifest") -> BuildingFrame | None:
-    """The building's frame as the site knew it when the version was made; None without. MapFormatError for one that is none."""
-    found = manifest.configuration.get(BUILDING_KEY)
-    if found is None:
-        return None
-    try:
-        return msgspec.convert(found, BuildingFrame)
-    except msgspec.ValidationError as error:
-        raise MapFormatError(
-            f"manifest of {manifest.site} version {manifest.version}: configuration.building: {error}; it is damaged"
-        ) from error

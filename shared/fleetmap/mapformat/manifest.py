@@ -5,7 +5,7 @@ from typing import Annotated, Any
 import msgspec
 
 from fleetmap.errors import MapFormatError, NewerFormatError
-from fleetmap.mapformat.building import building_frame
+from fleetmap.mapformat.building import BUILDING_KEY, BuildingFrame
 from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
 
 MANIFEST_FORMAT = 1
@@ -117,3 +117,16 @@ def decode_manifest(data: bytes) -> Manifest:
         raise MapFormatError(f"manifest: {error}; it is damaged or not a manifest") from error
     building_frame(manifest)
     return manifest
+
+
+def building_frame(manifest: Manifest) -> BuildingFrame | None:
+    """The building's frame as the site knew it when the version was made; None without. MapFormatError for one that is none."""
+    found = manifest.configuration.get(BUILDING_KEY)
+    if found is None:
+        return None
+    try:
+        return msgspec.convert(found, BuildingFrame)
+    except msgspec.ValidationError as error:
+        raise MapFormatError(
+            f"manifest of {manifest.site} version {manifest.version}: configuration.building: {error}; it is damaged"
+        ) from error

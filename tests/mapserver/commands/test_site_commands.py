@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from fleetmap.mapformat import decode_manifest, encode_manifest
-from fleetmap.mapformat.building import building_frame
+from fleetmap.mapformat.manifest import building_frame
 from fleetmap.messages import FailureReport, Placement
 from mapserver import releases
 from mapserver.api.metrics import Metrics
