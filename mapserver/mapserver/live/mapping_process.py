@@ -102,8 +102,9 @@ class MappingProcess:
         """make: the empty map, there. warm_up: frames on which its kernels are loaded before the survey begins."""
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
-        self._process = context.Process(target=_map, args=(theirs, make, rig, warm_up), daemon=True, name="mapping")
-        self._theirs = theirs
+        # What it needs goes through the pipe: more than a pipe holds, as arguments, would wait for ever for a process that has died.
+        self._process = context.Process(target=_map, args=(theirs,), daemon=True, name="mapping")
+        self._theirs, self._needed = theirs, (make, rig, warm_up)
         self._waiting: queue.Queue[_Item | None] = queue.Queue()
         self._sent = 0
         self._latest, self._failed = NO_SKETCH, ""
@@ -170,8 +171,9 @@ class MappingProcess:
 
     def _is_ready(self) -> bool:
         try:
+            self._ours.send(self._needed)
             return self._ours.poll(_READY_WITHIN_S) and self._ours.recv() == "ready"
-        except EOFError:  # it ended before it began
+        except (EOFError, OSError):  # it ended before it began
             return False
 
     def _send(self) -> None:
@@ -196,11 +198,12 @@ class MappingProcess:
             self._failed = self._failed or "the mapping process ended; the finished map is built all the same"
 
 
-def _map(pipe: Connection, make: MakeMap, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...]) -> None:
+def _map(pipe: Connection) -> None:
     """The process: answers every keyframe with the map that it makes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the survey's own process says when it is over
     os.nice(_NICENESS)
     cv2.setNumThreads(1)  # the other core is tracking's
+    make, rig, warm_up = pipe.recv()
     _warm(make(), warm_up)
     gc.freeze()
     growing, doctor, quality, looked_s, shown_s = make(), DriveDoctor(rig), _NO_QUALITY, 0.0, 0.0

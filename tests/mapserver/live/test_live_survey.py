@@ -1,6 +1,6 @@
 """A survey under way from end to end, on a small recording."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -211,6 +211,24 @@ def test_one_source_must_be_named(given: list[str], tmp_path: Path) -> None:
 def test_mapping_that_does_not_start_is_an_error_with_a_next_step() -> None:
     broken: Any = None  # settings without which the process ends before it is ready
     with pytest.raises(FleetmapError, match="mapserver prepare"), MappingProcess(broken, broken):
+        pass
+
+
+def _fails() -> None:
+    raise ValueError("not in this process")
+
+
+class _Unreadable:
+    """What another process cannot load."""
+
+    def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
+        return _fails, ()
+
+
+def test_a_process_that_dies_before_it_has_read_its_orders_is_not_waited_for() -> None:
+    orders: Any = _Unreadable()
+    frames: Any = (bytes(1 << 20),)  # more than a pipe holds
+    with pytest.raises(FleetmapError, match="mapserver prepare"), MappingProcess(orders, orders, frames):
         pass
 
 

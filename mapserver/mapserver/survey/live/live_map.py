@@ -37,6 +37,7 @@ _ROTATION_SIGMA_RAD = 0.02
 _LOST = 100.0  # times the variance of what pictures say, from which on odometry has lost a frame that they have not
 _NEWEST = 12
 _BELONGING = 2  # keyframes of which a map can be made
+_ADJUST_EVERY_S = 0.4  # keyframes that follow more quickly are adjusted with the next one
 _WIDE = 25.0  # factor on odometry's covariance where it only decides what pictures leave open
 
 
@@ -62,6 +63,7 @@ class LiveMap:
         self._closer: LoopCloser | None = None
         self._marginals: GraphMarginals | None = None
         self._level = np.eye(3)
+        self._adjusted_ns = 0
         self._seeing = np.zeros(0, bool)
         self._parts = Parts()  # by what keyframes share with their neighbours, and by odometry
         self._joined = Parts()  # by loops as well, as the loop closer has it
@@ -186,8 +188,10 @@ class LiveMap:
         found = self._matched(first)
         self._pairs = [pair for pair in self._pairs if pair.i >= first] + found
         self._step_covs.append(self._step_cov(new.step_cov, found))
-        self._adjust(first)
-        self._place_features(first)
+        if first == 0 or keyframe.stamp_ns - self._adjusted_ns >= _ADJUST_EVERY_S * 1e9:
+            self._adjusted_ns = keyframe.stamp_ns
+            self._adjust(first)
+            self._place_features(first)
         self._follow(first)
         self._connect(first)
         self._close()
