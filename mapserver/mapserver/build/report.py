@@ -181,7 +181,7 @@ def report_details(
 
     loop_records: every candidate, keyframe i against the older j of one recording. stage_s: wall seconds of each stage; reading
     and decoding images are part of odometry. frames_seen_in_map: frames that points of the map place; odometry or the IMU carries the
-    others, and all between keyframes where the trajectory was given. pair_turn: see survey/bundle/stereo_yaw_check.py. parts: the connected
+    others. pair_turn: see survey/bundle/stereo_yaw_check.py. parts: the connected
     components of each survey, of which the kept one is in the map.
     """
     survey_map, first = joined.map, surveyed[0]

@@ -1,33 +1,35 @@
 """Poses of another system in place of odometry: the first stage of a survey whose initial trajectory is given."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
-import cv2
 import numpy as np
 
-from fleetmap.features import stereo
 from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse, so3_log
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.tracking.tracker import MotionSince, Tracker
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory
-from mapserver.survey.keyframes.keyframes import FrameSummary, KeyframePolicy, make_keyframes, sharpness
-from mapserver.survey.odometry_pass import OdometryPass
+from mapserver.survey.frame_tracks import FrameTracks
+from mapserver.survey.keyframes.keyframes import KeyframePolicy, make_keyframes
+from mapserver.survey.odometry_pass import OdometryPass, summary_of
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 # Assumed drift of the poses, a random walk: standard deviations after one metre.
 _WALK_RAD, _WALK_M = 0.01, 0.05
 _UPRIGHT = np.cos(np.radians(20.0))  # what a ramp does not exceed
-_CORNERS, _UNKNOWN_DEPTH_M = 100, 5.0
+_UNKNOWN_DEPTH_M = 5.0
 
 
 def poses_as_odometry(
     given: Trajectory, inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools
 ) -> OdometryPass:
-    """The odometry pass that given poses of all F frames amount to; keyframes are chosen by motion alone.
+    """The odometry pass that given poses of all F frames amount to, with the points that the tracker follows by them.
 
-    With an IMU the poses are levelled by its mean specific force, and the gyro's bias is estimated from them; without one a frame in
-    which the body begins upright is kept, any other gives way to the body's axes at the first pose, as our odometry has them.
+    The poses only predict where points go: what is kept of a point is where it was seen, as of our own odometry. With an IMU the poses are
+    levelled by its mean specific force, and the gyro's bias is estimated from them; without one a frame in which the body begins upright
+    is kept, any other gives way to the body's axes at the first pose, as our odometry has them.
     """
     inertial = inputs.calibration.imu is not None and len(inputs.imu) > 0
     offset_ns = int(inputs.rectifier.imu_minus_cam_s * 1e9)
@@ -44,40 +46,49 @@ def poses_as_odometry(
     if len(given) > 1:
         velocities = np.asarray(np.gradient(odom_from_body[:, :3, 3], seconds, axis=0)).reshape(-1, 3)
     covariances = _covariances(odom_from_body)
-    estimates = [
-        OdometryEstimate(
-            stamp_ns=int(stamp_ns),
-            frame_index=number,
-            odom_from_body=odom_from_body[number],
-            cov_rot_trans=covariances[number],
-            velocity_odom_mps=velocities[number],
-            gyro_bias_radps=gyro_bias,
-            accel_bias_mps2=np.zeros(3),
-            status=OdometryStatus.TRACKING,
-            track_ids=np.zeros(1, np.int64),  # the same for all frames: the policy goes by motion
-            scene_depth_m=_UNKNOWN_DEPTH_M,
-            inlier_share=1.0,
-            after_gap=False,
-            inertial=inertial,
-            new_odom_from_old_odom=None,
-        )
-        for number, stamp_ns in enumerate(given.stamps_ns)
-    ]
-    policy, rectifier = KeyframePolicy(settings.keyframes), inputs.rectifier
+    odom_from_cam = odom_from_body @ inputs.rectifier.body_from_cam
+    policy, rectifier = KeyframePolicy(settings.keyframes, inputs.keyframes_at), inputs.rectifier
+    tracker = Tracker(rectifier.camera, settings.odometry.tracker, settings.stereo)
+    estimates: list[OdometryEstimate] = []
+    seen: list[FrameTracks] = []
 
     def chosen() -> Iterator[tuple[int, RectifiedFrame]]:
         for number, raw in enumerate(inputs.frames):
             frame = raw if isinstance(raw, RectifiedFrame) else rectifier.rectify(raw)
-            tools.progress("odometry", number + 1, inputs.frame_count)
-            depth_m, ids = _scene_depth_m(frame, rectifier.camera, settings), estimates[number].track_ids
-            summary = FrameSummary(
-                frame.stamp_ns, odom_from_body[number], ids, depth_m, sharpness(frame), after_gap=False
+            tools.at("odometry", number + 1, inputs.frame_count)
+            tracked = tracker.track(frame, _motion_to(odom_from_cam, number))
+            estimate = OdometryEstimate(
+                stamp_ns=frame.stamp_ns,
+                frame_index=number,
+                odom_from_body=odom_from_body[number],
+                cov_rot_trans=covariances[number],
+                velocity_odom_mps=velocities[number],
+                gyro_bias_radps=gyro_bias,
+                accel_bias_mps2=np.zeros(3),
+                status=OdometryStatus.TRACKING,
+                track_ids=tracked.ids,
+                scene_depth_m=_scene_depth_m(tracked.pixels, rectifier.camera),
+                inlier_share=tracked.inlier_share,
+                after_gap=tracked.by_descriptors,
+                inertial=inertial,
+                new_odom_from_old_odom=None,
+                track_pixels=tracked.pixels,
             )
-            if policy.wants(summary):
+            seen.append(FrameTracks.of_frame(estimate))
+            estimates.append(replace(estimate, track_ids=np.zeros(0, np.int64), track_pixels=None))
+            if policy.wants(summary_of(frame, estimate, odom_from_body[number])):
                 yield number, frame
 
     keyframes = list(make_keyframes(chosen(), rectifier.camera, settings, tools.images, tools.executor))
-    return OdometryPass(estimates, odom_from_body, covariances, np.ones(len(given), bool), keyframes, inertial)
+    tied = np.ones(len(given), bool)
+    return OdometryPass(
+        estimates, odom_from_body, covariances, tied, keyframes, inertial, tracks=FrameTracks.joined(seen)
+    )
+
+
+def _motion_to(odom_from_cam: Array, number: int) -> MotionSince:
+    """The motion of the camera to a frame from earlier ones, as the poses (F, 4, 4) say."""
+    return lambda earlier: np.asarray(se3_inverse(odom_from_cam[number]) @ odom_from_cam[earlier])
 
 
 def _levelled(given: Trajectory, inputs: SurveyInputs) -> Array:
@@ -109,12 +120,8 @@ def _covariances(odom_from_body: Array) -> Array:
     return np.asarray(variances[:, :, None] * np.eye(6))
 
 
-def _scene_depth_m(frame: RectifiedFrame, camera: StereoCamera, settings: SurveySettings) -> float:
-    """Median depth of some corners."""
-    corners = cv2.goodFeaturesToTrack(frame.left, _CORNERS, 0.01, 12)
-    if corners is None:
-        return _UNKNOWN_DEPTH_M
-    pixels = corners.reshape(-1, 2).astype(np.float64)
-    disparities = stereo.disparities(frame, camera, pixels, settings.stereo)[:, 0]
+def _scene_depth_m(pixels: Array, camera: StereoCamera) -> float:
+    """Median depth of the points that were followed, (N, 3) u_left v u_right."""
+    disparities = pixels[:, 0] - pixels[:, 2]
     known = disparities[np.isfinite(disparities) & (disparities > 0)]
     return float(camera.focal_px * camera.baseline_m / np.median(known)) if len(known) else _UNKNOWN_DEPTH_M

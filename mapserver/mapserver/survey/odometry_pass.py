@@ -36,7 +36,7 @@ class OdometryPass:
 
     odom_from_body (F, 4, 4), covariances (F, 6, 6) in odom axes, rotation first; tracked (F,): whether the frame is tied to the
     ones before; inertial: whether gravity was found; scale_known: whether lengths are metres; has_wheels: whether wheel odometry
-    took part; tracks: the points that were followed, None of given poses; cuts: where segments were to begin. Of one camera only tracked
+    took part; tracks: the points that were followed, None where none were; cuts: where segments were to begin. Of one camera only tracked
     frames are in one frame and scale, and only they give keyframes.
     """
 
@@ -85,7 +85,7 @@ class OdometryRun:
         self._odometry.handle_wheel(wheel)
         estimate = self._odometry.handle_stereo(frame)
         number, frame_from_body = len(self.chain.estimates), self.chain.append(estimate)
-        wanted = self._policy.wants(_summary(frame, estimate, frame_from_body))
+        wanted = self._policy.wants(summary_of(frame, estimate, frame_from_body))
         return TrackedFrame(number, frame, estimate, frame_from_body, wanted)
 
 
@@ -193,7 +193,8 @@ def continued_covariances(estimates: Sequence[OdometryEstimate]) -> Array:
     return np.array([continued.handle(estimate) for estimate in estimates])
 
 
-def _summary(frame: RectifiedFrame, estimate: OdometryEstimate, frame_from_body: Array) -> FrameSummary:
+def summary_of(frame: RectifiedFrame, estimate: OdometryEstimate, frame_from_body: Array) -> FrameSummary:
+    """What the choice of keyframes needs of a frame."""
     e = estimate
     return FrameSummary(frame.stamp_ns, frame_from_body, e.track_ids, e.scene_depth_m, sharpness(frame), e.after_gap)
 

@@ -117,7 +117,7 @@ def given_poses(recording: Recording, indices: NDArray[np.int64], other: OtherTr
     check_span(stamps_ns, is_placed, recording, other)
     at_frames = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
     at_frames[is_placed] = [pose_at(as_read, int(stamp)) for stamp in stamps_ns[is_placed]]
-    at_frames[:, :3, 3] *= found.scale
+    at_frames[:, :3, 3] *= found.in_metres
     at_frames = at_frames @ se3_inverse(shown.body_from(found.reading))
     if not is_placed.all():
         if not whole:
@@ -211,14 +211,14 @@ def _judged(
         )
     same = undecided(best, rest)
     open_items = [item for item in CHOICES if len({getattr(each.reading, item) for each in (best, *same)}) > 1]
-    if open_items or best.scale_sigma > SCALE_WITHIN:
+    if open_items or best.scale_within > SCALE_WITHIN:
         asked = [f"--trajectory-{item} {'|'.join(CHOICES[item])}" for item in open_items]
-        asked += ["--trajectory-scale METRES"] if best.scale_sigma > SCALE_WITHIN else []
+        asked += ["--trajectory-scale METRES"] if best.scale_within > SCALE_WITHIN else []
         raise UsageError(
             f"{other.file} can be read in {len(same) + 1} ways that {recording.name} does not tell apart over {count} stretches; "
             f"say {' and '.join(asked)}"
         )
-    words = f"trajectory {name}: {best.reading}, scale {best.scale:.4g}"
+    words = f"trajectory {name}: {best.reading}, scale {best.in_metres:.4g}"
     if not best.is_told:
         return best, f"{words}, as said; the recording moves too little to judge it"
     following = f"; the next reading, {rest[0].reading}, by {100 * rest[0].errors.mean():.0f} %" if rest else ""

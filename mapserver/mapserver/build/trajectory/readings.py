@@ -28,8 +28,9 @@ _STRETCH_RAD, _STRETCH_M, _STRETCH_NS = 0.15, 0.3, 1_000_000_000
 _LEAST_RAD, _LEAST_M = 0.05, 0.1  # of a motion, below which errors count as if it were so large
 LEAST_STRETCHES = 6
 _STANDARD_ERRORS = 4.0
+_OUTLIER_MEDIANS = 4.0  # of the distances between translations: 3 standard deviations and more
 FITS_WITHIN = 0.5  # of the motion: a guess that is further off is worse than none for the larger half
-SCALE_WITHIN = 0.05  # what the survey assumes of a given trajectory's drift
+SCALE_WITHIN = 0.05 * _STANDARD_ERRORS  # by what the survey assumes of a given trajectory's drift
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,13 +74,13 @@ class Shown:
 
 @dataclass(frozen=True)
 class Judged:
-    """A reading against the recording: metres in the file's unit of length with their sigma, errors (P,) of stretches as shares of the
-    motion, medians of those of rotations and ways and how many tell (None where fewer than LEAST_STRETCHES do).
+    """A reading against the recording: metres in the file's unit of length and how far their logarithm may be off, errors (P,) of stretches
+    as shares of the motion, medians of those of rotations and ways (None where fewer than LEAST_STRETCHES tell).
     """
 
     reading: PoseReading
     scale: float
-    scale_sigma: float
+    scale_within: float
     errors: Array
     turn_error: float | None
     way_error: float | None
@@ -88,6 +89,11 @@ class Judged:
     def fits(self) -> bool:
         """Whether the recording shows nothing else."""
         return all(error is None or error <= FITS_WITHIN for error in (self.turn_error, self.way_error))
+
+    @property
+    def in_metres(self) -> float:
+        """The scale, 1 where it cannot be told from that: the file is then in metres, which are better than what the comparison gives."""
+        return 1.0 if abs(np.log(self.scale)) <= self.scale_within else self.scale
 
     @property
     def is_told(self) -> bool:
@@ -198,10 +204,7 @@ def judge(as_read: Trajectory, reading: PoseReading, shown: Shown, scale: float 
     seen = se3_inverse(seen_ends[:, 0]) @ seen_ends[:, 1]
     turns, seen_turns = _angles(moved[:, :3, :3]), _angles(seen[:, :3, :3])
     ways, seen_ways = (np.linalg.norm(motion[:, :3, 3], axis=1) for motion in (moved, seen))
-    if scale is None:
-        scale, sigma = _scale(ways, seen_ways)
-    else:
-        sigma = 0.0
+    scale, within = (scale, 0.0) if scale is not None else fitted_scale(moved[:, :3, 3], seen[:, :3, 3])
     apart = _angles(np.swapaxes(seen[:, :3, :3], 1, 2) @ moved[:, :3, :3])
     turn_size, way_size = np.maximum(turns, seen_turns), np.maximum(scale * ways, seen_ways)
     turn_errors = np.minimum(apart / np.maximum(turn_size, _LEAST_RAD), 1.0)
@@ -211,7 +214,7 @@ def judge(as_read: Trajectory, reading: PoseReading, shown: Shown, scale: float 
         float(np.median(errors[tell])) if (tell := sizes >= least).sum() >= LEAST_STRETCHES else None
         for errors, sizes, least in ((turn_errors, turn_size, _LEAST_RAD), (way_errors, way_size, _LEAST_M))
     ]
-    return Judged(reading, scale, sigma, 0.5 * (turn_errors + way_errors), *medians)
+    return Judged(reading, scale, within, 0.5 * (turn_errors + way_errors), *medians)
 
 
 def undecided(best: Judged, others: list[Judged]) -> list[Judged]:
@@ -225,16 +228,27 @@ def undecided(best: Judged, others: list[Judged]) -> list[Judged]:
     return found
 
 
-def _scale(ways: Array, seen_ways: Array) -> tuple[float, float]:
-    """Median ratio over stretches that move and its sigma; infinite where too few do. 1 within its noise is 1: the file is in metres."""
-    moving = (seen_ways >= _LEAST_M) & (ways > 0)
+def fitted_scale(moved: Array, seen: Array) -> tuple[float, float]:
+    """Metres in the unit of translations moved (P, 3), given those in metres, seen (P, 3), and how far its logarithm may be off.
+
+    Both are noisy. A regression of either on the other is low by the share of noise in what it divides by, so that the truth lies between
+    the two; taken is their geometric mean, the ratio of root mean squares. It may be off by half of what the regressions differ by and four
+    standard errors; infinite where too few stretches move. Those that slipped on either side are left out. Source: Horn 1987, section 2.E
+    (symmetric scale).
+    """
+    moving = (np.linalg.norm(seen, axis=1) >= _LEAST_M) & (np.linalg.norm(moved, axis=1) > 0)
     if moving.sum() < LEAST_STRETCHES:
         return 1.0, np.inf
-    ratios = seen_ways[moving] / ways[moving]
-    scale = float(np.median(ratios))
-    spread = 1.4826 * float(np.median(np.abs(ratios - scale)))
-    sigma = 1.2533 * spread / np.sqrt(moving.sum())
-    return (1.0 if abs(scale - 1.0) <= _STANDARD_ERRORS * sigma else scale), sigma / scale
+    moved, seen = moved[moving], seen[moving]
+    start = float(np.median(np.linalg.norm(seen, axis=1) / np.linalg.norm(moved, axis=1)))
+    off_m = np.linalg.norm(start * moved - seen, axis=1)
+    kept = off_m <= _OUTLIER_MEDIANS * np.median(off_m)
+    moved_squared, seen_squared = (np.einsum("ni,ni->n", way, way) for way in (moved[kept], seen[kept]))
+    both = float(np.einsum("ni,ni->", moved[kept], seen[kept]))
+    moved_sum, seen_sum = float(moved_squared.sum()), float(seen_squared.sum())
+    apart = max(np.log(np.sqrt(moved_sum * seen_sum) / both), 0.0) if both > 0 else np.inf
+    error = 0.5 * float(np.linalg.norm(seen_squared / seen_sum - moved_squared / moved_sum))
+    return np.sqrt(seen_sum / moved_sum), apart + _STANDARD_ERRORS * error
 
 
 def _angles(rotations: Array) -> Array:
