@@ -37,7 +37,7 @@ from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_s
 from mapserver.survey.finish.map_transform import scaled, scaled_state
 from mapserver.survey.merge.multi_session import Joined, chained
 from mapserver.survey.pipeline import Survey, begin_survey, finish_survey, survey
-from mapserver.survey.settings import SurveySettings
+from mapserver.survey.settings import SurveySettings, for_depths
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
 
 _SHARED_STRETCHES = 3  # of which a calibration takes one
@@ -313,9 +313,9 @@ def survey_recording(
         if (begun := admission.begun) is not None:
             rectifier, done = begun.rectifier, finish_survey(begun.chain, options, tools)
         else:
-            has_depth = recording.sensor_set is SensorSet.RGBD
-            rectifier = Rectifier(recording.calibration, has_depth=has_depth, pinhole=pinhole)
-            done = survey(_inputs(recording, indices, rectifier, admission.given), options, tools)
+            rectifier = Rectifier(admission.rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
+            own = replace(options, settings=for_depths(options.settings, recording.depth_sigma_px))
+            done = survey(_inputs(recording, indices, rectifier, admission.given), own, tools)
         done, map_from_survey = _aligned(done, recording)
         return Surveyed(
             entry=RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices)),

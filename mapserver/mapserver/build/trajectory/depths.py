@@ -1,9 +1,9 @@
-"""Depths that DROID-SLAM keeps beside its poses, as depth images of a single camera's recording."""
+"""Depths that DROID-SLAM and MASt3R-SLAM keep beside their poses, as depth images of a single camera's recording."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
@@ -14,6 +14,8 @@ from fleetmap.geometry import AnyArray, Array
 from fleetmap.recordings import Recording
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps
+from mapserver.build.trajectory.cloud_depths import Placing, cloud_images, places
+from mapserver.build.trajectory.clouds import EDGE_RATIO
 from mapserver.build.trajectory.formats import PoseRows, array_in
 from mapserver.build.trajectory.given import OtherTrajectory, check_span, clock_of
 from mapserver.build.trajectory.readings import NEAR_NS, possible_units, stamps_of
@@ -27,44 +29,68 @@ if TYPE_CHECKING:
 _MOST_SIDE = 8192
 _ASPECT_WITHIN = 0.1  # cropping to multiples of 8 px and rounding of sizes stay well below
 _NETWORK_STEP = 8  # px between the network's cells, in whose unit DROID writes intrinsics
-_EDGE_RATIO = 1.25  # between neighbouring depths: what lies between them is neither surface
+
+
+class DepthImages(Protocol):
+    """Images of inverse depth, 0 where unknown, of a camera without distortion."""
+
+    @property
+    def scale(self) -> float:
+        """Metres in the unit of the depths."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of each."""
+
+    @property
+    def pinhole(self) -> Array:
+        """(4,) fx, fy, cx, cy of their pixels."""
+
+    def inverse(self, frame: int) -> NDArray[np.float32] | None:
+        """That of a frame by its number in the recording; None for a frame without."""
 
 
 def with_depths(
     recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory | None
 ) -> tuple[Recording, NDArray[np.int64]]:
-    """A single camera's recording as one with depth, and those of the selected frames that `disps.npy` beside the poses has.
+    """A single camera's recording as one with depth, and those of the selected frames that have one: by `disps.npy` beside DROID's poses,
+    or the cloud of points beside MASt3R's.
 
     The same recording and selection where there is no such file or the recording needs none. The scale must be said, as one camera does
     not show it: UsageError. RecordingError for a file that is not of these poses and this camera.
     """
-    if (
-        other is None
-        or other.format != "droid"
-        or recording.sensor_set not in (SensorSet.MONO, SensorSet.MONO_INERTIAL)
-    ):
+    if other is None or recording.sensor_set not in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
         return recording, indices
-    file = (other.file if other.file.is_dir() else other.file.parent) / "disps.npy"
-    if not file.exists():
+    folder = other.file if other.file.is_dir() else other.file.parent
+    file = {"droid": folder / "disps.npy", "mast3r": other.file.with_suffix(".ply")}.get(other.format)
+    if file is None or file == other.file or not file.exists():
         return recording, indices
     if other.scale is None:
         raise UsageError(
             f"{file} holds depths of one camera, which does not show their unit; say the metres in it with --trajectory-scale"
         )
     rows, camera = other.rows(), recording.calibration.cameras[0]
-    _check(file, len(rows.positions), camera)
-    row_of_frame = _rows_of_frames(rows, recording, indices, other)
+    if other.format == "droid":
+        _check(file, len(rows.positions), camera)
+    unit, row_of_frame = _rows_of_frames(rows, recording, indices, other)
     has_depth = row_of_frame[indices] >= 0
     check_span(recording.frame_stamps_ns[indices], has_depth, recording, other)
-    left_out = f"{int((~has_depth).sum())} of {len(indices)} frames have none in {file.name} and are left out"
+    words = f"{int((~has_depth).sum())} of {len(indices)} frames have none in {file.name} and are left out"
+    images: DepthImages = DispImages(file, row_of_frame, camera, other.scale)
+    sigma_px = None
+    if other.format == "mast3r":
+        placing = Placing(file, rows, unit, clock_of(rows, recording, indices, other), indices[has_depth])
+        images, found, sigma_px = cloud_images(recording, placing, other)
+        words += f"; {found}"
     unused = "; the IMU is not used" if len(recording.imu) else ""
     seen = replace(
         recording,
         sensor_set=SensorSet.RGBD,
         calibration=replace(recording.calibration, cameras=(camera,), imu=None),
         imu=ImuSamples.empty(),
-        frames=_DepthFrames(recording.frames, file, row_of_frame, camera, other.scale),
-        issues=(*recording.issues, DataIssue("depth of another system", left_out + unused)),
+        frames=_DepthFrames(recording.frames, images, np.arange(len(recording)), camera),
+        issues=(*recording.issues, DataIssue("depth of another system", words + unused)),
+        depth_sigma_px=sigma_px,
     )
     return seen, indices[has_depth]
 
@@ -92,8 +118,8 @@ def _check(file: Path, count: int, camera: CameraCalibration) -> None:
 
 def _rows_of_frames(
     rows: PoseRows, recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory
-) -> NDArray[np.int64]:
-    """(F,) for each frame of the recording the row of its pose, -1 without one, by the only unit of stamps that puts most at frames."""
+) -> tuple[str | None, NDArray[np.int64]]:
+    """The only unit of stamps that puts most at frames, and (F,) for each frame of the recording the row of its pose, -1 without one."""
     clock, stamps_ns = clock_of(rows, recording, indices, other), recording.frame_stamps_ns
     units = [None] if rows.stamps is None else [u for u in possible_units(rows, clock) if other.stamps in (None, u)]
     frames = {unit: _frames_at(stamps_of(rows, unit, clock), stamps_ns) for unit in units}
@@ -106,10 +132,10 @@ def _rows_of_frames(
         raise UsageError(
             f"{other.file} may have its stamps in {' or '.join(map(str, fitting))}; say --trajectory-stamps"
         )
-    (found,) = fitting.values()
+    ((unit, found),) = fitting.items()
     out = np.full(len(stamps_ns), -1)
     out[found[found >= 0]] = np.flatnonzero(found >= 0)
-    return out
+    return unit, out
 
 
 def _frames_at(stamps: Stamps, frame_stamps_ns: Stamps) -> NDArray[np.int64]:
@@ -146,27 +172,54 @@ def _pinhole(file: Path, camera: CameraCalibration, shape: tuple[int, ...]) -> A
 
 
 @dataclass(frozen=True)
-class _DepthFrames:
-    """Frames of `source`, each with the depth image of its row (F,), unknown everywhere for row -1. What was recorded is hashed alone."""
+class DispImages:
+    """The images in `disps.npy`, one for each pose: rows (F,) of the recording's frames, -1 for none; scale: metres in its unit."""
 
-    source: "FrameSource"
     file: Path
     rows: NDArray[np.int64]
     camera: CameraCalibration
     scale: float
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """See DepthImages."""
+        height, width = self._images.shape[1:]
+        return height, width
+
+    @cached_property
+    def pinhole(self) -> Array:
+        """See DepthImages."""
+        return _pinhole(self.file, self.camera, self.shape)
+
+    def inverse(self, frame: int) -> NDArray[np.float32] | None:
+        """See DepthImages."""
+        row = int(self.rows[frame])
+        return None if row < 0 else np.array(self._images[row], np.float32)
+
+    @cached_property
+    def _images(self) -> AnyArray:
+        return array_in(self.file)
+
+
+@dataclass(frozen=True)
+class _DepthFrames:
+    """Frames of `source`, whose numbers in `images` are numbers (F,), each with its depth image. What was recorded is hashed alone."""
+
+    source: "FrameSource"
+    images: DepthImages
+    numbers: NDArray[np.int64]
+    camera: CameraCalibration
+
     def stored(self, index: int) -> "StoredFrame":
         return self.source.stored(index)
 
     def frame(self, index: int) -> CameraFrame:
-        frame, row = self.source.frame(index), int(self.rows[index])
+        frame, inverse = self.source.frame(index), self.images.inverse(int(self.numbers[index]))
         depth_m = np.zeros((self.camera.height_px, self.camera.width_px), np.float32)
-        if row >= 0:
-            depth_m = self._depth_m(np.array(self._inverse[row], np.float32))
-        return CameraFrame(frame.stamp_ns, frame.left, depth_m=depth_m)
+        return CameraFrame(frame.stamp_ns, frame.left, depth_m=depth_m if inverse is None else self._depth_m(inverse))
 
     def part(self, indices: NDArray[np.int64]) -> "_DepthFrames":
-        return replace(self, source=self.source.part(indices), rows=self.rows[indices])
+        return replace(self, source=self.source.part(indices), numbers=self.numbers[indices])
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
         self.source.hash_into(digest)
@@ -179,27 +232,15 @@ class _DepthFrames:
         x, y = self._places
         (height, width), ones = inverse.shape, np.ones((2, 2), np.uint8)
         high, low = (each(inverse, ones, anchor=(0, 0)) for each in (cv2.dilate, cv2.erode))
-        one_surface = (low > 0) & (high <= _EDGE_RATIO * low)
+        one_surface = (low > 0) & (high <= EDGE_RATIO * low)
         known = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
         known[known] = one_surface[y[known].astype(np.int64), x[known].astype(np.int64)]
         between = cv2.remap(inverse, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         with np.errstate(divide="ignore", over="ignore"):
-            depth_m = np.asarray(np.float32(self.scale) / between, np.float32)
+            depth_m = np.asarray(np.float32(self.images.scale) / between, np.float32)
         return np.where(known & np.isfinite(depth_m), depth_m, np.float32(0))
 
     @cached_property
-    def _inverse(self) -> AnyArray:
-        return array_in(self.file)
-
-    @cached_property
     def _places(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """For each recorded pixel its place (x, y) in the depth images, which are of a camera without distortion; -9 for none."""
-        size = self.camera.height_px, self.camera.width_px
-        v, u = np.indices(size, np.float64)
-        rays = self.camera.ray_from_pixel(np.column_stack([u.ravel(), v.ravel()]))
-        pinhole = _pinhole(self.file, self.camera, self._inverse.shape[1:])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            places = pinhole[:2] * rays[:, :2] / rays[:, 2:] + pinhole[2:]
-        seen = (rays[:, 2] > 0) & np.isfinite(places).all(axis=1)
-        x, y = np.where(seen[:, None], places, -9.0).astype(np.float32).T
-        return x.reshape(size), y.reshape(size)
+        x, y = places(self.camera, self.images.pinhole).astype(np.float32)
+        return x, y

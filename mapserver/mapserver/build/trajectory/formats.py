@@ -68,9 +68,7 @@ def text_rows(*columns: int) -> PoseReader:
     def read(path: Path) -> PoseRows:
         rows: list[list[float]] = []
         stamps: list[int] = []
-        for number, line in enumerate(
-            read_text(_sized(path), "poses as lines of numbers are expected").splitlines(), 1
-        ):
+        for number, line in enumerate(read_text(sized(path), "poses as lines of numbers are expected").splitlines(), 1):
             fields = line.replace(",", " ").replace(";", " ").split()
             if not fields or fields[0].startswith("#"):
                 continue
@@ -134,7 +132,7 @@ TRAJECTORY_FORMATS: dict[str, PoseReader] = {
 def array_in(path: Path) -> AnyArray:
     """The numbers in a .npy file, mapped; RecordingError for anything else, of which nothing is unpacked."""
     try:
-        found = np.load(_sized(path, 4 << 30), mmap_mode="r", allow_pickle=False)
+        found = np.load(sized(path, 4 << 30), mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, OverflowError, SyntaxError, TokenError, TypeError, MemoryError) as error:
         raise RecordingError(f"{path} is no .npy file of numbers ({error})") from error
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "fiu" or found.ndim == 0:
@@ -155,7 +153,8 @@ def billionths(field: str) -> int:
     return int(value * BILLION)
 
 
-def _sized(path: Path, most_bytes: int = _MOST_BYTES) -> Path:
+def sized(path: Path, most_bytes: int = _MOST_BYTES) -> Path:
+    """The path of a file of at most so many bytes; RecordingError for anything else."""
     try:
         size = path.stat().st_size
     except OSError as error:

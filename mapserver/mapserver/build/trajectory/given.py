@@ -1,5 +1,6 @@
 """The initial trajectory that a file of poses gives: the reading that fits the recording, in metres, at every frame."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,7 +38,7 @@ from mapserver.build.trajectory.readings import (
     undecided,
 )
 from mapserver.survey.odometry_pass import OdometryRun, SampleFeed
-from mapserver.survey.settings import SurveySettings
+from mapserver.survey.settings import SurveySettings, for_depths
 
 CHOICES = {"frame": FRAMES, "direction": DIRECTIONS, "quaternion": QUATERNIONS, "stamps": STAMPS}
 _WINDOWS, _WINDOW_FRAMES = 5, 60
@@ -170,7 +171,7 @@ def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) 
     if not whole:
         starts = np.linspace(0, count - _WINDOW_FRAMES, _WINDOWS).round().astype(int).tolist()
         spans = [(start, start + _WINDOW_FRAMES) for start in starts]
-    rig, settings = recording.calibration, SurveySettings()
+    rig, settings = recording.calibration, for_depths(SurveySettings(), recording.depth_sigma_px)
     rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD)
     frame_from_body, piece, pieces = np.tile(np.eye(4), (count, 1, 1)), np.full(count, -1), 0
     for first, end in spans:
@@ -212,17 +213,21 @@ def _judged(
     same = undecided(best, rest)
     open_items = [item for item in CHOICES if len({getattr(each.reading, item) for each in (best, *same)}) > 1]
     if open_items or best.scale_within > SCALE_WITHIN:
-        asked = [f"--trajectory-{item} {'|'.join(CHOICES[item])}" for item in open_items]
-        asked += ["--trajectory-scale METRES"] if best.scale_within > SCALE_WITHIN else []
+        open_items += ["scale"] if best.scale_within > SCALE_WITHIN else []
         raise UsageError(
             f"{other.file} can be read in {len(same) + 1} ways that {recording.name} does not tell apart over {count} stretches; "
-            f"say {' and '.join(asked)}"
+            f"say {asked(open_items)}"
         )
     words = f"trajectory {name}: {best.reading}, scale {best.in_metres:.4g}"
     if not best.is_told:
         return best, f"{words}, as said; the recording moves too little to judge it"
     following = f"; the next reading, {rest[0].reading}, by {100 * rest[0].errors.mean():.0f} %" if rest else ""
     return best, f"{words}: off our own odometry by {figures} in the median of {count} stretches{following}"
+
+
+def asked(items: Iterable[str]) -> str:
+    """The options that say open items of a reading."""
+    return " and ".join(f"--trajectory-{item} {'|'.join(CHOICES.get(item, ('METRES',)))}" for item in items)
 
 
 def check_span(stamps_ns: Stamps, is_placed: NDArray[np.bool_], recording: Recording, other: OtherTrajectory) -> None:
