@@ -141,16 +141,15 @@ def test_the_scale_is_found(sample: Sample, recording: Path, tmp_path: Path, sca
 @pytest.mark.parametrize(("noise_m", "own_noise_m"), [(0.0, 0.0), (0.05, 0.0), (0.0, 0.05), (0.05, 0.05)])
 @pytest.mark.parametrize("metres", [1.0, 0.8, 1000.0])
 def test_noise_of_neither_side_passes_for_another_scale(noise_m: float, own_noise_m: float, metres: float) -> None:
-    """Over so many stretches four standard errors alone are less than what the noise takes from a regression."""
+    """Over so many stretches four standard errors alone are less than what the noise takes from a regression; our own odometry is off."""
     rng = np.random.default_rng(7)
     true_m = 0.3 * rng.normal(size=(4000, 3)) / np.sqrt(3)
     moved = (true_m + rng.normal(0, noise_m, true_m.shape)) / metres
-    seen = true_m + rng.normal(0, own_noise_m, true_m.shape)
+    seen = 0.995 * true_m + rng.normal(0, own_noise_m, true_m.shape)
     moved[::50] *= 5.0  # slips
     scale, within = fitted_scale(moved, seen)
-    assert abs(np.log(scale / metres)) <= within + 1e-9
-    assert within < 0.2
-    assert (abs(np.log(scale)) <= within + 1e-9) == (metres == 1.0)
+    assert abs(np.log(scale / metres)) <= within < 0.2
+    assert (abs(np.log(scale)) <= within) == (metres == 1.0)
 
 
 def test_kitti_and_droid_are_read(sample: Sample, recording: Path, tmp_path: Path) -> None:

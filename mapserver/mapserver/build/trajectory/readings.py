@@ -28,6 +28,9 @@ _STRETCH_RAD, _STRETCH_M, _STRETCH_NS = 0.15, 0.3, 1_000_000_000
 _LEAST_RAD, _LEAST_M = 0.05, 0.1  # of a motion, below which errors count as if it were so large
 LEAST_STRETCHES = 6
 _STANDARD_ERRORS = 4.0
+_OWN_SCALE_WITHIN = (
+    0.01  # what stereo and depth show of scale: a tenth of a pixel in ten of disparity, which no averaging takes away
+)
 _OUTLIER_MEDIANS = 4.0  # of the distances between translations: 3 standard deviations and more
 FITS_WITHIN = 0.5  # of the motion: a guess that is further off is worse than none for the larger half
 SCALE_WITHIN = 0.05 * _STANDARD_ERRORS  # by what the survey assumes of a given trajectory's drift
@@ -232,9 +235,9 @@ def fitted_scale(moved: Array, seen: Array) -> tuple[float, float]:
     """Metres in the unit of translations moved (P, 3), given those in metres, seen (P, 3), and how far its logarithm may be off.
 
     Both are noisy. A regression of either on the other is low by the share of noise in what it divides by, so that the truth lies between
-    the two; taken is their geometric mean, the ratio of root mean squares. It may be off by half of what the regressions differ by and four
-    standard errors; infinite where too few stretches move. Those that slipped on either side are left out. Source: Horn 1987, section 2.E
-    (symmetric scale).
+    the two; taken is their geometric mean, the ratio of root mean squares. It may be off by half of what the regressions differ by, four
+    standard errors and what our own metres may be; infinite where too few stretches move. Those that slipped on either side are left out.
+    Source: Horn 1987, section 2.E (symmetric scale).
     """
     moving = (np.linalg.norm(seen, axis=1) >= _LEAST_M) & (np.linalg.norm(moved, axis=1) > 0)
     if moving.sum() < LEAST_STRETCHES:
@@ -248,7 +251,7 @@ def fitted_scale(moved: Array, seen: Array) -> tuple[float, float]:
     moved_sum, seen_sum = float(moved_squared.sum()), float(seen_squared.sum())
     apart = max(np.log(np.sqrt(moved_sum * seen_sum) / both), 0.0) if both > 0 else np.inf
     error = 0.5 * float(np.linalg.norm(seen_squared / seen_sum - moved_squared / moved_sum))
-    return np.sqrt(seen_sum / moved_sum), apart + _STANDARD_ERRORS * error
+    return np.sqrt(seen_sum / moved_sum), apart + _STANDARD_ERRORS * error + _OWN_SCALE_WITHIN
 
 
 def _angles(rotations: Array) -> Array:
