@@ -40,6 +40,11 @@ class Threads:
         """See Executor."""
         return _in_order(lambda batch: self._pool.submit(function, shared, batch), Future.result, batches, self._ahead)
 
+    @property
+    def nearby(self) -> Executor:
+        """See Executor."""
+        return self
+
 
 class Processes:
     """An executor of processes of this machine; `folder` holds what they share."""
@@ -66,6 +71,11 @@ class Processes:
             return self._pool.submit(_do_shared, function, there, pickle.dumps(batch, protocol=5))
 
         return _in_order(submit, lambda future: pickle.loads(future.result()), batches, self._ahead)
+
+    @property
+    def nearby(self) -> Executor:
+        """See Executor."""
+        return SERIAL
 
 
 class Cluster:
@@ -94,6 +104,11 @@ class Cluster:
             return self._client.submit(_do, function, there, pickle.dumps(batch, protocol=5), pure=False)
 
         return _in_order(submit, lambda future: pickle.loads(future.result()), batches, ahead)
+
+    @property
+    def nearby(self) -> Executor:
+        """See Executor."""
+        return SERIAL
 
 
 _unpacked: dict[str, Any] = {}  # in a process of the cluster: what is shared now, by its name

@@ -16,6 +16,10 @@ class Executor(Protocol):
     ) -> Iterator[Result]:
         """function(shared, batch) of every batch, in their order. `shared` travels once, however many calls it takes part in."""
 
+    @property
+    def nearby(self) -> "Executor":
+        """For small batches that are waited for: the way to processes and back would cost more than they take over."""
+
 
 class SerialExecutor:
     """Computes one batch after the other in the calling thread, each when its result is asked for."""
@@ -25,6 +29,11 @@ class SerialExecutor:
     ) -> Iterator[Result]:
         """See Executor."""
         return (function(shared, batch) for batch in batches)
+
+    @property
+    def nearby(self) -> Executor:
+        """See Executor."""
+        return self
 
 
 SERIAL = SerialExecutor()

@@ -129,7 +129,7 @@ def _close_loops(
         kind, known = Sim3LoopCloser, gate_covariances(chain, scale_walk)
     marginals = GraphMarginals(state.map_from_body, known)
     parts = find_parts(covisibility_of(state), _sigmas_m(odometry), options.settings.join_sigma_m)
-    closer = kind(posed_keyframes(odometry, state), options, marginals, matched, tools.executor, parts)
+    closer = kind(posed_keyframes(odometry, state), options, marginals, matched, tools.executor.nearby, parts)
     for i in range(len(odometry.keyframes)):
         closer.close(i)
         tools.at("loops", i + 1, len(odometry.keyframes))

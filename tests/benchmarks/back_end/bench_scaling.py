@@ -6,8 +6,8 @@ busiest worker are taken to wait for each other. Besides: tasks, bytes that trav
 
     T(n) = serial + parallel / n + overhead of having a cluster at all
 
-over the numbers of processes, from which larger ones are extrapolated, and a site of 13,000 keyframes by its length. Pictures are missing
-as in `bench_site.py`, so that the odometry and sub-pixel alignment are in none of the figures.
+with no part below nothing, over the numbers of processes, from which larger ones are extrapolated, and a site of 13,000 keyframes by its
+length. Pictures are missing as in `bench_site.py`, so that the odometry and sub-pixel alignment are in none of the figures.
 
     python tests/benchmarks/back_end/bench_scaling.py --drive FILE [--keyframes 250] [--workers 1,2,4]
 """
@@ -23,6 +23,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from scipy.optimize import nnls
 
 from benchmarks.back_end.bench_site import SETTINGS, digest
 from benchmarks.common.simulated_survey import SimulatedSurvey, drawn_alignment
@@ -125,14 +126,17 @@ def fit(rows: Sequence[dict[str, Any]], key: str) -> dict[str, Any]:
     """Serial, parallel and overhead seconds that fit the rows' `key`, and what they make of more cores."""
     counts = np.array([max(row["workers"], 1) for row in rows], float)
     shares = np.column_stack([np.ones(len(rows)), 1.0 / counts, [float(row["workers"] > 0) for row in rows]])
-    (serial, parallel, overhead), *_ = np.linalg.lstsq(shares, np.array([row[key] for row in rows]), rcond=None)
+    (serial, parallel, overhead), left_over_s = nnls(shares, np.array([row[key] for row in rows]))
     alone = next(row[key] for row in rows if row["workers"] == 0)
+    tasks = max(row["tasks"] for row in rows)
     predicted = {n: round(float(serial + parallel / n + overhead), 2) for n in _CORES}
     return {
         "of": key,
         "serial_s": round(float(serial), 2),
         "parallel_s": round(float(parallel), 2),
         "overhead_s": round(float(overhead), 2),
+        "overhead_ms_per_task": round(1e3 * float(overhead) / max(tasks, 1), 1),
+        "not_explained_s": round(float(left_over_s), 2),
         "serial_share": round(float(serial / (serial + parallel)), 3),
         "predicted_s": predicted,
         "speed_up": {n: round(alone / each, 2) for n, each in predicted.items()},
