@@ -258,6 +258,17 @@ def test_a_build_from_poses_makes_a_map_of_them(
     assert np.arccos(np.clip(np.einsum("fi,fi->f", up, true_up), -1, 1)).max() < 0.01
 
 
+def test_frames_between_keyframes_lose_the_noise_of_the_file(sample: Sample, recording: Path, tmp_path: Path) -> None:
+    """Pictures place them: noise of 4 cm in every pose is not in the map's trajectory."""
+    rng = np.random.default_rng(4)
+    noisy = [drift @ se3_exp(rng.normal(0, [3e-3] * 3 + [0.04] * 3)) for drift in drifted(sample)]
+    file = written(tmp_path / "p.tum", np.array(noisy), in_seconds(sample))
+    options = BuildOptions(use=SensorSet.STEREO, trajectory=OtherTrajectory(file, "tum"), threads=1)
+    done = build_map(recording, tmp_path / "maps", "hall", options)
+    assert done.report["keyframes"] < FRAMES / 2
+    assert done.report["ate_rmse_m"] < 0.02
+
+
 def test_half_of_the_way_is_refused_by_name(sample: Sample, recording: Path, tmp_path: Path) -> None:
     write_tum(tmp_path / "half.tum", Trajectory(sample.stamps_ns[:28], drifted(sample)[:28]))
     with pytest.raises(UsageError, match=r"no pose for 33 of 61 frames of ride: \d+\.\d{9}, .* --frames"):
