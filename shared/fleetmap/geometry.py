@@ -4,6 +4,7 @@ A transform is a (4, 4) float64 matrix named `target_from_source`. Tangent vecto
 (rx, ry, rz, tx, ty, tz), radians and metres. Quaternions are `quat_wxyz`, unit, w >= 0.
 """
 
+from collections.abc import Iterable
 from math import sqrt
 from typing import Any
 
@@ -179,3 +180,15 @@ def rotation_between_vectors(source: Array, target: Array) -> Array:
         axis = np.cross(a, other)
         return so3_exp(np.pi * axis / np.linalg.norm(axis))
     return so3_exp(np.arctan2(sine, cosine) * axis / sine)
+
+
+def inside_rings(points: Array, rings: Iterable[Array]) -> NDArray[np.bool_]:
+    """(N,) whether points (N, 2) are inside, by the even-odd rule over all rings: (V, 2) corners, the first not repeated at the end."""
+    inside = np.zeros(len(points), bool)
+    x, y = points[:, :1], points[:, 1:]
+    for ring in rings:
+        (x0, y0), (x1, y1) = ring.T, np.roll(ring, -1, axis=0).T
+        crosses = (y0 > y) != (y1 > y)
+        left = x < x0 + (y - y0) / np.where(y1 == y0, 1.0, y1 - y0) * (x1 - x0)
+        inside ^= (np.count_nonzero(crosses & left, axis=1) % 2).astype(bool)
+    return inside

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import UsageError
-from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.geometry import Array, inside_rings, se3_inverse, transform_points
 from fleetmap.mapformat.building import BuildingFrame
 
 AREAS = "areas"
@@ -69,14 +69,7 @@ class Area:
 
     def holds(self, points_m: Array) -> NDArray[np.bool_]:
         """(N,) of points (N, 2)."""
-        inside = np.zeros(len(points_m), bool)
-        x, y = points_m[:, :1], points_m[:, 1:]
-        for ring in self.rings:
-            (x0, y0), (x1, y1) = ring.T, np.roll(ring, -1, axis=0).T
-            crosses = (y0 > y) != (y1 > y)
-            left = x < x0 + (y - y0) / np.where(y1 == y0, 1.0, y1 - y0) * (x1 - x0)
-            inside ^= (np.count_nonzero(crosses & left, axis=1) % 2).astype(bool)
-        return inside
+        return inside_rings(points_m, self.rings)
 
 
 @dataclass(frozen=True, slots=True)
