@@ -264,7 +264,13 @@ class _Judge:
 
 
 def _refined(ends: NDArray[np.complex128], points: NDArray[np.complex128], place: _Place, *, is_free: bool) -> _Place:
-    """Iterated least squares, landmark to nearest line, with Tukey's weights and a shrinking gate."""
+    """Iterated least squares, landmark to nearest line, with Tukey's weights and a shrinking gate.
+
+    Turn and scale are about the middle of the chosen landmarks and lines, so that neither looks like a shift far from the origin.
+    Damped by how near the place is known before: what the chosen lines do not tell, as the shift along parallel ones, stays as it is.
+    """
+    known = np.array([_OTHER_M, _OTHER_M, _OTHER_RAD, _OTHER_SCALE][: 4 if is_free else 3])
+    damping = np.diag((_NEAR_M / known) ** 2)
     starts, along = ends[:, 0], ends[:, 1] - ends[:, 0]
     lengths = np.abs(along)
     unit = along / np.maximum(lengths, 1e-12)
@@ -283,14 +289,16 @@ def _refined(ends: NDArray[np.complex128], points: NDArray[np.complex128], place
             return place
         normals = 1j * unit[nearest[chosen]]
         weights = (1 - (left_m[chosen] / gate_m) ** 2) ** 2
-        turned = 1j * place.turn * points[chosen]
+        middle, drawn = points[chosen].mean(), starts[nearest[chosen]].mean()
+        turned = 1j * place.turn * (points[chosen] - middle)
         columns = [normals.real, normals.imag, (np.conj(normals) * turned).real]
         if is_free:
-            columns.append(-place.scale * (np.conj(normals) * starts[nearest[chosen]]).real)
+            columns.append(-place.scale * (np.conj(normals) * (starts[nearest[chosen]] - drawn)).real)
         jacobian = np.stack(columns, axis=1)
-        sizes = np.linalg.norm(jacobian, axis=0) + 1e-12
-        weighted = jacobian / sizes * weights[:, None]
-        step = -np.linalg.lstsq(weighted.T @ (jacobian / sizes), weighted.T @ left_m[chosen], rcond=1e-10)[0] / sizes
+        weighted = jacobian * weights[:, None]
+        step = -np.linalg.solve(weighted.T @ jacobian + damping, weighted.T @ left_m[chosen])
         scale = place.scale * float(np.exp(step[3])) if is_free else place.scale
-        place = _Place(place.turn * complex(np.exp(1j * step[2])), place.shift + complex(step[0], step[1]), scale)
+        turn = place.turn * complex(np.exp(1j * step[2]))
+        about = complex((place.turn - turn) * middle + (scale - place.scale) * drawn)
+        place = _Place(turn, place.shift + complex(step[0], step[1]) + about, scale)
     return place

@@ -9,6 +9,7 @@ from mapserver.floor_plan.pins import Pin
 from mapserver.floor_plan.plan_file import PlanFile
 from mapserver.floor_plan.walls import fit_walls
 
+pytestmark = pytest.mark.filterwarnings("error")  # a step that lines do not tell would overflow
 # x0 y0 x1 y1 in metres of the building before it is turned
 HALL = [
     (0, 0, 60, 0), (60, 0, 60, 25), (60, 25, 38, 25), (38, 25, 38, 40), (38, 40, 0, 40), (0, 40, 0, 0),
