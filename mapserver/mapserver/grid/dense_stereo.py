@@ -11,7 +11,8 @@ from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 
 DENSE_SIGMA_PX = 0.3  # of a disparity of the matcher on textured surfaces
-_NEAREST_M, _BLOCK_PX, _FRACTIONS = 0.6, 5, 16
+BLOCK_PX = 5
+_NEAREST_M, _FRACTIONS = 0.6, 16
 _MIN_TEXTURE, _TEXTURE_PX = 1.5, 9  # mean horizontal gradient in grey levels, of a square around the pixel
 _FLOOR_REACH_M, _FLOOR_BIN_M, _MIN_FLOOR_POINTS = 4.0, 0.02, 400
 _FLOOR_APART_M, _FLOOR_SHARE = 0.05, 0.6
@@ -28,11 +29,11 @@ def dense_disparity(
         return frame.disparity_px, settings.depth_sigma_px
     assert frame.right is not None
     nearest_px = min(camera.focal_px * camera.baseline_m / _NEAREST_M, 0.4 * camera.width_px)
-    smooth = _BLOCK_PX * _BLOCK_PX
+    smooth = BLOCK_PX * BLOCK_PX
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=16 * int(np.ceil(nearest_px / 16)),
-        blockSize=_BLOCK_PX,
+        blockSize=BLOCK_PX,
         P1=8 * smooth,
         P2=32 * smooth,
         disp12MaxDiff=1,

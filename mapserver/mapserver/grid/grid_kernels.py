@@ -23,21 +23,24 @@ MAX_HIT_SIGMA_M = 0.08  # of the depth: beyond, points say only what is free bef
 _CLEAR_SIGMAS = 3.0  # and a cell: so far before a point its ray no longer proves a voxel free
 _MIN_POINTS = 6  # of a view in a voxel that it hits
 _MOST = 255
+PASSED, HIDDEN = 1, 2
 
 Counts = NDArray[np.uint8]
 
 
 @kernel
 def cast_view(
-    disparity_px: NDArray[np.float32], sigma_px: float, lens: Array, map_from_cam: Array, camera: Array, points: NDArray[np.uint16],
-    passes: Counts, heights: Counts,
+    disparity_px: NDArray[np.float32], nearest_px: NDArray[np.float32], sigma_px: float, lens: Array, map_from_cam: Array, camera: Array,
+    was_free: Counts, points: NDArray[np.uint16], looks: Counts, heights: Counts,
 ) -> None:  # fmt: skip
     """Fills the window of one view, which comes as zeros.
 
-    disparity_px (H, W), NaN unknown, with standard deviation sigma_px. lens (4,) as of StereoCamera. map_from_cam (3, 3) rotation.
-    camera (3,): its x and y in cells of the window, and its height over the floor in metres. points (R, C, SLICES): pixels
-    in each voxel; passes (R, C, SLICES): 1 where a ray went through, up to a clear distance before its point, and to the floor
-    itself. heights (R, C, 2): codes of the lowest and the highest of the points in hit voxels and on the floor.
+    disparity_px (H, W), NaN unknown, with standard deviation sigma_px; nearest_px (H, W): the largest around each, beyond whose
+    depth nothing is proved free. lens (4,) as of StereoCamera. map_from_cam (3, 3) rotation. camera (3,): its x and y in cells of
+    the window, and its height over the floor in metres. was_free (R, C): bits of the voxels that were free before this recording,
+    and all around them. points (R, C, SLICES): pixels in each voxel. looks (R, C, SLICES): PASSED where a ray went through, up to a
+    clear distance before its point, and to the floor itself; HIDDEN behind points where nothing was before. heights (R, C, 2): codes
+    of the lowest and the highest of the points in hit voxels and on the floor.
     Cells of a ray: Amanatides and Woo 1987; a voxel is that of the ray's height in the middle of its way through a cell.
     """
     rows, columns = disparity_px.shape
@@ -52,12 +55,15 @@ def cast_view(
             if is_near and not is_floor:
                 row, column, level = int(np.floor(end[1])), int(np.floor(end[0])), int((end[2] - FLOOR_M) / SLICE_M)
                 inside = 0 <= row < points.shape[0] and 0 <= column < points.shape[1]
-                if inside and level < SLICES and points[row, column, level] < 65535:
-                    points[row, column, level] += 1
+                if inside and level < SLICES:
+                    points[row, column, level] += points[row, column, level] < 65535
+                    if v % RAY_STRIDE == 0 and u % RAY_STRIDE == 0 and was_free[row, column] >> level & 1:
+                        _walk(camera, end, (1.0, np.inf), HIDDEN, looks)
             if v % RAY_STRIDE == 0 and u % RAY_STRIDE == 0:
                 clear_m = 0.0 if is_near and is_floor else _CLEAR_SIGMAS * sigma_m + CELL_M
-                if clear_m < depth_m:
-                    _pass(camera, end, 1.0 - clear_m / depth_m, passes)
+                free_m = min(depth_m - clear_m, lens[3] / nearest_px[v, u])
+                if free_m > 0.0:
+                    _walk(camera, end, (0.0, free_m / depth_m), PASSED, looks)
     for v in range(0, rows, HIT_STRIDE):
         for u in range(0, columns, HIT_STRIDE):
             if not _point(disparity_px[v, u], u, v, lens, map_from_cam, camera, end):
@@ -90,8 +96,9 @@ def _point(disparity_px: float, u: int, v: int, lens: Array, map_from_cam: Array
 
 
 @inner_kernel
-def _pass(camera: Array, end: Array, until: float, passes: Counts) -> None:
-    """Marks the voxels of a ray from camera to end, of which the share `until` is clear."""
+def _walk(camera: Array, end: Array, shares: tuple[float, float], mark: int, looks: Counts) -> None:
+    """Marks the voxels of a ray from camera to end between these shares of its length, which may lie behind its end."""
+    first, until = shares
     along_x, along_y, rise_m = end[0] - camera[0], end[1] - camera[1], end[2] - camera[2]
     column, row = int(np.floor(camera[0])), int(np.floor(camera[1]))
     step_x, step_y = (1 if along_x > 0 else -1), (1 if along_y > 0 else -1)
@@ -100,12 +107,14 @@ def _pass(camera: Array, end: Array, until: float, passes: Counts) -> None:
     next_x = (column + (1 if step_x > 0 else 0) - camera[0]) / along_x if along_x != 0.0 else np.inf
     next_y = (row + (1 if step_y > 0 else 0) - camera[1]) / along_y if along_y != 0.0 else np.inf
     begun = 0.0
-    while begun < until and 0 <= row < passes.shape[0] and 0 <= column < passes.shape[1]:
+    while begun < until and 0 <= row < looks.shape[0] and 0 <= column < looks.shape[1]:
         ended = min(next_x, next_y, until)
         height_m = camera[2] + 0.5 * (begun + ended) * rise_m
+        if begun > 1.0 and height_m < 0.0:
+            return
         level = int((height_m - FLOOR_M) / SLICE_M) if height_m >= FLOOR_M else 0
-        if level < SLICES:
-            passes[row, column, level] = 1
+        if level < SLICES and begun >= first:
+            looks[row, column, level] |= mark
         if next_x < next_y:
             begun, column, next_x = next_x, column + step_x, next_x + each_x
         else:
@@ -114,8 +123,8 @@ def _pass(camera: Array, end: Array, until: float, passes: Counts) -> None:
 
 @kernel
 def add_view(
-    points: NDArray[np.uint16], passes: Counts, heights: Counts, corner: NDArray[np.int64], tile_hits: Counts, tile_passes: Counts,
-    tile_heights: Counts,
+    points: NDArray[np.uint16], looks: Counts, heights: Counts, corner: NDArray[np.int64], tile_hits: Counts, tile_passes: Counts,
+    tile_hidden: Counts, tile_heights: Counts,
 ) -> None:  # fmt: skip
     """Adds a window to a tile (N, N, ...) whose cell (0, 0) is the window's cell `corner` (row, column); counts stop at 255.
 
@@ -129,8 +138,10 @@ def add_view(
             for level in range(SLICES):
                 if points[r, c, level] >= _MIN_POINTS:
                     tile_hits[row, column, level] = min(tile_hits[row, column, level] + 1, _MOST)
-                elif passes[r, c, level]:
+                elif looks[r, c, level] & PASSED:
                     tile_passes[row, column, level] = min(tile_passes[row, column, level] + 1, _MOST)
+                elif looks[r, c, level] & HIDDEN:
+                    tile_hidden[row, column, level] = min(tile_hidden[row, column, level] + 1, _MOST)
             low, high = heights[r, c, 0], heights[r, c, 1]
             if low:
                 known = tile_heights[row, column]

@@ -1,8 +1,9 @@
 """The grid of a site: what surveys saw of each cell, tile by tile, and what it is for a robot of some height."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,11 +11,13 @@ from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3
 from fleetmap.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from fleetmap.sensors.rectification import StereoCamera
+from mapserver.grid.dense_stereo import BLOCK_PX
 from mapserver.grid.grid_kernels import (
     CELL_M,
     FLOOR_M,
     HEIGHT_STEP_M,
     LOWEST_M,
+    RAY_STRIDE,
     SLICE_M,
     SLICES,
     Counts,
@@ -29,6 +32,8 @@ _RANGE_CELLS = 160  # of a view
 # A view that hits a voxel counts as two that pass it, since passes also come of its rim. What was known stays until two views more
 # speak against it, and is unknown between that and what decides: into a slot that was emptied few views look, and one night must do.
 _HIT, _OCCUPIED, _FREE, _AGAINST = 2, 4, 4, 2
+# A pixel's depth may be that of anything in the block that was matched, and its ray stands for the pixels up to the next one.
+_REACH_PX = (BLOCK_PX + RAY_STRIDE) // 2
 _WIDTH_M, _STEP_M = 0.5, 1.5  # of what carries the camera; and between keyframes of one drive
 _SAME_STEPS = 10  # heights that differ by less stay as they were
 _MAX_CELLS = 1 << 25
@@ -38,30 +43,38 @@ Tiles = dict[tuple[int, int], Counts]
 
 @dataclass(frozen=True, slots=True)
 class SessionViews:
-    """Counts of the views of one recording, by tile: hits and passes (N, N, SLICES), heights (N, N, 4)."""
+    """Counts of the views of one recording, by tile: hits, passes, hidden (N, N, SLICES) and heights (N, N, 4).
 
-    tiles: dict[tuple[int, int], tuple[Counts, Counts, Counts]] = field(default_factory=dict)
+    before: what was known. Hidden is what lies behind a thing that came since: it may be as deep as nobody can see.
+    """
+
+    before: Mapping[tuple[int, int], Counts] = field(default_factory=dict)
+    tiles: dict[tuple[int, int], tuple[Counts, Counts, Counts, Counts]] = field(default_factory=dict)
 
     def add(
         self, disparity: tuple[NDArray[np.float32], float], camera: StereoCamera, map_from_cam: Array, floor_m: float
     ) -> None:
         """One view. disparity: as of `dense_disparity`; floor_m: how far below the camera the floor is."""
         size = 2 * _RANGE_CELLS + 1
-        points, passes = np.zeros((size, size, SLICES), np.uint16), np.zeros((size, size, SLICES), np.uint8)
+        points, looks = np.zeros((size, size, SLICES), np.uint16), np.zeros((size, size, SLICES), np.uint8)
         heights = np.zeros((size, size, 2), np.uint8)
         at_cells = map_from_cam[:2, 3] / CELL_M
         corner = np.floor(at_cells).astype(np.int64) - _RANGE_CELLS
         place = np.array([*(at_cells - corner), floor_m])
         turn = np.ascontiguousarray(map_from_cam[:3, :3])
-        cast_view(*disparity, camera.lens, turn, place, points, passes, heights)
-        first, last = corner // TILE_CELLS, (corner + size - 1) // TILE_CELLS
-        for x in range(int(first[0]), int(last[0]) + 1):
-            for y in range(int(first[1]), int(last[1]) + 1):
+        px, sigma_px = disparity
+        block = np.ones((2 * _REACH_PX + 1, 2 * _REACH_PX + 1), np.uint8)
+        nearest_px = np.asarray(cv2.dilate(np.nan_to_num(px), block), np.float32)
+        parts, was_free = list(_parts(corner, size)), np.zeros((size, size), np.uint8)
+        for tile, in_tile, in_window in parts:
+            if tile in self.before:
+                was_free[in_window] = self.before[tile][in_tile][..., 1]
+        was_free = _all_around(was_free)
+        cast_view(px, nearest_px, sigma_px, camera.lens, turn, place, was_free, points, looks, heights)
+        for (x, y), _, in_window in parts:
+            if looks[in_window].any() or points[in_window].any():
                 start = np.array([y * TILE_CELLS - corner[1], x * TILE_CELLS - corner[0]])
-                low, high = np.maximum(start, 0), start + TILE_CELLS
-                part = slice(low[0], high[0]), slice(low[1], high[1])
-                if passes[part].any() or points[part].any():
-                    add_view(points, passes, heights, start, *self._tile(x, y))
+                add_view(points, looks, heights, start, *self._tile(x, y))
 
     def add_path(self, cameras_map: Array, floor_m: float) -> None:
         """The way of the camera (K, 2 or more): what carries it has been there, as wide as a person and as high as the camera."""
@@ -78,23 +91,47 @@ class SessionViews:
             passes = self._tile(x, y)[1]
             passes[mine[:, 1], mine[:, 0], :levels] = np.maximum(passes[mine[:, 1], mine[:, 0], :levels], _FREE)
 
-    def _tile(self, x: int, y: int) -> tuple[Counts, Counts, Counts]:
+    def _tile(self, x: int, y: int) -> tuple[Counts, Counts, Counts, Counts]:
         if (x, y) not in self.tiles:
-            shapes = ((SLICES,), (SLICES,), (4,))
-            hits, passes, heights = (np.zeros((TILE_CELLS, TILE_CELLS, *shape), np.uint8) for shape in shapes)
-            self.tiles[x, y] = hits, passes, heights
+            hits, passes, hidden = (np.zeros((TILE_CELLS, TILE_CELLS, SLICES), np.uint8) for _ in range(3))
+            self.tiles[x, y] = hits, passes, hidden, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8)
         return self.tiles[x, y]
 
 
-def updated(before: Mapping[tuple[int, int], Counts], views: SessionViews) -> Tiles:
-    """The tiles with what a session saw; what it did not see stays as it was."""
-    tiles = dict(before)
-    for place, (hits, passes, heights) in views.tiles.items():
-        old = before.get(place, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8))
+_Part = tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]
+
+
+def _parts(corner: NDArray[np.int64], size: int) -> Iterator[_Part]:
+    """The tiles that a window of so many cells each way meets: place, the part of the tile, the part of the window (rows, columns)."""
+    first, last = corner // TILE_CELLS, (corner + size - 1) // TILE_CELLS
+    for x in range(int(first[0]), int(last[0]) + 1):
+        for y in range(int(first[1]), int(last[1]) + 1):
+            start = np.array([y * TILE_CELLS - corner[1], x * TILE_CELLS - corner[0]])
+            low, high = np.maximum(start, 0), np.minimum(start + TILE_CELLS, size)
+            tile, window = (
+                tuple(slice(*ends) for ends in zip(low - off, high - off, strict=True)) for off in (start, 0)
+            )
+            yield (x, y), tile, window  # type: ignore[misc]
+
+
+def _all_around(bits: Counts) -> Counts:
+    """(R, C) the bits that a cell and its eight neighbours share; none at the border."""
+    for axis in (0, 1):
+        bits = bits & np.roll(bits, 1, axis) & np.roll(bits, -1, axis)
+    bits[[0, -1]], bits[:, [0, -1]] = 0, 0
+    return bits
+
+
+def updated(views: SessionViews) -> Tiles:
+    """The tiles with what a session saw; what it did not see stays as it was, but behind what came since."""
+    tiles = dict(views.before)
+    for place, (hits, passes, hidden, heights) in views.tiles.items():
+        old = views.before.get(place, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8))
         was_occupied, was_free = (np.unpackbits(old[..., i, None], axis=-1, bitorder="little") > 0 for i in (0, 1))
         score = _HIT * hits.astype(np.int16) - passes
         occupied = (score >= _OCCUPIED) | (was_occupied & (score > -_AGAINST))
-        free = ~occupied & ((score <= -_FREE) | (was_free & (score < _AGAINST)))
+        is_hidden = (hidden >= _AGAINST) & (score > -_AGAINST)
+        free = ~occupied & ((score <= -_FREE) | (was_free & (score < _AGAINST) & ~is_hidden))
         bits = [np.packbits(mask, axis=-1, bitorder="little")[..., 0] for mask in (occupied, free)]
         low, high = (_height(old[..., 2 + i], heights[..., 1 + 2 * i]) for i in (0, 1))
         # What stood there in some views alone has left no voxel.

@@ -31,15 +31,15 @@ def grow_grid(
     """The tiles after all sessions, in their order, and by name why a recording adds nothing."""
     tiles, without = dict(before), {}
     for session in sessions:
-        views = _views(session, settings)
+        views = _views(session, settings, tiles)
         if isinstance(views, str):
             without[session.name] = views
         else:
-            tiles = updated(tiles, views)
+            tiles = updated(views)
     return tiles, without
 
 
-def _views(session: GridSession, settings: StereoSettings) -> SessionViews | str:
+def _views(session: GridSession, settings: StereoSettings, before: Tiles) -> SessionViews | str:
     survey, camera = session.survey, session.survey.state.camera
     if not camera.baseline_m > 0:
         return "one camera measures no depth; a grid needs a stereo pair or a depth camera"
@@ -57,7 +57,7 @@ def _views(session: GridSession, settings: StereoSettings) -> SessionViews | str
     floor_m = floor_distance_m(((disparity, place) for disparity, _, place in seen(few)), camera)
     if floor_m is None:
         return "no floor at one height below the camera: it is carried by hand, looks past the floor, or its map is not level"
-    views = SessionViews()
+    views = SessionViews(before)
     for disparity_px, sigma_px, map_from_cam in seen(slice(None)):
         views.add((disparity_px, sigma_px), camera, map_from_cam, floor_m)
     frames = [keyframe.frame_index for keyframe in keyframes]

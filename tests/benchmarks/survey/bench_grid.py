@@ -2,13 +2,17 @@
 
     PYTHONPATH=tests python tests/benchmarks/survey/bench_grid.py SCENARIO:SEED ... [--every 6] [--height 1.1] [--picture FILE.png]
     PYTHONPATH=tests python tests/benchmarks/survey/bench_grid.py SCENARIO:SEED --store DIR --site NAME [--version N] [--day N]
+    PYTHONPATH=tests python tests/benchmarks/survey/bench_grid.py SCENARIO:SEED --nights --work DIR [--next-day 8] [--frames ::2]
 
 Without --store every so many frames of the scenario's first run are rendered and looked at from their true poses: what dense stereo
 and the cells do, without a survey's error. With it the grid of a built version is judged, which must have been built with
---frame-from-ground-truth. A path is planned by A* between two places of the drive, for a robot of 0.3 m radius.
+--frame-from-ground-truth. With --nights recordings of both days go through `mapserver build`, `publish`, `nightly` and `grid export`, and
+a robot fetches both versions. A path is planned by A* between two places of the drive, for a robot of 0.3 m radius.
 """
 
 import argparse
+import subprocess
+import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,37 +23,22 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from benchmarks.common.grid_truth import GridFigures, Mask, compare, in_hall, passable, plan, truth_mask
 from fleetmap.features.settings import StereoSettings
-from fleetmap.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
+from fleetmap.occupancy_grid import FREE, OCCUPIED, OccupancyGrid, read_grid
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
+from fleetsim.commands import record_order
 from fleetsim.recorder import Order, Session, prepare
 from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m
 from mapserver.grid.grid_codec import encode_grid, grid_of
-from mapserver.grid.grid_kernels import CELL_M
+from mapserver.grid.grid_kernels import CELL_M, FLOOR_M, SLICE_M
 from mapserver.grid.site_grid import TILE_CELLS, SessionViews, Tiles, occupancy, updated
 from mapserver.store import MapStore
 
 RADIUS_M = 0.3
 
 
-def kept_views(session: Session, every: int, folder: Path | None) -> SessionViews:
-    """As `views_from_truth`, from a file of `folder` where it was made before."""
-    if folder is None:
-        return views_from_truth(session, every)
-    order = session.order
-    path = folder / f"{order.scenario}-{order.seed}-{order.day}-{every}.npz"
-    if path.exists():
-        with np.load(path) as kept:
-            places = {tuple(int(v) for v in name.split(",")[:2]) for name in kept}
-            return SessionViews({(x, y): tuple(kept[f"{x},{y},{n}"] for n in range(3)) for x, y in places})
-    views = views_from_truth(session, every)
-    arrays = {f"{x},{y},{n}": array for (x, y), three in views.tiles.items() for n, array in enumerate(three)}
-    np.savez_compressed(path, **arrays)
-    return views
-
-
-def views_from_truth(session: Session, every: int) -> SessionViews:
-    """What the cameras see from where they really are."""
+def views_from_truth(session: Session, every: int, before: Tiles) -> SessionViews:
+    """What the cameras see from where they really are; before: the grid until then."""
     rectifier, seen = Rectifier(session.nominal), []
     shoot_s = look_s = 0.0
     for t in session.frame_times_s[::every]:
@@ -63,7 +52,7 @@ def views_from_truth(session: Session, every: int) -> SessionViews:
     few = seen[:: max(1, len(seen) // 15)]
     floor_m = floor_distance_m([(disparity[0], place) for disparity, place in few], rectifier.camera)
     assert floor_m is not None
-    views, begun_s = SessionViews(), time.process_time()
+    views, begun_s = SessionViews(before), time.process_time()
     for disparity, place in seen:
         views.add(disparity, rectifier.camera, place, floor_m)
     views.add_path(np.array([place[:3, 3] for _, place in seen]), floor_m)
@@ -110,24 +99,73 @@ def judge(grid: OccupancyGrid, session: Session, height_m: float) -> Judged:
     return Judged(figures, len(path), crossed, truth)
 
 
-def judge_night(before: Tiles, after: Tiles, truths: tuple[Mask, Mask], height_m: float) -> tuple[int, int]:
-    """Occupied cells whose stock was moved, one cell and more from what stands there now, and how many are occupied still."""
-    first, second = (in_hall(occupancy(tiles, height_m), truths[0].shape) for tiles in (before, after))
-    around = np.ones((3, 3), bool)
-    moved = (first == OCCUPIED) & binary_dilation(truths[0], around) & ~binary_dilation(truths[1], around)
-    fresh = truths[1] & ~binary_dilation(truths[0], around) & binary_dilation(second == OCCUPIED, around)
+def judge_night(views: SessionViews, after: Tiles, truths: tuple[Mask, Mask], height_m: float) -> tuple[int, int]:
+    """As `judge_moved`, where the second session looked into all that a robot needs; prints how much of the grid changed."""
+    before, looked, levels = views.before, np.zeros(truths[0].shape, bool), int(np.ceil((height_m - FLOOR_M) / SLICE_M))
+    for (x, y), (hits, passes, *_) in views.tiles.items():
+        rows, columns = np.nonzero((hits.astype(int) + passes >= 2)[..., :levels].all(axis=-1))
+        rows, columns = rows + y * TILE_CELLS, columns + x * TILE_CELLS
+        inside = (rows >= 0) & (columns >= 0) & (rows < looked.shape[0]) & (columns < looked.shape[1])
+        looked[rows[inside], columns[inside]] = True
+    moved = judge_moved((occupancy(before, height_m), occupancy(after, height_m)), truths, looked)
     sizes = [len(blob) for tiles in (before, after) for blob in encode_grid(tiles)]
     none = np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8)
     pairs = [(before.get(place, none), cells) for place, cells in after.items()]
     changed = sum(int((old[..., :2] != new[..., :2]).any(axis=-1).sum()) for old, new in pairs)
     known_cells = sum(int(cells[..., :2].any(axis=-1).sum()) for cells in after.values())
+    print(f"  {changed / known_cells:.1%} of the known cells changed; grid of {sum(sizes) // 2} bytes", flush=True)
+    return moved
+
+
+def judge_moved(
+    grids: tuple[OccupancyGrid, OccupancyGrid], truths: tuple[Mask, Mask], looked: Mask | None = None
+) -> tuple[int, int]:
+    """Occupied cells whose stock was moved, one cell and more from what stands there now, and how many are occupied still."""
+    first, second = (in_hall(grid, truths[0].shape) for grid in grids)
+    around = np.ones((3, 3), bool)
+    moved = (first == OCCUPIED) & binary_dilation(truths[0], around) & ~binary_dilation(truths[1], around)
+    every = int(moved.sum())
+    moved &= True if looked is None else looked
+    fresh = truths[1] & ~binary_dilation(truths[0], around) & binary_dilation(second == OCCUPIED, around)
+    count, left = int(moved.sum()), int((moved & (second == OCCUPIED)).sum())
     print(
-        f"  night: of {int(moved.sum())} occupied cells whose stock is gone {int((moved & (second == OCCUPIED)).sum())} are still "
-        f"occupied, {int((moved & (second == FREE)).sum())} are free; {int(fresh.sum())} cells of new stock found; "
-        f"{changed / known_cells:.1%} of the known cells changed; grid of {sum(sizes) // 2} bytes",
+        f"  night: of {count} occupied cells whose stock is gone ({every} with those that were not looked into) {left} are still "
+        f"occupied, {int((moved & (second == FREE)).sum())} are free; {int(fresh.sum())} cells of new stock found",
         flush=True,
     )
-    return int(moved.sum()), int((moved & (second == OCCUPIED)).sum())
+    return count, left
+
+
+def exported_nights(orders: tuple[Order, Order], work: Path, frames: str, height_m: float) -> list[OccupancyGrid]:
+    """The grids that `mapserver grid export` writes after a build of the first order and a night with the second."""
+    store, inbox, config = work / "store", work / "inbox", work / "mapserver.toml"
+    config.write_text("[survey]\noccupancy_grid = true\n")
+    inbox.mkdir(exist_ok=True)
+    where, grids = ("--site", "hall", "--store", str(store)), []
+    given = ("--config", str(config), "--frames", frames)
+    for number, order in enumerate(orders):
+        recording = work / f"{order.scenario}-{order.seed}-{order.day}.mcap"
+        if not recording.exists():
+            record_order(order, recording.with_suffix(".part"), "mcap")
+            recording.with_suffix(".part").rename(recording)
+        if number == 0:
+            mapserver("build", str(recording), *where, *given, "--frame-from-ground-truth")
+            mapserver("publish", *where)
+        else:
+            (inbox / recording.name).symlink_to(recording)
+            mapserver("nightly", *where, *given, "--inbox", str(inbox), "--settle-s", "0")
+        path = work / f"night-{number}.yaml"
+        mapserver("grid", "export", *where, str(path), "--robot-height", str(height_m))
+        grids.append(read_grid(path))
+    return grids
+
+
+def mapserver(*words: str) -> None:
+    """Runs the command, in a process of its own."""
+    begun_s = time.monotonic()
+    done = subprocess.run([sys.executable, "-m", "mapserver.cli", *words], capture_output=True, text=True, check=False)
+    print(f"  mapserver {words[0]}: {time.monotonic() - begun_s:.0f} s; {done.stdout.strip()}", flush=True)
+    assert done.returncode == 0, done.stderr
 
 
 def draw(path: Path, grid: OccupancyGrid, truth: Mask) -> None:
@@ -150,26 +188,37 @@ def main() -> None:
     parser.add_argument("--version", type=int)
     parser.add_argument("--day", type=int, default=0)
     parser.add_argument("--next-day", type=int, default=1, help="day of the second session's stock")
-    parser.add_argument("--work", type=Path, help="folder that keeps what the cameras saw")
+    parser.add_argument("--nights", action="store_true", help="through the commands of the map server")
+    parser.add_argument("--frames", default="::2", help="of the recordings")
+    parser.add_argument("--work", type=Path, help="empty folder for recordings and store")
     options = parser.parse_args()
     for hall in options.halls:
         scenario, _, seed = hall.partition(":")
         print(f"{hall}, robots of {options.height} m", flush=True)
         session = prepare(Order(scenario, seed=int(seed), day=options.day))
+        night = prepare(Order(scenario, seed=int(seed), day=options.next_day))
+        if options.nights:
+            orders = session.order, night.order
+            grids = exported_nights(orders, options.work, options.frames, options.height)
+            judged_nights = [
+                judge(grid, one, options.height) for grid, one in zip(grids, (session, night), strict=True)
+            ]
+            judge_moved((grids[0], grids[1]), (judged_nights[0].truth, judged_nights[1].truth))
+            continue
         if options.store is not None:
             with MapStore.open(options.store, read_only=True) as maps:
                 tiles = grid_of(maps.manifest(options.site, options.version or 1), maps.blob)
         else:
-            tiles = updated({}, kept_views(session, options.every, options.work))
+            tiles = updated(views_from_truth(session, options.every, {}))
         grid = occupancy(tiles, options.height)
         judged = judge(grid, session, options.height)
         if options.picture is not None:
             draw(options.picture, grid, judged.truth)
         if options.store is None:
-            night = prepare(Order(scenario, seed=int(seed), day=options.next_day))
-            after = updated(tiles, kept_views(night, options.every, options.work))
+            views = views_from_truth(night, options.every, tiles)
+            after = updated(views)
             judged_after = judge(occupancy(after, options.height), night, options.height)
-            judge_night(tiles, after, (judged.truth, judged_after.truth), options.height)
+            judge_night(views, after, (judged.truth, judged_after.truth), options.height)
 
 
 if __name__ == "__main__":
