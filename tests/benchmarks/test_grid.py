@@ -3,8 +3,9 @@
 import pytest
 
 from benchmarks.survey.bench_grid import judge, judge_night, views_from_truth
+from fleetmap.version_grid import occupancy
 from fleetsim.recorder import Order, prepare
-from mapserver.grid.site_grid import occupancy, updated
+from mapserver.grid.site_grid import updated
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 HEIGHT_M = 1.1

@@ -13,12 +13,12 @@ import msgspec  # noqa: E402
 import numpy as np  # noqa: E402
 
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_tile, encode_tile  # noqa: E402
+from fleetmap.mapformat.grid_tile import TILE_CELLS  # noqa: E402
 from fleetmap.messages import FailureReport, Thumbnail  # noqa: E402
 from fleetmap.version_file import EXPORT_FORMAT  # noqa: E402
+from fleetmap.version_grid import encode_grid, grid_report  # noqa: E402
 from mapserver import releases  # noqa: E402
 from mapserver.fleet.fleet import Fleet  # noqa: E402
-from mapserver.grid.grid_codec import encode_grid, grid_report  # noqa: E402
-from mapserver.grid.site_grid import TILE_CELLS  # noqa: E402
 from mapserver.quality.figures import Compared, Evidence, ProbeFigures, TrajectoryBreaks  # noqa: E402
 from mapserver.store import DraftContent, MapStore  # noqa: E402
 from mapserver.store.archive import ARCHIVE_FORMAT, encode_archive  # noqa: E402

@@ -136,6 +136,8 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         if told_bus is not None:
             publisher = open_publisher(PublisherInputs(told_bus, site, name, calibration, intake), config.output)
             stack.callback(publisher.close)
+            if server is not None:
+                server.client.takes_grids = publisher.grid_height_m is not None
         fleet_manager: MqttLink | None = None
         if server is not None and config.vda5050.broker is not None:
             fleet_manager = _fleet_manager(config, site, server, caches[0], intake)

@@ -1,6 +1,14 @@
 """Settings of what a robot tells its own programs."""
 
+from typing import Annotated
+
+import msgspec
+
 from fleetmap.config import Section
+from fleetmap.version_grid import FLOOR_M, TOP_M
+
+OF_VERSION = "version"
+"""Value of `map`: the grid that planners get is that of the version which the robot runs."""
 
 
 class OutputSection(Section, frozen=True):
@@ -8,7 +16,8 @@ class OutputSection(Section, frozen=True):
 
     format: str = "messagepack"
     endpoint: str | None = None
-    map: str | None = None
+    map: str = "version"
+    robot_height_m: Annotated[float, msgspec.Meta(gt=FLOOR_M, le=TOP_M)] = 1.1
     autostart: bool = True
     domain: int = 0
     keys: str = "rmw_zenoh"

@@ -8,6 +8,7 @@ from fleetmap.bus import Bus
 from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.messages import EstimateMessage, Placement, encode_message, robot_key
+from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sources.intake import Intake
 from locclient.daemon.output_section import OutputSection
@@ -37,6 +38,13 @@ class Publisher(Protocol):
 
     def alive(self, is_silent: bool) -> None:
         """Says once a second that the robot localizes; is_silent: no frames come."""
+
+    @property
+    def grid_height_m(self) -> float | None:
+        """Height of the robot for whose planners the version's grid is wanted; None where it is not."""
+
+    def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:
+        """The grid of the version that the robot runs now, or why there is none; from any thread."""
 
     def close(self) -> None:
         """Takes back what was declared."""
@@ -68,6 +76,14 @@ class MessagePackPublisher:
 
     def alive(self, is_silent: bool) -> None:
         """See Publisher; the map server hears of the robot's health by other ways."""
+
+    @property
+    def grid_height_m(self) -> float | None:
+        """See Publisher; nobody listens."""
+        return None
+
+    def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:
+        """See Publisher; never called."""
 
     def close(self) -> None:
         """See Publisher."""

@@ -48,7 +48,7 @@ from locclient.daemon.lifecycle import (
     encode_transitions,
     requested,
 )
-from locclient.daemon.output_section import OutputSection
+from locclient.daemon.output_section import OF_VERSION, OutputSection
 from locclient.localization.estimate import Estimate
 from locclient.robot.continuous_odom import PublishedPose
 
@@ -74,7 +74,9 @@ class Ros2Localizer:
     ) -> None:
         """Raises UsageError for names that are none, and FleetmapError for a grid that cannot be read."""
         self._section, self._robot, self._calibration, self._intake = section, robot, calibration, intake
-        self._grid = None if section.map is None else read_grid(Path(section.map))
+        is_file = section.map not in {OF_VERSION, ""}
+        self._grid = read_grid(Path(section.map)) if is_file else None
+        self._map_words = f"file {section.map}" if is_file else "none yet"
         self._state = LifecycleState.ACTIVE if section.autostart else LifecycleState.UNCONFIGURED
         self._lock = threading.Lock()  # of the state
         self._last: tuple[Estimate, PublishedPose] | None = None
@@ -162,7 +164,7 @@ class Ros2Localizer:
     def _diagnosis(self, is_silent: bool) -> Diagnosis:
         estimate = None if self._last is None else self._last[0]
         level, words = _WARN, "no frame yet"
-        values = {"lifecycle": self._state.name.lower()}
+        values = {"lifecycle": self._state.name.lower(), "map": self._map_words}
         if estimate is not None:
             level = _LEVELS.get(estimate.status, _WARN)
             words = f"{estimate.status.value}: {estimate.cause.value}" if estimate.cause else estimate.status.value
@@ -180,6 +182,23 @@ class Ros2Localizer:
         if self._refused:
             values["refused_initial_pose"] = self._refused[0]
         return Diagnosis(level, f"{self._section.node}: localization", words, self._robot, values)
+
+    @property
+    def grid_height_m(self) -> float | None:
+        """See Publisher. A file, also one that `load_map` named, stays in the place of the version's grid."""
+        return self._section.robot_height_m if self._section.map == OF_VERSION else None
+
+    def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:
+        """See Publisher. Without a grid the last one stays on the topic: the map's frame is the same in every version."""
+        if self._map_words.startswith("file "):
+            return
+        self._map_words = why if grid is None else f"grid of version {version}"
+        if grid is None:
+            _log.warning("planners get no new map: %s", why)
+            return
+        self._grid = grid
+        if self._state is LifecycleState.ACTIVE:
+            self._send_latched()
 
     def close(self) -> None:
         """See Publisher."""
@@ -230,13 +249,13 @@ class Ros2Localizer:
     def _load_map(self, request: bytes) -> bytes:
         result, grid = _LOADED, None
         try:
-            grid = _grid_at(decode_text(request))
+            grid = _grid_at(url := decode_text(request))
         except FleetmapError as error:
             _log.warning("load_map: %s", error)
             kinds = {MissingGridError: _NO_MAP, GridImageError: _BAD_IMAGE}
             result = kinds.get(type(error), _BAD_ENTRIES)
         if grid is not None:
-            self._grid = grid
+            self._grid, self._map_words = grid, f"file {url}"
             if self._state is LifecycleState.ACTIVE:
                 self._send_latched()
         return encode_loaded_map(time.time_ns(), self._section.map_frame, grid, result)

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from fleetmap.errors import FleetmapError, RecordingError
+from fleetmap.errors import FleetmapError, LinkError, RecordingError
 from fleetmap.messages import RobotHealth, WantedVersion, encode_message
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import Source
@@ -85,6 +85,7 @@ class Runtime:
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
         self._cache_faults = 0
         self._fetched_again: set[str] = set()
+        self._shown_grid: WantedVersion | None = None
         self._refused_tiles: dict[str, dict[Cell, str]] = {}
 
     def stop(self) -> None:
@@ -228,6 +229,7 @@ class Runtime:
         bound = shared.bound
         while server is not None and server.fetched:
             version = server.fetched.popleft()
+            self._shown_grid = None if version == self._shown_grid else self._shown_grid
             self._offers[version.manifest_sha256 or ""] = version
             loader.retry_refused(version)
         held = list(shared.held)
@@ -243,9 +245,29 @@ class Runtime:
             if loaded is not None:
                 shared.loaded.append(replace(loaded, is_offer=version not in held))
             self._note_refused_tiles(version)
+        if held:
+            self._show_grid(held[0])
         loader.keep_only(wanted)
         known = {version.manifest_sha256 or "" for version in wanted}
         self._refused_tiles = {sha256: cells for sha256, cells in self._refused_tiles.items() if sha256 in known}
+
+    def _show_grid(self, version: WantedVersion) -> None:
+        """Gives planners the grid of the confirmed version. What an older client did not fetch with it is fetched now, once."""
+        publisher = self._parts.publisher
+        height_m = None if publisher is None else publisher.grid_height_m
+        if publisher is None or height_m is None or version == self._shown_grid:
+            return
+        self._shown_grid, grid, why = version, None, ""
+        try:
+            grid = self._parts.tile_loader.grid(version, height_m)
+        except FleetmapError as error:
+            why = str(error)
+            key = f"grid {version.manifest_sha256}"
+            if isinstance(error, LinkError) and self._parts.server is not None and key not in self._fetched_again:
+                self._fetched_again.add(key)
+                self._parts.server.refetch.append(version)
+                return
+        publisher.show_grid(version.version or 0, grid, why)
 
     def _note_unusable(self, version: WantedVersion, reason: str) -> None:
         """A version without manifest or any tile is fetched again, once, and dropped where there is no server."""

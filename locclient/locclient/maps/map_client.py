@@ -1,6 +1,8 @@
 """A robot's client of the map server: maps through a cache, acknowledgements and reports."""
 
+import logging
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from fleetmap.bus import Bus, Handle
@@ -28,6 +30,7 @@ from fleetmap.messages import (
     robot_key,
 )
 from fleetmap.trust import TrustedMap
+from fleetmap.version_grid import grid_blobs, grid_index
 from locclient.maps.chunked_download import ChunkReader
 from locclient.maps.map_source import (
     FetchedTiles,
@@ -39,6 +42,8 @@ from locclient.maps.map_source import (
     collect_tiles,
 )
 from locclient.maps.tile_cache import TileCache
+
+_log = logging.getLogger(__name__)
 
 
 class MapClient(MapSource):
@@ -58,6 +63,7 @@ class MapClient(MapSource):
         self._timeout_s = timeout_s
         self._chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
         self._trust: TrustedMap | None = None
+        self.takes_grids = False  # of planners, where versions have them; a robot localizes without
         self._begun = ""  # the manifest's address of the version that was admitted last
 
     def require(self, trust: TrustedMap | None) -> None:
@@ -142,11 +148,14 @@ class MapClient(MapSource):
         for entry in manifest.tiles:
             # Decoded to check it, and not kept: a large site is larger than a robot's memory.
             checked_tile(entry, manifest.tile_size_m, self._tile_blob(entry, bases))
+        if self.takes_grids:
+            self._fetch_grid(manifest)
         return manifest
 
     def activate(self, manifest: Manifest, wanted: WantedVersion) -> None:
         """Makes a fetched version the one that the robot starts with; raises StoreError where a piece of it is missing."""
-        self._cache.activate(self._site, manifest.version, _addresses(manifest, wanted))
+        addresses = [*_addresses(manifest, wanted), *self._grid_addresses(manifest)]
+        self._cache.activate(self._site, manifest.version, addresses)
 
     # --- contents of a version ----------------------------------------------------------------------------------------
 
@@ -185,6 +194,38 @@ class MapClient(MapSource):
                 raise
 
         return collect_tiles(manifest, cells, blob)
+
+    def _fetch_grid(self, manifest: Manifest) -> None:
+        """A version without its grid is as good for the robot as any; what is missing is missing for planners."""
+        bases: dict[tuple[int, int], str] = {}
+        with suppress(LinkError, MapFormatError):
+            active = self._cache.active(self._site)
+            before = None if active is None else self.manifest(active.wanted(self._site))
+            found = [] if before is None else grid_blobs(before, self._cached)
+            bases = {(entry.x, entry.y): entry.sha256 for entry in found}
+        try:
+            for entry in grid_blobs(manifest, self.blob):
+                key = blob_key(self._site, entry.sha256)
+                self._blob(key, entry.sha256, entry.bytes, bases.get((entry.x, entry.y)))
+        except UnreachableError:
+            raise
+        except (LinkError, MapFormatError) as error:
+            _log.warning("version %s comes without its grid for planners: %s", manifest.version, error)
+
+    def _grid_addresses(self, manifest: Manifest) -> list[str]:
+        """Of a grid that is whole in the cache; nothing otherwise."""
+        with suppress(LinkError, MapFormatError):
+            found = [entry.sha256 for entry in grid_blobs(manifest, self._cached)]
+            index = grid_index(manifest)
+            if index is not None and all(sha256 in self._cache for sha256 in found):
+                return [index, *found]
+        return []
+
+    def _cached(self, sha256: str, _: int) -> bytes:
+        data = self._cache.get(sha256)
+        if data is None:
+            raise LinkError(f"{sha256} is not in the cache")
+        return data
 
     def _admitted_bytes(self, wanted: WantedVersion, sha256: str) -> int:
         """The manifest's size by the signed list. All else of a version follows from its manifest, by hash and size.

@@ -6,6 +6,8 @@ from fleetmap.bow import Vocabulary, decode_vocabulary
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import Manifest, Tile
 from fleetmap.messages import WantedVersion
+from fleetmap.occupancy_grid import OccupancyGrid
+from fleetmap.version_grid import grid_of, occupancy
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_source import MapSource
 from locclient.maps.tile_selection import Cell, PositionBound, TileSelectionSettings, select_tiles
@@ -45,6 +47,13 @@ class TileLoader:
             raise FleetmapError(f"no tile of version {version.manifest.version} can be used: {reasons}"[:1000])
         version.cells = cells
         return LoadedMap(wanted, version.manifest, version.vocabulary, dict(version.tiles))
+
+    def grid(self, wanted: WantedVersion, robot_height_m: float) -> OccupancyGrid:
+        """What planners of a robot of this height may drive on by a version's grid.
+
+        Raises StateError for a version without one, saying why, and other FleetmapErrors where it cannot be had or is damaged.
+        """
+        return occupancy(grid_of(self._source.manifest(wanted), self._source.blob), robot_height_m)
 
     def refused(self, wanted: WantedVersion) -> dict[Cell, str]:
         """Tiles of a version that could not be read, with the reasons."""

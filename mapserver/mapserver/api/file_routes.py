@@ -11,10 +11,9 @@ from fleetmap.errors import StateError
 from fleetmap.mapformat import sha256_hex
 from fleetmap.occupancy_grid import map_server_files
 from fleetmap.version_file import ExportHead
+from fleetmap.version_grid import grid_of, occupancy
 from mapserver.api.bytes_response import bytes_response
 from mapserver.api.parameters import RobotHeight, Site, Version
-from mapserver.grid.grid_codec import grid_of
-from mapserver.grid.site_grid import occupancy
 from mapserver.store import MapStore
 
 _DIGESTS_KEPT = 256

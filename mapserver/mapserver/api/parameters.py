@@ -7,8 +7,7 @@ from fastapi import Path, Query
 from pydantic import BaseModel
 
 from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
-from mapserver.grid.grid_kernels import FLOOR_M
-from mapserver.grid.site_grid import TOP_M
+from fleetmap.version_grid import FLOOR_M, TOP_M
 from mapserver.store import FailureFilter
 
 Item = TypeVar("Item")

@@ -19,6 +19,7 @@ from fleetmap.recordings import OpenOptions, Topics
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import SensorSet
+from fleetmap.version_grid import GridReport, Tiles, encode_grid, grid_report
 from mapserver.build.draft_evidence import Before, JudgedSession, examine_draft, replayed_probes
 from mapserver.build.image_spill import ImageSpill
 from mapserver.build.job_lock import Job, recorded_job
@@ -52,8 +53,6 @@ from mapserver.build.trajectory import OtherTrajectory
 from mapserver.build.vocabulary_selection import ChosenVocabulary, choose_vocabulary, judged
 from mapserver.build.worker import open_executor
 from mapserver.build.zones_file import read_zones
-from mapserver.grid.grid_codec import GridReport, encode_grid, grid_report
-from mapserver.grid.site_grid import Tiles
 from mapserver.grid.survey_grid import GridSession, grow_grid
 from mapserver.quality.figures import Evidence, merged
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore

@@ -19,9 +19,9 @@ from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import SensorSet, Trajectory
+from fleetmap.version_grid import Tiles as Grid
+from fleetmap.version_grid import known_grid
 from mapserver.build.sensor_subset import reduced
-from mapserver.grid.grid_codec import known_grid
-from mapserver.grid.site_grid import Tiles as Grid
 from mapserver.quality.directions import tile_directions
 from mapserver.quality.evidence import Probes, examine, trajectory_breaks
 from mapserver.quality.figures import Evidence, RigEvidence, TrajectoryBreaks

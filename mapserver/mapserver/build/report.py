@@ -12,8 +12,8 @@ import numpy as np
 from fleetmap.errors import RecordingError, disk_errors
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Trajectory
+from fleetmap.version_grid import GridReport
 from mapserver.evaluation.trajectory_error import AteResult, absolute_trajectory_error, paired
-from mapserver.grid.grid_codec import GridReport
 from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence, Starts, TileDirections
 from mapserver.quality.probes import lookalike_words

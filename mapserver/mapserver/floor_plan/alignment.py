@@ -10,8 +10,8 @@ from fleetmap.geometry import Array, transform_points
 from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import BuildingFrame
 
-ALIGNMENT, PLAN = "alignment", "plan"
-"""Kinds of a site's files in the store."""
+PLAN = "plan"
+"""Kind of a site's file in the store, which robots do not get."""
 
 
 class Alignment(msgspec.Struct, frozen=True, kw_only=True):

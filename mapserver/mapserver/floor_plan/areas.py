@@ -16,8 +16,6 @@ from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, inside_rings, se3_inverse, transform_points
 from fleetmap.mapformat.building import BuildingFrame
 
-AREAS = "areas"
-"""Kind of a site's file in the store."""
 OUTSIDE = "outside"
 """Key of what no area and no tile holds."""
 

@@ -8,24 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
+from fleetmap.mapformat.grid_tile import CELL_M
 from fleetmap.numerics.kernel import inner_kernel, kernel
+from fleetmap.version_grid import FLOOR_M, HEIGHT_STEP_M, LOWEST_M, SLICE_M, SLICES, Counts
 
-CELL_M = 0.05
-FLOOR_M, SLICE_M, SLICES = (
-    0.10,
-    0.25,
-    8,
-)  # what lies below FLOOR_M is floor: its unevenness, and the noise of its points
 BELOW_M = 0.15  # what lies deeper is a mirror image in the floor, or a wrong disparity
-HEIGHT_STEP_M, LOWEST_M = 0.01, -0.16  # codes of heights: 0 unknown, then steps from LOWEST_M
 HIT_STRIDE, RAY_STRIDE = 2, 4  # pixels
 MAX_HIT_SIGMA_M = 0.08  # of the depth: beyond, points say only what is free before them
 _CLEAR_SIGMAS = 3.0  # and a cell: so far before a point its ray no longer proves a voxel free
 _MIN_POINTS = 6  # of a view in a voxel that it hits
 _MOST = 255
 PASSED, HIDDEN = 1, 2
-
-Counts = NDArray[np.uint8]
 
 
 @kernel

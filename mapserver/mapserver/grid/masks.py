@@ -14,12 +14,10 @@ from fleetmap.errors import UsageError
 from fleetmap.geometry import se3
 from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import BuildingFrame
+from fleetmap.mapformat.grid_tile import CELL_M
 from fleetmap.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from mapserver.floor_plan.areas import Area, read_areas
-from mapserver.grid.grid_kernels import CELL_M
 
-MASKS = "masks"
-"""Kind of a site's file in the store."""
 _MAX_CELLS = 1 << 25
 # A cell is masked where its middle or one of its corners is.
 _WITHIN = np.array([(0.5, 0.5), (0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0)]) * CELL_M

@@ -7,27 +7,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.errors import UsageError
-from fleetmap.geometry import Array, se3
-from fleetmap.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from fleetmap.geometry import Array
+from fleetmap.mapformat.grid_tile import CELL_M, TILE_CELLS
+from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.version_grid import FLOOR_M, HEIGHT_STEP_M, LOWEST_M, SLICE_M, SLICES, Counts, Tiles, whole_grid
 from mapserver.grid.dense_stereo import BLOCK_PX
-from mapserver.grid.grid_kernels import (
-    CELL_M,
-    FLOOR_M,
-    HEIGHT_STEP_M,
-    LOWEST_M,
-    RAY_STRIDE,
-    SLICE_M,
-    SLICES,
-    Counts,
-    add_view,
-    cast_view,
-)
-from mapserver.tiles.tiling import TILE_SIZE_M
+from mapserver.grid.grid_kernels import RAY_STRIDE, add_view, cast_view
 
-TILE_CELLS = round(TILE_SIZE_M / CELL_M)
-TOP_M = FLOOR_M + SLICES * SLICE_M
 _RANGE_CELLS = 160  # of a view
 # A view that hits a voxel counts as two that pass it, since passes also come of its rim. What was known stays until two views more
 # speak against it, and is unknown between that and what decides: into a slot that was emptied few views look, and one night must do.
@@ -36,9 +23,6 @@ _HIT, _OCCUPIED, _FREE, _AGAINST = 2, 4, 4, 2
 _REACH_PX = (BLOCK_PX + RAY_STRIDE) // 2
 _WIDTH_M, _STEP_M = 0.5, 1.5  # of what carries the camera; and between keyframes of one drive
 _SAME_STEPS = 10  # heights that differ by less stay as they were
-_MAX_CELLS = 1 << 25
-Tiles = dict[tuple[int, int], Counts]
-"""By (x, y) of the tile: (N, N, 4) bits of occupied voxels, bits of free ones, codes of the lowest and the highest surface."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,53 +130,14 @@ def _height(old: Counts, new: Counts) -> Counts:
     return np.where((new == 0) | is_same, old, new)
 
 
-def occupancy(tiles: Mapping[tuple[int, int], Counts], robot_height_m: float) -> OccupancyGrid:
-    """What a robot of this height may drive on, in `map`, cut to what is known.
-
-    A cell is occupied where something is between floor and robot, free where all of that was seen to be empty, else unknown.
-    Raises UsageError for a height that the grid does not reach, and for a grid with more cells than a planner's map may have.
-    """
-    levels = int(np.ceil((robot_height_m - FLOOR_M) / SLICE_M - 1e-9))
-    if not 1 <= levels <= SLICES:
-        raise UsageError(
-            f"a robot of {robot_height_m} m; the grid tells heights above {FLOOR_M} m and up to {TOP_M:.2f} m"
-        )
-    below = np.uint8((1 << levels) - 1)
-
-    def states(cells: Counts) -> NDArray[np.int8]:
-        is_free = (cells[..., 1] & below) == below
-        return np.where(cells[..., 0] & below, OCCUPIED, np.where(is_free, FREE, UNKNOWN)).astype(np.int8)
-
-    return _whole({place: states(cells) for place, cells in tiles.items()}, UNKNOWN)
-
-
 def height_map(tiles: Mapping[tuple[int, int], Counts]) -> tuple[Array, OccupancyGrid]:
     """(2, H, W) metres over the floor of the lowest and the highest surface, NaN where none was seen, and where that lies."""
     layers = []
     for layer in (2, 3):
-        codes = _whole({place: cells[..., layer].view(np.int8) for place, cells in tiles.items()}, 0, is_cut=False)
+        codes = whole_grid({place: cells[..., layer].view(np.int8) for place, cells in tiles.items()}, 0, is_cut=False)
         known = codes.cells.view(np.uint8).astype(np.float64)
         layers.append(np.where(known > 0, LOWEST_M + (known - 0.5) * HEIGHT_STEP_M, np.nan))
     return np.stack(layers), codes
-
-
-def _whole(parts: Mapping[tuple[int, int], NDArray[np.int8]], empty: int, *, is_cut: bool = True) -> OccupancyGrid:
-    places = np.array(list(parts))
-    first, last = places.min(axis=0), places.max(axis=0) + 1
-    columns, rows = ((last - first) * TILE_CELLS).tolist()
-    if columns * rows > _MAX_CELLS:
-        raise UsageError(f"the grid has {columns} x {rows} cells; planners' maps have at most {_MAX_CELLS}")
-    cells = np.full((rows, columns), empty, np.int8)
-    for (x, y), part in parts.items():
-        row, column = (y - first[1]) * TILE_CELLS, (x - first[0]) * TILE_CELLS
-        cells[row : row + TILE_CELLS, column : column + TILE_CELLS] = part
-    low = np.zeros(2, np.int64)
-    if is_cut and (cells != empty).any():
-        seen = np.argwhere(cells != empty)
-        low, high = seen.min(axis=0), seen.max(axis=0) + 1
-        cells = np.ascontiguousarray(cells[low[0] : high[0], low[1] : high[1]])
-    corner = first * TILE_SIZE_M + low[::-1] * CELL_M
-    return OccupancyGrid(cells, CELL_M, se3(np.eye(3), np.array([*corner, 0.0])))
 
 
 def area_m2(grid: OccupancyGrid, state: int) -> float:

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
+from fleetmap.version_grid import Counts, Tiles
 from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m
-from mapserver.grid.grid_kernels import Counts
-from mapserver.grid.site_grid import SessionViews, Tiles, updated
+from mapserver.grid.site_grid import SessionViews, updated
 from mapserver.survey.bundle.stereo_yaw_check import disparity_shift
 from mapserver.survey.pipeline import Survey
 

@@ -45,7 +45,7 @@ REPORT_RATES = {"ack": (20, 1.0), "health": (20, 4.0), "pose": (80, 60.0)}
 _CACHED_BYTES = 64_000_000
 _RECENT_PATCHES_BYTES = 32_000_000
 _PATCH_SHARE = 0.7  # of the whole, above which a patch is not worth its work
-_PATCHED_KINDS = {"tile", "manifest"}
+_PATCHED_KINDS = {"tile", "manifest", "grid"}
 _PREPARE_S = 10.0  # in all: longer would keep robots and other background tasks waiting
 
 

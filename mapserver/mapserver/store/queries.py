@@ -10,8 +10,9 @@ import msgspec
 
 from fleetmap.errors import UsageError
 from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest
-from mapserver.floor_plan.alignment import ALIGNMENT, Alignment, decode_alignment
-from mapserver.floor_plan.areas import AREAS, Areas, read_areas
+from fleetmap.mapformat.building import ALIGNMENT, AREAS, FOR_ROBOTS
+from mapserver.floor_plan.alignment import Alignment, decode_alignment
+from mapserver.floor_plan.areas import Areas, read_areas
 from mapserver.quality.figures import Evidence
 from mapserver.store.access.chain import AuditLine, AuditMark
 from mapserver.store.access.operators import OperatorQueries
@@ -35,7 +36,7 @@ from mapserver.store.version_rows import canaries, site_releases
 
 JOB_STATES = ("running", "done", "failed")
 _EVENT = "id, stamp_ns, site, kind, detail, version, actor, reason"
-_SERVED_KINDS = ("manifest", "tile", "vocabulary")
+_SERVED_KINDS = ("manifest", "tile", "vocabulary", "grid", *FOR_ROBOTS)
 
 
 class StoreQueries:
@@ -123,13 +124,16 @@ class StoreQueries:
         return self._blobs.get(check_sha256(sha256))
 
     def served_kind(self, sha256: str, site: str | None = None) -> str | None:
-        """What robots (of a site) may fetch under this address: manifest, tile, vocabulary.
+        """What robots (of a site) may fetch under this address: manifest, tile, vocabulary, grid, or a site's file.
 
         None for everything else: archives, and what only drafts mention.
         """
         rows = self._transactions.query(
             """SELECT kind FROM version_blobs JOIN versions USING (site, version)
-               WHERE sha256 = ?1 AND state <> 'draft' AND (?2 IS NULL OR site = ?2)""",
+               WHERE sha256 = ?1 AND state <> 'draft' AND (?2 IS NULL OR site = ?2)
+               UNION SELECT 'grid' FROM grid_blobs JOIN versions USING (site, version)
+               WHERE sha256 = ?1 AND state <> 'draft' AND (?2 IS NULL OR site = ?2)
+               UNION SELECT kind FROM site_files WHERE sha256 = ?1 AND (?2 IS NULL OR site = ?2)""",
             (check_sha256(sha256), site),
         )
         kinds = {row["kind"] for row in rows}

@@ -6,10 +6,14 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
+from fleetmap.errors import MapFormatError
 from fleetmap.geometry import Array, se3, so3_exp
 
 BUILDING_KEY = "building"
 """In `configuration` of a manifest, where readers of before look over it: format 1 refuses keys that it does not know elsewhere."""
+
+ALIGNMENT, AREAS, MASKS = FOR_ROBOTS = ("alignment", "areas", "masks")
+"""Kinds of what a site keeps beside its versions and robots may have, by the address that the site's signed list names."""
 
 Coordinate = Annotated[float, msgspec.Meta(ge=-1e7, le=1e7)]
 Angle = Annotated[float, msgspec.Meta(ge=-pi - 1e-9, le=pi + 1e-9)]
@@ -32,3 +36,15 @@ class BuildingFrame(msgspec.Struct, frozen=True, kw_only=True):
     def building_from_map(self) -> Array:
         """(4, 4)."""
         return se3(so3_exp(np.array([0.0, 0.0, self.yaw_rad])), np.array([self.x_m, self.y_m, 0.0]))
+
+
+class _Alignment(msgspec.Struct):
+    frame: BuildingFrame
+
+
+def aligned_frame(data: bytes) -> BuildingFrame:
+    """The frame in a site's file of kind ALIGNMENT; MapFormatError for anything else."""
+    try:
+        return msgspec.json.decode(data, type=_Alignment).frame
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise MapFormatError(f"the site's alignment cannot be read ({error}); run `mapserver align` again") from error

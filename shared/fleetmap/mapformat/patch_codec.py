@@ -1,8 +1,8 @@
 """Patches: bytes that make a newer tile or manifest out of the one that a robot has. Magic FMPT, in `container`'s envelope.
 
 docs/map_format.md describes every byte. A tile's patch says what is gone and holds what is new as a small tile; that of
-anything else is the new bytes, compressed with the old ones before them. The old payload stands before a tile's patch too:
-a landmark that moved keeps its descriptor.
+anything else is the new bytes, compressed with the old ones before them, and of a grid tile both payloads. The old payload
+stands before a tile's patch too: a landmark that moved keeps its descriptor.
 
 The result is encoded anew and must have its address, so a robot whose zstd writes other bytes than the server's cannot use
 patches of tiles: it is told so by the error and fetches the tile whole.
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import MapFormatError
 from fleetmap.mapformat.columns import Columns, differences, planes
 from fleetmap.mapformat.container import pack, unpack
+from fleetmap.mapformat.grid_tile import GRID_MAGIC, grid_tile_payload, pack_grid_tile
 from fleetmap.mapformat.names import sha256_hex, verified
 from fleetmap.mapformat.tile import Ids, Tile, check_tile
 from fleetmap.mapformat.tile_codec import (
@@ -34,7 +35,7 @@ from fleetmap.mapformat.tile_codec import (
 PATCH_MAGIC = b"FMPT"
 PATCH_FORMAT = 1
 MAX_PATCH_PAYLOAD_BYTES = MAX_TILE_PAYLOAD_BYTES
-_TILE, _BYTES = 1, 0
+_BYTES, _TILE, _GRID_TILE = 0, 1, 2
 _SMALL_BYTES = 16_384
 _HEAD = struct.Struct("<32s32sBBHIIII")
 _NO_IDS: Ids = np.zeros(0, np.uint32)
@@ -52,6 +53,9 @@ def make_patch(base: bytes, result: bytes) -> bytes:
     addresses = bytes.fromhex(sha256_hex(base)), bytes.fromhex(sha256_hex(result))
     if len(base) + len(result) > MAX_PATCH_PAYLOAD_BYTES:
         raise MapFormatError(f"{len(base)} and {len(result)} bytes are too many for a patch; send them whole")
+    if base[:4] == GRID_MAGIC and result[:4] == GRID_MAGIC:
+        head = _HEAD.pack(*addresses, _GRID_TILE, 0, 0, 0, 0, 0, 0)
+        return pack(PATCH_MAGIC, PATCH_FORMAT, [head, grid_tile_payload(result)], prefix=_prefix(base))
     if base[:4] != TILE_MAGIC or result[:4] != TILE_MAGIC:
         head = _HEAD.pack(*addresses, _BYTES, 0, 0, 0, 0, 0, 0)
         return pack(PATCH_MAGIC, PATCH_FORMAT, [head, result], prefix=_prefix(base))
@@ -96,6 +100,8 @@ def apply_patch(base: bytes, patch: bytes) -> bytes:
     verified(base, base_sha.hex())
     if kind == _BYTES:
         return verified(payload[_HEAD.size :], result_sha.hex())
+    if kind == _GRID_TILE:
+        return verified(pack_grid_tile(payload[_HEAD.size :]), result_sha.hex())
     start = _HEAD.size + 4 * (landmarks + places + 2 * lists + changes)
     if kind != _TILE or number != TILE_FORMAT or start > len(payload):
         raise MapFormatError(f"{what} of kind {kind} for tiles of format {number} cannot be applied; fetch the whole")
@@ -115,6 +121,8 @@ def apply_patch(base: bytes, patch: bytes) -> bytes:
 
 def _prefix(base: bytes) -> bytes:
     """A tile's payload, because nothing repeats in its compressed bytes; anything else as it is."""
+    if base[:4] == GRID_MAGIC:
+        return grid_tile_payload(base)
     return tile_payload(base)[0] if base[:4] == TILE_MAGIC else base
 
 

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from fleetmap.geometry import Array
+from fleetmap.mapformat.grid_tile import CELL_M
 from fleetmap.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from fleetmap.version_grid import FLOOR_M
 from fleetsim.scene.faces import Faces
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.world import World
-from mapserver.grid.grid_kernels import CELL_M, FLOOR_M
 
 _STEP_M = 0.01
 _AROUND = np.ones((3, 3), bool)

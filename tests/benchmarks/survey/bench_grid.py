@@ -23,15 +23,15 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from benchmarks.common.grid_truth import GridFigures, Mask, compare, in_hall, passable, plan, truth_mask
 from fleetmap.features.settings import StereoSettings
+from fleetmap.mapformat.grid_tile import CELL_M, TILE_CELLS
 from fleetmap.occupancy_grid import FREE, OCCUPIED, OccupancyGrid, read_grid
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
+from fleetmap.version_grid import FLOOR_M, SLICE_M, Tiles, encode_grid, grid_of, occupancy
 from fleetsim.commands import record_order
 from fleetsim.recorder import Order, Session, prepare
 from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m
-from mapserver.grid.grid_codec import encode_grid, grid_of
-from mapserver.grid.grid_kernels import CELL_M, FLOOR_M, SLICE_M
-from mapserver.grid.site_grid import TILE_CELLS, SessionViews, Tiles, occupancy, updated
+from mapserver.grid.site_grid import SessionViews, updated
 from mapserver.store import MapStore
 
 RADIUS_M = 0.3

@@ -12,6 +12,7 @@ import pytest
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import RecordingError
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
+from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.daemon.runtime import Runtime, RuntimeParts
@@ -64,12 +65,17 @@ class Listener:
     """Keeps what the robot tells its own programs."""
 
     estimates: list[Estimate] = field(default_factory=list)
+    grids: list[tuple[int, OccupancyGrid | None, str]] = field(default_factory=list)
+    grid_height_m: float | None = None
 
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: np.ndarray) -> None:
         self.estimates.append(estimate)
 
     def alive(self, is_silent: bool) -> None:
         pass
+
+    def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:
+        self.grids.append((version, grid, why))
 
     def close(self) -> None:
         pass
@@ -160,12 +166,15 @@ def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world:
 
 
 def test_a_new_version_is_taken_while_driving(world: World) -> None:
-    robot, listener = robot_world.new_robot(), Listener()
+    """And planners get its grid; of the one before they hear that it has none."""
+    robot, listener = robot_world.new_robot(), Listener(grid_height_m=0.3)
     source = ScriptedSource(list(robot_world.bundles(200)), ready=lambda: robot.running is not None)
     parts = world.parts(source, robot, listener)
+    assert parts.server is not None
+    parts.server.client.takes_grids = True
 
     def publish() -> None:
-        robot_world.save(world.store)
+        robot_world.save(world.store, has_grid=True)
         current = robot_world.wanted(world.store)
         with MemoryBus(world.hub) as server:
             server.publish(robot_key("room", "r1", "wanted"), encode_message(current))
@@ -178,7 +187,11 @@ def test_a_new_version_is_taken_while_driving(world: World) -> None:
     runtime.run()
     assert listener.estimates[-1].map_version == 2
     assert [e.cause for e in listener.estimates[60:] if e.status != "TRACKING"] == []
-    assert parts.server is not None
+    (first, none, why), (second, grid, _) = listener.grids
+    assert (first, none, second) == (1, None, 2)
+    assert "version 1 of site room has no grid" in why
+    assert grid is not None
+    assert ((grid.cells == 100).sum(), (grid.cells == 0).sum()) == (400, 800)
     active = parts.server.client.active()
     assert active is not None
     assert active.version == 2

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fleetmap.mapformat.grid_tile import TILE_CELLS
 from fleetmap.occupancy_grid import read_grid
 from mapserver import releases
-from mapserver.grid.site_grid import TILE_CELLS
 from mapserver.store import MapStore, Retention
 from support.storage.map_samples import save_grid_draft, save_sample_draft
 

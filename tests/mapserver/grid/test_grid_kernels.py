@@ -7,21 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.mapformat.grid_tile import CELL_M
 from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.version_grid import FLOOR_M, SLICE_M, SLICES, Counts, occupancy
 from mapserver.grid.dense_stereo import floor_distance_m
-from mapserver.grid.grid_kernels import (
-    CELL_M,
-    FLOOR_M,
-    HIDDEN,
-    MAX_HIT_SIGMA_M,
-    PASSED,
-    RAY_STRIDE,
-    SLICE_M,
-    SLICES,
-    Counts,
-    cast_view,
-)
-from mapserver.grid.site_grid import SessionViews, height_map, occupancy, updated
+from mapserver.grid.grid_kernels import HIDDEN, MAX_HIT_SIGMA_M, PASSED, RAY_STRIDE, cast_view
+from mapserver.grid.site_grid import SessionViews, height_map, updated
 
 CAMERA = StereoCamera(60.0, 31.5, 23.5, 0.12, 64, 48)
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -8,10 +8,10 @@ import pytest
 
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.mapformat.grid_tile import CELL_M
 from fleetmap.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
-from mapserver.grid.grid_kernels import CELL_M
-from mapserver.grid.site_grid import occupancy
+from fleetmap.version_grid import occupancy
 from mapserver.grid.survey_grid import GridSession, grow_grid
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH
 from support.worlds.box_room import ROOM_M, points_seen, stereo_pair

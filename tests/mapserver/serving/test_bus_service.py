@@ -25,14 +25,18 @@ from fleetmap.messages import (
     part_of,
     robot_key,
 )
+from fleetmap.occupancy_grid import OccupancyGrid
 from locclient.maps.map_client import MapClient
-from locclient.maps.map_source import LocalMapSource
+from locclient.maps.map_source import CachedMap, LocalMapSource
+from locclient.maps.tile_cache import TileCache
+from locclient.maps.tile_loader import TileLoader
+from locclient.maps.tile_selection import TileSelectionSettings
 from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving import bus_service
-from mapserver.store import FailureFilter, MapStore
+from mapserver.store import Actor, FailureFilter, MapStore
 from support.fleet.served_world import World, served_world
-from support.storage.map_samples import random_tile, save_sample_draft
+from support.storage.map_samples import random_tile, save_grid_draft, save_sample_draft
 
 FOREIGN_VOCABULARY = b"other" * 50
 TILE_COLUMNS = (
@@ -62,6 +66,44 @@ def test_a_robot_fetches_everything_once(world: World) -> None:
         "blob",
         "blob",
     ]
+
+
+def test_a_robot_takes_the_grid_with_its_version_and_then_what_changed(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    def ready(seed: int) -> WantedVersion:
+        save_grid_draft(world.store, seed)
+        releases.publish(world.store, "lab", actor=Actor("ada", "a test"), force=True)
+        world.link.bring(world.link.wanted())
+        return world.link.wanted()
+
+    def grid(wanted: WantedVersion) -> OccupancyGrid:
+        cached = CachedMap(TileCache(world.folder.parent / "cache"), "lab")
+        return TileLoader(cached, TileSelectionSettings()).grid(wanted, 1.1)
+
+    with pytest.raises(LinkError, match="not in the cache"):
+        grid(ready(0))  # a robot that nobody plans for does without
+    world.link.takes_grids = True
+    before = world.link.received_bytes
+    first = grid(ready(1))
+    assert (first.cells == 100).any()
+    whole = world.link.received_bytes - before
+    world.counts.clear()
+    second = grid(ready(2))
+    assert (second.cells == 100).sum() < (first.cells == 100).sum()
+    assert ("patch", "ok") in {(what, result) for what, result, _ in world.counts}
+    assert world.link.received_bytes - before - whole < whole
+    # A grid that cannot be had costs the robot nothing else.
+    save_grid_draft(world.store, 3)
+    draft = world.store.manifest("lab", 5)
+    index = str(draft.report["grid"]["sha256"])
+    with pytest.raises(LinkError, match="no published bytes"):
+        world.link.blob(index, 10**6)
+    releases.publish(world.store, "lab", actor=Actor("ada", "a test"), force=True)
+    (world.folder / blob_path(index)).unlink()
+    world.link.bring(world.link.wanted())
+    assert world.link.active().version == 5
+    assert "without its grid" in caplog.text
 
 
 def test_a_store_folder_gives_the_same(world: World) -> None:

@@ -12,8 +12,8 @@ import pytest
 from fleetmap.errors import NewerFormatError
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_manifest, decode_tile, encode_manifest, pack
 from fleetmap.version_file import EXPORT_FORMAT
+from fleetmap.version_grid import known_grid
 from mapserver import releases
-from mapserver.grid.grid_codec import known_grid
 from mapserver.store import Actor, FailureFilter, MapStore
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
 from mapserver.store.migrations import MIGRATIONS

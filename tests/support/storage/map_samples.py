@@ -5,11 +5,11 @@ import numpy as np
 
 from fleetmap.geometry import se3_exp
 from fleetmap.mapformat import CameraEntry, RecordingEntry, Tile
+from fleetmap.mapformat.grid_tile import TILE_CELLS
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
+from fleetmap.version_grid import encode_grid, grid_report
 from mapserver import releases
-from mapserver.grid.grid_codec import encode_grid, grid_report
-from mapserver.grid.site_grid import TILE_CELLS
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.survey.survey_map import SurveyMap
 

@@ -12,10 +12,12 @@ from fleetmap.bow import decode_vocabulary, encode_vocabulary, train_vocabulary
 from fleetmap.features import orb
 from fleetmap.geometry import Array
 from fleetmap.mapformat import CameraEntry, Tile
+from fleetmap.mapformat.grid_tile import TILE_CELLS
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples
 from fleetmap.sources.sensor_bundle import SensorBundle
+from fleetmap.version_grid import encode_grid, grid_report
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap
 from locclient.robot.robot import Robot
@@ -158,17 +160,27 @@ def vocabulary() -> bytes:
     return encode_vocabulary(train_vocabulary(descriptors, 8, 3, np.random.default_rng(0)))
 
 
-def save(store: MapStore, *, site: str = SITE, of: tuple[Tile, ...] | None = None) -> int:
-    """A version of the room, made current."""
+def save(store: MapStore, *, site: str = SITE, of: tuple[Tile, ...] | None = None, has_grid: bool = False) -> int:
+    """A version of the room, made current; has_grid: with three square metres for planners, one of them occupied."""
     camera = rectifier().camera
     entry = CameraEntry(
         focal_px=camera.focal_px, width_px=camera.width_px, height_px=camera.height_px, baseline_m=camera.baseline_m
     )
-    details = msgspec.structs.replace(draft_details(path_m=10.0), tile_size_m=TILE_M, camera=entry)
+    grid: list[bytes] = []
+    if has_grid:
+        cells = np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8)
+        cells[:20, :60, 1], cells[:20, :20, 0] = 0xFF, 1
+        grid = encode_grid({(0, 0): cells})
+    report = {"grid": msgspec.to_builtins(grid_report(grid, {}))} if has_grid else {}
+    details = msgspec.structs.replace(draft_details(path_m=10.0, **report), tile_size_m=TILE_M, camera=entry)
     number = store.save_draft(
         site,
         DraftContent(
-            tiles=list(tiles() if of is None else of), vocabulary=vocabulary(), details=details, archive=b"archive"
+            tiles=list(tiles() if of is None else of),
+            vocabulary=vocabulary(),
+            details=details,
+            archive=b"archive",
+            grid=grid,
         ),
     )
     releases.publish(store, site)

@@ -58,7 +58,8 @@ def align(
     forget: Annotated[bool, typer.Option("--forget", help="Forget the alignment and the plan.")] = False,
 ) -> None:
     """Find where the map lies in the drawing of its building, and keep it; maps that are built from now on carry it."""
-    from mapserver.floor_plan.alignment import ALIGNMENT, PLAN, encode_alignment
+    from fleetmap.mapformat.building import ALIGNMENT
+    from mapserver.floor_plan.alignment import PLAN, encode_alignment
     from mapserver.store import MapStore
 
     named = given.plan is not None or bool(given.pin)

@@ -17,7 +17,8 @@ def import_(
     by: ActorOptions,
 ) -> None:
     """Take the areas of FILE in the place of those that the site has; reports, pages and metrics then speak of them."""
-    from mapserver.floor_plan.areas import AREAS, MAX_AREAS_BYTES
+    from fleetmap.mapformat.building import AREAS
+    from mapserver.floor_plan.areas import MAX_AREAS_BYTES
     from mapserver.store import MapStore
 
     with disk_errors(f"{file} cannot be read", "check the path and its rights", UsageError), file.open("rb") as opened:
@@ -33,7 +34,7 @@ def import_(
 @expand_options
 def remove(where: SiteOptions, by: ActorOptions) -> None:
     """Forget the areas of a site; what was counted for them stays."""
-    from mapserver.floor_plan.areas import AREAS
+    from fleetmap.mapformat.building import AREAS
     from mapserver.store import MapStore
 
     with MapStore.open(where.store) as maps:

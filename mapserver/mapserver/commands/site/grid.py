@@ -34,10 +34,10 @@ def export(
         raise UsageError(f"{file} must end in .yaml")
     import numpy as np
 
+    from fleetmap.mapformat.grid_tile import CELL_M
     from fleetmap.occupancy_grid import FREE, OCCUPIED, write_grid
-    from mapserver.grid.grid_codec import grid_of
-    from mapserver.grid.grid_kernels import CELL_M
-    from mapserver.grid.site_grid import area_m2, height_map, occupancy
+    from fleetmap.version_grid import grid_of, occupancy
+    from mapserver.grid.site_grid import area_m2, height_map
     from mapserver.store import MapStore
 
     with MapStore.open(store, read_only=True) as maps:

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 
 def _masks(maps: "MapStore", site: str) -> "list[Mask]":
-    from mapserver.grid.masks import MASKS, read_masks
+    from fleetmap.mapformat.building import MASKS
+    from mapserver.grid.masks import read_masks
 
     data, alignment = maps.site_file(site, MASKS), maps.alignment(site)
     return [] if data is None else read_masks(data, None if alignment is None else alignment.frame)
@@ -28,8 +29,9 @@ def import_(
     by: ActorOptions,
 ) -> None:
     """Take the masks of FILE in the place of those that the site has; they stay with it across versions."""
+    from fleetmap.mapformat.building import MASKS
     from mapserver.floor_plan.areas import MAX_AREAS_BYTES
-    from mapserver.grid.masks import MASKS, check_on_map, read_masks
+    from mapserver.grid.masks import check_on_map, read_masks
     from mapserver.store import MapStore
 
     with disk_errors(f"{file} cannot be read", "check the path and its rights", UsageError), file.open("rb") as opened:
@@ -46,7 +48,7 @@ def import_(
 @expand_options
 def remove(where: SiteOptions, by: ActorOptions) -> None:
     """Forget the masks of a site."""
-    from mapserver.grid.masks import MASKS
+    from fleetmap.mapformat.building import MASKS
     from mapserver.store import MapStore
 
     with MapStore.open(where.store) as maps:

@@ -1,26 +1,40 @@
-"""The grid as bytes: an index, and one blob for each tile of it; docs/map_format.md describes them."""
+"""The grid of a version: as bytes (an index, and one blob for each tile; docs/map_format.md), and what it is for a robot of some height.
 
-import struct
+A cell is a square column of the map. What lies below FLOOR_M is floor; above stand SLICES voxels of SLICE_M each.
+"""
+
 from collections.abc import Callable, Mapping
 from typing import Annotated
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from fleetmap.errors import MapFormatError, NewerFormatError, StateError
-from fleetmap.mapformat import Manifest, pack, sha256_hex, unpack
+from fleetmap.errors import MapFormatError, NewerFormatError, StateError, UsageError
+from fleetmap.geometry import se3
+from fleetmap.mapformat import Manifest, sha256_hex
+from fleetmap.mapformat.grid_tile import (
+    CELL_M,
+    GRID_FORMAT,
+    TILE_CELLS,
+    TILE_SIZE_M,
+    decode_grid_tile,
+    encode_grid_tile,
+)
 from fleetmap.mapformat.manifest import Positive, Sha256, TileEntry
-from mapserver.grid.grid_kernels import CELL_M, FLOOR_M, HEIGHT_STEP_M, LOWEST_M, SLICE_M, SLICES, Counts
-from mapserver.grid.site_grid import TILE_CELLS, Tiles
-from mapserver.tiles.tiling import TILE_SIZE_M
+from fleetmap.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+
+FLOOR_M, SLICE_M, SLICES = 0.10, 0.25, 8  # the floor's unevenness, and the noise of its points
+TOP_M = FLOOR_M + SLICES * SLICE_M
+HEIGHT_STEP_M, LOWEST_M = 0.01, -0.16  # codes of heights: 0 unknown, then steps from LOWEST_M
+Counts = NDArray[np.uint8]
+Tiles = dict[tuple[int, int], Counts]
+"""By (x, y) of the tile: (N, N, 4) bits of occupied voxels, bits of free ones, codes of the lowest and the highest surface."""
 
 GRID_KEY = "grid"
 """In `report` of a manifest, where readers of before pass over it; it names the index."""
 
-GRID_MAGIC, GRID_FORMAT = b"FMGT", 1
-_HEAD = struct.Struct("<ii")
-_LAYERS, _LEVEL, _MAX_TILES = 4, 12, 1 << 16
-_TILE_BYTES = _HEAD.size + _LAYERS * TILE_CELLS**2
+_MAX_TILES, _MAX_CELLS = 1 << 16, 1 << 25
 
 
 class GridIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -53,8 +67,7 @@ def encode_grid(tiles: Mapping[tuple[int, int], Counts]) -> list[bytes]:
     """The index and then each tile; nothing for a grid without tiles. The same grid gives the same bytes."""
     blobs, entries = [], []
     for (x, y), cells in sorted(tiles.items()):
-        columns = [np.ascontiguousarray(cells[..., layer]).tobytes() for layer in range(_LAYERS)]
-        data = pack(GRID_MAGIC, GRID_FORMAT, [_HEAD.pack(x, y), *columns], level=_LEVEL)
+        data = encode_grid_tile((x, y), cells)
         entries.append(TileEntry(x=x, y=y, sha256=sha256_hex(data), bytes=len(data), landmarks=0))
         blobs.append(data)
     return [msgspec.json.encode(GridIndex(tiles=tuple(entries)), order="deterministic"), *blobs] if blobs else []
@@ -89,6 +102,26 @@ def grid_of(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
     return tiles
 
 
+def grid_index(manifest: Manifest) -> str | None:
+    """Address of the index of a version's grid, None where it has none; errors as of `report_of`."""
+    report = report_of(manifest)
+    return None if report is None else report.sha256
+
+
+def grid_blobs(manifest: Manifest, blob: Callable[[str, int], bytes]) -> list[TileEntry]:
+    """The tiles of a version's grid, none where it has none. blob: the verified bytes of an address, of at most so many bytes.
+
+    Raises MapFormatError where they are more than the manifest says; errors as of `read_index`.
+    """
+    report = report_of(manifest)
+    if report is None or report.sha256 is None:
+        return []
+    index = read_index(blob(report.sha256, report.bytes))
+    if sum(entry.bytes for entry in index.tiles) > report.bytes:
+        raise MapFormatError(f"grid of version {manifest.version}: more than the {report.bytes} bytes of its manifest")
+    return list(index.tiles)
+
+
 def known_grid(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
     """As `grid_of`; no tiles for a version without a grid."""
     report = report_of(manifest)
@@ -117,11 +150,41 @@ def read_index(data: bytes) -> GridIndex:
     return index
 
 
-def decode_grid_tile(data: bytes) -> tuple[tuple[int, int], Counts]:
-    """Place and cells (N, N, 4) of a tile's bytes; errors as of `read_index`. Memory is bounded whatever the bytes say."""
-    _, payload = unpack(GRID_MAGIC, GRID_FORMAT, data, "grid tile", _TILE_BYTES)
-    if len(payload) != _TILE_BYTES:
-        raise MapFormatError(f"grid tile: {len(payload)} bytes, not {_TILE_BYTES}; the bytes are damaged")
-    layers = np.frombuffer(payload, np.uint8, offset=_HEAD.size).reshape(_LAYERS, TILE_CELLS, TILE_CELLS)
-    x, y = _HEAD.unpack_from(payload)
-    return (x, y), np.ascontiguousarray(np.moveaxis(layers, 0, -1))
+def occupancy(tiles: Mapping[tuple[int, int], Counts], robot_height_m: float) -> OccupancyGrid:
+    """What a robot of this height may drive on, in `map`, cut to what is known.
+
+    A cell is occupied where something is between floor and robot, free where all of that was seen to be empty, else unknown.
+    Raises UsageError for a height that the grid does not reach, and for a grid with more cells than a planner's map may have.
+    """
+    levels = int(np.ceil((robot_height_m - FLOOR_M) / SLICE_M - 1e-9))
+    if not 1 <= levels <= SLICES:
+        raise UsageError(
+            f"a robot of {robot_height_m} m; the grid tells heights above {FLOOR_M} m and up to {TOP_M:.2f} m"
+        )
+    below = np.uint8((1 << levels) - 1)
+
+    def states(cells: Counts) -> NDArray[np.int8]:
+        is_free = (cells[..., 1] & below) == below
+        return np.where(cells[..., 0] & below, OCCUPIED, np.where(is_free, FREE, UNKNOWN)).astype(np.int8)
+
+    return whole_grid({place: states(cells) for place, cells in tiles.items()}, UNKNOWN)
+
+
+def whole_grid(parts: Mapping[tuple[int, int], NDArray[np.int8]], empty: int, *, is_cut: bool = True) -> OccupancyGrid:
+    """Tiles (N, N) beside each other in `map`; empty: where none is, and what is cut off at the edges. UsageError for too many cells."""
+    places = np.array(list(parts))
+    first, last = places.min(axis=0), places.max(axis=0) + 1
+    columns, rows = ((last - first) * TILE_CELLS).tolist()
+    if columns * rows > _MAX_CELLS:
+        raise UsageError(f"the grid has {columns} x {rows} cells; planners' maps have at most {_MAX_CELLS}")
+    cells = np.full((rows, columns), empty, np.int8)
+    for (x, y), part in parts.items():
+        row, column = (y - first[1]) * TILE_CELLS, (x - first[0]) * TILE_CELLS
+        cells[row : row + TILE_CELLS, column : column + TILE_CELLS] = part
+    low = np.zeros(2, np.int64)
+    if is_cut and (cells != empty).any():
+        seen = np.argwhere(cells != empty)
+        low, high = seen.min(axis=0), seen.max(axis=0) + 1
+        cells = np.ascontiguousarray(cells[low[0] : high[0], low[1] : high[1]])
+    corner = first * TILE_SIZE_M + low[::-1] * CELL_M
+    return OccupancyGrid(cells, CELL_M, se3(np.eye(3), np.array([*corner, 0.0])))

@@ -6,8 +6,9 @@ import pytest
 
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError
 from fleetmap.mapformat import BlobEntry, Manifest, sha256_hex
-from mapserver.grid.grid_codec import decode_grid_tile, encode_grid, grid_of, grid_report, known_grid, read_index
-from mapserver.grid.site_grid import TILE_CELLS, Tiles
+from fleetmap.mapformat.grid_tile import TILE_CELLS, TILE_SIZE_M, decode_grid_tile
+from fleetmap.version_grid import Tiles, encode_grid, grid_of, grid_report, known_grid, read_index
+from mapserver.tiles import tiling
 from support.storage.map_samples import draft_details
 
 
@@ -35,6 +36,10 @@ def test_bytes_and_back_and_only_what_changed_is_new() -> None:
     changed = dict(tiles)
     changed[0, 0] = tiles[0, 0] ^ 1
     assert len(set(encode_grid(changed)) - set(blobs)) == 2  # the index and one tile
+
+
+def test_its_tiles_are_squares_of_the_maps() -> None:
+    assert TILE_SIZE_M == tiling.TILE_SIZE_M
 
 
 def test_a_version_without_a_grid_says_why() -> None:
