@@ -21,7 +21,7 @@ TIERS = {
         "": "site store server",
         "run": "server store site robot prior cache cache_bytes root identity insecure spool failures",
         "source": "kind sensors calibration endpoint recording device",
-        "output": "format endpoint map autostart",
+        "output": "format endpoint map robot_height_m autostart",
         "topics": "*",
         "vda5050": "broker manufacturer serial_number interface username password_file ca map_id versions download_from "
         "download_token_file download_ca robot_actions factsheet frame",

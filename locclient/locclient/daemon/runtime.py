@@ -124,6 +124,8 @@ class Runtime:
         bundle = self._parts.intake.take(_TAKE_S)
         while shared.loaded:
             robot.use(shared.loaded.popleft())
+        while self._parts.server is not None and self._parts.server.frames:
+            robot.align(self._parts.server.frames.popleft())
         outcome = None
         try:
             outcome = robot.handle(bundle)

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable
 
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
+from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.messages import RobotHealth, WantedVersion
 from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import deliver
@@ -45,6 +46,9 @@ class ServerSync:
         self.changes: deque[VersionChange] = deque()
         self.fetched: deque[WantedVersion] = deque()
         self.refetch: deque[WantedVersion] = deque(maxlen=1)
+        self.frames: deque[BuildingFrame | None] = deque()  # where the map lies in its building, whenever that changes
+        self._frame: BuildingFrame | None = None
+        self._learn_frame()  # as it was kept
         self._offered: set[str] = set()
         self._running = client.active()
         if self._running is not None:
@@ -92,6 +96,7 @@ class ServerSync:
         self._announced.clear()
         wanted = self.client.wanted()
         self._ask_at_s = now_s + _ASK_EVERY_S
+        self._learn_frame()
         sha256 = wanted.manifest_sha256
         if sha256 is None:
             return
@@ -117,6 +122,19 @@ class ServerSync:
         self._offered.add(sha256)
         self.fetched.append(wanted)
         return None
+
+    def _learn_frame(self) -> None:
+        """A site may be aligned anew while its version stays; what cannot be had changes nothing."""
+        try:
+            frame = self.client.building_frame()
+        except UnreachableError:
+            raise
+        except FleetmapError as error:
+            _log.warning("the building's frame stays as it was: %s", error)
+            return
+        if frame != self._frame:
+            self._frame = frame
+            self.frames.append(frame)
 
     def _fetch_again(self) -> None:
         """Fetches damaged or missing pieces of a version that the robot holds."""

@@ -14,8 +14,10 @@ from fleetmap.mapformat import (
     apply_patch,
     check_name,
     decode_manifest,
+    sha256_hex,
     verified,
 )
+from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame, aligned_frame
 from fleetmap.messages import (
     FailureAck,
     PoseMessage,
@@ -43,6 +45,7 @@ from locclient.maps.map_source import (
 )
 from locclient.maps.tile_cache import TileCache
 
+_MAX_ALIGNMENT_BYTES = 1 << 20
 _log = logging.getLogger(__name__)
 
 
@@ -275,6 +278,28 @@ class MapClient(MapSource):
             raise
         except (LinkError, MapFormatError):
             return None
+
+    # --- what a site keeps beside its versions ------------------------------------------------------------------------
+
+    def site_file(self, kind: str, max_bytes: int) -> bytes | None:
+        """What the last fresh signed list names of this kind, or what was kept before; None where the site has none.
+
+        Errors as of `manifest`; what was kept stays.
+        """
+        kept = self._cache.kept_file(self._site, kind)
+        named = None if self._trust is None else self._trust.files
+        if named is None or (kept is not None and sha256_hex(kept) == named.get(kind)):
+            return kept
+        data = None
+        if (sha256 := named.get(kind)) is not None:
+            data = verified(self._chunks.read(blob_key(self._site, sha256), max_bytes=max_bytes), sha256)
+        self._cache.keep_file(self._site, kind, data)
+        return data
+
+    def building_frame(self) -> BuildingFrame | None:
+        """Where the site's map lies in its building, by `site_file`; None where the manifest of each version says it."""
+        data = self.site_file(ALIGNMENT, _MAX_ALIGNMENT_BYTES)
+        return None if data is None else aligned_frame(data)
 
     # --- reports ------------------------------------------------------------------------------------------------------
 

@@ -135,6 +135,25 @@ class TileCache:
         """The site's kept versions, oldest first."""
         return [record for (of, _), record in sorted(self._kept.items()) if of == site]
 
+    def keep_file(self, site: str, kind: str, data: bytes | None) -> None:
+        """Keeps what a site has beside its versions, until the next one of that kind; None: it has none any more."""
+        path = self._folder / "sites" / check_name(site, "site") / "beside" / check_name(kind, "kind")
+        if data is None:
+            self._try_unlink(path)
+        else:
+            self._write(path, data)
+
+    def kept_file(self, site: str, kind: str) -> bytes | None:
+        """What `keep_file` was given last; None without."""
+        path = self._folder / "sites" / check_name(site, "site") / "beside" / check_name(kind, "kind")
+        try:
+            return path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            self._note(f"{path} cannot be read ({error.strerror}); it has to be fetched again")
+            return None
+
     def room_bytes(self) -> int:
         """Bytes that can be put beside what must stay."""
         return self._max_bytes - sum(self._sizes.get(sha256, 0) for sha256 in self._used())

@@ -7,6 +7,7 @@ from enum import StrEnum
 
 from fleetmap.failure_definition import may_be_mapped, radius_95_m
 from fleetmap.geometry import Array
+from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.mapformat.manifest import building_frame
 from fleetmap.messages import Cause, PoseMessage, Status, WantedVersion
 from fleetmap.recordings.images import StoredFrame, decode_frame
@@ -125,6 +126,8 @@ class Robot:
         self._onsets = OnsetRecorder()
         self._last: tuple[RectifiedFrame, Estimate] | None = None
         self._speed = SpeedGauge()
+        self._aligned: BuildingFrame | None = None
+        self._of_version: BuildingFrame | None = None
         self._building_from_map: Array | None = None
 
     @property
@@ -162,6 +165,11 @@ class Robot:
         else:
             versions.candidate, versions.trial, versions.is_recheck = loaded, self._new_trial(), False
         self._show(loaded)
+
+    def align(self, frame: BuildingFrame | None) -> None:
+        """Where the site's map lies in its building, whatever versions say of it; None: each version says it."""
+        self._aligned = frame
+        self._place_in_building()
 
     def handle(self, bundle: SensorBundle) -> Outcome | None:
         """Results of a bundle with a frame; None without one. RecordingError for images that cannot be read."""
@@ -221,9 +229,13 @@ class Robot:
 
     def _show(self, loaded: LoadedMap) -> None:
         focal_px, tiles = loaded.manifest.camera.focal_px, loaded.tiles.values()
-        frame = building_frame(loaded.manifest)
-        self._building_from_map = None if frame is None else frame.building_from_map
+        self._of_version = building_frame(loaded.manifest)
+        self._place_in_building()
         self.localizer.handle_version(loaded.version, tiles, loaded.vocabulary, focal_px, loaded.lookalikes)
+
+    def _place_in_building(self) -> None:
+        frame = self._aligned or self._of_version
+        self._building_from_map = None if frame is None else frame.building_from_map
 
     def _new_trial(self) -> VersionTrial | None:
         """Begins at the last frame of the version before; None without one, then at the next frame."""

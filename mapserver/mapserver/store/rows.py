@@ -1,7 +1,7 @@
 """Rows of the store: versions, verdicts, canaries, jobs, robots, failures, and what a release changes of them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import msgspec
@@ -252,6 +252,7 @@ class SiteReleases:
     """What releases of a site are decided by: its versions by number, and the canary that runs, if any.
 
     rollback_target: the version that was current before, None where none was; rollback_row: its row in the record of what was current.
+    files: addresses of what the site keeps beside its versions and robots may have, by kind.
     """
 
     site: str
@@ -259,6 +260,7 @@ class SiteReleases:
     rollback_target: int | None
     rollback_row: int | None
     canary: CanaryRow | None
+    files: dict[str, str] = field(default_factory=dict)
 
     @property
     def current(self) -> VersionInfo | None:

@@ -5,6 +5,7 @@ import sqlite3
 from collections.abc import Iterable
 
 from fleetmap.mapformat import Manifest
+from fleetmap.mapformat.building import FOR_ROBOTS
 from mapserver.store.database import Transactions
 from mapserver.store.rows import CanaryRow, LogEntry, ReleaseChanges, SiteReleases, VerdictRow, VersionInfo
 
@@ -20,12 +21,14 @@ def site_releases(transactions: Transactions, site: str) -> SiteReleases:
     rows = transactions.query("SELECT * FROM versions WHERE site = ? ORDER BY version", (site,))
     before = transactions.query(_ROLLBACK_TARGET, (site,))
     running = canaries(transactions, site, running=True)
+    files = transactions.query("SELECT kind, sha256 FROM site_files WHERE site = ? ORDER BY kind", (site,))
     return SiteReleases(
         site=site,
         versions={row["version"]: VersionInfo(**row) for row in rows},
         rollback_target=before[0]["version"] if before else None,
         rollback_row=before[0]["id"] if before else None,
         canary=running[0] if running else None,
+        files={row["kind"]: row["sha256"] for row in files if row["kind"] in FOR_ROBOTS},
     )
 
 

@@ -135,7 +135,7 @@ class ListRepository:
         name = site_role(site)
         signed = Targets(version=self.lists.newest(name) + 1, expires=self._expiry("site"))
         for entry in admitted:
-            about = {key: value for key, value in _fields(entry).items() if value is not None}
+            about = {key: value for key, value in _fields(entry).items() if value not in (None, {})}
             target = TargetFile(entry.length, {"sha256": entry.sha256}, manifest_target(site, entry.about.version))
             target.unrecognized_fields["custom"] = about
             signed.targets[target.path] = target

@@ -1,9 +1,10 @@
 """When something is signed: after releases, at night, and every few hours, as far as the keys that this account can use go."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from fleetmap.errors import FleetmapError, StateError, UsageError
@@ -31,7 +32,7 @@ def admitted_versions(rows: SiteReleases, previous: int) -> tuple[AdmittedVersio
         states[rows.canary.version] = "trial"
     if rows.current is not None:
         states[rows.current.version] = "current"
-    return tuple(_entry(rows.versions[number], state) for number, state in sorted(states.items()))
+    return tuple(_entry(rows.versions[number], state, rows.files) for number, state in sorted(states.items()))
 
 
 def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
@@ -168,12 +169,13 @@ def _check_unchanged(site: str, last: SiteList, entries: Sequence[AdmittedVersio
             )
 
 
-def _entry(info: VersionInfo, state: str) -> AdmittedVersion:
+def _entry(info: VersionInfo, state: str, files: Mapping[str, str] = MappingProxyType({})) -> AdmittedVersion:
     about = VersionState(
         version=info.version,
         state=state,  # type: ignore[arg-type]
         vocabulary=info.vocabulary_sha256,
         archive=info.archive_sha256,
+        files=dict(files),
     )
     return AdmittedVersion(info.manifest_sha256, info.manifest_bytes, about)
 

@@ -11,12 +11,17 @@ from fleetmap.mapformat.names import check_name
 
 
 class VersionState(msgspec.Struct, frozen=True, kw_only=True):
-    """The `custom` field of a target. state: what the version is for its site; archive: the whole survey, for the next build."""
+    """The `custom` field of a target. state: what the version is for its site; archive: the whole survey, for the next build.
+
+    files: addresses of what the site keeps beside its versions, by kind (`fleetmap.mapformat.building`): it may change while the
+    version stays.
+    """
 
     version: Positive
     state: Literal["current", "previous", "trial"]
     vocabulary: Sha256
     archive: Sha256 | None = None
+    files: dict[Annotated[str, msgspec.Meta(max_length=32)], Sha256] = {}
 
 
 class _Hashes(msgspec.Struct, frozen=True):

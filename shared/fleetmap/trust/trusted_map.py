@@ -97,6 +97,13 @@ class TrustedMap:
         )
 
     @property
+    def files(self) -> dict[str, str] | None:
+        """Addresses of what the site keeps beside its versions, by kind; None without a fresh word on it."""
+        if self._list is None or self._fault is not None or not self._list.admitted:
+            return None
+        return self._list.admitted[-1].about.files
+
+    @property
     def word_hours(self) -> float | None:
         """Hours since the server last proved what may be run; None if it never did."""
         return None if self._clock_s == 0 else max(0.0, self._wall_s() - self._clock_s) / 3600

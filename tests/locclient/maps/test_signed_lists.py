@@ -12,6 +12,8 @@ from tuf.api.metadata import MetaFile, Snapshot, Timestamp
 
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import FleetmapError, LinkError, UntrustedError
+from fleetmap.mapformat import blob_path
+from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
 from fleetmap.messages import (
     PART_BYTES,
     RobotAck,
@@ -30,6 +32,7 @@ from locclient.maps.tile_cache import TileCache
 from locclient.robot.robot import Change, VersionChange
 from mapserver import releases
 from mapserver.fleet.fleet import Fleet
+from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from mapserver.trust import KeyFolder, SignedLists, init_here, update_lists
@@ -319,3 +322,69 @@ def test_a_server_without_lists_is_told_from_an_attack(tmp_path: Path) -> None:
         update_lists(store)
         client.fetch(client.wanted())  # the control: the same robot, once they are there
         service.close()
+
+
+def align(world: World, x_m: float) -> None:
+    """As `mapserver align` keeps it; whatever signs has not looked yet."""
+    frame = BuildingFrame(x_m=x_m, y_m=2.0, yaw_rad=0.5)
+    found = encode_alignment(Alignment(frame=frame, metres_per_unit=0.05, method="pins"))
+    world.store.keep_site_files(SITE, {ALIGNMENT: found, PLAN: b"the drawing"}, "aligned")
+
+
+def learned(client: MapClient) -> float | None:
+    """Where the robot takes the origin of the map to be in the building, in x."""
+    client.wanted()
+    frame = client.building_frame()
+    return None if frame is None else frame.x_m
+
+
+def test_a_robot_learns_an_alignment_without_another_version(world: World, caplog: pytest.LogCaptureFixture) -> None:
+    client = world.client()
+    client.ready()
+    assert learned(client) is None
+    align(world, 7.0)
+    update_lists(world.store)
+    assert learned(client) == 7.0
+    assert running(client) == 2
+    received = client.received_bytes
+    assert (learned(client), client.received_bytes) == (7.0, received)
+    plan = world.store._transactions.query("SELECT sha256 FROM site_files WHERE kind = 'plan'", ())[0]["sha256"]
+    with pytest.raises(LinkError, match="no published bytes"):
+        client.blob(plan, 1000)
+    # It is there at the next start, before the server answers, and goes to the robot itself.
+    world.hub.reachable = False
+    sync = ServerSync(world.client(), Outbox(world.folder / "spool", max_bytes=10**6), retry_s=1.0)
+    assert sync.frames[0] is not None
+    assert sync.frames[0].x_m == 7.0
+    world.hub.reachable = True
+    align(world, 8.0)
+    update_lists(world.store)
+    sync.step()
+    assert [frame.x_m for frame in sync.frames if frame is not None] == [7.0, 8.0]
+    world.store.keep_site_files(SITE, {ALIGNMENT: None}, "forgotten")
+    update_lists(world.store)
+    assert learned(client) is None
+
+
+def test_an_alignment_that_nobody_signed_or_that_is_damaged_changes_nothing(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    client = world.client()
+    align(world, 7.0)
+    update_lists(world.store)
+    assert learned(client) == 7.0
+    # A thief of the server's database has no key of the site.
+    align(world, 666.0)
+    assert learned(client) == 7.0
+    update_lists(world.store)
+    assert learned(world.client("control")) == 666.0
+    # The bytes are others than those that were signed.
+    align(world, 9.0)
+    update_lists(world.store)
+    (entry,) = [e for e in SignedLists(world.store.folder).served(SITE).admitted if e.about.state == "current"]  # type: ignore[union-attr]
+    path = world.store.folder / blob_path(entry.about.files[ALIGNMENT])
+    path.write_bytes(path.read_bytes()[:-1] + b" ")
+    sync = ServerSync(client, Outbox(world.folder / "spool", max_bytes=10**6), retry_s=1.0)
+    sync.step()
+    assert [frame.x_m for frame in sync.frames if frame is not None] == [7.0]
+    assert "stays as it was" in caplog.text

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import se3, so3_exp
+from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.messages import Status
 from locclient.robot.robot import Change, Robot
 from mapserver.store import MapStore
@@ -55,6 +56,14 @@ def test_a_robot_knows_where_its_map_lies_in_the_building(store: MapStore) -> No
         assert outcome is not None
         found.append(outcome.published.building_from_map)
     assert found[0] is found[2] is None
+    robot.use(replace(loaded, manifest=aligned))
+    for frame_of_site in (BuildingFrame(x_m=9.0, y_m=8.0, yaw_rad=0.0), None):  # aligned anew, and that forgotten
+        robot.align(frame_of_site)
+        outcome = robot.handle(next(iter(robot_world.bundles(1))))
+        assert outcome is not None
+        found.append(outcome.published.building_from_map)
+    assert found[3][:2, 3].tolist() == [9.0, 8.0]
+    np.testing.assert_array_equal(found[4], found[1])
     np.testing.assert_allclose(found[1], se3(so3_exp(np.array([0.0, 0.0, 0.5])), np.array([3.0, -4.0, 0.0])))
 
 
