@@ -7,6 +7,7 @@ what the adjustment cannot know: lens distortion that the model leaves, bias of 
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -100,18 +101,23 @@ def measure_calibration(
 ) -> MeasuredCalibration:
     """What the busiest stretch of a recording with a pair of cameras says about every parameter of its calibration.
 
-    follow: see `estimate_calibration`.
+    follow: see `estimate_calibration`. Where nothing is wrong the calibration is used as it is: a finer measure would change nothing.
     """
     period_s = median_period_s(recording.frame_stamps_ns)
     if period_s > SPARSE_S:
         return _unknown(f"frames are {period_s:.2f} s apart", "record every frame of the camera")
     tools = SurveyTools(progress=lambda *_: on_frame(), executor=executor)
     try:
-        estimate = estimate_calibration([recording], SurveySettings(), tools, follow)
+        focal_px = Rectifier(recording.calibration).camera.focal_px
+        enough = partial(_is_good, focal_px)
+        estimate = estimate_calibration([recording], SurveySettings(), tools, follow, enough)
     except (FleetmapError, np.linalg.LinAlgError) as error:
         return _unknown(f"the frames could not be followed: {error}", "record a drive in the light, with every frame")
-    focal_px = Rectifier(recording.calibration).camera.focal_px
     return MeasuredCalibration(findings_of(estimate, focal_px), estimate)
+
+
+def _is_good(focal_px: float, estimate: CalibrationEstimate) -> bool:
+    return not any(f.verdict in (Verdict.WARN, Verdict.FAIL) for f in findings_of(estimate, focal_px))
 
 
 def findings_of(estimate: CalibrationEstimate, focal_px: float) -> list[Finding]:
