@@ -92,8 +92,10 @@ def bilinear(
     """Bilinear look-up with wrap-around; x, y in texels of the level that starts at `offset`."""
     x += _WRAP
     y += _WRAP
-    column, row = np.uint64(x), np.uint64(y)
-    share_x, share_y = x - np.float64(np.int64(column)), y - np.float64(np.int64(row))
+    # By way of signed numbers: without AVX-512 a processor has no conversion to unsigned ones.
+    whole_x, whole_y = np.int64(x), np.int64(y)
+    column, row = np.uint64(whole_x), np.uint64(whole_y)
+    share_x, share_y = x - np.float64(whole_x), y - np.float64(whole_y)
     one = np.uint64(1)
     mask_x, mask_y = (one << log_width) - one, (one << log_height) - one
     x0, x1 = column & mask_x, (column + one) & mask_x
