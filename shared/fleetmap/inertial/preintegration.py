@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
-from fleetmap.inertial.preintegration_kernels import integrate_samples
+from fleetmap.inertial.preintegration_kernels import cut_samples, integrate_samples
 from fleetmap.sensors.calibration import ImuNoise
-from fleetmap.sensors.samples import ImuSamples, Stamps
+from fleetmap.sensors.samples import ImuSamples
 
 GRAVITY_MPS2 = 9.81
 GRAVITY_MAP = np.array([0.0, 0.0, -GRAVITY_MPS2])
@@ -64,14 +64,15 @@ def preintegrate(
     with a covariance to match. Source: Forster et al. 2017, On-manifold preintegration for real-time VIO.
     """
     assert end_ns >= start_ns
-    stamps, gyro, accel, holes_s, period_s = _cut(imu, start_ns, end_ns)
     rotation, velocity, position = np.eye(3), np.zeros(3), np.zeros(3)
     jacobians, cov = np.zeros((5, 3, 3)), np.zeros((15, 15))
+    samples = imu.stamps_ns, np.ascontiguousarray(imu.gyro_radps), np.ascontiguousarray(imu.accel_mps2)
+    times_s, gyro, accel, holes_s, period_s = cut_samples(*samples, start_ns, end_ns)
     blind = len(imu) == 0
     if not blind:
         gyro, accel = gyro - gyro_bias, accel - accel_bias
-    times_s = _seconds(stamps, start_ns)
-    variances = _step_variances(np.diff(times_s), holes_s > GAP_PERIODS * period_s, blind, noise)
+    missing = holes_s > GAP_PERIODS * (DEFAULT_PERIOD_S if np.isnan(period_s) else period_s)
+    variances = _step_variances(np.diff(times_s), missing, blind, noise)
     integrate_samples(times_s, gyro, accel, variances, rotation, velocity, position, jacobians, cov)
     return Preintegrated(
         start_ns=int(start_ns),
@@ -90,41 +91,6 @@ def preintegrate(
         accel_bias_mps2=np.array(accel_bias, dtype=np.float64),
         max_gap_s=float(holes_s.max(initial=0.0)),
     )
-
-
-def _seconds(stamps: Stamps, start_ns: int) -> Array:
-    return np.asarray((stamps - start_ns) * 1e-9, dtype=np.float64)
-
-
-def _cut(imu: ImuSamples, start_ns: int, end_ns: int) -> tuple[Stamps, Array, Array, Array, float]:
-    """Stamps (N,), rates, forces (N, 3) with both ends added, the hole (N - 1,) around each step, the sample period."""
-    all_stamps = imu.stamps_ns
-    first = int(np.searchsorted(all_stamps, start_ns, side="right"))
-    last = max(int(np.searchsorted(all_stamps, end_ns)), first)
-    stamps = np.concatenate([[start_ns], all_stamps[first:last], [end_ns]]).astype(np.int64)
-    if len(all_stamps) == 0:
-        nothing = np.zeros((2, 3))
-        return stamps, nothing, nothing.copy(), np.array([(end_ns - start_ns) * 1e-9]), DEFAULT_PERIOD_S
-    near = slice(max(first - 2, 0), last + 2)
-    gyro = _with_ends(stamps, all_stamps[near], imu.gyro_radps[near], imu.gyro_radps[first:last])
-    accel = _with_ends(stamps, all_stamps[near], imu.accel_mps2[near], imu.accel_mps2[first:last])
-    diffs = np.diff(all_stamps[near])
-    period_s = float(np.median(diffs)) * 1e-9 if len(diffs) else DEFAULT_PERIOD_S
-    return stamps, gyro, accel, _holes_s(stamps, all_stamps), period_s
-
-
-def _with_ends(stamps: Stamps, near_stamps: Stamps, near_values: Array, inner: Array) -> Array:
-    ends = np.array([[np.interp(s, near_stamps, column) for column in near_values.T] for s in stamps[[0, -1]]])
-    return np.concatenate([ends[:1], inner, ends[1:]])
-
-
-def _holes_s(stamps: Stamps, all_stamps: Stamps) -> Array:
-    """For each step the distance between the recorded samples around it; outside the data, from the data's end."""
-    after = np.searchsorted(all_stamps, stamps[1:])
-    before = np.searchsorted(all_stamps, stamps[:-1], side="right") - 1
-    begins = np.where(before >= 0, all_stamps[np.maximum(before, 0)], stamps[:-1])
-    ends = np.where(after < len(all_stamps), all_stamps[np.minimum(after, len(all_stamps) - 1)], stamps[1:])
-    return np.asarray((ends - begins) * 1e-9)
 
 
 def _step_variances(dt_s: Array, missing: NDArray[np.bool_], blind: bool, noise: ImuNoise) -> Array:

@@ -12,6 +12,54 @@ from fleetmap.inertial.so3_kernels import (
     right_jacobian_into,
 )
 from fleetmap.numerics.kernel import kernel
+from fleetmap.sensors.samples import Stamps
+
+
+@kernel
+def _interpolated(stamp_ns: int, stamps_ns: Stamps, values: Array, out: Array) -> None:
+    """Row of `values` (N, 3) at a moment, between two stamps (N,) linearly, beyond them the nearest."""
+    after = int(np.searchsorted(stamps_ns, stamp_ns, side="right"))
+    if after in (0, len(stamps_ns)) or stamps_ns[after - 1] == stamp_ns:
+        out[:] = values[max(after - 1, 0)]
+        return
+    # Nanoseconds since 1970 do not fit into a float.
+    share = float(stamp_ns - stamps_ns[after - 1]) / float(stamps_ns[after] - stamps_ns[after - 1])
+    for a in range(3):
+        out[a] = values[after - 1, a] + share * (values[after, a] - values[after - 1, a])
+
+
+@kernel
+def cut_samples(
+    stamps_ns: Stamps, gyro: Array, accel: Array, start_ns: int, end_ns: int
+) -> tuple[Array, Array, Array, Array, float]:
+    """Samples between two moments with both ends added: seconds since the first (N,), rates and forces (N, 3), the hole (N - 1,)
+    around each step, and the sample period there, NaN where it is unknown.
+
+    A hole is the distance between the recorded samples around a step; outside the data it goes from the data's end.
+    """
+    first = int(np.searchsorted(stamps_ns, start_ns, side="right"))
+    last = max(int(np.searchsorted(stamps_ns, end_ns)), first)
+    inner = last - first
+    moments = np.empty(inner + 2, np.int64)
+    moments[0], moments[inner + 1] = start_ns, end_ns
+    moments[1 : inner + 1] = stamps_ns[first:last]
+    rates, forces = np.zeros((inner + 2, 3)), np.zeros((inner + 2, 3))
+    times_s, holes_s = np.asarray((moments - start_ns) * 1e-9, np.float64), np.empty(inner + 1)
+    if len(stamps_ns) == 0:
+        holes_s[0] = times_s[1]
+        return times_s, rates, forces, holes_s, np.nan
+    rates[1 : inner + 1], forces[1 : inner + 1] = gyro[first:last], accel[first:last]
+    for end in (0, inner + 1):
+        _interpolated(moments[end], stamps_ns, gyro, rates[end])
+        _interpolated(moments[end], stamps_ns, accel, forces[end])
+    for n in range(inner + 1):
+        before = int(np.searchsorted(stamps_ns, moments[n], side="right")) - 1
+        after = int(np.searchsorted(stamps_ns, moments[n + 1]))
+        begins = stamps_ns[before] if before >= 0 else moments[n]
+        ends = stamps_ns[after] if after < len(stamps_ns) else moments[n + 1]
+        holes_s[n] = (ends - begins) * 1e-9
+    near = stamps_ns[max(first - 2, 0) : last + 2]
+    return times_s, rates, forces, holes_s, float(np.median(np.diff(near))) * 1e-9 if len(near) > 1 else np.nan
 
 
 @kernel
