@@ -16,6 +16,7 @@ READY_WITHIN_S=60
 server_pid=
 robots_pid=
 prepare_pid=
+replay_pids=()
 publish_options=()
 
 say() { printf '\n== %s (%d s)\n' "$*" "$SECONDS"; }
@@ -59,7 +60,7 @@ if [[ ${1:-} == --check ]]; then
 fi
 recording=${1:-}
 check_recording "$recording"
-trap 'stop_server || true; kill $robots_pid $prepare_pid 2>/dev/null || true' EXIT
+trap 'stop_server || true; kill $robots_pid $prepare_pid ${replay_pids[@]+"${replay_pids[@]}"} 2>/dev/null || true' EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM
 rm -rf "$OUT"
@@ -101,7 +102,7 @@ half_of() {
 }
 
 warehouse() {
-  local robot
+  local robot number
   say "a survey robot drives through a simulated warehouse; meanwhile the kernels are compiled, the first time"
   ("$BIN/mapserver" prepare && "$BIN/locclient" prepare) >"$OUT/prepare.log" 2>&1 &
   prepare_pid=$!
@@ -113,11 +114,17 @@ warehouse() {
   build "$OUT/survey.mcap" --frame-from-ground-truth
   say "the robots come home with their recordings"
   wait "$robots_pid" || { cat "$OUT/robots.log" >&2; fail "recording the robots failed"; }
+  say "${ROBOTS[*]} are localized in yesterday's map, side by side"
   reports=()
   for robot in "${ROBOTS[@]}"; do
-    say "$robot is localized in yesterday's map"
-    replay "$robot" "$OUT/$robot.mcap"
+    replay "$robot" "$OUT/$robot.mcap" >"$OUT/$robot.log" 2>&1 &
+    replay_pids+=("$!")
     reports+=("$OUT/$robot.json")
+  done
+  for number in "${!ROBOTS[@]}"; do
+    robot=${ROBOTS[$number]}
+    wait "${replay_pids[$number]}" || { cat "$OUT/$robot.log" >&2; fail "$robot could not be localized"; }
+    cat "$OUT/$robot.log"
   done
 }
 
