@@ -36,7 +36,8 @@ from mapserver.store.version_rows import canaries, site_releases
 
 JOB_STATES = ("running", "done", "failed")
 _EVENT = "id, stamp_ns, site, kind, detail, version, actor, reason"
-_SERVED_KINDS = ("manifest", "tile", "vocabulary", "grid", *FOR_ROBOTS)
+_OF_VERSIONS = ("manifest", "tile", "vocabulary")
+_SERVED_KINDS = (*_OF_VERSIONS, "grid", *FOR_ROBOTS)
 
 
 class StoreQueries:

@@ -246,6 +246,6 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(store: MapStore, tm
     assert store.sites() == []
 
 
-def test_the_module_names_every_served_kind() -> None:
+def test_the_table_names_every_served_kind_of_a_version() -> None:
     kinds = "".join(MIGRATIONS[0])
-    assert all(f"'{kind}'" in kinds for kind in queries._SERVED_KINDS)
+    assert all(f"'{kind}'" in kinds for kind in queries._OF_VERSIONS)

@@ -57,7 +57,7 @@ def align(
     by: ActorOptions,
     forget: Annotated[bool, typer.Option("--forget", help="Forget the alignment and the plan.")] = False,
 ) -> None:
-    """Find where the map lies in the drawing of its building, and keep it; maps that are built from now on carry it."""
+    """Find where the map lies in the drawing of its building, and keep it; robots learn it by the signed list."""
     from fleetmap.mapformat.building import ALIGNMENT
     from mapserver.floor_plan.alignment import PLAN, encode_alignment
     from mapserver.store import MapStore
@@ -69,7 +69,7 @@ def align(
         corners = _corners(maps, where.site)
         if forget:
             maps.keep_site_files(where.site, {ALIGNMENT: None, PLAN: None}, "forgotten", actor=by.named())
-            typer.echo(f"site {where.site}: the alignment is forgotten; versions that carry it keep it")
+            typer.echo(f"site {where.site}: the alignment is forgotten; robots go by what their version says")
             return
         if named:
             found, data = _aligned(given, maps, where.site)
