@@ -13,9 +13,7 @@ class BundleSettings(Section, frozen=True):
     cutoff_sigmas: float = inf  # observations farther off have no influence
     lambda_start: float = 1e-4  # first damping
     relative_cost_tolerance: float = 1e-4  # relative gain of the last step
-    dense_unknowns: int = (
-        700  # reduced systems up to this size are solved by dense Cholesky; sparse factors are slower there
-    )
+    dense_unknowns: int = 700  # reduced systems up to this size are solved by dense Cholesky
     # For each keyframe; up to so many sparse factorisation is quicker than conjugate gradients.
     sparse_couplings: float = 40.0
     pcg_tolerance: float = 1e-4  # relative residual at the end
