@@ -23,7 +23,7 @@ from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 P = CalibrationParameter
 Follow = Callable[[RigCalibration], CalibrationData]
-IsEnough = Callable[[CalibrationEstimate], bool]
+IsEnough = Callable[[CalibrationEstimate, Sequence[CalibrationParameter]], bool]
 LONGEST_S = 30.0  # of a recording: its busiest stretch
 _FEATURES = 700  # of a keyframe: a calibration needs fewer than a map
 _OBSERVATIONS = 300  # of a keyframe in the mean: what so many features leave over
@@ -46,12 +46,12 @@ def estimate_calibration(
     settings: SurveySettings,
     tools: SurveyTools | None = None,
     follow: Follow | None = None,
-    is_enough: IsEnough = lambda _: False,
+    is_enough: IsEnough = lambda *_: False,
 ) -> CalibrationEstimate:
     """The calibration that recordings of one rig show together.
 
     follow: the stretch of the only recording under a calibration, instead of the first pass here. is_enough: whether an estimate need not
-    be any better, however far from the given calibration it is.
+    be any better, however far the parameters that are named are from the given calibration.
     RecordingError where there is none or where their calibrations differ; SurveyError where one of them holds too little to be followed.
     """
     if not recordings:
@@ -74,8 +74,8 @@ def estimate_calibration(
             stretches = [followed(r, current, settings, tools or SurveyTools()) for r in recordings]
         estimate = continued_from(before, estimate_from(stretches))
         after = estimate.corrections()
-        moved = any(abs(after[INDEX[p]] - before[INDEX[p]]) > limit for p, limit in _ANEW.items())
-        if not moved or is_enough(estimate):
+        moved = [p for p, limit in _ANEW.items() if abs(after[INDEX[p]] - before[INDEX[p]]) > limit]
+        if not moved or is_enough(estimate, moved):
             break
         before = after
     assert estimate is not None

@@ -5,7 +5,7 @@ baselines (depths), a robot at 2 m/s (clocks). Beyond the second limit the file 
 what the adjustment cannot know: lens distortion that the model leaves, bias of sub-pixel matching, a gyro's scale.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -116,8 +116,10 @@ def measure_calibration(
     return MeasuredCalibration(findings_of(estimate, focal_px), estimate)
 
 
-def _is_good(focal_px: float, estimate: CalibrationEstimate) -> bool:
-    return not any(f.verdict in (Verdict.WARN, Verdict.FAIL) for f in findings_of(estimate, focal_px))
+def _is_good(focal_px: float, estimate: CalibrationEstimate, moved: Sequence[CalibrationParameter]) -> bool:
+    """Whether nothing is wrong, and what has moved far is near enough for sure."""
+    bad, found = (Verdict.WARN, Verdict.FAIL), findings_of(estimate, focal_px)
+    return all(f.verdict is Verdict.OK if f.name in moved else f.verdict not in bad for f in found)
 
 
 def findings_of(estimate: CalibrationEstimate, focal_px: float) -> list[Finding]:

@@ -1,13 +1,16 @@
 """Verdicts on measured calibrations, and what a build makes of them."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
-from fleetmap.recordings import open_recording
+from fleetmap.recordings import Recording, open_recording
+from fleetmap.sensors.rectification import Rectifier
 from mapserver.build.admission import rig_evidence
-from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate
+from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate, recordings
 from mapserver.calibration.parameters import COLUMNS, RANGES
 from mapserver.doctor import Verdict
 from mapserver.doctor.calibration import (
@@ -19,6 +22,7 @@ from mapserver.doctor.calibration import (
     measure_calibration,
 )
 from mapserver.survey.executor import SERIAL
+from mapserver.survey.settings import SurveySettings
 from support.recordings.realdata import real_data
 from support.recordings.recording_samples import calibration
 
@@ -68,6 +72,27 @@ def test_a_dear_error_that_may_be_chance_is_neither_ok_nor_a_fault() -> None:
     assert finding.verdict is Verdict.NOT_JUDGED
     assert "that may be chance" in finding.sentence
     assert "turns" in finding.missing
+
+
+@pytest.mark.parametrize(
+    ("off", "is_enough"),
+    [({"principal_x": 3.5}, True), ({"principal_x": 6.5}, False), ({"principal_x": 3.5, "baseline": 0.02}, False)],
+    ids=["near enough", "in doubt", "something else wrong"],
+)
+def test_frames_are_followed_again_only_where_that_may_change_a_verdict(
+    off: dict[str, float], is_enough: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A principal point that moved by 3.5 px is none that a robot would notice, and the recording is used as it is."""
+    turned = {"camera_imu_y": off["principal_x"] / Rectifier(calibration()).camera.focal_px}  # which looks the same
+    followed: list[object] = []
+    monkeypatch.setattr(recordings, "followed", lambda _, rig, *__: followed.append(rig))
+    monkeypatch.setattr(recordings, "estimate_from", lambda _: estimate(**off, **turned))
+    stamps_ns = np.arange(100, dtype=np.int64) * 50_000_000
+    recording = cast(Recording, SimpleNamespace(frame_stamps_ns=stamps_ns, calibration=calibration(), path="drive"))
+    measure_calibration(recording, lambda: None, SERIAL)
+    assert (len(followed) == 1) == is_enough
+    recordings.estimate_calibration([recording], SurveySettings())
+    assert len(followed) > 2, "who writes the calibration wants the best one"
 
 
 def test_an_error_far_beyond_a_coarse_sigma_is_found_and_not_corrected() -> None:
