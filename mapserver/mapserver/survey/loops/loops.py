@@ -210,17 +210,20 @@ class LoopCloser:
         return self._telling(i, ids, scores, inside)[: loops.top]
 
     def _telling(self, i: int, ids: NDArray[np.int64], scores: Array, inside: list[int]) -> list[int]:
-        """Without most candidates from which the gate would learn nothing.
+        """Without most candidates that lie where the gate knows so well that it would learn nothing.
 
-        Where a stretch is driven again, every keyframe would be compared with all that have seen it, though a few tie it: the most alike
-        one confirms what is known well. One that is aside for certain may show how the site repeats; so does the most alike of them.
+        Where a stretch is driven again, every keyframe would be compared with all that have seen it, though a few tie it. The most
+        alike one confirms it; so may the most alike one of those far off show how the site repeats.
         """
         js = ids[inside]
-        reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[js])
-        is_near = self._marginals.reachable(i, js, _ALIAS_REACH * reach_m)
         known = self._marginals.are_known(i, js, self._well_known())
-        kept = is_near & ~known
-        for group in (~is_near, is_near & known):
+        reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[js])
+        far = (
+            np.linalg.norm(self._map_from_body[js, :3, 3] - self._map_from_body[i, :3, 3], axis=1)
+            > _ALIAS_REACH * reach_m
+        )
+        kept = ~known
+        for group in (known & far, known & ~far):
             kept[np.flatnonzero(group)[:1]] = True
         if not kept.all():
             first, *others = (inside[n] for n in np.flatnonzero(~kept))
