@@ -162,7 +162,7 @@ class LifecycleManager(RosProgram):
     def __init__(self, endpoint: str, node: str) -> None:
         super().__init__(endpoint)
         self.node, self.instance = node, str(uuid.uuid4())
-        self.beats: list[Any] = []
+        self._bond: list[Any] = []
 
     def state(self) -> int:
         return int(self.call(f"/{self.node}/get_state", "lifecycle_msgs/srv/GetState").current_state.id)
@@ -175,9 +175,14 @@ class LifecycleManager(RosProgram):
         """Configures, activates, and waits for the bond: half its timeout of 4 s."""
         if not (self.change(1) and self.state() == INACTIVE and self.change(3) and self.state() == ACTIVE):
             return False
-        self.beats = self.listen("/bond", "bond/msg/Status")
+        self._bond = self.listen("/bond", "bond/msg/Status")
         self.tell_bond(active=True)
-        return eventually(lambda: any(beat.active and beat.id == self.node for beat in self.beats), 2.0)
+        return eventually(lambda: any(beat.active for beat in self.beats), 2.0)
+
+    @property
+    def beats(self) -> list[Any]:
+        """What the robot has said on the bond: a subscriber hears itself too."""
+        return [beat for beat in self._bond if beat.id == self.node and beat.instance_id != self.instance]
 
     def tell_bond(self, *, active: bool) -> None:
         status = self.store.types["bond/msg/Status"](self.header(""), self.node, self.instance, active, 4.0, 0.1)
