@@ -4,20 +4,27 @@
 #   python3 -m pip wheel --no-deps --wheel-dir dist .
 #   deploy/install.sh dist/fleetmap-0.1.0-py3-none-any.whl server /opt/fleetmap
 # LOCK: the list of libraries with their hashes, made by lock.sh where it does not exist (default: deploy/EXTRA.lock); keep it.
+# WHEELS: folder with wheels of your own, such as that of opencv.sh, which are taken before those of the index (default: dist/wheels).
 set -eu
 [ $# -eq 3 ] && [ -f "$1" ] && [ ! -e "$3/bin" ] || { echo "usage: deploy/install.sh WHEEL server|client FOLDER; FOLDER/bin must not exist; make the wheel with: python3 -m pip wheel --no-deps --wheel-dir dist ." >&2; exit 2; }
 here=$(dirname "$0")
 wheel=$1 extra=$2 folder=$3
 lock=${LOCK:-$here/$extra.lock}
+wheels=${WHEELS:-$here/../dist/wheels}
 tools=$(mktemp -d)
 trap 'rm -rf "$tools"' EXIT
 export PIP_DISABLE_PIP_VERSION_CHECK=1
 "${PYTHON:-python3}" -m venv "$tools"
 "${PYTHON:-python3}" -m venv --without-pip "$folder"
 
-[ -f "$lock" ] || PYTHON=$tools/bin/python "$here/lock.sh" "$wheel" "$extra" "$lock"
+set --
+for own in "$wheels"/*.whl; do
+  [ ! -f "$own" ] || set -- "$@" "$own"
+done
+[ -f "$lock" ] || PYTHON=$tools/bin/python "$here/lock.sh" "$wheel" "$extra" "$lock" "$@"
+[ ! -d "$wheels" ] || set -- --find-links "$wheels"
 pip() { "$tools/bin/python" -m pip --python "$folder/bin/python" install --quiet "$@"; }
-pip --require-hashes --only-binary :all: -r "$lock"
+pip --require-hashes --only-binary :all: "$@" -r "$lock"
 pip --no-deps "$wheel"
 
 rm -rf "$folder"/lib/python*/site-packages/numba/tests "$folder"/lib/python*/site-packages/cv2/data/*.xml

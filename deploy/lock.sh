@@ -6,12 +6,14 @@
 #   pip install --require-hashes --only-binary :all: -r requirements.lock
 #   pip install --no-deps dist/fleetmap-0.1.0-py3-none-any.whl
 set -eu
-[ $# -eq 3 ] && [ -f "$1" ] || { echo "usage: deploy/lock.sh WHEEL server|client LOCK; make the wheel with: python3 -m pip wheel --no-deps --wheel-dir dist ." >&2; exit 2; }
+[ $# -ge 3 ] && [ -f "$1" ] || { echo "usage: deploy/lock.sh WHEEL server|client LOCK [OWN WHEEL...]; make the wheel with: python3 -m pip wheel --no-deps --wheel-dir dist ." >&2; exit 2; }
 here=$(dirname "$0")
+wheel=$1 extra=$2 lock=$3
+shift 3
 python=${PYTHON:-python3}
 report=$(mktemp)
 trap 'rm -f "$report"' EXIT
-"$python" -m pip install --dry-run --ignore-installed --quiet --only-binary :all: -c "$here/../constraints.txt" --report "$report" "$1[$2]"
-"$python" "$here/lock_report.py" "$report" > "$3.new"
-mv "$3.new" "$3"
-echo "$3: $(grep -c '==' "$3") libraries; keep it beside the wheel"
+"$python" -m pip install --dry-run --ignore-installed --quiet --only-binary :all: -c "$here/../constraints.txt" --report "$report" "$@" "$wheel[$extra]"
+"$python" "$here/lock_report.py" "$report" > "$lock.new"
+mv "$lock.new" "$lock"
+echo "$lock: $(grep -c '==' "$lock") libraries; keep it beside the wheel"
