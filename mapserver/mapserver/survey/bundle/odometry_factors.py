@@ -5,16 +5,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3_inverse, skew
+from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.bundle.bundle_adjustment import RelativeTerm
 from mapserver.survey.bundle.bundle_rounds import SurveyState
 from mapserver.survey.keyframes.connected_components import MIN_SEEN
 from mapserver.survey.odometry_pass import OdometryPass
-from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
-
-_FLOOR = 0.004, 0.01, 0.02  # least sigma of a step: of its turn, in metres, and in metres for each metre of way
-# With an IMU, of keyframes that are adjusted with their neighbours; what is wrong with a calibration is in no odometry's covariance.
-_INERTIAL_FLOOR = 0.0005, 0.002, 0.005
+from mapserver.survey.pose_graph.pose_graph import PoseEdge
 
 
 def odometry_factors(odometry: OdometryPass, map_from_body: Array) -> list[RelativeTerm]:
@@ -46,37 +42,11 @@ def blackout_factors(odometry: OdometryPass, state: SurveyState) -> list[Relativ
 
 def chain_edges(odometry: OdometryPass, state: SurveyState) -> list[PoseEdge]:
     """Edges between neighbours with their adjusted motion and the covariance of the odometry."""
-    covariance = _independent_step if odometry.inertial else edge_covariance
-    return [
-        PoseEdge(
-            k,
-            k + 1,
-            se3_inverse(state.map_from_body[k]) @ state.map_from_body[k + 1],
-            covariance(odometry, a, b),
-            is_loop=False,
-        )
-        for k, a, b in _neighbours(odometry)
-    ]
-
-
-def _independent_step(odometry: OdometryPass, a: int, b: int) -> Array:
-    """As `edge_covariance`, for steps whose covariances are to be added up along the way.
-
-    What odometry does not know of its direction moves all that comes later: its covariance of the position has that with every step
-    anew. Perturbed about the origin of its frame instead, its steps are independent of each other.
-    """
-    first, last = odometry.odom_from_body[[a, b]]
-    carry = adjoint(se3_inverse(first))
-    gained = _about_origin(odometry.covariances[b], last) - _about_origin(odometry.covariances[a], first)
-    distance = float(np.linalg.norm(last[:3, 3] - first[:3, 3]))
-    return _positive(carry @ gained @ carry.T) + _floor(distance, _INERTIAL_FLOOR)
-
-
-def _about_origin(cov_rot_trans: Array, odom_from_body: Array) -> Array:
-    """(6, 6) of a perturbation Exp(x) @ odom_from_body, from that of the rotation and of the position."""
-    about = np.eye(6)
-    about[3:, :3] = skew(odom_from_body[:3, 3])
-    return np.asarray(about @ cov_rot_trans @ about.T)
+    edges = []
+    for k, a, b in _neighbours(odometry):
+        i_from_j = se3_inverse(state.map_from_body[k]) @ state.map_from_body[k + 1]
+        edges.append(PoseEdge(k, k + 1, i_from_j, edge_covariance(odometry, a, b), is_loop=False))
+    return edges
 
 
 def _neighbours(odometry: OdometryPass) -> Iterator[tuple[int, int, int]]:
@@ -98,16 +68,8 @@ def edge_covariance(odometry: OdometryPass, a: int, b: int) -> Array:
 
 def gained_covariance(gained: Array, odom_from_body: Array, distance: float) -> Array:
     """The same from the difference (6, 6) of two covariances in odom axes, the rotation (3, 3) at the first and the way between."""
+    values, vectors = np.linalg.eigh(0.5 * (gained + gained.T))
+    gained = (vectors * np.maximum(values, 0.0)) @ vectors.T
     carry = np.kron(np.eye(2), odom_from_body.T)
-    return np.asarray(carry @ _positive(gained) @ carry.T + _floor(distance, _FLOOR))
-
-
-def _positive(covariance: Array) -> Array:
-    """The nearest matrix (6, 6) that may be a covariance: a filter that learns knows in part more than before."""
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
-
-
-def _floor(distance: float, least: tuple[float, float, float]) -> Array:
-    turn_rad, slip_m, share = least
-    return np.diag([turn_rad**2] * 3 + [(slip_m + share * distance) ** 2] * 3)
+    floor = np.diag([0.004**2] * 3 + [(0.01 + 0.02 * distance) ** 2] * 3)
+    return np.asarray(carry @ gained @ carry.T + floor)

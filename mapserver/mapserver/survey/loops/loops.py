@@ -207,32 +207,7 @@ class LoopCloser:
                 first, *others = (int(ids[n]) for n in refused)
                 fate = float(scores[refused[0]]), LoopVerdict.GATED_OUT, reason
                 self.loops.records.append(LoopRecord(i, first, *fate, also=tuple(others)))
-        return self._telling(i, ids, scores, inside)[: loops.top]
-
-    def _telling(self, i: int, ids: NDArray[np.int64], scores: Array, inside: list[int]) -> list[int]:
-        """Without most candidates that lie where the gate knows so well that it would learn nothing.
-
-        Where a stretch is driven again, every keyframe would be compared with all that have seen it, though a few tie it. The most
-        alike one confirms it; so may the most alike one of those far off show how the site repeats.
-        """
-        js = ids[inside]
-        known = self._marginals.are_known(i, js, self._well_known())
-        reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[js])
-        far = (
-            np.linalg.norm(self._map_from_body[js, :3, 3] - self._map_from_body[i, :3, 3], axis=1)
-            > _ALIAS_REACH * reach_m
-        )
-        kept = ~known
-        for group in (known & far, known & ~far):
-            kept[np.flatnonzero(group)[:1]] = True
-        if not kept.all():
-            first, *others = (inside[n] for n in np.flatnonzero(~kept))
-            reason = "where it lies is known too well for it to tell more than one like it"
-            also = tuple(ids[others].tolist())
-            self.loops.records.append(
-                LoopRecord(i, int(ids[first]), float(scores[first]), LoopVerdict.REJECTED, reason, also=also)
-            )
-        return [n for n, is_kept in zip(inside, kept, strict=True) if is_kept]
+        return inside[: loops.top]
 
     def _examine(
         self, i: int, j: int, score: float, match: PairMatch | None, aliases: NDArray[np.int64]

@@ -99,11 +99,6 @@ class GraphMarginals:
         variance = np.einsum("ma,mab,mb->m", direction, self.relative_covs(i, js)[:, 3:, 3:], direction)
         return np.asarray(beyond_m**2 <= chi2 * variance)
 
-    def are_known(self, i: int, js: Indices, enough: Array) -> NDArray[np.bool_]:
-        """(M,) whether no direction of i_from_j is less known than cov_rot_trans (6, 6) says, for each j of js (M,)."""
-        root = np.linalg.inv(np.linalg.cholesky(enough))
-        return np.asarray(np.linalg.eigvalsh(root @ self.relative_covs(i, js) @ root.T).max(axis=1, initial=0.0) <= 1.0)
-
     def innovation_squared(self, edge: PoseEdge) -> float:
         """Squared Mahalanobis distance, 6 degrees of freedom, of a measured edge from what the graph predicts.
 

@@ -96,16 +96,6 @@ def test_a_true_return_is_accepted_with_the_motion_that_was() -> None:
     assert set(accepted) <= {(i, j) for i in AGAIN for j in WALL}
 
 
-def test_few_revisits_confirm_what_is_known_and_the_others_are_not_compared() -> None:
-    """One where the keyframe is, and one aside of it: that might be an alias."""
-    loops, _ = closed(np.array([0.005, 0.0, 0.0]), 0.02)
-    for i in AGAIN:
-        fates = [(r.verdict, "known too well" in r.reason) for r in wall_records(loops) if r.i == i]
-        accepted = fates.count((LoopVerdict.ACCEPTED, False))
-        assert 1 <= accepted <= 2
-        assert fates.count((LoopVerdict.REJECTED, True)) == len(fates) - accepted > 0
-
-
 @pytest.mark.parametrize(
     ("shift", "sigma_m", "why"),
     [
