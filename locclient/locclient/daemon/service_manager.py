@@ -52,8 +52,8 @@ class ServiceManager:
             return
         with suppress(OSError):  # the robot drives on, and whoever reads the file finds it old
             fresh = self._folder / f"{_FILE}.new"
-            # Of the clock since the machine's start, which nobody sets.
-            fresh.write_text(f"{time.monotonic():.1f} {status}\n", encoding="utf-8")
+            # Of the clock since the machine's start, which nobody sets. Not rounded: rounded up, it would lie ahead.
+            fresh.write_text(f"{time.monotonic()!r} {status}\n", encoding="utf-8")
             fresh.replace(self._folder / _FILE)
 
 

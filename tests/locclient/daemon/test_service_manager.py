@@ -53,6 +53,13 @@ def test_what_the_daemon_says_can_be_asked_for(
     assert status(monkeypatch, tmp_path) == 3, "a daemon that was stopped says nothing any more"
 
 
+@pytest.mark.parametrize("now_s", [100.06, 100.04, 62485.199999])
+def test_a_status_can_be_read_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, now_s: float) -> None:
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    ServiceManager(folder=tmp_path).alive("TRACKING")
+    assert status(monkeypatch, tmp_path) == 0
+
+
 @pytest.mark.parametrize(
     ("later_s", "text", "words"),
     [
