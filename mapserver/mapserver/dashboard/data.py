@@ -1,19 +1,28 @@
 """Maps and surveys for the pages: all that they read from the store and change in it."""
 
+import logging
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
 
-from fleetmap.errors import StateError, UsageError
+from fleetmap.errors import FleetmapError, StateError, UsageError
 from fleetmap.mapformat import Manifest, decode_tile
+from fleetmap.mapformat.building import ALIGNMENT
+from fleetmap.version_grid import known_grid, occupancy
 from mapserver import releases
+from mapserver.dashboard.map_layers import Box, Layer, Picture, box_of
 from mapserver.dashboard.plan import Plan, make_plan
+from mapserver.dashboard.underlays import floor_picture, grid_picture
+from mapserver.floor_plan.alignment import PLAN
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
 from mapserver.store import Actor, CanaryRow, Event, JobInfo, MapStore, SiteInfo, VerdictRow, VersionInfo
 
+_log = logging.getLogger(__name__)
 _CACHED_PLANS = 8
+_CACHED_UNDERLAYS = 8
+_GRID_HEIGHT_M = 1.1  # as the API's grid without a height
 _EVENTS_SHOWN = 50
 _JOBS_SHOWN = 100
 
@@ -54,6 +63,7 @@ class MapData:
         self._gate = gate
         self.trial_share = trial_share
         self._plans: OrderedDict[str, Plan] = OrderedDict()
+        self._underlays: OrderedDict[tuple[object, ...], tuple[bytes, Box] | None] = OrderedDict()
         self._lock = threading.Lock()
 
     def sites(self) -> list[str]:
@@ -102,6 +112,47 @@ class MapData:
             while len(self._plans) > _CACHED_PLANS:
                 self._plans.popitem(last=False)
         return plan
+
+    def underlays(self, site: str, version: int, root: str) -> list[Layer]:
+        """The floor plan and the occupancy grid under a version's map, where there are any; root: prefix of their addresses."""
+        found = []
+        for name, kind in (("Floor plan", "floor"), ("Occupancy grid", "grid")):
+            picture = self.underlay(site, version, kind)
+            if picture is not None:
+                found.append(Layer(name, [Picture(f"{root}/underlays/{site}/{version}/{kind}.png", picture[1])]))
+        return found
+
+    def underlay(self, site: str, version: int, kind: str) -> tuple[bytes, Box] | None:
+        """A PNG and where it lies, None where the site or version has none or it cannot be drawn, which the log says."""
+        key = (
+            self._store.version(site, version).manifest_sha256,
+            kind,
+            *(self._store.site_file_sha256(site, file) for file in (PLAN, ALIGNMENT) if kind == "floor"),
+        )
+        with self._lock:
+            if key in self._underlays:
+                return self._underlays[key]
+        try:
+            made = self._floor(site, version) if kind == "floor" else self._grid(site, version)
+        except FleetmapError as error:
+            _log.warning("the map of %s is shown without its %s: %s", site, kind, error)
+            made = None
+        with self._lock:
+            self._underlays[key] = made
+            while len(self._underlays) > _CACHED_UNDERLAYS:
+                self._underlays.popitem(last=False)
+        return made
+
+    def _floor(self, site: str, version: int) -> tuple[bytes, Box] | None:
+        data, alignment = self._store.site_file(site, PLAN), self._store.alignment(site)
+        if data is None or alignment is None:
+            return None
+        box = box_of(self.plan(site, version))
+        return floor_picture(data, alignment, box), box
+
+    def _grid(self, site: str, version: int) -> tuple[bytes, Box] | None:
+        tiles = known_grid(self._store.manifest(site, version), self._store.blob)
+        return grid_picture(occupancy(tiles, _GRID_HEIGHT_M)) if tiles else None
 
     def areas(self, site: str) -> Areas:
         """The named areas of a site."""

@@ -20,6 +20,7 @@ FAILURES_SHOWN = 50
 _CACHED_NS = 5_000_000_000
 _ENDED_SHOWN_NS = 7 * DAY_H * HOUR_NS
 _SIGNIFICANCE = 0.05
+_PLACES = 5000
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +73,12 @@ class HealthData:
     def failures(self, wanted: FailureFilter, before: int | None) -> list[FailureRow]:
         """Failures, latest arrival first; one more than is shown if there are more."""
         return self._store.fleet.failures(wanted, before=before, limit=FAILURES_SHOWN + 1)
+
+    def recent_places(self, site: str) -> list[tuple[float, float]]:
+        """Where failures of the days that are shown began."""
+        since_ns = self._clock_ns() - DAYS_SHOWN * DAY_H * HOUR_NS
+        found = self._store.fleet.failures(FailureFilter(site=site, since_ns=since_ns), limit=_PLACES)
+        return [(row.x_map_m, row.y_map_m) for row in found if row.x_map_m is not None and row.y_map_m is not None]
 
     def failure(self, number: int) -> FailureDetail:
         """One failure."""

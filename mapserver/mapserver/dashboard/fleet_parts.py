@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 from markupsafe import Markup
 
-from mapserver.dashboard import drawing
-from mapserver.dashboard.drawing import Bar
+from mapserver.dashboard import bar_chart
+from mapserver.dashboard.bar_chart import Bar
 from mapserver.dashboard.markup import badge, joined, link, moment, share, table
 from mapserver.fleet_statistics.kpis import Kpis, Rate, driven_words, figure, format_rate, is_telling
 from mapserver.fleet_statistics.resurvey_test import TileConcern
@@ -89,7 +89,7 @@ def rates(found: list[Bar], remark: str) -> Markup:
     return Markup(
         '<h2>Failures per robot-day</h2>{}<p class="quiet">A robot-day is 16 hours of driving. The thin line is the 95 % interval of '
         "the true rate; periods with little driving have no bar. {}</p>"
-    ).format(drawing.bars(found, "Failures per robot-day"), remark)
+    ).format(bar_chart.bars(found, "Failures per robot-day"), remark)
 
 
 def resurvey(concerns: Sequence[TileConcern], tile_address: Callable[[str], str] | None = None) -> Markup:

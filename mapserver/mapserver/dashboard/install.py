@@ -1,6 +1,7 @@
 """Installation of the dashboard in the API's server: pages under /dashboard, and their pictures."""
 
 import time
+from typing import Literal
 
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import RedirectResponse
@@ -64,6 +65,17 @@ def _install_pictures(services: Services, store: MapStore) -> None:
             return _picture(services.maps.plan(site, version).png, "image/png", "private, max-age=31536000, immutable")
         except FleetmapError as error:
             return Response(str(error), 404, media_type="text/plain")
+
+    @pages.get("/underlays/{site}/{version}/{kind}.png", include_in_schema=False)
+    def underlay(site: str, version: int, kind: Literal["floor", "grid"]) -> Response:
+        """What lies under a map: the floor plan or the occupancy grid."""
+        try:
+            found = services.maps.underlay(site, version, kind)
+        except FleetmapError as error:
+            return Response(str(error), 404, media_type="text/plain")
+        if found is None:
+            return Response(f"version {version} of {site} has no {kind}", 404, media_type="text/plain")
+        return _picture(found[0], "image/png", "private, no-cache")
 
     @pages.get("/pictures/{failure}/{place}.jpg", include_in_schema=False)
     def picture(failure: int, place: int) -> Response:

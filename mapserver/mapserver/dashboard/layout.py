@@ -1,7 +1,7 @@
 """The common layout of all pages: navigation, light or dark look, and errors as sentences instead of a broken page."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,13 +13,12 @@ from nicegui import ui
 
 from fleetmap.errors import FleetmapError, UsageError
 from mapserver.api.guard import SIGN_IN, SIGN_OUT, GuardSettings
-from mapserver.dashboard import drawing
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
+from mapserver.dashboard.map_layers import Layer, box_of, ground
 from mapserver.dashboard.markup import address, joined, link
-from mapserver.dashboard.plan import Plan
-from mapserver.floor_plan.areas import Areas
+from mapserver.dashboard.site_map import SiteMap
 from mapserver.serving.live_surveys import LiveSurveys
 
 T = TypeVar("T")
@@ -105,12 +104,16 @@ async def show(
         html(notice("bad", str(error)))
 
 
-def show_map(context: PageContext, plan: Plan, version: int, layer: Markup, areas: Areas) -> ui.html:
-    """A version's map and the named areas with a layer over them; returns the layer, whose content may change."""
-    name, drawn = f"Map of {context.site}, version {version}", drawing.areas(plan, areas)
-    with ui.element("div"), ui.element("div").classes("planbox"):
-        html(drawing.site_map(plan, name, context.plan_picture(version), drawn))
-        return html(layer, classes="over")
+async def version_map(
+    services: Services, context: PageContext, version: int, over: Sequence[Layer], *, is_small: bool = False
+) -> SiteMap:
+    """A version's map with layers over it; their items may change."""
+    plan = await load(services.maps.plan, context.site, version)
+    below = await load(services.maps.underlays, context.site, version, context.root)
+    areas = await load(services.maps.areas, context.site)
+    layers = [*ground(plan, context.plan_picture(version), areas, below), *over]
+    with ui.element("div"):
+        return SiteMap(f"Map of {context.site}, version {version}", box_of(plan), layers, is_small=is_small)
 
 
 def notice(tone: str, words: object) -> Markup:

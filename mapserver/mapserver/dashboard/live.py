@@ -1,7 +1,8 @@
 """Current state of the robots, computed once for all open pages. Pure but for the clock that it is given."""
 
+import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from fleetmap.messages import Status
@@ -25,7 +26,7 @@ SILENT = ("silent", "quiet")
 
 @dataclass(frozen=True, slots=True)
 class LiveRobot:
-    """One robot as a page shows it; place: x and y of its last estimate in `map`, None where it never sent one.
+    """One robot as a page shows it; place: x and y of its last estimate in `map`, None where it never sent one; heading: from x to y.
 
     calibration: what the map shows of its cameras, empty for a robot that does not report it.
     """
@@ -34,6 +35,7 @@ class LiveRobot:
     words: str
     tone: str
     place_m: tuple[float, float] | None
+    heading_rad: float | None
     version: int | None
     wanted_version: int | None
     seconds_since: float
@@ -100,6 +102,7 @@ def live_robot(status: RobotStatus) -> LiveRobot:
         words=words,
         tone=tone,
         place_m=(float(place[0]), float(place[1])) if place is not None and is_somewhere else None,
+        heading_rad=_heading(estimate.get("quat_wxyz")),
         version=status.version,
         wanted_version=status.wanted_version,
         seconds_since=status.seconds_since,
@@ -109,3 +112,11 @@ def live_robot(status: RobotStatus) -> LiveRobot:
         clock_ahead_s=status.clock_ahead_s,
         calibration=calibration_figures(health),
     )
+
+
+def _heading(quat_wxyz: Sequence[float | None] | None) -> float | None:
+    """The angle from x towards y at which a rotation's x axis lies."""
+    if quat_wxyz is None or None in quat_wxyz:
+        return None
+    w, x, y, z = (float(value) for value in quat_wxyz if value is not None)
+    return round(math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), 3)

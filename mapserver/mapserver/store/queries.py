@@ -157,8 +157,13 @@ class StoreQueries:
 
     def site_file(self, site: str, kind: str) -> bytes | None:
         """What a site keeps beside its versions under this kind, such as `plan`; None without. Errors as of `blob`."""
+        sha256 = self.site_file_sha256(site, kind)
+        return None if sha256 is None else self._blobs.get(sha256)
+
+    def site_file_sha256(self, site: str, kind: str) -> str | None:
+        """The address of what `site_file` reads."""
         rows = self._transactions.query("SELECT sha256 FROM site_files WHERE site = ? AND kind = ?", (site, kind))
-        return self._blobs.get(rows[0]["sha256"]) if rows else None
+        return rows[0]["sha256"] if rows else None
 
     def alignment(self, site: str) -> Alignment | None:
         """Where the site's map lies in the drawing of its building; None for a site that was not aligned."""

@@ -1,5 +1,6 @@
 """What the pages are made of, without a browser."""
 
+import base64
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -11,19 +12,24 @@ import pytest
 from markupsafe import Markup
 
 from fleetmap.errors import StateError, UsageError
+from fleetmap.geometry import se3, se3_inverse
 from fleetmap.mapformat import Manifest
+from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
+from fleetmap.occupancy_grid import OccupancyGrid
 from mapserver.build.job_lock import recorded_job
-from mapserver.dashboard import drawing
+from mapserver.dashboard import bar_chart, map_layers
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData, trend_words
 from mapserver.dashboard.live import LiveRobots, live_robot
 from mapserver.dashboard.markup import address, age, choices, facts, link, size, table
 from mapserver.dashboard.pages.map_page import one_way
 from mapserver.dashboard.plan import make_plan
+from mapserver.dashboard.underlays import grid_picture
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.canary_test import CanarySettings
 from mapserver.fleet_statistics.kpis import Counters
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore
@@ -40,7 +46,7 @@ EVIL = "<script>alert(1)</script>\"'&"
         facts([(EVIL, EVIL)]),
         link(address("x", site=EVIL), EVIL),
         choices(EVIL, EVIL, [EVIL], EVIL),
-        drawing.bars([drawing.Bar(EVIL, 1.0, 0.5, 2.0, EVIL)], EVIL),
+        bar_chart.bars([bar_chart.Bar(EVIL, 1.0, 0.5, 2.0, EVIL)], EVIL),
     ],
 )
 def test_words_from_elsewhere_never_become_markup(made: Markup) -> None:
@@ -110,10 +116,61 @@ def _with_tiles(manifest: Manifest, tiles: tuple[object, ...]) -> Manifest:
     return msgspec.structs.replace(manifest, tiles=tiles)
 
 
-def test_marks_stand_with_y_upwards(store: MapStore) -> None:
+def test_a_map_has_its_layers(store: MapStore) -> None:
     plan = MapData(store, GateSettings(), 0.05).plan(SITE, 2)
-    drawn = drawing.marks(plan, [drawing.Mark(3.0, 5.0, "bad", "cross", "here")])
-    assert "translate(3.000 -5.000)" in drawn
+    layers = {layer.name: layer for layer in map_layers.ground(plan, "plan.png", Areas())}
+    assert [layer.shown for layer in layers.values()] == [False, True, True, False]
+    assert len(layers["Coverage"].items) == len(plan.tiles)
+    arrows = layers["Directions surveyed"].items
+    assert {(arrow.tone, round(arrow.heading_rad, 3)) for arrow in arrows} == {("accent", 0.0), ("warn", 3.142)}
+
+
+def test_where_failures_are_dense_the_map_is_red() -> None:
+    box = (-10.0, 0.0, 30.0, 20.0)
+    (picture,) = map_layers.heat([(0.0, 5.0), (0.0, 5.2), (20.0, 15.0), (99.0, 0.0)], box)
+    assert picture.box == box
+    opaque = shown(base64.b64decode(picture.url.split(",")[1]))[..., 3]
+    assert opaque.shape == (40, 80)
+    row, column = np.unravel_index(opaque.argmax(), opaque.shape)
+    assert ((column + 0.5) / 2 - 10, 20 - (row + 0.5) / 2) == pytest.approx((0.0, 5.1), abs=0.5)
+    assert 0 < opaque[10, 60] < opaque.max()
+    assert opaque[35, 75] == 0
+    assert map_layers.heat([(99.0, 0.0)], box) == []
+
+
+def shown(png: bytes) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def test_the_floor_plan_lies_under_the_map_as_it_was_aligned(store: MapStore) -> None:
+    data = MapData(store, GateSettings(), 0.05)
+    assert data.underlays(SITE, 2, "") == []
+    drawing = np.full((200, 300), 255, np.uint8)
+    drawing[40:50, 100:110] = 0  # 5 m from the left edge, 2.25 m below the upper one
+    frame = BuildingFrame(x_m=9.0, y_m=-8.0, yaw_rad=np.pi / 2)
+    alignment = Alignment(frame=frame, metres_per_unit=0.05, method="pins", plan="hall.png")
+    files = {PLAN: cv2.imencode(".png", drawing)[1].tobytes(), ALIGNMENT: encode_alignment(alignment)}
+    store.keep_site_files(SITE, files, "aligned")
+    (layer,) = data.underlays(SITE, 2, "/dashboard")
+    assert (layer.name, layer.items[0].url) == ("Floor plan", "/dashboard/underlays/hall/2/floor.png")
+    png, box = data.underlay(SITE, 2, "floor")
+    opaque = shown(png)[..., 3] > 100
+    scale_m = (box[2] - box[0]) / opaque.shape[1]
+    rows, columns = np.nonzero(opaque)
+    at_map = se3_inverse(frame.building_from_map) @ (5.25, -2.25, 0.0, 1.0)
+    found = box[0] + (columns.mean() + 0.5) * scale_m, box[3] - (rows.mean() + 0.5) * scale_m
+    assert found == pytest.approx(at_map[:2], abs=scale_m)
+    store.keep_site_files(SITE, {PLAN: b"no picture"}, "aligned")
+    assert data.underlays(SITE, 2, "") == [], "a page without it is better than none"
+
+
+def test_the_occupancy_grid_is_a_picture() -> None:
+    cells = np.full((4, 6), -1, np.int8)
+    cells[0, 0], cells[3, 5] = 100, 0
+    png, box = grid_picture(OccupancyGrid(cells, 0.5, se3(np.eye(3), np.array([2.0, -1.0, 0.0]))))
+    assert box == (2.0, -1.0, 5.0, 1.0)
+    opaque = shown(png)[..., 3]
+    assert (opaque[3, 0], opaque[0, 5], opaque[1, 1]) == (255, 60, 0)
 
 
 def test_changes_of_tiles_and_sites(store: MapStore) -> None:

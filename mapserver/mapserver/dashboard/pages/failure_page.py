@@ -6,8 +6,6 @@ from nicegui import ui
 
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import Cause, FailureKind, FailureReport
-from mapserver.dashboard import drawing
-from mapserver.dashboard.drawing import Mark
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN, FilterChoices
 from mapserver.dashboard.layout import (
     RESPONSE_TIMEOUT_S,
@@ -19,11 +17,11 @@ from mapserver.dashboard.layout import (
     notice,
     number,
     show,
-    show_map,
+    version_map,
 )
 from mapserver.dashboard.live import STATUSES
+from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
 from mapserver.dashboard.markup import badge, choices, facts, joined, link, moment, table
-from mapserver.dashboard.plan import Plan
 from mapserver.store import FailureDetail, FailureFilter, FailureRow
 
 _REFRESH_S = 3.0
@@ -69,8 +67,10 @@ def install(services: Services) -> None:
             detail = await load(services.health.failure, number(failure, "failure") or 0)
             html(back_link(context, "failures", "All failures"))
             html(Markup("<h1>Failure {} of {}</h1>").format(detail.failure.number, detail.failure.robot))
-            position = await _position(services, context, detail)
-            html(Markup('<div class="pair">{}{}</div>').format(_summary(context, detail), position))
+            with ui.element("div").classes("pair"):
+                html(_summary(context, detail))
+                with ui.element("div"):
+                    await _position(services, context, detail)
             html(_pictures(context, detail))
             html(_fixes(detail.report))
 
@@ -105,11 +105,11 @@ async def _list(services: Services, context: PageContext, wanted: FailureFilter,
     """The map and the table; the newest page is refreshed when failures arrive."""
     shown = await load(services.health.failures, wanted, before)
     version = wanted.version or await load(services.maps.current_version, context.site)
-    plan = None if version is None else await load(services.maps.plan, context.site, version)
-    layer = None
-    if plan is not None and version is not None:
-        areas = await load(services.maps.areas, context.site)
-        layer = show_map(context, plan, version, _layer(context, plan, shown), areas)
+    shown_map = None
+    if version is not None:
+        box = box_of(await load(services.maps.plan, context.site, version))
+        layers = [Layer("Density", heat(_places(shown), box), shown=False), Layer("Failures", _marks(context, shown))]
+        shown_map = await version_map(services, context, version, layers)
     listed = html(_rows(context, wanted, shown))
 
     async def refresh() -> None:
@@ -118,21 +118,26 @@ async def _list(services: Services, context: PageContext, wanted: FailureFilter,
         if found != shown:
             shown = found
             listed.set_content(str(_rows(context, wanted, found)))
-            if layer is not None and plan is not None:
-                layer.set_content(str(_layer(context, plan, found)))
+            if shown_map is not None:
+                shown_map.show("Failures", _marks(context, found))
+                shown_map.show("Density", heat(_places(found), box))
 
     if before is None:
         ui.timer(_REFRESH_S, refresh, immediate=False)
 
 
-def _layer(context: PageContext, plan: Plan, shown: list[FailureRow]) -> Markup:
+def _places(shown: list[FailureRow]) -> list[tuple[float, float]]:
+    return [(row.x_map_m, row.y_map_m) for row in shown if row.x_map_m is not None and row.y_map_m is not None]
+
+
+def _marks(context: PageContext, shown: list[FailureRow]) -> list[Mark]:
     """Crosses at the failures that have a position."""
     found = []
     for row in reversed(shown):
         if row.x_map_m is not None and row.y_map_m is not None:
             words, to_failure = f"failure {row.number}: {row.robot}, {row.cause}", context.to(f"failures/{row.number}")
             found.append(Mark(row.x_map_m, row.y_map_m, _tone(row), "cross", words, to_failure))
-    return drawing.svg(plan, "Failures on the map", [drawing.marks(plan, found)])
+    return found
 
 
 def _tone(row: FailureRow) -> str:
@@ -210,14 +215,14 @@ def _summary(context: PageContext, detail: FailureDetail) -> Markup:
     )
 
 
-async def _position(services: Services, context: PageContext, detail: FailureDetail) -> Markup:
+async def _position(services: Services, context: PageContext, detail: FailureDetail) -> None:
     """The position on the map, and the fixes before the failure."""
     row = detail.failure
     version = row.version or await load(services.maps.current_version, context.site)
     known = {info.version for info in (await load(services.maps.history, context.site)).versions}
     if version is None or version not in known:
-        return notice("warn", "The map version is no longer in the store; the position cannot be shown.")
-    plan = await load(services.maps.plan, context.site, version)
+        html(notice("warn", "The map version is no longer in the store; the position cannot be shown."))
+        return
     found = [
         Mark(fix.position_map_m[0], fix.position_map_m[1], "accent", "circle", f"fix, {fix.refused or 'used'}")
         for fix in detail.report.fixes
@@ -225,13 +230,13 @@ async def _position(services: Services, context: PageContext, detail: FailureDet
     ]
     if row.x_map_m is not None and row.y_map_m is not None:
         found.append(Mark(row.x_map_m, row.y_map_m, _tone(row), "cross", "believed position"))
-    address, marks = context.plan_picture(version), drawing.marks(plan, found)
-    outlines = drawing.areas(plan, await load(services.maps.areas, context.site))
-    picture = drawing.site_map(plan, f"Position of failure {row.number}", address, outlines, marks)
-    return Markup(
-        '<div><h2>Position</h2><div class="planbox">{}</div><p class="quiet">Cross: where the robot believed to be when it began. '
-        "Dots: fixes until the report. Map version {}.</p></div>"
-    ).format(picture, version)
+    html(Markup("<h2>Position</h2>"))
+    await version_map(services, context, version, [Layer("Failure", found)], is_small=True)
+    html(
+        Markup(
+            '<p class="quiet">Cross: where the robot believed to be when it began. Dots: fixes until the report. Map version {}.</p>'
+        ).format(version)
+    )
 
 
 def _landmarks(report: FailureReport) -> str | None:

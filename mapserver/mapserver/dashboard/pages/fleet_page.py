@@ -6,14 +6,14 @@ from fastapi import Request
 from markupsafe import Markup
 from nicegui import ui
 
-from mapserver.dashboard import drawing, fleet_parts
-from mapserver.dashboard.drawing import Mark
+from mapserver.dashboard import fleet_parts
 from mapserver.dashboard.fleet_health import SiteHealth
 from mapserver.dashboard.fleet_parts import Figure
-from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, show, show_map
+from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, show, version_map
 from mapserver.dashboard.live import LiveRobot, LiveSite
+from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
 from mapserver.dashboard.markup import age, joined, share
-from mapserver.dashboard.plan import Plan
+from mapserver.dashboard.site_map import SiteMap
 from mapserver.fleet_statistics.kpis import driven_words
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS, CalibrationFigure
 
@@ -42,8 +42,7 @@ def install(services: Services) -> None:
             html(Markup("<h1>Robots of {}</h1>").format(context.site))
             trials = html(fleet_parts.trial_notices(health.trials))
             figures = html(_figures(live, health))
-            over = await _plan(services, context, live)
-            html(_legend())
+            drawn = await _map(services, context, live)
             chart = html(_rates(health))
             robots = _table(context, live, health)
             calibrations = html(fleet_parts.calibrations(_calibrations(live)))
@@ -54,9 +53,8 @@ def install(services: Services) -> None:
                 health = await load(services.health.site, context.site)
                 figures.set_content(str(_figures(live, health)))
                 trials.set_content(str(fleet_parts.trial_notices(health.trials)))
-                if over is not None:
-                    plan, layer = over
-                    layer.set_content(str(_robots(plan, context, live)))
+                if drawn is not None:
+                    drawn.show("Robots", _marks(context, live))
 
             async def refresh_table() -> None:
                 live = await load(services.robots.look, context.site)
@@ -90,32 +88,39 @@ def _figures(live: LiveSite, health: SiteHealth) -> Markup:
     )
 
 
-async def _plan(services: Services, context: PageContext, live: LiveSite) -> tuple[Plan, ui.html] | None:
-    """The site map and the layer of the robots upon it, which moves; None without a version."""
+async def _map(services: Services, context: PageContext, live: LiveSite) -> SiteMap | None:
+    """The site map with the robots; None without a version."""
     version = await load(services.maps.current_version, context.site)
     if version is None:
         html(Markup('<p class="notice">No map is published yet: robots cannot be shown on it.</p>'))
         return None
-    plan = await load(services.maps.plan, context.site, version)
-    return plan, show_map(
-        context, plan, version, _robots(plan, context, live), await load(services.maps.areas, context.site)
-    )
+    box = box_of(await load(services.maps.plan, context.site, version))
+    failures = await load(services.health.recent_places, context.site)
+    layers = [
+        Layer("Failures of the last days", heat(failures, box), shown=False),
+        Layer("Robots", _marks(context, live)),
+    ]
+    shown = await version_map(services, context, version, layers)
+    html(_legend())
+    return shown
 
 
-def _robots(plan: Plan, context: PageContext, live: LiveSite) -> Markup:
+def _marks(context: PageContext, live: LiveSite) -> list[Mark]:
+    """Robots that ever sent a position, those in trouble on top."""
     found = []
     for robot in reversed(live.robots):
         if robot.place_m is not None:
             shape, words = _SHAPES.get(robot.tone, "circle"), f"{robot.name}: {robot.words}"
-            to_failures = context.to("failures", robot=robot.name)
-            found.append(Mark(*robot.place_m, robot.tone, shape, words, to_failures))
-    return drawing.svg(plan, "Robots on the map", [drawing.marks(plan, found)])
+            address, (x, y) = context.to("failures", robot=robot.name), robot.place_m
+            place = round(x, 2), round(y, 2)
+            found.append(Mark(*place, robot.tone, shape, words, address, robot.name, robot.heading_rad))
+    return found
 
 
 def _legend() -> Markup:
-    entry = Markup('<span><svg viewBox="-1.5 -1.5 3 3" aria-hidden="true"><g class="mark {}">{}</g></svg>{}</span>')
+    entry = Markup('<span class="{0}"><i class="{1}"></i>{2}</span>')
     return Markup('<div class="legend">{}</div>').format(
-        joined(entry.format(tone, Markup(drawing.SHAPES[_SHAPES[tone]]), words) for tone, words in _TONE_WORDS.items())
+        joined(entry.format(tone, _SHAPES[tone], words) for tone, words in _TONE_WORDS.items())
     )
 
 

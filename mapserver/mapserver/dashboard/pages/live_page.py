@@ -1,7 +1,5 @@
 """The live page: a survey while it drives, its path, landmarks and revisits, and whether tracking and mapping keep up."""
 
-from typing import NamedTuple
-
 import numpy as np
 from fastapi import Request
 from markupsafe import Markup
@@ -9,12 +7,12 @@ from nicegui import ui
 
 from fleetmap.geometry import Array
 from fleetmap.live_survey import COVERAGE_CELL_M
-from mapserver.dashboard import drawing, fleet_parts
-from mapserver.dashboard.drawing import Line, Mark
+from mapserver.dashboard import fleet_parts
 from mapserver.dashboard.fleet_parts import Figure
 from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, notice, show
+from mapserver.dashboard.map_layers import Dots, Layer, Line, Mark, Square, trail
 from mapserver.dashboard.markup import badge, facts, joined, link, table
-from mapserver.dashboard.plan import Plan
+from mapserver.dashboard.site_map import SiteMap
 from mapserver.serving.live_surveys import LiveSurvey
 
 _REFRESH_S = 0.5
@@ -38,14 +36,32 @@ def install(services: Services) -> None:
         async def build(context: PageContext) -> None:
             html(Markup("<h1>Survey of {}</h1>").format(context.site))
             shown = services.surveys.of(context.site)
-            content = html(_content(context, shown))
+            before = html(_before(context, shown))
+            place = ui.element("div")
+            drawn: SiteMap | None = None
+            after = html(_after(shown))
+
+            def draw(survey: LiveSurvey | None) -> None:
+                nonlocal drawn
+                if survey is None or not survey.state.path_m:
+                    return
+                if drawn is None:
+                    with place:
+                        drawn = _map(survey)
+                    return
+                for layer in _layers(survey):
+                    drawn.show(layer.name, layer.items)
+
+            draw(shown)
 
             def refresh() -> None:
                 nonlocal shown
                 found = services.surveys.of(context.site)
                 is_new = found is not None and (shown is None or found.state is not shown.state)
                 if is_new or (found is not None and shown is not None and found.is_silent != shown.is_silent):
-                    content.set_content(str(_content(context, found)))
+                    before.set_content(str(_before(context, found)))
+                    draw(found)
+                    after.set_content(str(_after(found)))
                 shown = found
 
             ui.timer(_REFRESH_S, refresh, immediate=False)
@@ -53,14 +69,22 @@ def install(services: Services) -> None:
         await show(services, request, "live", site, build)
 
 
-def _content(context: PageContext, survey: LiveSurvey | None) -> Markup:
+def _before(context: PageContext, survey: LiveSurvey | None) -> Markup:
+    """What stands above the map."""
     if survey is None:
         return Markup(
             '<p class="quiet">No survey of this site was heard since the server started. '
             "<code>mapserver live RECORDING --site {} --store DIR --server ENDPOINT</code> shows one here.</p>"
         ).format(context.site)
-    found = [_phase(context, survey), _scale(survey), _figures(survey), _parts(survey), _picture(survey)]
-    return joined([*found, _estimate(survey), _missing(survey), _revisits(survey), _refused(survey), _findings(survey)])
+    nothing = Markup("") if survey.state.path_m else Markup('<p class="quiet">No keyframe is mapped yet.</p>')
+    return joined([_phase(context, survey), _scale(survey), _figures(survey), _parts(survey), nothing])
+
+
+def _after(survey: LiveSurvey | None) -> Markup:
+    """What stands below the map."""
+    if survey is None:
+        return Markup("")
+    return joined([_estimate(survey), _missing(survey), _revisits(survey), _refused(survey), _findings(survey)])
 
 
 def _phase(context: PageContext, survey: LiveSurvey) -> Markup:
@@ -212,66 +236,72 @@ def _hue(number: int) -> int:
     return round(250 + number * 137.5) % 360
 
 
-def _part_trails(way: Array, survey: LiveSurvey, width_m: float) -> Markup:
-    """A wide line below each part's path, in its colour, where there are several."""
-    if len(survey.state.parts) < 2:
-        return Markup("")
-    numbers = survey.state.part_numbers()
-    return joined(
-        Markup('<g class="part" style="--hue:{}"><title>part {}</title>{}</g>').format(
-            _hue(n),
-            n + 1,
-            drawing.trail(np.column_stack([way[numbers == n, :2], np.ones(np.sum(numbers == n))]), width_m),
-        )
-        for n in range(len(survey.state.parts))
-    )
-
-
-class _Square(NamedTuple):
-    """A covered square, as `drawing.coverage` takes a tile."""
-
-    x: int
-    y: int
-    landmarks: int
-
-
-def _picture(survey: LiveSurvey) -> Markup:
+def _layers(survey: LiveSurvey) -> list[Layer]:
     """Landmarks, revisits and the path, coloured by how well it was tracked."""
     state = survey.state
-    way, marks, lines = state.path(), state.landmarks(), state.loop_lines()
-    if not len(way):
-        return Markup('<p class="quiet">No keyframe is mapped yet.</p>')
-    low, high = way[:, :2].min(axis=0) - _BEYOND_M, way[:, :2].max(axis=0) + _BEYOND_M
-    marks = marks[((marks > low) & (marks < high)).all(axis=1)][:: max(1, len(marks) // _SHOWN_LANDMARKS)]
-    seen = np.concatenate([way[:, :2], marks])
-    low, high = seen.min(axis=0) - _MARGIN_M, seen.max(axis=0) + _MARGIN_M
-    tiles = tuple(_Square(int(x), int(y), int(n)) for x, y, n in state.covered().tolist())
-    corners = (float(low[0]), float(low[1])), (float(high[0]), float(high[1]))
-    plan = Plan(*corners, COVERAGE_CELL_M, tiles, len(way), b"", ())
-    size_m = max(plan.size_m) * 0.004
-    loops = drawing.lines(Line((a, b), (c, d), "accent", "revisit") for a, b, c, d in lines.tolist())
-    here = Mark(float(way[-1, 0]), float(way[-1, 1]), "good" if way[-1, 2] > 0 else "bad", "circle", "newest keyframe")
+    way, marks = state.path(), state.landmarks()
+    if len(way):
+        low, high = way[:, :2].min(axis=0) - _BEYOND_M, way[:, :2].max(axis=0) + _BEYOND_M
+        marks = marks[((marks > low) & (marks < high)).all(axis=1)][:: max(1, len(marks) // _SHOWN_LANDMARKS)]
+    return [
+        Layer("Covered", _covered(state.covered())),
+        Layer("Landmarks", [Dots(np.round(marks, 2).ravel().tolist())] if len(marks) else []),
+        Layer(
+            "Revisits", [Line([(a, b), (c, d)], "accent", "revisit", 1) for a, b, c, d in state.loop_lines().tolist()]
+        ),
+        Layer("Way", [*_part_trails(way, survey), *trail(way)]),
+        Layer("Now", _now(survey, way)),
+    ]
+
+
+def _covered(cells: Array) -> list[Square]:
+    """Squares with landmarks, the fuller the darker."""
+    size, most = COVERAGE_CELL_M, max(1.0, float(cells[:, 2].max(initial=1.0)))
+    return [
+        Square((x * size, y * size, (x + 1) * size, (y + 1) * size), "tile", f"{n:.0f} landmarks", round(n / most, 3))
+        for x, y, n in cells.tolist()
+    ]
+
+
+def _now(survey: LiveSurvey, way: Array) -> list[Mark]:
+    """The newest keyframe, and where directions are missing."""
     lacking = [
         Mark(
             m.x_m, m.y_m, "warn", "triangle", f"nothing looks {m.heading}: {m.places} places were passed the other way"
         )
-        for m in state.missing
+        for m in survey.state.missing
     ]
-    layers = [
-        drawing.coverage(plan),
-        drawing.dots(marks, size_m),
-        loops,
-        _part_trails(way, survey, 3.5 * size_m),
-        drawing.trail(way, size_m),
-        drawing.marks(plan, [*lacking, here]),
-        drawing.scale_bar(plan),
-    ]
-    picture = drawing.svg(plan, f"Survey of {state.site} so far", layers)
-    return Markup(
-        '<div class="planbox">{}</div><p class="quiet">The way is green where tracking is good, yellow where half of the points disagree, '
-        "red where it was lost. Thin lines are revisits. Squares are covered, the fuller the more landmarks they hold; triangles lack a "
-        "direction. The finished map is adjusted anew.</p>"
-    ).format(picture)
+    if not len(way):
+        return lacking
+    tone = "good" if way[-1, 2] > 0 else "bad"
+    return [*lacking, Mark(float(way[-1, 0]), float(way[-1, 1]), tone, "circle", "newest keyframe")]
+
+
+def _part_trails(way: Array, survey: LiveSurvey) -> list[Line]:
+    """A wide line below each part's path, in its colour, where there are several."""
+    if len(survey.state.parts) < 2:
+        return []
+    numbers = survey.state.part_numbers()
+    found = []
+    for n in range(len(survey.state.parts)):
+        places = way[numbers == n, :2]
+        found += trail(np.column_stack([places, np.ones(len(places))]), 9, hue=_hue(n))
+    return found
+
+
+def _map(survey: LiveSurvey) -> SiteMap:
+    way = survey.state.path()
+    low, high = (way[:, :2].min(axis=0), way[:, :2].max(axis=0)) if len(way) else (np.zeros(2), np.zeros(2))
+    box = (*(low - _MARGIN_M).tolist(), *(high + _MARGIN_M).tolist())
+    shown = SiteMap(f"Survey of {survey.state.site} so far", box, _layers(survey), follows=True)
+    html(
+        Markup(
+            '<p class="quiet">The way is green where tracking is good, yellow where half of the points disagree, red where it was lost. '
+            "Thin lines are revisits. Squares are covered, the fuller the more landmarks they hold; triangles lack a direction. The "
+            "finished map is adjusted anew.</p>"
+        )
+    )
+    return shown
 
 
 def _refused(survey: LiveSurvey) -> Markup:

@@ -7,9 +7,9 @@ from fastapi import Request
 from markupsafe import Markup
 from nicegui import ui
 
-from mapserver.dashboard import drawing
-from mapserver.dashboard.data import MapData, SiteHistory, VersionQuality
-from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, number, show
+from mapserver.dashboard.data import SiteHistory, VersionQuality
+from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, number, show, version_map
+from mapserver.dashboard.map_layers import Layer, coverage, squares
 from mapserver.dashboard.markup import badge, choices, facts, joined, link, moment, share, size, table
 from mapserver.dashboard.pages.confirm import change_button
 from mapserver.dashboard.plan import Plan
@@ -49,8 +49,8 @@ def install(services: Services) -> None:
             shown = number(version, "version") or _default_version(history)
             html(_versions(context, history.versions, shown))
             if shown is not None:
-                await _one_version(services.maps, context, shown)
-            await _difference(services.maps, context, history, number(before, "version"), number(after, "version"))
+                await _one_version(services, context, shown)
+            await _difference(services, context, history, number(before, "version"), number(after, "version"))
             html(_events(history))
             _follow(services, context, history)
 
@@ -148,19 +148,22 @@ def _versions(context: PageContext, versions: list[VersionInfo], shown: int | No
     )
 
 
-async def _one_version(maps: MapData, context: PageContext, version: int) -> None:
+async def _one_version(services: Services, context: PageContext, version: int) -> None:
+    maps = services.maps
     quality = await load(maps.quality, context.site, version)
     plan, areas = await load(maps.plan, context.site, version), await load(maps.areas, context.site)
-    name, address = f"Tiles, landmarks and places of version {version}", context.plan_picture(version)
-    picture = drawing.site_map(plan, name, address, drawing.areas(plan, areas), below=drawing.coverage(plan))
-    left = Markup(
-        '<div><h2>Coverage of version {}</h2><div class="planbox">{}</div><p class="quiet">Grey: landmarks. Blue dots: places that robots '
-        "recognise. Squares: tiles, darker with more landmarks.</p></div>"
-    ).format(version, picture)
-    right = Markup("<div><h2>Quality of version {}</h2>{}{}</div>").format(
-        version, _quality_facts(quality, plan), _verdicts(quality)
-    )
-    html(Markup('<div class="pair">{}{}</div>').format(left, right))
+    with ui.element("div").classes("pair"):
+        with ui.element("div"):
+            html(Markup("<h2>Coverage of version {}</h2>").format(version))
+            await version_map(services, context, version, [Layer("Tiles", coverage(plan))])
+            html(
+                Markup(
+                    '<p class="quiet">Grey: landmarks. Blue dots: places that robots recognise. Squares: tiles, darker with more '
+                    "landmarks.</p>"
+                )
+            )
+        right = Markup("<h2>Quality of version {}</h2>{}{}")
+        html(right.format(version, _quality_facts(quality, plan), _verdicts(quality)))
     html(one_way(plan, areas))
 
 
@@ -230,9 +233,10 @@ def _verdicts(quality: VersionQuality) -> Markup:
 
 
 async def _difference(
-    maps: MapData, context: PageContext, history: SiteHistory, before: int | None, after: int | None
+    services: Services, context: PageContext, history: SiteHistory, before: int | None, after: int | None
 ) -> None:
     """Two versions to choose, and the differences between them."""
+    maps = services.maps
     numbers = [str(info.version) for info in history.versions]
     if len(numbers) < 2:
         return
@@ -254,15 +258,16 @@ async def _difference(
     found = await load(maps.difference, context.site, before, after)
     kinds = await load(maps.changed_tiles, context.site, before, after)
     plan = await load(maps.plan, context.site, after)
-    name, address = f"Tiles that changed from version {before} to {after}", context.plan_picture(after)
-    picture = drawing.site_map(plan, name, address, drawing.cells(plan, kinds))
-    html(
-        Markup(
-            '<div class="pair"><div><div class="planbox">{}</div><p class="quiet">Tiles <span class="good">added</span> '
-            '(solid line), <span class="warn">changed</span> (dashed), '
-            '<span class="bad">removed</span> (dotted).</p></div><div>{}</div></div>'
-        ).format(picture, _difference_facts(found))
-    )
+    with ui.element("div").classes("pair"):
+        with ui.element("div"):
+            await version_map(services, context, after, [Layer("Changed tiles", squares(plan, kinds))])
+            html(
+                Markup(
+                    '<p class="quiet">Tiles <span class="good">added</span> (solid line), <span class="warn">changed</span> (dashed), '
+                    '<span class="bad">removed</span> (dotted).</p>'
+                )
+            )
+        html(_difference_facts(found))
 
 
 def _difference_facts(found: Difference) -> Markup:

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from mapserver.dashboard import drawing, fleet_parts
-from mapserver.dashboard.drawing import Bar
+from mapserver.dashboard import bar_chart, fleet_parts
+from mapserver.dashboard.bar_chart import Bar
 from mapserver.dashboard.fleet_parts import Figure, Trial
 from mapserver.dashboard.markup import joined, moment, share, table
 from mapserver.fleet.shift_summary import FleetSummary
@@ -81,7 +81,7 @@ def _by_hour(summary: FleetSummary) -> Markup:
         count = sum(counts.get(hour, 0) for hour in range(start, start + step))
         words = f"{moment(start * HOUR_NS)}: {count}"
         bars.append(Bar(str(start % 24) if step == 1 else "", count, count, count, words))
-    drawn = drawing.bars(bars, "Failures over time")
+    drawn = bar_chart.bars(bars, "Failures over time")
     span = "an hour, UTC" if step == 1 else f"{step} hours"
     return Markup('<h2>Failures over time</h2>{}<p class="quiet">A bar for {}.</p>').format(drawn, span)
 

@@ -1,5 +1,6 @@
 """The survey page: jobs, the doctor's findings in their recordings, accepted and refused loops on the map."""
 
+from collections import Counter
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from typing import Any
@@ -8,9 +9,8 @@ from fastapi import Request
 from markupsafe import Markup
 from nicegui import ui
 
-from mapserver.dashboard import drawing
-from mapserver.dashboard.drawing import Line, Mark
-from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, number, show
+from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, number, show, version_map
+from mapserver.dashboard.map_layers import Item, Layer, Line, Mark
 from mapserver.dashboard.markup import badge, facts, joined, link, table
 from mapserver.store import JobInfo
 
@@ -165,29 +165,31 @@ async def _loops(services: Services, context: PageContext, report: dict[str, Any
     if version is None:
         html(Markup('<p class="notice">The version of this job was removed, and no version is current.</p>'))
         return
-    plan = await load(services.maps.plan, context.site, version)
-    lines, marks = [], []
+    lines: list[Item] = []
     for place in sorted(found, key=lambda p: p.get("verdict") == "accepted"):
         ends, tone = _ends(place), _VERDICTS.get(str(place.get("verdict")), "quiet")
         assert ends is not None
         words = f"{str(place.get('verdict')).replace('_', ' ')}: {place.get('reason') or 'consistent'}"
-        lines.append(Line(*ends, tone, words))
-        marks += [Mark(*end, tone, "circle", words) for end in ends if tone == "good"]
-    layers = drawing.lines(lines), drawing.marks(plan, marks)
-    picture = drawing.site_map(plan, "Loops on the map", context.plan_picture(version), *layers)
+        lines.append(Line(list(ends), tone, words))
+        if tone == "good":
+            lines += [Mark(*end, tone, "circle", words) for end in ends]
+    html(Markup("<h2>Loops on the map of version {}</h2>").format(version))
+    await version_map(services, context, version, [Layer("Loops", lines)])
     accepted = sum(place.get("verdict") == "accepted" for place in found)
     html(
         Markup(
-            '<h2>Loops on the map of version {}</h2><div class="planbox">{}</div><p>Green lines with dots: accepted loops ({}). Dashed red '
-            "and thin lines: the most similar refused ones ({}).</p>{}"
-        ).format(version, picture, accepted, len(found) - accepted, _refusals(found))
+            "<p>Green lines with dots: accepted loops ({}). Dashed red and thin lines: the most similar refused ones ({}).</p>{}"
+        ).format(accepted, len(found) - accepted, _refusals(found))
     )
 
 
 def _refusals(found: list[dict[str, Any]]) -> Markup:
-    refused = [place for place in found if place.get("verdict") != "accepted"][:_REASONS_SHOWN]
+    refused = [place for place in found if place.get("verdict") != "accepted"]
+    if not refused:
+        return Markup('<p class="quiet">No loops were refused.</p>')
+    reasons = Counter(str(place.get("reason") or place.get("verdict")).replace("_", " ") for place in refused)
     rows = []
-    for place in refused:
+    for place in refused[:_REASONS_SHOWN]:
         ends = _ends(place)
         assert ends is not None
         (x, y), (to_x, to_y) = ends
@@ -197,7 +199,11 @@ def _refusals(found: list[dict[str, Any]]) -> Markup:
         positions = f"{x:.1f}, {y:.1f} m", f"{to_x:.1f}, {to_y:.1f} m"
         rows.append((place.get("recording"), shown, place.get("reason"), similarity, *positions))
     head = ("Recording", "Verdict", "Why", "Similarity", "From", "To")
-    return table(head, rows, empty="No loops were refused.", name="Refused loops")
+    why = "; ".join(f"{reason} ({count})" for reason, count in reasons.most_common())
+    listed = table(head, rows, empty="", name="Refused loops")
+    return Markup("<details><summary>Why {} candidates were refused: {}</summary>{}</details>").format(
+        len(refused), why, listed
+    )
 
 
 def _ends(place: dict[str, Any]) -> tuple[tuple[float, float], tuple[float, float]] | None:

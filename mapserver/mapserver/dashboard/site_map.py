@@ -1,0 +1,33 @@
+"""The map of all pages: pan, zoom, layers and marks that move. Drawn by leaflet, which comes with the page library: nothing is loaded
+from elsewhere.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import nicegui.elements.leaflet  # gives the browser the library by its name
+from nicegui.element import Element
+
+from mapserver.dashboard.map_layers import Box, Item, Layer
+
+_STYLES = Path(nicegui.elements.leaflet.__file__).parent / "dist"
+
+
+class SiteMap(Element, component="site_map.js", default_classes="site-map"):
+    """A map of layers over a box. label: what it shows, for those who cannot see it. is_small: beside a text.
+
+    follows: the map keeps everything in sight while its layers grow, until somebody moves it.
+    """
+
+    def __init__(
+        self, label: str, box: Box, layers: Sequence[Layer], *, is_small: bool = False, follows: bool = False
+    ) -> None:
+        super().__init__()
+        self.add_resource(_STYLES)
+        self._props["scene"] = {"label": label, "box": box, "layers": layers, "follows": follows}
+        if is_small:
+            self.classes("small")
+
+    def show(self, layer: str, items: Sequence[Item]) -> None:
+        """Shows other items in a layer; marks with the same name move to their new places."""
+        self.run_method("show", layer, items)
