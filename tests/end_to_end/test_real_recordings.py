@@ -91,6 +91,15 @@ def test_v101_survey(v101: tuple[Report, Path]) -> None:
     assert report["path_m"] == pytest.approx(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum(), rel=0.01)
 
 
+def test_v101_as_a_whole_refuses_no_revisit_of_its_own(tmp_path: Path) -> None:
+    """A gate surer than the odometry refused two dozen that shared up to 209 points, after five seconds without a picture."""
+    report = built(real_data("euroc_v101_keyframes"), tmp_path)
+    assert report["ate_rmse_m"] <= 0.02
+    assert report["loops"]["accepted"] >= 100
+    refused = [r for r in report["loop_records"] if r["verdict"] == "gated_out" and r["inliers"] >= 30]
+    assert not refused
+
+
 def test_v101_held_out_pairs_are_localised(v101_held_out: tuple[Report, Path]) -> None:
     report, _ = v101_held_out
     assert report["frames"] == 50

@@ -2,15 +2,42 @@
 
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, skew
 from mapserver.survey.bundle.bundle_adjustment import RelativeTerm
 from mapserver.survey.bundle.bundle_rounds import SurveyState
 from mapserver.survey.keyframes.connected_components import MIN_SEEN
 from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
+
+
+class Floor(NamedTuple):
+    """Least sigma of a step: of its rotation, by itself and for each radian of it, of its translation, by itself and for each metre."""
+
+    rotation_rad: float
+    rotation_share: float
+    translation_m: float
+    translation_share: float
+
+    def covariance(self, first_from_last: Array) -> Array:
+        """(6, 6) of a step (4, 4)."""
+        turn_rad, way_m = rotation_angle_rad(first_from_last[:3, :3]), float(np.linalg.norm(first_from_last[:3, 3]))
+        sigmas = self.rotation_rad + self.rotation_share * turn_rad, self.translation_m + self.translation_share * way_m
+        return np.diag(np.repeat(np.square(sigmas), 3))
+
+
+FLOOR = Floor(0.004, 0.0, 0.01, 0.02)
+# With an IMU, of keyframes that are adjusted with their neighbours. What is wrong with a calibration is in no odometry's covariance: data
+# sheets of IMUs give the scale and the axes of their gyros to about 1 %, and a warm mount bends a stereo pair by as much.
+_INERTIAL_FLOOR = Floor(0.0005, 0.01, 0.002, 0.01)
+
+
+def floor_of(*, inertial: bool) -> Floor:
+    """That of the steps of a chain of keyframes, which are adjusted with their neighbours."""
+    return _INERTIAL_FLOOR if inertial else FLOOR
 
 
 def odometry_factors(odometry: OdometryPass, map_from_body: Array) -> list[RelativeTerm]:
@@ -42,10 +69,11 @@ def blackout_factors(odometry: OdometryPass, state: SurveyState) -> list[Relativ
 
 def chain_edges(odometry: OdometryPass, state: SurveyState) -> list[PoseEdge]:
     """Edges between neighbours with their adjusted motion and the covariance of the odometry."""
+    floor = floor_of(inertial=odometry.inertial)
     edges = []
     for k, a, b in _neighbours(odometry):
         i_from_j = se3_inverse(state.map_from_body[k]) @ state.map_from_body[k + 1]
-        edges.append(PoseEdge(k, k + 1, i_from_j, edge_covariance(odometry, a, b), is_loop=False))
+        edges.append(PoseEdge(k, k + 1, i_from_j, edge_covariance(odometry, a, b, floor), is_loop=False))
     return edges
 
 
@@ -59,17 +87,24 @@ def _factor(k: int, i_from_j: Array, covariance: Array) -> RelativeTerm:
     return RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(covariance).astype(np.float64))
 
 
-def edge_covariance(odometry: OdometryPass, a: int, b: int) -> Array:
+def edge_covariance(odometry: OdometryPass, a: int, b: int, floor: Floor = FLOOR) -> Array:
     """(6, 6) of i_from_j between frames a and b, axes of a: what the odometry's uncertainty gained, with a floor."""
     first, last = odometry.odom_from_body[[a, b]]
-    distance = float(np.linalg.norm(last[:3, 3] - first[:3, 3]))
-    return gained_covariance(odometry.covariances[b] - odometry.covariances[a], first[:3, :3], distance)
+    known = odometry.covariances[a], odometry.covariances[b]
+    return step_covariance(known, first[:3, :3], se3_inverse(first) @ last, floor)
 
 
-def gained_covariance(gained: Array, odom_from_body: Array, distance: float) -> Array:
-    """The same from the difference (6, 6) of two covariances in odom axes, the rotation (3, 3) at the first and the way between."""
+def step_covariance(known: tuple[Array, Array], odom_from_first: Array, first_from_last: Array, floor: Floor) -> Array:
+    """(6, 6) of a step in the axes of its first body, from the covariances (6, 6) of both places in odom axes; first's rotation (3, 3).
+
+    What odometry does not know of its direction at first moves the last one too, and its covariance has that with every step anew. About
+    the place of the first, where it moves nothing, the last one's is greater by what the step adds: such steps are independent.
+    """
+    about = np.eye(6)
+    about[3:, :3] = skew(odom_from_first @ first_from_last[:3, 3])
+    gained = about @ known[1] @ about.T - known[0]
     values, vectors = np.linalg.eigh(0.5 * (gained + gained.T))
-    gained = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    carry = np.kron(np.eye(2), odom_from_body.T)
-    floor = np.diag([0.004**2] * 3 + [(0.01 + 0.02 * distance) ** 2] * 3)
-    return np.asarray(carry @ gained @ carry.T + floor)
+    # Where a filter learns, it knows less of the first place than of the last: what it learned is not known of the step either.
+    gained = (vectors * np.abs(values)) @ vectors.T
+    carry = np.kron(np.eye(2), odom_from_first.T)
+    return np.asarray(carry @ gained @ carry.T + floor.covariance(first_from_last))

@@ -5,12 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample
-from mapserver.survey.bundle.odometry_factors import gained_covariance
+from mapserver.survey.bundle.odometry_factors import floor_of, step_covariance
 from mapserver.survey.live.live_values import NewKeyframe, joined_imu
 from mapserver.survey.odometry_pass import ContinuedCovariance, OdometryRun
 from mapserver.survey.settings import SurveySettings
@@ -37,7 +37,7 @@ class _Before(NamedTuple):
 
     covariance: Array
     odom_from_body: Array
-    position_m: Array
+    frame_from_body: Array
     torn_m2: float
 
 
@@ -88,12 +88,13 @@ class LiveTracking:
     ) -> NewKeyframe:
         before, step_cov, imu = self._before, None, joined_imu(self._imu)
         if before is not None:
-            way_m = float(np.linalg.norm(frame_from_body[:3, 3] - before.position_m))
-            step_cov = gained_covariance(covariance - before.covariance, before.odom_from_body, way_m)
+            step = se3_inverse(before.frame_from_body) @ frame_from_body
+            known, floor = (before.covariance, covariance), floor_of(inertial=estimate.inertial)
+            step_cov = step_covariance(known, before.odom_from_body, step, floor)
             if self._torn_m2 > before.torn_m2:
                 step_cov = step_cov + _TORN_M2 * np.eye(6)
         rotation = estimate.odom_from_body[:3, :3]
-        self._before = _Before(covariance, rotation, frame_from_body[:3, 3], self._torn_m2)
+        self._before = _Before(covariance, rotation, frame_from_body, self._torn_m2)
         self._imu = []
         return NewKeyframe(
             number=number,

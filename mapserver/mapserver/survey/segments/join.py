@@ -49,7 +49,7 @@ def refusal(before: SegmentSurvey, after: SegmentSurvey) -> str | None:
     off = se3_inverse(se3_inverse(a) @ b) @ after.led
     error = np.concatenate([so3_log(off[:3, :3]), off[:3, 3]])
     carry = np.kron(np.eye(2), after.led[:3, :3])  # covariances are in the axes of the first body
-    covariance = carry.T @ (edge_covariance(before.odometry, *led) + after.led_covariance) @ carry
+    covariance = carry.T @ (edge_covariance(before.odometry, led[0], led[1]) + after.led_covariance) @ carry
     if float(error @ np.linalg.solve(covariance, error)) > _GATE:
         metres, degrees = np.linalg.norm(error[3:]), np.degrees(np.linalg.norm(error[:3]))
         return (

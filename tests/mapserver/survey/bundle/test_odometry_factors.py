@@ -6,10 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fleetmap.geometry import se3, se3_exp, se3_inverse, so3_exp
-from mapserver.survey.bundle.odometry_factors import blackout_factors
+from fleetmap.geometry import se3, se3_exp, se3_inverse, skew, so3_exp
+from mapserver.survey.bundle.odometry_factors import blackout_factors, chain_edges
 from mapserver.survey.keyframes.connected_components import SigmaBetween
 from mapserver.survey.odometry_pass import OdometryPass, continued_covariances
+from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
+from mapserver.survey.pose_graph.pose_graph import adjoint
 from support.worlds.corridor_scene import scene
 
 
@@ -55,3 +57,42 @@ def test_beginning_anew_does_not_join_what_nothing_joins() -> None:
     seen = SimpleNamespace(cov_rot_trans=first, new_odom_from_old_odom=None, inertial=False)
     begun = continued_covariances([seen, estimate(0.0, turn)])
     np.testing.assert_allclose(np.diag(begun[1]), [0.0, 0.0, 0.0, 0.01, 0.04, 0.0], atol=1e-12)
+
+
+def test_what_a_filter_learns_at_a_step_is_not_known_of_that_step() -> None:
+    """Blind for a while, then tied to old points: the place before was as wrong as it was doubted, and so is the way from it."""
+    turn = so3_exp(np.array([0.0, 0.0, 0.7]))
+    odom_from_body = np.stack([se3(turn, turn @ np.array([0.5 * k, 0.0, 0.0])) for k in range(4)])
+    covariances = np.stack([np.diag([1e-8] * 3 + [sigma_m**2] * 3) for sigma_m in (0.05, 0.05, 0.26, 0.1)])
+    known = OdometryPass(
+        [], odom_from_body, covariances, np.ones(4, bool),
+        [SimpleNamespace(frame_index=k) for k in range(4)], inertial=True,
+    )  # fmt: skip
+    edges = chain_edges(known, SimpleNamespace(map_from_body=odom_from_body))
+    sigmas_m = [np.sqrt(np.diag(edge.cov_rot_trans)[3:]) for edge in edges]
+    assert sigmas_m[0].max() < 0.01
+    assert sigmas_m[1].min() > 0.25
+    assert sigmas_m[2].min() > 0.23
+
+
+def test_edges_of_the_chain_add_up_to_what_odometry_does_not_know() -> None:
+    """A filter's covariance of position holds what its direction has done to the whole way; no edge may say that once more."""
+    count, step = 200, se3_exp(np.array([0.0, 0.0, 0.002, 0.5, 0.0, 0.0]))
+    noise = np.diag([2e-6, 2e-6, 4e-6, 4e-4, 1e-4, 1e-4])
+    odom_from_body = se3(np.eye(3), np.array([30.0, -20.0, 1.0])) @ np.tile(np.eye(4), (count, 1, 1))
+    covariances, about = np.zeros((count, 6, 6)), np.tile(np.eye(6), (count, 1, 1))
+    for k in range(1, count):
+        carry = adjoint(odom_from_body[k - 1])
+        covariances[k] = covariances[k - 1] + carry @ noise @ carry.T
+        odom_from_body[k] = odom_from_body[k - 1] @ step
+    about[:, 3:, :3] = [-skew(place) for place in odom_from_body[:, :3, 3]]
+    known = OdometryPass(
+        [], odom_from_body, about @ covariances @ about.transpose(0, 2, 1), np.ones(count, bool),
+        [SimpleNamespace(frame_index=k) for k in range(count)], inertial=True,
+    )  # fmt: skip
+    graph = GraphMarginals(odom_from_body, chain_edges(known, SimpleNamespace(map_from_body=odom_from_body)))
+    carry = adjoint(se3_inverse(odom_from_body[20]))
+    expected = carry @ (covariances[-1] - covariances[20]) @ carry.T
+    ratios = np.sqrt(np.diag(graph.relative_cov(20, count - 1)) / np.diag(expected))
+    assert (ratios > 1.0).all()  # the floor adds to it
+    assert (ratios < 1.2).all()
