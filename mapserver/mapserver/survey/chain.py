@@ -61,9 +61,11 @@ def adjusted_chain(
     matched = {(p.i, p.j) for p in pairs}
     del pairs  # as large as all else in a long survey
     tools.at("local adjustment", 0, 1)
-    state = local_windows(state, settings)
     if state.motion.inertial:
+        # All at once: windows hold what came before them, and so lose the direction that odometry has from the gyro.
         state = bundle_rounds(state, settings, rounds=2)
+    else:
+        state = local_windows(state, settings)
     odometry = with_depths(odometry, state, depths)
     return AdjustedChain(odometry, state, matched, depths)
 
