@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
-from fleetmap.inertial.preintegration_kernels import cut_samples, integrate_samples
+from fleetmap.inertial.preintegration_kernels import cut_samples, integrate_samples, intervals
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 
@@ -113,14 +113,5 @@ def imu_intervals(imu: ImuSamples, start_ns: int, end_ns: int) -> tuple[Array, A
 
     Beyond the first and last sample the nearest one is held.
     """
-    if end_ns <= start_ns or len(imu) == 0:
-        return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
-    first, end = np.searchsorted(imu.stamps_ns, [start_ns + 1, end_ns]).tolist()
-    edges = np.concatenate([[start_ns], imu.stamps_ns[first:end], [end_ns]]).astype(np.int64)
-    origin = edges[0]
-    middles = 0.5 * ((edges[1:] - origin) + (edges[:-1] - origin))
-    around = slice(max(first - 1, 0), end + 1)
-    at = (imu.stamps_ns[around] - origin).astype(np.float64)
-    gyro = np.stack([np.interp(middles, at, imu.gyro_radps[around, k]) for k in range(3)], axis=1)
-    accel = np.stack([np.interp(middles, at, imu.accel_mps2[around, k]) for k in range(3)], axis=1)
-    return np.diff(edges) * 1e-9, gyro, accel
+    samples = imu.stamps_ns, np.ascontiguousarray(imu.gyro_radps), np.ascontiguousarray(imu.accel_mps2)
+    return intervals(*samples, int(start_ns), int(end_ns))

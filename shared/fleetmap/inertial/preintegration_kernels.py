@@ -29,6 +29,38 @@ def _interpolated(stamp_ns: int, stamps_ns: Stamps, values: Array, out: Array) -
 
 
 @kernel
+def _between(x: float, at: Array, values: Array, out: Array) -> None:
+    """Row of values (N, 3) at x, linear between at (N,), the nearest row beyond them. To the bit as np.interp."""
+    after = int(np.searchsorted(at, x, side="right"))
+    if after in (0, len(at)) or at[after - 1] == x:
+        out[:] = values[max(after - 1, 0)]
+        return
+    for a in range(3):
+        slope = (values[after, a] - values[after - 1, a]) / (at[after] - at[after - 1])
+        out[a] = slope * (x - at[after - 1]) + values[after - 1, a]
+
+
+@kernel
+def intervals(stamps_ns: Stamps, gyro: Array, accel: Array, start_ns: int, end_ns: int) -> tuple[Array, Array, Array]:
+    """As `preintegration.imu_intervals`."""
+    if end_ns <= start_ns or len(stamps_ns) == 0:
+        return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
+    first, end = int(np.searchsorted(stamps_ns, start_ns + 1)), int(np.searchsorted(stamps_ns, end_ns))
+    count, begin = end - first + 1, max(first - 1, 0)
+    steps_s, rates, forces = np.empty(count), np.empty((count, 3)), np.empty((count, 3))
+    at = (stamps_ns[begin : end + 1] - start_ns).astype(np.float64)
+    before_ns = start_ns
+    for n in range(count):
+        after_ns = stamps_ns[first + n] if n < count - 1 else end_ns
+        middle = 0.5 * ((after_ns - start_ns) + (before_ns - start_ns))
+        _between(middle, at, gyro[begin : end + 1], rates[n])
+        _between(middle, at, accel[begin : end + 1], forces[n])
+        steps_s[n] = (after_ns - before_ns) * 1e-9
+        before_ns = after_ns
+    return steps_s, rates, forces
+
+
+@kernel
 def cut_samples(
     stamps_ns: Stamps, gyro: Array, accel: Array, start_ns: int, end_ns: int
 ) -> tuple[Array, Array, Array, Array, float]:

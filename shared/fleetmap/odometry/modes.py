@@ -14,8 +14,9 @@ from fleetmap.odometry.filter.nav_state import InitialState, NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.init.static_initialization import is_steady, polynomial_rate, static_initialization
-from fleetmap.odometry.odometry_checks import DivergenceMonitor, ZeroVelocityDetector, longest_gap_ns
+from fleetmap.odometry.odometry_checks import DivergenceMonitor, ZeroVelocityDetector
 from fleetmap.odometry.sensor_buffer import SensorBuffer
+from fleetmap.odometry.sensor_kernels import longest_gap_ns
 from fleetmap.odometry.tracking.tracker import Tracked
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import Trajectory
@@ -300,7 +301,8 @@ class InertialMode(WindowMode):
         window, imu = self.window, self._imu
         self._frame_ns, self._last_odom_from_body = stamp_ns, window.filter.state.odom_from_body
         end_ns = stamp_ns + int(window.filter.imu_minus_cam_s * 1e9)
-        if longest_gap_ns(imu.samples.imu, window.stamp_ns, end_ns) > _IMU_GAP_NS and len(window.filter.clone_ids) > 1:
+        gap_ns = longest_gap_ns(imu.samples.imu.stamps_ns, window.stamp_ns, end_ns)
+        if gap_ns > _IMU_GAP_NS and len(window.filter.clone_ids) > 1:
             self._bridge_gap(end_ns)
         else:
             window.rate_body_radps = window.filter.propagate(

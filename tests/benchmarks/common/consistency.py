@@ -7,8 +7,8 @@ import numpy as np
 from benchmarks.common import estimator_loop
 from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.odometry import OdometryEstimate, OdometrySettings
-from fleetmap.odometry.odometry_checks import joined
 from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import ImuSamples
 from fleetsim.motion.body_motion import RouteMotion
 from fleetsim.motion.routes import Route
 from fleetsim.recorder import Order, Session, prepare
@@ -21,6 +21,8 @@ from support.estimator.simulated_run import EstimatorSession
 
 _SCENARIO = "small-loop"
 _SIDEWAYS_M = 0.15  # by which a run's way points are shifted at random
+
+_COLUMNS = "stamps_ns", "gyro_radps", "accel_mps2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +120,8 @@ def with_imu_of(session: EstimatorSession, other: EstimatorSession, from_s: floa
     """The run with another run's IMU from a time on."""
     own, foreign = session.session.imu, other.session.imu
     turn_ns = START_NS + int(from_s * 1e9)
-    mixed = joined([own.between(0, turn_ns), foreign.between(turn_ns, 1 << 62)])
+    before, after = own.between(0, turn_ns), foreign.between(turn_ns, 1 << 62)
+    mixed = ImuSamples(*(np.concatenate([getattr(part, name) for part in (before, after)]) for name in _COLUMNS))
     return EstimatorSession(replace(session.session, imu=mixed), field=session._field)
 
 

@@ -32,6 +32,16 @@ def transition(covariance: Array, first: int, state_to_state: Array, noise: Arra
 
 
 @kernel
+def forget(covariance: Array, kept: float, added: Array) -> None:
+    """Scales the first K errors by what is kept of them, and adds variances (K,); in place."""
+    count = len(added)
+    covariance[:count] *= kept
+    covariance[:, :count] *= kept
+    for k in range(count):
+        covariance[k, k] += added[k]
+
+
+@kernel
 def with_clone(covariance: Array, first: int, offset: int, by_offset: Array) -> Array:
     """The covariance with six more errors: rotation and position of the state that begins at `first`, as the time offset moves them.
 

@@ -1,12 +1,14 @@
 """The right-invariant multi-state constraint filter: propagation, clones, update."""
 
+import math
+from functools import lru_cache
 from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, se3_adjoint, se3_inverse, skew, so3_log
-from fleetmap.inertial import GRAVITY_MAP, imu_intervals
+from fleetmap.inertial import GRAVITY_MAP
 from fleetmap.odometry.filter import covariance_kernels, msckf_kernels, propagation_kernels
 from fleetmap.odometry.filter.measurements import CONSIDERED, LinearMeasurement
 from fleetmap.odometry.filter.msckf_kernels import Clones, NormalEquations, PixelModel, Tracks
@@ -80,16 +82,14 @@ class InvariantFilter:
 
         noise weighs the prediction; true_noise, where it differs, goes into true_error_cov.
         """
-        steps_s, gyro, accel = imu_intervals(imu, start_ns, end_ns)
-        phi, processes = np.eye(_NAV), np.zeros((2, _NAV, _NAV))
-        if len(steps_s):
-            densities = np.array([_densities(noise), _densities(true_noise or noise)])
-            s = self.state
-            state = s.rotation, s.velocity_mps, s.position_m, s.gyro_bias_radps, s.accel_bias_mps2
-            propagation_kernels.propagate(*state, GRAVITY_MAP, steps_s, gyro, accel, densities, phi, processes)
-        self._transition(phi, *processes)
-        self._forget_pair(max(end_ns - start_ns, 0) * 1e-9)
-        return gyro[-1] - self.state.gyro_bias_radps if len(gyro) else np.zeros(3)
+        s, kept, added = self.state, *self._pair_kept(max(end_ns - start_ns, 0) * 1e-9)
+        state = propagation_kernels.State(
+            s.rotation, s.velocity_mps, s.position_m, s.gyro_bias_radps, s.accel_bias_mps2
+        )
+        samples = imu.stamps_ns, imu.gyro_radps, imu.accel_mps2, int(start_ns), int(end_ns)
+        errors = self.covariance, self.true_error_cov, CONSIDERED
+        judged = _densities(noise, true_noise or noise)
+        return propagation_kernels.predict(state, GRAVITY_MAP, *samples, judged, *errors, kept, added)
 
     def predict_random_walk(
         self,
@@ -116,8 +116,9 @@ class InvariantFilter:
         # (free^-1 + measured^-1)^-1: the measured one where it is narrow, the free one where that is wider
         spread = free if measured_cov is None else free - free @ np.linalg.solve(free + measured_cov, free)
         process = np.asarray(shape @ spread @ shape.T)
-        self._transition(np.eye(_NAV), process, process)
-        self._forget_pair(duration_s)
+        for covariance, first in ((self.covariance, 0), (self.true_error_cov, CONSIDERED)):
+            covariance_kernels.transition(covariance, first, np.eye(_NAV), process)
+        covariance_kernels.forget(self.true_error_cov, *self._pair_kept(duration_s))
 
     def add_clone(self, clone_id: int, rate_body_radps: Array) -> None:
         """Keeps the current body transform in the window; the rate ties it to the time offset."""
@@ -290,16 +291,13 @@ class InvariantFilter:
             jacobian @ self.true_error_cov[CONSIDERED : CONSIDERED + _NAV, CONSIDERED : CONSIDERED + _NAV] @ jacobian.T
         )
 
-    def _transition(self, phi: Array, process: Array, real_process: Array) -> None:
-        covariance_kernels.transition(self.covariance, 0, phi, process)
-        covariance_kernels.transition(self.true_error_cov, CONSIDERED, phi, real_process)
+    def _pair_kept(self, duration_s: float) -> tuple[float, Array]:
+        """What is kept of the pair's errors, which change with the view, and the variances (2,) that come in for the rest.
 
-    def _forget_pair(self, duration_s: float) -> None:
-        """The pair's errors change with the view: a first-order Gauss-Markov process, back to the prior."""
-        kept = float(np.exp(-duration_s / self._settings.pair_error_memory_s))
-        self.true_error_cov[:_PAIR, :] *= kept
-        self.true_error_cov[:, :_PAIR] *= kept
-        self.true_error_cov[range(_PAIR), range(_PAIR)] += (1 - kept**2) * self._pair_variance
+        A first-order Gauss-Markov process, back to the prior.
+        """
+        kept = math.exp(-duration_s / self._settings.pair_error_memory_s)
+        return kept, (1 - kept**2) * self._pair_variance
 
     def _kept(self) -> tuple[NavState, Array, Array, float]:
         return NavState(**vars(self.state)), self._rotations.copy(), self._positions.copy(), self.imu_minus_cam_s
@@ -314,9 +312,11 @@ class InvariantFilter:
         msckf_kernels.turn_clones(self._rotations, self._positions, error[_CLONES:])
 
 
-def _densities(noise: ImuNoise) -> list[float]:
-    walks = noise.gyro_walk_radps2_rthz, noise.accel_walk_mps3_rthz
-    return [noise.gyro_noise_radps_rthz, noise.accel_noise_mps2_rthz, *walks]
+@lru_cache
+def _densities(*noises: ImuNoise) -> Array:
+    walks = [(noise.gyro_walk_radps2_rthz, noise.accel_walk_mps3_rthz) for noise in noises]
+    whites = [(noise.gyro_noise_radps_rthz, noise.accel_noise_mps2_rthz) for noise in noises]
+    return np.hstack([whites, walks])
 
 
 def _copied(covariance: Array, at: int, nav: int) -> Array:

@@ -1,19 +1,61 @@
 """Propagation of the right-invariant filter through IMU samples; error convention of `msckf_kernels`."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from fleetmap.geometry import Array
+from fleetmap.inertial.preintegration_kernels import intervals
 from fleetmap.numerics.kernel import kernel
 from fleetmap.numerics.linear_kernels import exp_so3, matmul, matmul_nt, rotate, skew
+from fleetmap.odometry.filter.covariance_kernels import forget, transition
+from fleetmap.sensors.samples import Stamps
+
+
+class State(NamedTuple):
+    """Rotation (3, 3), velocity, position, gyro bias and accelerometer bias (3,)."""
+
+    rotation: Array
+    velocity: Array
+    position: Array
+    gyro_bias: Array
+    accel_bias: Array
+
+
+@kernel
+def predict(
+    state: State,
+    gravity: Array,
+    stamps_ns: Stamps,
+    gyro: Array,
+    accel: Array,
+    start_ns: int,
+    end_ns: int,
+    noises: Array,
+    covariance: Array,
+    true_error_cov: Array,
+    considered: int,
+    kept: float,
+    added: Array,
+) -> Array:
+    """Moves the state and both covariances through samples (N,), (N, 3), by the first and the second noise; in place.
+
+    The last angular rate (3,), bias removed. considered: how many errors of the second covariance come before the state's; kept and
+    added as of `forget`. Other arguments as of `propagate`.
+    """
+    steps_s, rates, forces = intervals(stamps_ns, gyro, accel, start_ns, end_ns)
+    phi, processes = np.eye(15), np.zeros((2, 15, 15))
+    if len(steps_s) > 0:
+        propagate(state, gravity, steps_s, rates, forces, noises, phi, processes)
+    transition(covariance, 0, phi, processes[0])
+    transition(true_error_cov, considered, phi, processes[1])
+    forget(true_error_cov, kept, added)
+    return rates[len(rates) - 1] - state.gyro_bias if len(rates) > 0 else np.zeros(3)
 
 
 @kernel
 def propagate(
-    rotation: Array,
-    velocity: Array,
-    position: Array,
-    gyro_bias: Array,
-    accel_bias: Array,
+    state: State,
     gravity: Array,
     steps_s: Array,
     gyro: Array,
@@ -28,6 +70,8 @@ def propagate(
     accel walk, as so many may judge them. state_to_state (15, 15) and processes (D, 15, 15) receive the accumulated error
     transition and, for each of the judgements, the noise, order r nu rho bg ba.
     """
+    rotation, velocity, position = state.rotation, state.velocity, state.position
+    gyro_bias, accel_bias = state.gyro_bias, state.accel_bias
     phi = np.eye(15)
     processes[:, :, :] = 0.0
     for n in range(len(steps_s)):

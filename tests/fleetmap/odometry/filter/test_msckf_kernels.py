@@ -24,8 +24,8 @@ def moved(state: NavState, steps_s: Array, gyro: Array, accel: Array) -> tuple[N
     """The state after the intervals, transition and process noise."""
     s = NavState(**{name: value.copy() for name, value in vars(state).items()})
     phi, processes = np.empty((15, 15)), np.empty((1, 15, 15))
-    state = s.rotation, s.velocity_mps, s.position_m, s.gyro_bias_radps, s.accel_bias_mps2
-    propagation_kernels.propagate(*state, GRAVITY, steps_s, gyro, accel, DENSITIES[None], phi, processes)
+    state = propagation_kernels.State(*vars(s).values())
+    propagation_kernels.propagate(state, GRAVITY, steps_s, gyro, accel, DENSITIES[None], phi, processes)
     return s, phi, processes[0]
 
 

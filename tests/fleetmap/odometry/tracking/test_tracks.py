@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from fleetmap.odometry.odometry_checks import longest_gap_ns, without_spikes
+from fleetmap.odometry.sensor_buffer import SensorBuffer
+from fleetmap.odometry.sensor_kernels import longest_gap_ns
 from fleetmap.odometry.tracking.tracks import Observations
 from fleetmap.sensors.samples import ImuSamples
 from support.worlds.point_world import CAMERA
@@ -48,16 +49,38 @@ def samples(values: list[float], step_ns: int = 5_000_000) -> ImuSamples:
 
 def test_a_spike_goes_and_a_shock_that_lasts_stays() -> None:
     spiked = samples([0.1, 0.2, 90.0, 0.1, 0.1, 50.0, 51.0, 52.0])
-    kept = without_spikes(ImuSamples.empty(), spiked)
-    assert kept.stamps_ns.tolist() == [5_000_000 * k for k in (0, 1, 3, 4, 5, 6, 7)]
-    in_parts = without_spikes(
-        without_spikes(ImuSamples.empty(), spiked.between(0, 10_000_000)), spiked.between(10_000_000, 1 << 60)
-    )
-    assert in_parts.stamps_ns.tolist() == kept.stamps_ns.tolist()
+    expected = [5_000_000 * k for k in (0, 1, 3, 4, 5, 6, 7)]
+    for batches in ([spiked], [spiked.between(0, 10_000_000), spiked.between(10_000_000, 1 << 60)]):
+        buffer = SensorBuffer()
+        for batch in batches:
+            buffer.add_imu(batch)
+            buffer.absorb(0, 1.0)
+        assert buffer.imu.stamps_ns.tolist() == expected
+
+
+def test_the_buffer_grows_and_forgets_and_what_it_gave_away_stays() -> None:
+    buffer, period_ns, given = SensorBuffer(), 1_000_000, []
+    everything = samples(np.sin(np.arange(9000.0)).tolist(), period_ns)
+    for begin in range(0, 9000, 30):
+        rows = slice(begin, begin + 30)
+        buffer.add_imu(ImuSamples(*(column[rows] for column in columns(everything))))
+        buffer.absorb((begin + 30) * period_ns, 2.0)
+        given.append((buffer.imu, [column.copy() for column in columns(buffer.imu)]))
+        assert len(buffer.imu) >= min(begin + 30, 2000)
+        assert len(buffer.imu) <= 2000 + 800 + 30
+    for imu, was in given:
+        first = int(was[0][0]) // period_ns
+        for held, copied, whole in zip(columns(imu), was, columns(everything), strict=True):
+            np.testing.assert_array_equal(held, copied)
+            np.testing.assert_array_equal(held, whole[first : first + len(imu)])
+
+
+def columns(imu: ImuSamples) -> tuple[np.ndarray, ...]:
+    return imu.stamps_ns, imu.gyro_radps, imu.accel_mps2
 
 
 def test_a_gap_is_measured_across_the_edges() -> None:
     imu = samples([0.0] * 5, step_ns=10)
-    assert longest_gap_ns(imu, 5, 38) == 10
-    assert longest_gap_ns(imu, 20, 100) == 60
-    assert longest_gap_ns(ImuSamples.empty(), 0, 70) == 70
+    assert longest_gap_ns(imu.stamps_ns, 5, 38) == 10
+    assert longest_gap_ns(imu.stamps_ns, 20, 100) == 60
+    assert longest_gap_ns(ImuSamples.empty().stamps_ns, 0, 70) == 70
