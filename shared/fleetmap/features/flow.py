@@ -48,20 +48,17 @@ def follow(before: Pyramid, now: Pyramid, pixels: Array, predicted: Array, *, wi
             before.level(level), now.level(level), 0.5**level, half, _STEPS, _SETTLED_PX, start, places, found.copy()
         )
     flow_kernels.follow(before.level(0), now.level(0), 1.0, half, _STEPS, _SETTLED_PX, start, places, found)
-    return Flow(pixels, places, found)
+    return Flow(start, places, found)
 
 
 def forward_backward_check(
-    before: Pyramid, now: Pyramid, flow: Flow, *, window_px: int, within_px: float
+    before: Pyramid, now: Pyramid, flow: Flow, *, window_px: int, within_px: float, margin_px: float = -np.inf
 ) -> NDArray[np.bool_]:
     """(N,) which of the found places lead back to within so many pixels of where they were followed from.
 
-    Source: Kalal et al. 2010.
+    Nearer than margin_px to the image's edges none does. Source: Kalal et al. 2010.
     """
-    back, held = np.array(flow.pixels, np.float64), flow.found.copy()
-    half = window_px // 2
-    flow_kernels.follow(
-        now.level(0), before.level(0), 1.0, half, _STEPS_BACK, _SETTLED_BACK_PX, flow.places, back, held
-    )
-    off = back - flow.pixels
-    return np.asarray(held & (off[:, 0] ** 2 + off[:, 1] ** 2 < within_px**2))
+    held, ends = flow.found.copy(), (float(within_px), float(margin_px))
+    steps = window_px // 2, _STEPS_BACK, _SETTLED_BACK_PX
+    flow_kernels.check_back(before.level(0), now.level(0), *steps, flow.pixels, flow.places, *ends, held)
+    return held

@@ -190,3 +190,32 @@ def follow(
         )
         if found[n]:
             places[n, 0], places[n, 1] = x / scale, y / scale
+
+
+@kernel
+def check_back(
+    before: Grey,
+    now: Grey,
+    half: int,
+    steps: int,
+    settled_px: float,
+    pixels: Array,
+    places: Array,
+    within_px: float,
+    margin_px: float,
+    held: NDArray[np.bool_],
+) -> None:
+    """Of places (N, 2) that pixels (N, 2) were followed to, and that are held (N,), leaves those inside that lead back.
+
+    Other arguments as of `follow`.
+    """
+    height, width = now.shape
+    for n in range(len(places)):
+        x, y = places[n, 0], places[n, 1]
+        is_inside = x > margin_px and y > margin_px and x < width - 1 - margin_px and y < height - 1 - margin_px
+        held[n] = held[n] and is_inside
+    back = pixels.copy()
+    follow(now, before, 1.0, half, steps, settled_px, places, back, held)
+    for n in range(len(places)):
+        off_x, off_y = back[n, 0] - pixels[n, 0], back[n, 1] - pixels[n, 1]
+        held[n] = held[n] and off_x * off_x + off_y * off_y < within_px * within_px

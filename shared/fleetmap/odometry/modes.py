@@ -187,13 +187,13 @@ class VisualMode(WindowMode):
         An update takes the few tracks that are due or ended. Where they cluster or slip together the state must not
         follow them further than all the others allow; so loose, it adds no information to speak of.
         """
-        if tracked.cov_rot_trans is None:
+        if tracked.pnp is None:
             return None
         body_from_cam = np.zeros((6, 6))
         rotation = self._rig.body_from_cam[:3, :3]
         body_from_cam[:3, :3] = body_from_cam[3:, 3:] = rotation
         body_from_cam[3:, :3] = skew(self._rig.body_from_cam[:3, 3]) @ rotation
-        wide = self._rig.settings.filter.seen_motion_scale**2 * tracked.cov_rot_trans
+        wide = self._rig.settings.filter.seen_motion_scale**2 * tracked.pnp.cov_rot_trans
         return np.asarray(body_from_cam @ wide @ body_from_cam.T)
 
 

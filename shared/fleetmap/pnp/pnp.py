@@ -1,6 +1,7 @@
 """The pose of one camera from points with known positions: RANSAC, then robust least squares with covariance."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,18 +37,23 @@ class Correspondences:
         return Correspondences(self.camera, self.points_source[rows], self.pixels[rows], self.sigmas_px[rows])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class PnpResult:
     """A solved camera.
 
-    cam_from_source (4, 4); cov_rot_trans (6, 6) of a left perturbation in camera axes; inliers (N,); squared normalised
+    cam_from_source (4, 4); information (6, 6) on a left perturbation in camera axes; inliers (N,); squared normalised
     residuals (N,).
     """
 
     cam_from_source: Array
-    cov_rot_trans: Array
+    information: Array
     inliers: NDArray[np.bool_]
     squared: Array
+
+    @cached_property
+    def cov_rot_trans(self) -> Array:
+        """(6, 6) of the perturbation; not every caller needs it."""
+        return np.asarray(np.linalg.inv(self.information + 1e-9 * np.eye(6)))
 
 
 def refine_pnp(
@@ -70,8 +76,7 @@ def refine_pnp(
     limits = _WIDTH, GATE_SQUARED, prior, ITERATIONS
     if not pnp_kernels.refine_twice(rotation, translation, points, measured, weights, lens, *limits, hessian, squared):
         return None
-    covariance = np.asarray(np.linalg.inv(hessian + prior + 1e-9 * np.eye(6)))
-    return PnpResult(se3(rotation, translation), covariance, squared < GATE_SQUARED, squared)
+    return PnpResult(se3(rotation, translation), hessian + prior, squared < GATE_SQUARED, squared)
 
 
 def ransac_pnp(

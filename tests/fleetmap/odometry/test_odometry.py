@@ -271,7 +271,7 @@ def test_tracks_that_no_motion_explains_are_not_used(monkeypatch: pytest.MonkeyP
 
     def lost(tracker: Tracker, *inputs: Any) -> Tracked:
         found = track(tracker, *inputs)
-        return replace(found, cam_from_previous=None, cov_rot_trans=None) if tracker._frame_index > 2 else found
+        return replace(found, cam_from_previous=None, pnp=None) if tracker._frame_index > 2 else found
 
     def recorded(window: SlidingWindow, frame_index: int, tracked: Tracked, *inputs: Any) -> Any:
         taken.append(len(tracked.ids))

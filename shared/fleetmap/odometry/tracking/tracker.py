@@ -14,10 +14,18 @@ from fleetmap.features.settings import AlignSettings, OrbSettings, StereoSetting
 from fleetmap.geometry import Array, transform_points
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracking import tracker_kernels
-from fleetmap.pnp.pnp import Correspondences, PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
+from fleetmap.pnp.pnp import (
+    GATE_SQUARED,
+    REFINEMENT,
+    Correspondences,
+    PnpResult,
+    pnp_with_rotation,
+    ransac_pnp,
+)
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 
 _LEVELS_WHEN_SURE, _HELD_WHEN_SURE = 1, 0.6
+_MARGIN_PX = 6.0  # of the image, where no point is followed to
 Ids = NDArray[np.int64]
 _FLOW_ITERATIONS = 200  # finds a motion that a third of the points share; with fewer the flow has failed
 MotionSince = Callable[[int], Array | None]
@@ -41,7 +49,7 @@ class Tracked:
     """What one frame saw.
 
     ids (N,), ascending, and pixels (N, 3) u_left v u_right of the current frame. cam_from_previous: the motion measured since the
-    previous frame, None where too few points agree; cov_rot_trans (6, 6): of its left perturbation. After a gap
+    previous frame, None where too few points agree; `pnp`: where that comes from, None after a gap. Then
     (by_descriptors) `earlier` holds what was matched, best first.
     """
 
@@ -51,7 +59,7 @@ class Tracked:
     cam_from_previous: Array | None
     inlier_share: float
     by_descriptors: bool
-    cov_rot_trans: Array | None = None
+    pnp: PnpResult | None = None
 
     @property
     def lost(self) -> bool:
@@ -105,7 +113,7 @@ class Tracker:
         forgotten; rotation_sigma_rad says how well its rotation is known, None where it is only a guess.
         """
         motion: Array | None = None
-        covariance: Array | None = None
+        pnp: PnpResult | None = None
         earlier: tuple[Earlier, ...] = ()
         share, far = 1.0, False
         self._frame_index += 1
@@ -121,17 +129,19 @@ class Tracker:
                 sure = guess is not None and rotation_sigma_rad is not None
                 pnp, share = self._follow(frame, np.eye(4) if guess is None else guess, sure)
                 if pnp is not None:
-                    motion, covariance = pnp.cam_from_source, pnp.cov_rot_trans
+                    motion = pnp.cam_from_source
         self._renew_disparities(frame)
         self._add_corners(frame)
         self._previous = frame
         self._pyramids[0] = self._pyramids[1]
-        return Tracked(self._points.ids.copy(), self._points.pixels.copy(), earlier, motion, share, far, covariance)
+        return Tracked(self._points.ids.copy(), self._points.pixels.copy(), earlier, motion, share, far, pnp)
 
     def _points_cam(self, pixels: Array) -> Array:
         if self._camera.baseline_m == 0:
             return np.full((len(pixels), 3), np.nan)
-        return self._camera.point_from_pixel(pixels[:, :2], pixels[:, 0] - pixels[:, 2])
+        points_cam = np.empty((len(pixels), 3))
+        tracker_kernels.stereo_points(pixels, self._lens, points_cam)
+        return points_cam
 
     def _predict(self, points_cam: Array, pixels: Array, cam_from_previous: Array) -> Array:
         """Where the previous points should appear; those without depth move as if far away."""
@@ -170,29 +180,29 @@ class Tracker:
         return new, kept
 
     def _flow_from(self, frame: RectifiedFrame, predicted: Array, levels: int) -> tuple[Array, NDArray[np.bool_]]:
-        s = self._settings
-        before, now, old = self._pyramids[0], self._pyramids[1], np.ascontiguousarray(self._points.pixels[:, :2])
-        flowed = flow.follow(before, now, old, predicted, window_px=s.window_px, levels=levels)
-        new, (height, width) = flowed.places, frame.left.shape
-        inside = (new[:, 0] > 6) & (new[:, 1] > 6) & (new[:, 0] < width - 7) & (new[:, 1] < height - 7)
-        flowed = flowed._replace(found=flowed.found & inside)
-        return new, flow.forward_backward_check(before, now, flowed, window_px=s.window_px, within_px=s.back_check_px)
+        s, (before, now) = self._settings, self._pyramids
+        flowed = flow.follow(before, now, self._points.pixels[:, :2], predicted, window_px=s.window_px, levels=levels)
+        return flowed.places, flow.forward_backward_check(
+            before, now, flowed, window_px=s.window_px, within_px=s.back_check_px, margin_px=_MARGIN_PX
+        )
 
     def _motion(self, points_cam: Array, flowed: Array, kept: NDArray[np.bool_], guess: Array) -> PnpResult | None:
         """cam_from_previous from points with depth.
 
         Least squares from the guess, RANSAC where most points disagree with it.
         """
-        usable = kept & np.isfinite(points_cam).all(axis=1)
-        count = int(usable.sum())
+        motion, information, squared = guess.copy(), np.empty((6, 6)), np.empty(len(kept))
+        limits = self._lens, self._settings.min_inliers, REFINEMENT
+        count, agree = tracker_kernels.motion_of(points_cam, flowed, kept, *limits, motion, information, squared)
         if count < self._settings.min_inliers:
             return None
-        measured = np.column_stack([flowed[usable], np.full(count, np.nan)])
-        sigmas = np.full((count, 2), 1.0)
-        matches = Correspondences(self._camera, points_cam[usable], measured, sigmas)
-        result = refine_pnp(matches, guess)
-        if result is not None and result.inliers.sum() > 0.6 * count:
+        squared = squared[:count]
+        result = PnpResult(motion, information, squared < GATE_SQUARED, squared) if agree >= 0 else None
+        if agree > 0.6 * count:
             return result
+        usable = kept & np.isfinite(points_cam).all(axis=1)
+        measured = np.column_stack([flowed[usable], np.full(count, np.nan)])
+        matches = Correspondences(self._camera, points_cam[usable], measured, np.ones((count, 2)))
         again = ransac_pnp(
             matches,
             threshold_px=self._settings.ransac_px,

@@ -7,8 +7,10 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetmap.numerics.kernel import inner_kernel, kernel
+from fleetmap.pnp.pnp_kernels import refine_twice
 
 _NEAR_M = 1e-6
+Refinement = tuple[float, float, tuple[int, int]]  # of `pnp`: width, gate, iterations
 
 
 @inner_kernel
@@ -20,6 +22,60 @@ def _moved(motion: Array, x: float, y: float, z: float, is_point: bool) -> tuple
         motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * z + shift * motion[1, 3],
         motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * z + shift * motion[2, 3],
     )
+
+
+@kernel
+def stereo_points(pixels: Array, camera: Array, points_cam: Array) -> None:
+    """Fills points_cam (N, 3) of pixels (N, 3) u_left v u_right; not finite where there is no disparity."""
+    for n in range(len(pixels)):
+        z = camera[3] / (pixels[n, 0] - pixels[n, 2])
+        points_cam[n, 0], points_cam[n, 1] = (
+            (pixels[n, 0] - camera[1]) * z / camera[0],
+            (pixels[n, 1] - camera[2]) * z / camera[0],
+        )
+        points_cam[n, 2] = z
+
+
+@kernel
+def motion_of(
+    points_cam: Array,
+    flowed: Array,
+    kept: NDArray[np.bool_],
+    camera: Array,
+    least: int,
+    refinement: Refinement,
+    cam_from_previous: Array,
+    information: Array,
+    squared: Array,
+) -> tuple[int, int]:
+    """How many points (N, 3) with depth were kept (N,), and how many of these agree with the motion that flowed (N, 2) shows.
+
+    -1 agree where they determine none, or are fewer than `least`. cam_from_previous (4, 4) goes from a guess to the motion;
+    information (6, 6) and squared (N,), of the points with depth, are filled as by `refine_twice`.
+    """
+    usable = kept.copy()
+    for n in range(len(kept)):
+        for a in range(3):
+            if not math.isfinite(points_cam[n, a]):
+                usable[n] = False
+    count = int(usable.sum())
+    if count < least:
+        return count, -1
+    measured, at = np.full((count, 3), np.nan), 0
+    for n in range(len(kept)):
+        if usable[n]:
+            measured[at, 0], measured[at, 1] = flowed[n, 0], flowed[n, 1]
+            at += 1
+    width, gate_squared, iterations = refinement
+    rotation, translation = cam_from_previous[:3, :3].copy(), cam_from_previous[:3, 3].copy()
+    matches = points_cam[usable], measured, np.ones((count, 2))
+    if not refine_twice(
+        rotation, translation, matches[0], matches[1], matches[2], camera, width, gate_squared, np.zeros((6, 6)),
+        iterations, information, squared[:count],
+    ):  # fmt: skip
+        return count, -1
+    cam_from_previous[:3, :3], cam_from_previous[:3, 3] = rotation, translation
+    return count, int((squared[:count] < gate_squared).sum())
 
 
 @kernel
