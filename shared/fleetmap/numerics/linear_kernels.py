@@ -11,14 +11,22 @@ from fleetmap.numerics.kernel import kernel
 
 @kernel
 def matmul(a: Array, b: Array) -> Array:
-    """(n, m) product of (n, k) and (k, m)."""
+    """(n, m) product of (n, k) and (k, m); sums are in the order of k."""
     out = np.zeros((a.shape[0], b.shape[1]))
+    whole = a.shape[1] // 4 * 4
     for i in range(a.shape[0]):
-        for k in range(a.shape[1]):
-            x = a[i, k]
+        row = out[i]
+        for k in range(0, whole, 4):  # so that a row is read and written once for four additions
+            x0, x1, x2, x3 = a[i, k], a[i, k + 1], a[i, k + 2], a[i, k + 3]
+            if x0 != 0.0 or x1 != 0.0 or x2 != 0.0 or x3 != 0.0:
+                b0, b1, b2, b3 = b[k], b[k + 1], b[k + 2], b[k + 3]
+                for j in range(b.shape[1]):
+                    row[j] = row[j] + x0 * b0[j] + x1 * b1[j] + x2 * b2[j] + x3 * b3[j]
+        for k in range(whole, a.shape[1]):
+            x, last = a[i, k], b[k]
             if x != 0.0:
                 for j in range(b.shape[1]):
-                    out[i, j] += x * b[k, j]
+                    row[j] += x * last[j]
     return out
 
 
