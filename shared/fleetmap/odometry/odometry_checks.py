@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.geometry import Array
+from fleetmap.numerics.transform_kernels import angle_between_rad, distance_between
 from fleetmap.odometry.tracking import tracker_kernels
 
 _DISAGREEMENT_RAD = 0.02  # between the rotation of one step by images and by gyro
@@ -28,8 +29,8 @@ class DivergenceMonitor:
         """
         if predicted is None or seen is None:
             return False
-        off_rad = rotation_angle_rad(predicted[:3, :3].T @ seen[:3, :3])
-        self._disagreements = max(self._disagreements + (1 if off_rad > _DISAGREEMENT_RAD else -1), 0)
+        is_off = angle_between_rad(predicted, seen) > _DISAGREEMENT_RAD
+        self._disagreements = max(self._disagreements + (1 if is_off else -1), 0)
         return self._disagreements >= _MAX_DISAGREEMENTS
 
     def is_wrong_start(self, offset_s: float, predicted: Array | None, seen: Array | None) -> bool:
@@ -42,8 +43,7 @@ class DivergenceMonitor:
             return True
         if predicted is None or seen is None:
             return False
-        off_m = float(np.linalg.norm((predicted @ se3_inverse(seen))[:3, 3]))
-        self._diverged_frames = 0 if off_m < _DIVERGED_M else self._diverged_frames + 1
+        self._diverged_frames = 0 if distance_between(predicted, seen) < _DIVERGED_M else self._diverged_frames + 1
         return self._diverged_frames >= _MAX_DIVERGED_FRAMES
 
     def begin_again(self) -> None:

@@ -62,6 +62,16 @@ def with_clone(covariance: Array, first: int, offset: int, by_offset: Array) -> 
 
 
 @kernel
+def without_errors(covariance: Array, at: int) -> Array:
+    """The covariance less the six errors that begin there."""
+    size = len(covariance) - 6
+    kept = np.empty((size, size))
+    kept[:at, :at], kept[:at, at:] = covariance[:at, :at], covariance[:at, at + 6 :]
+    kept[at:, :at], kept[at:, at:] = covariance[at + 6 :, :at], covariance[at + 6 :, at + 6 :]
+    return kept
+
+
+@kernel
 def correct(
     covariance: Array,
     true_error_cov: Array,

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3_inverse, skew
+from fleetmap.geometry import Array, skew
+from fleetmap.odometry.filter import state_kernels
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.settings import FilterSettings
 from fleetmap.sensors.samples import WheelSample
@@ -49,18 +50,9 @@ def wheel_odometry(
     state: NavState, sample: WheelSample, gyro_radps: Array, base_from_body: Array, settings: FilterSettings
 ) -> LinearMeasurement:
     """The motion of `base` by its wheels: forward speed, no other, and yaw rate. gyro_radps (3,): measured at the same time."""
-    turn, base_body = base_from_body[:3, :3], se3_inverse(base_from_body)[:3, 3]
-    rate = gyro_radps - state.gyro_bias_radps
-    base_from_odom = turn @ state.rotation.T
-    velocity = base_from_odom @ state.velocity_mps + turn @ (skew(rate) @ base_body)
-    jacobian = np.zeros((4, _ERRORS))
-    # R^T v with the invariant error changes by R^T nu alone: turning the frame turns both
-    jacobian[:3, 3:6] = base_from_odom
-    jacobian[:3, 9:12] = turn @ skew(base_body)
-    jacobian[3, 9:12] = -turn[2]
-    residual = np.append(sample.velocity_base_mps - velocity, sample.yaw_rate_radps - (turn @ rate)[2])
+    jacobian, by_considered = np.zeros((4, _ERRORS)), np.zeros((4, CONSIDERED))
+    measured = sample.velocity_base_mps, float(sample.yaw_rate_radps), gyro_radps, base_from_body
+    residual = state_kernels.wheel_rows(state.arrays, *measured, jacobian, by_considered)
     sigmas = np.array([sample.sigma_mps, settings.wheel_slip_mps, settings.wheel_slip_mps, sample.sigma_radps])
-    by_considered = np.zeros((4, CONSIDERED))
-    by_considered[0, 2], by_considered[3, 3] = velocity[0], (turn @ rate)[2]
     weighed = np.diag((settings.wheel_sigma_scale * sigmas) ** 2)
     return LinearMeasurement(jacobian, residual, weighed, np.diag(sigmas**2), by_considered)

@@ -7,12 +7,14 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3, se3_adjoint, se3_inverse, skew, so3_log
+from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_log
 from fleetmap.inertial import GRAVITY_MAP
-from fleetmap.odometry.filter import covariance_kernels, msckf_kernels, propagation_kernels
+from fleetmap.numerics.transform_kernels import earlier_from_later
+from fleetmap.odometry.filter import covariance_kernels, msckf_kernels, propagation_kernels, state_kernels
 from fleetmap.odometry.filter.measurements import CONSIDERED, LinearMeasurement
 from fleetmap.odometry.filter.msckf_kernels import Clones, NormalEquations, PixelModel, Tracks
 from fleetmap.odometry.filter.nav_state import NavState
+from fleetmap.odometry.filter.state_kernels import Window
 from fleetmap.odometry.settings import FilterSettings
 from fleetmap.odometry.tracking.tracks import TrackBatch
 from fleetmap.sensors.calibration import ImuNoise
@@ -47,7 +49,7 @@ class InvariantFilter:
         true_error_cov: Array | None = None,
     ) -> None:
         """nav_covariance (15, 15) in the filter's error; true_error_cov: that of the true error, where it differs."""
-        self.state = state
+        self.state = state.copy()
         self.imu_minus_cam_s = 0.0
         self.clone_ids: list[int] = []
         self._rotations, self._positions = np.zeros((0, 3, 3)), np.zeros((0, 3))
@@ -82,14 +84,11 @@ class InvariantFilter:
 
         noise weighs the prediction; true_noise, where it differs, goes into true_error_cov.
         """
-        s, kept, added = self.state, *self._pair_kept(max(end_ns - start_ns, 0) * 1e-9)
-        state = propagation_kernels.State(
-            s.rotation, s.velocity_mps, s.position_m, s.gyro_bias_radps, s.accel_bias_mps2
-        )
+        kept, added = self._pair_kept(max(end_ns - start_ns, 0) * 1e-9)
         samples = imu.stamps_ns, imu.gyro_radps, imu.accel_mps2, int(start_ns), int(end_ns)
         errors = self.covariance, self.true_error_cov, CONSIDERED
         judged = _densities(noise, true_noise or noise)
-        return propagation_kernels.predict(state, GRAVITY_MAP, *samples, judged, *errors, kept, added)
+        return propagation_kernels.predict(self.state.arrays, GRAVITY_MAP, *samples, judged, *errors, kept, added)
 
     def predict_random_walk(
         self,
@@ -122,27 +121,16 @@ class InvariantFilter:
 
     def add_clone(self, clone_id: int, rate_body_radps: Array) -> None:
         """Keeps the current body transform in the window; the rate ties it to the time offset."""
-        s = self.state
-        turn = s.rotation @ rate_body_radps
-        by_offset = np.concatenate([turn, s.velocity_mps + skew(s.position_m) @ turn])
-        self.covariance = covariance_kernels.with_clone(self.covariance, 0, _OFFSET, by_offset)
-        at = CONSIDERED, CONSIDERED + _OFFSET
-        self.true_error_cov = covariance_kernels.with_clone(self.true_error_cov, *at, by_offset)
         self.clone_ids.append(clone_id)
-        self._rotations = np.concatenate([self._rotations, s.rotation[None]])
-        self._positions = np.concatenate([self._positions, s.position_m[None]])
+        grown = state_kernels.add_clone(self._window, self.state.arrays, rate_body_radps, CONSIDERED, _OFFSET)
+        self._rotations, self._positions, self.covariance, self.true_error_cov = grown
 
     def remove_clone(self, clone_id: int) -> None:
         """Forgets a clone (marginalises it)."""
         index = self.clone_ids.index(clone_id)
-        at = _CLONES + 6 * index
-        self.covariance, self.true_error_cov = (
-            _without(self.covariance, at),
-            _without(self.true_error_cov, CONSIDERED + at),
-        )
         del self.clone_ids[index]
-        self._rotations = np.delete(self._rotations, index, axis=0)
-        self._positions = np.delete(self._positions, index, axis=0)
+        left = state_kernels.drop_clone(self._window, index, CONSIDERED, _CLONES)
+        self._rotations, self._positions, self.covariance, self.true_error_cov = left
 
     def return_to_clone(self, clone_id: int) -> None:
         """Takes rotation and position of the state back to a clone's, as certain as that is; what moved them since is forgotten."""
@@ -172,9 +160,8 @@ class InvariantFilter:
         used = np.zeros(len(tracks), np.int8)
         if not len(tracks):
             return used
-        order = np.argsort(self.clone_ids)
-        ids = np.array(self.clone_ids)[order]
-        clones, anchors = (order[np.searchsorted(ids, wanted)] for wanted in (tracks.clone_ids, tracks.anchors))
+        held = np.array(self.clone_ids)
+        clones, anchors = (state_kernels.rows_of(held, wanted) for wanted in (tracks.clone_ids, tracks.anchors))
         rows = Tracks(tracks.starts, clones, tracks.pixels, anchors, tracks.points_cam)
         model = PixelModel(self._camera, self._weights / sigma_scale, self._noise, self._quantile)
         prior = self._kept()
@@ -260,7 +247,18 @@ class InvariantFilter:
 
     def body_since(self, clone_id: int) -> Array:
         """earlier_from_now (4, 4) between a clone and the newest one."""
-        return np.asarray(se3_inverse(self.odom_from_clone(clone_id)) @ self.odom_from_clone(self.clone_ids[-1]))
+        return self.motion_between(clone_id, self.clone_ids[-1])
+
+    def motion_between(self, earlier_id: int, later_id: int) -> Array:
+        """earlier_from_later (4, 4) between two clones."""
+        held = self.clone_ids.index(earlier_id), self.clone_ids.index(later_id)
+        return earlier_from_later(self._rotations, self._positions, *held)
+
+    def cam_from_earlier(self, clone_id: int, cam_from_body: Array) -> Array:
+        """(4, 4) from a clone's camera to that of the state."""
+        index, mounting = self.clone_ids.index(clone_id), (cam_from_body, self._body_from_cam)
+        clone = self._rotations[index], self._positions[index]
+        return state_kernels.cam_from_earlier(self.state.arrays, *clone, *mounting)
 
     def motion_since(self, clone_id: int) -> tuple[Array, Array]:
         """earlier_from_now (4, 4) between a clone and the newest one, and its covariance (6, 6).
@@ -268,13 +266,8 @@ class InvariantFilter:
         The covariance is that of a left perturbation in axes of the earlier body, from the joint covariance of both, so
         that what they share cancels.
         """
-        at = _CLONES + 6 * self.clone_ids.index(clone_id)
-        newest = _CLONES + 6 * (len(self.clone_ids) - 1)
-        c = self.true_error_cov[CONSIDERED:, CONSIDERED:]
-        difference = c[newest : newest + 6, newest : newest + 6] + c[at : at + 6, at : at + 6]
-        difference = difference - c[newest : newest + 6, at : at + 6] - c[at : at + 6, newest : newest + 6]
-        carry = se3_adjoint(se3_inverse(self.odom_from_clone(clone_id)))
-        return self.body_since(clone_id), np.asarray(carry @ difference @ carry.T)
+        index = self.clone_ids.index(clone_id)
+        return state_kernels.motion_since(self._window, index, CONSIDERED + _CLONES)
 
     @property
     def offset_sigma_s(self) -> float:
@@ -283,13 +276,11 @@ class InvariantFilter:
 
     def body_covariance(self) -> Array:
         """cov_rot_trans (6, 6) of odom_from_body: rotation error in odom axes, then position error."""
-        jacobian = np.zeros((6, _NAV))
-        jacobian[0:3, 0:3] = np.eye(3)
-        jacobian[3:6, 0:3] = -skew(self.state.position_m)
-        jacobian[3:6, 6:9] = np.eye(3)
-        return np.asarray(
-            jacobian @ self.true_error_cov[CONSIDERED : CONSIDERED + _NAV, CONSIDERED : CONSIDERED + _NAV] @ jacobian.T
-        )
+        return state_kernels.body_covariance(self.state.position_m, self.true_error_cov, CONSIDERED)
+
+    @property
+    def _window(self) -> Window:
+        return Window(self._rotations, self._positions, self.covariance, self.true_error_cov)
 
     def _pair_kept(self, duration_s: float) -> tuple[float, Array]:
         """What is kept of the pair's errors, which change with the view, and the variances (2,) that come in for the rest.
@@ -300,16 +291,15 @@ class InvariantFilter:
         return kept, (1 - kept**2) * self._pair_variance
 
     def _kept(self) -> tuple[NavState, Array, Array, float]:
-        return NavState(**vars(self.state)), self._rotations.copy(), self._positions.copy(), self.imu_minus_cam_s
+        return self.state.copy(), self._rotations.copy(), self._positions.copy(), self.imu_minus_cam_s
 
     def _restore(self, kept: tuple[NavState, Array, Array, float]) -> None:
-        self.state = NavState(**vars(kept[0]))
+        self.state = kept[0].copy()
         self._rotations, self._positions, self.imu_minus_cam_s = kept[1].copy(), kept[2].copy(), kept[3]
 
     def _correct(self, error: Array) -> None:
-        self.state.correct(error[:_NAV])
         self.imu_minus_cam_s += float(error[_OFFSET])
-        msckf_kernels.turn_clones(self._rotations, self._positions, error[_CLONES:])
+        state_kernels.apply_error(self.state.arrays, self._rotations, self._positions, error)
 
 
 @lru_cache
@@ -324,15 +314,6 @@ def _copied(covariance: Array, at: int, nav: int) -> Array:
     order = np.arange(len(covariance))
     order[nav : nav + 3], order[nav + 6 : nav + 9] = order[at : at + 3], order[at + 3 : at + 6]
     return covariance[np.ix_(order, order)]
-
-
-def _without(covariance: Array, at: int) -> Array:
-    """The covariance less the six errors that begin there."""
-    size = len(covariance) - 6
-    kept = np.empty((size, size))
-    kept[:at, :at], kept[:at, at:] = covariance[:at, :at], covariance[:at, at + 6 :]
-    kept[at:, :at], kept[at:, at:] = covariance[at + 6 :, :at], covariance[at + 6 :, at + 6 :]
-    return kept
 
 
 def _symmetric(covariance: Array) -> Array:

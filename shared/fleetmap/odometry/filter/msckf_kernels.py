@@ -15,7 +15,6 @@ from fleetmap.geometry import Array
 from fleetmap.numerics.kernel import kernel
 from fleetmap.numerics.linear_kernels import (
     cholesky_in_place,
-    exp_so3,
     forward_substitute,
     matmul,
     matmul_nt,
@@ -386,12 +385,3 @@ def _project_out(by_point: Array, by_clone: Array, residual: Array, rows: int) -
             dot += v[i] * residual[i]
         for i in range(k, rows):
             residual[i] -= beta * dot * v[i]
-
-
-@kernel
-def turn_clones(rotations: Array, positions: Array, errors: Array) -> None:
-    """Applies errors (6 M,) to the body transforms of M clones, in place."""
-    for m in range(len(positions)):
-        turn = exp_so3(errors[6 * m : 6 * m + 3])
-        rotations[m] = matmul(turn, rotations[m])
-        positions[m] = rotate(turn, positions[m]) + errors[6 * m + 3 : 6 * m + 6]

@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.geometry import Array, se3
+from fleetmap.odometry.filter.state_kernels import State
 
 
 @dataclass
@@ -22,14 +23,14 @@ class NavState:
         """(4, 4)."""
         return se3(self.rotation, self.position_m)
 
-    def correct(self, error: Array) -> None:
-        """Applies an error (15,) of the filter's convention: rotation, velocity, position, gyro bias, accelerometer bias."""
-        turn = so3_exp(error[0:3])
-        self.rotation = turn @ self.rotation
-        self.velocity_mps = turn @ self.velocity_mps + error[3:6]
-        self.position_m = turn @ self.position_m + error[6:9]
-        self.gyro_bias_radps = self.gyro_bias_radps + error[9:12]
-        self.accel_bias_mps2 = self.accel_bias_mps2 + error[12:15]
+    @property
+    def arrays(self) -> State:
+        """As kernels take it, and change it in place."""
+        return State(self.rotation, self.velocity_mps, self.position_m, self.gyro_bias_radps, self.accel_bias_mps2)
+
+    def copy(self) -> "NavState":
+        """One that shares no array with this one."""
+        return NavState(*(np.array(values, np.float64, order="C") for values in self.arrays))
 
 
 @dataclass(frozen=True, slots=True)

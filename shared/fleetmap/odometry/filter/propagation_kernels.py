@@ -1,7 +1,5 @@
 """Propagation of the right-invariant filter through IMU samples; error convention of `msckf_kernels`."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from fleetmap.geometry import Array
@@ -9,17 +7,8 @@ from fleetmap.inertial.preintegration_kernels import intervals
 from fleetmap.numerics.kernel import kernel
 from fleetmap.numerics.linear_kernels import exp_so3, matmul, matmul_nt, rotate, skew
 from fleetmap.odometry.filter.covariance_kernels import forget, transition
+from fleetmap.odometry.filter.state_kernels import State
 from fleetmap.sensors.samples import Stamps
-
-
-class State(NamedTuple):
-    """Rotation (3, 3), velocity, position, gyro bias and accelerometer bias (3,)."""
-
-    rotation: Array
-    velocity: Array
-    position: Array
-    gyro_bias: Array
-    accel_bias: Array
 
 
 @kernel

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, length, rotation_angle_rad, se3_adjoint, se3_inverse
+from fleetmap.geometry import Array, se3_adjoint, se3_inverse
+from fleetmap.numerics.transform_kernels import angle_between_rad, distance_between
 from fleetmap.odometry.filter.msckf import InvariantFilter
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.odometry_checks import middle
@@ -16,6 +17,7 @@ from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 
 _UNKNOWN_DEPTH_M = 5.0
+_NO_MOTION = np.eye(4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +69,18 @@ class SlidingWindow:
         if kept not in self.filter.clone_ids:
             return None
         kept_from_now, covariance = self.filter.motion_since(kept)
+        if kept == frame_index:
+            return kept_from_now, covariance
         carry = se3_adjoint(frame_from_kept)
         return frame_from_kept @ kept_from_now, carry @ covariance @ carry.T
 
     def body_since(self, frame_index: int) -> Array | None:
         """The transform of `motion_since` alone."""
         kept, frame_from_kept = self._kept(frame_index)
-        return frame_from_kept @ self.filter.body_since(kept) if kept in self.filter.clone_ids else None
+        if kept not in self.filter.clone_ids:
+            return None
+        since = self.filter.body_since(kept)
+        return since if kept == frame_index else frame_from_kept @ since
 
     def _kept(self, frame_index: int) -> tuple[int, Array]:
         """The frame that stands for one that was dropped, and frame_from_kept (4, 4); for any other that frame itself."""
@@ -87,9 +94,7 @@ class SlidingWindow:
         """(4, 4) from a frame's camera to the one at the state; None where the frame is not kept."""
         if frame_index not in self.filter.clone_ids:
             return None
-        odom_from_earlier = self.filter.odom_from_clone(frame_index)
-        body_from_odom = se3_inverse(self.filter.state.odom_from_body)
-        return np.asarray(self.rig.cam_from_body @ body_from_odom @ odom_from_earlier @ self.rig.body_from_cam)
+        return self.filter.cam_from_earlier(frame_index, self.rig.cam_from_body)
 
     def matched_body(self, tracked: Tracked) -> tuple[int, Array] | None:
         """After a gap: the best matched clone and odom_from_body (4, 4) as vision measured it since then."""
@@ -159,12 +164,10 @@ class SlidingWindow:
         self._merged.clear()
         while len(self.filter.clone_ids) >= settings.clones:
             ids = self.filter.clone_ids
-            earlier, candidate = self.filter.odom_from_clone(ids[-3]), self.filter.odom_from_clone(ids[-2])
-            motion = se3_inverse(earlier) @ candidate
-            parallax = length(motion[:3, 3]) / self.scene_depth_m
+            motion = self.filter.motion_between(ids[-3], ids[-2])
             is_still = (
-                rotation_angle_rad(motion[:3, :3]) < settings.keyframe_rotation_rad
-                and parallax < settings.keyframe_parallax
+                angle_between_rad(motion, _NO_MOTION) < settings.keyframe_rotation_rad
+                and distance_between(motion, _NO_MOTION) / self.scene_depth_m < settings.keyframe_parallax
             )
             gone = ids[-2] if is_still else ids[0]
             if is_still:

@@ -22,10 +22,9 @@ DENSITIES = np.array(
 
 def moved(state: NavState, steps_s: Array, gyro: Array, accel: Array) -> tuple[NavState, Array, Array]:
     """The state after the intervals, transition and process noise."""
-    s = NavState(**{name: value.copy() for name, value in vars(state).items()})
+    s = state.copy()
     phi, processes = np.empty((15, 15)), np.empty((1, 15, 15))
-    state = propagation_kernels.State(*vars(s).values())
-    propagation_kernels.propagate(state, GRAVITY, steps_s, gyro, accel, DENSITIES[None], phi, processes)
+    propagation_kernels.propagate(s.arrays, GRAVITY, steps_s, gyro, accel, DENSITIES[None], phi, processes)
     return s, phi, processes[0]
 
 
