@@ -9,7 +9,7 @@ from importlib import metadata
 from itertools import accumulate
 
 import msgspec
-from fastapi import FastAPI, Request, Response
+from fastapi import Depends, FastAPI, Request, Response
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -18,11 +18,26 @@ from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT
 from mapserver.api import describe, problems
 from mapserver.api.body_limit import BodyLimit
 from mapserver.api.bytes_response import bytes_response
+from mapserver.api.exact_json import ExactJson
 from mapserver.api.file_routes import install_file_routes
 from mapserver.api.fleet_routes import install_fleet_routes
 from mapserver.api.guard import Guard
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
-from mapserver.api.parameters import Limit, NameCursor, Number, NumberCursor, Sha256, Site, SiteFilter, Version, page
+from mapserver.api.parameters import (
+    Limit,
+    NameCursor,
+    Number,
+    NumberCursor,
+    Sha256,
+    Since,
+    Site,
+    SiteFilter,
+    Until,
+    Version,
+    known_parameters,
+    page,
+    time_range,
+)
 from mapserver.api.version_routes import ApiSettings, install_version_routes
 from mapserver.api.views import (
     EventList,
@@ -60,6 +75,8 @@ def create_app(
         redoc_url=None,
         lifespan=lifespan,
         responses=problems.PROBLEM_RESPONSES,
+        dependencies=[Depends(known_parameters)],
+        default_response_class=ExactJson,
     )
     problems.install(app)
     guard = settings.guard
@@ -126,10 +143,12 @@ def _install_list_routes(app: FastAPI, store: MapStore, fleet: Fleet) -> None:
         return VersionList([VersionView.model_validate(info) for info in shown], following)
 
     @app.get("/v1/sites/{site}/events")
-    def events(site: Site, limit: Limit = 100, cursor: NumberCursor = None) -> EventList:
+    def events(
+        site: Site, since: Since = None, until: Until = None, limit: Limit = 100, cursor: NumberCursor = None
+    ) -> EventList:
         """What happened to a site, oldest first: who did what, when and why."""
         store.current(site)  # an unknown site is not an empty one
-        found = store.events(site, after=cursor or 0, limit=limit + 1)
+        found = store.events(site, time_range(since, until), after=cursor or 0, limit=limit + 1)
         return EventList(*page(found, limit, lambda event: str(event.id)))
 
     @app.get("/v1/jobs")

@@ -6,6 +6,7 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
+from mapserver.api.exact_json import describe_stamps
 from mapserver.api.views import Problem
 from mapserver.fleet_statistics.kpis import Counters, kpis
 from mapserver.store import Event, FailureRow, JobInfo, SiteInfo
@@ -76,4 +77,5 @@ def _described(app: FastAPI) -> dict[str, Any]:
                 answer["example"] = _ANSWER_EXAMPLES[path]
             if path not in ("/healthz", "/readyz"):
                 operation["security"] = [{}, {"token": []}, {"session": []}]
+    describe_stamps(found)
     return found

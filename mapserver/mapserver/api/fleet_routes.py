@@ -1,9 +1,9 @@
 """Endpoints of the fleet's health: figures by site, robot, version, tile, area or cause, failures, tiles to survey again."""
 
 import time
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
-from fastapi import FastAPI, Query, Response
+from fastapi import Depends, FastAPI, Query, Response
 
 from fleetmap.messages import finite, report_dict
 from mapserver.api.bytes_response import PICTURE_HEADERS
@@ -17,9 +17,12 @@ from mapserver.api.parameters import (
     Number,
     NumberCursor,
     PictureNumber,
+    Since,
     Site,
     SiteFilter,
+    Until,
     page,
+    time_range,
 )
 from mapserver.api.views import FailureList, FailureView, HourList, HourView, KpisList, KpisView
 from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
@@ -28,15 +31,38 @@ from mapserver.fleet_statistics.resurvey_test import ResurveySettings, route_geo
 from mapserver.store import MapStore
 
 
+class Span(NamedTuple):
+    """Hours since 1970, the last one not included."""
+
+    first: int
+    end: int
+
+
+def _span(hours: Hours = 24, since: Since = None, until: Until = None) -> Span:
+    since_ns, until_ns = time_range(since, until)
+    end = hour_of(time.time_ns()) + 1 if until_ns is None else hour_of(until_ns - 1) + 1
+    return Span(end - hours if since_ns is None else hour_of(since_ns), end)
+
+
+Asked = Annotated[Span, Depends(_span)]
+
+
 def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettings) -> None:
     """Adds the endpoints."""
 
     @app.get("/v1/fleet/measures")
     def fleet_measures(
-        by: Axis = "site", site: SiteFilter = None, hours: Hours = 24, limit: Limit = 100, cursor: NameCursor = None
+        span: Asked,
+        by: Axis = "site",
+        site: SiteFilter = None,
+        limit: Limit = 100,
+        cursor: NameCursor = None,
     ) -> KpisList:
-        """Failures per robot-day with interval, availability and the rest, by site, robot, version, tile, area or cause."""
-        found = store.fleet.counters(site, by, since_hour=_since(hours))
+        """Failures per robot-day with interval, availability and the rest, by site, robot, version, tile, area or cause.
+
+        Whole hours are counted: those that `since` and `until` lie in, too.
+        """
+        found = store.fleet.counters(site, by, since_hour=span.first, until_hour=span.end)
         chosen = [(f"{key[0]}/{key[1]}", key, counts) for key, counts in found.items()]
         chosen = sorted(item for item in chosen if cursor is None or item[0] > cursor)
         shown, following = page(chosen, limit, lambda item: item[0])
@@ -45,15 +71,16 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
     @app.get("/v1/sites/{site}/hours")
     def fleet_hours(
         site: Site,
+        span: Asked,
         by: Axis = "site",
         key: KeyFilter = None,
-        hours: Hours = 24,
         limit: Limit = 100,
         cursor: NumberCursor = None,
     ) -> HourList:
         """The same figures hour by hour, of a site or of one of its robots, versions, tiles, areas or causes."""
         store.current(site)  # an unknown site is not an empty one
-        found = store.fleet.hours(site, by, key=key, since_hour=max(_since(hours), (cursor or -1) + 1))
+        first = max(span.first, (cursor or -1) + 1)
+        found = store.fleet.hours(site, by, key=key, since_hour=first, until_hour=span.end)
         shown, following = page(list(found.items()), limit, lambda item: str(item[0]))
         return HourList([HourView(hour * HOUR_NS, kpis(counts)) for hour, counts in shown], following)
 
@@ -91,7 +118,3 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
         """The route as GeoJSON, metres in `map` in the place of degrees."""
         found = resurvey_list(store, site, settings, time.time_ns())
         return route_geojson(site, found.version or 0, found.route)
-
-
-def _since(hours: int) -> int:
-    return hour_of(time.time_ns()) - hours + 1

@@ -4,10 +4,16 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Literal, TypeVar
 
 from fastapi import Path, Query
+from fastapi.dependencies.models import Dependant
+from fastapi.routing import APIRoute
 from pydantic import BaseModel
+from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection
 
+from fleetmap.errors import UsageError
 from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
 from fleetmap.version_grid import FLOOR_M, TOP_M
+from mapserver.api.moments import read_range
 from mapserver.store import FailureFilter
 
 Item = TypeVar("Item")
@@ -38,6 +44,48 @@ NumberCursor = Annotated[int | None, Query(ge=0, le=(1 << 62), description=_NEXT
 NameCursor = Annotated[str | None, Query(max_length=160, description=_NEXT, examples=[None])]
 
 
+_TIME = "ISO 8601; without an offset the server's local time, a day alone from its beginning to its end"
+Since = Annotated[
+    str | None, Query(max_length=40, description=f"not before: {_TIME}", examples=["2026-01-02T03:04:05Z"])
+]
+Until = Annotated[str | None, Query(max_length=40, description=f"before: {_TIME}", examples=[None])]
+
+
+def time_range(since: str | None, until: str | None) -> tuple[int | None, int | None]:
+    """Nanoseconds since 1970, None for an open end; 422 for what is no time or ends before it begins."""
+    try:
+        return read_range(since, until)
+    except UsageError as error:
+        raise HTTPException(422, str(error)) from error
+
+
+async def known_parameters(request: HTTPConnection) -> None:
+    """Refuses query parameters that an address does not know, for a filter that is not applied gives a wrong answer."""
+    route = request.scope.get("route")
+    if not request.query_params or not isinstance(route, APIRoute):
+        return
+    known = _query_names(route)
+    unknown = [name for name in request.query_params if name not in known]
+    if unknown:
+        words = f"this address knows {', '.join(sorted(known))}" if known else "this address has none"
+        raise HTTPException(422, f"unknown query parameter {unknown[0][:40]!r}; {words}")
+
+
+def _query_names(route: APIRoute) -> set[str]:
+    found: set[str] = set()
+
+    def look(dependant: Dependant) -> None:
+        for asked in dependant.query_params:
+            kind: object = asked.field_info.annotation
+            fields = kind.model_fields if isinstance(kind, type) and issubclass(kind, BaseModel) else {asked.alias}
+            found.update(fields)
+        for inner in dependant.dependencies:
+            look(inner)
+
+    look(route.dependant)
+    return found
+
+
 class FailureQuery(BaseModel):
     """Filters and the page of a list of failures."""
 
@@ -48,12 +96,16 @@ class FailureQuery(BaseModel):
     area: KeyFilter = None
     cause: KeyFilter = None
     kind: KeyFilter = None
+    since: Since = None
+    until: Until = None
     limit: Limit = 100
     cursor: NumberCursor = None
 
     def filter(self) -> FailureFilter:
         """As the store takes it."""
-        return FailureFilter(**self.model_dump(exclude={"limit", "cursor"}))
+        since_ns, until_ns = time_range(self.since, self.until)
+        named = self.model_dump(exclude={"limit", "cursor", "since", "until"})
+        return FailureFilter(**named, since_ns=since_ns, until_ns=until_ns)
 
 
 def page(items: Sequence[Item], limit: int, cursor_of: Callable[[Item], str]) -> tuple[list[Item], str | None]:

@@ -92,6 +92,10 @@ class MapData:
         current = self._store.current(site)
         return None if current is None else current.version
 
+    def has_version(self, site: str, version: int) -> bool:
+        """Whether the store has a version."""
+        return any(info.version == version for info in self._store.versions(site))
+
     def quality(self, site: str, version: int) -> VersionQuality:
         """A version with all that was said about it."""
         store = self._store

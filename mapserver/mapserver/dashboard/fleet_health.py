@@ -12,7 +12,7 @@ from mapserver.fleet.resurvey_list import resurvey_list
 from mapserver.fleet_statistics.canary_test import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, hour_of, kpis, rate
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings, TileConcern
-from mapserver.store import FailureDetail, FailureFilter, FailureRow, MapStore
+from mapserver.store import FailureDetail, FailureFilter, FailureRow, MapStore, TraceRow
 
 DAY_H = 24
 DAYS_SHOWN = 14
@@ -73,6 +73,11 @@ class HealthData:
     def failures(self, wanted: FailureFilter, before: int | None) -> list[FailureRow]:
         """Failures, latest arrival first; one more than is shown if there are more."""
         return self._store.fleet.failures(wanted, before=before, limit=FAILURES_SHOWN + 1)
+
+    def trace(self, site: str, robot: str, since_ns: int, until_ns: int) -> list[TraceRow]:
+        """Where a robot was and what it said of itself, thinned, oldest first."""
+        found = self._store.fleet.trace(site, robot, since_hour=hour_of(since_ns))
+        return [row for row in found if row.heard_ns is not None and since_ns <= row.heard_ns < until_ns]
 
     def recent_places(self, site: str) -> list[tuple[float, float]]:
         """Where failures of the days that are shown began."""

@@ -7,7 +7,7 @@ from markupsafe import Markup
 
 from mapserver.dashboard import bar_chart
 from mapserver.dashboard.bar_chart import Bar
-from mapserver.dashboard.markup import badge, joined, link, moment, share, table
+from mapserver.dashboard.markup import badge, joined, link, share, table
 from mapserver.fleet_statistics.kpis import Kpis, Rate, driven_words, figure, format_rate, is_telling
 from mapserver.fleet_statistics.resurvey_test import TileConcern
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS, CalibrationFigure
@@ -64,15 +64,16 @@ def localised_figure(name: str, found: Kpis) -> Figure:
     return Figure(name, shown or "–", f"{words} driven without being localised" if shown else "nothing was driven")
 
 
-def trial_notices(trials: Iterable[Trial]) -> Markup:
-    """The running trial of a version, and how those before it ended."""
+def trial_notices(trials: Iterable[Trial], moment: Callable[[int | None], str | None]) -> Markup:
+    """The running trial of a version, and how those before it ended; moment: a stamp as people read it."""
     notice = Markup('<div class="notice {}" role="status"><strong>Version {} {}.</strong><br>{}</div>')
     parts = []
     for canary, finding in trials:
         tone, sentence = _TRIAL_WORDS[canary.state]
         when = moment(canary.started_ns if canary.ended_ns is None else canary.ended_ns)
         words = sentence.format(share=share(canary.share), when=when)
-        parts.append(notice.format(tone, canary.version, words, finding))
+        said = f"{finding[:1].upper()}{finding[1:]}." if finding else ""
+        parts.append(notice.format(tone, canary.version, words, said))
     return joined(parts)
 
 

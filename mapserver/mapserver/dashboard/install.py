@@ -16,7 +16,15 @@ from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.layout import Services
 from mapserver.dashboard.live import LiveRobots
-from mapserver.dashboard.pages import failure_page, fleet_page, live_page, map_page, sign_in_page, survey_page
+from mapserver.dashboard.pages import (
+    failure_page,
+    fleet_page,
+    live_page,
+    map_page,
+    robot_page,
+    sign_in_page,
+    survey_page,
+)
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.store import MapStore
@@ -33,7 +41,7 @@ def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: Api
         settings.guard,
         surveys,
     )
-    for page in (fleet_page, map_page, failure_page, survey_page, live_page):
+    for page in (fleet_page, robot_page, map_page, failure_page, survey_page, live_page):
         page.install(services)
     sign_in_page.install(app, settings.guard)
     _install_pictures(services, store)

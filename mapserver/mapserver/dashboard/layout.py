@@ -1,8 +1,9 @@
 """The common layout of all pages: navigation, light or dark look, and errors as sentences instead of a broken page."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, tzinfo
 from functools import cache
 from pathlib import Path
 from typing import TypeVar
@@ -13,11 +14,12 @@ from nicegui import ui
 
 from fleetmap.errors import FleetmapError, UsageError
 from mapserver.api.guard import SIGN_IN, SIGN_OUT, GuardSettings
+from mapserver.api.moments import moment_text, read_moment, read_range, zone_of
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
 from mapserver.dashboard.map_layers import Layer, box_of, ground
-from mapserver.dashboard.markup import address, joined, link
+from mapserver.dashboard.markup import address, joined, link, time_fields
 from mapserver.dashboard.site_map import SiteMap
 from mapserver.serving.live_surveys import LiveSurveys
 
@@ -26,6 +28,11 @@ T = TypeVar("T")
 PAGES = {"": "Fleet", "map": "Map", "failures": "Failures", "surveys": "Surveys", "live": "Live"}
 RESPONSE_TIMEOUT_S = 30.0
 _LOOK_COOKIE = "fleetmap_look"
+_ZONE_COOKIE = "fleetmap_zone"
+_TELL_ZONE = (
+    f"<script>document.cookie = '{_ZONE_COOKIE}=' + Intl.DateTimeFormat().resolvedOptions().timeZone"
+    " + ';path=/;max-age=31536000;samesite=strict'</script>"
+)
 _SWITCH_LOOK = (
     "const dark = !document.body.classList.contains('body--dark');"
     f"document.cookie = '{_LOOK_COOKIE}=' + (dark ? 'dark' : 'light') + ';path=/;max-age=31536000;samesite=strict';"
@@ -50,11 +57,32 @@ class Services:
 
 @dataclass(frozen=True, slots=True)
 class PageContext:
-    """The page and the site that are shown; root: prefix of all addresses."""
+    """The page and the site that are shown; root: prefix of all addresses; zone: the browser's, None: the server's own."""
 
     root: str
     page: str
     site: str
+    zone: tzinfo | None = None
+    query: Mapping[str, str] = field(default_factory=dict)
+
+    def moment(self, stamp_ns: int | None) -> str | None:
+        """A stamp of the server's clock by the clock of whoever looks."""
+        return moment_text(stamp_ns, self.zone)
+
+    def written_moment(self, text: str | None) -> str | None:
+        """The same of ISO 8601 text."""
+        return self.moment(read_moment(text, "time", UTC))
+
+    def time_range(self) -> tuple[int | None, int | None]:
+        """`since` and `until` of the address; UsageError for what is no time."""
+        return read_range(self.query.get("since"), self.query.get("until"), self.zone)
+
+    def range_fields(self) -> Markup:
+        """Fields to choose that range by."""
+        return time_fields(*("" if ns is None else self._written(ns) for ns in self.time_range()))
+
+    def _written(self, stamp_ns: int) -> str:
+        return f"{datetime.fromtimestamp(stamp_ns / 1e9, UTC).astimezone(self.zone):%Y-%m-%dT%H:%M}"
 
     def to(self, path: str, **query: object) -> str:
         """The address of a page of the same site."""
@@ -77,10 +105,16 @@ async def load(function: Callable[..., T], *arguments: object) -> T:
 
 
 async def show(
-    services: Services, request: Request, page: str, site: str | None, build: Callable[[PageContext], Awaitable[None]]
+    services: Services,
+    request: Request,
+    page: str,
+    site: str | None,
+    build: Callable[[PageContext], Awaitable[None]],
+    knows: Sequence[str] = (),
 ) -> None:
     """The layout of a page with the content of `build`; a FleetmapError becomes a notice in its place.
 
+    knows: query parameters of the page beside the site; others are refused, since a filter that is not applied misleads.
     The live page knows sites of which the store has nothing yet: those that are being surveyed.
     """
     root = str(request.scope.get("root_path", ""))
@@ -91,7 +125,8 @@ async def show(
         if page == "live" and site is None and under_way:
             site = under_way[0]
         chosen = site if site in under_way else await load(services.maps.chosen_site, site)
-        sites, context = sorted({*sites, *under_way}), PageContext(root, page, chosen)
+        zone = zone_of(request.cookies.get(_ZONE_COOKIE))
+        sites, context = sorted({*sites, *under_way}), PageContext(root, page, chosen, zone, request.query_params)
     except FleetmapError as error:
         _head(services, request, page, None, [])
         html(notice("bad", str(error)))
@@ -99,9 +134,16 @@ async def show(
     _head(services, request, page, context.site, sites)
     _end_with_session(services, request)
     try:
+        _check_query(request, knows)
         await build(context)
     except FleetmapError as error:
         html(notice("bad", str(error)))
+
+
+def _check_query(request: Request, knows: Sequence[str]) -> None:
+    unknown = [name for name in request.query_params if name not in {"site", *knows}]
+    if unknown:
+        raise UsageError(f"unknown parameter {unknown[0][:40]!r}; this page knows {', '.join(('site', *knows))}")
 
 
 async def version_map(
@@ -137,7 +179,7 @@ def _style() -> str:
 
 def _set_look(request: Request) -> None:
     """The look that was chosen with the button, else that of the browser."""
-    ui.add_head_html(_style())
+    ui.add_head_html(_style() + _TELL_ZONE)
     look = request.cookies.get(_LOOK_COOKIE)
     if look in {"dark", "light"}:
         ui.dark_mode(look == "dark")

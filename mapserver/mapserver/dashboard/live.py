@@ -2,8 +2,9 @@
 
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from fleetmap.messages import Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
@@ -28,12 +29,15 @@ SILENT = ("silent", "quiet")
 class LiveRobot:
     """One robot as a page shows it; place: x and y of its last estimate in `map`, None where it never sent one; heading: from x to y.
 
-    calibration: what the map shows of its cameras, empty for a robot that does not report it.
+    state: the status that it sent, empty before. since_ns: since when it is localised, unsure or not localised, whichever it is.
+    metrics: figures of its last health report. calibration: what the map shows of its cameras, empty for a robot that does not report it.
     """
 
     name: str
     words: str
     tone: str
+    state: str
+    since_ns: int | None
     place_m: tuple[float, float] | None
     heading_rad: float | None
     version: int | None
@@ -43,6 +47,7 @@ class LiveRobot:
     refused: str
     is_canary: bool
     clock_ahead_s: float | None
+    metrics: Mapping[str, Any]
     calibration: tuple[CalibrationFigure, ...] = ()
 
     @property
@@ -57,9 +62,13 @@ class LiveSite:
 
     robots: tuple[LiveRobot, ...]
 
-    def count(self, tone: str) -> int:
-        """How many robots are in a tone."""
-        return sum(robot.tone == tone for robot in self.robots)
+    def count(self, tone: str, words: str | None = None) -> int:
+        """How many robots are in a tone, and in the state that these words say."""
+        return sum(robot.tone == tone and words in {None, robot.words} for robot in self.robots)
+
+    def robot(self, name: str) -> LiveRobot | None:
+        """The robot of a name, None where it was never heard."""
+        return next((robot for robot in self.robots if robot.name == name), None)
 
 
 _ORDER = {"bad": 0, "warn": 1, "quiet": 2, "good": 3}
@@ -101,6 +110,8 @@ def live_robot(status: RobotStatus) -> LiveRobot:
         name=status.robot,
         words=words,
         tone=tone,
+        state="" if sent is None else str(sent),
+        since_ns=status.state_since_ns,
         place_m=(float(place[0]), float(place[1])) if place is not None and is_somewhere else None,
         heading_rad=_heading(estimate.get("quat_wxyz")),
         version=status.version,
@@ -110,6 +121,7 @@ def live_robot(status: RobotStatus) -> LiveRobot:
         refused=str((status.last_ack or {}).get("refused", "")),
         is_canary=status.is_canary,
         clock_ahead_s=status.clock_ahead_s,
+        metrics=health.get("metrics") or {},
         calibration=calibration_figures(health),
     )
 

@@ -1,7 +1,6 @@
 """Pieces of HTML. All text from outside is escaped, because robots choose their words themselves. Pure."""
 
 from collections.abc import Iterable, Sequence
-from datetime import UTC, datetime
 from urllib.parse import urlencode
 
 from markupsafe import Markup, escape
@@ -73,9 +72,10 @@ def choices(
     return Markup('<label>{} <select name="{}">{}</select></label>').format(label, name, marked)
 
 
-def moment(stamp_ns: int | None) -> str | None:
-    """A stamp of the server's clock as UTC text."""
-    return None if stamp_ns is None else f"{datetime.fromtimestamp(stamp_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC"
+def time_fields(since: str, until: str) -> Markup:
+    """Two fields for a range of local time."""
+    field = Markup('<label>{} <input type="datetime-local" name="{}" value="{}"></label>')
+    return joined([field.format("From", "since", since), field.format("Until", "until", until)])
 
 
 def size(number: int | None) -> str | None:

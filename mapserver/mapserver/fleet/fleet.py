@@ -17,6 +17,7 @@ from fleetmap.messages import (
     PoseMessage,
     RobotAck,
     RobotHealth,
+    Status,
     WantedVersion,
     decode_message,
     finite,
@@ -35,6 +36,7 @@ MAX_FAILURE_BYTES = 4 * MAX_THUMBNAIL_BYTES + (128 << 10)  # four pictures, and 
 # A robot that fails more often than once a minute is broken; 60 are what one brings back from an hour without a network.
 FAILURE_BURST, FAILURES_PER_S = 60, 1 / 60
 _FORGET_AFTER_NS = 600_000_000_000
+_GAP_NS = 60_000_000_000  # who was silent for longer begins anew
 _USUAL = IngestSettings()
 
 
@@ -43,8 +45,9 @@ class RobotStatus:
     """One robot. version: what it runs, None before it said so; seconds_since: since it said anything.
 
     is_canary: whether it tries a version before the others. is_present: its liveliness token, None before the first look.
-    clock_ahead_s: by how much its wall clock is ahead of the server's, None before it reported. last_ack, last_health and last_pose are
-    its last messages as plain values, None before the first.
+    state_since_ns: since when, by the server's clock, it is localised, unsure (DEGRADED) or not localised, whichever it is now; None
+    before it reported. clock_ahead_s: by how much its wall clock is ahead of the server's, None before it reported. last_ack,
+    last_health and last_pose are its last messages as plain values, None before the first.
     """
 
     site: str
@@ -55,6 +58,7 @@ class RobotStatus:
     is_present: bool | None
     clock_ahead_s: float | None
     seconds_since: float
+    state_since_ns: int | None
     last_ack: dict[str, Any] | None
     last_health: dict[str, Any] | None
     last_pose: dict[str, Any] | None
@@ -131,7 +135,12 @@ class Fleet:
         _check_sender(site, robot, health)
         now_ns = self._clock_ns()
         with self._lock:
+            known = self._robots.get((site, robot))
+            is_gap = known is None or now_ns - known.seen_ns > _GAP_NS
             entry = self._entry(site, robot, now_ns, health.version)
+            last = entry.report.get("health") or {}
+            if is_gap or _state(last.get("status")) != _state(health.status) or "state_since_ns" not in entry.report:
+                entry.report["state_since_ns"] = now_ns
             if health.wall_ns is not None:
                 entry.skew.take(health.wall_ns, now_ns)
                 entry.report["clock_ahead_s"] = entry.skew.ahead_s
@@ -258,10 +267,16 @@ def _status(key: tuple[str, str], robot: _Robot, assignment: VersionAssignment, 
         is_present=robot.is_present,
         clock_ahead_s=robot.skew.ahead_s,
         seconds_since=max(0, now_ns - robot.seen_ns) / 1e9,
+        state_since_ns=robot.report.get("state_since_ns"),
         last_ack=robot.report.get("ack"),
         last_health=robot.report.get("health"),
         last_pose=None if robot.last_estimate is None else finite(report_dict(robot.last_estimate)),
     )
+
+
+def _state(status: object) -> object:
+    """What counts as the same state: LOST, AMBIGUOUS and INITIALISING are one, in which the robot does not know where it is."""
+    return status if status in {Status.TRACKING, Status.DEGRADED, None} else Status.LOST
 
 
 def _check_sender(site: str, robot: str, message: RobotAck | RobotHealth | FailureReport) -> None:

@@ -127,7 +127,7 @@ class Ingest:
                 if areas:
                     self._batch.add(site, "area", areas.at(place[0], place[1]) or OUTSIDE, hour, counts)
             if self._is_trace_due(stream, health, now_ns):
-                self._batch.traces.append(_trace(health, place, hour))
+                self._batch.traces.append(_trace(health, place, now_ns))
 
     def take_failure(self, report: FailureReport, now_ns: int, ahead_s: float | None) -> bool:
         """Brings a failure to the disk with its sums; False for one that is there already. Raises StoreError."""
@@ -251,16 +251,24 @@ def arm_key(canary: int, *, is_canary: bool) -> str:
     return f"{canary}:{'canary' if is_canary else 'others'}"
 
 
-def _trace(health: RobotHealth, place: tuple[float, float, float] | None, hour: int) -> TraceRow:
-    radius_m = health.metrics.get("radius_95_m")
+def _trace(health: RobotHealth, place: tuple[float, float, float] | None, now_ns: int) -> TraceRow:
+    def figure(name: str) -> float | None:
+        value = health.metrics.get(name)
+        return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
+
     return TraceRow(
         site=health.site,
         robot=health.robot,
-        hour=hour,
+        hour=hour_of(now_ns),
         stamp_ns=health.stamp_ns,
         status=health.status,
         version=health.version,
         x_map_m=None if place is None else place[0],
         y_map_m=None if place is None else place[1],
-        radius_95_m=float(radius_m) if isinstance(radius_m, int | float) else None,
+        radius_95_m=figure("radius_95_m"),
+        heard_ns=now_ns,
+        flags=",".join(health.flags) or None,
+        frame_ms=figure("frame_ms_mean"),
+        exposure=figure("exposure"),
+        sharpness=figure("sharpness"),
     )

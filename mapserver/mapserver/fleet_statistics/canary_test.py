@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import gammainc, gammaincinv
 
 from fleetmap.config import Section
-from mapserver.fleet_statistics.kpis import Counters, Rate, rate
+from mapserver.fleet_statistics.kpis import Counters, Rate, driven_words, format_rate, is_telling, rate
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Probability = Annotated[float, msgspec.Meta(gt=0, lt=1)]
@@ -82,8 +82,8 @@ def judge_canary(canary: Counters, others: Counters, age_days: float, settings: 
         action = "roll_back"
     else:
         action, why = "wait", _why_wait(ours, theirs, within, evidence)
-    margin = f"{settings.margin_ratio:g} times the others' rate + {settings.margin_per_robot_day:g} per robot-day"
-    reason = f"{why}; canary {_rate_text(ours)}, others {_rate_text(theirs)}, margin {margin}"
+    allowed = f"{settings.margin_ratio:g} times as often, and {settings.margin_per_robot_day:g} times a robot-day more"
+    reason = f"{why}. With it: {_rate_text(ours)}; without: {_rate_text(theirs)}. It may fail up to {allowed}"
     return CanaryFinding(action, reason, ours, theirs, evidence, within)
 
 
@@ -125,7 +125,8 @@ def _why_wait(canary: Rate, others: Rate, within: float, evidence: float) -> str
 
 
 def _rate_text(found: Rate) -> str:
-    if found.per_robot_day is None:
-        return f"{found.events} failures before anything was driven"
-    words = f"{found.per_robot_day:.3g} per robot-day, {found.low:.3g} to {found.high:.3g}"
-    return f"{found.events} in {found.robot_days:.3g} robot-days ({words})"
+    count = f"{found.events or 'no'} failure{'' if found.events == 1 else 's'}"
+    if found.robot_days <= 0:
+        return f"{count} and nothing driven"
+    per_day = f", {format_rate(found)} per robot-day" if is_telling(found) else ", too little for a rate"
+    return f"{count} in {driven_words(found.robot_days)}{per_day}"

@@ -33,6 +33,8 @@ _ADD = f"""INSERT INTO tallies (key_id, hour, {", ".join(COUNTER_COLUMNS)})
     VALUES (?, ?, {", ".join("?" * len(COUNTER_COLUMNS))})
     ON CONFLICT DO UPDATE SET {", ".join(f"{name} = {name} + excluded.{name}" for name in COUNTER_COLUMNS)}"""
 _REPORT_COLUMNS = ("site", "robot", "duration_s", "kind", "cause", "status", "version")
+_TRACED = tuple(TraceRow.__dataclass_fields__)[2:]
+_TRACE_COLUMNS = ", ".join(_TRACED)
 _FAILURE_COLUMNS = ", ".join(FailureRow.__dataclass_fields__)
 
 
@@ -65,8 +67,7 @@ class FleetQueries:
             _add_counters(connection, ids, batch.counters)
             where = [(ids[row.site, "robot", row.robot], row) for row in batch.traces]
             connection.executemany(
-                """INSERT OR IGNORE INTO traces (key_id, hour, stamp_ns, status, version, x_map_m, y_map_m, radius_95_m)
-                   VALUES (?, ?, ?, ?, ?, ?, ?, ?)""",
+                f"INSERT OR IGNORE INTO traces (key_id, {_TRACE_COLUMNS}) VALUES ({', '.join('?' * (1 + len(_TRACED)))})",
                 [(key_id, *astuple(row)[2:]) for key_id, row in where],
             )
             keep_last_reports(connection, batch.last_reports)
@@ -163,7 +164,7 @@ class FleetQueries:
         """Where a robot was, oldest first."""
         return self._transactions.rows(
             TraceRow,
-            """SELECT k.site, k.key robot, t.hour, t.stamp_ns, t.status, t.version, t.x_map_m, t.y_map_m, t.radius_95_m
+            f"""SELECT k.site, k.key robot, {_TRACE_COLUMNS}
                FROM traces t JOIN tally_keys k ON k.id = t.key_id
                WHERE t.hour >= ? AND k.site = ? AND k.axis = 'robot' AND k.key = ? ORDER BY t.hour, t.stamp_ns""",
             (since_hour, site, robot),

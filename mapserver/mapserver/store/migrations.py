@@ -241,4 +241,11 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
             PRIMARY KEY (site, version, sha256),
             FOREIGN KEY (site, version) REFERENCES versions(site, version)) WITHOUT ROWID""",
     ),
+    (
+        # When a robot said it, by the server's clock, and what its page shows beside the status.
+        *(
+            f"ALTER TABLE traces ADD COLUMN {column}"
+            for column in ("heard_ns INTEGER", "flags TEXT", "frame_ms REAL", "exposure REAL", "sharpness REAL")
+        ),
+    ),
 )

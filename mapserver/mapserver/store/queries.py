@@ -202,10 +202,15 @@ class StoreQueries:
         rows = self._transactions.query("SELECT figures FROM evidence WHERE site = ? AND version = ?", (site, version))
         return msgspec.json.decode(rows[0]["figures"], type=Evidence) if rows else None
 
-    def events(self, site: str, *, after: int = 0, limit: int = -1) -> list[Event]:
-        """A site's history, oldest first, behind event `after`."""
+    def events(
+        self, site: str, span_ns: tuple[int | None, int | None] = (None, None), *, after: int = 0, limit: int = -1
+    ) -> list[Event]:
+        """A site's history, oldest first, behind event `after`; span_ns: from when and until before when, None for ever."""
         return self._transactions.rows(
-            Event, f"SELECT {_EVENT} FROM events WHERE site = ? AND id > ? ORDER BY id LIMIT ?", (site, after, limit)
+            Event,
+            f"""SELECT {_EVENT} FROM events WHERE site = ?1 AND id > ?2 AND (?3 IS NULL OR stamp_ns >= ?3)
+                AND (?4 IS NULL OR stamp_ns < ?4) ORDER BY id LIMIT ?5""",
+            (site, after, *span_ns, limit),
         )
 
     def audit(self, kind: str, detail: str, *, actor: Actor = NOBODY, site: str = "") -> None:

@@ -213,7 +213,11 @@ class FailureFilter:
 
 @dataclass(frozen=True, slots=True)
 class TraceRow:
-    """Where a robot was and what its estimate was worth, thinned; hour: since 1970, by the server's clock."""
+    """Where a robot was and what its estimate was worth, thinned; hour: since 1970, by the server's clock.
+
+    heard_ns: by the same clock, None in rows of older stores; flags: with commas; frame_ms: CPU of a frame, mean of the last ones.
+    exposure, sharpness: of the left camera's last image.
+    """
 
     site: str
     robot: str
@@ -224,6 +228,11 @@ class TraceRow:
     x_map_m: float | None
     y_map_m: float | None
     radius_95_m: float | None
+    heard_ns: int | None = None
+    flags: str | None = None
+    frame_ms: float | None = None
+    exposure: float | None = None
+    sharpness: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

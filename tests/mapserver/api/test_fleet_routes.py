@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from urllib.parse import quote
 
@@ -156,3 +157,31 @@ def test_row_29_quotes_in_every_filter(server: Server, words: str) -> None:
     if "OR 1=1" in words:
         rows = server.store._transactions.query(f"SELECT robot FROM failures WHERE cause = '{words}'")
         assert rows == [{"robot": "r1"}]
+
+
+def test_a_range_of_time_is_kept_to_and_nothing_is_ignored(server: Server) -> None:
+    server.fleet.take_failure("lab", "r1", failure(1))
+    hour = timedelta(hours=1)
+    now = datetime.now(UTC)
+    before, after = ((now + step).isoformat() for step in (-hour, hour))
+    (shown,) = server.client.get("/v1/failures", params={"since": before, "until": after}).json()["failures"]
+    assert isinstance(shown["happened_ns"], str), "a number above 2^53 is another one to many programs"
+    assert abs(int(shown["happened_ns"]) - time.time_ns()) < 60 * 10**9
+    assert server.client.get("/v1/failures", params={"since": after}).json()["failures"] == []
+    for address, items in (("/v1/fleet/measures", "measures"), ("/v1/sites/lab/hours", "hours")):
+        assert len(server.client.get(address, params={"since": before, "until": after}).json()[items]) == 1
+        old = {"since": (now - 50 * hour).isoformat(), "until": (now - 48 * hour).isoformat()}
+        assert server.client.get(address, params=old).json()[items] == []
+    assert server.client.get("/v1/sites/lab/events", params={"until": before}).json()["events"] == []
+    events = server.client.get("/v1/sites/lab/events", params={"since": before}).json()["events"]
+    assert events
+    assert all(isinstance(event["stamp_ns"], str) for event in events)
+    check_problem(server.client.get("/v1/failures?since=soon"), 422, "since 'soon' is no time")
+    check_problem(server.client.get("/v1/failures?since=2026-01-02&until=2026-01-01T00:00"), 422, "exchange them")
+    check_problem(
+        server.client.get("/v1/failures?sinc=2026-01-01"), 422, "unknown query parameter 'sinc'; this address knows"
+    )
+    check_problem(server.client.get("/v1/sites?site=lab"), 422, "knows cursor, limit")
+    check_problem(server.client.get("/healthz?x=1"), 422, "this address has none")
+    kind = server.client.get("/openapi.json").json()["components"]["schemas"]["FailureRow"]["properties"]["happened_ns"]
+    assert (kind["type"], kind["pattern"]) == ("string", "^-?[0-9]+$")

@@ -3,8 +3,10 @@
 import re
 import time
 from collections.abc import Iterator
+from datetime import datetime, timedelta
 from pathlib import Path
 from urllib.parse import urlsplit
+from zoneinfo import ZoneInfo
 
 import httpx
 import pytest
@@ -34,6 +36,7 @@ PAGES = {
     "map": "Map of hall",
     "failures": "Failures of hall",
     "failures/1": "Failure 1 of tug-7",
+    "robots/tug-7": "tug-7",
     "surveys": "Surveys of hall",
     "live": "Survey of hall",
 }
@@ -67,6 +70,7 @@ def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 @pytest.fixture
 def page(browser: Browser) -> Iterator[Page]:
     context = browser.new_context(viewport={"width": 1280, "height": 900})
+    context.set_default_timeout(90_000)
     yield context.new_page()
     context.close()
 
@@ -135,10 +139,19 @@ def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> 
         page.get_by_role("button", name="Zoom in").click()
         page.wait_for_timeout(300)
         assert page.evaluate(PLACE_OF, "tug-4") == pytest.approx(place_of(4), abs=0.05)
-        before = page.evaluate("performance.timeOrigin")
         moved["tug-4"] = (40.0, 14.0)
         expect(mark).to_have_attribute("data-at", "40.00 14.00", timeout=15_000)
         expect(mark).to_have_class(re.compile("mark bad"), timeout=15_000)
+        attention = page.get_by_role("region", name="Robots that need a look")
+        expect(page.locator(".attention")).to_contain_text(f"of {ROBOTS} robots need a look")
+        attention.get_by_role("link").first.click()
+        lost = attention.page.url.rpartition("/")[2].partition("?")[0]
+        expect(page.locator("h1")).to_have_text(lost)
+        expect(page.locator(".notice.bad")).to_contain_text(re.compile(r"^Lost since \d{4}-"))
+        expect(page.locator(f".site-map .mark[data-name='{lost}']")).to_have_count(1)
+        expect(page.get_by_role("table", name="States, the last one first")).to_contain_text("lost")
+        opened(page, served, "")
+        before = page.evaluate("performance.timeOrigin")
         page.get_by_label("Find a robot").fill("tug-4")
         row = page.locator("tbody tr", has=page.get_by_role("link", name="tug-4", exact=True))
         expect(row).to_contain_text("lost", timeout=15_000)
@@ -167,7 +180,10 @@ def test_a_failure_is_found_opened_and_shown_with_its_context(page: Page, served
         expect(page.locator(".nicegui-content")).to_contain_text(words)
     pictures = page.locator(".pictures img")
     expect(pictures).to_have_count(2)
-    expect(pictures.nth(1)).to_have_attribute("alt", re.compile("^Matches"))
+    expect(pictures.first).to_have_attribute("alt", re.compile("^Matches"))
+    expect(page.locator(".notice.bad")).to_contain_text(
+        re.compile(r"^tug-7 failed at .* in tile 1,0: dark, lost for 3.5 s")
+    )
     pictures.nth(1).scroll_into_view_if_needed()
     page.wait_for_function(
         "[...document.querySelectorAll('.pictures img')].every(i => i.complete && i.naturalWidth === 160)"
@@ -223,18 +239,37 @@ def test_versions_are_compared(page: Page, served: Served) -> None:
     assert seen.faults == []
 
 
-def test_wrong_addresses_are_answered_in_words(page: Page, served: Served) -> None:
+def test_wrong_addresses_are_answered_in_words(served: Served) -> None:
     for path, words in (
         ("map?site=nowhere", "no site nowhere"),
         ("map?version=99", "no version 99"),
         ("map?version=x", "not a number"),
         ("failures/77", "no failure 77"),
         ("surveys?job=99", "no job 99"),
+        ("robots/nobody", "never heard of a robot"),
+        ("failures?sinc=2026-01-01", "this page knows site, robot"),
+        ("failures?since=soon", "is no time; write"),
+        ("robots/tug-7?since=2026-01-02&until=2026-01-01T00:00", "is not after since"),
     ):
-        page.goto(f"{served.http}/dashboard/{path}")
-        expect(page.locator(".notice.bad")).to_contain_text(words)
-    assert page.request.get(f"{served.http}/dashboard/plans/hall/99.png").status == 404
-    assert page.request.get(f"{served.http}/dashboard/pictures/1/9.jpg").status == 404
+        assert words in httpx.get(f"{served.http}/dashboard/{path}", timeout=60).text, path
+    for path in ("plans/hall/99.png", "pictures/1/9.jpg", "underlays/hall/2/floor.png", "underlays/hall/99/grid.png"):
+        assert httpx.get(f"{served.http}/dashboard/{path}").status_code == 404
+
+
+def test_times_are_those_of_the_browser_and_ranges_are_kept_to(served: Served) -> None:
+    def shown(query: str, zone: str) -> str:
+        answer = httpx.get(f"{served.http}/dashboard/failures?{query}", cookies={"fleetmap_zone": zone}, timeout=60)
+        return answer.text
+
+    now = datetime.now(ZoneInfo("Asia/Tokyo"))
+    assert f"{now:%Y-%m-%d}" in shown("", "Asia/Tokyo")
+    assert " JST" in shown("", "Asia/Tokyo")
+    assert " JST" not in shown("", "<script>"), "what is no zone is the server's"
+    later, earlier = f"{now + timedelta(hours=1):%Y-%m-%dT%H:%M}", f"{now - timedelta(hours=1):%Y-%m-%dT%H:%M}"
+    assert "No failures match" in shown(f"since={later}", "Asia/Tokyo")
+    within = shown(f"since={earlier}&until={later}", "Asia/Tokyo")
+    assert "No failures match" not in within
+    assert later in within, "the form says what was asked"
 
 
 def test_the_look_that_was_chosen_stays(page: Page, served: Served) -> None:
@@ -306,8 +341,9 @@ def test_a_version_taken_back_by_the_server_is_told_with_its_reason(page: Page, 
         expect(page.get_by_role("button", name="Stop trying version 1")).to_be_visible()
         expect(page.get_by_role("button", name="Roll back")).to_have_count(0)
         opened(page, served, "")
-        expect(page.locator(".notice")).to_contain_text("Version 1 is tried by 5.0 % of the robots")
+        trial = page.locator(".notice", has_text="Version 1")
+        expect(trial).to_contain_text("Version 1 is tried by 5.0 % of the robots")
         releases.end_canary(store, canary, promote=False, outcome="it fails more often than the margin allows")
-    expect(page.locator(".notice")).to_contain_text("rolled back", timeout=10_000)
-    expect(page.locator(".notice")).to_contain_text("it fails more often than the margin allows")
+    expect(trial).to_contain_text("rolled back", timeout=10_000)
+    expect(trial).to_contain_text("it fails more often than the margin allows")
     assert seen.faults == []

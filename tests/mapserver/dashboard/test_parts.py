@@ -23,7 +23,9 @@ from mapserver.dashboard.fleet_health import HealthData, trend_words
 from mapserver.dashboard.live import LiveRobots, live_robot
 from mapserver.dashboard.markup import address, age, choices, facts, link, size, table
 from mapserver.dashboard.pages.map_page import one_way
+from mapserver.dashboard.pages.robot_page import way
 from mapserver.dashboard.plan import make_plan
+from mapserver.dashboard.robot_history import SILENT, stretches
 from mapserver.dashboard.underlays import grid_picture
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.canary_test import CanarySettings
@@ -32,7 +34,7 @@ from mapserver.fleet_statistics.resurvey_test import ResurveySettings
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.gate import GateSettings
-from mapserver.store import Actor, MapStore
+from mapserver.store import Actor, MapStore, TraceRow
 from support.fleet.dashboard_scene import LENGTH_M, SITE, build_report, fill_store, hall_tiles
 
 EVIL = "<script>alert(1)</script>\"'&"
@@ -207,7 +209,7 @@ def test_a_trial_is_started_and_stopped(store: MapStore) -> None:
 def status(**changed: object) -> RobotStatus:
     sent = {"position_map_m": [1.0, 2.0, 0.0], "status": "TRACKING"}
     usual = {"site": SITE, "robot": "r", "version": 2, "wanted_version": 2, "is_canary": False, "is_present": None}
-    usual |= {"clock_ahead_s": None, "seconds_since": 0.5, "last_ack": None, "last_pose": sent}
+    usual |= {"state_since_ns": None, "clock_ahead_s": None, "seconds_since": 0.5, "last_ack": None, "last_pose": sent}
     usual |= {"last_health": {"status": "TRACKING"}}
     return RobotStatus(**(usual | changed))  # type: ignore[arg-type]
 
@@ -229,6 +231,33 @@ def status(**changed: object) -> RobotStatus:
 def test_a_robots_state_in_words(changed: dict[str, object], words: str, tone: str) -> None:
     robot = live_robot(status(**changed))
     assert (robot.words, robot.tone) == (words, tone)
+
+
+def traced(at_s: float, status: str, **more: object) -> TraceRow:
+    ns = round(at_s * 1e9)
+    return TraceRow(SITE, "r", 0, ns, status, 2, 1.0 + at_s, 2.0, 0.1, **({"heard_ns": ns} | more))  # type: ignore[arg-type]
+
+
+def test_traces_become_stretches_of_one_state() -> None:
+    rows = [traced(10 * n, "TRACKING", frame_ms=10.0 + n) for n in range(4)]
+    rows += [traced(33, "LOST", flags="dark"), traced(43, "LOST", flags="dark"), traced(300, "TRACKING")]
+    rows.append(traced(310, "TRACKING", heard_ns=None))  # of an older store
+    found = stretches(rows, 0, 320_000_000_000)
+    told = [(s.status, s.flags, s.since_ns // 10**9, s.until_ns // 10**9) for s in found]
+    assert told == [
+        ("TRACKING", "", 0, 33),
+        ("LOST", "dark", 33, 54),
+        (SILENT, "", 54, 300),
+        ("TRACKING", "", 300, 320),
+    ]
+    assert found[0].frame_ms == 11.5
+    assert [s.status for s in stretches(rows, 20 * 10**9, 40 * 10**9)] == ["TRACKING", "LOST"]
+    assert stretches([], 0, 10) == []
+
+
+def test_the_way_of_a_robot_has_gaps_where_it_was_silent() -> None:
+    rows = [traced(0, "TRACKING"), traced(10, "TRACKING"), traced(20, "LOST"), traced(300, "LOST"), traced(310, "LOST")]
+    assert [(line.tone, len(line.points)) for line in way(rows)] == [("good", 2), ("bad", 2), ("bad", 2)]
 
 
 def test_a_place_that_is_no_number_is_no_place() -> None:

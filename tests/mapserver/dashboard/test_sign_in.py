@@ -19,7 +19,7 @@ from mapserver.store import Actor, MapStore
 from support.fleet.dashboard_scene import SITE, Served, chromium, failure, fill_store, serving, watch
 
 PASSWORD = "a password of the test"
-PAGES = ("", "map", "failures", "failures/1", "surveys", "live")
+PAGES = ("", "map", "failures", "failures/1", "robots/tug-7", "surveys", "live")
 SCRIPT = "<img src=x onerror='window.injected = 1'>"
 
 

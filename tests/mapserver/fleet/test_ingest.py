@@ -219,6 +219,9 @@ def test_traces_are_thinned_but_show_every_change(site: Site) -> None:
     assert 30 <= len(trace) <= 30 + changes
     assert {row.status for row in trace} == {"TRACKING", "LOST"}
     assert all(0 <= row.x_map_m <= 32 for row in trace)
+    heard = [row.heard_ns for row in trace]
+    assert heard == sorted(heard)
+    assert 0 < heard[-1] - heard[0] < 300 * NS
 
 
 def test_old_and_many_things_go(site: Site) -> None:

@@ -116,6 +116,8 @@ def test_a_draft_of_an_older_store_is_known_by_the_job_that_its_log_names(tmp_pa
     for name in ("operator", "address", "sha256"):
         connection.execute(f"ALTER TABLE events DROP COLUMN {name}")
     connection.execute("ALTER TABLE failures DROP COLUMN area")
+    for name in ("heard_ns", "flags", "frame_ms", "exposure", "sharpness"):
+        connection.execute(f"ALTER TABLE traces DROP COLUMN {name}")
     for name in ("tokens", "sessions", "operators", "site_files", "grid_blobs"):
         connection.execute(f"DROP TABLE {name}")
     connection.execute("PRAGMA user_version = 4")

@@ -14,8 +14,10 @@ from mapserver.store import Actor
 _MAX_NAME, _MAX_REASON = 200, 2000
 
 
-def change_button(services: Services, words: str, explanation: str, act: Callable[[Actor], str]) -> None:
-    """A button that asks before it acts; the page is reloaded afterwards.
+def change_button(
+    services: Services, words: str, explanation: str, act: Callable[[Actor], str], *, css: str = ""
+) -> None:
+    """A button that asks before it acts; the page is reloaded afterwards. css: `forward` or `back`, so that acts cannot be confused.
 
     act: the change, in the name of an actor; its FleetmapError is shown and changes nothing. Who may only look gets no button.
     """
@@ -42,7 +44,7 @@ def change_button(services: Services, words: str, explanation: str, act: Callabl
                 "confirm"
             )
             ui.button("No, change nothing", on_click=dialog.close, color=None).props("no-caps flat").classes("plain")
-    ui.button(words, on_click=dialog.open, color=None).props("no-caps flat").classes("plain")
+    ui.button(words, on_click=dialog.open, color=None).props("no-caps flat").classes(f"plain {css}")
 
 
 async def _try(services: Services, act: Callable[[Actor], str], name: str | None, reason: str | None) -> str | None:

@@ -21,10 +21,11 @@ from mapserver.dashboard.layout import (
 )
 from mapserver.dashboard.live import STATUSES
 from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
-from mapserver.dashboard.markup import badge, choices, facts, joined, link, moment, table
+from mapserver.dashboard.markup import badge, choices, facts, joined, link, table
 from mapserver.store import FailureDetail, FailureFilter, FailureRow
 
 _REFRESH_S = 3.0
+_KNOWN = ("robot", "version", "area", "tile", "cause", "since", "until", "before")
 _PICTURES = {"frame": "Left camera image", "matches": "Matches: the image and the landmarks expected in it"}
 _KINDS = {FailureKind.NOT_FOUND: "does not find itself"}
 _ADVICE = {
@@ -45,6 +46,7 @@ def install(services: Services) -> None:
     async def failures_page(request: Request, site: str | None = None) -> None:
         async def build(context: PageContext) -> None:
             query = request.query_params
+            since_ns, until_ns = context.time_range()
             wanted = FailureFilter(
                 site=context.site,
                 robot=query.get("robot") or None,
@@ -52,12 +54,14 @@ def install(services: Services) -> None:
                 tile=query.get("tile") or None,
                 cause=query.get("cause") or None,
                 area=query.get("area") or None,
+                since_ns=since_ns,
+                until_ns=until_ns,
             )
             html(Markup("<h1>Failures of {}</h1>").format(context.site))
             html(_filters(context, wanted, await load(services.health.choices, context.site)))
             await _list(services, context, wanted, number(query.get("before"), "failure"))
 
-        await show(services, request, "failures", site, build)
+        await show(services, request, "failures", site, build, _KNOWN)
 
     @ui.page("/failures/{failure}", title="Failure – fleetmap", response_timeout=RESPONSE_TIMEOUT_S)
     async def failure_page(request: Request, failure: str, site: str | None = None) -> None:
@@ -67,6 +71,7 @@ def install(services: Services) -> None:
             detail = await load(services.health.failure, number(failure, "failure") or 0)
             html(back_link(context, "failures", "All failures"))
             html(Markup("<h1>Failure {} of {}</h1>").format(detail.failure.number, detail.failure.robot))
+            html(_answer(context, detail))
             with ui.element("div").classes("pair"):
                 html(_summary(context, detail))
                 with ui.element("div"):
@@ -87,7 +92,7 @@ def _site_of(services: Services, failure: str, site: str | None) -> str | None:
 
 def _filters(context: PageContext, wanted: FailureFilter, known: FilterChoices) -> Markup:
     return Markup(
-        '<form class="ask" method="get" action="{}"><input type="hidden" name="site" value="{}">{}{}{}{}{}'
+        '<form class="ask" method="get" action="{}"><input type="hidden" name="site" value="{}">{}{}{}{}{}{}'
         '<button type="submit">Show</button> <a href="{}">Show all</a></form>'
     ).format(
         f"{context.root}/failures",
@@ -97,6 +102,7 @@ def _filters(context: PageContext, wanted: FailureFilter, known: FilterChoices) 
         choices("area", "Area", known.areas, wanted.area) if known.areas or wanted.area else "",
         choices("tile", "Tile", known.tiles, wanted.tile),
         choices("cause", "Cause", known.causes, wanted.cause),
+        context.range_fields(),
         context.to("failures"),
     )
 
@@ -108,18 +114,21 @@ async def _list(services: Services, context: PageContext, wanted: FailureFilter,
     shown_map = None
     if version is not None:
         box = box_of(await load(services.maps.plan, context.site, version))
-        layers = [Layer("Density", heat(_places(shown), box), shown=False), Layer("Failures", _marks(context, shown))]
+        layers = [
+            Layer("Density", heat(_places(shown), box), shown=False),
+            Layer("Failures", failure_marks(context, shown)),
+        ]
         shown_map = await version_map(services, context, version, layers)
-    listed = html(_rows(context, wanted, shown))
+    listed = html(_rows(context, shown))
 
     async def refresh() -> None:
         nonlocal shown
         found = await load(services.health.failures, wanted, None)
         if found != shown:
             shown = found
-            listed.set_content(str(_rows(context, wanted, found)))
+            listed.set_content(str(_rows(context, found)))
             if shown_map is not None:
-                shown_map.show("Failures", _marks(context, found))
+                shown_map.show("Failures", failure_marks(context, found))
                 shown_map.show("Density", heat(_places(found), box))
 
     if before is None:
@@ -130,7 +139,7 @@ def _places(shown: list[FailureRow]) -> list[tuple[float, float]]:
     return [(row.x_map_m, row.y_map_m) for row in shown if row.x_map_m is not None and row.y_map_m is not None]
 
 
-def _marks(context: PageContext, shown: list[FailureRow]) -> list[Mark]:
+def failure_marks(context: PageContext, shown: list[FailureRow]) -> list[Mark]:
     """Crosses at the failures that have a position."""
     found = []
     for row in reversed(shown):
@@ -148,13 +157,23 @@ def _kind(row: FailureRow) -> Markup:
     return badge(_tone(row), _KINDS.get(FailureKind(row.kind), row.kind) if row.kind in set(FailureKind) else row.kind)
 
 
-def _rows(context: PageContext, wanted: FailureFilter, found: list[FailureRow]) -> Markup:
+def _rows(context: PageContext, found: list[FailureRow]) -> Markup:
     shown = found[:FAILURES_SHOWN]
+    listed = failure_table(context, shown, "No failures match these filters.")
+    if len(found) <= FAILURES_SHOWN:
+        return listed
+    filters = {name: context.query.get(name) for name in _KNOWN}
+    older = context.to("failures", **(filters | {"before": shown[-1].number}))
+    return Markup("{}<p>{}</p>").format(listed, link(older, "Older failures"))
+
+
+def failure_table(context: PageContext, shown: list[FailureRow], empty: str) -> Markup:
+    """Failures as a table; empty: the sentence where there are none."""
     rows = [
         (
             link(context.to(f"failures/{row.number}"), f"Failure {row.number}"),
-            moment(row.happened_ns),
-            row.robot,
+            context.moment(row.happened_ns),
+            link(context.to(f"robots/{row.robot}"), row.robot),
             row.cause.replace("_", " "),
             _kind(row),
             row.version,
@@ -164,41 +183,50 @@ def _rows(context: PageContext, wanted: FailureFilter, found: list[FailureRow]) 
         for row in shown
     ]
     head = ("Failure", "When", "Robot", "Cause", "Kind", "Map version", "Where", "Duration")
-    listed = table(head, rows, empty="No failures match these filters.", name="Failures")
-    if len(found) <= FAILURES_SHOWN:
-        return listed
-    filters = {name: getattr(wanted, name) for name in ("robot", "version", "tile", "area", "cause")}
-    older = context.to("failures", **filters, before=shown[-1].number)
-    return Markup("{}<p>{}</p>").format(listed, link(older, "Older failures"))
+    return table(head, rows, empty=empty, name="Failures")
+
+
+def _answer(context: PageContext, detail: FailureDetail) -> Markup:
+    """What happened, in a sentence."""
+    row, report = detail.failure, detail.report
+    kind = "suspects a failure" if row.kind == FailureKind.SUSPECTED else "failed"
+    where = f" in {row.area}" if row.area else f" in tile {row.tile}" if row.tile else ""
+    state = STATUSES.get(row.status, (row.status.lower(),))[0]
+    off = f", and was {report.wrong_by_m:.1f} m from where it believed to be" if report.wrong_by_m is not None else ""
+    lasted = f"{state} for {row.duration_s:.1f} s when it reported"
+    words = (
+        f"{row.robot} {kind} at {context.moment(row.happened_ns)}{where}: {row.cause.replace('_', ' ')}, {lasted}{off}."
+    )
+    return notice(_tone(row), words)
 
 
 def _summary(context: PageContext, detail: FailureDetail) -> Markup:
     row, report = detail.failure, detail.report
 
     def figure(value: float | None, unit: str = "") -> str | None:
-        return None if value is None else f"{value:.3g}{unit}"
+        if value is None:
+            return None
+        return f"{value:.0f}{unit}" if abs(value) >= 100 else f"{value:.3g}{unit}"
 
     def same(name: str, value: object) -> Markup | None:
         return None if value is None else link(context.to("failures", **{name: value}), value)
 
     suspected = row.kind == FailureKind.SUSPECTED
     advice = _ADVICE.get(Cause(row.cause)) if row.cause in set(Cause) else None
-    wrong = f"Fixes that agree with each other put the robot {figure(report.wrong_by_m, ' m')} from where it believed to be."
     doubt = (
         "The robot suspects a failure because its fixes contradict its position. Suspected failures are an estimate."
     )
-    return Markup("<div><h2>What happened</h2>{}{}{}{}</div>").format(
+    return Markup("<div><h2>What happened</h2>{}{}{}</div>").format(
         notice("warn", doubt) if suspected else "",
-        "" if report.wrong_by_m is None else notice("bad", wrong),
         "" if advice is None else notice("", advice),
         facts(
             [
-                ("Began", moment(row.happened_ns)),
+                ("Began", context.moment(row.happened_ns)),
                 ("Duration when reported", f"{row.duration_s:.1f} s"),
                 ("Cause", row.cause.replace("_", " ")),
                 ("Calibration", report.calibration or "–"),
                 ("State of the robot", STATUSES.get(row.status, (row.status,))[0]),
-                ("Robot", same("robot", row.robot)),
+                ("Robot", link(context.to(f"robots/{row.robot}"), row.robot)),
                 ("Map version", same("version", row.version)),
                 ("Area", same("area", row.area) or "–"),
                 ("Tile", same("tile", row.tile)),
@@ -209,7 +237,7 @@ def _summary(context: PageContext, detail: FailureDetail) -> Markup:
                 ("Matches in the last fix", report.inliers),
                 ("Brightness of the image (0 to 1)", figure(report.exposure)),
                 ("Sharpness (1 is usual)", figure(report.sharpness)),
-                ("Received", moment(row.received_ns)),
+                ("Received", context.moment(row.received_ns)),
             ]
         ),
     )
@@ -252,15 +280,16 @@ def _pictures(context: PageContext, detail: FailureDetail) -> Markup:
         )
     shown = joined(
         Markup(
-            '<figure><img src="{}" alt="{}" loading="lazy"><figcaption>{}, {:.1f} s {} the beginning</figcaption></figure>'
+            '<figure class="{}"><img src="{}" alt="{}" loading="lazy"><figcaption>{}, {:.1f} s {} the beginning</figcaption></figure>'
         ).format(
+            picture.kind if picture.kind in _PICTURES else "",
             f"{context.root}/pictures/{detail.failure.number}/{picture.place}.jpg",
             _PICTURES.get(picture.kind, picture.kind),
             _PICTURES.get(picture.kind, picture.kind),
             abs(picture.stamp_ns - detail.report.stamp_ns) * 1e-9,
             "after" if picture.stamp_ns >= detail.report.stamp_ns else "before",
         )
-        for picture in detail.pictures
+        for picture in sorted(detail.pictures, key=lambda picture: (picture.kind != "matches", picture.stamp_ns))
     )
     return Markup('<h2>Pictures</h2><div class="pictures">{}</div>').format(shown)
 
@@ -271,7 +300,11 @@ def _fixes(report: FailureReport) -> Markup:
             f"{(fix.stamp_ns - report.stamp_ns) * 1e-9:+.1f} s",
             STATUSES.get(fix.status, (fix.status,))[0],
             fix.inliers,
-            None if fix.innovation is None else f"{fix.innovation:.3g}",
+            None
+            if fix.innovation is None
+            else f"{fix.innovation:.0f}"
+            if fix.innovation >= 100
+            else f"{fix.innovation:.3g}",
             None if fix.position_map_m is None else f"{fix.position_map_m[0]:.2f}, {fix.position_map_m[1]:.2f} m",
             fix.refused or "used" if fix.position_map_m is not None else fix.refused,
         )

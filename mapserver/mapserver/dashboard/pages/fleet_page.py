@@ -1,25 +1,35 @@
 """The fleet page: the robots now, on the map and one by one, and their failure rates."""
 
+import time
 from typing import Any
 
 from fastapi import Request
 from markupsafe import Markup
 from nicegui import ui
 
+from fleetmap.messages import Status
 from mapserver.dashboard import fleet_parts
 from mapserver.dashboard.fleet_health import SiteHealth
 from mapserver.dashboard.fleet_parts import Figure
-from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, show, version_map
-from mapserver.dashboard.live import LiveRobot, LiveSite
+from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, notice, show, version_map
+from mapserver.dashboard.live import STATUSES, LiveRobot, LiveSite
 from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
-from mapserver.dashboard.markup import age, joined, share
+from mapserver.dashboard.markup import age, badge, joined, link, share, table
+from mapserver.dashboard.pages.robot_page import where_words
 from mapserver.dashboard.site_map import SiteMap
 from mapserver.fleet_statistics.kpis import driven_words
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS, CalibrationFigure
+from mapserver.floor_plan.areas import Areas
 
+_ATTENTION_ROWS = 6
 _MOVE_EVERY_S, _TABLE_EVERY_S = 1.0, 2.0
 _SHAPES = {"good": "circle", "warn": "triangle", "bad": "square", "quiet": "circle"}
-_TONE_WORDS = {"good": "localised", "warn": "unsure or starting", "bad": "lost", "quiet": "silent, last position"}
+_TONE_WORDS = {
+    "good": "localised",
+    "warn": "unsure or starting",
+    "bad": "not localised",
+    "quiet": "silent, last position",
+}
 _COLUMNS = {
     "robot": "Robot",
     "state": "State",
@@ -39,10 +49,12 @@ def install(services: Services) -> None:
         async def build(context: PageContext) -> None:
             live = await load(services.robots.look, context.site)
             health = await load(services.health.site, context.site)
+            areas = await load(services.maps.areas, context.site)
             html(Markup("<h1>Robots of {}</h1>").format(context.site))
-            trials = html(fleet_parts.trial_notices(health.trials))
-            figures = html(_figures(live, health))
+            attention = html(_attention(context, live, areas))
+            trials = html(fleet_parts.trial_notices(health.trials, context.moment))
             drawn = await _map(services, context, live)
+            figures = html(_figures(live, health))
             chart = html(_rates(health))
             robots = _table(context, live, health)
             calibrations = html(fleet_parts.calibrations(_calibrations(live)))
@@ -51,8 +63,9 @@ def install(services: Services) -> None:
             async def move() -> None:
                 live = await load(services.robots.look, context.site)
                 health = await load(services.health.site, context.site)
+                attention.set_content(str(_attention(context, live, areas)))
                 figures.set_content(str(_figures(live, health)))
-                trials.set_content(str(fleet_parts.trial_notices(health.trials)))
+                trials.set_content(str(fleet_parts.trial_notices(health.trials, context.moment)))
                 if drawn is not None:
                     drawn.show("Robots", _marks(context, live))
 
@@ -71,16 +84,67 @@ def install(services: Services) -> None:
         await show(services, request, "", site, build)
 
 
+def _attention(context: PageContext, live: LiveSite, areas: Areas) -> Markup:
+    """Whether anything is wrong now: which robots, where, since when and why."""
+    heard = [robot for robot in live.robots if robot.tone != "quiet"]
+    found = [robot for robot in heard if robot.tone in {"bad", "warn"} or _troubles(robot)]
+    silent = len(live.robots) - len(heard)
+    more = f" {silent} {'is' if silent == 1 else 'are'} silent." if silent else ""
+    if not found:
+        words = (
+            f"Nothing is wrong now: all {len(heard)} robots that are heard are localised."
+            if heard
+            else "No robot is heard now."
+        )
+        return notice("good" if heard else "", words + more)
+    lost = sum(robot.tone == "bad" for robot in found)
+    rows = [
+        (
+            link(context.to(f"robots/{robot.name}"), robot.name),
+            badge(robot.tone, robot.words),
+            _since(context, robot),
+            where_words(robot, areas),
+            ", ".join((*robot.flags, *_troubles(robot))).replace("_", " "),
+        )
+        for robot in found[:_ATTENTION_ROWS]
+    ]
+    head = ("Robot", "State", "Since", "Last seen", "Why")
+    rest = f" and {len(found) - _ATTENTION_ROWS} more, in the table below." if len(found) > _ATTENTION_ROWS else ""
+    told = f"{len(found)} of {len(heard)} robots need a look; {lost} {'does' if lost == 1 else 'do'} not know where they are.{more}"
+    return Markup('<div class="attention">{}{}<p class="quiet">{}</p></div>').format(
+        notice("bad" if lost else "warn", told), table(head, rows, empty="", name="Robots that need a look"), rest
+    )
+
+
+def _troubles(robot: LiveRobot) -> list[str]:
+    """What is wrong beside the state."""
+    found = [f"refuses a version: {robot.refused}"] if robot.refused else []
+    return found + [f"{PARAMETERS[f.name]} drifts" for f in robot.calibration if f.is_drifted]
+
+
+def _since(context: PageContext, robot: LiveRobot) -> str | None:
+    """When its state began; of a robot that is well, nothing."""
+    if robot.since_ns is None or robot.tone == "good":
+        return None
+    return f"{context.moment(robot.since_ns)} ({age(max(0.0, time.time() - robot.since_ns / 1e9))})"
+
+
 def _figures(live: LiveSite, health: SiteHealth) -> Markup:
     heard = len(live.robots) - live.count("quiet")
     lost = live.count("bad")
+    several = live.count("bad", STATUSES[Status.AMBIGUOUS][0])
     day = health.day
     return fleet_parts.figures(
         [
             fleet_parts.localised_figure("Localised while driving, last 24 h", day),
             Figure("Robots heard now", f"{heard} of {len(live.robots)}", "reported within 10 s"),
             Figure("Localised now", live.count("good"), f"{live.count('warn')} unsure or starting", "good"),
-            Figure("Lost now", lost, "position unknown", "bad" if lost else ""),
+            Figure(
+                "Not localised now",
+                lost,
+                f"{lost - several} lost, {several} where several places fit",
+                "bad" if lost else "",
+            ),
             fleet_parts.rate_figure("Failures per robot-day, last 24 h", day.failures, f"; {health.trend}"),
             fleet_parts.rate_figure("Silent failures per robot-day, an estimate", day.silent_estimated, ""),
             Figure("Time with a usable position", share(day.availability) or "–", "of the last 24 h"),
@@ -111,7 +175,7 @@ def _marks(context: PageContext, live: LiveSite) -> list[Mark]:
     for robot in reversed(live.robots):
         if robot.place_m is not None:
             shape, words = _SHAPES.get(robot.tone, "circle"), f"{robot.name}: {robot.words}"
-            address, (x, y) = context.to("failures", robot=robot.name), robot.place_m
+            address, (x, y) = context.to(f"robots/{robot.name}"), robot.place_m
             place = round(x, 2), round(y, 2)
             found.append(Mark(*place, robot.tone, shape, words, address, robot.name, robot.heading_rad))
     return found
@@ -183,5 +247,5 @@ def _row(context: PageContext, robot: LiveRobot, health: SiteHealth) -> dict[str
         "localised": "–" if own is None else share(own.localised_share_of_all) or "–",
         "since": "now" if robot.seconds_since < 3 else f"{age(robot.seconds_since)} ago",
         "remarks": ", ".join(remarks),
-        "to": context.to("failures", robot=robot.name),
+        "to": context.to(f"robots/{robot.name}"),
     }

@@ -7,10 +7,11 @@ from fastapi import Request
 from markupsafe import Markup
 from nicegui import ui
 
+from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from mapserver.dashboard.data import SiteHistory, VersionQuality
 from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, number, show, version_map
 from mapserver.dashboard.map_layers import Layer, coverage, squares
-from mapserver.dashboard.markup import badge, choices, facts, joined, link, moment, share, size, table
+from mapserver.dashboard.markup import badge, choices, facts, joined, link, share, size, table
 from mapserver.dashboard.pages.confirm import change_button
 from mapserver.dashboard.plan import Plan
 from mapserver.floor_plan.areas import Areas
@@ -19,6 +20,7 @@ from mapserver.releases import Difference
 from mapserver.store import CanaryRow, VersionInfo
 
 _REFRESH_S = 5.0
+_STATE_WORDS = {"published": "used before"}
 _STATE_TONES = {"current": "good", "draft": "warn", "published": "quiet", "retired": "quiet"}
 # Figures of a build's report with their labels.
 _FIGURES = {
@@ -45,16 +47,17 @@ def install(services: Services) -> None:
         async def build(context: PageContext) -> None:
             history = await load(services.maps.history, context.site)
             html(Markup("<h1>Map of {}</h1>").format(context.site))
-            _changes(services, context, history)
+            robots = len((await load(services.robots.look, context.site)).robots)
+            _changes(services, context, history, robots)
             shown = number(version, "version") or _default_version(history)
-            html(_versions(context, history.versions, shown))
+            html(_versions(context, history, shown))
             if shown is not None:
                 await _one_version(services, context, shown)
             await _difference(services, context, history, number(before, "version"), number(after, "version"))
-            html(_events(history))
+            html(_events(context, history))
             _follow(services, context, history)
 
-        await show(services, request, "map", site, build)
+        await show(services, request, "map", site, build, ("version", "before", "after"))
 
 
 def _default_version(history: SiteHistory) -> int | None:
@@ -69,54 +72,64 @@ def _trial_words(history: SiteHistory) -> str:
     return "" if trial is None else f" Version {trial.version} is tried by {share(trial.share)} of them."
 
 
-def _changes(services: Services, context: PageContext, history: SiteHistory) -> None:
-    """Buttons that change the versions."""
+def _changes(services: Services, context: PageContext, history: SiteHistory, robots: int) -> None:
+    """Buttons that change the versions, each with what it does to how many robots."""
     current = history.site.current_version
     used = f"Robots should use version {current}." + _trial_words(history)
     html(Markup("<p>{}</p>").format("No version is published yet." if current is None else used))
     with ui.row().classes("actions"):
         if history.trial is not None:
-            _stop_button(services, context, history.trial)
+            _stop_button(services, context, history.trial, robots)
         elif (before := history.before) is not None:
             change_button(
                 services,
                 f"Roll back to version {history.before}",
-                f"All robots of {context.site} go from version {current} back to version {history.before}. Version {current} "
+                f"All {robots} robots of {context.site} go from version {current} back to version {history.before}. Version {current} "
                 "is retired; it can be made current again later.",
                 lambda actor: services.maps.roll_back(context.site, before, actor),
+                css="back",
             )
         for info in history.versions:
             if info.state != "current":
-                _version_buttons(services, context, history, info)
+                _version_buttons(services, context, history, info, robots)
 
 
-def _stop_button(services: Services, context: PageContext, trial: CanaryRow) -> None:
+def _stop_button(services: Services, context: PageContext, trial: CanaryRow, robots: int) -> None:
     change_button(
         services,
         f"Stop trying version {trial.version}",
-        f"Robots with version {trial.version} go back to version {trial.base_version}. Version {trial.version} is retired; "
-        "it can be made current again later.",
+        f"The robots with version {trial.version} ({share(trial.share)} of {robots}) go back to version {trial.base_version}. Version "
+        f"{trial.version} is retired; it can be made current again later.",
         lambda actor: services.maps.stop_trial(context.site, trial, actor),
+        css="back",
     )
 
 
-def _version_buttons(services: Services, context: PageContext, history: SiteHistory, info: VersionInfo) -> None:
-    """Buttons that give a version to all robots, or to some of them first."""
+def _version_buttons(
+    services: Services, context: PageContext, history: SiteHistory, info: VersionInfo, robots: int
+) -> None:
+    """Buttons that give a version to all robots, or to some of them first. Older versions are gone back to, newer ones promoted."""
     version, current, share_words = info.version, history.site.current_version, f"{services.maps.trial_share:.0%}"
     through_gate = f"Draft {version} goes through the gate. If the gate accepts it, " if info.state == "draft" else ""
     if info.state == "draft":
         change_button(
             services,
             f"Publish draft {version}",
-            f"{through_gate}all robots of {context.site} get it.",
+            f"{through_gate}all {robots} robots of {context.site} get it.",
             lambda actor: services.maps.publish(context.site, version, actor),
+            css="forward",
         )
     elif version != history.before or history.trial is not None:
+        on_trial = history.trial is not None and history.trial.version == version
+        is_back = current is not None and version < current
+        words = f"Go back to version {version}" if is_back else f"Promote version {version}"
+        ends = " The trial ends." if history.trial is not None else ""
         change_button(
             services,
-            f"Promote version {version}",
-            f"All robots of {context.site} go from version {current} to version {version}.",
+            f"{words}, ending its trial" if on_trial else words,
+            f"All {robots} robots of {context.site} go from version {current} to version {version}.{ends}",
             lambda actor: services.maps.promote(context.site, version, actor),
+            css="back" if is_back else "forward",
         )
     if current is not None and history.trial is None and version > current:
         change_button(
@@ -125,22 +138,30 @@ def _version_buttons(services: Services, context: PageContext, history: SiteHist
             f"{through_gate}{share_words} of the robots get version {version}. If they fail more often than the others, it is rolled back "
             "automatically; otherwise all robots get it.",
             lambda actor: services.maps.start_trial(context.site, version, actor),
+            css="forward",
         )
 
 
-def _versions(context: PageContext, versions: list[VersionInfo], shown: int | None) -> Markup:
+def _state(history: SiteHistory, info: VersionInfo) -> Markup:
+    trial = history.trial
+    if trial is not None and trial.version == info.version:
+        return badge("warn", f"on trial, {share(trial.share)} of the robots")
+    return badge(_STATE_TONES[info.state], _STATE_WORDS.get(info.state, info.state))
+
+
+def _versions(context: PageContext, history: SiteHistory, shown: int | None) -> Markup:
     rows = [
         (
             link(context.to("map", version=info.version), f"Version {info.version}"),
-            joined([badge(_STATE_TONES[info.state], info.state), " (shown below)" if info.version == shown else ""]),
+            joined([_state(history, info), " (shown below)" if info.version == shown else ""]),
             info.parent,
-            info.created.replace("T", " ").replace("Z", " UTC"),
-            moment(info.published_ns),
+            context.written_moment(info.created),
+            context.moment(info.published_ns),
             info.tiles,
             info.landmarks,
             size(info.map_bytes),
         )
-        for info in versions
+        for info in history.versions
     ]
     head = ("Version", "State", "Built on", "Built", "Published", "Tiles", "Landmarks", "Size")
     return Markup("<h2>Versions</h2>{}").format(
@@ -163,7 +184,7 @@ async def _one_version(services: Services, context: PageContext, version: int) -
                 )
             )
         right = Markup("<h2>Quality of version {}</h2>{}{}")
-        html(right.format(version, _quality_facts(quality, plan), _verdicts(quality)))
+        html(right.format(version, _quality_facts(quality, plan), _verdicts(context, quality)))
     html(one_way(plan, areas))
 
 
@@ -186,6 +207,15 @@ def one_way(plan: Plan, areas: Areas) -> Markup:
     )
 
 
+def _download(info: VersionInfo) -> Markup:
+    """What a robot fetches; it has the shipped vocabulary already."""
+    has_vocabulary = shipped_vocabulary(info.vocabulary_sha256) is not None
+    return Markup("{}{}").format(
+        size(info.map_bytes + (0 if has_vocabulary else info.vocabulary_bytes)),
+        "; the vocabulary is on every robot" if has_vocabulary else f", {size(info.vocabulary_bytes)} of it vocabulary",
+    )
+
+
 def _quality_facts(quality: VersionQuality, plan: Plan) -> Markup:
     report, info = quality.manifest.report, quality.info
     pairs: list[tuple[str, object]] = [
@@ -198,7 +228,7 @@ def _quality_facts(quality: VersionQuality, plan: Plan) -> Markup:
         ("Landmarks for robots", info.landmarks),
         ("Places for robots", plan.places),
         ("Area with tiles", f"{area_m2:.0f} m²"),
-        ("Download for a robot", size(info.map_bytes + info.vocabulary_bytes)),
+        ("Download for a robot", _download(info)),
     ]
     loops = report.get("loops")
     if isinstance(loops, dict):
@@ -215,7 +245,7 @@ def _findings(report: dict[str, Any]) -> Iterable[tuple[str, list[str]]]:
     return found.items() if isinstance(found, dict) else ()
 
 
-def _verdicts(quality: VersionQuality) -> Markup:
+def _verdicts(context: PageContext, quality: VersionQuality) -> Markup:
     """Verdicts of the gate, latest first."""
     if not quality.verdicts:
         return Markup('<p class="quiet">The gate has not judged this version yet; publishing it will.</p>')
@@ -228,7 +258,7 @@ def _verdicts(quality: VersionQuality) -> Markup:
         missing = ", ".join(verdict.report.get("not_judged") or ()).replace("_", " ")
         unjudged = Markup('<p class="quiet">Not judged: {}.</p>').format(missing) if missing else ""
         entry = Markup("<p>Gate, {}: {}</p><ul>{}</ul>{}")
-        parts.append(entry.format(moment(verdict.stamp_ns), badge(tone, words), reasons, unjudged))
+        parts.append(entry.format(context.moment(verdict.stamp_ns), badge(tone, words), reasons, unjudged))
     return joined(parts)
 
 
@@ -294,9 +324,15 @@ def _difference_facts(found: Difference) -> Markup:
     return facts(pairs)
 
 
-def _events(history: SiteHistory) -> Markup:
+def _events(context: PageContext, history: SiteHistory) -> Markup:
     rows = [
-        (moment(event.stamp_ns), event.kind.replace("_", " "), event.detail, event.actor or "mapserver", event.reason)
+        (
+            context.moment(event.stamp_ns),
+            event.kind.replace("_", " "),
+            event.detail,
+            event.actor or "mapserver",
+            event.reason,
+        )
         for event in history.events
     ]
     return Markup("<h2>History</h2>{}").format(

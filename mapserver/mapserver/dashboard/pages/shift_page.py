@@ -1,14 +1,16 @@
 """The shift leader's page: one HTML file without links, made of the parts of the fleet page, light or dark as the screen is."""
 
 from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 
 from markupsafe import Markup
 
+from mapserver.api.moments import moment_text
 from mapserver.dashboard import bar_chart, fleet_parts
 from mapserver.dashboard.bar_chart import Bar
 from mapserver.dashboard.fleet_parts import Figure, Trial
-from mapserver.dashboard.markup import joined, moment, share, table
+from mapserver.dashboard.markup import joined, share, table
 from mapserver.fleet.shift_summary import FleetSummary
 from mapserver.fleet_statistics.kpis import HOUR_NS, Kpis, Rate, format_rate, is_telling
 
@@ -22,12 +24,12 @@ def html_page(summary: FleetSummary) -> str:
     """The page as a file's content."""
     heading = Markup(
         "<h1>Robots of {}</h1><p>{}, the last {} h, map version {}. A robot-day is 16 hours of driving.</p>"
-    ).format(summary.site, moment(summary.until_ns), summary.hours, summary.current_version or "none")
+    ).format(summary.site, _moment(summary.until_ns), summary.hours, summary.current_version or "none")
     parts = (
         heading,
         _figures(summary),
         _unreported(summary.total.unreported_blindness),
-        fleet_parts.trial_notices(Trial(row, row.outcome or found.reason) for row, found in summary.trials),
+        fleet_parts.trial_notices((Trial(row, row.outcome or found.reason) for row, found in summary.trials), _moment),
         _by_hour(summary),
         _kpis_table("Robots, the worst first", "Robot", summary.robots),
         _kpis_table("Map versions", "Version", summary.versions),
@@ -42,6 +44,11 @@ def html_page(summary: FleetSummary) -> str:
         '<body class="print"><main class="nicegui-content">\n{}\n</main></body></html>\n'
     )
     return str(page.format(summary.site, Markup(_STYLE.read_text("utf-8")), joined(parts, "\n")))
+
+
+def _moment(stamp_ns: int | None) -> str | None:
+    """By the clock of the machine that writes the page."""
+    return moment_text(stamp_ns, None)
 
 
 def _figures(summary: FleetSummary) -> Markup:
@@ -79,10 +86,11 @@ def _by_hour(summary: FleetSummary) -> Markup:
     bars = []
     for start in range(until - summary.hours, until, step):
         count = sum(counts.get(hour, 0) for hour in range(start, start + step))
-        words = f"{moment(start * HOUR_NS)}: {count}"
-        bars.append(Bar(str(start % 24) if step == 1 else "", count, count, count, words))
+        words = f"{_moment(start * HOUR_NS)}: {count}"
+        hour = str(datetime.fromtimestamp(start * HOUR_NS // 10**9).hour)
+        bars.append(Bar(hour if step == 1 else "", count, count, count, words))
     drawn = bar_chart.bars(bars, "Failures over time")
-    span = "an hour, UTC" if step == 1 else f"{step} hours"
+    span = "an hour" if step == 1 else f"{step} hours"
     return Markup('<h2>Failures over time</h2>{}<p class="quiet">A bar for {}.</p>').format(drawn, span)
 
 
@@ -118,7 +126,7 @@ def _causes(summary: FleetSummary) -> Markup:
 def _failures(summary: FleetSummary) -> Markup:
     rows = [
         (
-            moment(row.happened_ns),
+            _moment(row.happened_ns),
             row.robot,
             row.kind.replace("_", " "),
             row.cause.replace("_", " "),

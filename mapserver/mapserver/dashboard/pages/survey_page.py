@@ -46,7 +46,7 @@ def install(services: Services) -> None:
             if chosen is not None:
                 await _one_job(services, context, chosen)
 
-        await show(services, request, "surveys", site, build)
+        await show(services, request, "surveys", site, build, ("job",))
 
 
 def _jobs(context: PageContext, jobs: list[JobInfo]) -> Markup:
@@ -55,8 +55,8 @@ def _jobs(context: PageContext, jobs: list[JobInfo]) -> Markup:
             link(context.to("surveys", job=job.id), f"Job {job.id}"),
             job.kind,
             badge(_TONES.get(job.state, "quiet"), _state(job)),
-            _time(job.started),
-            _time(job.finished),
+            context.written_moment(job.started),
+            context.written_moment(job.finished),
             job.message,
         )
         for job in jobs
@@ -71,10 +71,6 @@ def _state(job: JobInfo) -> str:
         return job.state
     hours = (datetime.now(UTC) - datetime.fromisoformat(job.started)).total_seconds() / 3600
     return "running" if hours < _LONG_H else "running or killed"
-
-
-def _time(text: str | None) -> str | None:
-    return None if text is None else text.replace("T", " ").replace("Z", " UTC")
 
 
 async def _one_job(services: Services, context: PageContext, job: JobInfo) -> None:

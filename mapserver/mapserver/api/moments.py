@@ -1,0 +1,63 @@
+"""Moments as people and programs write them, and as pages show them: with an offset from UTC, or by a local time zone."""
+
+import re
+from datetime import UTC, date, datetime, timedelta, tzinfo
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+from fleetmap.errors import UsageError
+
+_LATEST_YEAR = 2200
+_NAME = re.compile(r"[A-Za-z0-9_+\-/]{1,64}", re.ASCII)
+_LOST_PLUS = re.compile(r"(T[\d:.]+) (\d\d:?\d\d)$")  # in an address + means a space
+
+
+def zone_of(name: str | None) -> tzinfo | None:
+    """The zone of an IANA name; None, the machine's own zone, for none and for one that this machine does not know."""
+    if not name or not _NAME.fullmatch(name):
+        return None
+    try:
+        return ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        return None
+
+
+def moment_text(stamp_ns: int | None, zone: tzinfo | None) -> str | None:
+    """A stamp by a zone's clock, with the zone's name for that moment; None for none."""
+    if stamp_ns is None:
+        return None
+    at = datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).astimezone(zone)
+    return f"{at:%Y-%m-%d %H:%M:%S} {at.tzname()}"
+
+
+def read_moment(text: str | None, name: str, zone: tzinfo | None = None, *, is_end: bool = False) -> int | None:
+    """Nanoseconds since 1970 of ISO 8601 text; without an offset it is in the zone, None: the machine's own. None for no text.
+
+    A day alone is its beginning, or its end with `is_end`. Raises UsageError for other text, naming the parameter.
+    """
+    if not text:
+        return None
+    written = _LOST_PLUS.sub(r"\1+\2", text.strip())
+    try:
+        if len(written) == 10:
+            day = date.fromisoformat(written) + timedelta(days=int(is_end))
+            at = datetime(day.year, day.month, day.day)
+        else:
+            at = datetime.fromisoformat(written)
+    except (ValueError, OverflowError):
+        at = None
+    if at is None or not 1970 < at.year < _LATEST_YEAR:
+        raise UsageError(
+            f"{name} {text[:40]!r} is no time; write 2026-01-31T14:03, with +01:00 or Z where it is not local"
+        )
+    if at.tzinfo is None:
+        at = at.replace(tzinfo=zone) if zone is not None else at.astimezone()
+    whole_s, part_s = divmod(at.timestamp(), 1)
+    return int(whole_s) * 1_000_000_000 + round(part_s * 1e6) * 1000
+
+
+def read_range(since: str | None, until: str | None, zone: tzinfo | None = None) -> tuple[int | None, int | None]:
+    """Both ends of a range. UsageError for text that is no time, and for an end before the beginning."""
+    start_ns, end_ns = read_moment(since, "since", zone), read_moment(until, "until", zone, is_end=True)
+    if start_ns is not None and end_ns is not None and end_ns <= start_ns:
+        raise UsageError(f"until {(until or '')[:40]!r} is not after since {(since or '')[:40]!r}; exchange them")
+    return start_ns, end_ns
