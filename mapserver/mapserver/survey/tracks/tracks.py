@@ -217,7 +217,7 @@ def _observe_batch(shared: tuple[StereoCamera, SurveySettings], batch: _Observat
         others = np.flatnonzero(~is_reference)
         others = others[np.argsort(references[others, 0], kind="stable")]
         sources, starts = np.unique(references[others, 0], return_index=True)
-        for source, inner in zip(sources.tolist(), np.split(others, starts[1:]), strict=True):
+        for source, inner in zip(sources.tolist(), np.split(others, starts)[1:], strict=True):
             cam_from_source = cam_from_map @ batch.map_from_cam[source]
             points_source = transform_points(se3_inverse(batch.map_from_cam[source]), points_map[inner])
             theirs = _patch_features(keyframes[source], keyframes[source].pictures, references[inner, 2])

@@ -15,7 +15,7 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, SensorSet
 from mapserver.config import survey_settings
 from mapserver.survey.live.live_map import LiveMap
-from mapserver.survey.live.live_values import LiveRig
+from mapserver.survey.live.live_values import LiveRig, NewKeyframe
 from mapserver.survey.live.tracking import LiveTracking
 from mapserver.survey.odometry_pass import SampleFeed
 from mapserver.survey.survey_inputs import SurveyConfig
@@ -101,3 +101,16 @@ def test_a_covered_camera_has_no_quality_and_the_map_goes_on() -> None:
     assert min(followed.qualities[50:]) > 0.0
     assert followed.stamps_ns[-1] > dark[-1] * FRAME_NS
     assert followed.error_m().max() < 0.15
+
+
+def test_pictures_that_do_not_change_at_all_are_mapped() -> None:
+    """A robot that stands, under a camera without noise: every point is seen first by the first of them."""
+    growing = LiveMap(SurveyConfig(SETTINGS, default_vocabulary()), LiveRig(CAMERA, BODY_FROM_CAM))
+    still, step = np.zeros(3), np.diag([1e-4] * 6)
+    for number in range(3):
+        frame = stereo_frame(FRAME_NS)
+        frame = RectifiedFrame((number + 1) * FRAME_NS, frame.left, frame.right, None)
+        new = NewKeyframe(number, np.eye(4), np.eye(3), step if number else None, still, still, still)
+        growing.add(frame, new)
+    assert len(growing.points_map()) > 100
+    np.testing.assert_allclose(growing.map_from_body[:, :3, 3], 0.0, atol=0.01)
