@@ -54,5 +54,8 @@ def _rotation_of_rays(before: Array, after: Array, camera: StereoCamera) -> Arra
     essential, inliers = cv2.findEssentialMat(before, after, camera.matrix, cv2.RANSAC, 0.999, 1.0)
     if essential is None or essential.shape != (3, 3) or int(inliers.sum()) < _MIN_POINTS:
         return None
-    _, after_from_before, _, _ = cv2.recoverPose(essential, before, after, camera.matrix, mask=inliers)
+    # Its two rotations are half a turn about the baseline apart. Which one puts points in front of both cameras is left open where the
+    # camera hardly moves; from one frame to the next it does not turn round.
+    first, second, _ = cv2.decomposeEssentialMat(essential)
+    after_from_before = first if np.trace(first) > np.trace(second) else second
     return np.asarray(after_from_before.T, np.float64)
